@@ -69,7 +69,7 @@ check: setup-build lint ## lints, documentation, licences, bans, sources and kno
 	scripts/deny.sh
 
 bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --only sync"); fails if one is not measured
-	cargo build --release --locked --bin rapid --example unplug_latency
+	cargo build --release --locked --bin rapid --example unplug_latency --example capture
 	cargo build --release --locked -p vbench -p rapid-bench --bins
 	RAPID_BIN='$(TARGET)/release/rapid' '$(TARGET)/release/rapid-bench' $(if $(JSON),--json) $(BENCH)
 

@@ -29,7 +29,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 /// Names the commit a release is built from. A source archive has none. Builds for development have
-/// none either: each commit would build them anew.
+/// none either: each commit would rebuild them.
 fn commit() {
     // Asked for here and not found by git itself: the archive may lie in somebody else's repository.
     if std::env::var("PROFILE").as_deref() != Ok("release") || !Path::new(".git").exists() {
@@ -53,7 +53,7 @@ fn commit() {
 /// needs none.
 fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed={PINNED}");
-    // They say where the cache is.
+    // They give the place of the cache.
     println!("cargo::rerun-if-env-changed=XDG_CACHE_HOME");
     println!("cargo::rerun-if-env-changed=HOME");
     let arch = std::env::var("CARGO_CFG_TARGET_ARCH")?;

@@ -7,8 +7,9 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid::device::DeviceNode;
 use rapid::driver::{Driver, DriverError, camera};
-use rapid::registry::{CameraSpec, DeviceNode, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec, WhenStale};
+use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec, WhenStale};
 use rapid::time::Stamp;
 
 #[tokio::main]

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""What each input of the policy is worth: trains five configurations of it and runs each in the program.
+"""Measures the contribution of each input of the policy: trains five configurations and evaluates each.
 
     ablation.py EPISODES --rapid target/release/rapid [--only NAME]... [--trials 100] [--iterations 3900]
 
-The configurations are those of the RAPID paper's appendix. Each is trained, exported and then judged by `rapid eval`,
-that is by the program that runs policies, with everything plugged in. What is trained already
-under --runs is not trained again; the results are written anew after every configuration, with those that are there.
+The configurations are those of the RAPID paper's appendix. Each is trained, exported and evaluated by `rapid eval`,
+the program that runs policies, with everything plugged in. Configurations already trained under --runs are not trained
+again; the results are rewritten after every configuration, with all that are available.
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ class Configuration:
     """One row of the table."""
 
     title: str
-    """What it is called in the paper."""
+    """Its name in the paper."""
     spec: Callable[[], Spec]
     data: str
-    """All episodes, or those of one texture."""
+    """Trained on all episodes, or on those of one texture."""
     paper: float
-    """Its success in the paper."""
+    """Its success rate in the paper."""
     shipped: bool = False
-    """It is the policy of the repository: judged as it is, not trained anew."""
+    """It is the policy of the repository: evaluated unchanged, not retrained."""
 
     def bundle(self, runs: Path) -> Path:
-        """Where its bundle is, or comes to be."""
+        """The folder of its bundle, existing or not."""
         return Path(__file__).parent / self.name if self.shipped else runs / self.name / "bundle"
 
     @property
     def name(self) -> str:
-        """Of its policy, and of its folder."""
+        """Name of its policy, and of its folder."""
         return self.spec().name
 
 
 CONFIGURATIONS = (
     Configuration("vision only", lambda: Spec("vision", (wrist(required=True), arm()), mask_aware=False), ALL, 0.5),
-    # With a single picture to take away it is the arm's own state that remains.
+    # Without its single picture, only the arm's own state remains.
     Configuration("vision + mask", lambda: Spec("vision-mask", (wrist(dropout=0.3), arm())), ALL, 0.5),
     Configuration("vision + mask + diff", tactile_id, ALL, 1.0, shipped=True),
     Configuration("vision + diff", lambda: unmasked("vision-diff-one"), ONE, 0.5),
@@ -70,7 +70,7 @@ CONFIGURATIONS = (
 
 
 def unmasked(name: str) -> Spec:
-    """Both pictures, neither ever taken away: such a policy cannot do without one."""
+    """Both pictures, neither ever masked: such a policy cannot run without one."""
     return Spec(name, (wrist(required=True), tactile(required=True), arm()), mask_aware=False)
 
 
@@ -137,7 +137,7 @@ def judge(configuration: Configuration, args: argparse.Namespace) -> None:
 
 
 def summarize(args: argparse.Namespace) -> None:
-    """Writes the table of what is judged so far."""
+    """Writes the table of the configurations evaluated so far."""
     rows = [row for c in CONFIGURATIONS if (row := summary(c, args.runs)) is not None]
     if not rows:
         return
@@ -149,7 +149,7 @@ def summarize(args: argparse.Namespace) -> None:
 
 
 def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
-    """One row; none where the configuration is not judged yet."""
+    """One row; none if the configuration has not been evaluated yet."""
     said = runs / configuration.name / "eval.json"
     if not said.exists():
         return None
@@ -157,7 +157,7 @@ def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
     trained = json.loads((configuration.bundle(runs) / "policy.json").read_text(encoding="utf-8"))["training"]
     trials = [line for line in judged["said"] if line["event"] == "trial"]
     outcomes = Counter("crash" if t["status"] == "crash" else t["outcome"] for t in trials)
-    # Left is where a triangular block belongs, and where a hexagonal one is wrong.
+    # Left is the bin of a triangular block, and wrong for a hexagonal one.
     left = [t for t in trials if t["outcome"] == ("success" if t["triangular"] else "wrong_bin")]
     return {
         "name": configuration.name,

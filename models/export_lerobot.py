@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         export(options)
     except Unsupported as error:
-        # What strangers wrote into a checkpoint must not steer the terminal.
+        # Text from a foreign checkpoint must not control the terminal.
         line = "".join(c if c.isprintable() else " " for c in str(error))
         print(f"export_lerobot: {line}", file=sys.stderr)
         return 1
@@ -99,7 +99,7 @@ def export(options: argparse.Namespace) -> None:
     config = checkpoint_config.read(options.path)
     settings = rig(options, config)
 
-    # LeRobot and torch take seconds to import, and a refusal needs neither.
+    # Importing LeRobot and torch takes seconds, and a refusal needs neither.
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     try:
         from lerobot_export import bundle, checkpoint, graphs, verify

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Tells the texture of a block from single pictures: how well the tactile camera shows it, raw and as difference to the
-untouched gel, and whether the wrist camera shows it too.
+"""Classifies the texture of a block from single pictures: how well the tactile camera shows it, raw and as difference
+to the untouched gel, and whether the wrist camera shows it too.
 
     texture.py EPISODES [--out results] [--folds 10] [--iterations 200] [--seed 0] [--threads 1]
 
-The classifier is an image encoder of the policy with one layer more. Every episode is tested by a classifier that never
-saw a picture of it: the episodes are dealt into folds, and each fold is tested by one trained on the others.
+The classifier is an image encoder of the policy with one additional layer. Every episode is tested by a classifier that
+was not trained on it: the episodes are divided into folds, and each fold is tested by one trained on the others.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ INPUTS = {
     "tactile, as it is": replace(tactile(), operation=None),
     "wrist camera": wrist(),
 }
-# In contact: the gel has changed by so many times what it changes by noise before it is touched.
+# In contact: the gel has changed by this multiple of its noise before the touch.
 CONTACT = 1.5
 UNTOUCHED = 10
 BATCH = 64
@@ -47,11 +47,11 @@ class Pictures:
     """N pictures of one input."""
 
     pixels: NDArray[np.float32]
-    """[N, 3, h, w] pooled, in -1..1, with the edge that leaves room for shifts"""
+    """[N, 3, h, w] pooled, in -1..1, with a margin for shifts"""
     labels: NDArray[np.int64]
     """[N] index in TEXTURES"""
     episodes: NDArray[np.int64]
-    """[N] which episode"""
+    """[N] index of the episode"""
 
 
 def main() -> None:
@@ -89,7 +89,7 @@ def main() -> None:
 
 
 def label(episode: Episode) -> int:
-    """The texture, which the simulation writes into the tags of an episode."""
+    """The texture, from the tags that the simulation writes into an episode."""
     try:
         return TEXTURES.index(episode.tags["texture"])
     except (KeyError, ValueError) as error:
@@ -97,7 +97,7 @@ def label(episode: Episode) -> int:
 
 
 def in_contact(episode: Episode) -> NDArray[np.bool_]:
-    """[T] the fingertip is pressed on the block."""
+    """[T] whether the fingertip is pressed on the block."""
     change = np.abs(pool(tactile(), episode)).mean((1, 2, 3))
     return episode.present["tactile_tip"] & (change > CONTACT * np.median(change[1:UNTOUCHED]))
 
@@ -115,7 +115,7 @@ def gather(
 
 
 def cross_validate(pictures: Pictures, folds: int, iterations: int, seed: int) -> dict[str, Any]:
-    """Counts what classifiers say of the pictures of episodes that they were not trained on."""
+    """Counts the results of classifiers on pictures of episodes that they were not trained on."""
     random = np.random.default_rng(seed)
     said = np.full(len(pictures.labels), -1)
     for fold in deal(pictures, folds, random):
@@ -127,7 +127,7 @@ def cross_validate(pictures: Pictures, folds: int, iterations: int, seed: int) -
 
 
 def deal(pictures: Pictures, folds: int, random: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Episodes in `folds` heaps, both textures spread evenly over them."""
+    """Divides the episodes into `folds` folds, with both textures spread evenly."""
     shuffled = []
     for texture in range(len(TEXTURES)):
         shuffled.extend(random.permutation(np.unique(pictures.episodes[pictures.labels == texture])))
@@ -147,7 +147,7 @@ class Classifier(nn.Module):
 
 
 def fit(pixels: NDArray[np.float32], labels: NDArray[np.int64], steps: int, random: np.random.Generator) -> Classifier:
-    """Trains on pictures shifted, turned by quarters and mirrored at random: a lattice stays what it is."""
+    """Trains on pictures randomly shifted, rotated by quarter turns and mirrored, which preserve a lattice."""
     classifier = Classifier(wrist().shape[1:])
     optimizer = torch.optim.AdamW(classifier.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
@@ -168,13 +168,13 @@ def fit(pixels: NDArray[np.float32], labels: NDArray[np.int64], steps: int, rand
 
 @torch.no_grad()
 def classify(classifier: Classifier, pixels: NDArray[np.float32]) -> NDArray[np.int64]:
-    """[N] what it says."""
+    """[N] the predicted class."""
     inner = torch.from_numpy(pixels[:, :, PAD:-PAD, PAD:-PAD])
     return torch.cat([classifier(part).argmax(1) for part in inner.split(256)]).numpy()
 
 
 def score(pictures: Pictures, said: NDArray[np.int64]) -> dict[str, Any]:
-    """Accuracy over pictures and over episodes (which go by the majority of theirs), precision, recall, counts."""
+    """Accuracy over pictures and over episodes (by majority of their pictures), precision, recall, counts."""
     labels = pictures.labels
     confusion = np.array([[np.sum((labels == t) & (said == s)) for s in (0, 1)] for t in (0, 1)])
     by_episode = [

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Times a chunk of actions in PyTorch beside onnxruntime, both from Python: encoder and all denoising steps, batch 1.
+"""Times a chunk of actions in PyTorch and onnxruntime, both from Python: encoder and all denoising steps, batch 1.
 
     torch_latency.py BUNDLE [--json] [--chunks 200] [--threads 1]
 
-The same weights on both sides: those of the bundle's graphs. No picture is decoded and no device read in these times.
+Both use the weights of the bundle's graphs. The times include neither decoding of pictures nor reading of devices.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from rapid_policy.weights import load_policy
 from torch import Tensor
 
 WARM_UP = 20
-# Above this the two do not compute the same, and a comparison of times would say nothing. The differences of the
-# single graphs add up over the denoising steps.
+# Above this the two do not compute the same, and comparing times would be meaningless. The differences of the single
+# graphs accumulate over the denoising steps.
 SAME = 1e-3
 
 
@@ -99,7 +99,7 @@ def in_onnxruntime(policy: Policy, folder: Path, threads: int) -> Way:
 
 
 def measure(way: Way, observation: tuple[Tensor, ...], noise: Tensor, chunks: int) -> dict[str, float]:
-    """Milliseconds a chunk; `cpu_p50` is the processor's own time, which other programs disturb less."""
+    """Milliseconds per chunk; `cpu_p50` is processor time, which other programs affect less."""
     times, worked = [], []
     for i in range(WARM_UP + chunks):
         began, began_work = time.perf_counter_ns(), time.process_time_ns()

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Runs a command beside busy loops: what fails then judged the machine and not the program.
+# Runs a command beside busy loops, to find tests that judge the machine and not the program.
 #
 #     busy.sh LOOPS COMMAND...          busy.sh 2 make test
 #
-# The loops end with this script, however it ends; its exit code is the command's.
+# The loops end with this script, however it ends; the exit code is the command's.
 set -euo pipefail
 [[ $# -ge 2 && $1 =~ ^[0-9]+$ ]] || { echo "usage: busy.sh LOOPS COMMAND..." >&2; exit 2; }
 readonly loops=$1
@@ -17,7 +17,7 @@ trap 'exit 143' TERM HUP
 
 readonly parent=$$
 for ((loop = 0; loop < loops; loop++)); do
-    # Each looks now and then whether the script is still there: SIGKILL runs no trap.
+    # Each checks regularly whether the script still runs: SIGKILL runs no trap.
     (
         trap - EXIT INT TERM HUP
         while kill -0 "$parent" 2>/dev/null; do
@@ -26,7 +26,7 @@ for ((loop = 0; loop < loops; loop++)); do
     ) &
     pids+=($!)
 done
-# In the background, so that a signal is acted on at once and not when the command has ended.
+# In the background, so that a signal takes effect at once and not when the command has ended.
 "$@" <&0 &
 readonly command=$!
 pids+=("$command")

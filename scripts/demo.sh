@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Records ten seconds of the simulated rig and shows what is in the file.
+# Records ten seconds of the simulated rig and shows the contents of the file.
 #
 #     demo.sh RAPID FOLDER
 set -euo pipefail

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Checks the dependencies against deny.toml: licences, bans, sources, and known vulnerabilities where their database
-# can be fetched (it does not lie in the package registry).
+# Checks the dependencies against deny.toml: licences, bans, sources, and known vulnerabilities if their database can be
+# fetched (it is not in the package registry).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Feeds every reader of strangers' bytes with libFuzzer, guided by coverage, each for FUZZ_SECONDS (60).
+# Fuzzes every parser of foreign bytes with libFuzzer, guided by coverage, each for FUZZ_SECONDS (60).
 #
 #     fuzz.sh [TARGET...]
 #
-# The stable compiler instruments by flags it passes to LLVM (the ones cargo-fuzz uses), so no nightly one is needed;
-# without it there is no address sanitizer, which matters little to code without `unsafe`. What was learnt is kept in
-# target/fuzz/corpus and used by the next run. An input that breaks a promise lies in target/fuzz/found: the last lines
-# print how to reproduce it, and where to put it so that the tests run it from then on.
+# The stable compiler instruments by flags passed to LLVM (the ones cargo-fuzz uses), so no nightly is needed; there is
+# no address sanitizer then, which matters little for code without `unsafe`. The corpus is kept in target/fuzz/corpus
+# and used by the next run. An input that breaks an invariant is in target/fuzz/found: the last lines print how to
+# reproduce it, and where to put it so that the tests run it from then on.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -21,7 +21,7 @@ export CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_STRIP=none CARGO_PROF
 RUSTFLAGS="${RUSTFLAGS:-} $instrumented" cargo build --locked --release -p fuzz --features libfuzzer --bin libfuzzer \
     --target "$triple" --target-dir "$PLACE"
 readonly BIN="$PLACE/$triple/release"
-# What lists and replays has no use for the instrumentation, and cannot be linked with it.
+# Listing and replaying do not need the instrumentation, and cannot be linked with it.
 cargo build --locked -p fuzz --bin fuzz
 readonly FUZZ="${CARGO_TARGET_DIR:-$PWD/target}/debug/fuzz"
 

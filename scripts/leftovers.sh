@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Runs a command and fails when it leaves something behind in /dev/shm or in the folder for temporary files.
+# Runs a command and fails if it leaves files behind in /dev/shm or in the folder for temporary files.
 #
 #     leftovers.sh COMMAND...           leftovers.sh cargo test --workspace
 #
-# The command gets a TMPDIR of its own, in which nothing may be left. In /dev/shm and in /tmp/iceoryx2, which belong to all
-# programs, what counts are names of rapid and of its bus that were not there before and that no process has open or mapped.
-# What is left in TMPDIR is removed; the rest is named and stays. The exit code is the command's, or 1.
+# The command gets its own TMPDIR, in which nothing may be left. In /dev/shm and in /tmp/iceoryx2, which all programs
+# share, only new names of rapid and of its bus count that no process has open or mapped. Files left in TMPDIR are
+# removed; others are listed and stay. The exit code is the command's, or 1.
 set -euo pipefail
 [[ $# -ge 1 ]] || { echo "usage: leftovers.sh COMMAND..." >&2; exit 2; }
 
-# What is ours in places that others use as well, one path a line. The bus names folders of its own by numbers alone.
+# Our files in shared places, one path per line. The bus names its folders only by numbers.
 shared() {
     {
         find /dev/shm -mindepth 1 -maxdepth 1 \( -name 'iox2_*' -o -name 'rapid*' \) || true
@@ -24,7 +24,7 @@ in_use() {
 
 temporary=$(mktemp -d)
 readonly temporary
-# As /tmp is: tests that are two users enter it.
+# Like /tmp: tests that run as two users enter it.
 chmod 1777 "$temporary"
 trap 'rm -rf "$temporary"' EXIT
 before=$(shared)

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds what one test needs and runs it with its output, wherever in the workspace it is.
+# Builds what one test needs and runs it with its output, wherever it is in the workspace.
 #
 #     one.sh NAME CARGO TEST...         one.sh plugging_again cargo test --locked --workspace
 #
@@ -12,7 +12,7 @@ shift
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 [[ $last =~ ^[A-Za-z0-9_]+$ ]] || { echo "one.sh: not a name of a test: $name" >&2; exit 2; }
 
-# Files that hold a test of that name, else a module of that name; a few tests are words of a macro or of a table.
+# Files that contain a test of that name, or else a module of that name; a few tests are named in a macro or a table.
 [[ $name == *::* ]] && readonly first=${name%%::*} || readonly first=
 sources() { git ls-files --cached --others --exclude-standard -- '*.rs' | grep -E "$1" || true; }
 tests() { LAST=$last xargs perl -0ne 'print "$ARGV\n" if /#\[(tokio::)?test\b[^\]]*\](\s*(#\[|\/\/)[^\n]*)*\s*(async )?fn \w*$ENV{LAST}/'; }
@@ -20,13 +20,13 @@ mapfile -t files < <(sources "${first:-.}" | tests)
 [[ ${#files[@]} -gt 0 ]] || mapfile -t files < <(sources "(^|/)$last(/|\.rs$)")
 [[ ${#files[@]} -gt 0 ]] || mapfile -t files < <(sources "(^|/)tests/.*${first}" | xargs grep -lE "$last" || true)
 
-# The name of a whole test program: all its tests.
+# The name of a whole test program selects all its tests.
 filter=$name
 mapfile -t whole < <(sources "^tests/([a-z]*/tests/)?$name(/main)?\.rs$")
 [[ ${#whole[@]} -eq 0 ]] || files=("${whole[@]}") filter=
 
-# The targets of cargo that these files are part of.
-# Beside them the program is built as the other tests have it, where they start it: cargo does that for those of its package.
+# The cargo targets that contain these files. The program that they start is built as for the other tests: cargo does
+# that for those of its package.
 targets=() beside=() all='' guest=''
 for file in "${files[@]}"; do
     case $file in
@@ -34,7 +34,7 @@ for file in "${files[@]}"; do
         tests/bench/tests/*) target="--test smoke" all=yes ;;
         tests/bench/src/*) target="--bin rapid-bench" ;;
         tests/vbench/src/* | tests/fuzz/src/* | examples/c/*.rs | src/*) target=--lib ;;
-        # They start examples, which cargo builds with all others only.
+        # They start examples, which cargo builds only together with all others.
         tests/program/process.rs | tests/program/docs.rs) target="--test program" all=yes ;;
         tests/support/*) target="--test program" ;;
         tests/*/tests/*.rs | examples/*/tests/*.rs) target="--test $(basename "$file" .rs)" ;;

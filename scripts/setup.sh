@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Brings a Debian or Ubuntu machine that has git, make and a Rust toolchain to where `rapid` builds, runs and is tested.
+# Prepares a Debian or Ubuntu machine with git, make and a Rust toolchain for building, running and testing `rapid`.
 #
 #     setup.sh [build] [test] [fuzz]
 #
-# build: what building and running need, the pinned onnxruntime library among it. test: the rest - lint tools, the
-# Python that reads episodes and topics from outside, the virtual bench with its guest image. fuzz: what libFuzzer is
-# built with.
+# build: requirements of building and running, including the pinned onnxruntime library. test: the rest - lint tools,
+# the Python that reads episodes and topics from outside, the virtual bench with its guest image. fuzz: the build
+# requirements of libFuzzer.
 #
-# Every step looks first and does nothing when it is done already. Whatever is fetched lies outside the tree in
-# ${XDG_CACHE_HOME:-~/.cache}/rapid, is checked against the hashes pinned in the tree, and gets its final name last:
-# a run that was interrupted leaves nothing that a later one would take for whole.
+# Every step checks first and does nothing if it was done before. Downloads are stored outside the tree in
+# ${XDG_CACHE_HOME:-~/.cache}/rapid, checked against the hashes pinned in the tree, and get their final names last: an
+# interrupted run leaves nothing that a later one would take for complete.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -31,12 +31,12 @@ did() { changed=1; say "$@"; }
 main() {
     [[ $# -gt 0 ]] || set -- build
     mkdir -p "$CACHE"
-    # Two runs at once would fetch the same things into the same place.
+    # Two simultaneous runs would download to the same place.
     exec 9>"$CACHE/setup.lock"
     flock 9
     rm -rf "$CACHE"/onnxruntime.partial.*
 
-    # The packages of all parts come first, in one step: an administrator is needed only once.
+    # The packages of all parts come first, in one step: administrator rights are needed only once.
     local wanted=() part
     for part in "$@"; do
         case "$part" in
@@ -64,13 +64,13 @@ lint_tools() {
     rustup component add rustfmt clippy
 }
 
-# The packages of the test part, a line each.
+# The packages of the test part, one per line.
 test_packages() {
     local list=tests/vbench/image/packages.txt
     [[ ! -f $list ]] || sed 's/#.*//' "$list" | tr -s '[:space:]' '\n' | sed '/^$/d'
 }
 
-# Installs those of the packages that are missing; asks for root only then.
+# Installs the missing packages; asks for root only if there are any.
 packages() {
     local missing=() package
     if ! command -v dpkg-query >/dev/null; then
@@ -92,10 +92,10 @@ packages() {
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "${missing[@]}"
 }
 
-# The virtual environment is whole when its stamp, written last, names the present requirements and its Python runs.
+# The virtual environment is complete if its stamp, written last, names the present requirements and its Python runs.
 python_venv() {
     local requirements=tests/python/requirements.txt stamp
-    # iceoryx2 is published for x86-64 alone.
+    # iceoryx2 is published only for x86-64.
     local imports='import mcap'
     [[ $(uname -m) != x86_64 ]] || imports='import iceoryx2, mcap'
     stamp=$(sha256sum <"$requirements")
@@ -139,13 +139,13 @@ onnxruntime() {
     checked "$partial" "$arch/$library" || die "$library is not the one that is pinned in scripts/onnxruntime.sha256"
     mkdir -p "$dir"
     mv "$partial/$library" "$dir/$library"
-    # A program that was built without it is built again: cargo watches this file, not one that was not there.
+    # A program built without it is rebuilt: cargo watches this file, but not one that did not exist.
     touch build.rs
     rm -rf "$partial"
     trap - EXIT
 }
 
-# Does the file in folder $1 have the hash pinned for $2 (ARCH/FILE)?
+# Whether the file in folder $1 has the hash pinned for $2 (ARCH/FILE).
 checked() {
     local want have
     want=$(awk -v name="$2" '$2 == name { print $1 }' scripts/onnxruntime.sha256)
@@ -153,7 +153,7 @@ checked() {
     [[ -n $want && ${have%% *} = "$want" ]]
 }
 
-# The virtual bench brings its own builder, which knows what belongs to its image.
+# The virtual bench has its own builder, which knows the contents of its image.
 guest_image() {
     local build=tests/vbench/image/build.sh
     [[ -x $build ]] || return 0

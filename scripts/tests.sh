@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Runs the tests of a workspace that is built, those of the virtual bench beside the others: both spend much of their time
-# waiting, for an emulated machine and for clocks. What the bench prints comes behind what the others print.
+# Runs the tests of a built workspace, those of the virtual bench in parallel with the others: both spend much of their
+# time waiting, for an emulated machine and for clocks. The bench's output is printed after that of the others.
 #
 #     tests.sh cargo test --locked --workspace
 #
@@ -13,7 +13,7 @@ messages=$("$@" --no-run --message-format=json)
 executables=$(sed -n "s|.*\"manifest_path\":\"[^\"]*/$package/Cargo.toml\".*\"profile\":{[^}]*\"test\":true}.*\"executable\":\"\([^\"]*\)\".*|\1|p" <<<"$messages")
 [[ -n $executables ]] || { echo "tests.sh: no tests in $package" >&2; exit 1; }
 
-# Each of them needs the machine's two cores: one after the other. While a guest runs, the next one is prepared.
+# Each of them needs the machine's two cores, so they run in sequence. While a guest runs, the next one is prepared.
 bench() {
     cd "$package"
     local code=0
@@ -25,7 +25,7 @@ bench() {
 }
 
 output=$(mktemp)
-# In a process group of its own: what ends this script ends the bench and its machines too.
+# In its own process group: a signal that ends this script also ends the bench and its machines.
 set -m
 bench >"$output" 2>&1 &
 readonly job=$!

@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# Runs what trains and measures policies, in a Python environment of its own.
+# Trains and measures policies, in its own Python environment.
 #
 #     train.sh policy [RAPID]      demonstrations, training, export to models/tactile-id
-#     train.sh ablation RAPID      what each input of the policy is worth: models/results/ablation.{json,md}
-#     train.sh texture             what a tactile picture shows of the texture: models/results/texture.{json,md}
+#     train.sh ablation RAPID      the contribution of each input of the policy: models/results/ablation.{json,md}
+#     train.sh texture             how well pictures show the texture: models/results/texture.{json,md}
 #     train.sh test                tests of the Python under models/
 #     train.sh python ARGS...      that Python, run in models/
 #
-# RAPID is the program, default target/release/rapid. RUNS=models/runs is where demonstrations and checkpoints go; what
-# is there already is used again: a training that was stopped continues. EPISODES=72, SEED=1000 of the demonstrations,
-# THREADS=2 and MINUTES of a training.
+# RAPID is the program, default target/release/rapid. Demonstrations and checkpoints are in RUNS=models/runs; existing
+# ones are used again: a stopped training continues. EPISODES=72, SEED=1000 of the demonstrations, THREADS=2 and MINUTES
+# of a training.
 #
-# Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks whole.
+# Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks complete.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -25,7 +25,7 @@ SCHEDULE=(--threads "$THREADS")
 [[ -z ${MINUTES:-} ]] || SCHEDULE+=(--minutes "$MINUTES")
 readonly SCHEDULE
 
-# Threads that spin while they wait take time from whatever else runs here.
+# Threads that spin while waiting slow down everything else on the machine.
 export OMP_WAIT_POLICY="${OMP_WAIT_POLICY:-PASSIVE}"
 
 say() { printf 'train: %s\n' "$*"; }
@@ -34,7 +34,7 @@ die() { printf 'train: %s\n' "$*" >&2; exit 1; }
 main() {
     local part="${1:-}" rapid
     rapid="$(realpath -m -- "${2:-target/release/rapid}")"
-    # What judges the episodes before they are learned from.
+    # The verdict on the episodes before they are used for training.
     [[ $part = test ]] || export RAPID_BIN="${RAPID_BIN:-$rapid}"
     case "$part" in
         policy) environment; demonstrations "$rapid"; policy ;;
@@ -50,11 +50,11 @@ in_models() {
     (cd models && exec "$VENV/bin/python" "$@")
 }
 
-# Whole when its stamp, written last, names the present requirements and its Python runs.
+# Complete if its stamp, written last, names the present requirements and its Python runs.
 environment() {
     local requirements=models/requirements.txt stamp
     stamp=$(sha256sum <"$requirements")
-    # Two runs at once would make it in the same place.
+    # Two simultaneous runs would create it in the same place.
     mkdir -p "$(dirname "$VENV")"
     exec 9>"$VENV.lock"
     flock 9

@@ -36,7 +36,6 @@ pub enum Arming {
 
 impl Arming {
     /// The word for it, as in JSON.
-    #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
             Self::Disarmed => "disarmed",
@@ -72,7 +71,6 @@ pub struct Trip {
 
 impl Trip {
     /// As text; `stops` are the names of all stops.
-    #[must_use]
     pub fn text(self, stops: &[Arc<str>]) -> String {
         let name = stops.get(usize::from(self.stop)).map_or("?", |name| name);
         format!("emergency stop {name} {}", if self.is_lost { "lost" } else { "pressed" })
@@ -144,13 +142,12 @@ impl OrderSlot {
     }
 
     /// Rings with every order, until the next [`Self::take`].
-    #[must_use]
     pub const fn bell(&self) -> &Bell {
         &self.bell
     }
 
-    /// Takes the pending orders, in the order in which they are to be carried out. An emergency stop comes before a
-    /// disarm, which also turns off what an emergency stop would hold.
+    /// Takes the pending orders in their order of execution. An emergency stop comes before a disarm, which also turns
+    /// off what an emergency stop would hold.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
         // First: an order that arrives in between rings again, which is harmless.
         self.bell.silence();

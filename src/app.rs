@@ -1,6 +1,6 @@
 //! The program: starts the stages, runs them, and shuts them down in order.
 //!
-//! Each stage is a tokio task that owns the threads that block for it ([`stage`] has the table).
+//! Each stage is a tokio task that owns the threads that block for it (`stage` has the table).
 //!
 //! Shutdown: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
 //! streams stop, the recorder finishes its file, the programs of devices are waited for, the mask is 0 and its files
@@ -113,7 +113,6 @@ pub struct Options {
 }
 
 /// Where the mask of an instance is published.
-#[must_use]
 pub fn mask_path(instance: Option<&str>) -> PathBuf {
     match instance {
         None => Path::new(MASK_PATH).to_owned(),

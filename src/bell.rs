@@ -28,7 +28,6 @@ impl Bell {
     }
 
     /// Readable while it rings.
-    #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         self.0.as_ref().map(AsFd::as_fd)
     }

@@ -34,7 +34,7 @@ pub struct Cli {
     /// Options of a policy.
     #[command(flatten)]
     pub policy: PolicyArgs,
-    /// General options, of the commands in [`general_options`].
+    /// General options, of the commands in `general_options`.
     #[command(flatten)]
     pub global: Global,
     /// Print version
@@ -160,7 +160,7 @@ pub struct TaskArgs {
     #[arg(long, value_name = "N", default_value_t = 0, hide_short_help = true)]
     pub seed: u64,
     /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
-    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window"], hide_short_help = true)]
+    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm"], hide_short_help = true)]
     pub expert: bool,
     /// Demonstrations to record, one trial each
     #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert", hide_short_help = true)]
@@ -199,7 +199,9 @@ pub enum Command {
     },
     /// Write the udev rules and systemd unit derived from the registry
     #[command(after_long_help = "Files: udev rules, one descriptor per entry, and a systemd unit.\n\nExamples:\n  \
-        rapid artifacts                to read them first, in udev/\n  sudo rapid artifacts --install")]
+        rapid artifacts                to read them first, in udev/\n  \
+        sudo install -D -m 644 devices.toml /etc/rapid/devices.toml\n  \
+        sudo rapid --config /etc/rapid/devices.toml artifacts --install")]
     Artifacts {
         /// Install them below /etc and reload udev (needs root)
         #[arg(long, conflicts_with = "to")]
@@ -301,7 +303,6 @@ impl Cli {
 
     /// The grammar for parsing, help, completions and manual pages: without the general options that have no effect on
     /// a command.
-    #[must_use]
     pub fn grammar() -> clap::Command {
         let command = Self::command();
         let general: Vec<_> = command.get_arguments().filter(|option| option.is_global_set()).cloned().collect();

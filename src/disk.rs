@@ -34,13 +34,11 @@ impl Disk {
 
     /// Whether `bytes` more would leave so little that an episode being recorded causes a warning, or is closed.
     /// `reserve` is the registry's `disk_reserve`.
-    #[must_use]
     pub fn lacks_room_beside_an_episode(self, bytes: u64, reserve: Option<u64>) -> bool {
         self.free < self.reserve(reserve).saturating_mul(2).saturating_add(bytes)
     }
 
     /// Bytes that are kept free: the value of the registry (`wanted`), else 1 GiB, or a twentieth of a smaller disk.
-    #[must_use]
     pub fn reserve(self, wanted: Option<u64>) -> u64 {
         wanted.unwrap_or_else(|| RESERVE.min(self.size / SHARE))
     }

@@ -22,25 +22,22 @@ use crate::commands::devices::{Entries, Formats};
 use crate::commands::inspect::InspectFailure;
 use crate::commands::mask::MaskOptions;
 use crate::commands::register::{self, Dialogue, Target};
-use crate::commands::{self, Format, Outcome};
-use crate::driver::{DriverError, replay};
+use crate::commands::{self, CommandStatus, Format};
+use crate::device::Attachment;
+use crate::driver::replay;
 use crate::headless::style::{ColourChoice, Palette, Terminal};
-use crate::hotplug::udev;
+use crate::hotplug::{HotplugError, udev};
 use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError, inspect};
 use crate::registry::scenario::Scenario;
-use crate::registry::{Attachment, Registry, RegistryErrors};
+use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{PresenceError, json_path, read_mask};
 use crate::{outlet, text};
 
 #[cfg(feature = "policy")]
 use crate::commands::compare::CompareFailure;
 #[cfg(feature = "policy")]
-use crate::commands::eval::EvalError;
-#[cfg(feature = "policy")]
 use crate::compare::CompareError;
-#[cfg(feature = "policy")]
-use crate::policy::bundle::BundleErrors;
 
 /// Tasks that are still running at the end must finish within this time.
 const TASKS_TIMEOUT: Duration = Duration::from_millis(500);
@@ -50,21 +47,18 @@ const STDERR_TIMEOUT: Duration = Duration::from_secs(2);
 const LARGEST_JSON: u64 = 1 << 20;
 
 /// Runs a command line.
-#[must_use]
 pub fn dispatch(cli: Cli) -> ExitCode {
     match execute(cli) {
         Ok(()) => ExitCode::SUCCESS,
-        // The reader of the output has closed it.
-        Err(Failure::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
-        Err(failure) => {
+        Err(Failure { text, code }) => {
             // Paths, and errors of libraries about files, are untrusted text.
-            let message = with_cause(failure.to_string());
+            let message = with_cause(text);
             let lines: Vec<_> = message.lines().map(|line| text::plain(line).into_owned()).collect();
             if !message.is_empty() {
                 let message = format!("{} {}\n", stderr_palette().bad("error:"), lines.join("\n"));
                 outlet::write_within(io::stderr(), message, STDERR_TIMEOUT);
             }
-            ExitCode::from(failure.code())
+            ExitCode::from(code)
         }
     }
 }
@@ -90,9 +84,9 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         Command::Register(args) => register(global, &args, format, out),
         Command::Unregister(args) => unregister(global, &args, format, out),
         Command::Doctor { out: episodes } => {
-            let registry = registry_path(global).and_then(|path| load(&path)).map_err(|failure| failure.to_string());
+            let registry = registry_path(global).and_then(|path| load(&path)).map_err(|failure| failure.text);
             let registry = registry.as_ref().map_err(String::as_str);
-            if commands::doctor::doctor(registry, &episodes, format, out)? { Ok(()) } else { Err(Failure::Found) }
+            if commands::doctor::doctor(registry, &episodes, format, out)? { Ok(()) } else { Err(Failure::printed(1)) }
         }
         Command::Artifacts { install, to } => {
             let registry = load(&registry_path(global)?)?;
@@ -126,7 +120,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         Command::Replay(args) if args.infer.is_some() => policy::compare(args, format),
         Command::Replay(args) => {
             let replay::Replayed { registry, scenario, length } =
-                replay::scenario(&args.file).map_err(Failure::Replay)?;
+                replay::scenario(&args.file).map_err(Failure::argument)?;
             let mut options = args.run;
             // Without a monitor, a replay ends where the episode does.
             if options.headless {
@@ -139,10 +133,10 @@ fn execute(cli: Cli) -> Result<(), Failure> {
     }
 }
 
-fn reported(outcome: Outcome) -> Result<(), Failure> {
+fn reported(outcome: CommandStatus) -> Result<(), Failure> {
     match outcome {
-        Outcome::Done => Ok(()),
-        Outcome::BadConfiguration => Err(Failure::Reported),
+        CommandStatus::Done => Ok(()),
+        CommandStatus::BadConfiguration => Err(Failure::printed(2)),
     }
 }
 
@@ -192,7 +186,8 @@ fn devices(global: &Global, formats: Formats, format: Format, out: &mut dyn Writ
         Ok(None) => Entries::NoFile,
         Err(_) => Entries::Wrong,
     };
-    let listed = commands::devices::list(known, &udev::enumerate()?, formats);
+    let mut listed = commands::devices::list(known, &udev::enumerate()?, formats);
+    listed.extend(commands::devices::other_cameras(formats));
     commands::devices::print(&listed, registry.as_ref().ok().and_then(Option::as_ref), format, out)?;
     registry.map(drop)
 }
@@ -232,11 +227,11 @@ fn recover(paths: Vec<PathBuf>, format: Format) -> Result<(), Failure> {
         tokio::select! {
             done = &mut work => Ok(done),
             // The disk may be slow; files that are already repaired stay repaired.
-            _ = tokio::signal::ctrl_c() => Err(Failure::App(AppError::InterruptedTwice)),
+            _ = tokio::signal::ctrl_c() => Err(Failure::from(AppError::InterruptedTwice)),
         }
     })??;
-    let (outcome, written) = ended.map_err(|_| Failure::App(AppError::Panicked("the repair")))?;
-    if outcome.is_done() { Ok(written?) } else { Err(Failure::Recover(outcome)) }
+    let (outcome, written) = ended.map_err(|_| AppError::Panicked("the repair"))?;
+    if outcome.is_done() { Ok(written?) } else { Err(Failure::printed(argument_code(outcome.is_bad_argument()))) }
 }
 
 /// Runs the rig of a registry, `(registry, devices)`.
@@ -251,7 +246,7 @@ fn run(
     registry.rig.sync_window = args.window.unwrap_or(registry.rig.sync_window);
     let episode = request(args, &registry)?;
     if args.record {
-        check_writable(&args.out).map_err(Failure::Folder)?;
+        check_writable(&args.out).map_err(Failure::argument)?;
     }
     let monitor = !args.headless && policy.as_ref().is_none_or(|policy| policy.infer.is_none() || policy.monitor);
     let screen = match (monitor && io::stdout().is_terminal(), global.json) {
@@ -300,7 +295,7 @@ fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()?;
     let done = catch_unwind(AssertUnwindSafe(|| runtime.block_on(work)));
     runtime.shutdown_timeout(TASKS_TIMEOUT);
-    done.map_err(|_| Failure::Panicked)
+    done.map_err(|_| Failure::panicked())
 }
 
 fn palette() -> Palette {
@@ -325,7 +320,7 @@ fn load(path: &Path) -> Result<Registry, Failure> {
 }
 
 fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
-    find_registry(global).ok_or_else(|| Failure::NoRegistry(usual_places()))
+    find_registry(global).ok_or_else(Failure::no_registry)
 }
 
 /// The registry named, or the first that exists in the usual places.
@@ -371,134 +366,120 @@ fn is_interactive(format: Format) -> bool {
     format == Format::Text && io::stdin().is_terminal() && io::stdout().is_terminal()
 }
 
-/// Why a command failed.
-#[derive(Debug, thiserror::Error)]
-enum Failure {
-    #[error(transparent)]
-    App(#[from] AppError),
-    /// The registry is invalid.
-    #[error("{0}")]
-    Registry(#[from] RegistryErrors),
-    /// There is no registry.
-    #[error(
-        "no devices.toml: looked for {}\n    fix: write one (`rapid devices` lists connected devices), name one with --config, \
-         or try `rapid --sim`", .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
-    )]
-    NoRegistry(Vec<PathBuf>),
-    #[error(transparent)]
-    Presence(#[from] PresenceError),
-    #[error(transparent)]
-    Hotplug(#[from] crate::hotplug::HotplugError),
-    #[error(transparent)]
-    Inspect(#[from] ReadError),
-    #[error(transparent)]
-    Artifacts(#[from] commands::artifacts::ArtifactsError),
-    #[error(transparent)]
-    Register(#[from] commands::register::RegisterError),
-    #[error(transparent)]
-    Order(#[from] commands::arm::OrderError),
-    #[error(transparent)]
-    Mask(#[from] commands::mask::MaskError),
-    #[error(transparent)]
-    Calibrate(#[from] commands::calibrate::CalibrateError),
-    /// Not every file was repaired; which, and why, has been printed.
-    #[error("")]
-    Recover(commands::recover::Outcome),
-    /// The file to replay is not an episode.
-    #[error(transparent)]
-    Replay(DriverError),
-    /// The folder for episodes cannot be written to.
-    #[error(transparent)]
-    Folder(RecordError),
-    #[cfg(feature = "policy")]
-    #[error(transparent)]
-    Eval(#[from] commands::eval::EvalError),
-    #[cfg(feature = "policy")]
-    /// The policy is invalid, or not for this rig.
-    #[error(transparent)]
-    Bundle(BundleErrors),
-    #[cfg(feature = "policy")]
-    /// The policy built into the program, on another rig than its own.
-    #[error(
-        "{0}\nThe policy built into rapid is for the simulated task only: rapid --infer --sim task\n    fix: name the folder \
-         of a policy that was trained on this rig: rapid --infer FOLDER (models/README.md describes how to make one)"
-    )]
-    OtherRig(BundleErrors),
-    #[cfg(feature = "policy")]
-    #[error(transparent)]
-    Compare(#[from] CompareFailure),
-    #[cfg(feature = "policy")]
-    #[error(transparent)]
-    Demonstrate(#[from] commands::demonstrate::DemonstrateError),
-    #[error(transparent)]
-    Module(#[from] crate::registry::ModuleError),
-    #[error(transparent)]
-    Ablation(#[from] commands::ablation::AblationError),
-    /// The arguments contradict each other.
-    #[error("{0}")]
-    Arguments(&'static str),
-    /// The mistakes have been printed.
-    #[error("")]
-    Reported,
-    /// The diagnosis found a problem, and printed it.
-    #[error("")]
-    Found,
-    #[error("output: {0}")]
-    Output(#[from] io::Error),
+/// Why a command failed: the text to print, if it was not printed already, and the exit code: 1 failed while running, 2
+/// invalid configuration or arguments, 3 a required device is missing, 4 a BAD episode, 130 interrupted twice.
+#[derive(Debug)]
+struct Failure {
+    text: String,
+    code: u8,
+}
+
+impl Failure {
+    /// A reader that has closed the output needs no message, and what the command did is done.
+    fn of(text: String, code: u8) -> Self {
+        // EPIPE, as worded by the standard library.
+        if text.ends_with("(os error 32)") { Self::printed(0) } else { Self { text, code } }
+    }
+
+    /// The reason has been printed.
+    const fn printed(code: u8) -> Self {
+        Self { text: String::new(), code }
+    }
+
+    /// An argument, or a file that it names, is invalid.
+    #[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]
+    fn argument(reason: impl ToString) -> Self {
+        Self { text: reason.to_string(), code: 2 }
+    }
+
     /// Devices and files have been released while unwinding.
-    #[error("rapid panicked; please report this")]
-    Panicked,
+    fn panicked() -> Self {
+        Self { text: "rapid panicked; please report this".to_owned(), code: 1 }
+    }
+
+    fn no_registry() -> Self {
+        let places: Vec<_> = usual_places().iter().map(|path| path.display().to_string()).collect();
+        Self::argument(format_args!(
+            "no devices.toml: looked for {}\n    fix: write one (`rapid devices` lists connected devices), name one with \
+             --config, or try `rapid --sim`",
+            places.join(", ")
+        ))
+    }
+}
+
+/// The exit code of each kind of error.
+macro_rules! failures {
+    ($($(#[$when:meta])* $error:ty: $code:expr;)+) => {$(
+        $(#[$when])*
+        impl From<$error> for Failure {
+            fn from(error: $error) -> Self {
+                let code: fn(&$error) -> u8 = $code;
+                Self::of(error.to_string(), code(&error))
+            }
+        }
+    )+};
+}
+
+/// The exit code of a failure, by whether an invalid argument caused it.
+const fn argument_code(is_bad_argument: bool) -> u8 {
+    if is_bad_argument { 2 } else { 1 }
+}
+
+failures! {
+    AppError: |error| match error {
+        AppError::InterruptedTwice => 130,
+        AppError::Bad { .. } => 4,
+        AppError::Required(_) => 3,
+        AppError::Logging(_) => 2,
+        _ => 1,
+    };
+    RegistryErrors: |_| 2;
+    ModuleError: |_| 2;
+    PresenceError: |_| 1;
+    HotplugError: |_| 1;
+    ReadError: |error| match error {
+        ReadError::NotMcap(_) | ReadError::NotFile(_) => 2,
+        ReadError::Io { source, .. } => {
+            argument_code(matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory))
+        }
+    };
+    commands::artifacts::ArtifactsError: |_| 1;
+    commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
+    commands::arm::OrderError: |error| match error {
+        commands::arm::OrderError::Give(_) => 3,
+        commands::arm::OrderError::Output(_) => 1,
+    };
+    commands::mask::MaskError: |_| 1;
+    commands::calibrate::CalibrateError: |error| argument_code(error.is_bad_argument());
+    commands::ablation::AblationError: |error| argument_code(error.is_bad_argument());
+    #[cfg(feature = "policy")]
+    commands::eval::EvalError: |error| argument_code(matches!(error, commands::eval::EvalError::Bundle(_)));
+    #[cfg(feature = "policy")]
+    CompareFailure: |error| argument_code(matches!(
+        error,
+        CompareFailure::Bundle(_)
+            | CompareFailure::Compare(
+                CompareError::File(_)
+                    | CompareError::Registry { .. }
+                    | CompareError::Unsuited { .. }
+                    | CompareError::Nothing(_)
+            )
+    ));
+    #[cfg(feature = "policy")]
+    commands::demonstrate::DemonstrateError: |_| 1;
+}
+
+impl From<io::Error> for Failure {
+    fn from(error: io::Error) -> Self {
+        Self::of(format!("output: {error}"), 1)
+    }
 }
 
 impl From<InspectFailure> for Failure {
     fn from(failure: InspectFailure) -> Self {
         match failure {
-            InspectFailure::Episode(error) => Self::Inspect(error),
-            InspectFailure::Output(error) => Self::Output(error),
-        }
-    }
-}
-
-impl Failure {
-    /// Exit codes: 1 failed while running, 2 invalid configuration or arguments, 3 a required device is missing, 4 a
-    /// BAD episode, 130 interrupted twice.
-    fn code(&self) -> u8 {
-        match self {
-            Self::App(AppError::InterruptedTwice) => 130,
-            Self::App(AppError::Logging(_))
-            | Self::Registry(_)
-            | Self::NoRegistry(_)
-            | Self::Replay(_)
-            | Self::Folder(_)
-            | Self::Inspect(ReadError::NotMcap(_))
-            | Self::Arguments(_)
-            | Self::Module(_)
-            | Self::Reported => 2,
-            #[cfg(feature = "policy")]
-            Self::Bundle(_)
-            | Self::OtherRig(_)
-            | Self::Eval(EvalError::Bundle(_))
-            | Self::Compare(
-                CompareFailure::Bundle(_)
-                | CompareFailure::Compare(
-                    CompareError::File(_)
-                    | CompareError::Registry { .. }
-                    | CompareError::Unsuited { .. }
-                    | CompareError::Nothing(_),
-                ),
-            ) => 2,
-            Self::Inspect(ReadError::Io { source, .. })
-                if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
-            {
-                2
-            }
-            Self::Calibrate(error) if error.is_bad_argument() => 2,
-            Self::Ablation(error) if error.is_bad_argument() => 2,
-            Self::Register(error) if error.is_bad_argument() => 2,
-            Self::Recover(outcome) if outcome.is_bad_argument() => 2,
-            Self::App(AppError::Bad { .. }) => 4,
-            Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Give(_)) => 3,
-            _ => 1,
+            InspectFailure::Episode(error) => error.into(),
+            InspectFailure::Output(error) => error.into(),
         }
     }
 }
@@ -551,7 +532,7 @@ mod failure_tests {
         let of = |code| {
             let error = io::Error::from_raw_os_error(code);
             let folder = FolderError::Io { path: PathBuf::from("out"), error };
-            with_cause(Failure::Folder(RecordError::Folder(folder)).to_string())
+            with_cause(RecordError::Folder(folder).to_string())
         };
         let text = of(24);
         assert!(text.contains("open files is reached") && text.contains("ulimit -n"), "{text}");

@@ -37,8 +37,8 @@ pub fn changes() -> impl Iterator<Item = Change> {
 }
 
 /// The share of the time from `from` to `to`, both after the beginning, in which it is lit.
-#[must_use]
-pub fn lit_share(from: Duration, to: Duration) -> f64 {
+#[cfg(test)]
+pub(crate) fn lit_share(from: Duration, to: Duration) -> f64 {
     let Some(span) = to.checked_sub(from).filter(|span| !span.is_zero()) else { return 0.0 };
     let mut lit = Duration::ZERO;
     let mut since = None;

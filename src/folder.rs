@@ -81,7 +81,6 @@ impl From<FolderError> for io::Error {
 
 /// Where this program keeps what should survive a restart: systemd.exec(5), XDG Base Directory
 /// Specification 0.8. `None` without any of them.
-#[must_use]
 pub fn state_directory() -> Option<PathBuf> {
     let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
     let systemd = std::env::var_os("STATE_DIRECTORY").and_then(|list| std::env::split_paths(&list).next());
@@ -124,13 +123,11 @@ impl Folder {
     }
 
     /// Its path, as it was named.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
     /// Its descriptor, for listing it.
-    #[must_use]
     pub fn descriptor(&self) -> &OwnedFd {
         &self.open
     }
@@ -222,7 +219,6 @@ impl Folder {
     }
 
     /// Whether anything has this name, including a dangling link.
-    #[must_use]
     pub fn has(&self, name: impl AsRef<OsStr>) -> bool {
         !matches!(rustix::fs::statat(&self.open, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW), Err(Errno::NOENT))
     }
@@ -361,7 +357,6 @@ impl<'a> PathWalk<'a> {
 }
 
 /// Whether files of this user may be changed by `owner`: root and this user may.
-#[must_use]
 pub fn is_trusted(owner: u32) -> bool {
     owner == 0 || owner == rustix::process::geteuid().as_raw()
 }

@@ -55,7 +55,6 @@ impl Input {
     }
 
     /// Readable when there is something to take.
-    #[must_use]
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.levels.as_fd()
     }
@@ -131,13 +130,11 @@ impl Output {
     }
 
     /// A line that another process has opened, and keeps open for as long as this is.
-    #[must_use]
     pub fn of(descriptor: OwnedFd) -> Self {
         Self(File::from(descriptor))
     }
 
     /// The descriptor that another process needs for [`Self::of`].
-    #[must_use]
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }

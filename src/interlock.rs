@@ -42,7 +42,6 @@ pub enum StopKind {
 
 impl StopKind {
     /// Its kind, as text for the user.
-    #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
             Self::Emergency => "emergency stop",
@@ -51,7 +50,6 @@ impl StopKind {
     }
 
     /// The state of an input of this kind, as text for the user.
-    #[must_use]
     pub const fn word(self, state: InputState) -> &'static str {
         match (self, state) {
             (_, InputState::Lost) => "lost",
@@ -131,7 +129,6 @@ const fn state_of(code: u8) -> InputState {
 
 impl Interlocks {
     /// Stops with these names, [`MAX_STOPS`] at most.
-    #[must_use]
     pub fn new<'a>(stops: impl Iterator<Item = (&'a str, StopKind)>) -> Self {
         let (names, all): (Vec<Arc<str>>, Vec<_>) = stops
             .map(|(name, kind)| {
@@ -142,13 +139,11 @@ impl Interlocks {
     }
 
     /// Names of the stops.
-    #[must_use]
     pub const fn names(&self) -> &Arc<[Arc<str>]> {
         &self.names
     }
 
     /// The state of an input.
-    #[must_use]
     pub fn state(&self, index: usize) -> InputState {
         self.all.get(index).map_or(InputState::Lost, |one| state_of(one.state.load(Ordering::SeqCst)))
     }

@@ -29,7 +29,6 @@ impl PhysicalMask {
     pub const EMPTY: Self = Self(0);
 
     /// Whether the modality is present.
-    #[must_use]
     pub const fn contains(self, id: ModalityId) -> bool {
         self.0 >> id.bit() & 1 == 1
     }
@@ -42,21 +41,18 @@ impl PhysicalMask {
     }
 
     /// How many modalities are present.
-    #[must_use]
     pub const fn online_count(self) -> u32 {
         self.0.count_ones()
     }
 
     /// Digits of the most significant bit first, at least 8 and as many whole bytes as
     /// `device_count` needs: `00000101`.
-    #[must_use]
     pub fn binary(self, device_count: usize) -> String {
         let width = digits(self, device_count);
         format!("{:0width$b}", self.0)
     }
 
     /// Hexadecimal with at least two digits: `0x05`.
-    #[must_use]
     pub fn hex(self, device_count: usize) -> String {
         let width = digits(self, device_count) / 4;
         format!("0x{:0width$x}", self.0)
@@ -122,7 +118,6 @@ pub enum MaskRecordError {
 
 impl MaskRecord {
     /// The record's bytes.
-    #[must_use]
     pub fn to_bytes(&self) -> [u8; RECORD_LEN] {
         let mut bytes = [0; RECORD_LEN];
         bytes[0..4].copy_from_slice(&MAGIC);

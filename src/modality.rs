@@ -19,19 +19,16 @@ pub struct ModalityId(u8);
 
 impl ModalityId {
     /// `Some` when `bit` is below [`MAX_MODALITIES`].
-    #[must_use]
     pub const fn new(bit: u8) -> Option<Self> {
         if (bit as usize) < MAX_MODALITIES { Some(Self(bit)) } else { None }
     }
 
     /// The bit in the physical mask, `0..64`.
-    #[must_use]
     pub const fn bit(self) -> u8 {
         self.0
     }
 
     /// The index into per-modality arrays, `0..64`.
-    #[must_use]
     pub const fn index(self) -> usize {
         self.0 as usize
     }

@@ -37,13 +37,11 @@ impl Outlet {
     }
 
     /// Whether everything sent so far has been passed to the writer.
-    #[must_use]
     pub fn is_idle(&self) -> bool {
         self.sender.capacity() == self.sender.max_capacity()
     }
 
     /// Whether the other end is gone.
-    #[must_use]
     pub fn is_closed(&self) -> bool {
         self.sender.is_closed()
     }

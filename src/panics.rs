@@ -44,7 +44,6 @@ pub fn keep() {
 }
 
 /// The messages kept. From now on they go to standard error.
-#[must_use]
 pub fn release() -> Vec<String> {
     match std::mem::replace(&mut *goes(), Goes::Stderr) {
         Goes::Kept(messages) => messages,

@@ -31,7 +31,7 @@ pub struct Permission {
     slot: OrderSlot,
     /// Actuators that are plugged in.
     actuators: AtomicUsize,
-    /// The actuator is to be armed when it is first plugged in: no other order has arrived since.
+    /// The actuator is armed when it is first plugged in: no other order has arrived since.
     at_first_plug: AtomicBool,
     /// Emergency stops and enabling switches.
     interlocks: Interlocks,
@@ -58,8 +58,7 @@ pub enum Void {
 }
 
 impl Permission {
-    /// For a run that begins; `at_first_plug`: its actuator is to be armed when it is first plugged in.
-    #[must_use]
+    /// For a new run; `at_first_plug`: its actuator is armed when it is first plugged in.
     pub fn new(at_first_plug: bool) -> Self {
         Self { at_first_plug: AtomicBool::new(at_first_plug), ..Self::default() }
     }
@@ -68,12 +67,6 @@ impl Permission {
     #[must_use]
     pub fn with_interlocks(self, interlocks: Interlocks) -> Self {
         Self { interlocks, ..self }
-    }
-
-    /// Emergency stops and enabling switches.
-    #[must_use]
-    pub const fn interlocks(&self) -> &Interlocks {
-        &self.interlocks
     }
 
     /// Input `index` of the interlocks has this state, as determined at `now`. An input that does not run stops the
@@ -148,7 +141,6 @@ impl Permission {
 
     /// An actuator was plugged in: it receives orders until the returned value is dropped, but none that were given
     /// before.
-    #[must_use]
     pub fn attend(self: &Arc<Self>) -> Attended {
         self.slot.take().for_each(drop);
         self.actuators.fetch_add(1, Ordering::SeqCst);
@@ -161,24 +153,40 @@ impl Permission {
 pub struct Attended(Arc<Permission>);
 
 impl Attended {
-    /// Whether it is to be armed now, without an order. At most once a run.
+    /// Arms it by `give`, without an order, if the first actuator that is plugged in is to be armed. At most once a run,
+    /// unless `give` fails. Returns why it was not armed, if an interlock prevents it.
     ///
     /// # Errors
-    /// When it was to be, and an interlock prevents it.
-    pub fn is_to_be_armed(&self) -> Result<bool, Blocked> {
-        let is_first = self.0.at_first_plug.swap(false, Ordering::SeqCst);
-        if is_first { self.0.interlocks.check().map(|()| true) } else { Ok(false) }
+    /// Those of `give`.
+    pub fn arm_at_first_plug<E>(&self, mut give: impl FnMut(Order) -> Result<(), E>) -> Result<Option<Blocked>, E> {
+        let Permission { at_first_plug, disarmed, interlocks, .. } = &*self.0;
+        // Before the swap: a disarm stores its time after it has reverted the flag.
+        let before = disarmed.load(Ordering::SeqCst);
+        if !at_first_plug.swap(false, Ordering::SeqCst) {
+            return Ok(None);
+        }
+        if let Err(blocked) = interlocks.check() {
+            return Ok(Some(blocked));
+        }
+        give(Order::Arm).inspect_err(|_| self.was_not_armed())?;
+        // A stop in the meantime may have been carried out before the arm.
+        if let Err(blocked) = interlocks.check() {
+            give(interlocks.order(blocked.index).unwrap_or(Order::Disarm))?;
+            return Ok(Some(blocked));
+        }
+        if disarmed.load(Ordering::SeqCst) != before {
+            give(Order::Disarm)?;
+        }
+        Ok(None)
     }
 
     /// Names of the emergency stops that an order may refer to.
-    #[must_use]
     pub fn stops(&self) -> &Arc<[Arc<str>]> {
         self.0.interlocks.names()
     }
 
-    /// It could not be armed as [`Self::is_to_be_armed`] requested: the next one is to be, unless an order came
-    /// meanwhile.
-    pub fn was_not_armed(&self) {
+    /// It could not be armed: the next one is to be, unless an order came meanwhile.
+    fn was_not_armed(&self) {
         self.0.at_first_plug.store(true, Ordering::SeqCst);
         // A disarm stores its time first, and then reverts this: it is either seen here, or comes after.
         if self.0.disarmed.load(Ordering::SeqCst) != 0 {
@@ -187,12 +195,11 @@ impl Attended {
     }
 
     /// Rings with every order, until the next [`Self::take`].
-    #[must_use]
     pub fn bell(&self) -> &Bell {
         self.0.slot.bell()
     }
 
-    /// Takes its orders since the last call, in the order in which they are to be carried out.
+    /// Takes its orders since the last call, in their order of execution.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
         self.0.slot.take()
     }

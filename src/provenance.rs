@@ -43,7 +43,6 @@ pub enum UnplugSource {
 
 impl UnplugSource {
     /// The word for it, as in JSON.
-    #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
             Self::Stream => "stream",

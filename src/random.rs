@@ -13,7 +13,6 @@ pub struct Random(Pcg64);
 
 impl Random {
     /// The stream from its beginning.
-    #[must_use]
     pub fn new(seed: u64, stream: u64) -> Self {
         Self(Pcg64::new(seed.into(), stream.into()))
     }

@@ -40,7 +40,6 @@ pub enum Encoding {
 
 impl Encoding {
     /// The encoding of a number found in a header; `None` if it is unknown.
-    #[must_use]
     pub const fn from_raw(raw: u32) -> Option<Self> {
         Some(match raw {
             0 => Self::Bytes,
@@ -93,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_header_has_no_padding_and_56_bytes() {
+    fn the_header_has_56_bytes_and_no_padding() {
         assert_eq!(std::mem::size_of::<SampleHeader>(), 56);
         assert_eq!(std::mem::offset_of!(SampleHeader, id), 32);
         assert_eq!(std::mem::offset_of!(SampleHeader, height), 52);

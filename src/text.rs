@@ -18,7 +18,6 @@ use unicode_segmentation::UnicodeSegmentation;
 use unicode_width::UnicodeWidthStr;
 
 /// The message about a failed open, read or write of a device; `group` is the one that may open it.
-#[must_use]
 pub fn not_opened(what: &str, group: &str, error: &io::Error) -> String {
     match Errno::from_io_error(error) {
         Some(Errno::NOENT | Errno::NODEV | Errno::NXIO | Errno::IO) => format!("{what} is not plugged in"),
@@ -33,7 +32,6 @@ pub fn not_opened(what: &str, group: &str, error: &io::Error) -> String {
 }
 
 /// Columns `text` takes.
-#[must_use]
 pub fn width(text: &str) -> usize {
     UnicodeWidthStr::width(text)
 }
@@ -41,7 +39,6 @@ pub fn width(text: &str) -> usize {
 /// `text` without control characters and without the invisible characters that reorder a line
 /// (Unicode bidirectional controls, zero-width characters, line and paragraph separators): each
 /// becomes a space.
-#[must_use]
 pub fn plain(text: &str) -> Cow<'_, str> {
     if text.contains(is_unsafe) { Cow::Owned(text.replace(is_unsafe, " ")) } else { Cow::Borrowed(text) }
 }
@@ -102,13 +99,11 @@ fn is_unsafe(c: char) -> bool {
 }
 
 /// `text` with every character outside ASCII as `?`, for terminals that cannot show it.
-#[must_use]
 pub fn ascii(text: &str) -> String {
     text.chars().map(|c| if c.is_ascii() { c } else { '?' }).collect()
 }
 
 /// `text` in at most `columns` columns; when it is longer, its beginning and `ellipsis`.
-#[must_use]
 pub fn cut<'a>(text: &'a str, columns: usize, ellipsis: &str) -> Cow<'a, str> {
     if width(text) <= columns {
         return Cow::Borrowed(text);
@@ -128,23 +123,13 @@ pub fn cut<'a>(text: &'a str, columns: usize, ellipsis: &str) -> Cow<'a, str> {
 }
 
 /// `text` in exactly `columns` columns, at the left.
-#[must_use]
 pub fn left(text: &str, columns: usize, ellipsis: &str) -> String {
     let text = cut(text, columns, ellipsis);
     let missing = columns.saturating_sub(width(&text));
     format!("{text}{:missing$}", "")
 }
 
-/// `text` in exactly `columns` columns, at the right.
-#[must_use]
-pub fn right(text: &str, columns: usize, ellipsis: &str) -> String {
-    let text = cut(text, columns, ellipsis);
-    let missing = columns.saturating_sub(width(&text));
-    format!("{:missing$}{text}", "")
-}
-
 /// Hours, minutes and seconds: `1:02:03`, below an hour `02:03`.
-#[must_use]
 pub fn clock(duration: Duration) -> String {
     let seconds = duration.as_secs();
     let (hours, minutes, seconds) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
@@ -152,7 +137,6 @@ pub fn clock(duration: Duration) -> String {
 }
 
 /// An age, for quick reading: `12 ms`, from one second `1.2 s`, from 100 seconds as a clock.
-#[must_use]
 pub fn age(duration: Duration) -> String {
     match duration.as_millis() {
         ms @ 0..1_000 => format!("{ms} ms"),
@@ -162,7 +146,6 @@ pub fn age(duration: Duration) -> String {
 }
 
 /// A time rounded down to its largest unit: `3 s`, `12 min`, `2 h`.
-#[must_use]
 pub fn about(duration: Duration) -> String {
     match duration.as_secs() {
         seconds @ 0..60 => format!("{seconds} s"),
@@ -172,7 +155,6 @@ pub fn about(duration: Duration) -> String {
 }
 
 /// A number of bytes in decimal units: `512 B`, `1.5 kB`, `12.3 MB`.
-#[must_use]
 pub fn size(bytes: u64) -> String {
     const UNITS: [&str; 5] = ["kB", "MB", "GB", "TB", "PB"];
     if bytes < 1000 {
@@ -190,7 +172,6 @@ pub fn size(bytes: u64) -> String {
 }
 
 /// A number with thousands separators: `9,312`.
-#[must_use]
 pub fn count(number: u64) -> String {
     let digits = number.to_string();
     let mut text = String::with_capacity(digits.len() + digits.len() / 3);
@@ -204,20 +185,17 @@ pub fn count(number: u64) -> String {
 }
 
 /// A number with its noun: `1 message`, `9,312 messages`.
-#[must_use]
 pub fn counted(number: u64, what: &str) -> String {
     format!("{} {what}{}", count(number), if number == 1 { "" } else { "s" })
 }
 
 /// Bytes as hexadecimal digits, two each.
-#[must_use]
 pub fn hexadecimal(bytes: &[u8]) -> String {
     let digit = |nibble: u8| char::from_digit(nibble.into(), 16).unwrap_or_default();
     bytes.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 0xf)]).collect()
 }
 
 /// Samples per second, with one decimal below 1000.
-#[must_use]
 pub fn hertz(hz: f64) -> String {
     if hz < 999.95 { format!("{hz:.1}") } else { format!("{hz:.0}") }
 }
@@ -236,7 +214,6 @@ mod tests {
         assert_eq!(cut("naïve-ü", 4, "..."), "n...");
         assert_eq!(cut("camera", 0, "…"), "");
         assert_eq!(left("相机", 6, "…"), "相机  ");
-        assert_eq!(right("12", 4, "…"), "  12");
     }
 
     #[test]

@@ -23,7 +23,6 @@ pub struct Stamp(pub u64);
 
 impl Stamp {
     /// The moment of the call.
-    #[must_use]
     pub fn now() -> Self {
         Self(read(ClockId::Monotonic))
     }
@@ -41,20 +40,17 @@ impl Stamp {
     }
 
     /// Time from `earlier` to this moment; zero if `earlier` is in fact later.
-    #[must_use]
     pub const fn since(self, earlier: Self) -> Duration {
         Duration::from_nanos(self.0.saturating_sub(earlier.0))
     }
 }
 
 /// `duration` in ns, saturating after 584 years.
-#[must_use]
 pub fn nanoseconds(duration: Duration) -> u64 {
     u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// The wall clock as ns since 1970, at this moment.
-#[must_use]
 pub fn realtime_ns() -> u64 {
     read(ClockId::Realtime)
 }
@@ -68,7 +64,6 @@ pub struct WallClock {
 
 impl WallClock {
     /// The present relation.
-    #[must_use]
     pub fn now() -> Self {
         // The monotonic clock is read before and after the wall clock; their mean corresponds to it.
         // A preempted thread makes it inaccurate: the quickest of a few tries counts.
@@ -89,19 +84,17 @@ impl WallClock {
     }
 
     /// A relation chosen by the caller: wall ns minus monotonic ns.
-    #[must_use]
-    pub const fn with_offset(offset_ns: i128) -> Self {
+    #[cfg(test)]
+    pub(crate) const fn with_offset(offset_ns: i128) -> Self {
         Self { offset_ns }
     }
 
     /// `stamp` on the wall clock, ns since 1970; clamped to what a u64 holds.
-    #[must_use]
     pub fn wall_ns(self, stamp: Stamp) -> u64 {
         u64::try_from((i128::from(stamp.0) + self.offset_ns).max(0)).unwrap_or(u64::MAX)
     }
 
     /// The stamp of a wall-clock time; clamped to what a u64 holds.
-    #[must_use]
     pub fn stamp(self, wall_ns: u64) -> Stamp {
         Stamp(u64::try_from((i128::from(wall_ns) - self.offset_ns).max(0)).unwrap_or(u64::MAX))
     }
@@ -116,7 +109,6 @@ pub struct ClockWatch(WallClock);
 
 impl ClockWatch {
     /// Steps are counted from `clock`.
-    #[must_use]
     pub const fn new(clock: WallClock) -> Self {
         Self(clock)
     }
@@ -134,21 +126,18 @@ impl ClockWatch {
 }
 
 /// A wall-clock time in UTC, to the millisecond: `2026-02-05T10:30:00.000Z` (RFC 3339).
-#[must_use]
 pub fn rfc3339(wall_ns: u64) -> String {
     let (year, month, day) = date(wall_ns);
     format!("{year:04}-{month:02}-{day:02}T{}", time_of_day(wall_ns))
 }
 
 /// The time of day of a wall-clock time in UTC: `22:13:20.123Z`.
-#[must_use]
 pub fn time_of_day(wall_ns: u64) -> String {
     let ms = wall_ns % NS_PER_DAY / 1_000_000;
     format!("{:02}:{:02}:{:02}.{:03}Z", ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60, ms % 1000)
 }
 
 /// Year, month and day of a wall-clock time in UTC.
-#[must_use]
 pub const fn date(wall_ns: u64) -> (u64, u64, u64) {
     civil(wall_ns / NS_PER_DAY)
 }

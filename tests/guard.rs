@@ -16,9 +16,10 @@ use std::time::{Duration, Instant};
 
 use motors::{Adapter, Hand, PATIENCE, spec};
 use rapid::action::{ActionSource, Order};
+use rapid::device::DeviceNode;
 use rapid::driver::can::guard;
 use rapid::driver::can::motors::Motors;
-use rapid::registry::{CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceNode, Stop};
+use rapid::registry::{CanAdapter, CanProtocol, CanSpec, DamiaoSpec, Stop};
 use rapid::time::Stamp;
 use rustix::process::{Pid, Signal, kill_process};
 

@@ -84,7 +84,7 @@ pub extern "C" fn rapid_node_open(max_bytes: usize) -> *mut RapidNode {
     match open(max_bytes) {
         Ok(node) => Box::into_raw(Box::new(node)),
         Err(error) => {
-            say(&*error);
+            report(&*error);
             std::ptr::null_mut()
         }
     }
@@ -98,7 +98,7 @@ pub extern "C" fn rapid_node_open(max_bytes: usize) -> *mut RapidNode {
 pub unsafe extern "C" fn rapid_node_publish(node: *mut RapidNode, sample: *const RapidSample) -> c_int {
     // SAFETY: the caller keeps to the header: both are null or valid, and no other thread uses the node meanwhile.
     let (Some(node), Some(sample)) = (unsafe { node.as_mut() }, unsafe { sample.as_ref() }) else {
-        say(&*Box::<dyn Error>::from("no node or no sample"));
+        report(&*Box::<dyn Error>::from("no node or no sample"));
         return -1;
     };
     let bytes = if sample.length == 0 || sample.bytes.is_null() {
@@ -110,7 +110,7 @@ pub unsafe extern "C" fn rapid_node_publish(node: *mut RapidNode, sample: *const
     match publish(node, sample, bytes) {
         Ok(()) => 0,
         Err(error) => {
-            say(&*error);
+            report(&*error);
             -1
         }
     }
@@ -149,7 +149,7 @@ pub unsafe extern "C" fn rapid_subscriber_open(topic: *const c_char) -> *mut Rap
     match subscribed {
         Ok(subscriber) => Box::into_raw(Box::new(subscriber)),
         Err(error) => {
-            say(&*error);
+            report(&*error);
             std::ptr::null_mut()
         }
     }
@@ -166,7 +166,7 @@ pub unsafe extern "C" fn rapid_subscriber_receive(
 ) -> c_int {
     // SAFETY: the caller keeps to the header: both are null or valid, and nothing else uses the subscriber meanwhile.
     let (Some(subscriber), false) = (unsafe { subscriber.as_mut() }, received.is_null()) else {
-        say(&*Box::<dyn Error>::from("no subscriber or no place for a sample"));
+        report(&*Box::<dyn Error>::from("no subscriber or no place for a sample"));
         return -1;
     };
     match receive(subscriber) {
@@ -176,7 +176,7 @@ pub unsafe extern "C" fn rapid_subscriber_receive(
             0
         }
         Err(error) => {
-            say(&*error);
+            report(&*error);
             -1
         }
     }
@@ -237,7 +237,7 @@ fn receive(subscriber: &mut RapidSubscriber) -> Result<RapidReceived, Box<dyn Er
     })
 }
 
-fn say(error: &dyn Error) {
+fn report(error: &dyn Error) {
     ERROR.set(CString::new(error.to_string().replace('\0', "")).unwrap_or_default());
 }
 

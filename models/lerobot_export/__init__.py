@@ -11,4 +11,4 @@ Invariant: a bundle gets its name only once it is verified.
 
 
 class Unsupported(Exception):
-    """Something that cannot be exported. The message names the file, its key and, where there is one, the way out."""
+    """Something that cannot be exported. The message names the file, its key and, if there is one, the fix."""

@@ -16,11 +16,11 @@ FORMAT = "rapid-policy/1"
 
 @dataclass
 class Options:
-    """What a checkpoint does not say of the rig."""
+    """Facts about the rig that a checkpoint does not contain."""
 
     name: str
     hz: float
-    # Modality of each observation, and the entry that is moved.
+    # Modality of each observation, and the entry of the actuator.
     modalities: dict[str, str]
     actuator: str
     mask_aware: bool = False
@@ -47,7 +47,7 @@ def input_names(config: Config) -> dict[str, str]:
 
 
 def write_policy(checkpoint: Checkpoint, options: Options, graphs: dict[str, str], folder: Path) -> dict:
-    """Writes policy.json beside the graphs it names, and returns what is in it."""
+    """Writes policy.json beside the graphs it names, and returns its contents."""
     config, names = checkpoint.config, input_names(checkpoint.config)
     observations = []
     for key in config.keys:
@@ -120,7 +120,7 @@ def sha256(file: Path) -> str:
 
 
 def write_card(policy: dict, folder: Path) -> None:
-    """README.md: the model card, from what policy.json says."""
+    """README.md: the model card, derived from policy.json."""
     action, scheduler, training = policy["action"], policy["scheduler"], policy["training"]
     rows = []
     for spec in policy["observations"]:

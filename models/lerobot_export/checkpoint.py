@@ -1,4 +1,4 @@
-"""LeRobot's own policy and normalisation, loaded on the CPU, and the statistics as a bundle writes them."""
+"""LeRobot's own policy and normalisation, loaded on the CPU, and the statistics in the format of a bundle."""
 
 import json
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from . import Unsupported
 from .config import ACTION_KEY, MAX_GRAPH_BYTES, Config
 
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
-# What LeRobot's DiffusionPolicy brings of its own. A step beside these would be left out of the bundle in silence.
+# The steps of LeRobot's own DiffusionPolicy. Any other step would silently be missing from the bundle.
 STEPS = {
     PRE: ["rename_observations_processor", "to_batch_processor", "device_processor", "normalizer_processor"],
     POST: ["unnormalizer_processor", "device_processor"],
@@ -41,7 +41,7 @@ class Checkpoint:
     postprocessor: PolicyProcessorPipeline
 
     def normalization(self, key: str) -> dict:
-        """How LeRobot normalises observation `key`, as a bundle says it."""
+        """LeRobot's normalisation of observation `key`, in the format of a bundle."""
         feature = "VISUAL" if key in self.config.cameras else "STATE"
         step, file = normalizer(self.preprocessor, "normalizer_processor"), self.config.folder / PRE
         only = step.normalize_observation_keys
@@ -62,19 +62,19 @@ class Checkpoint:
         return {"mode": "min_max", "min": decimals(low), "max": decimals(high)}
 
     def action_normalization(self) -> list[dict]:
-        """How LeRobot's postprocessor takes an action back to its units."""
+        """How LeRobot's postprocessor converts an action back to its units."""
         step, file = normalizer(self.postprocessor, "unnormalizer_processor"), self.config.folder / POST
         size = self.config.action_len
         mode = self._mode(step, ACTION_KEY, "ACTION")
         if mode == "IDENTITY":
             return [{"slice": [0, size], "mode": "identity"}]
         if mode == "MEAN_STD":
-            # LeRobot adds its eps only on the way in.
+            # LeRobot adds its eps only when normalising, not in the inverse.
             mean, std = (statistic(step, file, ACTION_KEY, name, size) for name in ("mean", "std"))
             return [mean_std(0, mean, std)]
         low, high = (statistic(step, file, ACTION_KEY, name, size) for name in BOUNDS[mode])
-        # A dimension that never changed in the data has no width; LeRobot gives it one of eps. A bundle's min_max has
-        # none either, and says the same as a mean and a tiny deviation.
+        # A dimension that never changed in the data has zero width; LeRobot replaces it by eps. A bundle's min_max
+        # does not allow it; a mean and a tiny deviation express the same.
         slices, begin, flat = [], 0, high == low
         for end in range(1, size + 1):
             if end < size and flat[end] == flat[begin]:
@@ -121,18 +121,18 @@ class Checkpoint:
         }
 
     def _mode(self, step, key: str, feature: str) -> str:
-        # LeRobot leaves alone what it has no statistics of.
+        # LeRobot leaves values without statistics unchanged.
         return step.norm_map.get(feature, "IDENTITY").upper() if key in (step.stats or {}) else "IDENTITY"
 
 
 def load(config: Config, scheduler: str | None, steps: int | None) -> Checkpoint:
-    """Loads the weights and processors; `scheduler` and `steps` overrule the configuration's where given."""
+    """Loads the weights and processors; `scheduler` and `steps` override those of the configuration, if given."""
     folder = config.folder
     pre = pipeline(folder / PRE, batch_to_transition, transition_to_batch)
     post = pipeline(folder / POST, policy_action_to_transition, transition_to_policy_action)
     settings = parse(config)
     settings.device = "cpu"
-    # All weights come from the checkpoint: nothing is fetched, and nothing is compiled before it is traced.
+    # All weights come from the checkpoint: nothing is downloaded, and nothing is compiled before tracing.
     settings.pretrained_backbone_weights = None
     settings.compile_model = False
     if scheduler is not None:
@@ -175,7 +175,7 @@ def pipeline(file: Path, to_transition, to_output) -> PolicyProcessorPipeline:
 
 
 def check_steps(file: Path) -> list[str]:
-    """The names of a processor's steps, all of them such as a bundle can say."""
+    """The names of a processor's steps, all of which a bundle can express."""
     try:
         steps = json.loads(file.read_text(encoding="utf-8"))["steps"]
         names = [step.get("registry_name") or step.get("class") for step in steps]
@@ -218,5 +218,5 @@ def mean_std(begin: int, mean: np.ndarray, std: np.ndarray) -> dict:
 
 
 def decimals(values: np.ndarray) -> list[float]:
-    """The shortest decimals that read back as these 32-bit floats."""
+    """The shortest decimals that parse to these 32-bit floats."""
     return [float(str(np.float32(value))) for value in values]

@@ -1,4 +1,4 @@
-"""What a checkpoint's config.json says, as far as a bundle cares; everything a bundle cannot carry is refused here.
+"""The parts of a checkpoint's config.json that a bundle needs; settings that a bundle cannot express are refused here.
 
 The keys are those of `lerobot.policies.diffusion.configuration_diffusion.DiffusionConfig`.
 """
@@ -44,7 +44,7 @@ class Config:
 
 
 def read(path: Path) -> Config:
-    """Reads and judges the checkpoint in folder `path` (or in its `pretrained_model`, where training leaves it)."""
+    """Reads and checks the checkpoint in folder `path` (or in its `pretrained_model`, where training leaves it)."""
     folder = checkpoint_folder(path)
     file = folder / "config.json"
     try:

@@ -75,7 +75,7 @@ class Encoder(nn.Module):
             # The batch is the one size left open: an unflatten would write that of the traced batch into the graph.
             x = encoder.relu(encoder.out(x)).reshape(-1, self.n_obs_steps, encoder.feature_dim)
             if self.mask_aware:
-                # Chosen rather than multiplied: whatever an absent camera's input holds, a NaN too, has no effect.
+                # Selected rather than multiplied: the input of an absent camera, even NaN, has no effect.
                 present = inputs[-1][:, index, None, None] > 0.5
                 x = torch.where(present, x, torch.zeros_like(x))
             features.append(x)
@@ -118,9 +118,9 @@ def export(policy, config: Config, names: dict[str, str], mask_aware: bool, fold
 
 
 def trace(module: nn.Module, args: list[Tensor], inputs: list[str], output: str, file: Path) -> Tensor:
-    """Writes the graph of `module` to `file`, and returns what `module` makes of `args`."""
+    """Writes the graph of `module` to `file`, and returns the result of `module` for `args`."""
     with warnings.catch_warnings():
-        # torch prefers its newer exporter, and says so for every graph.
+        # torch prefers its newer exporter, and warns about it for every graph.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module,
@@ -134,7 +134,7 @@ def trace(module: nn.Module, args: list[Tensor], inputs: list[str], output: str,
         )
     with torch.no_grad():
         made = module(*args)
-    # The tracer leaves the output's other sizes open as well. The program holds them against policy.json.
+    # The tracer leaves the output's other sizes open as well. The program checks them against policy.json.
     model = onnx.load(file)
     dims = model.graph.output[0].type.tensor_type.shape.dim
     for dim, size in zip(dims[1:], made.shape[1:], strict=True):

@@ -1,4 +1,4 @@
-"""Runs a bundle from its files alone, with numpy and onnxruntime: a stand-in for the program, to judge a bundle by."""
+"""Runs a bundle from its files alone, with numpy and onnxruntime: replaces the program, to check a bundle."""
 
 import json
 from collections.abc import Callable
@@ -15,7 +15,7 @@ class Bundle:
         self.spec = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
         graphs = self.spec["graphs"]
         options = onnxruntime.SessionOptions()
-        # More would wait busily, at the cost of PyTorch's on the other side.
+        # More threads would busy-wait, and slow down PyTorch's.
         options.intra_op_num_threads = 1
 
         def session(name: str) -> onnxruntime.InferenceSession:
@@ -25,7 +25,7 @@ class Bundle:
         self.encoder, self.denoiser = session("encoder"), session("denoiser")
 
     def condition(self, inputs: dict[str, np.ndarray], mask: np.ndarray | None) -> np.ndarray:
-        """The condition for normalised observations by key; what the mask says is absent is zeros."""
+        """The condition for normalised observations by key; absent ones according to the mask are zeros."""
         spec = self.spec["mask"]
         inputs = dict(inputs)
         if spec is not None:
@@ -92,7 +92,7 @@ def denormalize(value: np.ndarray, slices: list[dict]) -> np.ndarray:
 
 
 def steps(spec: dict):
-    """The timesteps from the last, each with its alpha and that of the one visited next; spacing "leading" alone."""
+    """The timesteps from the last, each with its alpha and that of the one visited next; only for spacing "leading"."""
     assert spec["timestep_spacing"] == "leading", spec["timestep_spacing"]
     stride = spec["num_train_timesteps"] // spec["num_inference_steps"]
     alphas = np.cumprod(1 - betas(spec), dtype=np.float32)
@@ -125,7 +125,7 @@ def step(spec: dict, output, x, alpha, alpha_previous, fresh_noise) -> np.ndarra
     if spec["clip_sample"]:
         clean = np.clip(clean, -np.float32(spec["clip_sample_range"]), np.float32(spec["clip_sample_range"]))
     if spec["type"] == "DDIM":
-        # diffusers does not compute epsilon anew from what it clipped.
+        # diffusers does not recompute epsilon from the clipped sample.
         return (np.sqrt(alpha_previous) * clean + np.sqrt(1 - alpha_previous) * epsilon).astype(np.float32)
     ratio = alpha / alpha_previous
     mean = np.sqrt(alpha_previous) * (1 - ratio) / (1 - alpha) * clean

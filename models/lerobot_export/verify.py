@@ -1,4 +1,4 @@
-"""Holds a written bundle against LeRobot: its graphs alone, then everything from raw observations to actions.
+"""Compares a written bundle with LeRobot: its graphs alone, then everything from raw observations to actions.
 
 LeRobot's side is LeRobot's own code throughout (processors, crop, encoders, scheduler); the bundle's side knows the
 files of the bundle alone.
@@ -16,13 +16,13 @@ from .checkpoint import Checkpoint
 from .config import STATE_KEY
 from .runtime import Bundle
 
-# Of numbers around 1: normalised observations, features, normalised actions.
+# For numbers around 1: normalised observations, features, normalised actions.
 TOLERANCE = 1e-4
 SEED = 20
 
 
 class Mismatch(Unsupported):
-    """The bundle does not do what LeRobot does."""
+    """The bundle computes something else than LeRobot."""
 
 
 def verify(checkpoint: Checkpoint, folder: Path) -> dict[str, float]:
@@ -38,7 +38,7 @@ def verify(checkpoint: Checkpoint, folder: Path) -> dict[str, float]:
             "denoiser": max(denoiser(checkpoint, bundle, random, batch) for batch in (1, 3)),
             **end_to_end(checkpoint, bundle, random),
         }
-    # A difference that is no number compares as false with everything.
+    # A NaN difference compares as false with everything.
     if wrong := [name for name, difference in found.items() if not difference <= TOLERANCE]:
         figures = ", ".join(f"{name} {difference:.2e}" for name, difference in found.items())
         raise Mismatch(
@@ -48,7 +48,7 @@ def verify(checkpoint: Checkpoint, folder: Path) -> dict[str, float]:
 
 
 def encoder(checkpoint: Checkpoint, bundle: Bundle, random, batch: int) -> float:
-    """Over every mask that leaves something, with NaN where a camera is absent."""
+    """Over every mask with at least one camera present, with NaN for absent cameras."""
     config = checkpoint.config
     inputs = {key: normal(random, batch, config.n_obs_steps, *shape) for key, shape in config.cameras.items()}
     inputs[STATE_KEY] = normal(random, batch, config.n_obs_steps, config.state_len)
@@ -77,7 +77,7 @@ def denoiser(checkpoint: Checkpoint, bundle: Bundle, random, batch: int) -> floa
 
 
 def end_to_end(checkpoint: Checkpoint, bundle: Bundle, random) -> dict[str, float]:
-    """Raw observations to executed actions, from the same noise: as the denoiser leaves them, and in their units.
+    """Raw observations to executed actions, from the same noise: as the denoiser returns them, and in their units.
 
     The latter are divided by the width of their range, so that degrees and metres are judged alike.
     """
@@ -100,7 +100,7 @@ def end_to_end(checkpoint: Checkpoint, bundle: Bundle, random) -> dict[str, floa
 
     worst = {"actions": 0.0, "actions in units": 0.0}
     for mask in masks(checkpoint, bundle):
-        # DDPM draws noise at every step: both sides from one seed.
+        # DDPM draws noise at every step: both use the same seed.
         torch.manual_seed(SEED)
         expected = lerobot_actions(checkpoint, inputs, mask, noise)
         torch.manual_seed(SEED)
@@ -131,7 +131,7 @@ def lerobot_condition(checkpoint: Checkpoint, inputs: dict) -> torch.Tensor:
 
 
 def masked(checkpoint: Checkpoint, condition: torch.Tensor, mask) -> torch.Tensor:
-    """LeRobot knows no mask: the columns of the absent cameras are zeroed in what it computes."""
+    """LeRobot has no mask: the columns of the absent cameras are zeroed in its result."""
     if mask is None:
         return condition
     config = checkpoint.config
@@ -156,7 +156,7 @@ def masks(checkpoint: Checkpoint, bundle: Bundle) -> list:
 
 
 def states(checkpoint: Checkpoint, bundle: Bundle, random, shape: tuple) -> np.ndarray:
-    """States as the training data have them."""
+    """States as in the training data."""
     spec = bundle.spec["observations"][-1]["normalization"]
     if spec["mode"] == "min_max":
         return random.uniform(spec["min"], spec["max"], shape).astype(np.float32)
@@ -170,5 +170,5 @@ def normal(random, *shape: int) -> np.ndarray:
 
 
 def largest(worst: float, difference: np.ndarray) -> float:
-    """The larger, and NaN once there is one."""
+    """The larger value; NaN if either is NaN."""
     return float(np.maximum(worst, np.abs(difference).max()))

@@ -1,4 +1,4 @@
-"""Writes what stands beside the graphs of a bundle: `policy.json` and the model card."""
+"""Writes the other files of a bundle beside its graphs: `policy.json` and the model card."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def encoder_inputs(spec: Spec) -> list[str]:
 
 
 def write_policy(spec: Spec, facts: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Writes `policy.json` beside the graphs, which are there already. `facts` is the provenance of the weights."""
+    """Writes `policy.json` beside the graphs, which exist already. `facts` is the provenance of the weights."""
     policy = policy_json(spec, facts, {name: sha256(folder / name) for name in (ENCODER, DENOISER)})
     (folder / POLICY).write_text(json.dumps(policy, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return policy
 
 
 def policy_json(spec: Spec, facts: dict[str, Any], hashes: dict[str, str]) -> dict[str, Any]:
-    """The content of `policy.json`; models/README.md says what each key means."""
+    """The content of `policy.json`; models/README.md describes each key."""
     ranges = {key: MinMax.from_dict(value) for key, value in facts["normalization"].items()}
     limits = ranges["action"].widened(LIMIT_MARGIN)
     actions = len(spec.action_names)
@@ -94,7 +94,7 @@ def _observation(o: Observation, ranges: dict[str, MinMax]) -> dict[str, Any]:
 
 
 def sha256(path: Path) -> str:
-    """Of a file, in hexadecimal."""
+    """The hash of a file, in hexadecimal."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Windows of episodes as the networks take them: normalised, pooled, shifted at random."""
+"""Windows of episodes as inputs of the networks: normalised, pooled, shifted at random."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Batch:
 
 
 class Dataset:
-    """All ticks of all episodes in one row, and the windows among them.
+    """All ticks of all episodes in sequence, and the windows among them.
 
     A window belongs to a tick. It does not reach over a tick that lacks a required modality or an action, nor over a
     gap in the frame index: at such a place one segment ends and another begins, and steps beyond either end repeat it.
@@ -69,7 +69,7 @@ class Dataset:
         done = np.clip(done, begin[:, None], end[:, None] - 1)
         observations = {}
         for i, o in enumerate(self.spec.images):
-            # Just plugged in again: the steps from before show what is the first to be seen, as they do at the start.
+            # Just plugged in again: the earlier steps show the first new picture, as at the start.
             steps = np.where(self.present[seen, i], seen, tick[:, None])
             observations[o.key] = torch.from_numpy(self._pictures(o, steps, random))
         for o in self.spec.vectors:
@@ -79,7 +79,7 @@ class Dataset:
         return Batch(observations, torch.from_numpy(self.present[tick]), torch.from_numpy(self.actions[done]))
 
     def _pictures(self, o: Observation, steps: NDArray[np.int64], random: np.random.Generator) -> NDArray[np.float32]:
-        """[B, To, 3, h, w] of the rows `steps` [B, To]; all steps of a window are shifted alike."""
+        """[B, To, 3, h, w] of the rows `steps` [B, To]; all steps of a window have the same shift."""
         source = self.pictures[o.key]
         height, width = (side // POOL for side in o.shape[1:])
         shift = SHIFT[o.operation]
@@ -113,14 +113,14 @@ def _unit(pictures: NDArray[np.uint8]) -> Tensor:
 
 
 def _windows(spec: Spec, episodes: list[Episode]) -> list[NDArray[np.int64]]:
-    """For each episode [W, 3]: a tick, and where its segment begins and ends, as rows of all episodes."""
+    """For each episode [W, 3]: a tick, and the start and end of its segment, as rows of all episodes."""
     windows, start = [], 0
     for episode in episodes:
         usable = episode.acted.copy()
         for o in spec.observations:
             if o.required:
                 usable &= episode.present[o.modality]
-        # Pictures that are not required: one of them at least has to be there.
+        # Pictures that are not required: at least one of them must be present.
         if spec.images:
             usable &= np.logical_or.reduce([episode.present[o.modality] for o in spec.images])
         breaks = np.flatnonzero(~(usable[1:] & usable[:-1] & (np.diff(episode.ticks) == 1))) + 1

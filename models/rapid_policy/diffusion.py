@@ -1,4 +1,4 @@
-"""The diffusion process: how noise is added in training, and the DDIM sampler that takes it away again.
+"""The diffusion process: how noise is added in training, and the DDIM sampler that removes it.
 
 The tables are float32 and the formulas those of the diffusers library, which the program's own scheduler follows too.
 """
@@ -54,7 +54,7 @@ def ddim(
         alpha = table[t]
         previous = table[t - stride] if t >= stride else torch.tensor(1.0)
         epsilon = denoise(sample, torch.full((len(sample),), t, dtype=torch.int64))
-        # The prediction is clipped, the noise is not computed anew from it: so does diffusers.
+        # The prediction is clipped, but the noise is not recomputed from it, as in diffusers.
         clean = ((sample - (1 - alpha).sqrt() * epsilon) / alpha.sqrt()).clamp(-1, 1)
         sample = previous.sqrt() * clean + (1 - previous).sqrt() * epsilon
     return sample

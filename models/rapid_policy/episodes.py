@@ -1,4 +1,4 @@
-"""Reads recorded episodes: what each tick of the frame index saw, and the action taken at it.
+"""Reads recorded episodes: the samples of each tick of the frame index, and the action taken at it.
 
 The frame index of a file (`/rapid/frame`) names the sample of every modality at every tick by its sequence number, and
 the mask in force. What is read here is therefore what a policy would have been given, not the nearest sample by a rule
@@ -31,7 +31,7 @@ SEQUENCE_BITS = 0xFFFF_FFFF
 
 
 class EpisodeError(Exception):
-    """A file that cannot be learned from; says which and why."""
+    """A file that cannot be used for training; names it and the reason."""
 
     def __init__(self, path: Path, what: str) -> None:
         super().__init__(f"{path}: {what}")
@@ -39,7 +39,7 @@ class EpisodeError(Exception):
 
 @dataclass
 class Episode:
-    """One episode, a row for each of its T ticks. Rows that are not `present` hold zeros."""
+    """One episode, a row for each of its T ticks. Rows that are not `present` are zeros."""
 
     path: Path
     ticks: NDArray[np.int64]
@@ -55,11 +55,11 @@ class Episode:
     actions: NDArray[np.float64]
     """[T, Da]"""
     acted: NDArray[np.bool_]
-    """[T] an action was taken at the tick."""
+    """[T] whether an action was taken at the tick."""
     facts: dict[str, str]
-    """The metadata record `rapid`: what is known at the beginning."""
+    """The metadata record `rapid`, written at the beginning."""
     summary: dict[str, str]
-    """The metadata record `rapid/summary`: what is known at the end."""
+    """The metadata record `rapid/summary`, written at the end."""
     tags: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -77,7 +77,7 @@ def episode_files(folder: Path) -> list[Path]:
 def read_episodes(
     files: Iterable[Path], observations: tuple[Observation, ...], actions: int
 ) -> tuple[list[Episode], list[str]]:
-    """All files that are GOOD or SUSPECT as they are now, and a line for each that is not."""
+    """All files that are GOOD or SUSPECT at present, and a line for each that is not."""
     files = list(files)
     try:
         judged = judge(files)
@@ -112,7 +112,7 @@ def read_episode(path: Path, observations: tuple[Observation, ...], actions: int
                 messages[channel.topic].append(_Message(message.log_time, message.sequence, schema.name, decoded))
     except EpisodeError:
         raise
-    # Damage comes to light in the container, the compression, a schema or a message: each has errors of its own.
+    # Damage is found in the container, the compression, a schema or a message: each has its own errors.
     except Exception as error:
         raise EpisodeError(path, f"not a whole episode: {error}") from error
     return _assemble(path, facts, summary, wanted, observations, actions, messages)
@@ -137,7 +137,7 @@ def _streams(path: Path, facts: dict[str, str]) -> dict[str, dict[str, Any]]:
 
 
 class _Decoder:
-    """Decodes messages by the schemas that the file itself carries."""
+    """Decodes messages by the schemas in the file itself."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -195,7 +195,7 @@ def _assemble(
 
 
 def _chosen(stream: dict[str, Any], frames: list[_Message], samples: list[_Message]) -> list[_Message | None]:
-    """The sample of the modality at each tick; none where its bit is clear or the tick has none that may be used."""
+    """The sample of the modality at each tick; none if its bit is clear or the tick has no usable one."""
     by_sequence: dict[int, list[_Message]] = defaultdict(list)
     for sample in samples:
         by_sequence[sample.sequence].append(sample)
@@ -207,7 +207,7 @@ def _chosen(stream: dict[str, Any], frames: list[_Message], samples: list[_Messa
         if not usable:
             chosen.append(None)
             continue
-        # After a replug a device may count from the beginning again: of several with one number the nearest is meant.
+        # After a replug a device may count from the beginning again: of several with one number the nearest is used.
         captured = frame.time - slot.age_ns + latency
         candidates = by_sequence[slot.seq & SEQUENCE_BITS]
         chosen.append(min(candidates, key=lambda m: abs(m.time - captured), default=None))
@@ -247,7 +247,7 @@ def _numbers(path: Path, what: str, message: _Message, length: int) -> NDArray[n
 def _actions(
     path: Path, facts: dict[str, str], frames: list[_Message], messages: list[_Message], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """[T, Da] and [T]: an action belongs to the tick whose time it carries."""
+    """[T, Da] and [T]: an action belongs to the tick with its time."""
     if not messages:
         raise EpisodeError(path, f"no action: nothing on {ACTIONS}")
     times = np.array([m.time for m in frames])

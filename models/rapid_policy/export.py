@@ -1,4 +1,4 @@
-"""Makes a bundle of a checkpoint: both graphs as ONNX, checked against PyTorch, `policy.json` and a model card.
+"""Exports a checkpoint to a bundle: both graphs as ONNX, checked against PyTorch, `policy.json` and a model card.
 
     python -m rapid_policy.export RUN/checkpoint.pt --out models/NAME
 """
@@ -25,12 +25,12 @@ from .progress import plot
 from .spec import Spec
 
 OPSET = 17
-# Both compute in float32 and in another order.
+# Both compute in float32, but in a different order.
 TOLERANCE = 1e-4
 
 
 def export(state: dict[str, Any], out: Path) -> float:
-    """Writes the bundle of the checkpoint `state` into `out`. Returns the largest difference found to PyTorch."""
+    """Writes the bundle of the checkpoint `state` into `out`. Returns the largest difference from PyTorch."""
     spec = Spec.from_dict(state["spec"])
     policy = Policy(spec)
     policy.load_state_dict(state["average"])
@@ -91,7 +91,7 @@ def write_graph(module: nn.Module, example: tuple[Tensor, ...], inputs: list[str
 
 
 def largest_difference(spec: Spec, policy: Policy, folder: Path) -> float:
-    """Between the graphs and PyTorch, over random inputs: every mask, batches of 1 and 3, all timesteps used."""
+    """Difference between graphs and PyTorch, over random inputs: every mask, batches of 1 and 3, all timesteps used."""
     encoder, denoiser = (session(folder / name) for name in (ENCODER, DENOISER))
     masks = itertools.product((0, 1), repeat=len(spec.images)) if spec.mask_aware else [None]
     differences = []
@@ -101,14 +101,14 @@ def largest_difference(spec: Spec, policy: Policy, folder: Path) -> float:
             expected = policy.encoder(*inputs)
             differences.append(_difference(expected, encoder, encoder_inputs(spec), inputs))
             if mask is not None:
-                # Whatever an absent picture holds, it must not come through.
+                # The contents of an absent picture must have no effect.
                 spoilt = _spoil_absent(spec, inputs, mask)
                 differences.append(_difference(expected, encoder, encoder_inputs(spec), spoilt))
         for timestep, batch in itertools.product(range(0, 100, 10), (1, 3)):
             inputs = denoiser_example(spec, batch, timestep)
             names = ["sample", "timestep", "global_cond"]
             differences.append(_difference(policy.denoiser(*inputs), denoiser, names, inputs))
-    # `max` would pass over a NaN.
+    # `max` would ignore a NaN.
     return float(np.max(differences))
 
 
@@ -120,7 +120,7 @@ def _spoil_absent(spec: Spec, inputs: tuple[Tensor, ...], mask: tuple[int, ...])
 
 
 def session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
-    """A graph, run on so many threads."""
+    """A graph, run on this many threads."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

@@ -1,4 +1,4 @@
-"""What recorded files are worth: the judgement of `rapid inspect`, which is that of the recorder and the monitor.
+"""The verdict on recorded files by `rapid inspect`, which is that of the recorder and the monitor.
 
 Only the standard library is used, so that whoever picks episodes can ask without an environment for training.
 """
@@ -13,14 +13,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-# As many files as one command line names: their paths may be long.
+# Number of files per command line: their paths may be long.
 AT_ONCE = 200
 # Exit code of `rapid inspect` when a file of a list cannot be read.
 UNREADABLE = 2
 
 
 class JudgementError(Exception):
-    """`rapid inspect` cannot be asked; says why and what to do."""
+    """`rapid inspect` cannot be run; contains the reason and the fix."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Judgement:
     """The verdict on one file."""
 
     verdict: str | None
-    """GOOD, SUSPECT, BAD; None of a file that is not an episode of rapid or cannot be read."""
+    """GOOD, SUSPECT, BAD; None for a file that is not an episode of rapid or cannot be read."""
     reasons: tuple[str, ...]
     """Why it is not GOOD."""
 
@@ -37,7 +37,7 @@ class Judgement:
 
 
 def program() -> str:
-    """The program that judges: RAPID_BIN, otherwise `rapid` of the PATH."""
+    """The program that gives the verdict: RAPID_BIN, otherwise `rapid` of the PATH."""
     named = os.environ.get("RAPID_BIN")
     found = shutil.which(named or "rapid")
     if found is None:
@@ -47,7 +47,7 @@ def program() -> str:
 
 
 def judge(files: Iterable[Path]) -> dict[Path, Judgement]:
-    """Every file read whole and judged, by its path."""
+    """The verdict on every file, read completely, by its path."""
     files, rapid = list(files), program()
     judged: dict[Path, Judgement] = {}
     for first in range(0, len(files), AT_ONCE):
@@ -56,7 +56,7 @@ def judge(files: Iterable[Path]) -> dict[Path, Judgement]:
 
 
 def _ask(rapid: str, files: list[Path]) -> dict[Path, Judgement]:
-    # A file named twice makes a list, in which one that cannot be read has a line like the others.
+    # Naming a file twice makes the output a list, in which an unreadable file has a line like the others.
     names = [str(file) for file in (files if len(files) > 1 else files * 2)]
     command = [rapid, "inspect", "--json", "--", *names]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""The two networks: an encoder of observations that knows what is absent, and the denoiser of action sequences.
+"""The two networks: a mask-aware encoder of observations, and the denoiser of action sequences.
 
 The denoiser is the one-dimensional U-Net of Diffusion Policy (Chi et al., 2023) at a size that one processor core runs
 ten times in a control period.
@@ -28,7 +28,7 @@ class SpatialSoftmax(nn.Module):
         self.features = nn.Conv2d(channels, keypoints, 1)
         self.sharpness = nn.Parameter(torch.tensor(4.0))
         y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-        # Not a weight: nothing that is learned, so that a checkpoint and the reader of a graph do without it.
+        # Not a weight, because it is not learned: neither a checkpoint nor the reader of a graph needs it.
         self.register_buffer("grid", torch.stack([x.reshape(-1), y.reshape(-1)], 1), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -48,7 +48,7 @@ class ImageEncoder(nn.Module):
 
         c = sizes.image_width
         self.net = nn.Sequential(block(3, c, 5, 2), block(c, 2 * c, 3, 2), block(2 * c, 4 * c, 3, 1))
-        # The mean says what is there, the keypoints where it is.
+        # The mean shows what is present, the keypoints where it is.
         self.where = SpatialSoftmax(4 * c, sizes.keypoints, height // POOL // 4, width // POOL // 4)
         self.out = nn.Linear(4 * c + 2 * sizes.keypoints, sizes.image_features)
 
@@ -56,7 +56,7 @@ class ImageEncoder(nn.Module):
         return self.pooled(F.avg_pool2d(x, POOL))
 
     def pooled(self, x: Tensor) -> Tensor:
-        """The same of a picture that is pooled already: [B, 3, H / POOL, W / POOL]."""
+        """The same for a picture that is already pooled: [B, 3, H / POOL, W / POOL]."""
         features = self.net(x)
         return self.out(torch.cat([features.mean((2, 3)), self.where(features)], 1))
 
@@ -78,7 +78,7 @@ class ObservationEncoder(nn.Module):
         return self.encode(observations, inputs[-1] if self.mask_aware else None, pooled=False)
 
     def encode(self, observations: dict[str, Tensor], mask: Tensor | None, *, pooled: bool) -> Tensor:
-        """`mask` [B, M], 1 where the picture is there. `pooled` says that the pictures are pooled already."""
+        """`mask` [B, M], 1 for present pictures. `pooled`: the pictures are already pooled."""
         vectors = [observations[key] for key in self.vector_keys]
         embeddings = []
         for i, key in enumerate(self.image_keys):
@@ -86,7 +86,7 @@ class ObservationEncoder(nn.Module):
             embedding = (encoder.pooled if pooled else encoder)(pictures.flatten(0, 1))
             embedding = embedding.unflatten(0, pictures.shape[:2])
             if mask is not None:
-                # Chosen, not multiplied: NaN times zero would still be NaN, and an absent picture may hold anything.
+                # Selected, not multiplied: NaN times zero is still NaN, and an absent picture may contain anything.
                 present = mask[:, None, i : i + 1] > 0.5
                 embedding = torch.where(present, embedding, torch.zeros((), dtype=embedding.dtype, device=mask.device))
             embeddings.append(embedding)
@@ -160,7 +160,7 @@ class Denoiser(nn.Module):
 
 
 class Policy(nn.Module):
-    """Both networks, as they are trained."""
+    """Both networks, for training."""
 
     def __init__(self, spec: Spec) -> None:
         super().__init__()
@@ -170,5 +170,5 @@ class Policy(nn.Module):
 
 
 def parameters(modules: Iterable[nn.Module]) -> int:
-    """How many numbers are learned."""
+    """Number of trainable parameters."""
     return sum(p.numel() for module in modules for p in module.parameters())

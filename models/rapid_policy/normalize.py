@@ -40,10 +40,10 @@ class MinMax:
         return MinMax(self.low - margin, self.high + margin)
 
     def to_dict(self) -> dict[str, Any]:
-        """As `policy.json` has it."""
+        """In the format of `policy.json`."""
         return {"mode": "min_max", "min": self.low.tolist(), "max": self.high.tolist()}
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> MinMax:
-        """Back from `to_dict`."""
+        """The inverse of `to_dict`."""
         return MinMax(np.array(data["min"], np.float64), np.array(data["max"], np.float64))

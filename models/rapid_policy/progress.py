@@ -1,4 +1,4 @@
-"""What is seen of a training: a bar on a terminal, lines in a log, a plot at the end."""
+"""Progress of a training: a bar on a terminal, lines in a log, a plot at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Progress:
         self._bar = tqdm(total=iterations, initial=already, desc=name) if sys.stderr.isatty() else None
 
     def step(self, losses: list[float], done: float, seconds: float) -> None:
-        """One iteration more; `done` is the share of the whole schedule."""
+        """One more iteration; `done` is the share of the whole schedule."""
         if self._bar is not None:
             if len(losses) % 10 == 0:
                 self._bar.set_postfix(loss=f"{recent(losses):.4f}", refresh=False)

@@ -1,4 +1,4 @@
-"""What a policy sees, does and consists of: the one description that loader, model and exporter follow."""
+"""Observations, actions and networks of a policy: the only description, used by loader, model and exporter."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Observation:
     shape: tuple[int, ...]
     """(3, H, W) of a picture, (D,) of a vector."""
     required: bool = True
-    """Without it there is no policy: a moment that lacks it is not learned from."""
+    """The policy requires it: ticks without it are not used for training."""
     operation: str | None = None
     """`diff_to_reference`: the difference to the first picture of the episode."""
     dropout: float = 0.0
-    """How often it is taken away in training."""
+    """How often it is masked in training."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Spec:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Spec:
-        """Back from `to_dict`."""
+        """The inverse of `to_dict`."""
         plain = dict(data)
         observations = (Observation(**{**o, "shape": tuple(o["shape"])}) for o in plain.pop("observations"))
         network = plain.pop("network")
@@ -108,17 +108,17 @@ def wrist(dropout: float = 0.0, required: bool = False) -> Observation:
 
 
 def tactile(dropout: float = 0.0, required: bool = False) -> Observation:
-    """The camera behind the gel of the fingertip, as difference to the gel untouched."""
+    """The camera behind the gel of the fingertip, as difference to the untouched gel."""
     return Observation("tactile", "image", "tactile_tip", PICTURE, required, "diff_to_reference", dropout)
 
 
 def arm() -> Observation:
-    """Where the gripper is, and how far open."""
+    """Position and opening of the gripper."""
     return Observation("state", "vector", "arm", (4,))
 
 
 def tactile_id() -> Spec:
-    """Grasp, tell the texture by touch, place: the policy that is shipped."""
+    """Grasp, identify the texture by touch, place: the shipped policy."""
     return Spec("tactile-id", (wrist(dropout=0.3), tactile(dropout=0.3), arm()))
 
 

@@ -37,28 +37,28 @@ SAVE_EVERY = 500
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long and how fast to learn."""
+    """Training schedule."""
 
     iterations: int = 3900
     minutes: float = math.inf
-    """The learning rate falls by whichever of the two runs out first; training ends there."""
+    """The learning rate falls with whichever limit is reached first; training ends there."""
     seed: int = 0
     windows: int = 64
-    """A batch."""
+    """Batch size."""
     draws: int = 2
-    """Noises drawn for each window: the encoder is the dearer half, and runs once for all of them."""
+    """Noises drawn for each window: the encoder is the more expensive half, and runs once for all of them."""
     learning_rate: float = 1e-3
     final_rate: float = 0.005
     """Share of the learning rate that is left at the end."""
     warmup: int = 100
     """Iterations."""
     decay: float = 0.995
-    """Of the moving average of the weights, which is what is exported."""
+    """Decay of the moving average of the weights, which is exported."""
 
 
 @dataclass
 class Run:
-    """All that a checkpoint holds."""
+    """The contents of a checkpoint."""
 
     spec: Spec
     schedule: Schedule
@@ -72,7 +72,7 @@ class Run:
     losses: list[float] = field(default_factory=list)
 
     def save(self, path: Path) -> None:
-        """Writes the checkpoint; a run that is stopped meanwhile leaves the one before."""
+        """Writes the checkpoint; a run that is stopped meanwhile leaves the previous one."""
         state = {
             "spec": self.spec.to_dict(),
             "schedule": vars(self.schedule),
@@ -91,7 +91,7 @@ class Run:
         partial.replace(path)
 
     def load(self, state: dict[str, Any]) -> None:
-        """Goes on where the checkpoint `state` was written."""
+        """Continues from the checkpoint `state`."""
         self.policy.load_state_dict(state["policy"])
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -101,7 +101,7 @@ class Run:
 
 
 def begin(spec: Spec, schedule: Schedule, dataset: Dataset, provenance: dict[str, Any], device: torch.device) -> Run:
-    """Networks of random weights, all of which follow from the seed."""
+    """Networks with random weights, determined by the seed."""
     torch.manual_seed(schedule.seed)
     policy = Policy(spec).to(device)
     optimizer = torch.optim.AdamW(
@@ -166,7 +166,7 @@ def _loss(run: Run, batch: Batch, table: Tensor, device: torch.device) -> Tensor
     """Mean squared error of the predicted noise."""
     observations = {key: value.to(device) for key, value in batch.observations.items()}
     mask = drop(run.spec, batch.present, run.random).to(device) if run.spec.mask_aware else None
-    # The encoder alone: convolutions gain most by half the width, and the denoiser's small ones nothing.
+    # Only the encoder: its convolutions gain most from half precision, the denoiser's small ones nothing.
     with torch.autocast(device.type, torch.bfloat16, enabled=half_width(device)):
         condition = run.policy.encoder.encode(observations, mask, pooled=True)
     condition = condition.float().repeat(run.schedule.draws, 1)
@@ -178,7 +178,7 @@ def _loss(run: Run, batch: Batch, table: Tensor, device: torch.device) -> Tensor
 
 
 def drop(spec: Spec, present: Tensor, random: np.random.Generator) -> Tensor:
-    """Takes pictures away at random, f32 [B, M]: of those `present` bool [B, M] one always stays if there are several.
+    """Masks pictures at random, f32 [B, M]: of several `present` ones, bool [B, M], at least one always remains.
 
     A policy with one picture has its vectors left.
     """
@@ -186,7 +186,7 @@ def drop(spec: Spec, present: Tensor, random: np.random.Generator) -> Tensor:
     there = present.numpy()
     kept = there & (random.random(there.shape) >= rates)
     if len(rates) > 1:
-        # The one that stays in a window that lost all: any of those that were there, each as likely.
+        # The one that remains in a window that lost all: any present one, with equal probability.
         lot = np.where(there, random.random(there.shape), -1.0)
         lost = ~kept.any(1) & there.any(1)
         kept[lost, lot[lost].argmax(1)] = True
@@ -195,21 +195,21 @@ def drop(spec: Spec, present: Tensor, random: np.random.Generator) -> Tensor:
 
 @torch.no_grad()
 def _follow(run: Run) -> None:
-    """Moves the average towards the weights; faster in the beginning, when they are not worth remembering."""
+    """Moves the average towards the weights; faster in the beginning, when the early weights are of no use."""
     decay = min(run.schedule.decay, (1 + run.iteration) / (10 + run.iteration))
     averages, weights = list(run.average.parameters()), list(run.policy.parameters())
     torch._foreach_lerp_(averages, weights, 1 - decay)
 
 
 def half_width(device: torch.device) -> bool:
-    """Whether the device computes in bfloat16 itself; where it would be emulated it costs time."""
+    """Whether the device computes natively in bfloat16; emulation would cost time."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
     return bool(torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def provenance(episodes: list[Episode], command: str) -> dict[str, Any]:
-    """Where the weights come from: what was learned from, with what."""
+    """The origin of the weights: training data and software."""
     digest = hashlib.sha256()
     for episode in episodes:
         digest.update(hashlib.sha256(episode.path.read_bytes()).digest())
@@ -228,7 +228,7 @@ def provenance(episodes: list[Episode], command: str) -> dict[str, Any]:
 
 
 def load_episodes(spec: Spec, folder: Path) -> list[Episode]:
-    """The episodes of a folder; says what is left out."""
+    """The episodes of a folder; prints those left out."""
     episodes, left_out = read_episodes(episode_files(folder), spec.observations, len(spec.action_names))
     for line in left_out:
         print(line, file=sys.stderr)
@@ -245,7 +245,7 @@ def pick_device(name: str) -> torch.device:
 
 
 def hardware(device: torch.device) -> str:
-    """What is trained on, in words."""
+    """The device of the training, in words."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     threads = torch.get_num_threads()

@@ -18,7 +18,7 @@ from .spec import Network, Observation, Spec
 
 
 def load_policy(folder: Path) -> Policy:
-    """The policy of a bundle that `rapid_policy.export` made; of another's the names of the weights do not fit."""
+    """The policy of a bundle that `rapid_policy.export` made; other bundles have other weight names."""
     described = json.loads((folder / POLICY).read_text(encoding="utf-8"))
     encoder, denoiser = _initializers(folder / ENCODER), _initializers(folder / DENOISER)
     policy = Policy(_spec(described, encoder, denoiser))
@@ -40,7 +40,7 @@ def _load(module: nn.Module, found: dict[str, torch.Tensor], path: Path) -> None
 
 
 def _spec(described: dict[str, Any], encoder: dict[str, torch.Tensor], denoiser: dict[str, torch.Tensor]) -> Spec:
-    """What `policy.json` says, with the sizes that only the weights tell."""
+    """The contents of `policy.json`, with the sizes that only the weights show."""
     observations = tuple(
         Observation(o["key"], o["kind"], o["modality"], tuple(o["shape"]), o["required"], o.get("operation"))
         for o in described["observations"]

@@ -1,9 +1,9 @@
-//! Where the actuator is to go: the topic of actions, for the thread or task that drives the actuator.
+//! Where the actuator should move: the topic of actions, for the thread or task that drives the actuator.
 //!
-//! An event service of the topic's name wakes it; an action of a program that does not notify is found by the clock.
+//! An event service of the same name wakes it; actions of programs that do not notify are found by polling.
 //!
-//! Invariant: once this process, which runs a policy, has published an action, those of other programs move nothing.
-//! Invariant: what is no list of at most [`MAX_ACTION`] finite numbers is no action, whatever its publisher.
+//! Invariant: once this process, which runs a policy, has published an action, actions of other programs are ignored.
+//! Invariant: a payload that is not a list of at most [`MAX_ACTION`] finite numbers is rejected.
 
 use std::os::fd::{BorrowedFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,11 +22,10 @@ use crate::action::{ActionSource, MAX_ACTION, NoAction};
 use crate::sample::{Encoding, SampleHeader};
 use crate::time::Stamp;
 
-/// A bell for a task to wait for; `None` where the system cannot watch it, and who waits looks by the clock alone.
-#[must_use]
+/// An event for a task to wait for; `None` where the system cannot watch it and the caller must poll.
 pub fn watch(bell: BorrowedFd<'_>) -> Option<AsyncFd<OwnedFd>> {
     let bell = bell.try_clone_to_owned().ok()?;
-    // SAFETY: what is registered owns one descriptor all its life.
+    // SAFETY: the registered value owns one descriptor for its whole life.
     unsafe { AsyncFd::register_with_interest(bell, Interest::READABLE) }.ok()
 }
 
@@ -36,9 +35,9 @@ pub struct Actions {
     depth: usize,
     subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
     listener: Guarded<Listener<Service>>,
-    /// The one of this process.
+    /// Publisher of this process.
     writer: UniquePublisherId,
-    /// It has published.
+    /// Set once `writer` has published.
     is_written: AtomicBool,
 }
 
@@ -69,7 +68,7 @@ impl Actions {
         })
     }
 
-    /// Forgets actions that were meant for a device before this one.
+    /// Discards actions that were meant for a previous device.
     pub fn discard(&self) {
         let _ = self.newest(&mut [0.0; MAX_ACTION]);
     }
@@ -77,13 +76,13 @@ impl Actions {
 
 impl ActionSource for Actions {
     fn bell(&self) -> Option<BorrowedFd<'_>> {
-        // SAFETY: the descriptor belongs to the listener, which lives as long as `self` and neither closes nor exchanges
-        // it before.
+        // SAFETY: the descriptor belongs to the listener, which lives as long as `self` and does not close or replace
+        // it before then.
         Some(unsafe { BorrowedFd::borrow_raw(self.listener.file_descriptor().native_handle()) })
     }
 
     fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
-        // First: what was announced is received below.
+        // First clear the event: what it announced is received below.
         let _ = contained(|| self.listener.try_wait(|_| {}));
         let (mut newest, mut refused) = (None, None);
         for _ in 0..self.depth {
@@ -107,7 +106,7 @@ impl ActionSource for Actions {
             }
             newest = Some((numbers.len(), Stamp(sample.user_header().capture_ns)));
         }
-        // What was read may be the zeros of a page that was lost, and no action.
+        // The bytes read may be zeros of a lost page rather than an action.
         if sigbus::happened() {
             return Ok(None);
         }

@@ -1,7 +1,7 @@
-//! Why the bus cannot be used: the cause behind what iceoryx2 reports, with its fix.
+//! Why the bus cannot be used: the cause behind the error that iceoryx2 reports, with its fix.
 //!
-//! iceoryx2 0.10 reports most failures of the system as `InternalError`. What the system lacked is found out by
-//! looking at it.
+//! iceoryx2 0.10 reports most system failures as `InternalError`. The missing resource is found by inspecting the
+//! system.
 
 use std::fmt::Debug;
 use std::path::PathBuf;
@@ -13,8 +13,8 @@ use super::room;
 use crate::registry::MAX_SUBSCRIBERS;
 use crate::text;
 
-/// Below so many descriptors that are still free, their limit is what a failure came from: iceoryx2 closes those
-/// of the step that failed before it returns.
+/// With fewer free descriptors than this, the failure is attributed to their limit: iceoryx2 closes the descriptors of
+/// the failed step before it returns.
 const SPARE_DESCRIPTORS: u64 = 16;
 /// The same in bytes of address space.
 const SPARE_ADDRESSES: u64 = 64 << 20;
@@ -30,13 +30,13 @@ pub enum BusError {
         /// What iceoryx2 reports.
         reason: String,
     },
-    /// All places of a topic's subscribers are taken.
+    /// The topic has its maximum number of subscribers.
     #[error("topic {topic}: {MAX_SUBSCRIBERS} programs subscribe already, and no more may; end one")]
     Full {
         /// The topic.
         topic: String,
     },
-    /// What the bus lives in is another user's.
+    /// The bus's files belong to another user.
     #[error(
         "shared-memory bus: {}: {what}; end the programs that use it and remove it (`sudo rm -r {}`), or run rapid as \
          that user", path.display(), path.display()
@@ -58,7 +58,7 @@ pub enum BusError {
         /// What is wrong with it.
         what: String,
     },
-    /// The file system of shared memory has too little room.
+    /// The file system of shared memory has too little space.
     #[error(
         "{}: {} free of {}, and {} are needed; enlarge it (`sudo mount -o remount,size={}M {}`), remove what fills it, \
          or lower memory_budget under [rig]",
@@ -90,10 +90,10 @@ pub enum BusError {
         /// What to do.
         fix: &'static str,
     },
-    /// The system gives no information about the process.
+    /// `/proc` cannot be read.
     #[error("/proc: it is not mounted, and rapid needs it; mount it: sudo mount -t proc proc /proc")]
     NoProc,
-    /// The process may make no file that is large enough.
+    /// The file size limit of the process is too low.
     #[error(
         "{}: files are limited to {}, and a segment of shared memory is larger; raise the limit (`ulimit -f \
          unlimited`, or LimitFSIZE=infinity in the unit)", room::PLACE, text::size(*limit)
@@ -154,7 +154,7 @@ pub(super) fn topic_error(topic: &str, error: &dyn Debug) -> BusError {
     lacking().unwrap_or_else(|| BusError::Topic { topic: topic.to_owned(), reason: explained(&reported) })
 }
 
-/// Instead of `error`, the damaged file it may come from. A lack of something else is no damage.
+/// Replaces `error` with the damaged file that may have caused it, unless it reports a missing resource.
 pub(super) fn or_damage(error: BusError, files: &Files) -> BusError {
     match error {
         BusError::Topic { .. } | BusError::Node(_) => files.unreadable().unwrap_or(error),
@@ -162,7 +162,7 @@ pub(super) fn or_damage(error: BusError, files: &Files) -> BusError {
     }
 }
 
-/// What the system lacks, if it lacks something.
+/// The resource that the system lacks, if any.
 pub(super) fn lacking() -> Option<BusError> {
     room::lacking().or_else(descriptors).or_else(|| addresses(SPARE_ADDRESSES).err())
 }
@@ -176,7 +176,7 @@ fn descriptors() -> Option<BusError> {
     exhausted.then_some(BusError::Descriptors { limit })
 }
 
-/// Fails where fewer than `need` bytes of addresses may still be mapped.
+/// Fails if fewer than `need` bytes of address space are left.
 pub(super) fn addresses(need: u64) -> Result<(), BusError> {
     let Some(limit) = getrlimit(Resource::As).current else { return Ok(()) };
     // See proc(5): the first number is the size in pages.

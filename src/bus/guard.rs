@@ -1,9 +1,9 @@
-//! What iceoryx2 does with tables that another program has damaged: it panics, in calls and in drops. Here that is
-//! contained, and ends the run as memory that is lost does (`sigbus`).
+//! iceoryx2 panics, in calls and in drops, when another program has damaged its tables. Such panics are contained here
+//! and end the run in the same way as lost memory (`sigbus`).
 //!
 //! Invariant: every call and every drop of iceoryx2 that reads shared memory goes through [`contained`] or [`Guarded`].
-//! Invariant: nothing of iceoryx2 is used or dropped once memory of the bus has been lost. What is left behind by
-//! that is files, which are removed as those of a process that was killed.
+//! Invariant: nothing of iceoryx2 is used or dropped once memory of the bus has been lost. Only files are left behind;
+//! they are removed like those of a killed process.
 
 use std::mem::ManuallyDrop;
 use std::ops::Deref;
@@ -16,14 +16,14 @@ pub(super) fn contained<T>(call: impl FnOnce() -> T) -> Result<T, BusError> {
     if sigbus::happened() {
         return Err(sigbus::error());
     }
-    // What a panic leaves half done is used no more.
+    // Whatever a panic leaves half done is never used again.
     catch_unwind(AssertUnwindSafe(call)).map_err(|_| {
         sigbus::damaged();
         sigbus::error()
     })
 }
 
-/// A port, service or sample of iceoryx2: dropped so that no panic comes of it, or not at all.
+/// A port, service or sample of iceoryx2 whose drop contains panics, or is skipped.
 #[derive(Debug)]
 pub(super) struct Guarded<T>(ManuallyDrop<T>);
 
@@ -43,7 +43,7 @@ impl<T> Deref for Guarded<T> {
 
 impl<T> Drop for Guarded<T> {
     fn drop(&mut self) {
-        // SAFETY: dropped once, here, and not used after it.
+        // SAFETY: dropped once, here, and not used afterwards.
         let _ = contained(|| unsafe { ManuallyDrop::drop(&mut self.0) });
     }
 }
@@ -60,14 +60,14 @@ mod tests {
         }
     }
 
-    /// Not a test of its own: what it does to the process stays.
+    /// Not a test of its own: its effect on the process is permanent.
     #[test]
     fn helper() {
         if std::env::var_os("RAPID_TEST_GUARD").is_none() {
             return;
         }
         assert_eq!(contained(|| 7).unwrap(), 7);
-        // A panic with two of them on the stack: without containment, it ends the process.
+        // A panic with two guarded values on the stack would end the process without containment.
         let unwound = catch_unwind(|| {
             let _both = (Guarded::new(Broken), Guarded::new(Broken));
             panic!("something else");
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_of_a_drop_while_another_unwinds_is_contained_and_ends_the_use_of_the_bus() {
+    fn a_panic_in_drop_during_unwinding_is_contained_and_ends_the_use_of_the_bus() {
         let ended = std::process::Command::new(std::env::current_exe().unwrap())
             .args(["--exact", "bus::guard::tests::helper"])
             .env("RAPID_TEST_GUARD", "")

@@ -1,4 +1,4 @@
-//! A node of iceoryx2 on a bus whose files are in order: taking part, and leaving nothing behind.
+//! An iceoryx2 node on a bus whose files are in order: joins the bus and leaves no files behind.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -14,17 +14,17 @@ use super::leftovers::Files;
 use super::service::Service;
 use super::{BusError, place, room, sigbus};
 
-/// A process that looks through the files takes milliseconds.
+/// A process that scans the files takes milliseconds.
 const TURN_LIMIT: Duration = Duration::from_millis(500);
 const TURN_LOOK: Duration = Duration::from_millis(5);
-/// How long another process may take to fill a file that it has made.
+/// How long another process may take to fill a file that it has created.
 const FILL_LIMIT: Duration = Duration::from_millis(400);
-/// How long iceoryx2 waits for another process to finish what it makes.
+/// How long iceoryx2 waits for another process to finish creating a resource.
 const CREATION_LIMIT: Duration = Duration::from_millis(400);
-// Damage is reported within two seconds, which others waiting for their turn and the rest of a start share.
+// Damage is reported within two seconds. Processes waiting for their turn and the rest of the start share that time.
 const _: () = assert!(FILL_LIMIT.as_millis() + CREATION_LIMIT.as_millis() < 1000, "damage is reported too late");
 
-/// A node. When it goes, so do the files of the bus that no other process uses.
+/// A node. Dropping it removes the files of the bus that no other process uses.
 #[derive(Debug)]
 pub(super) struct Home {
     // Declared in the order they must be dropped.
@@ -40,10 +40,10 @@ struct Leaving {
 }
 
 impl Home {
-    /// Takes part in the bus of `instance`, for which `need` bytes of shared memory are to be there.
+    /// Joins the bus of `instance`, which needs `need` bytes of free shared memory.
     ///
     /// # Errors
-    /// When what the bus lives in is not ours, is damaged, or has too little room.
+    /// When the bus's files belong to another user, are damaged, or have too little space.
     pub(super) fn open(instance: Option<&str>, need: u64) -> Result<Self, BusError> {
         sigbus::install()?;
         place::memory()?;
@@ -53,7 +53,7 @@ impl Home {
         place::make(&root)?;
         let prefix = config.global.prefix.to_string();
         let files = Leaving { files: Files::new(prefix.clone(), root.clone()), root };
-        // Until the node is there: who looks through the files meanwhile would take its first ones for a dead one's.
+        // Held until the node exists: a scan meanwhile would take its first files for those of a dead process.
         let turn = take_turn(&files.root);
         files.files.clear(FILL_LIMIT)?;
         room::check(need)?;
@@ -75,17 +75,17 @@ impl Home {
         &self.node
     }
 
-    /// `error`, or the damaged file it comes from, or the room that was not there.
+    /// `error`, or its cause: a damaged file or missing space.
     pub(super) fn explain(&self, error: BusError) -> BusError {
         if sigbus::happened() { sigbus::error() } else { or_damage(error, &self.files.files) }
     }
 
-    /// The files that this process needs for as long as it takes part.
+    /// The files that this process needs while it is on the bus.
     pub(super) fn needed(&self) -> Vec<PathBuf> {
         self.files.files.needed()
     }
 
-    /// Gives back what programs that were killed held. Blocks for as long as files are looked through.
+    /// Releases the resources of killed programs. Blocks while it scans the files.
     pub(super) fn sweep(&self) {
         let _ = contained(|| self.node.try_cleanup_dead_nodes());
         self.files.clear();
@@ -93,7 +93,7 @@ impl Home {
 }
 
 impl Leaving {
-    /// What cannot be cleared now is reported by the next start.
+    /// The next start reports files that cannot be removed now.
     fn clear(&self) {
         let _turn = take_turn(&self.root);
         let _ = self.files.clear(Duration::ZERO);
@@ -106,7 +106,7 @@ impl Drop for Leaving {
     }
 }
 
-/// Removes what instances other than `instance` left behind of which no process lives. What cannot be removed is
+/// Removes the files of other instances than `instance` that have no live process. Those that cannot be removed are
 /// reported by that instance's next start.
 pub(super) fn clear_others(instance: Option<&str>) {
     let Ok(config) = config(instance) else { return };
@@ -119,12 +119,12 @@ pub(super) fn clear_others(instance: Option<&str>) {
 
 /// The folder of iceoryx2.
 fn root(config: &Config) -> PathBuf {
-    // Its path ends in a slash, behind which a link could not be distinguished from what it means.
+    // Its path ends in a slash, which would hide whether it is a symbolic link.
     PathBuf::from(config.global.root_path().to_string()).components().collect()
 }
 
-/// Keeps the processes of this program from looking through the files at the same time; `None` where another takes
-/// longer than [`TURN_LIMIT`], or there is no folder.
+/// Keeps processes of this program from scanning the files at the same time; `None` if another takes longer than
+/// [`TURN_LIMIT`], or there is no folder.
 fn take_turn(root: &Path) -> Option<File> {
     let folder = File::open(root).ok()?;
     let until = Instant::now() + TURN_LIMIT;
@@ -137,7 +137,7 @@ fn take_turn(root: &Path) -> Option<File> {
     Some(folder)
 }
 
-/// Begins the names of all files of a bus.
+/// Sets the prefix of the names of all files of a bus.
 fn config(instance: Option<&str>) -> Result<Config, BusError> {
     let mut config = Config::global_config().clone();
     config.global.creation_timeout = CREATION_LIMIT;

@@ -1,11 +1,11 @@
 //! An inbox: every topic of the rig, for one consumer.
 //!
-//! Any program of the same user may publish on a topic of ours; iceoryx2 names the publisher of every sample.
+//! Any program of the same user may publish on the rig's topics; iceoryx2 names the publisher of every sample.
 //!
-//! Invariant: on the topic of a modality and of the mask, only samples of their one writer are handed over. What
-//! another program publishes there is counted and dropped.
-//! Invariant: actions of another program are handed over, so that an episode has them; they are counted once this
-//! process, which runs a policy, has published one, and the actuator follows them no more ([`super::Actions`]).
+//! Invariant: on the topic of a modality and of the mask, only samples of their one writer are handed over. Samples of
+//! other programs are counted and dropped.
+//! Invariant: actions of other programs are handed over, so that an episode contains them. They are counted once this
+//! process, which runs a policy, has published one; the actuator then ignores them ([`super::Actions`]).
 
 use std::cell::Cell;
 use std::time::Duration;
@@ -29,36 +29,36 @@ pub struct Inbox {
 struct Subscription {
     id: TopicId,
     name: String,
-    /// Samples that can wait here.
+    /// Maximum number of samples in the queue.
     depth: usize,
     subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
-    /// Of the topic's one writer.
+    /// Publisher id of the topic's one writer.
     writer: UniquePublisherId,
     /// The writer has published since this inbox was opened.
     is_written: Cell<bool>,
-    /// The last other publisher and its samples, since they were asked for.
+    /// The last foreign publisher and its number of samples since the last report.
     other: Cell<Option<(UniquePublisherId, u64)>>,
 }
 
-/// Samples of another program on a topic of ours.
+/// Samples of another program on a topic of the rig.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Foreign<'a> {
     /// The topic's name.
     pub topic: &'a str,
     /// Process that published them.
     pub process: u32,
-    /// How many, since they were asked for last.
+    /// Number of samples since the last report.
     pub samples: u64,
 }
 
 impl Subscription {
-    /// Is a sample of this publisher another program's?
+    /// Whether this publisher belongs to another program.
     fn is_foreign(&self, publisher: UniquePublisherId) -> bool {
         if publisher == self.writer {
             self.is_written.set(true);
             return false;
         }
-        // Actions come from outside, unless a policy runs here.
+        // Actions come from other programs, unless a policy runs here.
         let is_foreign = self.id != TopicId::Action || self.is_written.get();
         if is_foreign {
             let samples = self.other.get().map_or(0, |(_, samples)| samples);
@@ -75,7 +75,7 @@ impl std::fmt::Debug for Inbox {
 }
 
 impl Inbox {
-    /// `writers` are those of `topics`, in the same order.
+    /// `writers` has the same order as `topics`.
     pub(super) fn open<'a>(
         topics: &[(TopicSpec, Guarded<TopicFactory>)],
         writers: impl Iterator<Item = &'a Writer>,
@@ -104,8 +104,8 @@ impl Inbox {
         Ok(Self { topics, wake: Guarded::new(wake) })
     }
 
-    /// Blocks until a modality was published or `timeout` passed, whichever is first, or the process was continued after
-    /// it was stopped. The mask alone wakes no inbox.
+    /// Blocks until a modality is published, `timeout` passes, or the process is continued after a stop. The mask alone
+    /// wakes no inbox.
     ///
     /// # Errors
     /// When the event service is broken.
@@ -117,26 +117,25 @@ impl Inbox {
         }
     }
 
-    /// An error as soon as memory of the bus has been lost: samples may have parts of others, or none, from then on.
-    #[must_use]
+    /// An error once memory of the bus has been lost: from then on samples may be mixed or empty.
     pub fn lost(&self) -> Option<BusError> {
         sigbus::happened().then(sigbus::error)
     }
 
-    /// Hands over every sample that waits at the time of the call, oldest first within a topic; the
-    /// bytes are lent from shared memory for the call. Ends however fast more are published.
+    /// Hands over every sample that is queued at the time of the call, oldest first within a topic; the bytes are
+    /// borrowed from shared memory for the call. It terminates however fast samples are published.
     ///
     /// # Errors
-    /// The first topic that cannot be read; the others are handed over all the same. None is once memory of the bus
-    /// has been lost.
+    /// The first topic that cannot be read; the others are still handed over. Nothing is handed over once bus memory is
+    /// lost.
     pub fn drain(&self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), BusError> {
         if let Some(error) = self.lost() {
             return Err(error);
         }
         let mut result = Ok(());
         for topic in &self.topics {
-            // No more than this wait at any time: a topic that is filled faster than `take` empties
-            // it must not keep the others, or the caller, waiting.
+            // No more than this are queued at any time: a topic that is filled faster than `take` empties it must not
+            // hold up the others or the caller.
             for _ in 0..topic.depth {
                 match contained(|| topic.subscriber.receive())? {
                     Ok(Some(sample)) => {
@@ -157,7 +156,7 @@ impl Inbox {
         result
     }
 
-    /// Hands over who else has published on our topics since the last call, as far as it was drained.
+    /// Reports which other programs have published on the rig's topics since the last call, as far as drained.
     pub fn foreign(&self, take: &mut dyn FnMut(Foreign<'_>)) {
         for topic in &self.topics {
             let Some((publisher, samples)) = topic.other.take() else { continue };

@@ -1,11 +1,11 @@
 //! An ingress: the topic on which a program of the rig publishes for one modality.
 //!
-//! It stands beside the modality's own topic and never reaches a consumer: what comes here is judged
-//! by the rig and republished by the topic's one writer. An event service of the same name wakes
-//! the rig; a program that does not notify is looked after every [`LOOK`].
+//! It is separate from the modality's own topic and never reaches a consumer: the rig validates these samples and the
+//! topic's one writer republishes them. An event service of the same name wakes the rig; programs that do not notify
+//! are polled every [`LOOK`].
 //!
-//! Invariant: at most [`Ingress::depth`] samples wait; the oldest give way.
-//! Invariant: a header is copied before anybody looks at it: its program can still write to it.
+//! Invariant: at most `depth` samples are queued; the oldest are dropped.
+//! Invariant: a header is copied before it is examined: its program can still write to it.
 
 use std::os::fd::{AsRawFd, RawFd};
 use std::sync::Arc;
@@ -24,13 +24,13 @@ use super::{BusError, MAX_NODES, Service, service_name};
 use crate::registry::DeviceSpec;
 use crate::sample::SampleHeader;
 
-/// Begins the name of an ingress; the modality's topic follows.
+/// Prefix of an ingress topic's name; the modality's topic follows.
 const PREFIX: &str = "/rapid/ingress";
-/// The longest that a sample without a notification waits.
+/// The longest time that a sample without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);
-/// A successor may come while the place of a program that died is not yet given back.
+/// A successor may start before the slot of a dead program is released.
 const PUBLISHERS: usize = 4;
-/// Samples that may wait: the rig fetches each at once, and their pool is memory of the program.
+/// Queue depth: the rig fetches each sample at once, and the pool is the program's memory.
 const DEPTH: usize = 256;
 /// The same for samples of more than [`LARGE`] bytes.
 const DEPTH_OF_LARGE: usize = 16;
@@ -84,18 +84,11 @@ impl Ingress {
     }
 
     /// Where the program publishes.
-    #[must_use]
     pub fn topic(&self) -> &str {
         &self.topic
     }
 
-    /// Samples that may wait.
-    #[must_use]
-    pub const fn depth(&self) -> usize {
-        self.depth
-    }
-
-    /// The oldest sample that waits.
+    /// The oldest queued sample.
     ///
     /// # Errors
     /// When the topic cannot be read.
@@ -109,9 +102,9 @@ impl Ingress {
         }
     }
 
-    /// Throws away what waits.
+    /// Discards all queued samples.
     pub fn clear(&self) {
-        // A program that publishes meanwhile must not hold us here.
+        // Bounded: a program that publishes meanwhile must not hold up the caller.
         for _ in 0..2 * self.depth {
             if !matches!(self.take(), Ok(Some(_))) {
                 return;
@@ -131,7 +124,7 @@ impl Ingress {
     }
 }
 
-/// A sample as its program gave it; nothing in it has been checked.
+/// A sample as its program published it; nothing in it has been checked.
 pub struct Given {
     header: SampleHeader,
     sample: Guarded<Sample<Service, [u8], SampleHeader>>,
@@ -145,13 +138,11 @@ impl std::fmt::Debug for Given {
 
 impl Given {
     /// The header as it was when the sample was taken.
-    #[must_use]
     pub const fn header(&self) -> &SampleHeader {
         &self.header
     }
 
     /// The payload.
-    #[must_use]
     pub fn bytes(&self) -> &[u8] {
         self.sample.payload()
     }
@@ -164,10 +155,10 @@ pub struct Arrivals {
 }
 
 impl Arrivals {
-    /// Returns when a sample may have come, at the latest after [`LOOK`]. Cancel-safe.
+    /// Returns when a sample may have arrived, at the latest after `LOOK`. Cancel-safe.
     pub async fn wait(&self) {
         let Ok(Ok(mut ready)) = tokio::time::timeout(LOOK, self.descriptor.readable()).await else { return };
-        // What is taken here was published before; the caller looks now.
+        // Samples announced here were published before; the caller looks next.
         if !matches!(contained(|| self.descriptor.get_ref().0.listener.try_wait(|_| {})), Ok(Ok(1..))) {
             ready.clear_ready();
         }
@@ -180,8 +171,8 @@ struct Descriptor(Arc<Ingress>);
 
 impl AsRawFd for Descriptor {
     fn as_raw_fd(&self) -> RawFd {
-        // SAFETY: the descriptor belongs to the listener, which lives as long as `self` and neither
-        // closes nor exchanges it before; it is only watched here.
+        // SAFETY: the descriptor belongs to the listener, which lives as long as `self` and does not close or replace
+        // it before then; it is only watched here.
         unsafe { self.0.listener.file_descriptor().native_handle() }
     }
 }

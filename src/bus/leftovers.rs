@@ -1,16 +1,16 @@
-//! The files of a bus: which there are, which of them are in use, and their removal.
+//! The files of a bus: which exist, which are in use, and their removal.
 //!
-//! iceoryx2 0.10 keeps a bus in `/dev/shm` and in a folder of its own. It gives back what a killed process held
-//! node by node, reading the files of both: what is damaged stays for ever, makes every start fail, or holds it
-//! for ever. Here no file is read to be removed: its name shows whose it is, and a lock whether that process lives.
+//! iceoryx2 0.10 keeps a bus in `/dev/shm` and in a folder of its own. It releases the resources of a killed process
+//! node by node, reading the files of both: a damaged file stays for ever, makes every start fail, or blocks it for
+//! ever. Here no file is read before removal: its name shows its owner, and a lock whether that process lives.
 //!
 //! Names, below a prefix that ends in `_`: `<hash>_<port>.data`, `<hash>_<sender>_<receiver>.connection`,
 //! `<hash>_<port>.event_mgmt` and `<hash>_<service>.dynamic` in `/dev/shm`; `<port>.event`,
 //! `services/<hash>.service`, `nodes/<node>.node_monitor*` and `nodes/<node>/*` in the folder. A hash has 40
 //! digits; nodes and ports are numbers with the process id in their third 32 bits.
 //!
-//! Invariant: no file is removed that a living process may use. A file is unused when its names are of
-//! processes without a node, or when the bus has no node at all.
+//! Invariant: no file is removed that a living process may use. A file is unused when its name refers only to processes
+//! without a node, or when the bus has no node at all.
 //! Invariant: a lock file of this process is never opened: closing it would give up the lock.
 
 use std::collections::BTreeSet;
@@ -28,14 +28,14 @@ use super::{BusError, room, sigbus};
 
 /// The first 8 bytes of each file of iceoryx2 0.10.0 in shared memory: major, minor and patch, 16 bits each.
 const VERSION: u64 = 10 << 16;
-/// Ends the name of the segment of iceoryx2 0.10.0 in which nodes are counted: version and number, 16 bytes. The hash
-/// is that of the name of its type.
+/// Suffix of the name of the segment in which iceoryx2 0.10.0 counts nodes: version and number, 16 bytes. The hash is
+/// that of its type's name.
 const COUNTER: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
 /// A key of every service's file.
 const SERVICE_KEY: &str = "messaging_pattern";
-/// How often it is looked whether a file has been filled.
+/// Interval of checks whether a file has been filled.
 const LOOK: Duration = Duration::from_millis(20);
-/// Access of anybody but the owner.
+/// Permissions of group and others.
 const OTHERS: u32 = 0o077;
 
 /// The files of one bus.
@@ -45,14 +45,14 @@ pub(super) struct Files {
     root: PathBuf,
 }
 
-/// What a file is for.
+/// The purpose of a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Use {
     /// Ports of the processes with these ids.
     Ports(Vec<u32>),
     /// The node with this number.
     Node(u128),
-    /// All of the bus.
+    /// The bus as a whole.
     Common,
 }
 
@@ -67,14 +67,14 @@ impl Files {
         Self { prefix, root }
     }
 
-    /// Removes what no process uses, and takes away what others may do with the rest. A file that another process has made
-    /// and not filled is waited for up to `patience`, once for all of them.
+    /// Removes files that no process uses, and restricts the permissions of the rest. Waits up to `patience` in total
+    /// for files that other processes have created but not filled.
     ///
     /// # Errors
-    /// When something that is no use to anybody cannot be removed, or something damaged may be in use.
+    /// When an unused file cannot be removed, or a damaged file may be in use.
     pub(super) fn clear(&self, patience: Duration) -> Result<(), BusError> {
         let until = Instant::now() + patience;
-        // First the files, then the processes: one that begins meanwhile has made none of these.
+        // First the files, then the processes: a process that starts meanwhile has created none of these files.
         let entries = self.entries();
         let living = self.living(&entries);
         for Entry { path, used } in entries {
@@ -93,11 +93,11 @@ impl Files {
         Ok(())
     }
 
-    /// Makes the file in which other programs count their nodes, for its owner alone: theirs would be writable by
-    /// everybody. They do without where it cannot be made.
+    /// Creates the file in which other programs count their nodes, for its owner alone: if they created it, everybody
+    /// could write to it. They work without it if it cannot be created.
     pub(super) fn make_counter(&self) {
         let path = Path::new(room::PLACE).join(format!("{}{COUNTER}", self.prefix));
-        // A process that finds it with this mode waits.
+        // A process that finds the file with this mode waits.
         let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let Ok(file) = rustix::fs::open(&path, flags, Mode::WUSR).map(File::from) else { return };
         let mut content = [0; 16];
@@ -131,7 +131,7 @@ impl Files {
         })
     }
 
-    /// The same, by its name alone.
+    /// The same, judged by its name alone.
     pub(super) fn damaged(&self) -> Option<PathBuf> {
         match self.unreadable()? {
             BusError::Damaged { path, .. } => Some(path),
@@ -139,7 +139,7 @@ impl Files {
         }
     }
 
-    /// What this process needs for as long as it takes part. Connections come and go with others.
+    /// The files this process needs while it is on the bus. Connections come and go with other processes.
     pub(super) fn needed(&self) -> Vec<PathBuf> {
         let own = std::process::id();
         let is_needed = |used: &Use| match used {
@@ -150,20 +150,20 @@ impl Files {
         self.entries().into_iter().filter(|entry| is_needed(&entry.used)).map(|entry| entry.path).collect()
     }
 
-    /// Removes what dead processes left of other buses. One with no node in our folder may have its nodes elsewhere.
+    /// Removes what dead processes left of other buses. A bus with no node in our folder may have its nodes elsewhere.
     pub(super) fn clear_others(&self) {
         let monitors = std::fs::read_dir(self.root.join("nodes")).into_iter().flatten().flatten();
         let prefixes = monitors.filter_map(|entry| prefix_of(entry.file_name().to_str()?).map(str::to_owned));
         for prefix in prefixes.filter(|prefix| *prefix != self.prefix).collect::<BTreeSet<_>>() {
             let other = Self { prefix, root: self.root.clone() };
-            // First the files, then who lives, as above.
+            // First the files, then the live processes, as above.
             let entries = other.entries();
             if !other.living(&entries).is_empty() {
                 continue;
             }
             for Entry { path, .. } in entries {
                 if let Some(there) = std::fs::symlink_metadata(&path).ok().filter(is_ours) {
-                    // What cannot be removed is reported by that instance's next start.
+                    // That instance's next start reports what cannot be removed.
                     let _ = remove(&path, &there);
                 }
             }
@@ -187,7 +187,7 @@ impl Files {
         [in_memory, sockets, services, monitors, folders].into_iter().flatten().collect()
     }
 
-    /// Does all that lies in this folder of a node belong to this bus? Folders carry no prefix.
+    /// Whether all files of a node in this folder belong to this bus. Folders carry no prefix.
     fn is_our_folder(&self, folder: &Path) -> bool {
         let ours = |name: &str| {
             let rest = name.strip_prefix(&self.prefix)?;
@@ -209,7 +209,7 @@ impl Files {
         let nodes = self.root.join("nodes");
         let lock = nodes.join(format!("{}{node}.node_monitor", self.prefix));
         if process(node) == std::process::id() {
-            // Once memory has been lost, a node is left where it stands.
+            // Once memory has been lost, a node is left in place.
             let is_locked = |lock: Metadata| is_locked_by_us(lock.ino());
             return !sigbus::happened() && std::fs::symlink_metadata(&lock).is_ok_and(is_locked);
         }
@@ -219,7 +219,7 @@ impl Files {
             // Its holder may be in another namespace of process ids.
             matches!(fcntl_getlk(lock, &asked), Ok(Some(_)))
         });
-        // One that begins has not locked yet; of another, the lock has been exchanged.
+        // A process that is starting has not locked yet; in other cases the lock may have been replaced.
         locked || has_lived_since(node)
     }
 }
@@ -241,7 +241,7 @@ fn list(folder: &Path, used: impl Fn(&str) -> Option<Use>) -> Vec<Entry> {
 fn in_memory(name: &str) -> Option<Use> {
     let (_, rest) = name.split_once('_').filter(|(hash, _)| is_hash(hash))?;
     let (ports, suffix) = rest.split_once('.')?;
-    // A segment that grows has a number after its port's.
+    // A segment that grows has a number after its port's number.
     let owners: Vec<u32> = ports.split('_').filter_map(number).map(process).collect();
     let of_ports = matches!(suffix, "data" | "connection" | "event_mgmt") && !owners.is_empty();
     Some(if of_ports { Use::Ports(owners) } else { Use::Common })
@@ -256,7 +256,7 @@ fn monitor(name: &str) -> Option<Use> {
     suffix.starts_with("node_monitor").then_some(Use::Node(number(node)?))
 }
 
-/// The prefix of a bus of which this is a node's file.
+/// The prefix of the bus to which this node file belongs.
 fn prefix_of(name: &str) -> Option<&str> {
     let (node, _) = name.split_once(".node_monitor")?;
     let at = node.rfind('_')? + 1;
@@ -268,40 +268,39 @@ fn is_hash(text: &str) -> bool {
     text.len() == 40 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// The number of a node or port: at least its process id is in it.
+/// The number of a node or port: it contains at least the process id.
 fn number(text: &str) -> Option<u128> {
     text.parse().ok().filter(|number| process(*number) != 0)
 }
 
-/// Whose a node or port is, see `UniqueSystemId` of iceoryx2.
+/// The process id in a node or port number, see `UniqueSystemId` of iceoryx2.
 #[expect(clippy::cast_possible_truncation, reason = "the third 32 bits")]
 const fn process(number: u128) -> u32 {
     (number >> 64) as u32
 }
 
-/// Does the process that made this node live? A later one with the same id has begun after the node was made, the
-/// time of which is in the lowest 32 bits, in seconds of `CLOCK_MONOTONIC`.
+/// Whether the process that created this node lives. A later process with the same id started after the node's creation
+/// time, which is in the lowest 32 bits, in seconds of `CLOCK_MONOTONIC`.
 #[expect(clippy::cast_possible_truncation, reason = "the lowest 32 bits")]
 fn has_lived_since(node: u128) -> bool {
     let Some(begun) = begin(process(node)) else { return false };
     let seconds = |clock| clock_gettime(clock).tv_sec.unsigned_abs();
-    // A process's begin counts the time that the machine was suspended, too.
+    // A process's start time includes the time that the machine was suspended.
     let suspended = seconds(ClockId::Boottime).saturating_sub(seconds(ClockId::Monotonic));
     begun <= u64::from(node as u32) + suspended
 }
 
-/// When a process began, in seconds since the machine was started, see proc(5).
+/// Start time of a process in seconds since the machine was booted, see proc(5).
 fn begin(process: u32) -> Option<u64> {
     let about = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
     // The name, in brackets, may contain anything.
     let ticks: u64 = about.rsplit_once(')')?.1.split_whitespace().nth(19)?.parse().ok()?;
-    // SAFETY: asks for a number.
+    // SAFETY: returns a number.
     let a_second = unsafe { libc::sysconf(libc::_SC_CLK_TCK) };
     ticks.checked_div(u64::try_from(a_second).ok()?)
 }
 
-/// Does this process hold a lock of the file with this number, as proc(5) lists them? Where it cannot be
-/// known it does.
+/// Whether this process holds a lock of the file with this inode number, as listed in proc(5). True if unknown.
 fn is_locked_by_us(inode: u64) -> bool {
     let Ok(locks) = std::fs::read_to_string("/proc/locks") else { return true };
     let (process, file) = (std::process::id().to_string(), format!(":{inode}"));
@@ -326,7 +325,7 @@ fn remove(path: &Path, there: &Metadata) -> Result<(), BusError> {
     }
 }
 
-/// iceoryx2 makes some files so that everybody may write to them.
+/// iceoryx2 creates some files writable by everybody.
 fn narrow(path: &Path, there: &Metadata) {
     let mode = there.permissions().mode();
     if there.is_file() && mode & OTHERS != 0 {
@@ -334,7 +333,7 @@ fn narrow(path: &Path, there: &Metadata) {
     }
 }
 
-/// Fails for what iceoryx2 would wait for without end: what is not the kind of file it makes, and what stays empty.
+/// Fails where iceoryx2 would wait without end: the file is not of the expected kind, or stays empty.
 fn usable(path: &Path, used: &Use, until: Instant) -> Result<(), BusError> {
     let suffix = path.extension().and_then(|suffix| suffix.to_str());
     let may_be_empty = matches!(used, Use::Node(_)) || suffix == Some("event");
@@ -359,7 +358,7 @@ fn usable(path: &Path, used: &Use, until: Instant) -> Result<(), BusError> {
     }
 }
 
-/// Is a file of this use and suffix of such a kind?
+/// Whether a file of this use and suffix has the kind that iceoryx2 creates.
 fn is_kind_of(used: &Use, suffix: Option<&str>, kind: FileType) -> bool {
     match (used, suffix) {
         (Use::Node(_), None) => kind.is_dir(),
@@ -372,12 +371,12 @@ fn strange(path: PathBuf) -> BusError {
     BusError::Damaged { path, what: "it is no file of iceoryx2".to_owned() }
 }
 
-/// Are these the first bytes of a file in shared memory?
+/// Whether these are the first bytes of a file in shared memory.
 pub(super) fn is_head(bytes: [u8; 8]) -> bool {
     u64::from_le_bytes(bytes) == VERSION
 }
 
-/// The first bytes of a file that may be read.
+/// The first bytes of a file, if it may be read.
 fn head(path: &Path) -> Option<Vec<u8>> {
     let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
     let file = File::from(rustix::fs::open(path, flags, Mode::empty()).ok()?);

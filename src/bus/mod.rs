@@ -1,20 +1,20 @@
 //! The bus: every modality and the mask as a topic in shared memory, open for the whole run.
 //!
-//! One iceoryx2 node; all topics are opened once from the registry, so that a plug or unplug re-wires
-//! nothing. The payload is what the driver gave, the user header a [`SampleHeader`]; any process with
-//! an iceoryx2 binding can subscribe. One event service wakes consumers: the event's id is the
-//! modality's bit. The topic of actions has one of its own, which wakes nothing but the actuator.
+//! One iceoryx2 node; all topics are opened once from the registry, so that a plug or unplug reconnects nothing. The
+//! payload is the driver's data, the user header a [`SampleHeader`]; any process with an iceoryx2 binding can
+//! subscribe. One event service wakes consumers: the event's id is the modality's bit. The topic of actions has an
+//! event service of its own, which wakes only the actuator.
 //!
 //! Invariant: a writer never waits for a reader. A reader that falls `depth` samples behind loses
 //! the oldest, and sees the hole in `SampleHeader::seq`.
-//! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a
-//! loan in memory that is used again (`shared`): once a thread has published a sample, no sample
-//! allocates (`tests/memory/stream_alloc.rs`). The locks of a topic's port are its stream's alone.
-//! Invariant: every segment of this program has all its memory from when it is made (`room`); what others made and is
-//! gone ends the run in order (`sigbus`). Nothing of the bus is writable by others, and none of it outlives the
-//! processes that use it (`leftovers`).
-//! Invariant: writers live as long as the bus. What a reader has not fetched dies with its writer
-//! (iceoryx2 0.10), so a writer that went with its device would take the last samples along.
+//! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a loan in reused memory
+//! (`shared`): once a thread has published a sample, no sample allocates (`tests/memory/stream_alloc.rs`). Only a
+//! topic's own stream takes the locks of its port.
+//! Invariant: every segment of this program has all its memory from its creation (`room`); if segments of other
+//! programs lose pages, the run ends in order (`sigbus`). Nothing of the bus is writable by others, and nothing
+//! outlives the processes that use it (`leftovers`).
+//! Invariant: writers live as long as the bus. Samples that a reader has not fetched are lost with their writer
+//! (iceoryx2 0.10), so a writer that ended with its device would take the last samples along.
 
 mod actions;
 mod error;
@@ -59,10 +59,10 @@ type TopicFactory = iceoryx2::service::port_factory::publish_subscribe::PortFact
 
 /// Name of the event service that wakes consumers.
 const WAKE_SERVICE: &str = "/rapid/wake";
-/// Processes that may take part at once: `rapid`, and subscribers or publishers of other programs.
+/// Maximum number of processes on the bus: `rapid`, and subscribers or publishers of other programs.
 const MAX_NODES: usize = 32;
 
-/// Bytes of addresses that a run takes beside the bus: stacks and heaps of its threads.
+/// Address space that a run needs besides the bus: stacks and heaps of its threads.
 const OTHER_ADDRESSES: u64 = 512 << 20;
 
 // SAFETY: `SampleHeader` is `repr(C)`, holds only integers, no padding and no pointers.
@@ -77,7 +77,7 @@ unsafe impl ZeroCopySend for SampleHeader {
 pub struct Bus {
     // Declared in the order they must be dropped: ports, services, node.
     writers: Vec<(TopicId, Arc<Writer>)>,
-    /// None without an actuator.
+    /// `None` without an actuator.
     actions: Option<Arc<Actions>>,
     topics: Vec<(TopicSpec, Guarded<TopicFactory>)>,
     wake: Guarded<EventFactory<Service>>,
@@ -93,16 +93,16 @@ impl std::fmt::Debug for Bus {
 }
 
 impl Bus {
-    /// Removes what instances other than `instance` left behind of which no process lives: their memory is free for
-    /// this one. Blocks for as long as files are looked through.
+    /// Removes the files of other instances than `instance` that have no live process, which frees their memory for
+    /// this one. Blocks while it scans the files.
     pub fn clear_others(instance: Option<&str>) {
         home::clear_others(instance);
     }
 
-    /// Opens the node and every topic of `registry`, with room in shared memory for all of them. What killed
-    /// processes left behind is removed.
+    /// Opens the node and every topic of `registry`, with space in shared memory for all of them. Removes the files of
+    /// killed processes.
     ///
-    /// `instance` keeps a second rig on the same machine, or a test, apart from the others.
+    /// `instance` separates a second rig on the same machine, or a test, from the others.
     ///
     /// # Errors
     /// When a topic is in use with another layout, a file of the bus is damaged, or the system lacks memory or
@@ -153,72 +153,65 @@ impl Bus {
         Ok(Self { writers, actions, topics, wake, ingresses, instance, home: Arc::clone(home) })
     }
 
-    /// What keeps this rig apart from others of the machine, if anything does.
-    #[must_use]
+    /// The instance that separates this rig from others on the machine, if any.
     pub fn instance(&self) -> Option<&str> {
         self.instance.as_deref()
     }
 
     /// Where the program that reads modality `id` publishes; `None` if no program does.
-    #[must_use]
     pub fn ingress(&self, id: ModalityId) -> Option<Arc<Ingress>> {
         self.ingresses.iter().find(|(modality, _)| *modality == id).map(|(_, ingress)| Arc::clone(ingress))
     }
 
     /// What programs need to know to take part in this bus.
-    #[must_use]
     pub fn membership(&self) -> Membership {
         Membership { home: Arc::clone(&self.home) }
     }
 
     /// The one writer of a topic; `None` if the registry has no such topic.
-    #[must_use]
     pub fn writer(&self, id: TopicId) -> Option<Arc<Writer>> {
         self.writers.iter().find(|(topic, _)| *topic == id).map(|(_, writer)| Arc::clone(writer))
     }
 
-    /// A consumer of every topic, from now on.
+    /// A consumer of every topic, starting now.
     ///
     /// # Errors
-    /// When more programs subscribe than the topics have room for.
+    /// When the topics have no free slot for another subscriber.
     pub fn inbox(&self) -> Result<Inbox, BusError> {
         contained(|| Inbox::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref()), &self.wake))?
     }
 
     /// Actions for the actuator; `None` without an actuator in the registry.
-    #[must_use]
     pub fn actions(&self) -> Option<Arc<Actions>> {
         self.actions.clone()
     }
 
-    /// Watches over the files of the bus that this process needs, from now on.
-    #[must_use]
+    /// Monitors, from now on, the files of the bus that this process needs.
     pub fn watchman(&self) -> Watchman {
         Watchman { files: self.home.needed() }
     }
 
     /// Bytes of shared memory that the pools of all topics reserve.
-    #[must_use]
     pub fn reserved_bytes(&self) -> u64 {
         self.topics.iter().map(|(spec, _)| spec.pool_bytes()).sum()
     }
 }
 
-/// Notices when files of the bus are removed: programs that come later cannot take part then, and get no reason.
+/// Detects removed files of the bus: programs that start later cannot join then, and get no reason.
 #[derive(Debug)]
 pub struct Watchman {
     files: Vec<PathBuf>,
 }
 
 impl Watchman {
-    /// What has been removed since the last look.
+    /// The files removed since the last call.
     pub fn removed(&mut self) -> Vec<PathBuf> {
         let is_gone = |path: &mut PathBuf| std::fs::symlink_metadata(path).is_err();
         self.files.extract_if(.., is_gone).collect()
     }
 }
 
-/// Who takes part in the bus.
+/// What a program needs to join the bus.
 #[derive(Clone)]
 pub struct Membership {
     home: Arc<Home>,
@@ -231,14 +224,13 @@ impl std::fmt::Debug for Membership {
 }
 
 impl Membership {
-    /// iceoryx2's `global.prefix` of this bus: a program with another one is on another bus.
-    #[must_use]
+    /// iceoryx2's `global.prefix` of this bus: a program with another prefix is on another bus.
     pub fn prefix(&self) -> String {
         self.home.node().config().global.prefix.to_string()
     }
 
-    /// Gives back what programs that were killed held of the bus: shared memory, their places at
-    /// topics. Blocks for as long as files are looked through.
+    /// Releases what killed programs held of the bus: shared memory and subscriber slots. Blocks while it scans the
+    /// files.
     pub fn sweep(&self) {
         self.home.sweep();
     }
@@ -267,7 +259,7 @@ fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Guard
     Ok((spec, Guarded::new(factory)))
 }
 
-/// An event service of that name.
+/// Opens an event service of that name.
 fn open_wake(node: &Node<Service>, name: &str, notifiers: usize) -> Result<Guarded<EventFactory<Service>>, BusError> {
     let service = node
         .service_builder(&service_name(name)?)

@@ -1,8 +1,8 @@
-//! Where iceoryx2 keeps its files, and whether they are ours to use.
+//! Where iceoryx2 keeps its files, and whether this user may use them.
 //!
-//! iceoryx2 0.10 makes its folder (`/tmp/iceoryx2`) for the user who comes first, mode 0750, and its
-//! shared memory under names that anybody can foretell. Of another user's folder it only reports
-//! `InternalError`; in one that is open to everybody it would use what lies there.
+//! iceoryx2 0.10 creates its folder (`/tmp/iceoryx2`) for the first user, mode 0750, and its shared memory under names
+//! that anybody can predict. For another user's folder it only reports `InternalError`; in a folder that is open to
+//! everybody it would use the files that are there.
 
 use std::fs::{Metadata, Permissions};
 use std::io::ErrorKind;
@@ -14,11 +14,11 @@ use rustix::fs::Access;
 use super::BusError;
 use super::room::PLACE;
 
-/// Access to the folders: the owner's alone, whatever the umask.
+/// Access to the folders: only the owner, whatever the umask.
 const MODE: u32 = 0o700;
 
-/// Refuses a folder that another user made, which leads elsewhere by another's link, or which we
-/// may not use. One that is missing will be made.
+/// Refuses a folder that another user created, that is reached by another user's link, or that this process may not
+/// use. A missing folder is created later.
 pub(super) fn check(folder: &Path) -> Result<(), BusError> {
     let foreign = |what: String| BusError::Foreign { path: folder.to_owned(), what };
     let Ok(named) = std::fs::symlink_metadata(folder) else { return Ok(()) };
@@ -40,7 +40,7 @@ pub(super) fn check(folder: &Path) -> Result<(), BusError> {
     }
 }
 
-/// Refuses shared memory that is not there or may not be written to.
+/// Refuses shared memory that is missing or not writable.
 ///
 /// # Errors
 /// In these cases, with the fix.
@@ -66,7 +66,7 @@ fn usable(place: &Path) -> Result<(), BusError> {
     }
 }
 
-/// Makes the folders that iceoryx2 keeps files in, for their owner alone.
+/// Creates the folders that iceoryx2 keeps files in, for their owner alone.
 pub(super) fn make(root: &Path) -> Result<(), BusError> {
     for folder in [root.to_owned(), root.join("nodes"), root.join("services")] {
         let unusable = |what: String| BusError::Damaged { path: folder.clone(), what };
@@ -87,7 +87,7 @@ pub(super) fn make(root: &Path) -> Result<(), BusError> {
     Ok(())
 }
 
-/// A file of another user under a name that begins with ours: why a node could not be made.
+/// Another user's file under a name that starts with our prefix: why a node could not be created.
 pub(super) fn in_the_way(prefix: &str) -> Option<BusError> {
     let entries = std::fs::read_dir(PLACE).ok()?.flatten();
     let ours = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix));
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_folder_of_ours_is_used() {
+    fn only_a_folder_we_own_is_used() {
         let dir = tempfile::tempdir().unwrap();
         let folder = dir.path().join("iceoryx2");
         assert!(check(&folder).is_ok(), "it is made when it is missing");

@@ -1,11 +1,11 @@
-//! Room in shared memory: a segment that this program makes is reserved when it is made.
+//! Space in shared memory: this program reserves each segment when it creates it.
 //!
-//! iceoryx2 0.10 makes a segment with the C library's `ftruncate`, which reserves nothing on tmpfs: the first
-//! write to a page for which there is no room ends the process with SIGBUS, at any time later. [`ftruncate`] here
-//! takes that function's place in this program. The standard library and rustix do not use it.
+//! iceoryx2 0.10 creates a segment with the C library's `ftruncate`, which reserves nothing on tmpfs: the first write
+//! to a page without space ends the process with SIGBUS at any later time. The [`ftruncate`] here replaces that
+//! function in this program. The standard library and rustix do not use it.
 //!
-//! Invariant: a segment on tmpfs that this program made, at the start or for a subscriber that came later, has all
-//! its pages; or it was not made, and iceoryx2 reports it.
+//! Invariant: a segment on tmpfs that this program created, at the start or for a later subscriber, has all its pages;
+//! otherwise it was not created, and iceoryx2 reports it.
 
 use std::sync::atomic::{AtomicI32, Ordering};
 
@@ -18,13 +18,13 @@ use super::BusError;
 pub(super) const PLACE: &str = "/dev/shm";
 /// The type of tmpfs in `statfs(2)`.
 const TMPFS_MAGIC: i64 = 0x0102_1994;
-/// Bytes for iceoryx2's own books of one topic or node, at most.
+/// Upper bound for iceoryx2's own bookkeeping of one topic or node, in bytes.
 pub(super) const BOOKS: u64 = 128 << 10;
 
-/// Why a segment was not made, an `errno`, until it is asked for; 0 if all were.
+/// Why a segment was not created, as an `errno`, until it is queried; 0 if all were created.
 static REFUSED: AtomicI32 = AtomicI32::new(0);
 
-/// Fails where fewer than `need` bytes are free.
+/// Fails if fewer than `need` bytes are free.
 pub(super) fn check(need: u64) -> Result<(), BusError> {
     match space() {
         Some((size, free)) if free < need => Err(BusError::Room { need, free, size }),
@@ -32,7 +32,7 @@ pub(super) fn check(need: u64) -> Result<(), BusError> {
     }
 }
 
-/// The error of a segment that was not made since the last call.
+/// The error of a segment that could not be created since the last call.
 pub(super) fn lacking() -> Option<BusError> {
     match REFUSED.swap(0, Ordering::Relaxed) {
         0 => return None,
@@ -45,26 +45,26 @@ pub(super) fn lacking() -> Option<BusError> {
 
 /// Bytes of a page.
 pub(super) fn page() -> usize {
-    // SAFETY: asks for a number.
+    // SAFETY: returns a number.
     usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).unwrap_or(4096)
 }
 
-/// Size and free bytes of the file system; `None` where the system does not limit it.
+/// Size and free bytes of the file system; `None` if the system does not limit it.
 fn space() -> Option<(u64, u64)> {
     let space = rustix::fs::statvfs(PLACE).ok()?;
     let bytes = |blocks: u64| blocks.saturating_mul(space.f_frsize);
     (space.f_blocks > 0).then(|| (bytes(space.f_blocks), bytes(space.f_bavail)))
 }
 
-/// The size in MiB with which `need` bytes are free.
+/// The size in MiB at which `need` bytes are free.
 pub(super) const fn mebibytes(size: u64, free: u64, need: u64) -> u64 {
     size.saturating_add(need.saturating_sub(free)).div_ceil(1 << 20) + 64
 }
 
-/// `ftruncate(2)`, which on tmpfs fails with `ENOSPC` where there is no room for all of the file.
+/// `ftruncate(2)`, which on tmpfs fails with `ENOSPC` if there is no space for the whole file.
 ///
 /// # Safety
-/// As for the C library's: every descriptor and length is allowed.
+/// As for the C library's function: every descriptor and length is allowed.
 // SAFETY: signature and contract are those of the C library's function of this name.
 #[unsafe(no_mangle)]
 unsafe extern "C" fn ftruncate(descriptor: c_int, length: off_t) -> c_int {
@@ -73,9 +73,9 @@ unsafe extern "C" fn ftruncate(descriptor: c_int, length: off_t) -> c_int {
         while unsafe { libc::fallocate(descriptor, 0, 0, length) } != 0 {
             match std::io::Error::last_os_error().raw_os_error() {
                 Some(libc::EINTR) => {}
-                // Nothing to reserve with: not Linux's own tmpfs.
+                // No means to reserve: not Linux's own tmpfs.
                 Some(libc::EOPNOTSUPP | libc::ENOSYS) => break,
-                // `errno` is the caller's answer.
+                // The caller reads `errno`.
                 refused => {
                     REFUSED.store(refused.unwrap_or(libc::ENOSPC), Ordering::Relaxed);
                     return -1;
@@ -99,13 +99,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_size_to_mount_with_has_room_for_what_is_needed() {
+    fn the_suggested_mount_size_has_enough_room() {
         assert_eq!(mebibytes(64 << 20, 10 << 20, 74 << 20), 128 + 64);
         assert_eq!(mebibytes(64 << 20, 10 << 20, 0), 64 + 64);
     }
 
     #[test]
-    fn what_is_needed_and_not_there_is_an_error_that_tells_the_fix() {
+    fn missing_memory_is_an_error_with_its_fix() {
         assert!(check(0).is_ok());
         if space().is_none() {
             println!("NOT CHECKED: {PLACE} has no limit");

@@ -1,16 +1,15 @@
-//! The iceoryx2 service the bus is made of: that of iceoryx2's `ipc_threadsafe`, with [`Shared`]
-//! in place of its shared handles.
+//! The iceoryx2 service used by the bus: iceoryx2's `ipc_threadsafe`, with [`Shared`] in place of its shared handles.
 //!
-//! iceoryx2 0.10 makes one handle for every loan and frees it when the sample is sent. Its own
-//! handles are an `Arc` around a POSIX mutex: an allocation, a mutex set up and taken down for every
-//! sample. Ours reuses the memory, so that a sample costs none of it.
+//! iceoryx2 0.10 creates one handle for every loan and frees it when the sample is sent. Its own handles are an `Arc`
+//! around a POSIX mutex: an allocation, a mutex set up and torn down for every sample. Ours reuses the memory and
+//! avoids all of this.
 //!
-//! What counts the nodes of a process is memory of the process alone: iceoryx2's own segment for it is writable by
-//! everybody, outlives every run, and when damaged holds each start for ever. Numbers of nodes stay apart by process
-//! and time.
+//! The nodes of a process are counted in the process's own memory: iceoryx2's own segment for this is writable by
+//! everybody, outlives every run, and when damaged blocks every start for ever. Node numbers differ by process and
+//! time.
 //!
-//! Invariant: everything another process sees (names, files, layouts) is iceoryx2's own: programs
-//! with the ordinary `ipc` service talk to this one.
+//! Invariant: everything another process sees (names, files, layouts) is iceoryx2's own: programs with the ordinary
+//! `ipc` service communicate with this one.
 
 use std::fmt::Debug;
 

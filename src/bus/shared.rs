@@ -1,9 +1,9 @@
-//! A value shared by reference count and locked to be used, whose memory is used again.
+//! A reference-counted value behind a lock, whose memory is reused.
 //!
-//! Memory that is given back waits on its thread for the next value of the same layout. A sample is
-//! loaned and sent by one call, on one thread: after its first sample a thread allocates no more.
+//! Freed memory is kept on its thread for the next value of the same layout. One call loans and sends a sample on one
+//! thread: after its first sample a thread allocates no more.
 //!
-//! Invariant: a value is dropped when its last handle is, and its memory is given back after that.
+//! Invariant: a value is dropped with its last handle, and its memory is released after that.
 
 use std::alloc::{Layout, alloc, dealloc, handle_alloc_error};
 use std::cell::RefCell;
@@ -17,9 +17,9 @@ use iceoryx2_bb_elementary_traits::testing::abandonable::Abandonable;
 use iceoryx2_cal::arc_sync_policy::{ArcSyncPolicy, ArcSyncPolicyCreationError, LockGuard};
 use parking_lot::{ReentrantMutex, ReentrantMutexGuard};
 
-/// Pieces of memory that wait on a thread at most. One is in use while a sample is on its way.
+/// Maximum number of memory blocks kept per thread. One is in use while a sample is sent.
 const SPARE: usize = 4;
-/// Larger pieces are not kept: what is made for every sample is smaller.
+/// Larger blocks are not kept: the objects made for every sample are smaller.
 const SPARE_BYTES: usize = 512;
 
 /// See the module's comment.
@@ -27,11 +27,11 @@ pub(super) struct Shared<T>(NonNull<Inner<T>>, PhantomData<Inner<T>>);
 
 struct Inner<T> {
     handles: AtomicUsize,
-    // One thread may lock it more than once: iceoryx2's own lock may be, too.
+    // Reentrant, because iceoryx2's own lock may be.
     value: ReentrantMutex<T>,
 }
 
-// SAFETY: the value is reached through the lock only, by one thread at a time, and dropped by one.
+// SAFETY: the value is reached only through the lock, by one thread at a time, and is dropped by one thread.
 unsafe impl<T: Send> Send for Shared<T> {}
 // SAFETY: as above.
 unsafe impl<T: Send> Sync for Shared<T> {}
@@ -41,21 +41,21 @@ impl<T> Shared<T> {
 
     fn with(value: T) -> Self {
         let memory = spare::take(Self::LAYOUT).cast::<Inner<T>>();
-        // SAFETY: the memory has the layout of `Inner<T>` and has no other owner.
+        // SAFETY: the memory has the layout of `Inner<T>` and no other owner.
         unsafe { memory.write(Inner { handles: AtomicUsize::new(1), value: ReentrantMutex::new(value) }) };
         Self(memory, PhantomData)
     }
 
     fn inner(&self) -> &Inner<T> {
-        // SAFETY: written by `with`, and there as long as a handle is.
+        // SAFETY: written by `with`, and valid as long as a handle exists.
         unsafe { self.0.as_ref() }
     }
 }
 
 impl<T> Clone for Shared<T> {
     fn clone(&self) -> Self {
-        // A clone is made from a handle: nothing can be dropped meanwhile. A count that wraps would
-        // need more handles than fit in memory, unless they are leaked: then the process ends.
+        // A clone is made from a handle, so nothing can be dropped meanwhile. A count that wraps would need more
+        // handles than fit in memory, unless they are leaked: then the process ends.
         if self.inner().handles.fetch_add(1, Ordering::Relaxed) > usize::MAX / 2 {
             std::process::abort();
         }
@@ -68,11 +68,11 @@ impl<T> Drop for Shared<T> {
         if self.inner().handles.fetch_sub(1, Ordering::Release) != 1 {
             return;
         }
-        // Everything the other handles did with the value comes before its end.
+        // Every use of the value through other handles happens before its drop.
         fence(Ordering::Acquire);
         // SAFETY: this was the last handle, and `with` wrote the value.
         unsafe { self.0.drop_in_place() };
-        // SAFETY: the memory was taken with this layout, and nothing lives in it any more.
+        // SAFETY: the memory was allocated with this layout and holds no value any more.
         unsafe { spare::give(self.0.cast(), Self::LAYOUT) };
     }
 }
@@ -124,7 +124,7 @@ impl<T: Send + fmt::Debug + Abandonable> ArcSyncPolicy<T> for Shared<T> {
     }
 }
 
-/// Memory that waits for its next use, on each thread its own.
+/// Memory kept for reuse, per thread.
 mod spare {
     use super::{Layout, NonNull, RefCell, SPARE, SPARE_BYTES, alloc, dealloc, handle_alloc_error};
 
@@ -145,10 +145,10 @@ mod spare {
         }
     }
 
-    /// Memory of `layout`, which is not of size 0, not initialised.
+    /// Uninitialised memory of `layout`, whose size is not 0.
     pub(super) fn take(layout: Layout) -> NonNull<u8> {
         let fitting = |piece: &&mut Option<Piece>| piece.is_some_and(|(_, kept)| kept == layout);
-        // No pieces at the end of a thread, when they are gone already.
+        // At the end of a thread the kept blocks may be gone already.
         let kept = PIECES.try_with(|pieces| Some(pieces.borrow_mut().0.iter_mut().find(fitting)?.take()?.0));
         kept.ok().flatten().unwrap_or_else(|| {
             // SAFETY: the size is not 0: every `Inner` holds a count.
@@ -159,7 +159,7 @@ mod spare {
     /// Keeps or frees memory.
     ///
     /// # Safety
-    /// It was allocated with `layout`, and has no user left.
+    /// It was allocated with `layout` and is no longer used.
     pub(super) unsafe fn give(memory: NonNull<u8>, layout: Layout) {
         let kept = layout.size() <= SPARE_BYTES
             && PIECES.try_with(|pieces| match pieces.borrow_mut().0.iter_mut().find(|piece| piece.is_none()) {
@@ -170,7 +170,7 @@ mod spare {
                 None => false,
             }) == Ok(true);
         if !kept {
-            // SAFETY: the caller's promise.
+            // SAFETY: guaranteed by the caller.
             unsafe { dealloc(memory.as_ptr(), layout) };
         }
     }
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn the_value_goes_with_its_last_handle_and_its_memory_is_used_again() {
+    fn the_value_is_dropped_with_its_last_handle_and_its_memory_is_reused() {
         let dropped = Arc::new(AtomicUsize::new(0));
         let first = Shared::with(Noted::new(&dropped));
         let place = first.0;
@@ -217,14 +217,14 @@ mod tests {
         drop(second);
         assert_eq!(dropped.load(Ordering::Relaxed), 1);
         assert_eq!(Shared::with(Noted::new(&dropped)).0, place);
-        // More at once than are kept, and back.
+        // More at once than are kept, then all dropped.
         let many: Vec<_> = (0..3 * SPARE).map(|_| Shared::with(Noted::new(&dropped))).collect();
         drop(many);
         assert_eq!(dropped.load(Ordering::Relaxed), 2 + 3 * SPARE);
     }
 
     #[test]
-    fn one_thread_at_a_time_and_one_more_than_once() {
+    fn the_lock_is_exclusive_between_threads_and_reentrant_within_one() {
         #[derive(Debug)]
         struct Count {
             so_far: std::cell::Cell<u64>,

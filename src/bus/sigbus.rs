@@ -1,15 +1,14 @@
-//! The last resort where shared memory has no page to write to: segments that other programs made, and files
-//! that other programs truncate.
+//! The last resort where shared memory has no page to write to: segments created by other programs, and files truncated
+//! by other programs.
 //!
-//! The kernel raises SIGBUS. Its handler puts a page of the process's own in the place of the one that is missing,
-//! so that the thread continues, and wakes the task that waits in [`lost`]: the run ends in order, with motors disabled
-//! and the episode closed.
+//! The kernel raises SIGBUS. Its handler maps a page of the process's own in place of the missing one, so that the
+//! thread continues, and wakes the task that waits in [`lost`]: the run ends in order, with motors disabled and the
+//! episode closed.
 //!
-//! The same end comes when iceoryx2 panics over a table that was overwritten (`guard`).
+//! The run ends in the same way when iceoryx2 panics over an overwritten table (`guard`).
 //!
-//! Invariant: what the handler calls is safe in a signal handler: system calls and atomics.
-//! Invariant: a SIGBUS of any other memory is left to the handler before this one; that of the standard library
-//! ends the process.
+//! Invariant: the handler calls only what is safe in a signal handler: system calls and atomics.
+//! Invariant: a SIGBUS of any other memory goes to the previous handler; that of the standard library ends the process.
 
 use std::ffi::OsStr;
 use std::mem::MaybeUninit;
@@ -28,7 +27,7 @@ use tokio::io::unix::AsyncFd;
 use super::leftovers::Files;
 use super::{BusError, room};
 
-/// Bytes of a line of `/proc/self/maps` that are looked at: its numbers and the path.
+/// Bytes of a line of `/proc/self/maps` that are examined: its numbers and the path.
 const LINE: usize = 320;
 /// Bytes read at a time: a signal stack is small.
 const PIECE: usize = 512;
@@ -37,33 +36,33 @@ const BUS_ADRERR: c_int = 2;
 
 static HAPPENED: AtomicBool = AtomicBool::new(false);
 static HANDLER: OnceLock<Handler> = OnceLock::new();
-/// The path of the file whose page was missing, ended by a zero.
+/// The path of the file whose page was missing, null-terminated.
 static FILE: [AtomicU8; LINE] = [const { AtomicU8::new(0) }; LINE];
-/// The bus of this process, in which a damaged file is looked for.
+/// The bus of this process, which is searched for a damaged file.
 static FILES: OnceLock<Files> = OnceLock::new();
 static ERROR: OnceLock<PathBuf> = OnceLock::new();
 
-/// What the handler needs, made before it is one.
+/// The handler's state, created before it is installed.
 struct Handler {
-    /// Of `/proc/self/maps`: there may be no descriptor left when it is needed.
+    /// Descriptor of `/proc/self/maps`: none may be free when it is needed.
     maps: RawFd,
     wake: RawFd,
     page: usize,
     before: libc::sigaction,
 }
 
-/// Has memory of the bus been lost?
+/// Whether memory of the bus has been lost.
 pub(super) fn happened() -> bool {
     HAPPENED.load(Ordering::Relaxed)
 }
 
-/// Where a damaged file is to be looked for.
+/// Sets where to look for a damaged file.
 pub(super) fn watch_over(files: Files) {
-    // A process of this program is on one bus.
+    // A process of this program uses one bus.
     let _ = FILES.set(files);
 }
 
-/// Memory of the bus is there, and holds nothing that can be used: ends its use, as if it had been lost.
+/// Memory of the bus is present but unusable: ends its use, as if it had been lost.
 pub(super) fn damaged() {
     HAPPENED.store(true, Ordering::Relaxed);
     if let Some(handler) = HANDLER.get() {
@@ -85,14 +84,14 @@ pub(super) fn error() -> BusError {
     BusError::Lost { file: file.clone() }
 }
 
-/// Returns as soon as memory of the bus has been lost; needs tokio's I/O. Cancel-safe.
+/// Returns once memory of the bus has been lost; needs tokio's I/O. Cancel-safe.
 pub async fn lost() -> BusError {
     let Some(handler) = HANDLER.get() else { return std::future::pending().await };
     // SAFETY: the descriptor is open for as long as the process lives.
     let wake = unsafe { std::os::fd::BorrowedFd::borrow_raw(handler.wake) };
-    // One of its own: a descriptor can be waited for once at a time.
+    // A duplicate: a descriptor can be waited for only once at a time.
     let wake = wake.try_clone_to_owned().ok();
-    // SAFETY: an owned descriptor stays open, and the same, for as long as it is watched.
+    // SAFETY: an owned descriptor stays open and unchanged for as long as it is watched.
     let wake = wake.and_then(|wake| unsafe { AsyncFd::register_with_interest(wake, Interest::READABLE) }.ok());
     let Some(wake) = wake else { return std::future::pending().await };
     while !happened() {
@@ -130,7 +129,7 @@ pub(super) fn install() -> Result<(), BusError> {
         return Ok(());
     }
     let _ = (maps.into_raw_fd(), wake.into_raw_fd());
-    // SAFETY: the handler keeps to what a handler may do; its signature is that of SA_SIGINFO.
+    // SAFETY: the handler does only what a signal handler may; its signature is that of SA_SIGINFO.
     unsafe {
         let mut action = MaybeUninit::<libc::sigaction>::zeroed().assume_init();
         action.sa_sigaction = handle as *const () as usize;
@@ -164,12 +163,12 @@ impl Handler {
         unsafe { libc::write(self.wake, (&raw const one).cast(), size_of::<u64>()) };
     }
 
-    /// Is this address in a mapping of a file in shared memory?
+    /// Whether this address is in a mapping of a file in shared memory.
     fn is_of_the_bus(&self, address: usize) -> bool {
         let (mut line, mut length, mut at) = ([0; LINE], 0, 0);
         loop {
             let mut piece = [0_u8; PIECE];
-            // SAFETY: `piece` has as many bytes.
+            // SAFETY: `piece` has this many bytes.
             let got = unsafe { libc::pread(self.maps, piece.as_mut_ptr().cast(), PIECE, at) };
             let Some(read) = usize::try_from(got).ok().filter(|read| *read > 0) else { return false };
             at += got as libc::off_t;
@@ -189,7 +188,7 @@ impl Handler {
         }
     }
 
-    /// Puts a page of our own where `address` is.
+    /// Maps a page of this process at `address`.
     fn replace(&self, address: usize) -> bool {
         let page = address & !(self.page - 1);
         let protection = libc::PROT_READ | libc::PROT_WRITE;
@@ -199,11 +198,11 @@ impl Handler {
         mapped != libc::MAP_FAILED
     }
 
-    /// Does what would have been done without this handler.
+    /// Does what would have happened without this handler.
     fn pass_on(&self, signal: c_int, info: *mut siginfo_t, context: *mut c_void) {
         match self.before.sa_sigaction {
             libc::SIG_DFL | libc::SIG_IGN => {
-                // The instruction is tried again, and ends the process.
+                // The instruction is retried and ends the process.
                 // SAFETY: allowed in a handler.
                 unsafe { libc::signal(signal, libc::SIG_DFL) };
             }
@@ -222,7 +221,7 @@ impl Handler {
     }
 }
 
-/// Is `line` of `/proc/self/maps` that of a shared mapping of a file in shared memory, with `address` in it?
+/// Whether `line` of `/proc/self/maps` is a shared mapping of a file in shared memory that contains `address`.
 fn covers(line: &[u8], address: usize) -> bool {
     let mut words = line.split(|byte| *byte == b' ').filter(|word| !word.is_empty());
     let (Some(range), Some(permissions)) = (words.next(), words.next()) else { return false };
@@ -233,11 +232,11 @@ fn covers(line: &[u8], address: usize) -> bool {
     shared && (first..end).contains(&address) && words.nth(3).is_some_and(|path| path.starts_with(b"/dev/shm/"))
 }
 
-/// Keeps the path of this line, if it is the first.
+/// Stores the path of this line, if it is the first.
 fn note(line: &[u8]) {
     let path = line.iter().position(|byte| *byte == b'/').and_then(|at| line.get(at..)).unwrap_or_default();
     if !happened() {
-        // The last place stays zero.
+        // The last byte stays zero.
         for (place, byte) in FILE.iter().take(LINE - 1).zip(path) {
             place.store(*byte, Ordering::Relaxed);
         }
@@ -256,7 +255,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_shared_mappings_of_shared_memory_are_of_the_bus() {
+    fn only_shared_mappings_of_shared_memory_belong_to_the_bus() {
         let line = b"7f0000001000-7f0000003000 rw-s 00000000 00:1b 7     /dev/shm/iox2_a.data (deleted)";
         for (address, covered) in [(0xfff, false), (0x1000, true), (0x2fff, true), (0x3000, false)] {
             assert_eq!(covers(line, 0x7f00_0000_0000 + address), covered, "{address:x}");
@@ -271,14 +270,14 @@ mod tests {
             assert!(!covers(other, 0x7f00_0000_1000), "{}", String::from_utf8_lossy(other));
         }
     }
-    /// Not a test of its own: touches a file's page that is gone.
+    /// Not a test of its own: touches a page that its file no longer has.
     #[test]
     fn helper() {
         let Ok(path) = std::env::var("RAPID_TEST_TOUCH") else { return };
         install().unwrap();
         let file = std::fs::File::options().read(true).write(true).create(true).truncate(false).open(path).unwrap();
         file.set_len(4096).unwrap();
-        // SAFETY: a mapping of its own, touched within its length.
+        // SAFETY: a mapping of its own, accessed within its length.
         unsafe {
             let flags = libc::MAP_SHARED;
             let page =
@@ -292,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn a_page_of_shared_memory_that_is_gone_is_replaced_and_any_other_ends_the_process() {
+    fn a_lost_page_of_shared_memory_is_replaced_and_any_other_ends_the_process() {
         use std::os::unix::process::ExitStatusExt;
         let number = std::process::id();
         for (path, signal) in [

@@ -77,7 +77,7 @@ fn a_sample_arrives_whole_with_its_header_and_wakes_the_consumer() {
 }
 
 #[test]
-fn a_slow_consumer_loses_the_oldest_and_sees_the_hole() {
+fn a_slow_consumer_loses_the_oldest_samples_and_sees_the_gap() {
     let (registry, bus) = open("b", 16);
     let inbox = bus.inbox().expect("inbox");
     let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
@@ -104,7 +104,7 @@ fn a_slow_consumer_does_not_exhaust_the_pool_of_a_fast_one() {
 }
 
 #[test]
-fn an_oversized_sample_is_refused_by_name() {
+fn an_oversized_sample_is_rejected_and_named() {
     let (registry, bus) = open("d", 16);
     let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
     let error = writer.publish(SampleHeader::default(), &[0; 65]).expect_err("too large");
@@ -115,7 +115,7 @@ fn an_oversized_sample_is_refused_by_name() {
 }
 
 #[test]
-fn a_consumer_that_comes_later_gets_what_is_published_from_then_on() {
+fn a_late_consumer_gets_only_what_is_published_from_then_on() {
     let (registry, bus) = open("e", 16);
     let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
     writer.publish(SampleHeader { seq: 0, ..SampleHeader::default() }, &[1]).expect("publish");
@@ -125,7 +125,7 @@ fn a_consumer_that_comes_later_gets_what_is_published_from_then_on() {
     assert_eq!(got, [1]);
 }
 
-/// A subscriber of the one device's topic that keeps what it receives.
+/// A subscriber of the one device's topic that keeps the samples it receives.
 fn holder(registry: &Registry, bus: &Bus) -> iceoryx2::port::subscriber::Subscriber<Service, [u8], SampleHeader> {
     let id = TopicId::Modality(registry.devices[0].id);
     let (_, factory) = bus.topics.iter().find(|(spec, _)| spec.id == id).expect("topic");
@@ -133,7 +133,7 @@ fn holder(registry: &Registry, bus: &Bus) -> iceoryx2::port::subscriber::Subscri
 }
 
 #[test]
-fn the_pool_is_enough_when_every_subscriber_holds_all_it_may() {
+fn the_pool_suffices_when_every_subscriber_holds_its_maximum() {
     let (registry, bus) = open("f", 16);
     let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
     let subscribers: Vec<_> = (0..MAX_SUBSCRIBERS).map(|_| holder(&registry, &bus)).collect();
@@ -145,7 +145,7 @@ fn the_pool_is_enough_when_every_subscriber_holds_all_it_may() {
             seq += 1;
         }
     };
-    // Each holds samples of other moments than all the others.
+    // Each holds samples of different moments.
     for subscriber in &subscribers {
         for _ in 0..MAX_BORROWED {
             publish(40);
@@ -159,7 +159,7 @@ fn the_pool_is_enough_when_every_subscriber_holds_all_it_may() {
     publish(1000);
 }
 
-/// Not a test of its own: the process that the next one kills.
+/// Not a test of its own: the process that the next test kills.
 #[test]
 fn held_samples_helper() {
     let Ok(instance) = std::env::var("RAPID_TEST_HOLD") else { return };
@@ -170,7 +170,7 @@ fn held_samples_helper() {
     loop {
         held.extend(subscriber.receive().ok().flatten().filter(|_| held.len() < MAX_BORROWED));
         if held.len() == MAX_BORROWED {
-            std::fs::write(std::env::temp_dir().join(&instance), "held").expect("tell");
+            std::fs::write(std::env::temp_dir().join(&instance), "held").expect("a file");
             std::thread::sleep(Duration::from_mins(10));
         }
         std::thread::yield_now();
@@ -178,7 +178,7 @@ fn held_samples_helper() {
 }
 
 #[test]
-fn a_subscriber_killed_while_it_holds_samples_costs_no_sample_and_its_place_is_given_back() {
+fn a_killed_subscriber_that_held_samples_loses_none_and_frees_its_place() {
     let name = format!("busg{}", std::process::id());
     let registry = registry(16);
     let bus = Bus::open(&registry, Some(&name)).expect("bus");
@@ -203,7 +203,7 @@ fn a_subscriber_killed_while_it_holds_samples_costs_no_sample_and_its_place_is_g
             writer.publish(SampleHeader::default(), &[1; 64]).expect("the pool is enough");
         }
     }
-    // A node that is made cleans up after the dead ones: all places can be taken.
+    // Creating a node cleans up after dead ones: every subscriber slot is free again.
     let other = Bus::open(&registry, Some(&name));
     drop(other);
     let all: Vec<_> = (0..MAX_SUBSCRIBERS).map(|_| holder(&registry, &bus)).collect();
@@ -214,7 +214,7 @@ fn a_subscriber_killed_while_it_holds_samples_costs_no_sample_and_its_place_is_g
 }
 
 #[test]
-fn one_subscriber_too_many_is_told_how_many_there_may_be() {
+fn one_subscriber_too_many_gets_an_error_with_the_limit() {
     let (_registry, bus) = open("h", 16);
     let _all: Vec<Inbox> = (0..MAX_SUBSCRIBERS).map(|_| bus.inbox().expect("inbox")).collect();
     let error = bus.inbox().expect_err("too many");
@@ -222,7 +222,7 @@ fn one_subscriber_too_many_is_told_how_many_there_may_be() {
 }
 
 #[test]
-fn a_topic_filled_faster_than_it_is_emptied_does_not_hold_the_consumer() {
+fn a_topic_filled_faster_than_it_is_emptied_does_not_trap_the_consumer() {
     let (registry, bus) = open("i", 16);
     let inbox = bus.inbox().expect("inbox");
     let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
@@ -239,7 +239,7 @@ fn a_topic_filled_faster_than_it_is_emptied_does_not_hold_the_consumer() {
     assert_eq!(sequences(&inbox).len(), 1);
 }
 
-/// Another publisher on a topic of `bus`, as a program of the same user has it.
+/// Another publisher on a topic of `bus`, like a program of the same user.
 fn stranger(bus: &Bus, id: TopicId) -> iceoryx2::port::publisher::Publisher<Service, [u8], SampleHeader> {
     let (_, factory) = bus.topics.iter().find(|(spec, _)| spec.id == id).expect("topic");
     factory.publisher_builder().initial_max_slice_len(64).create().expect("publisher")
@@ -258,7 +258,7 @@ fn foreign(inbox: &Inbox) -> Vec<(String, u32, u64)> {
 }
 
 #[test]
-fn samples_of_another_publisher_are_not_handed_over_but_counted_with_their_process() {
+fn samples_of_a_foreign_publisher_are_counted_by_process_and_not_delivered() {
     let (registry, bus) = open("j", 16);
     let motor = TopicId::Modality(registry.devices[0].id);
     let inbox = bus.inbox().expect("inbox");
@@ -277,7 +277,7 @@ fn samples_of_another_publisher_are_not_handed_over_but_counted_with_their_proce
 }
 
 #[test]
-fn actions_of_another_program_are_its_right_until_a_policy_of_ours_gives_some() {
+fn actions_of_another_program_are_accepted_until_our_policy_publishes() {
     let mut registry = registry(16);
     registry.devices[0].action = Some(crate::registry::ActionSpec {
         names: vec!["x".into()],
@@ -298,7 +298,7 @@ fn actions_of_another_program_are_its_right_until_a_policy_of_ours_gives_some() 
     let header = SampleHeader { seq: 2, encoding: Encoding::F64 as u32, ..SampleHeader::default() };
     ours.publish(header, &[0; 8]).expect("publish");
     assert_eq!((taken(&inbox), foreign(&inbox)), (vec![2], vec![]));
-    // It is recorded, and moves nothing.
+    // It is recorded, but moves nothing.
     assert!(matches!(actions.newest(&mut numbers), Ok(Some(_))));
     give(&other, 3);
     assert_eq!(actions.newest(&mut numbers), Err(NoAction::Foreign));
@@ -313,11 +313,11 @@ fn foreign_after(inbox: &Inbox, taken: &[u64]) -> Vec<(String, u32, u64)> {
 }
 
 #[test]
-fn every_segment_has_all_its_memory_when_the_bus_is_open_and_no_more_than_was_asked_for() {
+fn every_segment_has_exactly_its_requested_memory_once_the_bus_is_open() {
     use std::os::unix::fs::MetadataExt;
     let (registry, bus) = open("m", 600);
     let _inboxes: Vec<Inbox> = (0..MAX_SUBSCRIBERS).map(|_| bus.inbox().expect("inbox")).collect();
-    // A publisher meets its subscribers when it publishes.
+    // A publisher connects to its subscribers when it publishes.
     for spec in specs(&registry) {
         bus.writer(spec.id).expect("writer").publish(SampleHeader::default(), &[0; 16]).expect("publish");
     }

@@ -1,4 +1,4 @@
-//! Topics: name, depth and memory of each, decided once from the registry.
+//! Topics: name, depth and memory of each, derived once from the registry.
 
 use super::room::BOOKS;
 use crate::action::{ACTION_TOPIC, MAX_ACTION};
@@ -6,7 +6,7 @@ use crate::mask::MASK_TOPIC;
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
-/// 4 s of mask at 500 Hz: as long as a consumer may be held up without losing one.
+/// 4 s of mask at 500 Hz: how long a consumer may be held up without losing a sample.
 const MASK_DEPTH: usize = 2048;
 /// u64 mask and u64 sequence.
 const MASK_BYTES: usize = 16;
@@ -14,21 +14,21 @@ const MASK_BYTES: usize = 16;
 /// 2 s of actions at 200 Hz, twice the rate of the fastest policy.
 const ACTION_DEPTH: usize = 400;
 
-/// Which topic.
+/// Identifies a topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TopicId {
     /// Samples of a modality.
     Modality(ModalityId),
     /// The physical mask.
     Mask,
-    /// Actions for the actuator; there is none without an actuator in the registry.
+    /// Actions for the actuator; exists only with an actuator in the registry.
     Action,
 }
 
-/// A topic as it is opened.
+/// Specification of a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TopicSpec {
-    /// Which.
+    /// Its identity.
     pub id: TopicId,
     /// Service name.
     pub name: String,
@@ -64,18 +64,18 @@ impl TopicSpec {
 
     /// Samples in a pool that is never exhausted.
     ///
-    /// Every subscriber's queue holds the newest `depth` samples at most, so the queues of all of
-    /// them together hold no more than `depth` different ones; beside these each may hold a few, and
-    /// the writer one. iceoryx2's own bound counts every queue as if it held other samples.
+    /// Each subscriber's queue holds at most the newest `depth` samples, so all queues together hold no more than
+    /// `depth` different ones; in addition each subscriber may hold a few, and the writer one. iceoryx2's own bound
+    /// assumes that every queue holds different samples.
     pub(super) const fn pool_for(depth: usize) -> usize {
         depth + POOL_SPARE
     }
 
-    /// Bytes of shared memory that the topic takes with as many subscribers as it may have, at most.
+    /// Maximum bytes of shared memory that the topic takes with its maximum number of subscribers.
     pub(super) fn room(&self) -> u64 {
-        /// Of iceoryx2 for each sample, with alignment.
+        /// iceoryx2's overhead per sample, with alignment.
         const SAMPLE: u64 = 64;
-        /// Of iceoryx2 for a sample that waits for, or is lent to, one subscriber.
+        /// iceoryx2's overhead per sample that is queued for, or borrowed by, one subscriber.
         const WAITING: u64 = 24;
         let samples = self.pool_samples() as u64;
         let waiting = samples.saturating_mul(WAITING * MAX_SUBSCRIBERS as u64);
@@ -83,7 +83,6 @@ impl TopicSpec {
     }
 
     /// Bytes of the pool.
-    #[must_use]
     pub fn pool_bytes(&self) -> u64 {
         let sample = self.max_bytes + size_of::<crate::sample::SampleHeader>();
         (self.pool_samples() as u64).saturating_mul(sample as u64)

@@ -1,6 +1,6 @@
 //! A topic's writer: one copy from the driver's buffer into shared memory.
 //!
-//! Invariant: a pool whose first page is gone or overwritten is not written to: iceoryx2 keeps in it where it writes.
+//! Invariant: a pool whose first page is lost or overwritten is not written to: it holds iceoryx2's write position.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -22,9 +22,9 @@ pub struct Writer {
     topic: String,
     max_bytes: usize,
     publisher: Guarded<Publisher<Service, [u8], SampleHeader>>,
-    /// Of the publisher, to look at its head.
+    /// The publisher's segment, to check its first page.
     pool: Option<File>,
-    /// Of the actuator first, which has no time to lose, then of all consumers.
+    /// First the actuator's, which is the most urgent, then those of all consumers.
     wakes: Vec<Guarded<Notifier<Service>>>,
 }
 
@@ -35,14 +35,14 @@ impl std::fmt::Debug for Writer {
 }
 
 impl Writer {
-    /// `own` is the event service of this topic alone, if it has one.
+    /// `own` is the event service of this topic alone, if any.
     pub(super) fn open(
         spec: &TopicSpec,
         factory: &TopicFactory,
         wake: &EventFactory<Service>,
         own: Option<&EventFactory<Service>>,
     ) -> Result<Self, BusError> {
-        // A topic that another program kept open from an earlier run may have deeper queues than asked.
+        // A topic that another program kept open from an earlier run may have deeper queues than requested.
         let samples = TopicSpec::pool_for(factory.static_config().subscriber_max_buffer_size().max(spec.depth));
         let publisher = factory
             .publisher_builder()
@@ -56,7 +56,7 @@ impl Writer {
             .map_err(|error| topic_error(&spec.name, &error))?;
         let event = match spec.id {
             TopicId::Modality(modality) => Some(modality.index()),
-            // Consumers find the mask when they look; 500 wake-ups a second would be of no use to them.
+            // Consumers poll the mask; 500 wake-ups a second would be useless to them.
             TopicId::Mask => None,
             TopicId::Action => Some(MAX_MODALITIES),
         };
@@ -72,7 +72,7 @@ impl Writer {
         Ok(Self { topic: spec.name.clone(), max_bytes: spec.max_bytes, publisher, pool, wakes })
     }
 
-    /// Names this writer in every sample it publishes.
+    /// Identifies this writer in every sample it publishes.
     pub(super) fn id(&self) -> UniquePublisherId {
         self.publisher.id()
     }
@@ -80,14 +80,14 @@ impl Writer {
     /// Publishes one sample and wakes the consumers.
     ///
     /// # Errors
-    /// When the payload is larger than the topic allows, the pool is exhausted because a subscriber that died still
-    /// holds samples, or memory of the bus has been lost.
+    /// When the payload is larger than the topic allows, the pool is exhausted because a dead subscriber still holds
+    /// samples, or memory of the bus has been lost.
     pub fn publish(&self, header: SampleHeader, payload: &[u8]) -> Result<(), BusError> {
         if payload.len() > self.max_bytes {
             let (size, max) = (payload.len(), self.max_bytes);
             return Err(BusError::TooLarge { topic: self.topic.clone(), size, max });
         }
-        // A system call of a fraction of a microsecond.
+        // One system call; takes a fraction of a microsecond.
         let mut head = [0; 8];
         let is_whole = |pool: &File| pool.read_exact_at(&mut head, 0).is_ok() && leftovers::is_head(head);
         if !self.pool.as_ref().is_none_or(is_whole) {
@@ -102,7 +102,7 @@ impl Writer {
         *sample.user_header_mut() = header;
         sample.write_from_slice(payload).send().map_err(|error| self.transfer(&format!("{error:?}")))?;
         for wake in &self.wakes {
-            // A consumer that cannot be woken looks by itself soon after; the sample is not lost.
+            // A consumer that cannot be woken polls soon after; the sample is not lost.
             let _ = wake.notify();
         }
         Ok(())
@@ -113,7 +113,7 @@ impl Writer {
     }
 }
 
-/// The segment in which a publisher's samples are.
+/// The segment that contains a publisher's samples.
 fn pool(publisher: UniquePublisherId) -> Option<File> {
     let ending = format!("_{}.data", publisher.value());
     let mut entries = std::fs::read_dir(room::PLACE).ok()?.flatten();

@@ -39,7 +39,6 @@ pub enum AblationError {
 
 impl AblationError {
     /// Whether the arguments or the plan are at fault.
-    #[must_use]
     pub const fn is_bad_argument(&self) -> bool {
         matches!(self, Self::File(_) | Self::Plan(_) | Self::NoPlan)
     }

@@ -20,9 +20,10 @@ use super::Format;
 use crate::app::signals::Signals;
 use crate::calibration::{self, Estimate, Flip, Seen, brightness};
 use crate::cli::LatencyArgs;
+use crate::device::{Attachment, DeviceNode};
 use crate::driver::Driver;
-use crate::registry::scenario::SimDevice;
-use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, NodeSpec, Registry};
+use crate::registry::{Assigner, Assignment, DeviceSpec, NodeSpec, Registry};
+use crate::simulation::SimDevice;
 use crate::time::Stamp;
 use crate::tui::flashlight::{self, Flashlight};
 use crate::{flash, text};
@@ -87,7 +88,6 @@ pub enum CalibrateError {
 
 impl CalibrateError {
     /// Whether the arguments are at fault.
-    #[must_use]
     pub const fn is_bad_argument(&self) -> bool {
         matches!(
             self,

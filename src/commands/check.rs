@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{Format, Outcome};
+use super::{CommandStatus, Format};
 use crate::interlock::StopKind;
 use crate::registry::{
     CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InterlockInput, InterlockSpec, Loaded, ModuleSpec,
@@ -17,11 +17,11 @@ use crate::text;
 ///
 /// # Errors
 /// When `out` cannot be written to.
-pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Outcome> {
+pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<CommandStatus> {
     let loaded = Registry::load(path);
     let (lines, outcome) = match &loaded {
-        Ok(loaded) => (lines(loaded), Outcome::Done),
-        Err(errors) => (errors.diagnostics.iter().map(Line::Error).collect(), Outcome::BadConfiguration),
+        Ok(loaded) => (lines(loaded), CommandStatus::Done),
+        Err(errors) => (errors.diagnostics.iter().map(Line::Error).collect(), CommandStatus::BadConfiguration),
     };
     if format == Format::Json {
         lines.iter().try_for_each(|line| writeln!(out, "{}", text::json(line)?))?;
@@ -214,7 +214,7 @@ fn table(loaded: &Loaded, out: &mut dyn Write) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    fn checked(text: &str, format: Format) -> (Outcome, String) {
+    fn checked(text: &str, format: Format) -> (CommandStatus, String) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("devices.toml");
         std::fs::write(&path, text).unwrap();
@@ -226,7 +226,7 @@ mod tests {
     #[test]
     fn a_good_registry_is_listed() {
         let (outcome, text) = checked(crate::registry::BUILTIN, Format::Text);
-        assert_eq!(outcome, Outcome::Done);
+        assert_eq!(outcome, CommandStatus::Done);
         assert_eq!(
             text,
             "bit  name         node    identity                  topic                  format\n\
@@ -240,11 +240,11 @@ mod tests {
     #[test]
     fn warnings_and_problems_are_listed_and_problems_fail_the_check() {
         let (outcome, text) = checked("[device.a]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\n", Format::Text);
-        assert_eq!(outcome, Outcome::Done);
+        assert_eq!(outcome, CommandStatus::Done);
         assert!(text.contains("warning: devices.toml:1:9: [device.a] no bit given, it gets bit 0"), "{text}");
         assert!(text.ends_with("devices.toml: 1 device, ok\n"), "{text}");
         let (outcome, text) = checked("[device.a]\nvid = \"1\"\npid = \"2\"\nnode = \"camrea\"\n", Format::Text);
-        assert_eq!(outcome, Outcome::BadConfiguration);
+        assert_eq!(outcome, CommandStatus::BadConfiguration);
         assert_eq!(
             text,
             "devices.toml:4:8: [device.a] node \"camrea\" is neither built in nor a program\n    fix: did you mean \"camera\"?\n\
@@ -260,7 +260,7 @@ mod tests {
                       other_fault = \"brake\", brake = { chip = \"/dev/brakes\", line = 4, released = \"high\" } },\n\
                       { name = \"wheel\", slave = 2, type = \"DM4310\", mode = \"velocity\", position = [-9, 9] },\n]\n";
         let (outcome, text) = checked(motors, Format::Text);
-        assert_eq!(outcome, Outcome::Done, "{text}");
+        assert_eq!(outcome, CommandStatus::Done, "{text}");
         for line in [
             "motor lift of arm: limp on its own fault, brake on another's, limp on an emergency stop; brake on line 4 of \
              /dev/brakes\n",
@@ -307,7 +307,7 @@ mod tests {
         assert_eq!(rows[0]["serial"], "CAM00A1");
         assert_eq!(rows[2]["format"], "115200 baud line csv x3");
         let (outcome, text) = checked("[device.a]\n", Format::Json);
-        assert_eq!(outcome, Outcome::BadConfiguration);
+        assert_eq!(outcome, CommandStatus::BadConfiguration);
         let first: serde_json::Value = serde_json::from_str(text.lines().next().unwrap()).unwrap();
         assert_eq!((&first["kind"], &first["line"]), (&"error".into(), &1.into()));
     }

@@ -9,12 +9,12 @@ use serde_json::json;
 
 use super::Format;
 use super::progress::Bar;
-use crate::driver::sim::task::Texture;
 use crate::lockstep::STEP;
 use crate::lockstep::TrialError;
 use crate::lockstep::collect;
 use crate::record::EpisodeRequest;
 use crate::registry::Registry;
+use crate::simulation::task::Texture;
 use crate::status::{Board, Grade};
 use crate::text;
 

@@ -1,14 +1,14 @@
 //! `rapid devices`: the devices that are plugged in, and the registry entry each matches, or why none.
 
 use std::io::{self, Write};
+use std::path::PathBuf;
 
 use serde::Serialize;
 
 use super::Format;
-use crate::driver::camera::{CameraInfo, query};
-use crate::registry::{
-    Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, IdentitySpec, Registry, Unit, UsbSpec,
-};
+use crate::device::{Attachment, DeviceNode, Unit};
+use crate::driver::camera::{CameraInfo, cameras, is_on_usb, name, query};
+use crate::registry::{Assigner, Assignment, DeviceSpec, IdentitySpec, Registry, UsbSpec};
 use crate::text;
 
 /// A node that is plugged in.
@@ -16,9 +16,9 @@ use crate::text;
 pub struct Plugged {
     /// Node, for example `/dev/video0`.
     pub node: String,
-    /// Its device, as the device describes itself.
+    /// Its device, as the device describes itself; none of a camera that is not on USB.
     #[serde(flatten)]
-    pub unit: Unit,
+    pub unit: Option<Unit>,
     /// The entry it matches, if any.
     pub entry: Option<String>,
     /// Why it matches that entry, or none.
@@ -52,7 +52,6 @@ pub enum Entries<'a> {
 }
 
 /// Matches what is attached against the registry, as a starting rig would.
-#[must_use]
 pub fn list(entries: Entries<'_>, attached: &[Attachment], formats: Formats) -> Vec<Plugged> {
     let mut assigner = match entries {
         Entries::Of(registry) => Some((Assigner::new(registry), registry)),
@@ -71,9 +70,28 @@ pub fn list(entries: Entries<'_>, attached: &[Attachment], formats: Formats) -> 
             },
             _ => (None, None),
         };
-        Plugged { node: attachment.node.label(), unit: attachment.unit.clone(), entry, reasons, camera, camera_error }
+        let unit = Some(attachment.unit.clone());
+        Plugged { node: attachment.node.label(), unit, entry, reasons, camera, camera_error }
     };
     attached.iter().filter(|attachment| is_listed(entries, attachment)).map(plugged).collect()
+}
+
+/// Cameras that are not on USB, such as those on a board or of a loopback driver: no entry can match them.
+pub fn other_cameras(formats: Formats) -> Vec<Plugged> {
+    let other = |path: PathBuf| {
+        let asked = match formats {
+            Formats::Ask => name(&path).and_then(|name| name.map(|_| query(&path)).transpose()).transpose()?.map(Some),
+            Formats::Skip => name(&path).transpose()?.map(|_| None),
+        };
+        let (camera, camera_error) = match asked {
+            Ok(camera) => (camera, None),
+            Err(error) => (None, Some(error.to_string())),
+        };
+        let reason = "it is not on USB: an entry matches a camera by its USB identity".to_owned();
+        let node = path.display().to_string();
+        Some(Plugged { node, unit: None, entry: None, reasons: vec![reason], camera, camera_error })
+    };
+    cameras().into_iter().filter(|path| !is_on_usb(path)).filter_map(other).collect()
 }
 
 /// Every hub and mouse is a USB device: only those that an entry matches are listed as such.
@@ -144,8 +162,12 @@ fn print_text(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write)
         writeln!(out, "No camera and no serial device is plugged in.")?;
     }
     let cells = |device: &Plugged| {
-        let unit = &device.unit;
         let entry = device.entry.as_ref().map_or("not used".to_owned(), |entry| format!("[device.{entry}]"));
+        let Some(unit) = &device.unit else {
+            let name = device.camera.as_ref().map(|camera| camera.name.clone()).unwrap_or_default();
+            let cells = [entry, device.node.clone(), "no USB".to_owned(), String::new(), String::new(), name];
+            return cells.map(|cell| text::plain(&cell).into_owned());
+        };
         let serial = unit.serial().map_or("no serial".to_owned(), |serial| format!("serial {serial:?}"));
         let port = unit.location();
         let product = unit.usb().and_then(|usb| usb.product.as_deref()).unwrap_or("(no product name)");

@@ -9,7 +9,6 @@ use serde_json::json;
 use super::Format;
 use super::progress::Bar;
 use crate::cli::EvalArgs;
-use crate::driver::sim::task::Outcome;
 use crate::lockstep::TrialError;
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, robot_time, wilson};
 use crate::policy::bundle::{Bundle, BundleErrors};
@@ -17,6 +16,7 @@ use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
 use crate::policy::sampler::PolicyError;
 use crate::registry::Registry;
+use crate::simulation::task::Outcome;
 use crate::text;
 
 /// Why there is no result.

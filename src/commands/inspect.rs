@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use super::{Format, Outcome, progress};
+use super::{CommandStatus, Format, progress};
 use crate::record::inspect::{self, Judgement, Paint, ReadError};
 use crate::text;
 
@@ -20,7 +20,7 @@ pub enum InspectFailure {
 }
 
 /// Reports on the episodes at `paths`. In a list, a file that cannot be read has a line too; then the
-/// outcome is not [`Outcome::Done`]. An MCAP file of another program is not an error.
+/// outcome is not [`CommandStatus::Done`]. An MCAP file of another program is not an error.
 ///
 /// # Errors
 /// When the only file named cannot be read, or nothing can be written to `out`.
@@ -30,7 +30,7 @@ pub fn inspect(
     columns: usize,
     paint: Paint,
     out: &mut impl Write,
-) -> Result<Outcome, InspectFailure> {
+) -> Result<CommandStatus, InspectFailure> {
     if let [path] = paths
         && !path.is_dir()
     {
@@ -39,7 +39,7 @@ pub fn inspect(
             Format::Json => write_json(out, &inspection)?,
             Format::Text => out.write_all(inspect::render(&inspection, columns, paint).as_bytes())?,
         }
-        return Ok(Outcome::Done);
+        return Ok(CommandStatus::Done);
     }
     let files = inspect::episodes(paths)?;
     if files.is_empty() && format == Format::Text {
@@ -53,10 +53,10 @@ pub fn inspect(
         text::plain(&name.to_string_lossy()).into_owned()
     };
     let name = files.iter().map(|file| text::width(&name_of(file))).max().unwrap_or(0);
-    let mut outcome = Outcome::Done;
+    let mut outcome = CommandStatus::Done;
     progress::each(&files, inspect::list, |file, listed| {
         if matches!(listed.verdict, Judgement::Unreadable(_)) {
-            outcome = Outcome::BadConfiguration;
+            outcome = CommandStatus::BadConfiguration;
         }
         match format {
             Format::Json => write_json(out, &listed),

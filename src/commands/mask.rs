@@ -45,7 +45,6 @@ pub enum MaskError {
 }
 
 /// The names of the bits, from the text of the published JSON file; `None` if it has none.
-#[must_use]
 pub fn layout(json: &str) -> Option<Vec<(u8, String)>> {
     #[derive(Deserialize)]
     struct File {
@@ -61,7 +60,6 @@ pub fn layout(json: &str) -> Option<Vec<(u8, String)>> {
 }
 
 /// The record as text: the mask, its age, and one line per modality. `now_ns` is the current wall time.
-#[must_use]
 pub fn render(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64, palette: Palette) -> String {
     let count = usize::from(record.device_count);
     let head = format!(

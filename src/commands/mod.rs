@@ -32,7 +32,7 @@ pub enum Format {
 
 /// The outcome of a command; the caller turns it into an exit code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Outcome {
+pub enum CommandStatus {
     /// Success.
     Done,
     /// The configuration is invalid; its mistakes have been written.

@@ -27,7 +27,6 @@ pub struct Bar {
 
 impl Bar {
     /// A line for `total` units of work, if `wanted` and standard error is a terminal.
-    #[must_use]
     pub fn new(label: &'static str, total: usize, wanted: bool) -> Self {
         Self { label, total, begun: Instant::now(), drawn: None, shown: wanted && stderr().is_terminal() }
     }
@@ -127,7 +126,7 @@ mod episodes_tests {
     use super::*;
 
     #[test]
-    fn results_come_in_the_order_of_the_files_until_an_error() {
+    fn results_follow_the_order_of_the_files_until_an_error() {
         let files: Vec<PathBuf> = (0..500).map(|number| PathBuf::from(number.to_string())).collect();
         let number = |file: &Path| file.to_str().unwrap().parse::<usize>().unwrap();
         let mut taken = Vec::new();

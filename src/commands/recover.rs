@@ -14,20 +14,18 @@ use crate::text;
 
 /// The outcome of all files together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Outcome {
+pub struct FailureCounts {
     failed: usize,
     bad_arguments: usize,
 }
 
-impl Outcome {
+impl FailureCounts {
     /// Whether everything that can be repaired was.
-    #[must_use]
     pub const fn is_done(self) -> bool {
         self.failed == 0 && self.bad_arguments == 0
     }
 
     /// Whether some argument was not an episode, and nothing worse happened.
-    #[must_use]
     pub const fn is_bad_argument(self) -> bool {
         self.failed == 0 && self.bad_arguments > 0
     }
@@ -44,8 +42,8 @@ pub fn run(
     stop: &AtomicBool,
     out: &mut impl Write,
     err: &mut impl Write,
-) -> (Outcome, io::Result<()>) {
-    let mut report = Report { outcome: Outcome::default(), format, out, written: Ok(()), err };
+) -> (FailureCounts, io::Result<()>) {
+    let mut report = Report { outcome: FailureCounts::default(), format, out, written: Ok(()), err };
     for path in paths {
         let (unfinished, finished) = match work_of(path) {
             Ok(work) => work,
@@ -86,7 +84,7 @@ fn work_of(path: &Path) -> io::Result<(Vec<PathBuf>, Vec<PathBuf>)> {
 
 /// Writes a line per file, and keeps the outcome so far.
 struct Report<'a, O, E> {
-    outcome: Outcome,
+    outcome: FailureCounts,
     format: Format,
     out: &'a mut O,
     /// The first error of `out`, after which nothing more is written to it.
@@ -161,7 +159,7 @@ impl<O: Write, E: Write> Report<'_, O, E> {
         }
     }
 
-    fn end(self) -> (Outcome, io::Result<()>) {
+    fn end(self) -> (FailureCounts, io::Result<()>) {
         let Self { outcome, out, written, .. } = self;
         (outcome, written.and_then(|()| out.flush()))
     }

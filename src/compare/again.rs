@@ -60,7 +60,6 @@ pub struct Actions {
 
 impl Again {
     /// The largest of all differences; `None` if nothing was compared.
-    #[must_use]
     pub fn largest(&self) -> Option<f64> {
         let actions = self.actions.difference.all.largest;
         (self.compared > 0).then(|| self.difference.all.largest.max(actions))

@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn nan_is_far_from_all_but_itself() {
+    fn nan_differs_from_everything_but_itself() {
         let (nan, far) = (f64::NAN, f64::INFINITY);
         for (one, other, expected) in [(1.0, 3.0, 2.0), (nan, nan, 0.0), (nan, 1.0, far), (far, far, 0.0)] {
             assert_eq!(distance(one, other).total_cmp(&expected), std::cmp::Ordering::Equal, "{one} {other}");

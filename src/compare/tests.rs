@@ -256,7 +256,7 @@ fn the_reference_picture_is_the_first_one_or_unknown() {
 }
 
 #[test]
-fn a_watching_policy_does_what_it_would_have_done() {
+fn actions_without_chunks_are_compared_with_those_of_a_watching_policy() {
     let recorded = Recorded::new();
     // Its own actions without its chunks; those of the inference ticks came from the chunk before.
     let inferred: Vec<u64> = recorded.chunks().iter().map(|chunk| chunk["tick"].as_u64().unwrap()).collect();

@@ -1,6 +1,6 @@
 //! A frame of a CAN 2.0 bus.
 
-/// One frame, as it was received or is to be sent.
+/// One received frame, or one to be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct CanFrame {
     /// Identifier, 11 bits, or 29 of an extended frame.
@@ -9,7 +9,7 @@ pub struct CanFrame {
     pub extended: bool,
     /// A request for a frame, without data.
     pub remote: bool,
-    /// A report of the controller about the bus; no frame of the bus itself.
+    /// A report of the controller about the bus, not a frame of the bus.
     pub error: bool,
     /// Bytes of data, `0..=8`.
     pub len: u8,
@@ -19,13 +19,11 @@ pub struct CanFrame {
 
 impl CanFrame {
     /// A data frame of eight bytes with an 11-bit identifier. Bits of `id` beyond them are dropped.
-    #[must_use]
     pub const fn standard(id: u16, data: [u8; 8]) -> Self {
         Self { id: (id & 0x7ff) as u32, extended: false, remote: false, error: false, len: 8, data }
     }
 
-    /// The bytes that are there.
-    #[must_use]
+    /// The bytes in use.
     pub fn data(&self) -> &[u8] {
         self.data.get(..usize::from(self.len)).unwrap_or(&self.data)
     }
@@ -36,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn data_ends_at_the_length_and_never_beyond_eight() {
+    fn data_ends_at_its_length_and_at_eight_bytes_at_most() {
         let frame = CanFrame::standard(0x1805, [1, 2, 3, 4, 5, 6, 7, 8]);
         assert_eq!((frame.id, frame.data().len()), (5, 8));
         for (len, there) in [(0, 0), (3, 3), (8, 8), (9, 8), (255, 8)] {

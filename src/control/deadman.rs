@@ -1,9 +1,8 @@
 //! The deadman: no action, no motion.
 //!
-//! Without a fresh action for two periods of actions, or as long as is configured, motors hold; after
-//! holding for a while longer, if that is configured, they are to be disabled. An action that comes while they hold moves them
-//! again. Two periods are never taken for less than two cycles of commands and the time that an action is
-//! on its way.
+//! Without a fresh action for two action periods, or for the configured time, motors hold. After holding for another
+//! configured time, if there is one, they are to be disabled. An action that arrives while they hold moves them again.
+//! Two periods count as at least two command cycles plus the transport delay of an action.
 //!
 //! Invariant: after being armed, and without an action, it returns `Hold` and then perhaps `Disable`, never
 //! `Follow`.
@@ -12,11 +11,11 @@ use std::time::Duration;
 
 use crate::time::Stamp;
 
-/// Periods of actions that may pass without one.
+/// Action periods that may pass without an action.
 const PERIODS: u32 = 2;
-/// Cycles of commands that may pass without an action, however quickly the last two came...
+/// Command cycles that may pass without an action, however short the period...
 const CYCLES: u32 = 2;
-/// ...and how long an action may have been on its way when it is looked at.
+/// ...and the longest transport delay of an action.
 const WAY: Duration = Duration::from_millis(20);
 
 /// See the module's comment.
@@ -26,7 +25,7 @@ pub struct Deadman {
     /// The default is no shorter.
     least: Duration,
     disable_after: Option<Duration>,
-    /// Of the newest action, if any came since arming.
+    /// Tick of the newest action since arming, if any.
     fresh: Option<Stamp>,
     armed: Stamp,
 }
@@ -44,7 +43,6 @@ pub enum Verdict {
 
 impl Deadman {
     /// `hold_after` of `None` is two periods, `disable_after` of `None` never. `cycle` is the time between two commands.
-    #[must_use]
     pub fn new(hold_after: Option<Duration>, disable_after: Option<Duration>, cycle: Duration) -> Self {
         let least = cycle.saturating_mul(CYCLES).saturating_add(WAY);
         Self { hold_after, least, disable_after, fresh: None, armed: Stamp(0) }
@@ -56,19 +54,17 @@ impl Deadman {
         self.armed = now;
     }
 
-    /// There is an action that was fresh at this moment.
+    /// An action of this moment arrived.
     pub fn feed(&mut self, fresh: Stamp) {
         self.fresh = self.fresh.max(Some(fresh));
     }
 
-    /// How old an action may be, with so long between actions.
-    #[must_use]
+    /// How old an action may be, at this action period.
     pub fn patience(&self, period: Duration) -> Duration {
         self.hold_after.unwrap_or_else(|| period.saturating_mul(PERIODS).max(self.least))
     }
 
-    /// What to do at `now`, with so long between actions.
-    #[must_use]
+    /// What to do at `now`, at this action period.
     pub fn look(&self, now: Stamp, period: Duration) -> Verdict {
         let holds_from = self.fresh.map_or(self.armed, |fresh| fresh.after(self.patience(period)));
         if self.fresh.is_some() && now < holds_from {

@@ -1,20 +1,20 @@
-//! From targets, ten a second or so, to the commands between them, hundreds a second.
+//! From about ten targets a second to hundreds of commands a second between them.
 //!
-//! A target is reached on a straight line from the command in force at its arrival, in the time between two
-//! targets: then the next one is due. After that the target is held. The time between two targets is the
-//! shorter one of the last two: a pause is none, and who is slow is known by the second.
+//! The command moves on a straight line from its value at the arrival of a target to that target, within one target
+//! period: then the next target is due. After that the target is held. The period is the shorter of the last two
+//! intervals between targets: a pause does not lengthen it, and a slow publisher is recognised by its second target.
 //!
-//! Invariant: what is between two targets lies between them, on every axis.
+//! Invariant: a command between two targets lies between their values, on every axis.
 
 use std::time::Duration;
 
 use crate::time::Stamp;
 
-/// The time between two targets before there were two.
+/// The target period before there were two targets.
 pub const FIRST_PERIOD: Duration = Duration::from_millis(100);
-/// Targets that come quicker are reached in this time all the same.
+/// The shortest target period: faster targets are reached in this time too.
 const SHORTEST: Duration = Duration::from_millis(1);
-/// Targets farther apart than this had a pause between them, which does not count for their rate.
+/// A longer interval between targets is a pause and does not count for the period.
 const LONGEST: Duration = Duration::from_secs(1);
 
 /// See the module's comment.
@@ -31,8 +31,7 @@ pub struct Interpolator {
 }
 
 impl Interpolator {
-    /// For so many axes, all held at 0.
-    #[must_use]
+    /// For this many axes, all held at 0.
     pub fn new(axes: usize) -> Self {
         Self {
             from: vec![0.0; axes],
@@ -45,7 +44,7 @@ impl Interpolator {
         }
     }
 
-    /// Holds `command` from now on. The time between targets is known no more.
+    /// Holds `command` from now on and forgets the target period.
     pub fn restart(&mut self, command: &[f64]) {
         self.hold(command);
         self.tick = None;
@@ -61,7 +60,7 @@ impl Interpolator {
         self.takes = Duration::ZERO;
     }
 
-    /// Heads for `target`, the one of `tick`, from `command`, the one of `begin`.
+    /// Moves from `command`, in force at `begin`, towards `target`, the action of `tick`.
     pub fn head_for(&mut self, target: &[f64], tick: Stamp, command: &[f64], begin: Stamp) {
         if let Some(apart) = self.tick.map(|last| tick.since(last)).filter(|apart| *apart <= LONGEST) {
             let gap = apart.max(SHORTEST);
@@ -77,8 +76,7 @@ impl Interpolator {
         self.takes = self.period;
     }
 
-    /// What to command on an axis at `now`; 0 on one that is not there.
-    #[must_use]
+    /// The command of an axis at `now`; 0 for an axis that does not exist.
     pub fn at(&self, axis: usize, now: Stamp) -> f64 {
         let (Some(from), Some(to)) = (self.from.get(axis), self.to.get(axis)) else { return 0.0 };
         let passed = now.since(self.begin);
@@ -86,18 +84,16 @@ impl Interpolator {
             return *to;
         }
         let share = passed.as_secs_f64() / self.takes.as_secs_f64();
-        // Rounding must not carry it beyond an end.
+        // Rounding must not carry the command beyond an end.
         (from + (to - from) * share).clamp(from.min(*to), from.max(*to))
     }
 
-    /// The time between two targets: the shorter one of the last two, [`FIRST_PERIOD`] where there were fewer.
-    #[must_use]
+    /// The target period: the shorter of the last two intervals, [`FIRST_PERIOD`] with fewer.
     pub const fn period(&self) -> Duration {
         self.period
     }
 
     /// The tick of the newest target since the last restart.
-    #[must_use]
     pub const fn tick(&self) -> Option<Stamp> {
         self.tick
     }

@@ -5,36 +5,37 @@
 //! | Probing   | disabled, parameters are read  | Disarmed, when all have answered                 |
 //! | Disarmed  | disabled, positions stream     | Arming, when asked                               |
 //! | Arming    | read, cleared, enabled         | Holding, when all are enabled; Faulted, when not |
-//! | Following | go where actions say           | Holding, without a fresh action                  |
+//! | Following | follow actions                 | Holding, without a fresh action                  |
 //! | Holding   | stay                           | Following; Disabling, after a while              |
 //! | Disabling | ordered to turn off            | Disarmed, when all have confirmed it             |
 //! | Faulted   | ordered off, damped, or hold   | Arming, when asked; Disabling, when asked        |
 //! | Stopped   | ordered off by the caller      |                                                  |
 //!
-//! A cycle is: [`MotorBus::feed`] every frame that came, [`MotorBus::target`] the newest action,
-//! [`MotorBus::step`], and send what that gives. Who polls motors knows their positions without
-//! enabling them: that is what happens in all states but the last.
+//! A cycle: [`MotorBus::feed`] every received frame, [`MotorBus::target`] the newest action, [`MotorBus::step`], and
+//! send the frames it returns. Polled motors report their positions without being enabled, in every state but
+//! `Stopped`.
 //!
-//! Every arm reads the parameters again: a motor that lost its power has forgotten its mode and its time
-//! limit, by which it stops on its own when this program was killed.
+//! Every arm reads the parameters again: a motor that lost power has forgotten its mode and its time limit, after which
+//! it stops on its own when this program is killed.
 //!
-//! Invariant: no command before an arm was asked for, nor after a disarm or a stop until one is asked for again; after a
-//! fault none but to damp a joint or to keep it where it is.
-//! Invariant: one motor that is silent, faulty or hot stops all, each in its way ([`Stop`](crate::registry::Stop)): an
-//! arm must not continue without its elbow, nor fall because of it. None of them follows an action before the next arm.
-//! An emergency stop is a fault of no motor, with a way to stop of its own.
+//! Invariant: no command is sent before an arm is requested, nor after a disarm or a stop until the next request; after
+//! a fault only commands that damp a joint or hold its position.
+//! Invariant: one motor that is silent, faulty or hot stops all, each as configured ([`Stop`](crate::registry::Stop)):
+//! a robot arm must not continue without its elbow, nor fall because of it. No motor follows an action before the next
+//! arm. An emergency stop is a fault without a motor, with its own configured way to stop.
 //! Invariant: the first command is where the joint is. From there a commanded position changes by the
-//! slew limit at most, as softly as [`Ramp`] allows, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
-//! comes back. In MIT mode the stiffness asks for no more than the torque limit: the command comes towards the joint as
-//! fast as it may, and for the rest the stiffness is lowered.
-//! Invariant: cycles that stood still for longer than [`stalled_after`] end an arm: what happened to the motors meanwhile
-//! is not known.
-//! Invariant: the first action after an arm is near to where every joint is, or the arm is refused, or the action.
-//! Invariant: an action is followed only if its tick is after the arm, after those of all before it, and
-//! no older than the deadman allows.
-//! Invariant: a sample holds an answer of every motor, each newer than those of the sample before.
-//! Invariant: a motor that answers is in samples sooner or later, whatever befell the bus before its ranges
-//! were read, unless they cannot be used.
+//! slew limit at most, as softly as [`Ramp`] allows, and stays within the limits; for a joint beyond them it stays or
+//! comes back. In MIT mode the stiffness requests no more than the torque limit: the command moves towards the joint as
+//! fast as permitted, and the stiffness is lowered for the rest.
+//! Invariant: a pause between cycles longer than [`stalled_after`] ends an arm: what the motors did meanwhile is
+//! unknown.
+//! Invariant: the first action after an arm is near the position of every joint; otherwise the arm or the action is
+//! refused.
+//! Invariant: an action is followed only if its tick is after the arm, after the ticks of all earlier actions, and no
+//! older than the deadman allows.
+//! Invariant: a sample holds an answer of every motor, each newer than in the previous sample.
+//! Invariant: a motor that answers eventually appears in samples, whatever happened to the bus before its ranges were
+//! read, unless the ranges are unusable.
 
 mod brakes;
 mod due;
@@ -60,7 +61,7 @@ pub use returning::RETURN_SPEED;
 pub use words::Words;
 
 use super::can::CanFrame;
-use super::damiao::codec::{self, Order};
+use super::damiao::codec::{self, StateCommand};
 use super::damiao::parameter::Reply;
 use super::deadman::Deadman;
 use super::interpolate::Interpolator;
@@ -70,12 +71,12 @@ use crate::action::Trip;
 use crate::registry::DamiaoSpec;
 use crate::time::Stamp;
 
-/// Numbers a motor has in a sample: position rad, velocity rad/s, torque Nm, temperature of the
+/// Values per motor in a sample: position rad, velocity rad/s, torque Nm, temperature of the
 /// transistors °C, of the winding °C, and the code of its status.
 pub const SAMPLE_VALUES: usize = 6;
 /// A motor may leave the frames of this many cycles unanswered, however short the configured time.
 const SILENT_CYCLES: u32 = 3;
-/// A step that comes later than this many cycles moves no farther than after so many.
+/// A step that is later than this many cycles moves no farther than after this many.
 const LATE_CYCLES: u32 = 2;
 
 /// See the module's comment.
@@ -96,7 +97,7 @@ pub struct MotorBus {
     since: Stamp,
     reason: Reason,
     cycle: Duration,
-    /// The longest time that a brake takes to be released.
+    /// The longest release time of any brake.
     slowest_brake: Duration,
     silent_after: Duration,
     stalled_after: Duration,
@@ -108,9 +109,9 @@ pub struct MotorBus {
     clamped: Vec<Seldom>,
     /// The motor that another program commanded last, and when.
     other_master: Option<(usize, Stamp)>,
-    /// Joints outside their limits are being driven back into them, or are to be once they are armed.
+    /// Joints outside their limits are being driven back into them, or will be once they are armed.
     is_returning: bool,
-    /// The motor whose frames are sent first: where there is no room for all, each has its turn.
+    /// The motor whose frames are sent first; it rotates, so that a full queue does not always hit the same motor.
     first: usize,
     notices: Notices,
     counts: Counts,
@@ -134,8 +135,7 @@ pub struct Counts {
 }
 
 impl MotorBus {
-    /// All motors of an entry, of which nothing is known yet.
-    #[must_use]
+    /// All motors of an entry, in an unknown state.
     pub fn new(spec: &DamiaoSpec, now: Stamp) -> Self {
         let cycle = Duration::from_secs(1) / spec.hz.max(1);
         let axes = spec.motors.len();
@@ -170,32 +170,27 @@ impl MotorBus {
         }
     }
 
-    /// Where the bus stands.
-    #[must_use]
+    /// The state of the bus.
     pub const fn state(&self) -> BusState {
         self.state
     }
 
     /// Are all motors enabled?
-    #[must_use]
     pub const fn is_armed(&self) -> bool {
         matches!(self.state, BusState::Following | BusState::Holding)
     }
 
     /// Names of the motors, for [`Notice::words`].
-    #[must_use]
     pub fn names(&self) -> &[String] {
         &self.names
     }
 
     /// The command to each motor as of the last step, rad or rad/s. Means nothing unless armed.
-    #[must_use]
     pub fn commands(&self) -> &[f64] {
         &self.commands
     }
 
     /// What has happened so far.
-    #[must_use]
     pub fn counts(&self) -> Counts {
         let clamped = self.limits.iter().map(Limits::clamped).sum();
         Counts { clamped, lost_notices: self.notices.lost(), ..self.counts }
@@ -209,7 +204,7 @@ impl MotorBus {
     /// A frame came from the bus.
     pub fn feed(&mut self, frame: &CanFrame, now: Stamp) {
         if codec::data_of(frame).is_none() {
-            // A command of one or two numbers may be shorter.
+            // A command of one or two values may be shorter.
             let is_frame = !(frame.extended || frame.remote || frame.error);
             if let Some(motor) = self.motors.iter().position(|motor| is_frame && motor.is_commanded_by(frame)) {
                 self.received_master(motor, now);
@@ -230,7 +225,7 @@ impl MotorBus {
         } else {
             motor.take_feedback(frame, now, &mut self.notices)
         };
-        // At once: the next report of a motor must not cover it up.
+        // At once: the next report of a motor must not mask it.
         if self.state != BusState::Stopped
             && let Some(fault) = taken.err().or_else(|| self.judge(index))
         {
@@ -248,7 +243,7 @@ impl MotorBus {
         self.refusing = refusal;
         if let Some(refusal) = refusal {
             self.counts.refused += 1;
-            // Another reason is another beginning.
+            // Another reason begins a new spell.
             if self.refused.look(is_same, now) || self.refused.look(true, now) {
                 self.notices.notify(Notice::Refused(refusal));
             }
@@ -273,7 +268,7 @@ impl MotorBus {
                 *slot = clamped.value;
             }
         }
-        // The command in force is that of the last step: the line begins there, so that already the next step moves.
+        // The line begins at the last step, whose command is in force, so that the next step already moves.
         let begin = self.stepped.map_or(now, |last| last.max(now.before(self.cycle * LATE_CYCLES)));
         self.line.head_for(&self.targets, tick, &self.commands, begin);
         self.deadman.feed(tick.min(now));
@@ -286,12 +281,12 @@ impl MotorBus {
     }
 
     /// Enables all motors, after reading their parameters and clearing their faults. A notice reports
-    /// whether that went well. Changes nothing where they are enabled, or are being enabled.
+    /// whether that succeeded. Does nothing while they are enabled or being enabled.
     pub fn arm(&mut self, now: Stamp) {
         if matches!(self.state, BusState::Probing | BusState::Disarmed | BusState::Faulted(_) | BusState::Disabling) {
             let passed = self.stepped.map_or(Duration::ZERO, |last| now.since(last));
             if passed >= self.stalled_after {
-                // The order may be as old.
+                // The order may be that old too.
                 self.fail(Fault::Stalled { after: passed }, now);
                 return;
             }
@@ -302,7 +297,7 @@ impl MotorBus {
         }
     }
 
-    /// Stops all motors at an emergency stop, each in its way, until the next arm.
+    /// Stops all motors at an emergency stop, each as configured, until the next arm.
     pub fn emergency(&mut self, trip: Trip, now: Stamp) {
         self.stop_at_emergency(trip, now);
     }
@@ -322,24 +317,22 @@ impl MotorBus {
         }
     }
 
-    /// The frames that disable every motor, for any way out. Nothing else is sent after them; they may be
-    /// had again.
+    /// The frames that disable every motor, for every way to end. No other frame follows them; they may be taken again.
     pub fn stop_frames(&mut self) -> impl Iterator<Item = CanFrame> + '_ {
         self.state = BusState::Stopped;
         self.motors.iter_mut().map(|motor| {
             motor.stop();
-            Order::Disable.frame(motor.spec.slave)
+            StateCommand::Disable.frame(motor.spec.slave)
         })
     }
 
-    /// Names of the motors that were ordered to turn on, or reported that they are on, and have not reported since they
-    /// were ordered to turn off that they are off.
+    /// Names of the motors that may be on: ordered or reported to be on, and not reported off since the last disable.
     pub fn still_on(&self) -> impl Iterator<Item = &str> {
         self.motors.iter().filter(|motor| motor.may_be_on).map(|motor| motor.spec.name.as_str())
     }
 
-    /// Fills `out` with [`SAMPLE_VALUES`] numbers a motor, if every motor has answered since the last
-    /// sample, and returns when the first of them did. `None` too where `out` has another length.
+    /// Fills `out` with [`SAMPLE_VALUES`] values per motor if every motor has answered since the last sample, and
+    /// returns the time of the earliest answer. Also `None` if `out` has another length.
     pub fn sample(&mut self, out: &mut [f64]) -> Option<Stamp> {
         if out.len() != self.motors.len() * SAMPLE_VALUES || !self.motors.iter().all(|motor| motor.is_new) {
             return None;
@@ -360,8 +353,8 @@ impl MotorBus {
         Some(captured)
     }
 
-    /// One cycle: what is due is decided, and the frames of the cycle go to `send`, at most two a motor.
-    /// All frames that came are to be fed before.
+    /// One cycle: decides what is due and passes its frames to `send`, at most two per motor. Feed all received frames
+    /// first.
     pub fn step(&mut self, now: Stamp, mut send: impl FnMut(CanFrame)) {
         if self.state == BusState::Stopped {
             return;

@@ -1,8 +1,9 @@
 //! When a cycle of the control thread begins: on a grid, or early for a fresh action.
 //!
-//! Invariant: from one cycle to the next no more than 9/8 of the configured cycle passes, unless the thread was held up.
-//! Invariant: over any time, cycles are at most 5/4 as many as configured, and one more, however often actions come: the
-//! bus has room for them.
+//! Invariant: from one cycle to the next no more than 9/8 of the configured cycle passes, unless the thread was
+//! delayed.
+//! Invariant: over any time there is at most 5/4 of the configured number of cycles plus one, however often actions
+//! arrive: the bus has room for them.
 
 use std::time::Duration;
 
@@ -19,25 +20,22 @@ pub struct Pace {
 
 impl Pace {
     /// The first cycle is due one cycle after `now`.
-    #[must_use]
     pub fn new(cycle: Duration, now: Stamp) -> Self {
         Self { cycle, due: now.after(cycle), empty: now.after(cycle * 4 / 5) }
     }
 
-    /// When the next cycle begins at the latest.
-    #[must_use]
+    /// The latest time at which the next cycle begins.
     pub const fn due(&self) -> Stamp {
         self.due
     }
 
-    /// When the next cycle may begin at the earliest, for a fresh action.
-    #[must_use]
+    /// The earliest time at which the next cycle may begin, for a fresh action.
     pub fn earliest(&self) -> Stamp {
         self.empty.before(self.cycle / 2).min(self.due)
     }
 
-    /// A cycle began at `now`. On the grid, cycles that were missed are left out. After an early one the grid begins
-    /// again, an eighth of a cycle late: actions that come once a cycle find it waiting for them, not under way.
+    /// A cycle began at `now`. On the grid, missed cycles are skipped. After an early cycle the grid restarts an eighth
+    /// of a cycle later: actions once per cycle then find the thread waiting and not in a cycle.
     pub fn begin(&mut self, now: Stamp) {
         self.empty = self.empty.max(now).after(self.cycle * 4 / 5);
         if now < self.due {
@@ -100,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn actions_once_a_cycle_are_taken_as_they_come() {
+    fn actions_once_a_cycle_are_taken_on_arrival() {
         // 4.9 to 5.1 ms apart.
         let mut at = BEGIN;
         let actions: Vec<Stamp> = (0..1000_u64)
@@ -130,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn missed_cycles_are_left_out() {
+    fn missed_cycles_are_skipped() {
         let mut pace = Pace::new(CYCLE, BEGIN);
         pace.begin(BEGIN.after(CYCLE * 7 / 2));
         assert_eq!(pace.due(), BEGIN.after(CYCLE * 4));

@@ -1,8 +1,7 @@
 //! A commanded position that starts, speeds up and stops softly.
 //!
-//! Speed and acceleration are limited; the command brakes in time to stop at what is wanted, which therefore is never
-//! passed but by a target that turns round. After an arm the highest speed grows from 0 within the soft start. Jerk is not
-//! limited.
+//! Speed and acceleration are limited; the command brakes in time to stop at the target and overshoots it only if the
+//! target reverses. After an arm the maximum speed grows from 0 over the soft start. Jerk is not limited.
 //!
 //! Invariant: a command never changes faster than [`Limits`] allow, whatever the acceleration.
 
@@ -13,7 +12,7 @@ use super::limits::Limits;
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ramp {
-    /// rad/s²; infinite is none.
+    /// rad/s²; infinite means no limit.
     acceleration: f64,
     soft_start: Duration,
     /// How fast the command changes, rad/s.
@@ -24,18 +23,16 @@ pub struct Ramp {
 
 impl Ramp {
     /// With an acceleration in rad/s², above 0, and the time in which the highest speed is reached after a start.
-    #[must_use]
     pub const fn new(acceleration: f64, soft_start: Duration) -> Self {
         Self { acceleration, soft_start, speed: 0.0, moved: Duration::ZERO }
     }
 
-    /// It rests, and starts softly from here.
+    /// Rests, and starts softly from here.
     pub const fn restart(&mut self) {
         (self.speed, self.moved) = (0.0, Duration::ZERO);
     }
 
-    /// From the command before towards `wanted`, in the time that passed.
-    #[must_use]
+    /// Moves the previous command towards `wanted`, in the elapsed time.
     pub fn next(&self, limits: &Limits, before: f64, wanted: f64, passed: Duration) -> f64 {
         let seconds = passed.as_secs_f64();
         if passed.is_zero() || !(wanted.is_finite() && before.is_finite()) {
@@ -45,12 +42,13 @@ impl Ramp {
         let change = self.acceleration * seconds;
         let speed = (distance.abs() / seconds).min(self.stopping(distance.abs(), seconds)).copysign(distance);
         let speed = speed.clamp(self.speed - change, self.speed + change);
-        // What is in reach is reached without rounding.
+        // A target within reach is reached without rounding.
         let next = if (speed * seconds - distance).abs() < 1e-12 { wanted } else { before + speed * seconds };
         limits.slew(before, next, passed.mul_f64(self.share(passed)))
     }
 
-    /// The command changed so in the time that passed; `is_led`: by an action, of which there was one since the start.
+    /// Records a change of the command in the elapsed time; `is_led`: by an action, after the first one since the
+    /// start.
     pub fn took(&mut self, change: f64, passed: Duration, is_led: bool) {
         self.speed = if passed.is_zero() { 0.0 } else { change / passed.as_secs_f64() };
         if is_led && (change != 0.0 || !self.moved.is_zero()) {
@@ -58,13 +56,12 @@ impl Ramp {
         }
     }
 
-    /// Where the command can stop that is at `command`.
-    #[must_use]
+    /// Where a command at `command` can stop.
     pub fn stops_at(&self, command: f64) -> f64 {
         command + self.speed * self.speed.abs() / (2.0 * self.acceleration)
     }
 
-    /// The highest speed from which it stops within `distance`, in steps of so many seconds.
+    /// The highest speed from which the command stops within `distance`, in steps of this many seconds.
     fn stopping(&self, distance: f64, seconds: f64) -> f64 {
         if self.acceleration.is_infinite() {
             return f64::INFINITY;
@@ -73,7 +70,7 @@ impl Ramp {
         (half * half + 2.0 * self.acceleration * distance).sqrt() - half
     }
 
-    /// How much of the highest speed the soft start allows.
+    /// The share of the maximum speed that the soft start allows.
     fn share(&self, passed: Duration) -> f64 {
         let moved = self.moved.saturating_add(passed);
         if moved >= self.soft_start { 1.0 } else { moved.as_secs_f64() / self.soft_start.as_secs_f64() }
@@ -105,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn it_reaches_a_target_without_passing_it_and_rests_there() {
+    fn a_target_is_reached_without_overshoot_and_kept() {
         let limits = Limits::new(-2.0, 2.0, 4.0);
         let mut ramp = Ramp::new(40.0, Duration::ZERO);
         let commands = play(&mut ramp, &limits, 400, |_| 1.5);
@@ -146,7 +143,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn speed_and_acceleration_are_limited_whatever_is_wanted(
+        fn speed_and_acceleration_are_limited_whatever_the_target(
             wanted in prop::collection::vec((-3.0..3.0, 1_usize..60), 1..12), slew in 0.1..20.0, share in 1.0..200.0,
             soft in 0_u64..1500,
         ) {

@@ -9,7 +9,7 @@ use super::{block_on, check_writable, is_task, request};
 use crate::app::PolicyOptions;
 use crate::cli::{EvalArgs, Global, PolicyArgs, ReplayArgs, RunArgs, TaskArgs};
 use crate::commands::{self, Format};
-use crate::policy::bundle::Bundle;
+use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::horizon::WithoutMask;
 use crate::policy::live::LiveOptions;
 use crate::registry::Registry;
@@ -17,8 +17,13 @@ use crate::registry::Registry;
 /// The policy of a run, if one was requested.
 pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Result<Option<PolicyOptions>, Failure> {
     let Some(named) = args.infer else { return Ok(None) };
-    let bundle = Bundle::open(named.as_deref()).map_err(Failure::Bundle)?;
-    let unfit = |errors| if bundle.inside { Failure::OtherRig(errors) } else { Failure::Bundle(errors) };
+    let bundle = Bundle::open(named.as_deref()).map_err(Failure::argument)?;
+    let unfit = |errors: BundleErrors| {
+        let inside = "\nThe policy built into rapid is for the simulated task only: rapid --infer --sim task\n    fix: name the \
+                      folder of a policy that was trained on this rig: rapid --infer FOLDER (models/README.md describes \
+                      how to make one)";
+        Failure::argument(format_args!("{errors}{}", if bundle.inside { inside } else { "" }))
+    };
     bundle.check_registry(registry).map_err(unfit)?;
     let actuator = registry.actuator().map(|(device, action)| (device.name.as_str(), action.names.len()));
     // A dry run moves nothing, so it needs no actuator.
@@ -41,11 +46,11 @@ pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Res
 /// Records demonstrations of the simulated task.
 pub(super) fn demonstrate(global: &Global, args: &RunArgs, task: &TaskArgs, format: Format) -> Result<(), Failure> {
     if !is_task(global) {
-        return Err(Failure::Arguments(
+        return Err(Failure::argument(
             "--expert demonstrates the simulated task only: write --sim task --expert --record",
         ));
     }
-    check_writable(&args.out).map_err(Failure::Folder)?;
+    check_writable(&args.out).map_err(Failure::argument)?;
     let request = request(args, &Registry::task())?;
     let (seed, episodes) = (task.seed, task.episodes);
     interruptible(move |stop| commands::demonstrate::run(&request, seed, episodes, format, stop, &mut io::stdout()))
@@ -77,6 +82,6 @@ fn interruptible<E: Into<Failure> + Send + 'static>(
         });
         work.await
     })?
-    .map_err(|_| Failure::Panicked)?
+    .map_err(|_| Failure::panicked())?
     .map_err(Into::into)
 }

@@ -1,4 +1,4 @@
-//! Stands in for the drivers of a cargo feature that this program was built without: no value of it exists.
+//! Replaces the drivers of a cargo feature that this program was built without: no value of it exists.
 
 use std::convert::Infallible;
 use std::future::Pending;
@@ -9,8 +9,8 @@ use super::{Agreed, DriverError, Reading};
 use tokio::sync::mpsc;
 
 use crate::action::{ActionSource, ActuatorNotice, Order};
+use crate::device::DeviceNode;
 use crate::permission::Attended;
-use crate::registry::DeviceNode;
 
 /// Never opened.
 #[derive(Debug)]
@@ -20,7 +20,6 @@ pub struct Absent {
 }
 
 impl Absent {
-    #[must_use]
     pub const fn unlinked(_: &DeviceNode) -> Option<Pending<()>> {
         None
     }

@@ -1,4 +1,4 @@
-//! When each of several messages that came with one read of a serial line was complete.
+//! Completion times of several messages that arrived in one read of a serial line.
 //!
 //! Invariant: pure. Stamps increase, and none is later than the read unless the line is faster than USB at full speed.
 
@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use crate::time::Stamp;
 
-/// What a byte takes at full speed of USB, 12 Mbit/s (USB 2.0, section 7.1.11). The baud rate of a CDC-ACM device means
-/// nothing about its line.
+/// Transfer time of a byte at full speed of USB, 12 Mbit/s (USB 2.0, section 7.1.11). The baud rate of a CDC-ACM device
+/// says nothing about its line.
 const BYTE_TIME: Duration = Duration::from_nanos(667);
 
 /// When the message before the last `behind` bytes of a read at `arrived` was complete; later than `last`, the stamp of
-/// the message before it.
+/// the previous message.
 pub(super) fn completed(arrived: Stamp, behind: usize, last: Stamp) -> Stamp {
     let behind = BYTE_TIME.saturating_mul(u32::try_from(behind).unwrap_or(u32::MAX));
     arrived.before(behind).max(last.after(Duration::from_nanos(1)))
@@ -25,10 +25,10 @@ mod tests {
 
     proptest! {
         #[test]
-        fn messages_of_one_read_are_one_after_another(
+        fn messages_of_one_read_have_increasing_times(
             reads in proptest::collection::vec((1u64..50_000_000, proptest::collection::vec(1usize..100, 1..40)), 1..20),
         ) {
-            // As a line does: no byte comes faster than the line carries it.
+            // As on a real line: no byte arrives faster than the line carries it.
             let (mut arrived, mut last) = (Stamp(1_000_000_000), Stamp::default());
             for (pause, lengths) in reads {
                 let mut behind: usize = lengths.iter().sum();

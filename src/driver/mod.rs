@@ -1,11 +1,10 @@
-//! Drivers: the edge. Bytes in from a device's node.
+//! Drivers read bytes from a device's node: the edge of the program.
 //!
-//! A driver is an enum, not a trait object: its [`Reading`] lends bytes from the kernel's buffer
-//! until the next read.
+//! A driver is an enum, not a trait object: its [`Reading`] borrows bytes from the kernel's buffer until the next read.
 //!
 //! Invariant: `read` is cancel-safe: dropping its future loses no sample.
-//! Invariant: no driver blocks: what may block while opening runs on tokio's blocking pool.
-//! Invariant: no bytes from a device make a driver panic.
+//! Invariant: no driver blocks: blocking calls during opening run on tokio's blocking pool.
+//! Invariant: no bytes from a device can make a driver panic.
 
 #[cfg(not(all(feature = "lan", feature = "motors")))]
 mod absent;
@@ -27,11 +26,12 @@ use std::sync::Arc;
 use tokio::sync::mpsc;
 
 use crate::action::{ActionSource, ActuatorNotice, Order};
+use crate::device::DeviceNode;
 use crate::permission::Attended;
 use crate::provenance::Negotiated;
-use crate::registry::scenario::{SimDevice, SimSource};
-use crate::registry::{CanProtocol, DeviceNode, DeviceSpec, NodeSpec};
+use crate::registry::{CanProtocol, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
+use crate::simulation::{SimDevice, SimSource};
 use crate::status::Episode;
 use crate::time::Stamp;
 #[cfg(not(feature = "lan"))]
@@ -43,18 +43,18 @@ use can::{motors::Motors, raw::Raw as RawCan};
 #[cfg(feature = "lan")]
 use lan::Lan;
 
-/// One sample as the device gave it, borrowed until the next read.
+/// One sample as received from the device, borrowed until the next read.
 #[derive(Debug)]
 pub struct Reading<'a> {
     /// Payload.
     pub bytes: &'a [u8],
     /// How the payload is encoded.
     pub encoding: Encoding,
-    /// Capture time; from the kernel where it gives one, otherwise the moment of arrival.
+    /// Capture time: the kernel's if available, otherwise the moment of arrival.
     pub captured: Stamp,
     /// `sample::FLAG_*`.
     pub flags: u32,
-    /// Image: pixels; numbers: how many; otherwise 0.
+    /// Image: pixels; numbers: their count; otherwise 0.
     pub width: u32,
     /// Image: pixels, otherwise 0.
     pub height: u32,
@@ -62,7 +62,7 @@ pub struct Reading<'a> {
     pub lost: u64,
 }
 
-/// What was agreed with a device when it was opened.
+/// The settings agreed with a device when it was opened.
 #[derive(Debug, Clone, Default)]
 pub struct Agreed {
     /// For people.
@@ -71,19 +71,19 @@ pub struct Agreed {
     pub negotiated: Negotiated,
 }
 
-/// Why a device cannot be opened or read, by what to do next.
+/// Why a device cannot be opened or read, classified by the next step.
 #[derive(Debug, thiserror::Error)]
 pub enum DriverError {
-    /// The device is no longer there: wait for it to be attached again.
+    /// The device is no longer present: wait until it is attached again.
     #[error("unplugged")]
     Gone,
-    /// The adapter that leads to the device is there, and its link is down: wait for the link.
+    /// The adapter that leads to the device is present, but its link is down: wait for the link.
     #[error("the network link is down")]
     Unlinked,
-    /// Trying again later may help.
+    /// Retrying later may help.
     #[error("{0}")]
     Retry(String),
-    /// Trying again cannot help before something is changed; the text names it.
+    /// Retrying cannot help until something is changed; the text names it.
     #[error("{0}")]
     Fatal(String),
 }
@@ -107,7 +107,7 @@ pub enum Driver {
     Replay(Box<replay::Replay>),
 }
 
-/// The same expression for the driver of every kind.
+/// Applies one expression to the driver of any kind.
 macro_rules! each {
     ($self:ident, $driver:ident => $what:expr) => {
         match $self {
@@ -123,9 +123,8 @@ macro_rules! each {
 }
 
 impl Driver {
-    /// Is the link that leads to the device behind `node` down? If so, a future that ends when it is not: while a cable
-    /// is out, opening again and again leads nowhere.
-    #[must_use]
+    /// If the link to the device behind `node` is down, a future that ends when the link is up again: while a cable is
+    /// unplugged, repeated opening is useless.
     pub fn unlinked(spec: &DeviceSpec, node: &DeviceNode) -> Option<impl Future<Output = ()> + Send + use<>> {
         if matches!(spec.node, NodeSpec::Lan(_)) { Lan::unlinked(node) } else { None }
     }
@@ -160,7 +159,7 @@ impl Driver {
                 Ok(Self::Lan(Box::new(Lan::open(spec, settings, node).await?)))
             }
             (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
-            // The rig supervises programs itself: `process` only starts and ends them.
+            // The rig supervises programs; `process` only starts and ends them.
             (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
         }
     }
@@ -174,7 +173,7 @@ impl Driver {
         Ok(Self::Sim(Box::new(sim)))
     }
 
-    /// The next sample. Waits as long as the device sends nothing.
+    /// The next sample. Waits for as long as the device sends nothing.
     ///
     /// # Errors
     /// When the device is gone or cannot be read any more.
@@ -182,11 +181,11 @@ impl Driver {
         each!(self, driver => driver.read().await)
     }
 
-    /// Commands an actuator that does not follow actions itself ([`Self::attend`]): a target for each axis, in the order
-    /// and the units of its table of actions.
+    /// Commands an actuator that does not receive actions itself ([`Self::attend`]): a target for each axis, in the
+    /// order and units of its table of actions.
     ///
     /// # Errors
-    /// When the device takes no actions, or others.
+    /// When the device takes no actions, or different ones.
     pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         match self {
             Self::Motors(_) => Ok(()),
@@ -198,7 +197,7 @@ impl Driver {
     /// Lets an actuator move, or stops it. A device that needs no permission accepts the order and does nothing.
     ///
     /// # Errors
-    /// When it does not take orders now.
+    /// When it does not accept orders now.
     pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
         match self {
             Self::Motors(driver) => driver.order(order),
@@ -210,8 +209,8 @@ impl Driver {
         }
     }
 
-    /// Has it carry out these orders and actions from now on. Returns whether it takes them itself; otherwise they are to be
-    /// passed on to [`Self::order`] and [`Self::command`].
+    /// Makes it carry out these orders and actions from now on. Returns whether it receives them itself; otherwise the
+    /// caller passes them to [`Self::order`] and [`Self::command`].
     pub fn attend(&mut self, orders: &Arc<Attended>, actions: &Arc<dyn ActionSource>) -> bool {
         match self {
             Self::Motors(driver) => {
@@ -225,7 +224,7 @@ impl Driver {
         false
     }
 
-    /// What happens to an actuator, at the first call.
+    /// The events of an actuator; `Some` at the first call only.
     pub fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
         match self {
             Self::Motors(driver) => driver.notices(),
@@ -234,12 +233,12 @@ impl Driver {
         }
     }
 
-    /// Notifies a device that records by itself of the episode in progress, or with `None` that there is
-    /// none: when one begins or ends, and of one in progress when the device is opened. Returns at once:
-    /// what takes time is done by [`Self::read`] or a task of the driver's own.
+    /// Notifies a device that records by itself of the episode in progress, or with `None` that there is none: when one
+    /// begins or ends, and when the device is opened during one. Returns at once: [`Self::read`] or a task of the
+    /// driver's own does the slow work.
     ///
     /// # Errors
-    /// When the device cannot do it, for people; it is read on.
+    /// When the device cannot do it, for people; it is still read.
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
         match self {
             Self::Lan(driver) => driver.record(episode.map(|episode| episode.file.clone())),
@@ -251,8 +250,8 @@ impl Driver {
         }
     }
 
-    /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
-    /// up after a moment. A driver that is only dropped has been read to its end, or was given up.
+    /// Ends in order the device's own activities: the run ends, or the device was unplugged. Abandoned after a moment.
+    /// A driver that is only dropped was read to its end or abandoned.
     pub async fn close(self) {
         match self {
             Self::Motors(driver) => driver.close().await,
@@ -262,15 +261,13 @@ impl Driver {
         }
     }
 
-    /// What was agreed with the device: format, rate, driver, for people.
-    #[must_use]
+    /// The settings agreed with the device: format, rate, driver, for people.
     pub fn description(&self) -> String {
         each!(self, driver => driver.agreed.description.clone())
     }
 
-    /// What was agreed with the device, for the recording. Of the driver only what the open node
+    /// The settings agreed with the device, for the recording. Includes about the driver only what the open node
     /// reports: a serial line reports nothing.
-    #[must_use]
     pub fn negotiated(&self) -> Negotiated {
         each!(self, driver => driver.agreed.negotiated.clone())
     }
@@ -292,7 +289,7 @@ fn wrong_kind(spec: &DeviceSpec, requested: &str, node: &DeviceNode) -> DriverEr
     ))
 }
 
-/// Runs on tokio's blocking pool what may block while a device is opened.
+/// Runs a possibly blocking step of opening a device on tokio's blocking pool.
 async fn unblock<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, DriverError> + Send + 'static,
 ) -> Result<T, DriverError> {

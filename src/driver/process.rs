@@ -1,16 +1,15 @@
-//! The edge to child processes: starting one so that nothing of ours leaks into it and it does not
-//! outlive us, and ending all of it.
+//! Child processes: starts them so that no resources leak into them and they do not outlive this process, and ends
+//! whole process groups.
 //!
-//! A child leads a session and group of its own: a Ctrl-C in our terminal is not meant for it, and a
-//! signal reaches whatever it started itself. It inherits no descriptor but the standard ones: a
-//! camera's node held open by an unknowing child would keep the camera busy.
+//! A child leads a session and group of its own: a Ctrl-C in our terminal does not reach it, and a signal reaches
+//! everything it started. It inherits only the standard descriptors: a camera's node held open by an unknowing child
+//! would keep the camera busy.
 //!
 //! Invariant: no shell.
-//! Invariant: a group is signalled only before its leader is reaped, while no other process can have got
-//! its number.
-//! Invariant: when we end, however that comes, the kernel kills the children. Not what they have started in
-//! turn: that ends with them only where we are still there to end the group. A script whose last command is
-//! `exec PROGRAM` is that program.
+//! Invariant: a group is signalled only before its leader is reaped, while no other process can have got its number.
+//! Invariant: when this process ends, for any reason, the kernel kills the children. It does not kill their own
+//! children: these end only if this process is still there to end the group. A script whose last command is
+//! `exec PROGRAM` becomes that program.
 
 use std::ffi::OsString;
 use std::io;
@@ -30,22 +29,22 @@ use tokio::sync::oneshot;
 
 use super::DriverError;
 
-/// What is to be started.
+/// Specification of a process to start.
 #[derive(Debug, Clone)]
 pub struct Launch {
     /// The program.
     pub program: PathBuf,
     /// Its arguments.
     pub args: Vec<String>,
-    /// What is set in its environment, or with `None` is not to be there; the rest is ours.
+    /// Variables set in its environment or, with `None`, unset; the rest is inherited.
     pub env: Vec<(&'static str, Option<OsString>)>,
 }
 
-/// Starts children, on a thread of its own: the kernel kills a child when the *thread* that started
-/// it ends (prctl(2), `PR_SET_PDEATHSIG`), and tokio's threads come and go.
+/// Starts children on a thread of its own: the kernel kills a child when the *thread* that started it ends (prctl(2),
+/// `PR_SET_PDEATHSIG`), and tokio's threads come and go.
 #[derive(Debug, Clone)]
 pub struct Spawner {
-    /// `None` if the system gave no thread.
+    /// `None` if the thread could not be started.
     orders: Option<mpsc::Sender<Request>>,
 }
 
@@ -55,7 +54,7 @@ struct Request {
     reply: oneshot::Sender<io::Result<Started>>,
 }
 
-/// A child and its ends of the pipes, before tokio knows them.
+/// A child and our ends of its pipes, before tokio knows them.
 #[derive(Debug)]
 struct Started {
     leader: Leader,
@@ -67,12 +66,11 @@ struct Started {
 impl Spawner {
     /// Starts the thread, which ends with the last clone of this; children still running then are
     /// killed.
-    #[must_use]
     pub fn start() -> Self {
         let (orders, inbox) = mpsc::channel::<Request>();
         let serve = move || {
             for Request { launch, reply } in inbox {
-                // A program that is no longer waited for is killed when it is dropped.
+                // If the receiver is gone, dropping the child kills it.
                 let _ = reply.send(start(&launch));
             }
         };
@@ -81,9 +79,8 @@ impl Spawner {
     }
 
     /// Starts a child.
-    ///
     /// # Errors
-    /// When the program cannot be run, now or at all.
+    /// When the program cannot be run, temporarily or at all.
     pub async fn spawn(&self, launch: Launch) -> Result<Child, DriverError> {
         let program = launch.program.display().to_string();
         let (reply, answer) = oneshot::channel();
@@ -129,7 +126,7 @@ fn start(launch: &Launch) -> io::Result<Started> {
 fn prepare(parent: Pid) -> io::Result<()> {
     setsid()?;
     set_parent_process_death_signal(Some(Signal::KILL))?;
-    // We may have ended before the line above.
+    // This process may have ended before the line above.
     if getppid() != Some(parent) {
         return Err(io::Error::from_raw_os_error(libc::ESRCH));
     }
@@ -137,8 +134,8 @@ fn prepare(parent: Pid) -> io::Result<()> {
     Ok(())
 }
 
-/// What is open here is not to be open in the program that this process becomes, but for the standard descriptors. Between
-/// fork and exec it makes a system call and nothing else.
+/// Keeps descriptors open here from being open in the program that this process becomes, except the standard ones.
+/// Makes only a system call, as required between fork and exec.
 pub(super) fn leak_nothing() {
     // Libraries open descriptors without O_CLOEXEC. Linux 5.11; before that they are inherited.
     // SAFETY: closes nothing now and takes no pointers.
@@ -151,31 +148,30 @@ pub struct Child {
     leader: Leader,
     /// Readable once the leader has ended.
     pidfd: AsyncFd<OwnedFd>,
-    /// What it prints.
+    /// Its standard output.
     pub stdout: Receiver,
-    /// What it complains about.
+    /// Its standard error.
     pub stderr: Receiver,
 }
 
 impl Child {
     fn new(started: Started) -> io::Result<Self> {
         let Started { leader, pidfd, stdout, stderr } = started;
-        // SAFETY: the descriptor is owned by what is registered.
+        // SAFETY: the registered value owns the descriptor.
         let pidfd = unsafe { AsyncFd::register_with_interest(pidfd, Interest::READABLE)? };
         Ok(Self { leader, pidfd, stdout: Receiver::from_owned_fd(stdout)?, stderr: Receiver::from_owned_fd(stderr)? })
     }
 
     /// Its process id, which is also that of its group.
-    #[must_use]
     pub fn id(&self) -> u32 {
         self.leader.process.id()
     }
 
-    /// Waits for the leader's end; it stays to be reaped. Cancel-safe.
+    /// Waits for the leader's end without reaping it. Cancel-safe.
     pub async fn ended(&self) {
-        // The readiness is never cleared: once ended, always ended.
+        // The readiness is never cleared: a process ends only once.
         if self.pidfd.readable().await.is_err() {
-            // tokio is going down, and with it the waiting task.
+            // The tokio runtime is shutting down, and with it the waiting task.
             std::future::pending::<()>().await;
         }
     }
@@ -190,7 +186,7 @@ impl Child {
         self.leader.signal(Signal::KILL);
     }
 
-    /// Takes the exit status of an ended leader; what is left of its group is killed.
+    /// Takes the exit status of an ended leader, and kills the rest of its group.
     ///
     /// # Errors
     /// When it has not ended.
@@ -202,7 +198,7 @@ impl Child {
     }
 }
 
-/// The process that was started.
+/// The process that was started: the group's leader.
 #[derive(Debug)]
 struct Leader {
     process: std::process::Child,
@@ -215,7 +211,7 @@ impl Leader {
     }
 
     fn signal(&self, signal: Signal) {
-        // Who has ended needs no signal.
+        // An ended process needs no signal.
         if let (false, Ok(pid)) = (self.reaped, self.pid()) {
             let _ = kill_process_group(pid, signal);
         }
@@ -223,7 +219,7 @@ impl Leader {
 
     fn kill(&mut self) {
         self.signal(Signal::KILL);
-        // A process that even this does not end is left to the kernel.
+        // A process that survives even this is left to the kernel.
         self.reaped = matches!(self.process.try_wait(), Ok(Some(_)));
     }
 }

@@ -1,13 +1,11 @@
-//! Replay: a recorded episode as a scenario, its mask as plugs and unplugs, and one of its topics played as a device.
+//! Replay: a recorded episode as a scenario: its mask becomes plugs and unplugs, each topic a device.
 //!
-//! The file is read a batch of messages ahead on the blocking pool; each is due at its recorded
-//! distance from the scenario's beginning. When the messages are used up the device stays silent, as one that
-//! hangs does.
+//! The file is read one batch of messages ahead on the blocking pool; each message is due at its recorded offset from
+//! the scenario's beginning. When the messages are used up the device stays silent, like one that hangs.
 //!
-//! Invariant: the file is read from its beginning to its end, chunk by chunk, never held whole.
-//! Invariant: what lies in a damaged chunk is not played.
-//! Invariant: a damaged file ends the topic early or leaves out what is damaged; it never ends the
-//! program.
+//! Invariant: the file is read from start to end, chunk by chunk, and never held whole.
+//! Invariant: messages in a damaged chunk are not played.
+//! Invariant: a damaged file ends the topic early or omits the damaged part; it never ends the program.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -22,6 +20,7 @@ use tokio::time::Instant;
 
 use super::sim::stamp_of;
 use super::{Agreed, DriverError, Reading, unblock};
+use crate::device::{LanIdentity, UsbIdentity};
 use crate::episode::decode::{Content, Kind, Sample, Scratch};
 use crate::episode::reader::{Channel, Item, Reader};
 use crate::episode::record_iter::{FileEnd, MAGIC};
@@ -29,26 +28,25 @@ use crate::episode::{self, ReadAt, ReadError};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
-use crate::registry::scenario::{
-    Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice, SimFaults, SimSource,
-};
-use crate::registry::{DeviceSpec, LanIdentity, Registry, UsbIdentity};
+use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
+use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
+use crate::simulation::{SimDevice, SimFaults, SimSource};
 use crate::time::{Stamp, nanoseconds};
 
-/// Messages read at once: at 1 kHz this bridges the reading of a chunk.
+/// Messages per read: at 1 kHz this covers the reading of a chunk.
 const BATCH: usize = 32;
-/// Bytes of payload after which a batch is full, for large pictures.
+/// Payload bytes after which a batch is full, for large pictures.
 const BATCH_BYTES: usize = 8 << 20;
-/// How soon a pulled cable or a silence is noticed, at the latest.
+/// Upper limit for noticing a pulled cable or a silence.
 const NOTICE: Duration = Duration::from_millis(10);
-/// The first time a device is opened, what was recorded while it was being opened is still played.
+/// The first time a device is opened, samples recorded during its opening are still played.
 const OPENING: Duration = Duration::from_secs(2);
 
-/// Changes of the mask that are played: a device that flaps at 500 Hz, the rate of the mask, reaches
-/// them after half an hour.
+/// Maximum number of mask changes that are played: a device that flaps at 500 Hz, the rate of the mask, reaches it
+/// after half an hour.
 const MAX_CHANGES: usize = 1_000_000;
-/// A device is attached before its first sample, with which its bit begins: by this much.
+/// How long before its first sample, which sets its bit, a device is attached.
 const LEAD: Duration = Duration::from_millis(100);
 
 /// A topic being played.
@@ -56,7 +54,7 @@ const LEAD: Duration = Duration::from_millis(100);
 pub struct Replay {
     device: Arc<SimDevice>,
     playing: Vec<Message>,
-    /// The message of `playing` that is next.
+    /// Index of the next message of `playing`.
     next: usize,
     /// The batch after `playing`; `None` once the file is used up.
     reading: Option<JoinHandle<Batch>>,
@@ -66,7 +64,7 @@ pub struct Replay {
 
 #[derive(Debug)]
 struct Message {
-    /// Recorded capture time after the episode's beginning.
+    /// Recorded capture time relative to the episode's beginning.
     after: Duration,
     encoding: Encoding,
     width: u32,
@@ -75,7 +73,7 @@ struct Message {
 }
 
 impl Replay {
-    /// Begins to play the device's topic from the present moment of the scenario.
+    /// Starts playing the device's topic from the scenario's present moment.
     ///
     /// # Errors
     /// When the file cannot be read, has no such topic, or the topic holds no samples.
@@ -90,7 +88,7 @@ impl Replay {
         let description = format!("replay of {topic} in {}", file.display());
         let messages = unblock(move || play(&file, &topic, from_ns)).await?;
         let reading = Some(tokio::task::spawn_blocking(move || batch(messages, begin_ns, Vec::new())));
-        // For a recording of the replay the file takes the place of the device.
+        // In a recording of the replay the file represents the device.
         let version = Some(env!("CARGO_PKG_VERSION").to_owned());
         let driver = Some(KernelDriver { name: "rapid-replay".to_owned(), version });
         let negotiated = Negotiated { driver, bus: Some(description.clone()), ..Negotiated::default() };
@@ -104,7 +102,7 @@ impl Replay {
     /// [`DriverError::Gone`] once the cable is pulled.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         let captured = self.wait_due().await?;
-        // Nothing waits from here on: a future that is dropped has taken no sample.
+        // No await from here on: a future dropped earlier has taken no sample.
         self.device.sequence.fetch_add(1, Ordering::AcqRel);
         let Some(&Message { encoding, width, height, ref payload, .. }) = self.playing.get(self.next) else {
             return Err(DriverError::Gone);
@@ -129,7 +127,7 @@ impl Replay {
             if due > now_stamp {
                 tokio::time::sleep_until((now + due.since(now_stamp)).min(now + NOTICE)).await;
             } else if self.device.is_silent() {
-                // What a silent device would have sent now is not sent later.
+                // A sample due during a silence is skipped.
                 self.next += 1;
             } else {
                 return Ok(due);
@@ -137,17 +135,17 @@ impl Replay {
         }
     }
 
-    /// Takes the batch that was read meanwhile and has the next one read; gives up at `until`.
+    /// Switches to the prefetched batch and starts reading the next one; gives up at `until`.
     async fn turn_over(&mut self, until: Instant) {
         let Some(reading) = &mut self.reading else {
             // The file is used up.
             tokio::time::sleep_until(until).await;
             return;
         };
-        // Dropped here, the handle and the batch behind it stay.
+        // If dropped here, the handle and its batch remain.
         let Ok(read) = tokio::time::timeout_at(until, reading).await else { return };
         self.reading = None;
-        // It ends without a batch only when the runtime is going down.
+        // It ends without a batch only when the runtime is shutting down.
         let Ok(Batch { messages, rest }) = read else { return };
         let used = std::mem::replace(&mut self.playing, messages);
         self.next = 0;
@@ -156,15 +154,15 @@ impl Replay {
     }
 }
 
-/// Messages, and what is to be read after them; `None` at the end of the file.
+/// Messages, and the reader of the following ones; `None` at the end of the file.
 #[derive(Debug)]
 struct Batch {
     messages: Vec<Message>,
     rest: Option<Messages<File>>,
 }
 
-/// The next messages, in the memory of `used` ones; reads the file, on the blocking pool. The file's end or its first
-/// damage is the end.
+/// The next messages, reusing the memory of `used`; reads the file, on the blocking pool. Stops at the file's end or
+/// first damage.
 fn batch(mut recorded: Messages<File>, begin_ns: u64, used: Vec<Message>) -> Batch {
     let mut spare = used.into_iter().map(|message| message.payload);
     let (mut messages, mut bytes) = (Vec::with_capacity(BATCH), 0);
@@ -177,7 +175,7 @@ fn batch(mut recorded: Messages<File>, begin_ns: u64, used: Vec<Message>) -> Bat
                 return Batch { messages, rest: None };
             }
         }
-        // A message that cannot be read was not recorded by us; it has no sample to play.
+        // A message that cannot be read was not recorded by this program; it has no sample to play.
         let Some((log_time, sample)) = recorded.sample() else { continue };
         let mut payload = spare.next().unwrap_or_default();
         payload.clear();
@@ -200,7 +198,7 @@ impl From<ReadError> for DriverError {
     }
 }
 
-/// What an episode holds.
+/// Contents of an episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeDescription {
     /// Wall time of the first message, ns since 1970.
@@ -228,7 +226,7 @@ pub struct TopicDescription {
     pub messages: u64,
 }
 
-/// What is in `file`. Reads the whole of it, a chunk at a time; blocks.
+/// The contents of `file`. Reads the whole file, a chunk at a time; blocks.
 ///
 /// # Errors
 /// When the file cannot be read, or is damaged or was never closed.
@@ -243,7 +241,7 @@ pub fn describe(file: &Path) -> Result<EpisodeDescription, DriverError> {
     collected.description().map_err(|why| fatal(file, why))
 }
 
-/// Opens a file that ends as a finished one does.
+/// Opens a file that was properly closed.
 fn open(path: &Path) -> Result<Reader<File>, DriverError> {
     let (file, size) = episode::open(path)?;
     let not_mcap = || ReadError::NotMcap(path.to_owned());
@@ -263,7 +261,7 @@ fn open(path: &Path) -> Result<Reader<File>, DriverError> {
     Ok(Reader::new(file, size, path, None)?)
 }
 
-/// The messages of `topic` in the file at `path` from `from_ns` on.
+/// The messages of `topic` in the file at `path`, starting at `from_ns`.
 fn play(path: &Path, topic: &str, from_ns: u64) -> Result<Messages<File>, DriverError> {
     let mut messages = Messages::new(open(path)?, topic, from_ns);
     if messages.seek()? {
@@ -276,8 +274,7 @@ fn fix(path: &Path) -> String {
     format!("`rapid recover {}` makes it whole, `rapid inspect` reads what is there", path.display())
 }
 
-/// Reads `bytes`, which may be any, as replay reads a file: what they hold and every message that a
-/// device could play.
+/// Reads arbitrary `bytes` as replay reads a file: the description and every message that a device could play.
 pub fn read_bytes(bytes: &[u8]) {
     let reader = || Reader::new(bytes, bytes.len() as u64, Path::new("bytes.mcap"), None);
     let Ok(Ok(described)) = reader().and_then(Collected::read).map(Collected::description) else { return };
@@ -290,7 +287,7 @@ pub fn read_bytes(bytes: &[u8]) {
     }
 }
 
-/// What is gathered of the whole file.
+/// Data collected over the whole file.
 struct Collected<R> {
     reader: Reader<R>,
     /// Messages by channel.
@@ -337,7 +334,7 @@ impl<R: ReadAt> Collected<R> {
         let mut layout: Vec<_> =
             layout.into_iter().filter_map(|(name, bit)| Some((name, ModalityId::new(bit)?))).collect();
         layout.sort_by_key(|(_, id)| *id);
-        // Within a topic of ours times ascend; of another writer's file nothing is known.
+        // Within our own topics times ascend; other writers' files may differ.
         self.mask.sort_by_key(|(at, _)| *at);
         let (begin_ns, end_ns) = self.times.unwrap_or_default();
         let registry = self.reader.about("registry").unwrap_or_default().to_owned();
@@ -370,7 +367,7 @@ impl<R: ReadAt> Messages<R> {
         channel.topic == self.topic && matches!(channel.kind, Kind::Sample(_))
     }
 
-    /// Reads up to a channel of the topic that can be played; is there one?
+    /// Reads up to a channel of the topic that can be played; returns whether one exists.
     fn seek(&mut self) -> Result<bool, ReadError> {
         while self.reader.advance()? {
             if matches!(self.reader.item(), Item::Channel(channel) if self.is_playable(channel)) {
@@ -393,7 +390,7 @@ impl<R: ReadAt> Messages<R> {
         Ok(false)
     }
 
-    /// The message moved to, and its time; `None` if it cannot be read.
+    /// The current message and its time; `None` if it cannot be read.
     fn sample(&mut self) -> Option<(u64, Sample<'_>)> {
         let Item::Message(message) = self.reader.item() else { return None };
         let Some(Content::Sample(sample)) = message.content(&mut self.scratch) else { return None };
@@ -418,14 +415,13 @@ impl<R: ReadAt> Messages<R> {
 pub struct Replayed {
     /// The registry it was recorded with.
     pub registry: Registry,
-    /// Each modality is a device that plays its topic and is plugged and unplugged as the recorded
-    /// mask shows.
+    /// Each modality is a device that plays its topic and is plugged and unplugged according to the recorded mask.
     pub scenario: Scenario,
-    /// From its first message to its last.
+    /// Time from its first message to its last.
     pub length: Duration,
 }
 
-/// Makes devices of a recorded episode; blocks.
+/// Creates devices from a recorded episode; blocks.
 ///
 /// # Errors
 /// When the file cannot be read, or does not hold the registry and the layout.
@@ -470,13 +466,13 @@ fn plug_events(episode: &EpisodeDescription, name: &str, id: ModalityId) -> Vec<
     events
 }
 
-/// A device on the network is found by its entry.
+/// A device on the network is identified by its entry.
 fn lan_identity(spec: &DeviceSpec) -> Option<LanIdentity> {
     let found = || LanIdentity { entry: spec.name.clone(), address: String::from("replay"), instance: None };
     spec.identity.usb().is_none().then(found)
 }
 
-/// The identity of the entry; a port is made up where it names none.
+/// The identity of the entry; a port is invented if it has none.
 fn usb_identity(spec: &DeviceSpec) -> UsbIdentity {
     let identity = spec.identity.usb();
     UsbIdentity {

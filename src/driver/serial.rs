@@ -1,16 +1,15 @@
-//! Serial lines: bytes in, messages cut out of them, numbers read from each message.
+//! Serial lines: cuts the received bytes into messages and parses the numbers of each message.
 //!
-//! A message that is malformed (overlong, badly stuffed, wrong count, not numbers) is skipped and
-//! counted in `lost` of the next reading; it never ends the stream. What arrives before the first
-//! message boundary after opening is the tail of a message and dropped without being counted.
-//! `nan` and `inf` in a message are values like any other and are passed on as they are.
+//! A malformed message (overlong, badly stuffed, wrong count, not numbers) is skipped and counted in `lost` of the next
+//! reading; it never ends the stream. Bytes before the first message boundary after opening are the tail of a message
+//! and dropped without being counted. `nan` and `inf` are valid values and are passed on unchanged.
 //!
-//! Invariant: the messages depend on the bytes alone, not on how they were cut into reads.
-//! Invariant: memory is bounded by the longest permitted message, whatever the device sends; a longer one is never held.
-//! Invariant: nothing allocates for a message that is well formed.
-//! Invariant: a stamp is the moment the bytes that completed the message came into our hands; a
-//! serial line gives no earlier one. Of several messages in one read each is older than the next by the
-//! least time that its bytes take on a line (`arrival`): stamps always increase.
+//! Invariant: the messages depend only on the bytes, not on how reads divide them.
+//! Invariant: memory is bounded by the longest permitted message, whatever the device sends; longer ones are not held.
+//! Invariant: a well-formed message causes no allocation.
+//! Invariant: a stamp is the moment the bytes that completed the message were read; a serial line provides no earlier
+//! one. Each of several messages in one read is older than the next by the least time that its bytes take on a line
+//! (`arrival`): stamps always increase.
 
 use std::fmt;
 use std::os::fd::{FromRawFd as _, IntoRawFd as _, OwnedFd};
@@ -26,11 +25,11 @@ use crate::registry::{Framing, Parse, SerialSpec};
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
-/// Bytes taken from the kernel at once.
+/// Bytes read from the kernel at once.
 const INBOX: usize = 4096;
 /// Longest message of a text format without many channels.
 const SHORT_MESSAGE: usize = 4096;
-/// The longest a number in text may reasonably be, with its separator; JSON keys included.
+/// Maximum plausible length of a number in text with its separator, JSON keys included.
 const TEXT_PER_CHANNEL: usize = 64;
 
 /// An open serial line.
@@ -39,19 +38,19 @@ pub struct Serial {
     stream: SerialStream,
     decoder: Decoder,
     inbox: Box<[u8; INBOX]>,
-    /// `inbox[taken..filled]` is still to be looked at.
+    /// `inbox[taken..filled]` is unprocessed.
     taken: usize,
     filled: usize,
     /// When the bytes in `inbox` arrived.
     arrived: Stamp,
-    /// Of the last message.
+    /// Stamp of the last message.
     stamped: Stamp,
     lost: u64,
     pub(super) agreed: Agreed,
 }
 
 impl Serial {
-    /// Opens the line at `path` for ourselves alone. `max_bytes` bounds a raw message.
+    /// Opens the line at `path` exclusively. `max_bytes` bounds a raw message.
     ///
     /// Opening a USB serial adapter or CDC-ACM device raises DTR, which restarts some boards.
     ///
@@ -84,7 +83,7 @@ impl Serial {
     /// [`DriverError::Gone`] when the line hung up.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         while !self.decode() {
-            // A dropped future leaves the bytes either in the kernel or in the inbox.
+            // If the future is dropped, the bytes stay in the kernel or in the inbox.
             let count = self.stream.read(&mut self.inbox[..]).await.map_err(|error| read_error(&error))?;
             if count == 0 {
                 return Err(DriverError::Gone);
@@ -97,7 +96,7 @@ impl Serial {
         Ok(self.decoder.reading(self.stamped, lost))
     }
 
-    /// Takes bytes from the inbox until a good message is complete.
+    /// Takes bytes from the inbox until a valid message is complete.
     fn decode(&mut self) -> bool {
         while let Some(bytes) = self.inbox.get(self.taken..self.filled)
             && !bytes.is_empty()
@@ -114,19 +113,19 @@ impl Serial {
     }
 }
 
-/// From bytes to readings, without I/O.
+/// Converts bytes to readings, without I/O.
 #[derive(Debug)]
 struct Decoder {
     framer: Framer,
     parse: Parse,
     values: Vec<f64>,
     output: Vec<u8>,
-    /// `Framing::Fixed` only: the last message was refused, and bytes are being let go one by one
-    /// until a message fits again.
+    /// `Framing::Fixed` only: the last message was refused, and bytes are dropped one by one until a message fits
+    /// again.
     slipping: bool,
 }
 
-/// What came of feeding bytes.
+/// Result of feeding bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Decoded {
     /// More bytes are needed.
@@ -203,8 +202,7 @@ impl Decoder {
     }
 }
 
-/// What a line that delivers `pieces` one after another would be read as: the payloads, and how many
-/// messages were refused.
+/// Decodes a line that delivers `pieces` one after another: the payloads, and the number of refused messages.
 #[doc(hidden)]
 pub fn decode<'p>(
     spec: &SerialSpec,
@@ -229,17 +227,17 @@ pub fn decode<'p>(
 
 fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {
     let stream = SerialStream::open(&line(path, baud)?).map_err(|error| open_error(path, baud, &error))?;
-    // Whatever waited in the kernel is older than this opening.
+    // Bytes waiting in the kernel precede this opening.
     let _ = stream.clear(ClearBuffer::Input);
     Ok(stream)
 }
 
-/// The line at `path` for ourselves alone, 8 bits without parity, for who reads and writes it by itself.
-/// Neither waits.
+/// Opens the line at `path` exclusively, 8 bits without parity, for callers that read and write it themselves. Neither
+/// reads nor writes wait.
 pub(super) fn open_raw(path: &Path, baud: u32) -> Result<OwnedFd, DriverError> {
     let port = line(path, baud)?.open_native().map_err(|error| open_error(path, baud, &error))?;
     let _ = port.clear(ClearBuffer::All);
-    // SAFETY: the port gives its descriptor away and does not close it.
+    // SAFETY: the port hands over its descriptor and does not close it.
     let fd = unsafe { OwnedFd::from_raw_fd(port.into_raw_fd()) };
     rustix::fs::fcntl_setfl(&fd, rustix::fs::OFlags::NONBLOCK)
         .map_err(|error| DriverError::Retry(format!("{}: {error}", path.display())))?;
@@ -267,13 +265,13 @@ fn open_error(path: &Path, baud: u32, error: &tokio_serial::Error) -> DriverErro
             "{shown} may not be opened: add the user to group dialout (`sudo usermod -aG dialout $USER`, then log in \
              again) or install the udev rules (`rapid artifacts --install`)"
         )),
-        // ENODEV, ENXIO and EIO arrive without their number; whether the node is gone distinguishes them.
+        // ENODEV, ENXIO and EIO arrive without their number; check instead whether the node is gone.
         _ if !path.exists() => DriverError::Gone,
         _ => DriverError::Retry(format!("{shown} at {baud} baud: {error}")),
     }
 }
 
-/// EIO, ENODEV and ENXIO are what a line reports whose device is gone.
+/// A line whose device is gone reports EIO, ENODEV or ENXIO.
 fn read_error(error: &std::io::Error) -> DriverError {
     const GONE: [i32; 4] = [libc::EIO, libc::ENODEV, libc::ENXIO, libc::EBADF];
     match error.raw_os_error() {
@@ -282,7 +280,7 @@ fn read_error(error: &std::io::Error) -> DriverError {
     }
 }
 
-/// Reads exactly `values.len()` numbers from `message`; false if it holds anything else.
+/// Parses exactly `values.len()` numbers from `message`; false if it contains anything else.
 fn numbers(parse: Parse, message: &[u8], values: &mut [f64]) -> bool {
     match parse {
         Parse::Csv => csv(message, values),
@@ -301,7 +299,7 @@ fn csv(message: &[u8], values: &mut [f64]) -> bool {
     fields.next().is_none()
 }
 
-/// A number in decimal notation with blanks around it; `nan`, `inf` and `-inf` included.
+/// A decimal number, optionally surrounded by blanks; `nan`, `inf` and `-inf` included.
 fn decimal(field: &[u8]) -> Option<f64> {
     std::str::from_utf8(field.trim_ascii()).ok()?.parse().ok()
 }
@@ -340,8 +338,8 @@ impl Sink<'_> {
     }
 }
 
-/// An array of numbers, or an object whose numeric values count in the order they stand in; its
-/// other values (names, units, nested objects) are passed over.
+/// An array of numbers, or an object whose numeric values are taken in order; its other values (names, units, nested
+/// objects) are skipped.
 struct Document<'a, 'b>(&'a mut Sink<'b>);
 
 impl<'de> Visitor<'de> for Document<'_, '_> {
@@ -426,7 +424,7 @@ impl<'de> Visitor<'de> for Element {
     }
 }
 
-/// What feeding bytes led to.
+/// Result of feeding bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Cut {
     /// The message is not complete.
@@ -445,7 +443,7 @@ struct Framer {
     message: Vec<u8>,
     /// A boundary was seen since the beginning.
     aligned: bool,
-    /// The message so far is longer than the limit; its bytes are let go up to the boundary.
+    /// The message so far is longer than the limit; bytes are dropped up to the boundary.
     overlong: bool,
     /// The message was handed out: the next byte begins a new one.
     complete: bool,
@@ -453,19 +451,19 @@ struct Framer {
 
 impl Framer {
     fn new(framing: Framing, limit: usize) -> Self {
-        // COBS adds one byte to each 254 and one more; a line may end in a carriage return.
+        // COBS adds one byte per 254 and one more; a line may end in a carriage return.
         let limit = match framing {
             Framing::Line => limit.saturating_add(1),
             Framing::Cobs => limit.saturating_add(limit / 254 + 1),
             Framing::Fixed(length) => length.max(1),
         };
-        // Raw messages may be permitted to be large; what they need is reserved as they come.
+        // Raw messages may be large; memory for them is reserved as they arrive.
         let message = Vec::with_capacity(limit.min(1 << 16));
         let aligned = matches!(framing, Framing::Fixed(_));
         Self { framing, limit, message, aligned, overlong: false, complete: false }
     }
 
-    /// Consumes bytes up to the end of a message, and returns how many.
+    /// Consumes bytes up to the end of a message, and returns their number.
     fn feed(&mut self, bytes: &[u8]) -> (usize, Cut) {
         if std::mem::take(&mut self.complete) {
             self.message.clear();
@@ -488,9 +486,8 @@ impl Framer {
         &self.message
     }
 
-    /// Lets the first byte of a complete message go and keeps the rest as the beginning of the next:
-    /// how messages of fixed length find their boundary again. `false` for other framings, which
-    /// have boundaries of their own.
+    /// Drops the first byte of a complete message and keeps the rest as the start of the next: this is how messages of
+    /// fixed length find their boundary again. `false` for other framings, which have explicit boundaries.
     fn slip(&mut self) -> bool {
         if !matches!(self.framing, Framing::Fixed(_)) || self.message.is_empty() {
             return false;
@@ -527,7 +524,7 @@ impl Framer {
         self.message.extend_from_slice(bytes);
     }
 
-    /// At a boundary. An empty message is none: senders repeat boundaries to be sure of one.
+    /// At a boundary. An empty message is ignored: senders repeat boundaries for safety.
     fn finish(&mut self) -> Cut {
         let aligned = std::mem::replace(&mut self.aligned, true);
         let overlong = std::mem::take(&mut self.overlong);
@@ -551,9 +548,9 @@ impl Framer {
     }
 }
 
-/// Undoes consistent overhead byte stuffing in place (Cheshire and Baker, 1999): a code byte `n` is
-/// followed by `n - 1` bytes and stands for a zero after them, except where `n` is 255 or the
-/// message ends. `message` holds no zero. False if a code points beyond the end.
+/// Undoes consistent overhead byte stuffing in place (Cheshire and Baker, 1999): a code byte `n` is followed by `n - 1`
+/// bytes and stands for a zero after them, except where `n` is 255 or the message ends. `message` contains no zero.
+/// False if a code points beyond the end.
 fn unstuff(message: &mut Vec<u8>) -> bool {
     let (mut read, mut written) = (0, 0);
     while let Some(&code) = message.get(read) {
@@ -566,7 +563,7 @@ fn unstuff(message: &mut Vec<u8>) -> bool {
         written += run;
         read = to;
         if code != u8::MAX && read < message.len() {
-            // `written` is below `read`: the code byte made room.
+            // `written` is below `read`: the code byte left space.
             message[written] = 0;
             written += 1;
         }

@@ -1,14 +1,13 @@
-//! Simulated devices: what a scenario plugs in.
+//! Simulated devices, plugged in by a scenario.
 //!
-//! Samples lie on an absolute grid in time that begins with the scenario, so nothing drifts, and
-//! their bytes are a function of seed and sequence, so a test knows what a recording must hold.
-//! Time is tokio's: under a paused clock a scenario runs as fast as it is read.
+//! Samples lie on an absolute time grid that starts with the scenario, so nothing drifts. Their bytes are a function of
+//! seed and sequence, so a test knows the expected recording. Time is tokio's: under a paused clock a scenario runs as
+//! fast as it is read.
 //!
 //! Invariant: the sequence continues over a replug; skipped numbers are counted in `lost`.
 
 mod joints;
 mod pictures;
-pub mod task;
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -30,17 +29,18 @@ use crate::driver::can::{
 };
 use crate::modality::ModalityKind;
 use crate::provenance::{Format, Negotiated};
-use crate::registry::scenario::{self, SimDevice, SimSource, TaskPart};
 use crate::registry::{CAN_RECORD, DeviceSpec, MOTOR_CHANNELS, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
+use crate::simulation::task::{self, PictureError, SharedTrial};
+use crate::simulation::{self, SimDevice, SimSource, TaskPart};
 use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
 
-/// Pictures a camera keeps for a reader that is late, as many as the real driver has buffers.
+/// Pictures a camera keeps for a late reader, as many as the real driver has buffers.
 const CAMERA_BACKLOG: u64 = 4;
-/// Time a serial line keeps for a reader that is late: the kernel's buffer outlasts this.
+/// Time that a serial line buffers for a late reader: the kernel's buffer lasts longer than this.
 const SERIAL_BACKLOG: Duration = Duration::from_secs(1);
-/// How soon a pulled cable or a silence is noticed, at the latest.
+/// Upper limit for noticing a pulled cable or a silence.
 const NOTICE: Duration = Duration::from_millis(10);
 
 /// A running simulated device.
@@ -53,13 +53,13 @@ pub struct Sim {
     next: u64,
     backlog: u64,
     payload: Vec<u8>,
-    /// Losses not reported yet.
+    /// Losses not yet reported.
     owed: u64,
-    /// The sample in `payload` is to be sent once more, with this stamp.
+    /// The sample in `payload` must be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
     pub(super) agreed: Agreed,
-    /// Its motors, if it has some.
+    /// Its motors, if any.
     pub(super) joints: Joints,
     /// It was ordered to record.
     records: bool,
@@ -70,7 +70,13 @@ enum Content {
     Pictures(Pictures),
     Values { channels: usize, seed: u64 },
     Records { records: Records, seed: u64 },
-    Task { part: TaskPart, trial: task::Shared },
+    Task { part: TaskPart, trial: SharedTrial },
+}
+
+impl From<PictureError> for DriverError {
+    fn from(error: PictureError) -> Self {
+        Self::Fatal(error.to_string())
+    }
 }
 
 impl Sim {
@@ -88,8 +94,8 @@ impl Sim {
             SimSource::Serial { channels, hz, seed } => {
                 (Content::Values { channels, seed }, hz, SERIAL_BACKLOG.as_secs() * u64::from(hz.max(1)))
             }
-            SimSource::Task { part, ref scene } => {
-                let content = Content::Task { part, trial: task::Shared::of(scene)? };
+            SimSource::Task { part, ref trial } => {
+                let content = Content::Task { part, trial: trial.clone() };
                 (content, task::STEP_HZ, CAMERA_BACKLOG)
             }
             SimSource::Process | SimSource::Replay { .. } => {
@@ -121,8 +127,8 @@ impl Sim {
         })
     }
 
-    /// As `spec` has it. With the controls that it sets: a simulated camera has those and no others. With its
-    /// motors, which are at their targets. With bytes where it sends those.
+    /// Configures the device as in `spec`: with the controls that it sets, and no others, for a simulated camera; with
+    /// its motors, at their targets; with bytes if it sends those.
     #[must_use]
     pub(super) fn with_node(mut self, spec: &NodeSpec) -> Self {
         if let (Some(records), Content::Values { seed, .. }) = (Records::of(spec), &self.content) {
@@ -139,16 +145,16 @@ impl Sim {
         self
     }
 
-    /// Sets the action of the arm of the simulated task: as many numbers as it has axes.
+    /// Sets the action of the arm of the simulated task: one number per axis.
     ///
     /// # Errors
-    /// When the device is no actuator, or takes another count of numbers.
+    /// When the device is no actuator, or takes another number of values.
     pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         if self.joints.command(target) {
             return Ok(());
         }
         match (&self.content, target.try_into()) {
-            (Content::Task { part: TaskPart::Arm, trial }, Ok(target)) => trial.trial().command(target),
+            (Content::Task { part: TaskPart::Arm, trial }, Ok(target)) => trial.lock().command(target),
             (Content::Task { part: TaskPart::Arm, .. }, Err(_)) => {
                 let text = format!("{} takes {} numbers, not {}", self.device.name, task::AXES, target.len());
                 return Err(DriverError::Retry(text));
@@ -158,7 +164,7 @@ impl Sim {
         Ok(())
     }
 
-    /// Orders the device to record, or to stop recording.
+    /// Orders the device to start or stop recording.
     pub(super) fn record(&mut self, record: bool) {
         if self.records != record {
             self.records = record;
@@ -166,7 +172,7 @@ impl Sim {
         }
     }
 
-    /// Ends its recording, and takes as long as the scenario states.
+    /// Ends its recording, which takes as long as the scenario states.
     pub(super) async fn close(mut self) {
         self.record(false);
         tokio::time::sleep(self.device.faults.close).await;
@@ -190,7 +196,7 @@ impl Sim {
             self.next += 1;
             self.owed += 1;
         }
-        // Nothing waits from here on: a future that is dropped has taken no sample.
+        // No await from here on: a future dropped earlier has taken no sample.
         let (lost, point) = (std::mem::take(&mut self.owed), self.next);
         let skipped = u32::try_from(lost).unwrap_or(u32::MAX);
         let sequence = self.device.sequence.fetch_add(skipped.wrapping_add(1), Ordering::AcqRel).wrapping_add(skipped);
@@ -209,7 +215,7 @@ impl Sim {
                 }
                 Content::Records { records, seed } => records.write(*seed, sequence, captured, &mut self.payload),
                 Content::Task { part, trial } => {
-                    let mut trial = trial.trial();
+                    let mut trial = trial.lock();
                     trial.advance_to(u32::try_from(point).unwrap_or(u32::MAX));
                     trial.sample(*part, &mut self.payload)?;
                 }
@@ -224,7 +230,7 @@ impl Sim {
         Ok(self.reading(captured, lost))
     }
 
-    /// What is in `payload`.
+    /// The reading for the sample in `payload`.
     fn reading(&self, captured: Stamp, lost: u64) -> Reading<'_> {
         let (encoding, width, height) = match &self.content {
             Content::Pictures(pictures) => (Encoding::Mjpeg, pictures.width, pictures.height),
@@ -235,23 +241,23 @@ impl Sim {
         Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost }
     }
 
-    /// Waits until the next sample is due; returns how many the device had to drop before it because
-    /// they were not read.
+    /// Waits until the next sample is due; returns how many samples the device had to drop before it because they were
+    /// not read.
     async fn next_due(&mut self) -> Result<u64, DriverError> {
         loop {
-            // Before the look at the cable: what is stamped now was sent while it was plugged.
+            // Before the cable is checked: a sample stamped now was sent while plugged in.
             let now = Instant::now();
             if self.device.is_unplugged() {
                 return Err(DriverError::Gone);
             }
             if self.device.is_silent() {
-                // A silent device makes no samples: its sequence stands still, nothing is lost.
+                // A silent device produces no samples: its sequence stops and nothing is lost.
                 self.next = self.next.max(first_after(self.grid, stamp_of(now)));
                 tokio::time::sleep_until(now + NOTICE.min(self.grid.tick(1).since(self.grid.tick(0)))).await;
                 continue;
             }
             let due = self.grid.tick(self.next);
-            // A sample with a long latency becomes available that late.
+            // A sample with a long latency becomes available later by that time.
             let now_stamp = stamp_of(now).before(self.device.faults.delay);
             if due <= now_stamp {
                 let newest = first_after(self.grid, now_stamp).saturating_sub(1);
@@ -263,7 +269,7 @@ impl Sim {
         }
     }
 
-    /// What the device is.
+    /// A description of the device, for people.
     fn description(&self) -> String {
         match self.device.source {
             SimSource::Camera { width, height, fps, .. } => {
@@ -304,26 +310,26 @@ impl Sim {
             SimSource::Replay { .. } | SimSource::Process => None,
         };
         let bus = Some(format!("sim:{}", self.device.name));
-        Negotiated { driver: Some(scenario::driver()), card: None, bus, format, controls: self.controls.clone() }
+        Negotiated { driver: Some(simulation::driver()), card: None, bus, format, controls: self.controls.clone() }
     }
 }
 
-/// Identifier of every frame.
+/// Identifier of all simulated frames.
 #[cfg(feature = "motors")]
 const ID: u16 = 0x123;
 
-/// What a simulated device sends whose samples are bytes as they come: frames of a bus, packets, messages.
+/// Samples of a simulated device that sends raw bytes: frames of a bus, packets, messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Records {
-    /// One frame a sample, laid out as those of a real bus are.
+    /// One frame per sample, laid out like those of a real bus.
     #[cfg(feature = "motors")]
     Frames,
-    /// A packet, or a message.
+    /// One packet or message per sample.
     Packets,
 }
 
 impl Records {
-    /// What a device of this kind sends; `None` where it sends pictures or numbers.
+    /// The samples of a device of this kind; `None` if it sends pictures or numbers.
     fn of(node: &NodeSpec) -> Option<Self> {
         match node {
             _ if node.modality_kind() != ModalityKind::Bytes => None,
@@ -333,10 +339,10 @@ impl Records {
         }
     }
 
-    /// Number `sequence`, taken at `captured`: it begins with the number, or a frame's data does.
+    /// Writes sample `sequence`, captured at `captured`: the payload, or a frame's data, starts with the number.
     fn write(self, seed: u64, sequence: u32, captured: Stamp, payload: &mut Vec<u8>) {
         payload.clear();
-        // The lower half of the seed behind the number: little-endian, as all numbers here.
+        // The lower half of the seed follows the number: little-endian, as all numbers here.
         let data = (u64::from(sequence) | seed << 32).to_le_bytes();
         match self {
             #[cfg(feature = "motors")]
@@ -363,10 +369,10 @@ fn first_after(grid: Grid, now: Stamp) -> u64 {
     grid.ticks_before(Stamp(now.0.saturating_add(1)))
 }
 
-/// Does the scenario's device send what the registry declares?
+/// Checks that the scenario's device sends what the registry declares.
 ///
 /// # Errors
-/// When kind, picture size or number of channels differ: what follows is laid out by the registry.
+/// When kind, picture size or number of channels differ: later stages rely on the registry's layout.
 pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverError> {
     let (sends, requested) = match (&device.source, &spec.node) {
         (SimSource::Camera { width, height, .. }, NodeSpec::Camera(camera)) => {
@@ -389,7 +395,7 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             }
             (format!("{channels} numbers"), can.channels().to_string())
         }
-        // What stands for it sends as much as it likes.
+        // A simulated replacement may send any amount.
         (SimSource::Camera { .. } | SimSource::Serial { .. }, NodeSpec::Lan(_)) => return Ok(()),
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
         (SimSource::Camera { .. }, NodeSpec::Can(_)) => (String::from("pictures"), String::from("a CAN adapter")),
@@ -399,14 +405,13 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
         }
     };
     Err(DriverError::Fatal(format!(
-        "the scenario's device {} sends {sends}, [device.{}] says {requested}: make them equal",
+        "the scenario's device {} sends {sends}, [device.{}] declares {requested}: make them equal",
         device.name, spec.name
     )))
 }
 
 /// The bytes a simulated device sends as number `sequence`; `None` for a recording
 /// or a program.
-#[must_use]
 pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
     let mut payload = Vec::new();
     match *source {
@@ -436,8 +441,8 @@ fn write_values(channels: usize, seed: u64, sequence: u32, payload: &mut Vec<u8>
     }
 }
 
-/// The stamp of a moment on tokio's clock. `std`'s `Instant` is `CLOCK_MONOTONIC` on Linux, so one
-/// offset holds for the whole process; with a paused clock, stamps stand still and leap with it.
+/// The stamp of a moment on tokio's clock. `std`'s `Instant` is `CLOCK_MONOTONIC` on Linux, so one offset holds for the
+/// whole process; with a paused clock, stamps stop and jump with it.
 pub(super) fn stamp_of(instant: Instant) -> Stamp {
     static ANCHOR: OnceLock<(std::time::Instant, Stamp)> = OnceLock::new();
     let (origin, stamp) = *ANCHOR.get_or_init(|| (std::time::Instant::now(), Stamp::now()));

@@ -1,4 +1,4 @@
-//! A chunk opened up: its records decompressed and held against their check value.
+//! Opening a chunk: its records are decompressed and compared with their check value.
 
 use std::io::Read;
 use std::ops::Range;
@@ -7,14 +7,14 @@ use super::op;
 use super::record_iter::MAX_RECORD;
 use super::wire::Fields;
 
-/// What stands before the records of a chunk.
+/// The header of a chunk, before its records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct ChunkHead {
     /// `log_time` of the first message and of the last.
     pub(super) times: (u64, u64),
     /// Bytes of its records.
     pub(super) size: u64,
-    /// Their check value; zero: there is none.
+    /// Their check value; zero means none.
     pub(super) crc: u32,
     pub(super) packing: Packing,
     /// Bytes of its records as they lie in the file.
@@ -53,7 +53,7 @@ impl ChunkHead {
     }
 }
 
-/// Where the records of a chunk are.
+/// The location of the records of a chunk.
 #[derive(Debug)]
 pub(super) struct Records {
     /// In the decompressed bytes; otherwise in the chunk itself.
@@ -62,22 +62,22 @@ pub(super) struct Records {
     pub(super) range: Range<usize>,
 }
 
-/// What a chunk's content is.
+/// The state of a chunk's content.
 pub(super) enum Opened {
     /// Its check value is right, or there is none.
     Right(Records),
-    /// It is not what was written.
+    /// It differs from what was written.
     Damaged,
-    /// It would decompress to more than what may still be decompressed.
+    /// It would decompress to more than the remaining budget.
     TooMuch,
 }
 
-/// What a record of a compressed chunk counts, bytes decompressed: it is shown and judged, however short it is. Samples
+/// The cost of a record of a compressed chunk, in decompressed bytes: every record is processed, however short. Samples
 /// of a 1 kHz sensor compress to six bytes and more.
 const RECORD: u64 = 400;
 
-/// Opens `content`, which begins with `head`. What has to be decompressed is in `unpacked` then and is taken off
-/// `budget`, bytes, with [`RECORD`] for each of its records.
+/// Opens `content`, which begins with `head`. Decompressed records go to `unpacked`; their bytes, and [`RECORD`] for
+/// each record, are subtracted from `budget`.
 pub(super) fn open(head: &ChunkHead, content: &[u8], unpacked: &mut Vec<u8>, budget: &mut u64) -> Opened {
     let packed = usize::try_from(head.bytes).ok().and_then(|begin| Some((begin, content.get(begin..)?)));
     let Some((begin, rest)) = packed else { return Opened::Damaged };
@@ -106,7 +106,7 @@ pub(super) fn open(head: &ChunkHead, content: &[u8], unpacked: &mut Vec<u8>, bud
     Opened::Right(Records { unpacked: true, range: 0..unpacked.len() })
 }
 
-/// Are `bytes` as they were written? A check value of zero means that there is none.
+/// Whether `bytes` match the check value. A check value of zero means that there is none.
 pub(crate) fn is_sound(bytes: &[u8], crc: u32) -> bool {
     crc == 0 || crc32fast::hash(bytes) == crc
 }
@@ -143,8 +143,7 @@ pub(super) fn may_begin(head: &ChunkHead, opcode: u8, begin: &[u8]) -> bool {
     }
 }
 
-/// Decompresses `packed` to exactly `size` bytes: memory is taken for what comes out, not for what
-/// is promised.
+/// Decompresses `packed` to exactly `size` bytes; memory grows with the actual output, not with the stated size.
 fn unpack(packing: Packing, packed: &[u8], size: u64, into: &mut Vec<u8>) -> Option<()> {
     let read = match packing {
         Packing::Zstd => zstd::stream::read::Decoder::new(packed).ok()?.take(size).read_to_end(into),

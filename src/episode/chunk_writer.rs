@@ -1,7 +1,7 @@
-//! The container of an episode as it is written: chunks of a bounded size, each of which begins with the record that
-//! names its episode and defines the channels.
+//! Writes the container of an episode: chunks of bounded size, each of which begins with the record that names its
+//! episode and defines the channels.
 //!
-//! Invariant: of a file whose episode is known every chunk can be read alone, whatever became of the others.
+//! Invariant: if the episode of a file is known, every chunk can be read without the others.
 //! Invariant: only whole chunks reach the sink.
 
 use std::collections::BTreeMap;
@@ -33,9 +33,9 @@ const MESSAGE: usize = 22;
 pub(crate) struct ChunkWriter<S: Write> {
     writer: Writer<NoSeek<BufWriter<S>>>,
     own: Option<Own>,
-    /// Bytes of records in the chunk that is open; none where none is.
+    /// Bytes of records in the open chunk, if there is one.
     open: u64,
-    /// Bytes that may still be spent on definitions in chunks; beyond them a chunk names the episode alone.
+    /// Remaining bytes for definitions in chunks; beyond them a chunk only names the episode.
     spare: u64,
 }
 
@@ -55,14 +55,14 @@ impl<S: Sink> ChunkWriter<S> {
         Ok(Self { writer, own: episode.map(Own::new), open: 0, spare: REPEATED.0 })
     }
 
-    /// Has every chunk from now on name `episode`, unless they do already or a channel is defined.
+    /// Makes every later chunk name `episode`, unless they already do or a channel is defined.
     pub(crate) fn belong(&mut self, episode: Option<EpisodeId>) {
         if self.own.is_none() && self.open == 0 {
             self.own = episode.map(Own::new);
         }
     }
 
-    /// Makes room for a record whose content has so many bytes.
+    /// Makes room for a record with this many bytes of content.
     fn room(&mut self, bytes: usize) -> Result<(), McapError> {
         if self.open > CHUNK_BYTES {
             self.flush()?;
@@ -142,7 +142,7 @@ impl<S: Sink> ChunkWriter<S> {
         self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata })
     }
 
-    /// Ends the chunk if it is not small: what is copied keeps the size of the chunks that it had.
+    /// Ends the chunk if it is not small: copied records keep the chunk sizes of the original.
     pub(crate) fn part(&mut self) -> Result<(), McapError> {
         if self.open > SMALL_BYTES { self.flush() } else { Ok(()) }
     }

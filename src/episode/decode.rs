@@ -1,10 +1,9 @@
 //! The content of recorded messages, which are protobuf: the inverse of [`encode`](super::encode).
 //!
-//! Every message is read once, by hand, just the fields that are used; what other programs write into the
-//! same schemas is read too.
+//! Every message is read once, by hand, only the fields in use; messages of other programs with the same schemas are
+//! read too.
 //!
-//! Invariant: any bytes may stand in a message; one that is not whole, or not of its schema, is `None`, never a
-//! panic.
+//! Invariant: any bytes are accepted; a message that is not whole, or not of its schema, is `None`, never a panic.
 //! Invariant: memory does not grow with what a message claims.
 
 use super::encode::EventText;
@@ -41,7 +40,7 @@ pub(crate) enum Content<'a> {
     Other,
 }
 
-/// A sample, as its device gave it.
+/// A sample, as sent by its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Sample<'a> {
     /// How `payload` is encoded.
@@ -66,7 +65,7 @@ pub(crate) struct FrameSlot {
     pub(crate) age_ns: i64,
 }
 
-/// Memory for content that does not lie in the message as it is needed; used again for every message.
+/// Memory for content that must be converted; reused for every message.
 #[derive(Debug, Default)]
 pub(crate) struct Scratch {
     payload: Vec<u8>,
@@ -86,7 +85,6 @@ pub(crate) fn content<'a>(kind: Kind, message: &'a [u8], scratch: &'a mut Scratc
 
 /// The payload of one message of the schema named so, with its width and height.
 #[doc(hidden)]
-#[must_use]
 pub fn decode(schema: &str, message: &[u8]) -> Option<(Vec<u8>, u32, u32)> {
     let mut scratch = Vec::new();
     let sample = sample(SampleSchema::named(schema)?, message, &mut scratch)?;
@@ -188,7 +186,7 @@ fn raw<'a>(message: &'a [u8], scratch: &'a mut Vec<u8>) -> Option<Sample<'a>> {
     Some(Sample { encoding, width, height, payload })
 }
 
-/// Of each line of `step` bytes the first `row`.
+/// The first `row` bytes of each line of `step` bytes.
 fn without_padding<'a>(data: &[u8], step: usize, row: usize, height: u32, into: &'a mut Vec<u8>) -> &'a [u8] {
     into.clear();
     for line in data.chunks(step).take(height as usize) {
@@ -197,8 +195,8 @@ fn without_padding<'a>(data: &[u8], step: usize, row: usize, height: u32, into: 
     into
 }
 
-/// Doubles lie in the message as the driver once gave them: little endian, packed one after another. Only those in
-/// several pieces are copied.
+/// The doubles of a message: little endian and packed, as the driver sent them. Only those in several pieces are
+/// copied.
 fn scalars<'a>(message: &'a [u8], into: &'a mut Vec<u8>) -> Option<Sample<'a>> {
     into.clear();
     let mut last: &[u8] = &[];
@@ -237,7 +235,7 @@ fn last_bytes(message: &[u8], requested: u64) -> Option<&[u8]> {
     Some(found)
 }
 
-/// Width and height in a JPEG's frame header (ITU-T T.81, B.2.2): any SOF marker but DHT, JPG, DAC.
+/// Width and height in a JPEG's frame header (ITU-T T.81, B.2.2): any SOF marker except DHT, JPG, DAC.
 fn jpeg_size(bytes: &[u8]) -> Option<(u32, u32)> {
     let mut rest = bytes.strip_prefix(&[0xff, 0xd8])?;
     loop {

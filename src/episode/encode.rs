@@ -1,4 +1,4 @@
-//! Messages as protobuf, written by hand into a buffer that is used again and again.
+//! Messages as protobuf, written by hand into a reused buffer.
 //!
 //! Wire format: <https://protobuf.dev/programming-guides/encoding/>. Fields at their default value
 //! are left out, as proto3 does.

@@ -1,11 +1,11 @@
-//! What a recorder writes behind a file that it called BAD because the disk or another program damaged it: the summary
-//! may be GOOD by then, and its name may be given back. What is damaged is unknown, so that this stands behind
+//! The mark that a recorder appends to a file that it called BAD because the disk or another program damaged it: the
+//! summary may be GOOD by then, and the file may get its name back. The damaged place is unknown, so the mark follows
 //! everything else and is found from the end of the file alone: the reason, its length and check value, [`MARK`].
 //!
-//! The program that damaged the file may write more behind that: it is looked for in the last [`SEARCHED`] bytes, unless
-//! the file ends as a whole one does.
+//! The program that damaged the file may append more: the mark is searched in the last [`SEARCHED`] bytes, unless the
+//! file ends like a whole one.
 //!
-//! Invariant: to every other reader these are bytes behind the end, which make no file whole.
+//! Invariant: other readers see only bytes after the end, which do not make a file whole.
 
 use std::io;
 
@@ -17,7 +17,7 @@ use super::wire::Fields;
 const MARK: [u8; 16] = *b"\0rapid/failed/1\n";
 /// Bytes of length and check value.
 const HEAD: usize = 8;
-/// Bytes at the end in which it is looked for: the program that damaged the file may have written more since.
+/// Bytes at the end that are searched: the program that damaged the file may have appended more.
 const SEARCHED: u64 = 1 << 20;
 /// Longest reason in bytes.
 const LONGEST: usize = 4096;
@@ -27,26 +27,26 @@ const LONGEST: usize = 4096;
 pub(crate) struct Failed {
     /// For people.
     pub(crate) why: String,
-    /// Bytes of the file before this.
+    /// Bytes of the file before the mark.
     pub(crate) at: u64,
 }
 
 impl Failed {
-    /// What is to be written behind the file.
+    /// The bytes to append to the file.
     pub(crate) fn mark(why: &str) -> Vec<u8> {
         let why = why.get(..why.floor_char_boundary(LONGEST)).unwrap_or_default().as_bytes();
         let length = u32::try_from(why.len()).unwrap_or_default();
         [why, &length.to_le_bytes(), &crc32fast::hash(why).to_le_bytes(), &MARK].concat()
     }
 
-    /// Reads it from the end of a file of `size` bytes, if it stands there; of several the last.
+    /// Reads the mark from the end of a file of `size` bytes, if present; the last of several.
     pub(crate) fn of(file: &(impl ReadAt + ?Sized), size: u64) -> io::Result<Option<Self>> {
         let mut end = Vec::new();
         let from = size.saturating_sub(SEARCHED);
         if !Source::new(file, size).read(from, size - from, &mut end)? || end.ends_with(&MAGIC) {
             return Ok(None);
         }
-        // A reason may contain the text of a mark, but nothing that is right as one.
+        // A reason may contain the text of a mark, but not a valid mark.
         let mut marks = end.windows(MARK.len()).enumerate().rev().filter(|(_, bytes)| *bytes == MARK);
         Ok(marks.find_map(|(mark, _)| Self::before(end.get(..mark)?, from)))
     }
@@ -67,22 +67,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_behind_it_hide_it_only_where_they_end_a_file() {
+    fn trailing_bytes_hide_the_mark_only_if_they_end_an_mcap_file() {
         let bytes = |behind: &[u8]| [&b"content"[..], &Failed::mark("another program cut it"), behind].concat();
         let found = |bytes: &[u8]| Failed::of(bytes, bytes.len() as u64).unwrap();
         for behind in [&b"\n"[..], b"a line\n", &[0; 300], &vec![7; 1 << 19]] {
             let found = found(&bytes(behind)).unwrap_or_else(|| panic!("{} bytes", behind.len()));
             assert_eq!((found.at, found.why.as_str()), (7, "another program cut it"), "{} bytes", behind.len());
         }
-        // Of several the last; a whole file with such a mark in one of its messages has not failed.
+        // The last of several counts; a whole file with such a mark in a message has not failed.
         assert_eq!(found(&bytes(&Failed::mark("the disk"))).unwrap().why, "the disk");
         assert_eq!(found(&bytes(b"\x89MCAP0\r\n")), None);
-        // What looks like a mark and is none hides none.
+        // An invalid mark hides no valid one.
         assert_eq!(found(&bytes(&MARK)).unwrap().why, "another program cut it");
     }
 
     #[test]
-    fn it_is_found_behind_whatever_is_there_and_nowhere_else() {
+    fn the_mark_is_found_after_any_content_and_nowhere_else() {
         let long = "ü".repeat(LONGEST);
         for before in [&b""[..], b"x", &[0; 9000]] {
             for why in ["", "another program cut it", &long] {

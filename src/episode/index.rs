@@ -1,5 +1,5 @@
-//! The summary at the end of a finished file, where its check value is right: where the chunks and the other
-//! records lie, and what the channels are.
+//! The index: the summary at the end of a finished file, if its check value is right. It has the places of the chunks
+//! and of other records, and the channels.
 
 use std::io;
 
@@ -11,7 +11,7 @@ use super::wire::Fields;
 
 /// The footer's record and the magic number behind it, bytes.
 pub(super) const TAIL: u64 = 9 + 20 + 8;
-/// Bytes of a summary: what lists two million chunks, 2 TB of an episode. Without one the chunks are searched for.
+/// Most bytes of a summary: enough for two million chunks, 2 TB of an episode. In longer ones the chunks are searched.
 const LARGEST: u64 = 256 << 20;
 /// Bytes read at once.
 const PIECE: u64 = 1 << 20;
@@ -44,7 +44,7 @@ pub(super) struct Index {
     pub(super) definitions: Vec<(u8, u64, u64)>,
 }
 
-/// Is the end of the file that of a finished one? Where its summary begins, and the check value of that.
+/// If the file ends like a finished one: where its summary begins, and the summary's check value.
 pub(super) fn footer<R: ReadAt>(source: &mut Source<R>) -> io::Result<Option<(u64, u32)>> {
     let Some(at) = source.size.checked_sub(TAIL).filter(|at| *at >= MAGIC.len() as u64) else { return Ok(None) };
     let mut fields = Fields(source.peek(at, 37)?);
@@ -56,7 +56,7 @@ pub(super) fn footer<R: ReadAt>(source: &mut Source<R>) -> io::Result<Option<(u6
 }
 
 impl Index {
-    /// Reads it, if there is one and it is right.
+    /// Reads the index, if there is a valid one.
     pub(super) fn read<R: ReadAt>(source: &mut Source<R>) -> io::Result<Option<Self>> {
         let Some((summary, crc)) = footer(source)? else { return Ok(None) };
         let end = source.size.saturating_sub(TAIL);
@@ -92,7 +92,7 @@ impl Index {
             }
             at = content + length;
             let place = match place {
-                // What stands before its sizes is as long as the chunk has channels.
+                // The part before its sizes grows with the number of channels.
                 Some((place, Place::Chunk { times, .. })) => {
                     let mut sizes = Fields(source.peek(at.saturating_sub(16), 16)?);
                     let (packed, size) = (sizes.u64().unwrap_or(0), sizes.u64().unwrap_or(0));

@@ -1,4 +1,4 @@
-//! How whole a file is: what reading it finds of the file itself.
+//! How intact a file is, as found while reading it.
 
 use super::own::EpisodeId;
 use super::wire::Fields;
@@ -10,20 +10,20 @@ use crate::text;
 pub enum FileEnd {
     /// With its footer: the recorder finished it.
     Finished,
-    /// Between two records: the recorder was ended before it could finish, or is still writing.
+    /// Between two records: the recorder was ended early, or is still writing.
     #[default]
     Unfinished,
     /// Within a record: the last write was cut in two.
     Torn,
-    /// At something that is no record; what follows it is unknown.
+    /// At something that is not a record; anything after it is unknown.
     Damaged,
 }
 
-/// What of a file is left out because it cannot be read, or because nothing proves it.
+/// Parts of a file that are left out because they cannot be read or proven.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 pub struct LeftOut {
-    /// Places at which the file could not be read. Reading continued behind them where anything right follows.
+    /// Places that could not be read. Reading continued after them with the next valid record.
     pub gaps: u64,
     /// Records larger than 256 MiB.
     pub oversized_records: u64,
@@ -31,11 +31,11 @@ pub struct LeftOut {
     pub swollen_chunks: u64,
     /// Definitions of channels and metadata beyond 8 MiB, channels beyond 4096, and metadata within a chunk.
     pub excess_records: u64,
-    /// Chunks that were there before.
+    /// Repeated chunks.
     pub repeated_chunks: u64,
-    /// Messages of right chunks whose channel nothing in the file defines.
+    /// Messages of valid chunks whose channel is not defined in the file.
     pub nameless_messages: u64,
-    /// Whole messages of a chunk that the end of the file cuts, which nothing proves.
+    /// Whole but unproven messages of a chunk cut by the end of the file.
     pub unproven_messages: u64,
     /// Bytes of that chunk.
     pub unproven_bytes: u64,
@@ -43,13 +43,12 @@ pub struct LeftOut {
     pub other_chunks: u64,
     /// Bytes before the beginning of the file: an archive's, or a mail's.
     pub bytes_before: u64,
-    /// Bytes behind the end of a finished file: they are another file's, or belong to none.
+    /// Bytes after the end of a finished file, of another file or of none.
     pub bytes_behind: u64,
 }
 
 impl LeftOut {
-    /// What it is and how much, for people, one part after the other; of `damaged_chunks` too.
-    #[must_use]
+    /// The parts with their amounts, for people; `damaged_chunks` included.
     pub fn sentences(&self, damaged_chunks: u64) -> Vec<String> {
         let Self { gaps, oversized_records, swollen_chunks, excess_records, repeated_chunks, .. } = *self;
         let Self { nameless_messages, other_chunks, bytes_before, bytes_behind, .. } = *self;
@@ -84,40 +83,40 @@ fn is(count: u64, what: &str) -> String {
     format!("{} {}", text::counted(count, what), if count == 1 { "is" } else { "are" })
 }
 
-/// How whole a file is, as far as it has been read.
+/// How intact a file is, as far as it has been read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct Integrity {
     /// How the file ends.
     pub(crate) end: FileEnd,
     /// Bytes understood.
     pub(crate) bytes: u64,
-    /// Chunks whose content is not what was written; nothing of them is shown.
+    /// Chunks with a wrong check value; nothing of them is shown.
     pub(crate) damaged_chunks: u64,
-    /// What else is left out.
+    /// Other parts left out.
     pub(crate) left_out: LeftOut,
-    /// Whole messages of a chunk that the end of the file cuts, shown although their check value is not there: the kernel
-    /// that was running when they were written still is, and has kept their order.
+    /// Whole messages of a chunk cut by the end of the file, shown without a check value: the kernel that was running
+    /// when they were written still runs, and has kept their order.
     pub(crate) ordered_messages: u64,
-    /// The file is whole: finished, nothing behind its end, every check value right, nothing left out.
+    /// The file is whole: finished, nothing after its end, every check value right, nothing left out.
     pub(crate) sound: bool,
-    /// It is sound, and every check value is there: none is zero, which the format has for "not computed".
+    /// It is whole, and no check value is zero, the format's value for "not computed".
     pub(crate) proven: bool,
     /// Which program wrote it.
     pub(crate) writer: Writer,
-    /// Its end states where its index lies.
+    /// Its end gives the place of its index.
     pub(crate) indexed: bool,
     /// The episode that its chunks name.
     pub(crate) episode: Option<EpisodeId>,
 }
 
 impl Integrity {
-    /// Of the `size` bytes of the file those that were not understood. What stands before it and behind it is not its own.
+    /// The bytes of `size` that were not understood, without foreign bytes before and after the file.
     pub(crate) fn unread(&self, size: u64) -> u64 {
         let LeftOut { bytes_before, bytes_behind, .. } = self.left_out;
         [self.bytes, bytes_before, bytes_behind].into_iter().fold(size, u64::saturating_sub)
     }
 
-    /// What of the file could not be read, for people; `None`: nothing.
+    /// The unreadable parts of the file, for people; `None` if there are none.
     #[cfg(feature = "policy")]
     pub(crate) fn damage(&self) -> Option<String> {
         let end = match self.end {
@@ -167,7 +166,7 @@ pub(super) fn writer(header: &[u8]) -> Writer {
     if library.starts_with(LIBRARY) {
         return Writer::Rapid;
     }
-    // A name that was overwritten with zeros is none.
+    // A name overwritten with zeros is not a name.
     let is_text = !profile.chars().chain(library.chars()).any(char::is_control);
     if is_text && !(profile.is_empty() && library.is_empty()) { Writer::Another } else { Writer::Unknown }
 }

@@ -1,9 +1,9 @@
 //! Episodes as files: MCAP, read record by record, whole or not.
 //!
-//! What reads an episode, to report on it, to repair it or to play it, reads it through a
-//! [`records::RecordIter`]; what only one of them needs is theirs.
+//! Report, repair and replay all read an episode through a `RecordIter`; code for only one of them lives
+//! there.
 //!
-//! Invariant: no bytes make anything here panic, and memory holds one record of a file at a time.
+//! Invariant: no bytes cause a panic here, and memory holds one record of a file at a time.
 
 mod chunk;
 pub(crate) mod chunk_writer;
@@ -87,13 +87,13 @@ pub enum ReadError {
     /// It is a folder, a pipe or a device.
     #[error("{}: not a file; name an episode, a file that ends in .mcap or .mcap.partial", .0.display())]
     NotFile(PathBuf),
-    /// It does not begin as an MCAP file does.
+    /// It does not begin like an MCAP file.
     #[error("{}: not an MCAP file", .0.display())]
     NotMcap(PathBuf),
 }
 
 /// Opens a file to be read, and its size in bytes. Pipes, devices and folders are refused without
-/// being opened: opening one may wait for ever, or do something.
+/// being opened: opening one may block forever or have side effects.
 pub(crate) fn open(path: &Path) -> Result<(File, u64), ReadError> {
     let io = |source| ReadError::Io { path: path.to_owned(), source };
     let not_file = || ReadError::NotFile(path.to_owned());
@@ -102,7 +102,7 @@ pub(crate) fn open(path: &Path) -> Result<(File, u64), ReadError> {
     }
     let flags = OFlags::NONBLOCK.bits().cast_signed();
     let file = File::options().read(true).custom_flags(flags).open(path).map_err(io)?;
-    // What has the name now may be another thing than what had it a moment ago.
+    // The name may mean something else than a moment ago.
     let metadata = file.metadata().map_err(io)?;
     if metadata.is_file() { Ok((file, metadata.len())) } else { Err(not_file()) }
 }

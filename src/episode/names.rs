@@ -1,11 +1,10 @@
-//! What the channels and schemas of a file are, wherever in it that stands.
+//! The channels and schemas of a file, wherever in it they are defined.
 //!
-//! A chunk need not repeat what an earlier one defined, and that one may be damaged: what is defined at another place,
-//! the summary or the record at the head of a chunk of ours, is shown in its stead, before the first message that needs
-//! it.
+//! A chunk need not repeat the definitions of an earlier one, which may be damaged: then the definition in the summary,
+//! or in the record at the head of one of our chunks, is shown instead, before the first message that needs it.
 //!
-//! Invariant: of definitions and metadata at most [`LARGEST`] bytes and [`MOST`] definitions are shown:
-//! their number is bounded. The rest is counted.
+//! Invariant: at most [`LARGEST`] bytes of definitions and metadata and at most [`MOST`] definitions are shown. The
+//! rest is counted.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -13,7 +12,7 @@ use super::op;
 use super::own::{EpisodeId, Owner, Owners};
 use super::wire::Fields;
 
-/// Bytes of definitions and metadata: many times what an episode of 64 devices has, which is replugged all day.
+/// Maximum bytes of definitions and metadata: many times those of an episode of 64 devices that are replugged all day.
 const LARGEST: usize = 8 << 20;
 /// Schemas and channels.
 const MOST: usize = 4096;
@@ -24,16 +23,16 @@ pub(super) struct Names {
     /// Check value of each definition shown or waiting, by opcode and number.
     known: BTreeMap<(u8, u16), u32>,
     waiting: VecDeque<(u8, Vec<u8>)>,
-    /// Of definitions and metadata shown or waiting.
+    /// Bytes of definitions and metadata shown or waiting.
     bytes: usize,
     /// Definitions and metadata that are not shown: too many, or not where such a record belongs.
     pub(super) excess: u64,
-    /// The episode that the file is, by its chunks, and by the metadata at its beginning.
+    /// The episode of the file, according to its chunks and to the metadata at its beginning.
     pub(super) owner: Owner,
     pub(super) named: Option<EpisodeId>,
-    /// Where the owner is looked for: the episodes of its chunks.
+    /// The episodes of its chunks, from which the owner is determined.
     pub(super) owners: Owners,
-    /// Messages not shown because their channel is not known, by its number.
+    /// Messages not shown because their channel is unknown, by channel number.
     pub(super) unknown: BTreeMap<u16, u64>,
 }
 
@@ -42,7 +41,7 @@ impl Names {
         Self { owner, ..Self::default() }
     }
 
-    /// Is this record to be shown? Definitions are remembered; a message of an unknown channel is counted.
+    /// Whether this record is shown. Definitions are remembered; a message of an unknown channel is counted.
     pub(super) fn admit(&mut self, opcode: u8, data: &[u8]) -> bool {
         if opcode == op::METADATA {
             return self.has_room(data);
@@ -51,7 +50,7 @@ impl Names {
         match opcode {
             op::SCHEMA | op::CHANNEL => {
                 let (crc, known) = (crc32fast::hash(data), self.known.get(&(opcode, id)));
-                // What was shown is not shown again; what contradicts it is.
+                // A definition is not shown twice, but one that contradicts it is.
                 if known == Some(&crc) || known.is_none() && self.is_full() || !self.has_room(data) {
                     return false;
                 }
@@ -66,7 +65,7 @@ impl Names {
         }
     }
 
-    /// Takes note of a definition or of metadata that are kept; `false`: no more may be.
+    /// Counts a definition or metadata record to be kept; `false` if the limit is reached.
     pub(super) fn has_room(&mut self, data: &[u8]) -> bool {
         let bytes = self.bytes.saturating_add(data.len());
         let has_room = bytes <= LARGEST;
@@ -81,19 +80,19 @@ impl Names {
         is_full
     }
 
-    /// Is the channel of this message known?
+    /// Whether the channel of this message is known.
     pub(super) fn knows(&self, message: &[u8]) -> bool {
         Fields(message).u16().is_some_and(|id| self.known.contains_key(&(op::CHANNEL, id)))
     }
 
-    /// Is this definition another one than that of the same number which is known?
+    /// Whether this definition differs from the known one of the same number.
     pub(super) fn contradicts(&self, opcode: u8, data: &[u8]) -> bool {
         let id = Fields(data).u16();
         let known = id.and_then(|id| self.known.get(&(opcode, id)));
         known.is_some_and(|crc| *crc != crc32fast::hash(data))
     }
 
-    /// Has a definition wait to be shown, if its number is new.
+    /// Queues a definition to be shown, if its number is new.
     pub(super) fn wait(&mut self, opcode: u8, data: &[u8]) {
         let Some(id) = Fields(data).u16().filter(|_| matches!(opcode, op::SCHEMA | op::CHANNEL)) else { return };
         let bytes = self.bytes.saturating_add(data.len());
@@ -104,7 +103,7 @@ impl Names {
         }
     }
 
-    /// The next definition that waits.
+    /// The next queued definition.
     pub(super) fn next(&mut self) -> Option<(u8, Vec<u8>)> {
         self.waiting.pop_front()
     }

@@ -1,15 +1,14 @@
-//! The record that begins every chunk of an episode of ours: which episode the chunk belongs to, and what its channels
-//! are.
+//! The record that begins every chunk of our episodes: it names the episode and defines the channels.
 //!
-//! A chunk need not repeat what an earlier one defines, and that one may be damaged; nor does MCAP record which file a
-//! chunk belongs to, and one that is found behind damage may be the payload of a message. The chunk's check value covers
-//! this record, so both are known wherever the chunk is right.
+//! A chunk need not repeat the definitions of an earlier one, which may be damaged. Nor does MCAP record which file a
+//! chunk belongs to, and a chunk found after damage may be the payload of a message. The check value of the chunk
+//! covers this record, so both are known wherever the chunk is valid.
 //!
-//! Layout: private opcode [`op::OWN`], which other readers pass over; its content is [`MARK`], 16 bytes of the episode,
+//! Layout: private opcode [`op::OWN`], which other readers skip; its content is [`MARK`], 16 bytes of the episode,
 //! then schema and channel records with their heads, each schema before the channels that need it.
 //!
-//! Which episode a file is follows from its metadata `rapid`, or from its first chunk, if everything before that is right.
-//! Otherwise from all of its right chunks, see [`Owners`].
+//! The episode of a file follows from its metadata `rapid`, or from its first chunk if everything before that is valid.
+//! Otherwise it follows from all valid chunks, see [`Owners`].
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -24,16 +23,16 @@ use super::{ABOUT, BOOT_ID};
 
 /// Distinguishes the record from another program's of the same opcode.
 const MARK: [u8; 8] = *b"rapid/1\n";
-/// Bytes of definitions that are repeated in every chunk; no more, or a hostile file would grow without bound when it is
-/// repaired. An episode of 64 devices has about 30 KiB.
+/// Maximum bytes of definitions repeated in every chunk: otherwise the repair of a hostile file could grow without
+/// bound. An episode of 64 devices has about 30 KiB.
 const LARGEST: usize = 256 << 10;
 
-/// Identifies an episode among all that may lie in one file.
+/// Identifies an episode among several in one file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct EpisodeId([u8; 16]);
 
 impl EpisodeId {
-    /// Of the episode that begins now: ns since 1970, and ns of the monotonic clock, which no two have alike.
+    /// Of an episode that begins now: ns since 1970, and ns of the monotonic clock, whose combination is unique.
     pub(crate) fn new(wall_ns: u64, monotonic_ns: u64) -> Self {
         Self((u128::from(wall_ns) << 64 | u128::from(monotonic_ns)).to_le_bytes())
     }
@@ -50,9 +49,9 @@ impl EpisodeId {
 pub(super) enum Owner {
     #[default]
     Unknown,
-    /// Whose file it is is being looked for: every chunk counts.
+    /// The owner of the file is being determined: every chunk counts.
     Any,
-    /// No right chunk names one: the file is another program's, or is older than this record.
+    /// No valid chunk names one: the file is another program's, or older than this record.
     Unnamed,
     Episode(EpisodeId),
 }
@@ -98,7 +97,7 @@ impl Own {
     }
 }
 
-/// Is this private record's content ours?
+/// Whether this private record's content is ours.
 pub(crate) fn is(content: &[u8]) -> bool {
     content.starts_with(&MARK)
 }
@@ -120,13 +119,13 @@ impl<R: ReadAt> RecordIter<R> {
         }
     }
 
-    /// Is the file an episode of ours, as far as anything in it shows?
+    /// Whether the file is an episode of ours, as far as its contents show.
     pub(super) fn is_episode(&mut self) -> io::Result<bool> {
         self.look_for_owner()?;
         Ok(matches!(self.names.owner, Owner::Episode(_) | Owner::Any))
     }
 
-    /// Do these records name an episode of ours?
+    /// Whether these records name an episode of ours.
     pub(super) fn is_owned(&self, records: &Records) -> bool {
         first(self.bytes(records)).is_some()
     }
@@ -136,7 +135,7 @@ impl<R: ReadAt> RecordIter<R> {
         bytes.get(records.range.clone()).unwrap_or_default()
     }
 
-    /// Learns from a right chunk, where the records of this file lie; `false`: it is not this file's.
+    /// Learns from a valid chunk; `false` if it does not belong to this file.
     pub(super) fn learn(&mut self, records: &Records) -> io::Result<bool> {
         let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
         if self.names.owner == Owner::Unknown {
@@ -173,12 +172,12 @@ impl<R: ReadAt> RecordIter<R> {
         let Some(about) = about(&self.buffer) else { return };
         self.begin_ns = about.get("begin_wall_ns").and_then(|ns| ns.parse().ok());
         self.same_boot = self.boot.is_some() && about.get(BOOT_ID) == self.boot.as_ref();
-        // What stands behind damage may be another file's.
+        // Records after damage may belong to another file.
         self.names.named = if self.checked && !self.chunked { EpisodeId::of(&about) } else { None };
     }
 
-    /// Are these records, found behind damage, this file's? Where no chunk names an episode, it is those that contradict
-    /// nothing.
+    /// Whether these records, found after damage, belong to this file. If no chunk names an episode, they do unless
+    /// they contradict it.
     pub(super) fn is_own(&mut self, records: &Records) -> io::Result<bool> {
         let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
         self.look_for_owner()?;
@@ -190,7 +189,7 @@ impl<R: ReadAt> RecordIter<R> {
         })
     }
 
-    /// Reads the file once more, for whose it is, unless that is known or was looked for.
+    /// Reads the file once more to determine its owner, unless that is known or was tried before.
     fn look_for_owner(&mut self) -> io::Result<()> {
         if self.names.owner != Owner::Unknown {
             return Ok(());
@@ -204,7 +203,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(())
     }
 
-    /// Where the episode begins of which a chunk was found, if its beginning stands before that, behind something else.
+    /// Where the episode of a found chunk begins, if its beginning lies before the chunk, after other bytes.
     pub(super) fn beginning(&mut self) -> io::Result<Option<u64>> {
         let Some(episode) = self.episode() else { return Ok(None) };
         let begun = beginnings(&mut self.source, self.at)?;
@@ -219,7 +218,7 @@ fn about(content: &[u8]) -> Option<BTreeMap<String, String>> {
     fields.map()
 }
 
-/// The episode that each [`MARK`] in `bytes` behind the first names.
+/// The episode named by each [`MARK`] in `bytes` after the first.
 fn marks(bytes: &[u8]) -> impl Iterator<Item = EpisodeId> {
     let mut rest = bytes;
     std::iter::from_fn(move || {
@@ -234,22 +233,22 @@ fn marks(bytes: &[u8]) -> impl Iterator<Item = EpisodeId> {
     })
 }
 
-/// Episodes that are distinguished in a file, and beginnings that are looked at.
+/// Maximum number of episodes that are distinguished in a file, and of beginnings that are examined.
 const MOST: usize = 64;
-/// Metadata at a beginning have less.
+/// Metadata at a beginning are smaller.
 const LARGEST_ABOUT: u64 = 4 << 20;
 
-/// The episodes of the right chunks of a file: whose it is in which chunks of several lie. One may be the payload of a
-/// message of another, or all of them lie in an archive.
+/// The episodes of the valid chunks of a file, to determine its owner if there are several. One may be the payload of a
+/// message of another, or all of them may lie in an archive.
 ///
 /// 1. The metadata at its undamaged beginning name it.
-/// 2. An episode is not the file if it lies within a right chunk of another.
-/// 3. An episode that has its own beginning in the file lies in it; one whose beginning is lost is the file. Of several
-///    it is the last: what lies in a message of an episode is followed by the rest of that episode.
-/// 4. If each has its own, the file is an archive, and the first is taken.
+/// 2. An episode is not the owner if it lies within a valid chunk of another.
+/// 3. An episode with its own beginning in the file is embedded; one whose beginning is lost is the owner. Of several,
+///    the last one: an episode embedded in a message is followed by the rest of the outer one.
+/// 4. If each has its own beginning, the file is an archive, and the first is taken.
 ///
-/// Not decidable, and then 3. and 4. may name the inner one: the outer beginning is lost, no right chunk of the outer
-/// episode holds the inner one, and none follows it.
+/// Undecidable case, in which 3. and 4. may name the inner one: the outer beginning is lost, no valid chunk of the
+/// outer episode holds the inner one, and none follows it.
 #[derive(Debug, Default)]
 pub(super) struct Owners {
     /// By their first chunk.
@@ -269,7 +268,7 @@ struct Mention {
 }
 
 impl Owners {
-    /// Takes a right chunk of an episode.
+    /// Takes a valid chunk of an episode.
     pub(super) fn take(&mut self, owner: Owner, records: &[u8]) {
         self.chunks += 1;
         let itself = if let Owner::Episode(episode) = owner { Some(episode) } else { None };
@@ -290,7 +289,7 @@ impl Owners {
         }
     }
 
-    /// Whose file it is. `named`: what the metadata at its beginning name; `checked`: what was read so far is right;
+    /// The owner of the file. `named`: by the metadata at its beginning; `checked`: everything read so far is valid;
     /// `is_foreign`: its header names another program.
     pub(super) fn owner<R: ReadAt>(
         self,
@@ -299,7 +298,7 @@ impl Owners {
         is_foreign: bool,
         source: &mut Source<R>,
     ) -> io::Result<Owner> {
-        // Behind damage a chunk of another episode is a message's; before any it is the file's, which contradicts itself.
+        // After damage a chunk of another episode belongs to a message; before any damage the file contradicts itself.
         let is_there = |named: &EpisodeId| self.seen.iter().any(|seen| seen.episode == *named);
         if let Some(named) = named.filter(|named| is_there(named) || !checked && !self.is_unnamed) {
             return Ok(Owner::Episode(named));

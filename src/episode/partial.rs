@@ -1,8 +1,8 @@
-//! A file that is being written or repaired: its lock, and its final name, which is given once and never taken from
-//! another file.
+//! A file being written or repaired: its lock, and its final name, which is given once and never taken from another
+//! file.
 //!
-//! The lock is an advisory one of the open file (flock): it ends with the process that holds it, however that
-//! ends, and copies of the handle share it.
+//! The lock is an advisory lock of the open file (flock): it ends with its process, however that ends, and copies of
+//! the handle share it.
 //!
 //! Invariant: a process that writes, repairs or removes a `.partial` holds its lock.
 
@@ -16,16 +16,16 @@ use crate::folder::{Folder, Links, Missing};
 /// Extension of a file that is not finished.
 pub(crate) const PARTIAL: &str = "partial";
 
-/// Whose a file is.
+/// The owner of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Lock {
     /// Ours, as long as the handle or a copy of it is open.
     Ours,
     /// Another process writes or repairs it.
     Others,
-    /// The name has gone, or means another file by now.
+    /// The name is gone, or means another file by now.
     Gone,
-    /// This file system knows no locks.
+    /// This file system has no locks.
     Unknown,
 }
 
@@ -61,7 +61,7 @@ pub(crate) fn publish(file: &Path, name: &Path) -> io::Result<()> {
 pub(crate) fn rename(folder: &Folder, file: &Path, name: &Path) -> io::Result<()> {
     let part = |path: &'_ Path| path.file_name().unwrap_or_default().to_owned();
     folder.rename_new(&part(file), &part(name))?;
-    // The file has its name: what remains is what a loss of power right now would do to it.
+    // The file has its name; only a loss of power right now could undo that.
     if let Err(error) = folder.sync() {
         tracing::warn!(folder = %folder.path().display(), %error, "folder not synced");
     }

@@ -1,10 +1,10 @@
 //! The one reader of episodes: the records of a file in their order, typed.
 //!
-//! Recorder tests, inspect, replay, compare and the fuzz targets read through it; repair, which copies records as they
-//! are, reads the [`RecordIter`] below it.
+//! Recorder tests, inspect, replay, compare and the fuzz targets use it; repair, which copies records unchanged, uses
+//! the [`RecordIter`] below it.
 //!
 //! Invariant: memory holds one record of the file at a time, and the definitions of its channels, which are bounded.
-//! Invariant: content is read when it is asked for, and then once.
+//! Invariant: content is read on request, and only once.
 
 use std::collections::BTreeMap;
 #[cfg(feature = "policy")]
@@ -54,7 +54,7 @@ pub(crate) struct Channel {
 pub(crate) enum Item<'a> {
     Channel(&'a Channel),
     Message(Message<'a>),
-    /// Anything but a channel and a message.
+    /// Any record except a channel and a message.
     Other(Entry<'a>),
     /// Shorter than its fields, or a message without a channel.
     Unreadable,
@@ -74,7 +74,7 @@ pub(crate) struct Message<'a> {
 }
 
 impl<'a> Message<'a> {
-    /// Reads the content; `None` if it is not whole or not of the channel's schema.
+    /// Reads the content; `None` if it is incomplete or does not match the channel's schema.
     pub(crate) fn content<'s>(&self, scratch: &'s mut Scratch) -> Option<Content<'s>>
     where
         'a: 's,
@@ -99,7 +99,7 @@ impl Reader<File> {
 }
 
 impl<R: ReadAt> Reader<R> {
-    /// Begins to read `size` bytes, called `path` in errors. `boot`: see [`RecordIter::of_boot`].
+    /// Starts reading `size` bytes, called `path` in errors. `boot`: see [`RecordIter::of_boot`].
     pub(crate) fn new(file: R, size: u64, path: &Path, boot: Option<String>) -> Result<Self, ReadError> {
         let records = RecordIter::new(file, size)
             .map_err(|source| ReadError::Io { path: path.to_owned(), source })?
@@ -125,14 +125,14 @@ impl<R: ReadAt> Reader<R> {
                 let defined = || Channel::new(id, topic, encoding, schema, metadata);
                 self.channels.entry(id).or_insert_with(defined);
             }
-            // Of two the first: it was there when the episode began.
+            // The first of two: it was written when the episode began.
             Some(Entry::Metadata { name: ABOUT, map: Some(map) }) if self.about.is_none() => self.about = Some(map),
             _ => {}
         }
         Ok(advanced)
     }
 
-    /// The record moved to.
+    /// The current record.
     pub(crate) fn item(&self) -> Item<'_> {
         let read = match Entry::read(self.records.record()) {
             Some(Entry::Message { header, data }) => self.channels.get(&header.channel_id).map(|channel| {
@@ -156,7 +156,7 @@ impl<R: ReadAt> Reader<R> {
         self.about.as_ref()?.get(key).map(String::as_str)
     }
 
-    /// What was found of the file so far; all there is once the last record was read.
+    /// The integrity of the file so far; complete once the last record was read.
     pub(crate) fn integrity(&self) -> Integrity {
         self.records.integrity()
     }
@@ -179,7 +179,7 @@ impl Channel {
 
 /// A record of the container with its fields read. Format: <https://mcap.dev/spec#records>.
 ///
-/// Any bytes may stand in a record; one that is shorter than its fields is none, never a panic.
+/// A record may contain any bytes; one that is shorter than its fields is `None`, never a panic.
 #[derive(Debug)]
 pub(crate) enum Entry<'a> {
     Schema {

@@ -1,18 +1,18 @@
-//! The records of an MCAP file from its beginning to its end, whole or not.
+//! The records of an MCAP file from beginning to end, complete or not.
 //!
 //! Format: <https://mcap.dev/spec>. The framing is read here and not by the `mcap` crate's readers
 //! because those panic on some damaged files (mcap 0.26: an inner record longer than its chunk, an
 //! attachment shorter than its check value, an index that names another record) and keep in memory
-//! as many chunks as an index calls overlapping, and because what lies behind damage is worth having.
+//! as many chunks as an index calls overlapping, and because the data after damage is worth reading.
 //!
-//! Where something is no record, reading continues behind it: see `resync`.
+//! After bytes that are not a record, reading continues as described in `resync`.
 //!
-//! Invariant: no file makes anything here panic.
-//! Invariant: every message of every chunk whose check value is right is shown, once, if its channel is known; of
-//! a damaged chunk nothing is shown. What is left out is counted in [`Integrity`].
-//! Invariant: memory holds one record of the file at a time, a chunk of at most [`MAX_RECORD`], as it
-//! is and decompressed, and the head of every chunk.
-//! Invariant: work is bounded by the size of the file, also that of decompressing.
+//! Invariant: no file causes a panic here.
+//! Invariant: every message of every chunk with a right check value is shown once, if its channel is known; nothing of
+//! a damaged chunk is shown. Everything left out is counted in [`Integrity`].
+//! Invariant: memory holds one record of the file at a time, a chunk of at most [`MAX_RECORD`] both packed and
+//! decompressed, and the head of every chunk.
+//! Invariant: work, including decompression, is bounded by the size of the file.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -31,20 +31,20 @@ pub(crate) use super::op;
 
 /// At the beginning of a file and at its end.
 pub(crate) const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
-/// Largest record that is read: more is taken for a damaged length. A 4K raw picture has 16 MiB.
+/// Largest record that is read: a greater length counts as damaged. A 4K raw picture has 16 MiB.
 pub(crate) const MAX_RECORD: u64 = 256 << 20;
 /// An opcode, and the length of what follows as u64.
 pub(super) const HEAD: u64 = 9;
-/// Bytes that may be decompressed, what each record counts among them: of any file, and for each of its bytes.
+/// Bytes that may be decompressed, including an overhead per record: for any file, and per byte of it.
 const UNPACKED: (u64, u64) = (256 << 20, 200);
-/// Bytes that may be tried in vain for a chunk in any file, and for each of its bytes.
+/// Bytes that may be searched in vain for a chunk: in any file, and per byte of it.
 const TRIED: (u64, u64) = (64 << 20, 2);
 
-/// Bytes read at once of what is passed over.
+/// Bytes read at once while skipping.
 const PIECE: u64 = 64 << 10;
 /// Bytes of a chunk's head and of the shortest record's: with fewer of them nothing in it can be read.
 pub(super) const LEAST: usize = 40 + 9;
-/// Records without a check value that may be tried before the first chunk: of any file, and one for so many of its bytes.
+/// Records without a checksum that may be tried before the first chunk: for any file, and one per this many bytes.
 const EARLY: (u64, u64) = (4096, 64 << 10);
 
 /// A file being read.
@@ -54,16 +54,16 @@ pub(crate) struct RecordIter<R> {
     /// Where the next record of the file begins.
     pub(super) at: u64,
     /// Up to here it is known which bytes belong to which record: a record without a check value may lack some, unless
-    /// another stands behind it.
+    /// another one follows it.
     pub(super) sure: u64,
     pub(super) integrity: Integrity,
     ended: bool,
     pub(super) data_ended: bool,
-    /// Of the section being read, data or summary.
+    /// Check value of the section being read, data or summary.
     pub(super) crc: crc32fast::Hasher,
-    /// Every check value so far was right, and nothing was passed over.
+    /// Every check value so far was right, and nothing was skipped.
     pub(super) checked: bool,
-    /// Every check value so far was there and right.
+    /// Every check value so far was present and right.
     pub(super) proven: bool,
     /// Where the summary begins.
     pub(super) summary: u64,
@@ -74,52 +74,52 @@ pub(crate) struct RecordIter<R> {
     found: Option<Found>,
     /// A definition shown.
     defined: Vec<u8>,
-    /// There was a chunk.
+    /// A chunk was read.
     pub(super) chunked: bool,
     /// A chunk had a check value: one without is not one of this writer's.
     pub(super) with_checks: bool,
-    /// The chunk being shown is the last, and not whole.
+    /// The chunk being shown is the last one, and incomplete.
     pub(super) cut: bool,
     /// Chunks shown: sizes and check value.
     pub(super) seen: BTreeSet<(u64, u64, u32)>,
     pub(super) names: Names,
     /// Definitions of the summary, until its check value is read.
     pub(super) summarised: Vec<(u8, Vec<u8>)>,
-    /// Only definitions are wanted.
+    /// Only definitions are read.
     pub(super) defining: bool,
-    /// Bytes that may still be decompressed, and be tried in vain.
+    /// Remaining bytes to decompress, and to search in vain.
     pub(super) budget: (u64, u64),
     /// Records without a check value that may still be tried before the first chunk.
     pub(super) early: u64,
-    /// The boot of this machine, if that is to prove anything; then, whether the episode was recorded in it.
+    /// The boot of this machine, if it may prove anything; then, whether the episode was recorded in it.
     pub(super) boot: Option<String>,
     pub(super) same_boot: bool,
     /// When the episode began, ns since 1970.
     pub(super) begin_ns: Option<u64>,
-    /// Damage was met: the index was looked for.
+    /// Damage was found: the index was searched for.
     pub(super) index: Known,
-    /// Definitions were looked for elsewhere, once.
+    /// Definitions were searched for elsewhere, once.
     pub(super) looked: bool,
 }
 
-/// The index, once it was looked for.
+/// The index, once it was searched for.
 #[derive(Debug, Default)]
 pub(super) enum Known {
     #[default]
     NotYet,
-    /// There is none that is right.
+    /// There is no valid one.
     None,
     Right(Index),
 }
 
-/// What a step through the file found.
+/// The result of a step through the file.
 pub(super) enum Step {
     Show(u8),
     Again,
     End(FileEnd),
 }
 
-/// Where a record that is shown lies.
+/// The place of a record that is shown.
 enum Found {
     Buffer(u8),
     Defined(u8),
@@ -127,19 +127,19 @@ enum Found {
 }
 
 impl<R: ReadAt> RecordIter<R> {
-    /// Begins to read a file of `size` bytes. `None`: no MCAP file.
+    /// Starts reading a file of `size` bytes. `None`: not an MCAP file.
     pub(crate) fn new(file: R, size: u64) -> io::Result<Option<Self>> {
         Self::begin(Source::new(file, size), None)
     }
 
-    /// With an owner only the definitions of its chunks are of use.
+    /// With an owner only the definitions of its chunks are used.
     pub(super) fn begin(source: Source<R>, owner: Option<Owner>) -> io::Result<Option<Self>> {
         let mut records = Self::of(source, owner);
         if records.source.peek(0, MAGIC.len())?.starts_with(&MAGIC) {
             records.begin_read();
             return Ok(Some(records));
         }
-        // Its beginning may be damaged, or stand behind something else: then there is a chunk of it somewhere.
+        // Its beginning may be damaged, or preceded by other bytes: then a chunk of it is somewhere in the file.
         if !records.resync(0, 0)? {
             return Ok(None);
         }
@@ -194,13 +194,13 @@ impl<R: ReadAt> RecordIter<R> {
         }
     }
 
-    /// Lets `boot`, the present boot of this machine, prove what was written last: the kernel keeps the order of writes.
+    /// Uses `boot`, the present boot of this machine, to prove the last writes: the kernel keeps their order.
     pub(crate) fn of_boot(mut self, boot: Option<String>) -> Self {
         self.boot = boot;
         self
     }
 
-    /// The next record that is not one of the container's own, chunks opened up; `None` at the end.
+    /// The next record that is not one of the container's own, with chunks opened; `None` at the end.
     pub(crate) fn next(&mut self) -> io::Result<Option<Record<'_>>> {
         Ok(if self.advance()? { Some(self.record()) } else { None })
     }
@@ -211,7 +211,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(self.found.is_some())
     }
 
-    /// The record gone to last; one of no content before the first and after the last.
+    /// The current record; an empty one before the first and after the last.
     pub(crate) fn record(&self) -> Record<'_> {
         match &self.found {
             None => Record { opcode: 0, data: &[] },
@@ -224,7 +224,7 @@ impl<R: ReadAt> RecordIter<R> {
         }
     }
 
-    /// What was found so far; all there is once the last record was read.
+    /// The integrity so far; complete once the last record was read.
     pub(crate) fn integrity(&self) -> Integrity {
         self.integrity
     }
@@ -304,7 +304,7 @@ impl<R: ReadAt> RecordIter<R> {
         }
     }
 
-    /// Takes a step through the file.
+    /// Makes a step through the file.
     fn step(&mut self) -> io::Result<Step> {
         if self.cut {
             return Ok(Step::End(FileEnd::Torn));
@@ -316,7 +316,7 @@ impl<R: ReadAt> RecordIter<R> {
         }
         let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { return Ok(Step::End(FileEnd::Torn)) };
         let left = self.source.size.saturating_sub(at).saturating_sub(HEAD);
-        // No writer mixes messages with chunks: it is the index of a chunk's messages, one bit of it changed.
+        // No writer mixes messages with chunks: this is the message index of a chunk with a flipped bit.
         if !is_known(opcode)
             || opcode == op::CHUNK && length.min(left) > MAX_RECORD
             || opcode == op::MESSAGE && self.chunked
@@ -326,7 +326,7 @@ impl<R: ReadAt> RecordIter<R> {
         let fit = self.source.fit(opcode, at + HEAD, length)?;
         if length > left {
             self.sure = if fit == Fit::Exact { at } else { self.sure };
-            // What follows the last record, such as another file, may look like a record of any length, above all like a
+            // Bytes after the last record, such as another file, may look like a record of any length, above all a
             // private one.
             let is_cut = length <= MAX_RECORD
                 && match fit {
@@ -352,7 +352,7 @@ impl<R: ReadAt> RecordIter<R> {
         self.take(at, opcode, length)
     }
 
-    /// Takes the record at `at`, which is whole.
+    /// Takes the complete record at `at`.
     fn take(&mut self, at: u64, opcode: u8, length: u64) -> io::Result<Step> {
         // The footer's check value covers the summary and the footer's own first bytes, that of the data ends before
         // the record that holds it.
@@ -378,7 +378,7 @@ impl<R: ReadAt> RecordIter<R> {
                 Step::Again
             }
             op::SCHEMA | op::CHANNEL | op::MESSAGE | op::ATTACHMENT | op::METADATA | op::PRIVATE.. => {
-                // Messages and the like do not belong into the summary.
+                // Messages and the like do not belong in the summary.
                 if length > MAX_RECORD {
                     self.integrity.left_out.oversized_records += u64::from(!self.data_ended);
                     self.skip(at, length)?
@@ -427,15 +427,15 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(Step::Again)
     }
 
-    /// Are these records under a check value? The format has zero for "not computed", which this writer always does: in
-    /// a file of ours a chunk without one is damaged.
+    /// Whether these records have a check value. Zero means "not computed"; this program always computes it, so in a
+    /// file of ours a chunk without one is damaged.
     fn is_verified(&self, head: &ChunkHead, records: &Records) -> bool {
         let is_ours = self.with_checks || self.integrity.writer == Writer::Rapid || self.is_owned(records);
         head.crc != 0 || !is_ours || crc32fast::hash(self.bytes(records)) == 0
     }
 
-    /// Is the record in the buffer, behind which reading continues, not one that lacks some of its bytes and has some of
-    /// the next one's instead?
+    /// Whether the record in the buffer, after which reading continues, contains only its own bytes and none of the
+    /// next record.
     fn is_whole(&mut self, opcode: u8) -> io::Result<bool> {
         let is_alone = match opcode {
             op::ATTACHMENT => {
@@ -444,10 +444,10 @@ impl<R: ReadAt> RecordIter<R> {
                     crc != 0 && chunk::is_sound(content, crc)
                 });
                 self.sure = if is_right { self.at } else { self.sure };
-                // Its check value is judged by the caller.
+                // The caller verifies its check value.
                 true
             }
-            // Text has no zeros, the head of every record has.
+            // Text contains no zeros, but the header of every record does.
             op::METADATA => {
                 let mut fields = Fields(&self.buffer);
                 let map = fields.string().and_then(|_| fields.map());
@@ -459,11 +459,11 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(is_alone || self.source.stands(self.at, self.chunked)?)
     }
 
-    /// Shows the chunk in the buffers next, unless it was there before.
+    /// Shows the chunk in the buffers next, unless it was shown before.
     pub(super) fn show(&mut self, head: ChunkHead, records: Records) -> io::Result<()> {
         self.sure = self.at;
         (self.chunked, self.with_checks) = (true, self.with_checks || head.crc != 0);
-        // Nothing is recorded twice; without a clock it is not known.
+        // Nothing is recorded twice; without a clock this is unknown.
         let is_new = self.seen.insert((head.size, head.packed, head.crc)) || head.crc == 0 || head.times == (0, 0);
         if is_new {
             self.chunk = self.learn(&records)?.then_some(records);
@@ -474,9 +474,9 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(())
     }
 
-    /// A chunk, or another record, that the end of the file cuts.
+    /// A chunk or another record cut by the end of the file.
     fn torn(&mut self, at: u64, opcode: u8) -> io::Result<Step> {
-        // Its length may be damaged, and what follows be all there.
+        // Its length may be damaged, and everything after it intact.
         let torn = if opcode == op::CHUNK { self.within(at)? } else { None };
         let from = torn.as_ref().map_or(at, |torn| torn.sure);
         if self.resync(at, from)? {
@@ -542,7 +542,7 @@ impl<R: ReadAt> RecordIter<R> {
         let is_last = rest.is_empty() || rest.starts_with(&MAGIC);
         self.integrity.bytes += HEAD + length + MAGIC.len() as u64;
         self.at += MAGIC.len() as u64;
-        // Parts of the file itself may stand behind: another file does not belong to it.
+        // Parts of the file itself may follow; another file does not belong to it.
         self.sure = self.at;
         if is_last || !self.resync(self.at, self.at)? {
             self.integrity.left_out.bytes_behind = self.source.size.saturating_sub(self.sure);
@@ -551,7 +551,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(Step::Again)
     }
 
-    /// Passes over the content of the record at `at`, which counts for the check value of its section.
+    /// Skips the content of the record at `at`, but includes it in the check value of its section.
     fn skip(&mut self, at: u64, length: u64) -> io::Result<Step> {
         let (mut at, end) = (at + HEAD, at + HEAD + length);
         while self.counts() && at < end {
@@ -574,7 +574,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(())
     }
 
-    /// Is the check value of what is being read of use? Behind damage only that of the summary.
+    /// Is the check value of the current section useful? After damage only that of the summary.
     fn counts(&self) -> bool {
         self.checked || self.data_ended
     }

@@ -1,17 +1,17 @@
-//! Behind damage: where reading continues.
+//! Resynchronisation: where reading continues after damage.
 //!
-//! 1. A record that is wrong in itself and is followed by one that stands is passed over. A right chunk within an index of
-//!    messages, or within a record that is longer than its fields, shows that this one is wrong.
-//! 2. Where the summary of a finished file has the right check value, its index gives the places of the chunks.
-//! 3. Otherwise the next place is searched at which a chunk may begin and whose check value is right. Nothing is searched
-//!    within what is known to be whole: in the records of a right chunk, in an attachment, in the records of a damaged
-//!    chunk as far as one follows the other. A chunk found within what is left, damaged, may be the payload of a
-//!    message: of an episode of ours only a chunk that names it is taken (see `own`). In another
-//!    file a chunk is taken unless it shows that it is another one's, by a channel or schema that contradicts one
-//!    of this file's, or by messages from before this episode began: a file is recorded before it is sent.
+//! 1. An invalid record followed by a valid one is skipped. A valid chunk within a message index, or within a record
+//!    that is longer than its fields, shows that this record is invalid.
+//! 2. If the summary of a finished file has the right check value, its index gives the places of the chunks.
+//! 3. Otherwise the next place is searched where a chunk with a right check value begins. Parts known to be whole are
+//!    not searched: the records of a valid chunk, an attachment, the records of a damaged chunk as far as they follow
+//!    one another. A chunk found in the damaged rest may be the payload of a message: in our episodes only a chunk that
+//!    names the episode is taken (see `own`). In another file a chunk is taken unless it belongs elsewhere, by a
+//!    channel or schema that contradicts this file, or by messages from before this episode began: a file is recorded
+//!    before it is sent.
 //! 4. Metadata have no check value. They are taken where the index names them, or before the first chunk.
 //!
-//! Invariant: what is tried in vain is counted in bytes and bounded by the size of the file.
+//! Invariant: bytes searched in vain are counted and bounded by the size of the file.
 
 use std::io;
 
@@ -24,7 +24,7 @@ use super::wire::Fields;
 
 /// Bytes that show whether a chunk may begin: its head and the first of its records'.
 const LOOK: usize = 64;
-/// Messages of an episode may be captured so long before it begins, ns: a mask, and what a latency takes off.
+/// Messages of an episode may be captured this long before it begins, ns: a mask, and the latency of a sample.
 const BEFORE: u64 = 60_000_000_000;
 /// Magic numbers of the two packings' frames.
 const ZSTD: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
@@ -34,21 +34,21 @@ const LZ4: [u8; 4] = [0x04, 0x22, 0x4d, 0x18];
 pub(super) struct Within {
     /// Where the first begins.
     pub(super) begin: u64,
-    /// Where the last begins that looks like one; what comes before it is whole.
+    /// Where the last apparent record begins; everything before it is whole.
     pub(super) sure: u64,
     /// Whole messages.
     pub(super) messages: u64,
-    /// They do so to the end of the file.
+    /// They reach the end of the file.
     pub(super) is_whole: bool,
 }
 
 impl<R: ReadAt> RecordIter<R> {
-    /// There is no whole record at `at`, whatever its opcode.
+    /// Handles an incomplete record at `at`, with any opcode.
     pub(super) fn lost(&mut self, at: u64, opcode: u8) -> io::Result<Step> {
         let mut head = Fields(self.source.peek(at, 9)?);
         let length = head.u8().and_then(|_| head.u64()).filter(|_| is_known(opcode) && opcode != op::FOOTER);
         let next = length.and_then(|length| (at + HEAD).checked_add(length));
-        // What stands behind this record is evidence only if it begins where the last one ended.
+        // The bytes after this record are evidence only if it begins where the last one ended.
         if let Some(next) = next.filter(|next| *next <= self.source.size && self.sure >= at)
             && self.source.stands(next, true)?
         {
@@ -78,23 +78,23 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(Step::End(FileEnd::Finished))
     }
 
-    /// Finds where to continue, `at` being no record and nothing to be searched for before `from`; `false`: nowhere.
+    /// Finds where to continue after `at`, which is not a record, searching from `from`; `false`: nowhere.
     pub(super) fn resync(&mut self, at: u64, from: u64) -> io::Result<bool> {
         let before = self.sure;
         self.read_index()?;
         let index = std::mem::take(&mut self.index);
         let found = match &index {
-            // What begins at `sure` was read.
+            // The record at `sure` was read.
             Known::Right(index) => self.by_index(index, if self.sure < at { self.sure + 1 } else { at }),
             _ if self.sure < at => self.scan(self.sure + 1, u64::MAX),
-            // The chunk itself may be right, and only what stands before it damaged.
+            // The chunk itself may be valid, and only the bytes before it damaged.
             _ => match self.try_at(at + HEAD) {
                 Ok(false) => self.scan(from, u64::MAX),
                 found => found,
             },
         };
         self.index = index;
-        // Only forward, or there would be no end.
+        // Only forward, to guarantee an end.
         if found? && (self.at > before || at == 0) {
             self.sure = self.at;
             self.integrity.left_out.gaps += 1;
@@ -111,7 +111,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(())
     }
 
-    /// What a damaged chunk defined has to be found elsewhere.
+    /// The definitions of a damaged chunk must be found elsewhere.
     pub(super) fn look_for_names(&mut self) -> io::Result<()> {
         self.looked = true;
         self.read_index()?;
@@ -125,7 +125,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(())
     }
 
-    /// Reads the file once more, for definitions alone.
+    /// Reads the file once more, only for definitions.
     fn define(&mut self) -> io::Result<()> {
         if self.defining {
             return Ok(());
@@ -171,17 +171,17 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(false)
     }
 
-    /// Does a right chunk begin in the damaged one at `at`, which ends at `end`? Bytes may be missing in between. Then
+    /// Does a valid chunk begin in the damaged one at `at`, which ends at `end`? Bytes may be missing between. Then
     /// reading continues with it.
     pub(super) fn hides(&mut self, at: u64, end: u64) -> io::Result<bool> {
         self.read_index()?;
         let from = match self.within(at)? {
-            // What names the episode may be searched for anywhere.
+            // A chunk that names the episode may be searched anywhere.
             Some(within) if within.is_whole && !self.is_episode()? => return Ok(false),
             Some(within) => within.sure,
             None => at,
         };
-        // With a right index nothing has moved.
+        // With a valid index nothing has moved.
         if matches!(self.index, Known::Right(_)) || !self.scan(from, end)? {
             return Ok(false);
         }
@@ -191,9 +191,9 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(true)
     }
 
-    /// Does a right chunk begin in the record at `at`, which ends at `end`, an index of messages or one that is longer than
-    /// its fields? It has no check value and holds no payload: bytes of it are missing, or its length is damaged, and it is
-    /// as long as it claims to be by the bytes of the records behind it. Then reading continues with the chunk.
+    /// Does a valid chunk begin in the record at `at`, which ends at `end`, a message index or a record longer than its
+    /// fields? Such a record has no check value and no payload: bytes of it are missing or its length is damaged, and
+    /// it includes bytes of the following records. Then reading continues with the chunk.
     pub(super) fn takes_along(&mut self, at: u64, end: u64) -> io::Result<bool> {
         if !self.scan(at + HEAD, end)? {
             return Ok(false);
@@ -205,7 +205,7 @@ impl<R: ReadAt> RecordIter<R> {
 
     /// Searches from `at` on, up to `end`.
     fn scan(&mut self, mut at: u64, end: u64) -> io::Result<bool> {
-        // A file in which another lies, such as an archive: not this one's beginning is damaged.
+        // A file that contains another, such as an archive: the damage is not at its own beginning.
         let is_foreign = self.at == 0;
         let mut is_behind = false;
         loop {
@@ -229,7 +229,7 @@ impl<R: ReadAt> RecordIter<R> {
             if at >= end || is_begun && is_foreign && at > 0 && !self.is_episode()? {
                 return Ok(false);
             }
-            // What follows may be another file's.
+            // The rest may belong to another file.
             is_behind |= is_begun && is_foreign;
             if is_chunk && self.try_at(at)? || !is_chunk && self.is_early(at)? {
                 return Ok(true);
@@ -243,7 +243,7 @@ impl<R: ReadAt> RecordIter<R> {
 
     /// Does a whole record without a check value of its own stand at `at`, before any chunk?
     fn is_early(&mut self, at: u64) -> io::Result<bool> {
-        // What it needs is looked for anywhere in the file.
+        // Its prerequisites are searched anywhere in the file.
         self.early = self.early.saturating_sub(1);
         let mut head = Fields(self.source.peek(at, 9)?);
         let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { return Ok(false) };
@@ -256,7 +256,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(is_whole)
     }
 
-    /// Continues with the chunk whose content begins at `at`, if there is one that is right and this file's.
+    /// Continues with the chunk whose content begins at `at`, if it is valid and belongs to this file.
     fn try_at(&mut self, at: u64) -> io::Result<bool> {
         let bytes = self.source.peek(at, LOOK)?;
         let head = if may_be_chunk(bytes) { ChunkHead::read(bytes) } else { None };
@@ -294,7 +294,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(true)
     }
 
-    /// Does nothing in these records show that they are another file's?
+    /// Could these records belong to this file? `false` if they show otherwise.
     pub(super) fn is_consistent(&self, records: &[u8]) -> bool {
         let mut fields = Fields(records);
         let earliest = self.begin_ns.unwrap_or(0).saturating_sub(BEFORE);
@@ -315,7 +315,8 @@ impl<R: ReadAt> RecordIter<R> {
         true
     }
 
-    /// How far the records of the chunk at `at` follow one another; `None` if they are compressed or its head is none.
+    /// How far the records of the chunk at `at` follow one another; `None` if they are compressed or its head is
+    /// invalid.
     pub(super) fn within(&mut self, at: u64) -> io::Result<Option<Within>> {
         let head = ChunkHead::read(self.source.peek(at + HEAD, LOOK)?);
         let Some(head) = head.filter(|head| head.packing == Packing::Plain) else { return Ok(None) };

@@ -1,5 +1,5 @@
 //! Schemas of what is recorded, written into every file. They are compiled from the `.proto` files beside them; the test
-//! `schemas_are_those_of_their_proto_files` shows how.
+//! `schemas_match_their_proto_files` shows how.
 
 use crate::modality::ModalityKind;
 use crate::registry::{DeviceSpec, NodeSpec, PixelFormat};
@@ -53,7 +53,6 @@ impl SampleSchema {
     pub const COUNT: usize = 4;
 
     /// The schema itself.
-    #[must_use]
     pub const fn schema(self) -> Schema {
         match self {
             Self::CompressedImage => schema!("foxglove.CompressedImage"),
@@ -64,21 +63,18 @@ impl SampleSchema {
     }
 
     /// The schema of this name.
-    #[must_use]
     pub fn named(name: &str) -> Option<Self> {
         [Self::CompressedImage, Self::RawImage, Self::Scalars, Self::Bytes]
             .into_iter()
             .find(|schema| schema.schema().name == name)
     }
 
-    /// Position in arrays with one entry a schema.
-    #[must_use]
+    /// Index into arrays with one entry per schema.
     pub const fn index(self) -> usize {
         self as usize
     }
 
-    /// What the registry lets expect of a device.
-    #[must_use]
+    /// The schema expected of a device by the registry.
     pub fn expected(device: &DeviceSpec) -> Self {
         match &device.node {
             NodeSpec::Camera(camera) => match camera.format {
@@ -88,7 +84,7 @@ impl SampleSchema {
             NodeSpec::Serial(_) | NodeSpec::Process(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => {
                 match device.modality().kind {
                     ModalityKind::Scalars => Self::Scalars,
-                    // A program's raw pictures get a channel of their own when the first one comes.
+                    // Raw pictures of a program get their own channel when the first one arrives.
                     ModalityKind::Image => Self::CompressedImage,
                     ModalityKind::Bytes => Self::Bytes,
                 }
@@ -96,9 +92,8 @@ impl SampleSchema {
         }
     }
 
-    /// What a sample can be written as without losing a byte: a payload that does not match its header is
-    /// written as bytes.
-    #[must_use]
+    /// The schema that stores a sample without losing a byte: a payload that does not match its header is written as
+    /// bytes.
     pub fn of(header: &SampleHeader, payload: &[u8]) -> Self {
         match Encoding::from_raw(header.encoding) {
             Some(Encoding::Mjpeg) => Self::CompressedImage,

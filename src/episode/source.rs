@@ -1,5 +1,5 @@
-//! Bytes of a file, from any place, and whether a record stands there: one without a check value shows that it is whole by
-//! its fields, which fill it exactly.
+//! Random access to the bytes of a file, and whether a record begins at a place: one without a check value is whole if
+//! its fields fill it exactly.
 //!
 //! Format: <https://mcap.dev/spec#records>.
 
@@ -15,7 +15,7 @@ const WINDOW: usize = 64 << 10;
 /// Bytes read at once into a growing buffer.
 const PIECE: u64 = 1 << 20;
 
-/// What can be read from any place, as `pread` does.
+/// Random access reading, like `pread`.
 pub(crate) trait ReadAt {
     /// Reads up to `buffer.len()` bytes from `at`; 0 at the end.
     fn read_at(&self, buffer: &mut [u8], at: u64) -> io::Result<usize>;
@@ -44,12 +44,12 @@ impl<T: ReadAt + ?Sized> ReadAt for &T {
     }
 }
 
-/// A file and what of it was read last.
+/// A file with a window around the last place read.
 pub(super) struct Source<R> {
     pub(super) file: R,
-    /// Bytes before the file: places are counted from there.
+    /// Bytes before the file: places are relative to its beginning.
     base: u64,
-    /// Bytes of the file: no more are read, whatever it grows to; fewer once its end is met.
+    /// Bytes of the file: no more are read even if it grows; fewer once its end is reached.
     pub(super) size: u64,
     window: Vec<u8>,
     at: u64,
@@ -90,8 +90,8 @@ impl<R: ReadAt> Source<R> {
         Ok(held(self).and_then(|from| self.window.get(from..)).unwrap_or_default())
     }
 
-    /// Reads `count` bytes from `at` into `into`, in place of what it holds; were there as many? Memory grows
-    /// with what is there, not with what is asked for.
+    /// Reads `count` bytes from `at` into `into`, in place of what it holds; returns whether there were as many.
+    /// Memory grows with the bytes present, not with the request.
     pub(super) fn read(&mut self, at: u64, count: u64, into: &mut Vec<u8>) -> io::Result<bool> {
         into.clear();
         self.fill(at, count, into)?;
@@ -151,8 +151,8 @@ impl<R: ReadAt> Source<R> {
         })
     }
 
-    /// Does a record stand at `at`? Its head may be one and its fields fill it; what the end of the file cuts may be
-    /// one as far as it goes. So may the end of the file.
+    /// Does a record begin at `at`: a plausible head, and fields that fill it? One cut by the end of the file counts as
+    /// far as it goes, and so does the end of the file.
     pub(super) fn stands(&mut self, at: u64, chunked: bool) -> io::Result<bool> {
         let Some(left) = self.size.checked_sub(at) else { return Ok(false) };
         let mut head = Fields(self.peek(at, 9)?);
@@ -165,7 +165,7 @@ impl<R: ReadAt> Source<R> {
         let is_there = length <= left.saturating_sub(9);
         Ok(match self.fit(opcode, at + 9, length)? {
             Fit::Exact => true,
-            // Of a private record or a message its length is all there is: one that fits by chance is rare.
+            // A private record or a message has only its length, which rarely fits by chance.
             Fit::Loose => is_there && is_opaque(opcode),
             Fit::Cut => !is_there,
             Fit::Not => false,
@@ -178,18 +178,18 @@ impl<R: ReadAt> Source<R> {
 enum Part {
     /// So many bytes.
     Bytes(u64),
-    /// A u32 count of bytes and as many: text, a map, an array; a multiple of so many.
+    /// A u32 length and as many bytes: text, a map, an array; the length is a multiple of this.
     Short(u64),
-    /// A u64 count of bytes and as many.
+    /// A u64 length and as many bytes.
     Long,
 }
 
-/// How a record's fields fill it.
+/// How the fields of a record fill it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Fit {
     /// Exactly.
     Exact,
-    /// They leave some of it over, or nothing is known of its fields.
+    /// Bytes are left over, or its fields are unknown.
     Loose,
     /// Not at all: its length or one of theirs is damaged.
     Not,
@@ -221,12 +221,12 @@ fn parts(opcode: u8) -> &'static [Part] {
     }
 }
 
-/// Is this the opcode of a record that has been defined?
+/// Is this a defined opcode?
 pub(super) fn is_known(opcode: u8) -> bool {
     (1..=op::DATA_END).contains(&opcode) || opcode >= op::PRIVATE
 }
 
-/// May a record of this opcode hold anything? A message does, and a private record.
+/// May a record of this opcode hold any bytes, like a message or a private record?
 pub(super) fn is_opaque(opcode: u8) -> bool {
     opcode == op::MESSAGE || opcode >= op::PRIVATE
 }

@@ -59,7 +59,7 @@ fn a_whole_file_is_sound_and_every_flipped_bit_of_it_is_noticed() {
 }
 
 #[test]
-fn a_record_longer_than_its_chunk_is_damage_however_the_chunk_is_packed() {
+fn a_record_longer_than_its_chunk_is_damage_with_every_compression() {
     let inner = [&[op::MESSAGE][..], &u64::MAX.to_le_bytes(), &[0; 30]].concat();
     let zstd = zstd::encode_all(&inner[..], 0).unwrap();
     let mut lz4 = lz4::EncoderBuilder::new().build(Vec::new()).unwrap();
@@ -77,7 +77,7 @@ fn a_record_longer_than_its_chunk_is_damage_however_the_chunk_is_packed() {
 }
 
 #[test]
-fn lengths_that_are_no_lengths_take_no_memory() {
+fn impossible_lengths_allocate_no_memory() {
     let huge = [u64::MAX, 1 << 63, 1 << 40, 1 << 28];
     for length in huge {
         for opcode in (0..=0x10).chain([0x7f, 0x80, 0xff]) {
@@ -97,7 +97,7 @@ fn lengths_that_are_no_lengths_take_no_memory() {
 }
 
 #[test]
-fn a_chunk_that_swells_is_read_no_further_than_its_stated_size() {
+fn a_chunk_is_decompressed_only_to_its_stated_size() {
     // A hundred MiB of zeros in a few kB.
     let zeros = zstd::encode_all(&vec![0; 100 << 20][..], 0).unwrap();
     assert!(zeros.len() < 100_000);
@@ -107,7 +107,7 @@ fn a_chunk_that_swells_is_read_no_further_than_its_stated_size() {
 }
 
 #[test]
-fn chunks_in_chunks_and_chunks_of_nothing_are_passed_over() {
+fn nested_and_empty_chunks_are_skipped() {
     let mut inner = record(op::MESSAGE, b"message");
     for _ in 0..1000 {
         inner = chunk("", inner.len() as u64, 0, &inner);
@@ -119,7 +119,7 @@ fn chunks_in_chunks_and_chunks_of_nothing_are_passed_over() {
 }
 
 #[test]
-fn attachments_and_private_records_are_shown_and_text_that_is_none_is_not_trusted() {
+fn attachments_and_private_records_are_shown_and_invalid_text_is_not_trusted() {
     let bytes = file(&[record(op::ATTACHMENT, &[0; 36]), record(0x85, b"mine"), chunk("\u{fffd}", 0, 0, b"")]);
     let mut bytes = bytes;
     // The name of the compression is no UTF-8.

@@ -1,6 +1,6 @@
 //! Reading untrusted bytes: MCAP's fields and protobuf's.
 //!
-//! Invariant: no bytes make anything here panic, or allocate more than they are long.
+//! Invariant: no bytes cause a panic here, or an allocation longer than they are.
 
 use std::collections::BTreeMap;
 
@@ -104,12 +104,12 @@ impl<'a> Proto<'a> {
     }
 }
 
-/// The fields of a protobuf message, until its end or the first byte that makes no sense.
+/// The fields of a protobuf message, until its end or the first invalid byte.
 pub(crate) fn protobuf(message: &[u8]) -> impl Iterator<Item = (u64, Proto<'_>)> {
     whole_protobuf(message).map_while(|field| field)
 }
 
-/// The fields of a protobuf message; one `None` at the end if the bytes are no whole message.
+/// The fields of a protobuf message; one `None` at the end if the bytes are not a whole message.
 pub(crate) fn whole_protobuf(message: &[u8]) -> impl Iterator<Item = Option<(u64, Proto<'_>)>> {
     let mut fields = Fields(message);
     std::iter::from_fn(move || {
@@ -147,7 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn protobuf_fields_are_read_until_they_make_no_sense() {
+    fn protobuf_fields_are_read_up_to_the_first_malformed_one() {
         let message = [0x08, 0x96, 0x01, 0x12, 0x02, b'h', b'i', 0x1d, 1, 0, 0, 0, 0x21, 2, 0, 0, 0, 0, 0, 0, 0];
         let read: Vec<_> = protobuf(&message).collect();
         let expected =

@@ -78,7 +78,7 @@ fn a_taken_temporary_name_is_avoided() {
 }
 
 #[test]
-fn links_on_the_way_are_followed_depending_on_their_owner() {
+fn links_in_the_path_are_followed_depending_on_their_owner() {
     let dir = tempfile::tempdir().unwrap();
     let real = dir.path().join("real/deep");
     fs::create_dir_all(&real).unwrap();

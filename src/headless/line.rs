@@ -1,4 +1,4 @@
-//! How an event is written: a line for people, or a JSON object.
+//! Formats events: as a line for people, or as a JSON object.
 
 use serde::Serialize;
 
@@ -54,15 +54,15 @@ pub(super) fn begin_json(snapshot: &Snapshot, wall_ns: u64) -> serde_json::Resul
 /// Columns of the lines for people.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Columns {
-    /// Of the longest device name.
+    /// Columns for the longest device name.
     pub(super) name: usize,
     /// Colours.
     pub(super) palette: Palette,
 }
 
-/// Columns of the word for what happened.
+/// Columns for the word that names the event.
 const WORD: usize = 12;
-/// Columns of the rest of a line: a device may give itself a name of many thousand characters.
+/// Maximum columns of the rest of a line: a device may have a name of many thousand characters.
 const REST: usize = 1000;
 
 impl Columns {

@@ -1,12 +1,12 @@
 //! Headless output: state changes as lines or JSON objects, progress, and a summary at the end.
 //!
-//! Invariant: it only reads the board; a reader at the other end that is slow or gone holds up
-//! nothing but this output, and missed events are counted.
+//! Invariant: it only reads the board; a slow or vanished reader of the output holds up nothing else, and missed events
+//! are counted.
 
 mod line;
 mod progress;
 pub mod style;
-mod tally;
+mod totals;
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -23,29 +23,29 @@ use crate::status::{Board, Event, Snapshot, What};
 use crate::text;
 use crate::time::{Stamp, WallClock};
 use style::{ColourChoice, Palette, Terminal};
-use tally::Tally;
+use totals::RunTotals;
 
-/// Pieces of output a reader may be behind before events wait for it, and are missed in the end.
+/// Maximum backlog of output; beyond it events wait, and are eventually missed.
 const DEPTH: usize = 1024;
-/// How often progress is looked at, and rewritten on a terminal.
+/// Interval at which progress is checked, and rewritten on a terminal.
 const LOOK: Duration = Duration::from_millis(250);
-/// How often progress is a line of its own where it cannot be rewritten.
+/// Interval of separate progress lines where progress cannot be rewritten.
 const PROGRESS_LINE: Duration = Duration::from_secs(10);
-/// How long a reader may take for the rest at the end.
+/// How long a reader may take for the remaining output at the end.
 const LAST: Duration = Duration::from_secs(5);
-/// Back to the beginning of the line, which is erased.
+/// Returns to the start of the line and erases it.
 pub const ERASE_LINE: &str = "\r\x1b[K";
 
-/// What to print, and how.
+/// Options of the output.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct HeadlessOptions {
-    /// One JSON object a line instead of text.
+    /// One JSON object per line instead of text.
     pub json: bool,
     /// Colours, in text.
     pub colour: ColourChoice,
     /// Progress between the events: rewritten in place on a terminal, otherwise every ten seconds.
     pub progress: bool,
-    /// How long the run is to last; only shown. Who ends the run is not this module.
+    /// The planned duration of the run; only shown. This module does not end the run.
     pub duration: Option<Duration>,
 }
 
@@ -56,8 +56,8 @@ enum Progress {
     InPlace,
 }
 
-/// Prints events to `out`, the process's standard output, until `shutdown`; then what is announced
-/// already, and the summary.
+/// Prints events to `out`, the process's standard output, until `shutdown`; then the remaining announced events and the
+/// summary.
 ///
 /// Events count from this call, not from the first poll. Cancel `shutdown` when everything else has
 /// ended, so that the last episode is in the summary. The future ends early, with `Ok`, when the reader of
@@ -90,7 +90,7 @@ pub fn run(
     }
 }
 
-/// Has the reader gone: a pipe was closed, or a terminal?
+/// Whether the reader is gone: a closed pipe or terminal.
 fn is_gone(error: &io::Error) -> bool {
     let errno = rustix::io::Errno::from_io_error(error);
     matches!(errno, Some(rustix::io::Errno::PIPE | rustix::io::Errno::IO)) || error.kind() == io::ErrorKind::BrokenPipe
@@ -105,8 +105,8 @@ struct Printer {
     wall: WallClock,
     began: Stamp,
     rates: Rates,
-    tally: Tally,
-    /// The terminal shows a progress line, without a line end.
+    totals: RunTotals,
+    /// The terminal shows a progress line without a line end.
     pending: bool,
     last_line: Stamp,
 }
@@ -122,7 +122,7 @@ impl Printer {
             wall: WallClock::now(),
             began: snapshot.taken,
             rates: Rates::default(),
-            tally: Tally::new(snapshot),
+            totals: RunTotals::new(snapshot),
             pending: false,
             last_line: snapshot.taken,
         }
@@ -147,7 +147,7 @@ impl Printer {
                 event = events.recv() => match event {
                     Ok(event) => Some(self.event(&event)?).filter(|piece| !piece.is_empty()),
                     Err(RecvError::Lagged(missed)) => Some(self.missed(missed, &board.snapshot())),
-                    // The board, which we hold, keeps the channel open.
+                    // The board, which this task holds, keeps the channel open.
                     Err(RecvError::Closed) => break,
                 },
                 _ = looks.tick() => self.look(&board.snapshot())?.filter(|_| outlet.is_idle()),
@@ -156,7 +156,7 @@ impl Printer {
             tokio::select! {
                 biased;
                 () = shutdown.cancelled() => {
-                    // Into the rest, where it waits for room.
+                    // Kept in `rest`, where it waits for space.
                     rest = piece;
                     break;
                 }
@@ -175,7 +175,7 @@ impl Printer {
         outlet.finish(LAST).await
     }
 
-    /// What the run begins with: the rig and its modalities.
+    /// The start of the output: the rig and its modalities.
     fn opening(&mut self, snapshot: &Snapshot) -> io::Result<String> {
         let wall_ns = self.wall.wall_ns(snapshot.taken);
         let line = if self.json { line::begin_json(snapshot, wall_ns)? } else { self.columns.begin(snapshot, wall_ns) };
@@ -183,11 +183,11 @@ impl Printer {
     }
 
     fn event(&mut self, event: &Event) -> io::Result<String> {
-        self.tally.count(event);
+        self.totals.count(event);
         let wall_ns = self.wall.wall_ns(event.stamp);
         let line = match &event.what {
             _ if self.json => line::json(event, wall_ns)?,
-            // They come all the time, and progress shows how fast.
+            // Chunks arrive continuously; progress shows their rate.
             What::Chunk(chunk) if chunk.skipped == 0 => return Ok(String::new()),
             _ => self.columns.line(event, wall_ns),
         };
@@ -195,8 +195,8 @@ impl Printer {
     }
 
     fn missed(&mut self, missed: u64, now: &Snapshot) -> String {
-        self.tally.miss(missed);
-        self.tally.agree(now);
+        self.totals.miss(missed);
+        self.totals.agree(now);
         let line = if self.json {
             let time = crate::time::rfc3339(self.wall.wall_ns(now.taken));
             serde_json::json!({ "event": "missed", "count": missed, "time": time }).to_string()
@@ -227,20 +227,20 @@ impl Printer {
             return Ok(Some(self.whole_line(&line)));
         }
         self.pending = true;
-        // The last column stays empty: a full line would wrap, and then could not be rewritten.
+        // The last column stays empty: a full line would wrap and could not be rewritten.
         let line = text::cut(&line, terminal_columns().saturating_sub(1), "~").into_owned();
         Ok(Some(format!("{ERASE_LINE}{}", self.columns.palette.faint(&line))))
     }
 
     fn summary(&mut self, end: &Snapshot) -> io::Result<String> {
-        let tally = std::mem::replace(&mut self.tally, Tally::new(end));
-        let summary = tally.summary(end);
+        let totals = std::mem::replace(&mut self.totals, RunTotals::new(end));
+        let summary = totals.summary(end);
         let text =
             if self.json { text::json(&summary)? } else { summary.text(self.columns.name, self.columns.palette) };
         Ok(self.whole_line(&text))
     }
 
-    /// `line` with its end, in place of the progress line if there is one.
+    /// `line` with a line end, replacing the progress line if there is one.
     fn whole_line(&mut self, line: &str) -> String {
         let erase = if std::mem::take(&mut self.pending) { ERASE_LINE } else { "" };
         format!("{erase}{line}\n")

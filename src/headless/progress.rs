@@ -1,4 +1,4 @@
-//! The progress line: how far the run is, at a glance.
+//! The progress line: the state of the run at a glance.
 
 use std::time::Duration;
 
@@ -8,13 +8,13 @@ use crate::status::rates::Rates;
 use crate::status::{PolicyStatus, SlotState, Snapshot};
 use crate::text;
 
-/// Progress as one line, without a line end: time, mask, policy, the episode, rates of what streams.
+/// Progress as one line, without a line end: time, mask, policy, the episode, rates of streaming devices.
 pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, duration: Option<Duration>) -> String {
     let of = duration.map(|duration| format!("/{}", text::clock(duration))).unwrap_or_default();
     let mut parts = vec![format!("{}{of}", text::clock(elapsed))];
     parts.push(format!("mask {}", snapshot.mask.hex(snapshot.devices.len())));
     parts.extend(snapshot.policy.as_ref().map(progress));
-    // The episode comes before the rates: with many devices it is the end that is cut off.
+    // The episode comes before the rates: with many devices the end is cut off.
     if let Some(recording) = &snapshot.recording {
         parts.push(format!(
             "rec {} {} {:.1} MB/s",
@@ -106,7 +106,7 @@ pub(super) fn json(
     })
 }
 
-/// What the policy does now, in a few words for the progress line.
+/// What the policy is doing, in a few words for the progress line.
 pub(super) fn progress(policy: &PolicyStatus) -> String {
     let dry = if policy.dry_run { " dry" } else { "" };
     let latency = policy.latency_ms.map(|ms| format!(" {ms:.0} ms")).unwrap_or_default();
@@ -121,7 +121,7 @@ pub(super) fn progress(policy: &PolicyStatus) -> String {
 pub(super) struct PolicyProgress<'a> {
     policy: &'a str,
     dry_run: bool,
-    /// What it saw last, `0x05`.
+    /// The mask it observed last, `0x05`.
     mask: String,
     /// Why it does nothing; null while it acts.
     hold: Option<String>,

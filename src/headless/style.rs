@@ -1,11 +1,11 @@
-//! Colour in printed lines: whether, and which.
+//! Colours of printed lines.
 
 use crate::status::{Grade, Level, SlotState};
 
 /// What the user chose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ColourChoice {
-    /// By the environment and by where the output goes.
+    /// Depending on the environment and on the destination of the output.
     #[default]
     Auto,
     /// Always.
@@ -15,9 +15,8 @@ pub enum ColourChoice {
 }
 
 impl ColourChoice {
-    /// Are colours to be printed? `CLICOLOR_FORCE` and `NO_COLOR` as on <https://bixense.com/clicolors>
-    /// and <https://no-color.org>; the user's own choice comes first, then `NO_COLOR`.
-    #[must_use]
+    /// Whether colours are printed. `CLICOLOR_FORCE` and `NO_COLOR` as on <https://bixense.com/clicolors> and
+    /// <https://no-color.org>; the user's own choice takes precedence, then `NO_COLOR`.
     pub fn resolve(self, terminal: Terminal, variable: impl Fn(&str) -> Option<String>) -> Palette {
         let set = |name: &str| variable(name).is_some_and(|value| !value.is_empty());
         let forced = || set("CLICOLOR_FORCE") && variable("CLICOLOR_FORCE").is_none_or(|value| value != "0");
@@ -32,65 +31,58 @@ impl ColourChoice {
     }
 }
 
-/// Does the output go to a terminal?
+/// Whether the output goes to a terminal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Terminal {
     /// Yes.
     Yes,
-    /// To a file or a pipe.
+    /// No: a file or a pipe.
     No,
 }
 
 impl Terminal {
-    /// Where `out` goes.
-    #[must_use]
+    /// The destination of `out`.
     pub fn of(out: &impl std::io::IsTerminal) -> Self {
         if out.is_terminal() { Self::Yes } else { Self::No }
     }
 }
 
-/// Ways to set off a word.
+/// Ways to highlight a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Palette {
     /// ANSI escape sequences, the 16 colours.
     Ansi,
-    /// The word as it is.
+    /// No highlighting.
     Plain,
 }
 
 impl Palette {
     /// `text` as something good.
-    #[must_use]
     pub fn good(self, text: &str) -> String {
         self.wrap("32", text)
     }
 
-    /// `text` as something to look at.
-    #[must_use]
+    /// `text` as something that needs attention.
     pub fn warn(self, text: &str) -> String {
         self.wrap("33", text)
     }
 
     /// `text` as something wrong.
-    #[must_use]
     pub fn bad(self, text: &str) -> String {
         self.wrap("1;31", text)
     }
 
-    /// `text` as something beside the point.
-    #[must_use]
+    /// `text` as something secondary.
     pub fn faint(self, text: &str) -> String {
         self.wrap("2", text)
     }
 
     /// `text` as a name or a heading.
-    #[must_use]
     pub fn bold(self, text: &str) -> String {
         self.wrap("1", text)
     }
 
     /// `text` in the colour of a state.
-    #[must_use]
     pub fn state(self, state: SlotState, text: &str) -> String {
         match state {
             SlotState::Streaming => self.good(text),
@@ -102,7 +94,6 @@ impl Palette {
     }
 
     /// `text` in the colour of a severity.
-    #[must_use]
     pub fn level(self, level: Level, text: &str) -> String {
         match level {
             Level::Debug => self.faint(text),
@@ -113,7 +104,6 @@ impl Palette {
     }
 
     /// `text` in the colour of a verdict.
-    #[must_use]
     pub fn grade(self, grade: Grade, text: &str) -> String {
         match grade {
             Grade::Good => self.good(text),

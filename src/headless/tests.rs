@@ -3,10 +3,10 @@ use std::sync::Mutex;
 use serde_json::Value;
 
 use super::*;
+use crate::device::UsbIdentity;
 use crate::interlock::{InputState, StopKind};
 use crate::mask::{PhysicalMask, SizedMask};
 use crate::provenance::{KernelDriver, Negotiated, UnplugSource};
-use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
 use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use crate::status::{
@@ -14,7 +14,7 @@ use crate::status::{
     Verdict, What,
 };
 
-/// An output that keeps what it is given.
+/// An output that stores the bytes written to it.
 #[derive(Clone, Default)]
 struct Kept(Arc<Mutex<Vec<u8>>>);
 
@@ -253,7 +253,7 @@ fn a_run_begins_with_its_modalities() {
 }
 
 #[test]
-fn progress_names_what_counts_first() {
+fn progress_shows_the_most_important_first() {
     let mut snapshot = every_state();
     snapshot.recording = Some(recording(2));
     let line = progress::line(&snapshot, &Rates::default(), Duration::from_secs(12), Some(Duration::from_secs(30)));
@@ -302,11 +302,11 @@ fn progress_shows_the_policy() {
 fn the_summary_counts_the_policy() {
     let start = three_streaming();
     let summary = |events: &[What]| {
-        let mut tally = Tally::new(&start);
+        let mut totals = RunTotals::new(&start);
         for what in events {
-            tally.count(&event(what.clone()));
+            totals.count(&event(what.clone()));
         }
-        tally.summary(&start)
+        totals.summary(&start)
     };
     let whole = summary(&[loaded(true), policy_end(104)]);
     let object = serde_json::to_value(&whole).unwrap();
@@ -324,7 +324,7 @@ fn the_summary_counts_the_policy() {
 }
 
 #[test]
-fn chunks_in_time_are_lines_in_json_alone() {
+fn timely_chunks_are_printed_only_as_json() {
     let snapshot = three_streaming();
     let print = |json, what: What| {
         let options = HeadlessOptions { json, ..HeadlessOptions::default() };
@@ -336,48 +336,48 @@ fn chunks_in_time_are_lines_in_json_alone() {
 }
 
 #[test]
-fn the_mean_rate_is_not_over_the_time_that_closing_takes() {
+fn the_mean_rate_excludes_the_time_that_closing_takes() {
     let start = three_streaming();
     let at = |ms: u64| Stamp(start.taken.0 + ms * 1_000_000);
-    // 20 Hz for 2 s; then closing takes 2 s, after which the device is announced as gone, or the run ends first.
+    // 20 Hz for 2 s; then closing takes 2 s, after which the device is announced as gone, or the run ends before that.
     for announced in [true, false] {
-        let mut tally = Tally::new(&start);
+        let mut totals = RunTotals::new(&start);
         if announced {
-            tally.count(&Event { stamp: at(4000), what: state("cam_wrist", 0, SlotState::Absent, "") });
+            totals.count(&Event { stamp: at(4000), what: state("cam_wrist", 0, SlotState::Absent, "") });
         }
-        // Silence is none of closing.
-        tally.count(&Event { stamp: at(3000), what: state("cam_top", 1, SlotState::Stalled, "") });
+        // Silence does not count as closing.
+        totals.count(&Event { stamp: at(3000), what: state("cam_top", 1, SlotState::Stalled, "") });
         let mut end = start.clone();
         end.taken = at(4000);
         for device in &mut end.devices {
             device.samples += 40;
             device.newest = Some(at(1950));
         }
-        let object = serde_json::to_value(tally.summary(&end)).unwrap();
+        let object = serde_json::to_value(totals.summary(&end)).unwrap();
         assert_eq!((&object["devices"][0]["hz"], &object["devices"][1]["hz"]), (&20.0.into(), &10.0.into()));
         assert_eq!(object["devices"][0]["present"], 1.0);
     }
 }
 
 #[test]
-fn the_summary_counts_from_its_beginning_and_means_while_present() {
+fn the_summary_counts_from_its_beginning_and_averages_over_presence() {
     let start = three_streaming();
-    let mut tally = Tally::new(&start);
+    let mut totals = RunTotals::new(&start);
     let at = |seconds: u64| Stamp(start.taken.0 + seconds * 1_000_000_000);
-    // Present from 0 to 4 s and from 9 s on: half of the run.
+    // Present from 0 to 4 s and from 9 s to the end: half of the run.
     for (seconds, to) in
         [(4, SlotState::Absent), (8, SlotState::Opening), (9, SlotState::Streaming), (9, SlotState::Stalled)]
     {
-        tally.count(&Event { stamp: at(seconds), what: state("cam_wrist", 0, to, "") });
+        totals.count(&Event { stamp: at(seconds), what: state("cam_wrist", 0, to, "") });
     }
-    tally.count(&Event { stamp: at(9), what: episode(3, None) });
+    totals.count(&Event { stamp: at(9), what: episode(3, None) });
     let mut end = start.clone();
     end.taken = at(10);
     for device in &mut end.devices {
         device.samples += 150;
         device.gaps += u64::from(device.id.bit());
     }
-    let summary = tally.summary(&end);
+    let summary = totals.summary(&end);
     let object = serde_json::to_value(&summary).unwrap();
     assert_eq!(object["event"], "summary");
     assert_eq!(object["devices"][0]["samples"], 150);

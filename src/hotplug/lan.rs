@@ -1,19 +1,19 @@
 //! Devices on the network: those that announce themselves (mDNS) and those at a fixed address.
 //!
-//! Registration is parallel to USB: only entries that are found by mDNS or by their address are searched for, and
-//! nothing else on the network. A device that is found is reported as `Added` with the entry's name; it is reported as
+//! Registration is parallel to USB: only entries identified by mDNS or by address are searched for, and nothing else on
+//! the network. A device that is found is reported as `Added` with the entry's name; it is reported as
 //! `Removed`
 //!
-//! * at once when the link that leads to it is down ([`UnplugSource::Link`]), and a second after its goodbye
-//!   ([`UnplugSource::Goodbye`]), in which another device may announce itself (RFC 6762, 10.1),
+//! * at once when the link that leads to it is down (`UnplugSource::Link`), and a second after its goodbye
+//!   (`UnplugSource::Goodbye`), during which another device may announce itself (RFC 6762, 10.1),
 //! * otherwise when nothing was received from it for the entry's lease, or its address reports that no device is there
-//!   and its driver received nothing either ([`UnplugSource::Lease`]).
+//!   and its driver received nothing either (`UnplugSource::Lease`).
 //!
-//! What a driver receives counts: a device that sends is not queried, and one whose announcements are lost on the
-//! network while its pictures arrive is present.
+//! A driver's reception counts: a device that sends is not queried, and one whose announcements are lost on the network
+//! while its pictures arrive is present.
 //!
-//! Invariant: what is found is bounded and reported unchanged; the code that displays it escapes it.
-//! Invariant: nothing here waits for a device without a limit, and nothing waits for anything here.
+//! Invariant: discovered data is bounded and reported unchanged; the code that displays it escapes it.
+//! Invariant: every wait for a device is bounded, and nothing else waits for this module.
 
 mod mdns;
 mod probe;
@@ -32,7 +32,7 @@ use self::watch::Watch;
 use super::{HotplugError, HotplugEvent};
 use crate::registry::{LanFind, NodeSpec, Probe, Registry};
 
-/// Events that may wait; the rig reads them at once.
+/// Queue length for events; the rig reads them at once.
 const DEPTH: usize = 64;
 
 /// See the module's comment.
@@ -44,8 +44,7 @@ pub struct LanMonitor {
 }
 
 impl LanMonitor {
-    /// Begins to search for the entries of devices on the network; `None` if there are none.
-    #[must_use]
+    /// Starts searching for the entries of devices on the network; `None` if there are none.
     pub fn open(registry: &Registry) -> Option<Self> {
         let (report, events) = mpsc::channel(DEPTH);
         let mut tasks = JoinSet::new();
@@ -57,7 +56,7 @@ impl LanMonitor {
             match &lan.find {
                 LanFind::Adapter { .. } => {}
                 LanFind::Host { host, probe, port } => {
-                    // While the driver waits for the end of a cooldown, nothing receives packets.
+                    // While the driver waits for the end of a cooldown, no packets are received.
                     let grace = if *probe == Probe::Udp { registry.rig.cooldown } else { Duration::ZERO };
                     tasks.spawn(probe::watch(watch().waits(grace), lan.server(*host), (*host, *port).into(), *probe));
                 }
@@ -73,7 +72,7 @@ impl LanMonitor {
         }
         let browser = if announced.is_empty() { None } else { Browser::open(&phones) };
         for (service, wanted) in announced {
-            // Without a socket for mDNS, which was reported, they are never found.
+            // Without an mDNS socket, which was reported, they are never found.
             if let Some(browser) = &browser {
                 tasks.spawn(browser.watch(service, wanted));
             }
@@ -83,7 +82,7 @@ impl LanMonitor {
     }
 }
 
-/// What is used of the name of an announced instance, for the fuzzer.
+/// The part of an announced instance's name that is used, for the fuzzer.
 #[doc(hidden)]
 pub fn fuzz_label(label: &str) {
     mdns::fuzz(label);
@@ -95,7 +94,7 @@ impl Stream for LanMonitor {
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         match self.events.poll_recv(context) {
             Poll::Ready(Some(event)) => Poll::Ready(Some(Ok(event))),
-            // Tasks that have ended find nothing more; what was found stays.
+            // Tasks that have ended find nothing more; earlier findings remain.
             Poll::Ready(None) | Poll::Pending => Poll::Pending,
         }
     }

@@ -1,9 +1,9 @@
-//! Hot-plug: a stream of devices plugged in and unplugged, whatever the source.
+//! Hot-plug: a stream of devices plugged in and unplugged, from any source.
 //!
-//! `udev` watches the machine, `lan` the network, `script` plays a scenario; all yield the same [`HotplugEvent`]s, and
+//! `udev` monitors the machine, `lan` the network, `script` plays a scenario; all yield the same [`HotplugEvent`]s, and
 //! their consumers cannot distinguish them.
 //!
-//! Invariant: what is attached when the stream begins is reported as `Added` before anything else.
+//! Invariant: devices attached when the stream begins are reported as `Added` before anything else.
 //! Invariant: a node reported twice as `Added` without a removal in between is the same attachment.
 
 #[cfg(feature = "lan")]
@@ -16,14 +16,14 @@ use std::pin::Pin;
 
 use futures::Stream;
 
+use crate::device::Attachment;
 use crate::provenance::UnplugSource;
-use crate::registry::Attachment;
 use crate::time::Stamp;
 
 /// A device was plugged in or unplugged.
 #[derive(Debug, Clone, PartialEq)]
 pub enum HotplugEvent {
-    /// A node is there and may be opened: rules and permissions are in place.
+    /// A node is present and may be opened: rules and permissions are in place.
     Added(Attachment),
     /// Everything at or below this path in sysfs is gone.
     Removed {
@@ -36,7 +36,7 @@ pub enum HotplugEvent {
     },
 }
 
-/// Why plugging can no longer be watched.
+/// Why hot-plug events can no longer be monitored.
 #[derive(Debug, thiserror::Error)]
 pub enum HotplugError {
     /// The netlink sockets or sysfs.

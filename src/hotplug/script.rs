@@ -12,8 +12,9 @@ use futures::Stream;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::{HotplugError, HotplugEvent, UnplugSource};
-use crate::registry::scenario::{self, Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice};
-use crate::registry::{Attachment, DeviceNode, Unit};
+use crate::device::{Attachment, DeviceNode, Unit};
+use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
+use crate::simulation::{self, SimDevice};
 use crate::time::Stamp;
 
 /// Plays a [`Scenario`] on tokio's clock, from the moment it is created.
@@ -25,15 +26,14 @@ pub struct Script {
 }
 
 impl Script {
-    /// Begins: what is plugged at the start is reported at once.
-    #[must_use]
+    /// Starts: devices plugged in at the start are reported at once.
     pub fn new(scenario: Scenario) -> Self {
         let begin = Instant::now();
         Self { timeline: Timeline::new(scenario, Stamp::now()), begin, timer: Box::pin(sleep_until(begin)) }
     }
 }
 
-/// The events of a [`Scenario`] in their order, for a caller that keeps the time.
+/// The events of a [`Scenario`] in order, for a caller that keeps the time.
 #[derive(Debug)]
 pub struct Timeline {
     devices: Vec<ScenarioDevice>,
@@ -42,7 +42,7 @@ pub struct Timeline {
     sequences: HashMap<String, u32>,
     events: Vec<ScenarioEvent>,
     next: usize,
-    /// When the current round of events began, from the scenario's beginning.
+    /// When the current round of events began, relative to the scenario's beginning.
     round: Duration,
     repeat: Option<Duration>,
     begun: Stamp,
@@ -51,7 +51,6 @@ pub struct Timeline {
 
 impl Timeline {
     /// The scenario's beginning, at `begun`: the first events report what is plugged in then.
-    #[must_use]
     pub fn new(scenario: Scenario, begun: Stamp) -> Self {
         let mut timeline = Self {
             devices: scenario.devices,
@@ -121,7 +120,7 @@ impl Timeline {
         }
     }
 
-    /// When the next event is due, from the beginning; `None` when the scenario has ended.
+    /// When the next event is due, relative to the beginning; `None` when the scenario has ended.
     fn due(&mut self) -> Option<Duration> {
         if self.next == self.events.len() {
             let repeat = self.repeat.filter(|_| !self.events.is_empty())?;
@@ -132,20 +131,19 @@ impl Timeline {
     }
 }
 
-/// What is plugged in when a scenario begins.
-#[must_use]
+/// The devices plugged in when a scenario begins.
 pub fn attached(scenario: &Scenario) -> Vec<Attachment> {
     let begun = Stamp::now();
     scenario.devices.iter().filter(|device| device.plugged).map(|device| attachment(device, begun).0).collect()
 }
 
-/// The attachment of a device that is plugged in now, and its cable.
+/// The attachment of a device plugged in now, and its cable.
 fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevice>) {
     let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun).with_faults(device.faults));
     let syspath = PathBuf::from("/sim").join(&device.usb.port);
     let unit = device.lan.clone().map_or_else(|| Unit::Usb(device.usb.clone()), Unit::Lan);
     let node = DeviceNode::Sim(Arc::clone(&sim));
-    (Attachment { syspath, node, unit, driver: Some(Box::new(scenario::driver())) }, sim)
+    (Attachment { syspath, node, unit, driver: Some(Box::new(simulation::driver())) }, sim)
 }
 
 impl Stream for Script {
@@ -156,8 +154,8 @@ impl Stream for Script {
             if let Some(event) = self.timeline.queue.pop_front() {
                 return Poll::Ready(Some(Ok(event)));
             }
-            // The stream of a finished scenario continues without events, like that of a machine whose
-            // devices do not change.
+            // The stream of a finished scenario stays open without events, like that of a machine whose devices do not
+            // change.
             let Some(due) = self.timeline.due() else { return Poll::Pending };
             let due = self.begin + due;
             self.timer.as_mut().reset(due);
@@ -172,8 +170,8 @@ impl Stream for Script {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::registry::UsbIdentity;
-    use crate::registry::scenario::{SimFaults, SimSource};
+    use crate::device::UsbIdentity;
+    use crate::simulation::{SimFaults, SimSource};
     use futures::StreamExt;
 
     fn device(name: &str, port: &str, plugged: bool) -> ScenarioDevice {
@@ -223,7 +221,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn an_unplugged_device_is_notified_at_once() {
+    async fn an_unplugged_simulated_device_falls_silent_at_once() {
         let mut script = Script::new(Scenario {
             devices: vec![device("a", "1-1", true)],
             events: vec![event(5, "a", ScenarioAction::Silence), event(10, "a", ScenarioAction::Unplug)],

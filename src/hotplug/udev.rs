@@ -1,13 +1,13 @@
 //! The machine itself: kernel uevents for removal, udev's processed events for the node to open.
 //!
-//! The monitors listen before the devices are enumerated, so that nothing plugged in meanwhile is
-//! missed. A removal is reported by whichever source is first (on the virtual bench the kernel's uevent
-//! comes some 50 ms before udev's); an addition only by udev, once rules and permissions are in place.
+//! The monitors start before the devices are enumerated, so that nothing plugged in meanwhile is missed. A removal is
+//! reported by whichever source is first (on the virtual bench the kernel's uevent comes some 50 ms before udev's); an
+//! addition only by udev, once rules and permissions are in place.
 //!
-//! The kernel numbers its events. A node reported by event N cannot be removed by a removal before
-//! N, which only arrived late: kernel and udev send on two sockets, each with its own backlog (`Known`).
+//! The kernel numbers its events. A removal before event N cannot remove a node reported by N; it only arrived late:
+//! kernel and udev send on two sockets, each with its own backlog (`Known`).
 //!
-//! Invariant: a node in `Known` has been reported as `Added` and not since as `Removed`.
+//! Invariant: a node in `Known` has been reported as `Added` and not as `Removed` since.
 //! Invariant: lost events are never silent: when a socket overflows, devices are enumerated again
 //! and the difference is reported.
 
@@ -22,11 +22,11 @@ use tokio::io::unix::AsyncFd;
 use udev::{Device, Enumerator, EventType, MonitorBuilder, MonitorSocket};
 
 use super::{HotplugError, HotplugEvent, UnplugSource};
+use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::provenance::KernelDriver;
-use crate::registry::{Attachment, DeviceNode, UsbIdentity};
 use crate::time::Stamp;
 
-/// Subsystems whose nodes are opened, beside the USB devices themselves.
+/// Subsystems whose nodes are opened, in addition to USB devices themselves.
 const NODE_SUBSYSTEMS: [&str; 3] = ["video4linux", "tty", "net"];
 
 /// See the module's comment.
@@ -38,7 +38,7 @@ pub struct UdevMonitor {
 }
 
 impl UdevMonitor {
-    /// Begins to listen, then enumerates what is there.
+    /// Starts monitoring, then enumerates the present devices.
     ///
     /// # Errors
     /// When the netlink sockets are not available or sysfs cannot be read.
@@ -55,7 +55,7 @@ impl UdevMonitor {
 
     /// Reports the difference between the devices that are present and those that are known.
     fn enumerate(&mut self) -> Result<(), HotplugError> {
-        // Read before the devices: an event up to here may be about a device that is gone by now.
+        // Read before the devices: an event up to this one may concern a device that is gone by now.
         let sequence = newest_event();
         self.queue.extend(self.known.enumerated(attached()?, sequence, Stamp::now()));
         Ok(())
@@ -81,7 +81,7 @@ impl UdevMonitor {
         Ok(())
     }
 
-    /// Moves pending events of a socket into the queue. Ready when the socket is drained and registered for a wakeup.
+    /// Moves pending events of a socket into the queue. Ready when the socket is drained and registered for a wake-up.
     fn poll_socket(&mut self, context: &mut Context<'_>, source: UnplugSource) -> Poll<Result<(), HotplugError>> {
         loop {
             let socket = if source == UnplugSource::Kernel { &self.kernel } else { &self.udev };
@@ -92,7 +92,7 @@ impl UdevMonitor {
                 match error.raw_os_error() {
                     Some(libc::ENOBUFS) => self.enumerate()?,
                     Some(libc::EAGAIN) => guard.clear_ready(),
-                    // A message that is not from udev: the next one may be.
+                    // A message that is not from udev; the next one may be.
                     _ => {}
                 }
                 continue;
@@ -108,7 +108,7 @@ impl Stream for UdevMonitor {
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         if self.queue.is_empty() {
-            // The kernel's socket first: its removals are the earlier ones.
+            // The kernel's socket first: it reports removals earlier.
             for source in [UnplugSource::Kernel, UnplugSource::Udev] {
                 if let Poll::Ready(Err(error)) = self.poll_socket(context, source) {
                     return Poll::Ready(Some(Err(error)));
@@ -122,7 +122,7 @@ impl Stream for UdevMonitor {
     }
 }
 
-/// What is attached now and could be opened, for `rapid devices`.
+/// The devices attached now that could be opened, for `rapid devices`.
 ///
 /// # Errors
 /// When sysfs cannot be read.
@@ -153,7 +153,7 @@ fn attached() -> Result<Vec<Present>, HotplugError> {
     enumerator.match_subsystem("usb")?;
     enumerator.match_is_initialized()?;
     let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| present(&device)).collect();
-    // In the order of ports, so that equal units are assigned the same way at each start.
+    // Sorted by port, so that identical units are assigned the same way at each start.
     found.sort_by(|a, b| {
         let (a, b) = (&a.attachment, &b.attachment);
         (a.unit.place(), &a.syspath).cmp(&(b.unit.place(), &b.syspath))
@@ -167,9 +167,9 @@ fn present(device: &Device) -> Option<Present> {
     let node = match device.subsystem()?.to_str()? {
         "video4linux" if captures(device) => DeviceNode::Video(path()?),
         "tty" => DeviceNode::Tty(path()?),
-        // An interface has a name and no node.
+        // An interface has a name but no node.
         "net" => DeviceNode::Net(device.sysname().to_str()?.to_owned()),
-        // Of this subsystem, only the devices themselves have a node.
+        // In this subsystem, only the devices themselves have a node.
         "usb" => DeviceNode::Usb(path()?),
         _ => return None,
     };
@@ -218,7 +218,7 @@ fn kernel_driver(device: &Device) -> Option<KernelDriver> {
     Some(KernelDriver { name, version })
 }
 
-/// A UVC camera offers a second video node for metadata, which has no pictures.
+/// A UVC camera has a second video node for metadata, which has no pictures.
 fn captures(device: &Device) -> bool {
     match device.property_value("ID_V4L_CAPABILITIES") {
         Some(capabilities) => capabilities.to_string_lossy().contains(":capture:"),
@@ -230,7 +230,7 @@ fn captures(device: &Device) -> bool {
 #[derive(Debug, Clone)]
 pub(super) struct Present {
     pub(super) attachment: Attachment,
-    /// Number the kernel gave the USB device; a new one after each plug.
+    /// Number the kernel gave the USB device; it changes with each plug.
     pub(super) device_number: Option<String>,
 }
 
@@ -249,19 +249,18 @@ struct Node {
     since: u64,
 }
 
-/// What has been reported as attached, and what an event or an enumeration changes in it. Pure.
+/// The nodes reported as attached, and how events and enumerations change them. Pure.
 #[derive(Debug, Default)]
 struct Known {
     nodes: HashMap<PathBuf, Node>,
-    /// Paths that the kernel removed, with udev events for them still to come.
+    /// Paths that the kernel removed and whose udev events are still to come.
     removals: HashMap<PathBuf, u64>,
     /// The newest event before the last enumeration.
     enumerated: u64,
 }
 
 impl Known {
-    /// Takes what an enumeration found that began after event `sequence`; reports the difference,
-    /// removals first.
+    /// Applies an enumeration that began after event `sequence`; reports the difference, removals first.
     pub(super) fn enumerated(&mut self, present: Vec<Present>, sequence: u64, now: Stamp) -> Vec<HotplugEvent> {
         self.enumerated = sequence;
         let is_there = |path: &Path, node: &Node| {
@@ -275,7 +274,7 @@ impl Known {
         events
     }
 
-    /// Takes udev's addition number `sequence`.
+    /// Applies udev's addition number `sequence`.
     pub(super) fn added(&mut self, present: Present, sequence: u64, now: Stamp) -> Vec<HotplugEvent> {
         let path = &present.attachment.syspath;
         let removed_since = |(removed, number): (&PathBuf, &u64)| path.starts_with(removed) && *number > sequence;
@@ -289,7 +288,7 @@ impl Known {
         events
     }
 
-    /// Takes the removal number `sequence` of everything at or below `path`.
+    /// Applies the removal number `sequence` of everything at or below `path`.
     pub(super) fn removed(
         &mut self,
         path: &Path,
@@ -346,7 +345,7 @@ mod tests {
 #[cfg(test)]
 mod known_tests {
     use super::*;
-    use crate::registry::{DeviceNode, UsbIdentity};
+    use crate::device::{DeviceNode, UsbIdentity};
 
     /// A node `port/name` of the device with this number.
     fn node(path: &str, number: u32) -> Present {
@@ -358,7 +357,7 @@ mod known_tests {
     }
 
     enum Step {
-        /// What is there, after which event.
+        /// The nodes found, and the event after which they were enumerated.
         Found(&'static [(&'static str, u32)], u64),
         Added(&'static str, u32, u64),
         Kernel(&'static str, u64),

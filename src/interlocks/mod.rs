@@ -33,7 +33,6 @@ use crate::time::Stamp;
 use tap::Tap;
 
 /// The stops of a registry, none of which runs.
-#[must_use]
 pub fn of(registry: &Registry) -> Interlocks {
     Interlocks::new(registry.stops.iter().map(|stop| (stop.name.as_str(), stop.kind)))
 }
@@ -94,7 +93,6 @@ impl Watched {
     }
 
     /// The inputs that are numbers in the samples of a device.
-    #[must_use]
     pub fn taps(&self) -> &[Tap] {
         &self.taps
     }

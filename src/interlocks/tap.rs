@@ -50,7 +50,6 @@ impl Tap {
     }
 
     /// Name of the device whose samples are evaluated.
-    #[must_use]
     pub fn device(&self) -> &str {
         &self.0.device
     }
@@ -103,7 +102,6 @@ fn number(bytes: &[u8], index: usize) -> Option<f64> {
 }
 
 /// Reports the taps as lost when it is dropped.
-#[must_use]
 pub fn lost_at_the_end(taps: &Arc<[Tap]>) -> impl Drop + use<> {
     Lost(Arc::clone(taps))
 }

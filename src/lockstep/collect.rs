@@ -3,19 +3,19 @@
 use std::sync::Arc;
 
 use super::{Lockstep, TrialError};
-use crate::driver::sim::task::{Expert, Outcome, Texture, World};
 use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
+use crate::simulation::task::{Expert, Outcome, Texture, World};
 use crate::status::Board;
 use crate::time::{Stamp, WallClock};
 
-/// By how much the gripper misses while it demonstrates, so that the demonstrations show how to correct.
+/// How far the gripper misses during a demonstration, so that demonstrations show corrections.
 const SHAKE: f64 = 0.006;
-/// Steps in which everything is plugged in and seen, before an episode begins.
+/// Steps in which all devices are plugged in and observed, before an episode begins.
 const SETTLE: u32 = 3;
-/// Steps recorded after the block is in its bin: what to do then is part of the task.
+/// Steps recorded after the block is in its bin: what to do then belongs to the task.
 const TAIL: u32 = 8;
 
 /// A recorded demonstration.
@@ -23,7 +23,7 @@ const TAIL: u32 = 8;
 pub struct Demonstration {
     /// Seed of its trial.
     pub seed: u64,
-    /// Of the block.
+    /// Texture of the block.
     pub texture: Texture,
     /// Steps recorded.
     pub steps: u32,
@@ -31,8 +31,8 @@ pub struct Demonstration {
     pub report: EpisodeReport,
 }
 
-/// The seeds of `count` demonstrations from `first` on, as many of one texture as of the other; of an odd
-/// count one more of that which comes first. Seeds whose demonstration would fail are left out.
+/// The seeds of `count` demonstrations from `first` on, the same number of each texture; for an odd count one more of
+/// the texture that comes first. Seeds whose demonstration would fail are skipped.
 pub fn seeds(first: u64, count: usize) -> impl Iterator<Item = u64> {
     let mut left = [count.div_ceil(2), count.div_ceil(2)];
     let wanted = move |seed: &u64| {
@@ -57,7 +57,7 @@ fn succeeds(mut world: World, seed: u64) -> bool {
 /// Records the demonstration of trial `seed`.
 ///
 /// # Errors
-/// When its file cannot be made.
+/// When its file cannot be written.
 pub fn demonstrate(
     registry: &Arc<Registry>,
     board: &Arc<Board>,
@@ -68,7 +68,7 @@ pub fn demonstrate(
     let mut recorder = Stepped::new(Arc::clone(registry), Arc::clone(board), WallClock::now());
     let mut rig = Lockstep::new(registry, Scenario::task(registry, seed), begun, &[])?;
     let mut expert = Expert::new(seed);
-    let texture = rig.trial().trial().world.texture;
+    let texture = rig.trial().lock().world.texture;
     for _ in 0..SETTLE {
         rig.deliver(&mut recorder)?;
         rig.rest(&mut recorder)?;
@@ -81,7 +81,7 @@ pub fn demonstrate(
     while tail > 0 {
         rig.deliver(&mut recorder)?;
         let (action, done) = {
-            let trial = rig.trial().trial();
+            let trial = rig.trial().lock();
             (expert.act(&trial.world), trial.world.is_done())
         };
         rig.act(steps.into(), action, &mut recorder);

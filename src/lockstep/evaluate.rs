@@ -1,7 +1,7 @@
-//! Closed-loop trials of a policy on the simulated task, with a sensor that is pulled out.
+//! Closed-loop trials of a policy on the simulated task, with a sensor that is unplugged.
 //!
-//! The policy is asked at a tick and its answer is there at the next one, as in a run in real time, where
-//! a chunk takes a tenth of a tick. Every trial has sensors of another phase and latency ([`Timing`]).
+//! The policy is queried at a tick and its answer is available at the next one, as in real time, where a chunk takes a
+//! tenth of a tick. In every trial the sensors have a different phase and latency ([`Timing`]).
 
 use std::time::Duration;
 
@@ -10,7 +10,6 @@ use serde::Serialize;
 use super::timing::Timing;
 use super::{Lockstep, STEP, Taker, TrialError};
 use crate::bus::TopicId;
-use crate::driver::sim::task::{AXES, Outcome, Texture};
 use crate::mask::PhysicalMask;
 use crate::policy::bundle::Bundle;
 use crate::policy::horizon::{Counts, WithoutMask};
@@ -23,30 +22,31 @@ use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
 use crate::registry::{Registry, task};
 use crate::sample::SampleHeader;
+use crate::simulation::task::{AXES, Outcome, Texture};
 use crate::status::Event;
 use crate::time::Stamp;
 
-/// The stream of a trial's seed that decides when cables are pulled.
+/// The random stream of a trial's seed that determines when cables are unplugged.
 const WINDOWS: u64 = 0x7769_6e64_6f77;
-/// The device that is pulled out.
+/// The device that is unplugged.
 const PULLED: &str = task::PARTS[1].0;
-/// Steps in which everything is plugged in and seen, before the policy begins.
+/// Steps in which all devices are plugged in and observed, before the policy begins.
 const SETTLE: u32 = 3;
 
-/// What happens to the sensors (paper, table "Hot-plug robustness", and one more).
+/// The sensor conditions (paper, table "Hot-plug robustness", and one more).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Condition {
     /// Nothing.
     Full,
-    /// The tactile sensor is not there.
+    /// The tactile sensor is absent.
     NoTactile,
-    /// It is pulled out at a step of 30 to 74: the block is touched at 35 to 45, the ways to the bins part
-    /// at 60 to 70.
+    /// It is unplugged at a step of 30 to 74: the block is touched at 35 to 45, and the paths to the bins separate at
+    /// 60 to 70.
     HotUnplug,
-    /// It is pulled out at a step of 10 to 29 and plugged in again 15 to 29 steps later.
+    /// It is unplugged at a step of 10 to 29 and plugged in again 15 to 29 steps later.
     HotReplug,
-    /// The wrist camera is not there: nothing shows where the block lies. Not in the paper's table.
+    /// The wrist camera is absent: nothing shows the block's position. Not in the paper's table.
     NoWrist,
 }
 
@@ -54,8 +54,7 @@ impl Condition {
     /// All of them, in the order of the paper's table.
     pub const ALL: [Self; 5] = [Self::Full, Self::NoTactile, Self::HotUnplug, Self::HotReplug, Self::NoWrist];
 
-    /// As it is written on the command line.
-    #[must_use]
+    /// Its word on the command line.
     pub const fn word(self) -> &'static str {
         match self {
             Self::Full => "full",
@@ -66,8 +65,7 @@ impl Condition {
         }
     }
 
-    /// The steps at which the sensor is pulled out and plugged in again in trial `seed`.
-    #[must_use]
+    /// The steps at which the sensor is unplugged and plugged in again in trial `seed`.
     pub fn windows(self, seed: u64) -> (Option<u32>, Option<u32>) {
         let mut random = Random::new(seed, WINDOWS);
         let mut step = |low: u32, high: u32| low + u32::try_from(random.below(u64::from(high - low))).unwrap_or(0);
@@ -92,7 +90,7 @@ impl Condition {
             device.plugged = false;
         }
         let (out, back) = self.windows(seed);
-        // Between two ticks: at the tick of that step the bit is clear.
+        // Between two ticks, so that at the tick of that step the bit is clear.
         let at = |step: u32| STEP * (SETTLE + step - 1) + STEP / 2;
         let event = |step, action| ScenarioEvent { at: at(step), device: PULLED.to_owned(), action };
         scenario.events.extend(out.map(|step| event(step, ScenarioAction::Unplug)));
@@ -101,68 +99,68 @@ impl Condition {
     }
 }
 
-/// Which sensors a run expects.
+/// Which sensors a run requires.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Configuration {
-    /// Those that are there.
+    /// Those that are present.
     Dynamic,
-    /// Those that were there when it began: one that is missing later ends it, as a configuration file
-    /// and a driver that raises do.
+    /// Those present at the start: a sensor that is missing later ends the run, as with a configuration file and a
+    /// driver that raises an exception.
     Static,
 }
 
-/// How a run took what happened.
+/// The result of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
-    /// All sensors were there.
+    /// All sensors were present.
     Normal,
     /// It continued without one.
     Degraded,
-    /// It ended.
+    /// It was aborted.
     Crash,
 }
 
 /// One trial.
 #[derive(Debug, Clone, Serialize)]
 pub struct Trial {
-    /// Its number, which decides all of it.
+    /// Its number, which determines everything in it.
     pub seed: u64,
-    /// What happened to the sensor.
+    /// The condition of the sensors.
     pub condition: Condition,
-    /// Of the block: true if triangular.
+    /// Texture of the block: true if triangular.
     pub triangular: bool,
-    /// Step at which the sensor was pulled out.
+    /// Step at which the sensor was unplugged.
     pub unplugged_at: Option<u32>,
     /// Step at which it was plugged in again.
     pub plugged_at: Option<u32>,
     /// How it ended.
     pub outcome: Outcome,
-    /// How the run took it.
+    /// The status of the run.
     pub status: Status,
     /// Steps of the task.
     pub steps: u32,
     /// What the executor counted.
     pub counts: Counts,
-    /// Answers that failed, the last reason.
+    /// The last failure of the policy.
     pub failure: Option<String>,
 }
 
-/// Records what a policy does.
+/// Records the behaviour of a policy.
 #[derive(Debug)]
 pub struct Recording<'a> {
     /// Writes the file.
     pub recorder: &'a mut Stepped,
-    /// What file.
+    /// Name and folder of the file.
     pub request: &'a EpisodeRequest,
-    /// Where onnxruntime comes from.
+    /// The origin of onnxruntime.
     pub library: &'a str,
-    /// The moment at which the trial begins.
+    /// The start time of the trial.
     pub begun: Stamp,
 }
 
-/// What a trial is run with.
+/// The inputs of a trial.
 #[derive(Debug)]
 pub struct Bench<'a> {
     /// The policy.
@@ -171,7 +169,7 @@ pub struct Bench<'a> {
     pub registry: &'a Registry,
     /// Its graphs.
     pub model: &'a mut Model,
-    /// Which sensors are expected.
+    /// Which sensors are required.
     pub configuration: Configuration,
 }
 
@@ -179,7 +177,7 @@ impl Bench<'_> {
     /// Runs trial `seed`.
     ///
     /// # Errors
-    /// When the simulation fails; what a policy does wrong is in the result.
+    /// When the simulation fails; mistakes of a policy are part of the result.
     pub fn run(&mut self, condition: Condition, seed: u64) -> Result<Trial, TrialError> {
         self.carry_out(condition, seed, None).map(|(trial, _)| trial)
     }
@@ -187,7 +185,7 @@ impl Bench<'_> {
     /// Runs trial `seed` with sensors locked to the ticks, and records it from the policy's first tick on.
     ///
     /// # Errors
-    /// When the simulation fails, or the file cannot be made.
+    /// When the simulation fails, or the file cannot be written.
     pub fn record(
         &mut self,
         condition: Condition,
@@ -228,7 +226,7 @@ impl Bench<'_> {
         let launched = rig.mask();
         let (mut status, mut failure) = (Status::Normal, None);
         let mut tick = 0;
-        while !rig.trial().trial().world.is_done() {
+        while !rig.trial().lock().world.is_done() {
             rig.deliver(&mut witness)?;
             if self.configuration == Configuration::Static && missing(launched, rig.mask()) {
                 status = Status::Crash;
@@ -258,7 +256,7 @@ impl Bench<'_> {
             tick += 1;
         }
         let report = witness.recorder.as_mut().and_then(|recorder| recorder.finish(rig.now()));
-        let trial = rig.trial().trial();
+        let trial = rig.trial().lock();
         let (unplugged_at, plugged_at) = condition.windows(seed);
         let trial = Trial {
             seed,
@@ -276,7 +274,7 @@ impl Bench<'_> {
     }
 }
 
-/// Gives the pilot its answer. Returns how many actions of a chunk came too late; `None` without a chunk.
+/// Passes the answer to the pilot. Returns how many actions of a chunk came too late; `None` without a chunk.
 fn take(
     answer: Option<Result<(), AnswerError>>,
     pilot: &mut Pilot,
@@ -290,7 +288,7 @@ fn take(
             if let Err(refused) = &taken {
                 *failure = Some(refused.to_string());
             }
-            // One that is not used was computed all the same, and may have been the first with a picture.
+            // An unused chunk was computed nevertheless, and may have been the first with a picture.
             Some(taken.unwrap_or(0))
         }
         Err(error) => {
@@ -315,7 +313,7 @@ fn axes(action: &[f32]) -> Option<[f64; AXES]> {
     Some(action.map(f64::from))
 }
 
-/// What follows the rig: the policy, and the recorder if there is one.
+/// Receivers of the rig's samples: the policy, and the recorder if there is one.
 struct Spectator<'a> {
     pilot: Pilot,
     recorder: Option<&'a mut Stepped>,
@@ -336,8 +334,7 @@ impl Taker for Spectator<'_> {
     }
 }
 
-/// 95 % interval of a share `count / total` (Wilson 1927).
-#[must_use]
+/// 95 % interval of the share `count / total` (Wilson 1927).
 pub fn wilson(count: usize, total: usize) -> (f64, f64) {
     const Z: f64 = 1.959_964;
     if total == 0 {
@@ -350,8 +347,7 @@ pub fn wilson(count: usize, total: usize) -> (f64, f64) {
     (((middle - reach) / scale).max(0.0), ((middle + reach) / scale).min(1.0))
 }
 
-/// How long a trial's step stands for.
-#[must_use]
+/// The robot time of a trial's steps.
 pub fn robot_time(steps: u64) -> Duration {
     Duration::from_secs_f64(STEP.as_secs_f64() * steps as f64)
 }
@@ -361,7 +357,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_interval_is_wilsons() {
+    fn the_confidence_interval_is_that_of_wilson() {
         let near = |(low, high): (f64, f64), expected: (f64, f64)| {
             assert!((low - expected.0).abs() < 5e-4 && (high - expected.1).abs() < 5e-4, "{low} {high}");
         };

@@ -1,8 +1,8 @@
-//! The simulated task stepped by a virtual clock: as fast as the machine computes, the same at every run.
+//! The simulated task stepped by a virtual clock: as fast as the machine computes, with the same result in every run.
 //!
-//! What decides is the same code as in a run in real time: hot-plug events of a scenario, the assignment
-//! to entries, the slots, the mask, the recorder's session, the policy. What differs is who carries it: one
-//! loop instead of threads, and moments that are counted instead of read from a clock.
+//! The decisions are made by the same code as in real time: hot-plug events of a scenario, the assignment to entries,
+//! the slots, the mask, the recorder's session, the policy. The execution differs: one loop instead of threads, and
+//! times that are computed instead of read from a clock.
 //!
 //! Invariant: a run is a function of its seed and its scenario.
 
@@ -14,23 +14,25 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use crate::bus::TopicId;
+use crate::device::{Attachment, DeviceNode};
 use crate::driver::DriverError;
-use crate::driver::sim::task::{self, AXES, AXIS_COUNT, STEP_HZ, Shared};
 use crate::hotplug::script::Timeline;
 use crate::mask::{PhysicalMask, SizedMask};
 use crate::modality::ModalityId;
 use crate::provenance::Negotiated;
 use crate::record::RecordError;
 use crate::record::stepped::Taker;
-use crate::registry::scenario::{Scenario, SimSource, TaskPart};
-use crate::registry::{Attachment, DeviceNode, DeviceSpec, Registry};
+use crate::registry::scenario::Scenario;
+use crate::registry::{DeviceSpec, Registry};
 use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
 use crate::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
+use crate::simulation::task::{self, AXES, AXIS_COUNT, STEP_HZ, SharedTrial};
+use crate::simulation::{SimSource, TaskPart};
 use crate::status::{Event, Provenance, SlotState, What};
 use crate::time::{Stamp, nanoseconds};
 use timing::Timing;
 
-/// The mask is published this often (paper, appendix "Physical Mask Data Format": 500 Hz).
+/// Publication period of the mask (paper, appendix "Physical Mask Data Format": 500 Hz).
 const MASK_PERIOD: Duration = Duration::from_millis(2);
 /// One step of the task.
 pub const STEP: Duration = Duration::from_nanos(1_000_000_000 / STEP_HZ as u64);
@@ -52,10 +54,10 @@ pub struct Lockstep {
     timeline: Timeline,
     core: Core,
     lanes: Vec<Lane>,
-    trial: Shared,
+    trial: SharedTrial,
     mask_sequence: u64,
     now: Stamp,
-    /// When the step in progress began; `None` until the first.
+    /// When the current step began; `None` until the first.
     stepping: Option<Stamp>,
     payload: Vec<u8>,
 }
@@ -67,13 +69,13 @@ struct Lane {
     running: Option<(Epoch, TaskPart)>,
     sequence: u64,
     latency: Duration,
-    /// When it captures next, plugged in or not.
+    /// Time of its next capture, plugged in or not.
     due: Stamp,
-    /// Captured and not yet seen, oldest first.
+    /// Captured samples not yet delivered, oldest first.
     transit: VecDeque<Captured>,
 }
 
-/// A sample on its way.
+/// A sample in transit.
 #[derive(Debug)]
 struct Captured {
     epoch: Epoch,
@@ -83,14 +85,14 @@ struct Captured {
 }
 
 impl Lockstep {
-    /// A rig at the moment `begun`, at which `scenario` begins: nothing has been sent yet. `timings` are those of
-    /// the devices in the order of the registry; one without is [locked](Timing::LOCKED) to the steps.
+    /// A rig at the time `begun`, at which `scenario` begins: nothing has been sent yet. `timings` has the timings of
+    /// the devices in the order of the registry; a device without one is [locked](Timing::LOCKED) to the steps.
     ///
     /// # Errors
-    /// When the scenario is not of the simulated task.
+    /// When the scenario does not belong to the simulated task.
     pub fn new(registry: &Registry, scenario: Scenario, begun: Stamp, timings: &[Timing]) -> Result<Self, DriverError> {
-        let scene = scenario.devices.iter().find_map(|device| match &device.source {
-            SimSource::Task { scene, .. } => Some(Shared::of(scene)),
+        let trial = scenario.devices.iter().find_map(|device| match &device.source {
+            SimSource::Task { trial, .. } => Some(trial.clone()),
             _ => None,
         });
         let timings = timings.iter().copied().chain(std::iter::repeat(Timing::LOCKED));
@@ -103,7 +105,7 @@ impl Lockstep {
             transit: VecDeque::new(),
         };
         Ok(Self {
-            trial: scene.unwrap_or_else(|| Err(DriverError::Fatal("a scenario without the simulated task".into())))?,
+            trial: trial.ok_or_else(|| DriverError::Fatal("a scenario without the simulated task".into()))?,
             timeline: Timeline::new(scenario, begun),
             core: Core::new(registry),
             lanes: registry.devices.iter().zip(timings).map(lane).collect(),
@@ -115,28 +117,25 @@ impl Lockstep {
     }
 
     /// The trial.
-    #[must_use]
-    pub const fn trial(&self) -> &Shared {
+    pub const fn trial(&self) -> &SharedTrial {
         &self.trial
     }
 
-    /// The moment it has come to.
-    #[must_use]
+    /// The current virtual time.
     pub const fn now(&self) -> Stamp {
         self.now
     }
 
     /// The mask in force.
-    #[must_use]
     pub const fn mask(&self) -> PhysicalMask {
         self.core.mask()
     }
 
-    /// Lets a tenth of a second pass in which nothing moves, the mask is published, and cables are plugged and
-    /// pulled. What is captured or seen at its end is left to [`Self::deliver`].
+    /// Advances a tenth of a second in which nothing moves, the mask is published, and cables are plugged and
+    /// unplugged. Captures and deliveries at its end are left to [`Self::deliver`].
     ///
     /// # Errors
-    /// When a picture cannot be made.
+    /// When a picture cannot be encoded.
     pub fn rest(&mut self, taker: &mut dyn Taker) -> Result<(), DriverError> {
         let end = self.now.after(STEP);
         let mut publish = self.now;
@@ -157,26 +156,26 @@ impl Lockstep {
         Ok(())
     }
 
-    /// Moves the arm for one step and lets a tenth of a second pass; who captures meanwhile sees it on its way.
+    /// Moves the arm for one step and advances a tenth of a second; captures during it show the arm on its way.
     ///
     /// # Errors
-    /// When a picture cannot be made.
+    /// When a picture cannot be encoded.
     pub fn step(&mut self, shake: f64, taker: &mut dyn Taker) -> Result<(), DriverError> {
-        self.trial.trial().step(shake);
+        self.trial.lock().step(shake);
         self.stepping = Some(self.now);
         self.rest(taker)
     }
 
-    /// Plugs and pulls what is due now, and lets every device that runs send what is captured or seen now.
+    /// Applies the plugs and unplugs due now, and lets every running device send the samples captured or delivered now.
     ///
     /// # Errors
-    /// When a picture cannot be made.
+    /// When a picture cannot be encoded.
     pub fn deliver(&mut self, taker: &mut dyn Taker) -> Result<(), DriverError> {
         self.plug(taker);
         self.sense(taker)
     }
 
-    /// Captures what is due, and hands over what is seen by now.
+    /// Takes the captures that are due, and delivers the samples whose latency has passed.
     fn sense(&mut self, taker: &mut dyn Taker) -> Result<(), DriverError> {
         let Self { lanes, trial, now, stepping, .. } = self;
         let (now, stepping) = (*now, *stepping);
@@ -187,7 +186,7 @@ impl Lockstep {
                 let Some((epoch, part)) = lane.running else { continue };
                 let share = stepping.map_or(1.0, |begun| at.since(begun).as_secs_f64() / STEP.as_secs_f64());
                 let mut payload = Vec::new();
-                trial.trial().sample_part_way(part, share, &mut payload)?;
+                trial.lock().sample_part_way(part, share, &mut payload)?;
                 lane.transit.push_back(Captured { epoch, part, at, payload });
             }
         }
@@ -206,10 +205,10 @@ impl Lockstep {
         Ok(())
     }
 
-    /// Gives the arm its actions from now on, as a policy does on the topic of actions at tick `number` of its
-    /// control grid.
+    /// Gives the arm its action from now on, as a policy does on the topic of actions at tick `number` of its control
+    /// grid.
     pub fn act(&mut self, number: u64, action: [f64; AXES], taker: &mut dyn Taker) {
-        self.trial.trial().command(action);
+        self.trial.lock().command(action);
         self.payload.clear();
         self.payload.extend(action.into_iter().flat_map(f64::to_le_bytes));
         let header = SampleHeader {
@@ -223,7 +222,7 @@ impl Lockstep {
         taker.take(TopicId::Action, &header, &self.payload);
     }
 
-    /// Takes what was plugged and pulled until now, and the deadlines that passed.
+    /// Applies the plugs and unplugs up to now, and the deadlines that have passed.
     fn plug(&mut self, taker: &mut dyn Taker) {
         while let Some(event) = self.timeline.next_by(self.now) {
             self.apply(Input::Hotplug(event), taker);
@@ -231,7 +230,7 @@ impl Lockstep {
         self.apply(Input::Timer, taker);
     }
 
-    /// Takes one step of the core and carries out its effects.
+    /// Runs one step of the core and carries out its effects.
     fn apply(&mut self, input: Input, taker: &mut dyn Taker) {
         let mut effects = Vec::new();
         self.core.step(input, self.now, &mut effects);
@@ -248,7 +247,7 @@ impl Lockstep {
         }
     }
 
-    /// Carries out one effect and returns what is to be announced of it.
+    /// Carries out one effect and returns the event to announce.
     fn carry_out(&mut self, id: ModalityId, effect: DeviceEffect) -> Option<What> {
         let devices = self.lanes.len();
         let lane = self.lanes.iter_mut().find(|lane| lane.spec.id == id)?;
@@ -293,7 +292,7 @@ impl Lockstep {
 }
 
 impl Lane {
-    /// Opens the part of the simulated task that is attached; `None` for a device of another kind.
+    /// Opens the attached part of the simulated task; `None` for a device of another kind.
     fn start(&mut self, epoch: Epoch, attachment: &Attachment, attached: Stamp) -> Option<Provenance> {
         let DeviceNode::Sim(device) = &attachment.node else { return None };
         let SimSource::Task { part, .. } = device.source else { return None };
@@ -309,13 +308,13 @@ impl Lane {
         })
     }
 
-    /// When it captures next, and when what it has captured is seen.
+    /// The times of its next capture and next delivery.
     fn moments(&self) -> impl Iterator<Item = Stamp> {
         let seen = self.transit.front().map(|sample| sample.at.after(self.latency));
         std::iter::once(self.due).chain(seen)
     }
 
-    /// The oldest sample on its way that is seen by `now`.
+    /// The oldest sample in transit that is delivered by `now`.
     fn seen_by(&mut self, now: Stamp) -> Option<Captured> {
         let seen = self.transit.front().is_some_and(|sample| sample.at.after(self.latency) <= now);
         if seen { self.transit.pop_front() } else { None }

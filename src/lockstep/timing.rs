@@ -1,10 +1,10 @@
-//! When the sensors of a trial capture, and when their samples are seen, as on a rig whose devices share no clock.
+//! When the sensors of a trial capture, and when their samples arrive, as on a rig whose devices share no clock.
 //!
-//! Every sensor samples once a step, at a moment of the step of its own (phase), and what it captured is seen
-//! a while later (latency). The control grid begins as in a run in real time: when the last sensor has been
-//! seen, and not before [`FIRST_TICK_AFTER`] its capture.
+//! Every sensor samples once per step, at its own offset in the step (phase); the sample arrives some time later
+//! (latency). The control grid begins as in real time: when the last sensor's first sample has arrived, and not before
+//! [`FIRST_TICK_AFTER`] its capture.
 //!
-//! Invariant: pure; a function of the seed and of which sensors are there.
+//! Invariant: pure; a function of the seed and of which sensors are present.
 
 use std::time::Duration;
 
@@ -14,42 +14,40 @@ use crate::random::Random;
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
 
-/// The stream of a trial's seed that decides them.
+/// The random stream of a trial's seed that determines the timings.
 const TIMING: u64 = 0x7469_6d69_6e67;
-/// From the capture of a sample until it is seen, microseconds: a serial line with its USB adapter takes a few
+/// Time from the capture of a sample to its arrival, microseconds: a serial line with its USB adapter takes a few
 /// milliseconds, a camera with exposure and transfer a few tens.
 const LATENCY_US: (u64, u64) = (5_000, 50_000);
 
-/// Of one sensor.
+/// The timing of one sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Timing {
-    /// From a tick of the control grid to the next capture, below [`STEP`].
+    /// Time from a tick of the control grid to the next capture, below [`STEP`].
     pub phase: Duration,
-    /// From a capture until the sample is seen.
+    /// Time from a capture to the sample's arrival.
     pub latency: Duration,
 }
 
 impl Timing {
-    /// It captures at the ticks and is seen at once, as in a demonstration.
+    /// Captures at the ticks and arrives at once, as in a demonstration.
     pub const LOCKED: Self = Self { phase: Duration::ZERO, latency: Duration::ZERO };
 
-    /// Of each device of a registry in trial `seed`, which begins with those that `scenario` states as plugged in.
-    #[must_use]
+    /// The timing of each device in trial `seed`; `scenario` lists the devices plugged in at the start.
     pub fn of_trial(seed: u64, registry: &Registry, scenario: &Scenario) -> Vec<Self> {
         let plugged = |name: &str| scenario.devices.iter().any(|device| device.name == name && device.plugged);
         let there: Vec<bool> = registry.devices.iter().map(|device| plugged(&device.name)).collect();
         Self::draw(seed, &there)
     }
 
-    /// Of each sensor of trial `seed`. `there` states which of them are plugged in when the policy begins: on
-    /// these the control grid waits.
-    #[must_use]
+    /// The timing of each sensor of trial `seed`. `there` states which of them are plugged in when the policy begins:
+    /// the control grid waits for these.
     pub fn draw(seed: u64, there: &[bool]) -> Vec<Self> {
         let mut random = Random::new(seed, TIMING);
         let step = micros(STEP);
         let mut below = |end: i64| i64::try_from(random.below(end.unsigned_abs())).unwrap_or(0);
         let (low, high) = (LATENCY_US.0.cast_signed(), LATENCY_US.1.cast_signed());
-        // Moments from when the policy begins to look, microseconds.
+        // Times relative to the start of the policy, microseconds.
         let drawn: Vec<(i64, i64)> = there.iter().map(|_| (below(step), low + below(high - low))).collect();
         let begins = drawn.iter().zip(there).filter(|(_, there)| **there);
         let begins = begins.map(|((seen, latency), _)| (*seen).max(seen - latency + micros(FIRST_TICK_AFTER)));
@@ -70,14 +68,14 @@ fn micros(duration: Duration) -> i64 {
 mod tests {
     use super::*;
 
-    /// How old the newest sample that has been seen is at a tick.
+    /// Age at a tick of the newest sample that has arrived.
     fn age(timing: Timing) -> Duration {
         let newest = STEP.saturating_sub(timing.phase);
         if newest >= timing.latency { newest } else { newest + STEP }
     }
 
     #[test]
-    fn sensors_have_every_phase_and_latency_and_the_last_seen_is_as_fresh_as_it_can_be() {
+    fn every_phase_and_latency_occurs_and_the_last_sample_seen_is_as_fresh_as_possible() {
         let mut tenths = [[0; 10]; 3];
         let (mut fastest, mut slowest) = (Duration::MAX, Duration::ZERO);
         for seed in 0..2000 {
@@ -97,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_waits_for_a_sensor_that_is_not_there() {
+    fn nothing_waits_for_an_absent_sensor() {
         for seed in 0..500 {
             let drawn = Timing::draw(seed, &[true, false, false]);
             assert_eq!(age(drawn[0]), drawn[0].latency.max(FIRST_TICK_AFTER), "seed {seed}");

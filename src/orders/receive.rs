@@ -162,7 +162,7 @@ mod tests {
     use crate::orders::line;
 
     #[test]
-    fn an_arm_of_a_closed_connection_does_nothing_and_a_disarm_does() {
+    fn an_arm_of_a_closed_connection_is_ignored_and_a_disarm_is_not() {
         let permission = Arc::new(Permission::default());
         let attended = permission.attend();
         for (order, is_gone, taken) in [

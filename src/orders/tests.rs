@@ -157,7 +157,7 @@ fn an_invalid_order_moves_nothing_and_delays_no_other() {
 }
 
 #[test]
-fn an_unanswering_socket_of_that_name_is_named_with_its_process() {
+fn an_unresponsive_socket_is_named_with_its_process() {
     let instance = format!("orders-e-{}", std::process::id());
     let name = name(this_user(), Some(&instance), std::process::id());
     let listener = UnixListener::bind_addr(&address(&name).unwrap()).unwrap();

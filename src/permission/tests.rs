@@ -16,7 +16,7 @@ fn a_disarm_without_an_actuator_is_remembered_until_a_newer_arm() {
     let permission = Arc::new(Permission::new(true));
     assert!(!permission.disarm(at(1)));
     let attended = permission.attend();
-    assert!(!attended.is_to_be_armed().unwrap());
+    assert!(!is_armed(&attended).unwrap());
     assert_eq!(attended.take().count(), 0);
     // Given before the disarm arrived.
     assert_eq!(permission.arm(at(1), at(1)), Err(Void::Overtaken));
@@ -30,7 +30,7 @@ fn an_arm_that_is_too_old_or_early_or_without_an_actuator_does_nothing() {
     let permission = Arc::new(Permission::new(false));
     assert_eq!(permission.arm(at(1), at(1)), Err(Void::NoActuator));
     let attended = permission.attend();
-    assert!(!attended.is_to_be_armed().unwrap());
+    assert!(!is_armed(&attended).unwrap());
     assert_eq!(permission.arm(at(1), at(3)), Err(Void::Old(Duration::from_secs(2))));
     assert_eq!(permission.arm(at(4), at(3)), Err(Void::Early));
     assert_eq!(attended.take().count(), 0);
@@ -40,17 +40,54 @@ fn an_arm_that_is_too_old_or_early_or_without_an_actuator_does_nothing() {
     assert_eq!(permission.attend().take().count(), 0);
 }
 
+/// Whether it is armed as at its plug.
+fn is_armed(attended: &Attended) -> Result<bool, Blocked> {
+    let mut given = Vec::new();
+    let give = |order| {
+        given.push(order);
+        Ok::<_, ()>(())
+    };
+    let blocked = attended.arm_at_first_plug(give).unwrap();
+    blocked.map_or(Ok(given == [Arm]), Err)
+}
+
 #[test]
 fn an_arm_at_the_first_plug_is_given_once_and_not_after_an_order() {
     let permission = Arc::new(Permission::new(true));
     let attended = permission.attend();
-    assert!(attended.is_to_be_armed().unwrap() && !attended.is_to_be_armed().unwrap());
-    attended.was_not_armed();
-    assert!(permission.attend().is_to_be_armed().unwrap());
-    attended.was_not_armed();
-    permission.disarm(at(1));
-    attended.was_not_armed();
-    assert!(!permission.attend().is_to_be_armed().unwrap());
+    assert_eq!(attended.arm_at_first_plug(|_| Err("gone")), Err("gone"));
+    assert!(is_armed(&permission.attend()).unwrap() && !is_armed(&attended).unwrap());
+
+    let permission = Arc::new(Permission::new(true));
+    let fails = |_| {
+        permission.disarm(at(1));
+        Err("gone")
+    };
+    assert_eq!(permission.attend().arm_at_first_plug(fails), Err("gone"));
+    assert!(!is_armed(&permission.attend()).unwrap());
+}
+
+#[test]
+fn a_stop_during_the_arm_at_the_first_plug_is_given_after_it() {
+    let disarm = |permission: &Permission| permission.disarm(at(1));
+    let lose = |permission: &Permission| permission.report(0, InputState::Lost, at(1));
+    for stop in [disarm as fn(&Permission) -> bool, lose] {
+        let permission = with_stops(true);
+        all_run(&permission);
+        let attended = permission.attend();
+        let mut given = Vec::new();
+        let give = |order| {
+            if order == Arm {
+                stop(&permission);
+                // The thread that carries orders out takes the stop before the arm reaches it.
+                attended.take().for_each(drop);
+            }
+            given.push(order);
+            Ok::<_, ()>(())
+        };
+        let _ = attended.arm_at_first_plug(give);
+        assert!(given.len() == 2 && given[0] == Arm && given[1] != Arm, "{given:?}");
+    }
 }
 
 proptest! {
@@ -162,9 +199,9 @@ fn an_arm_at_the_first_plug_is_refused_too_and_does_not_wait_for_an_input() {
             }
         }
         let attended = permission.attend();
-        assert_eq!(attended.is_to_be_armed().ok(), expected, "{reports:?}");
+        assert_eq!(is_armed(&attended).ok(), expected, "{reports:?}");
         all_run(&permission);
-        assert_eq!((attended.is_to_be_armed(), attended.take().count()), (Ok(false), 0), "once");
+        assert_eq!((is_armed(&attended), attended.take().count()), (Ok(false), 0), "once");
     }
 }
 
@@ -178,7 +215,7 @@ proptest! {
     ) {
         let permission = with_stops(true);
         let attended = permission.attend();
-        let (mut is_armed, mut is_given, mut now) = (attended.is_to_be_armed().unwrap_or(false), false, 1);
+        let (mut is_armed, mut is_given, mut now) = (is_armed(&attended).unwrap_or(false), false, 1);
         let mut states = [InputState::Lost; 3];
         for ((what, state, back), looks) in steps.into_iter().zip(looks) {
             now += 1;

@@ -1,17 +1,17 @@
 //! A policy bundle: the folder `models/<name>/` with `policy.json` and the two graphs it names.
 //!
-//! `encoder.onnx` takes one input per observation, named by its key (image f32 `[B, To, 3, H, W]`,
-//! vector f32 `[B, To, D]`), and the mask (f32 `[B, M]`), and gives `global_cond` (f32 `[B, Dc]`).
-//! `denoiser.onnx` takes `sample` (f32 `[B, Tp, Da]`), `timestep` (i64 `[B]`) and `global_cond`, and
-//! gives its prediction (f32 `[B, Tp, Da]`). `B` is 1 or left open. `To` is `n_obs_steps`, `Tp` is
-//! `horizon`, `Da` the number of values of an action, `M` the length of the mask's order.
+//! `encoder.onnx` takes one input per observation, named by its key (image f32 `[B, To, 3, H, W]`, vector f32
+//! `[B, To, D]`), and the mask (f32 `[B, M]`), and returns `global_cond` (f32 `[B, Dc]`). `denoiser.onnx` takes
+//! `sample` (f32 `[B, Tp, Da]`), `timestep` (i64 `[B]`) and `global_cond`, and returns its prediction (f32
+//! `[B, Tp, Da]`). `B` is 1 or left open. `To` is `n_obs_steps`, `Tp` is `horizon`, `Da` the length of an action,
+//! `M` that of the mask's order.
 //!
 //! Text -> `read` (no key twice, serde, types of `file` and `spec`) -> `validate` -> [`Bundle`]. It
 //! is then compared with the registry ([`Bundle::check_registry`]) and with the inputs and outputs of the graphs
 //! ([`Bundle::check_graphs`]).
 //!
 //! Invariant: every check reports all mistakes at once, each with the path of its key and a fix.
-//! Invariant: nothing downstream of a [`Bundle`] checks it again.
+//! Invariant: no later code checks a [`Bundle`] again.
 
 #[cfg(test)]
 pub(crate) mod example;

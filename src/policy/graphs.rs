@@ -27,19 +27,19 @@ pub struct GraphError {
 /// What is wrong with a graph.
 #[derive(Debug, thiserror::Error)]
 pub enum GraphProblem {
-    /// The file is no graph, or one this onnxruntime cannot run; in its words.
+    /// The file is not a graph, or not one this onnxruntime can run; with its message.
     #[error("onnxruntime cannot load it: {0}")]
     Load(String),
-    /// A tensor, of this name, of a kind that no bundle has.
+    /// A tensor of this name has a type that no bundle uses.
     #[error("`{0}` is not a tensor of 32-bit floats or 64-bit integers with at most 2^31 elements")]
     Kind(String),
     /// The input of this name is missing.
     #[error("there is no input `{0}`")]
     NoInput(String),
-    /// What is written to the input at this place does not suit it.
+    /// The data written to the input with this index does not match it.
     #[error("input {0} does not take what it is given")]
     Input(usize),
-    /// A run failed, in onnxruntime's words.
+    /// A run failed, with onnxruntime's message.
     #[error("{0}")]
     Run(String),
 }
@@ -62,7 +62,7 @@ impl LoadedGraph {
     /// calling one among them, at least 1.
     ///
     /// # Errors
-    /// When the bytes are no graph that this onnxruntime can run.
+    /// When the bytes are not a graph that this onnxruntime can run.
     pub fn load(environment: &Environment, name: &str, bytes: &[u8], threads: usize) -> Result<Self, GraphError> {
         let session = Session::builder(&environment.ort)
             .and_then(|builder| configure(builder, name, threads))
@@ -71,8 +71,7 @@ impl LoadedGraph {
         Ok(Self { name: name.to_owned(), session })
     }
 
-    /// What it takes and gives.
-    #[must_use]
+    /// Its inputs and outputs.
     pub fn shape(&self) -> GraphShape {
         GraphShape {
             name: self.name.clone(),
@@ -81,11 +80,10 @@ impl LoadedGraph {
         }
     }
 
-    /// Makes the memory of its inputs, filled with zeros, and of its outputs. Dimensions that it
-    /// leaves open become 1.
+    /// Allocates its inputs, filled with zeros, and its outputs. Open dimensions become 1.
     ///
     /// # Errors
-    /// When it has tensors that no bundle has, or there is no memory.
+    /// When it has tensors that no bundle uses, or memory is exhausted.
     pub fn bind(self) -> Result<BoundGraph, GraphError> {
         let Self { name, session } = self;
         let inputs = session
@@ -111,7 +109,7 @@ pub struct BoundGraph {
 }
 
 impl BoundGraph {
-    /// The place among the inputs of the one called `name`.
+    /// The index of the input called `name`.
     ///
     /// # Errors
     /// When there is none.
@@ -123,7 +121,7 @@ impl BoundGraph {
     /// Writes the numbers of an input.
     ///
     /// # Errors
-    /// When there is no such input, or it holds others or not so many.
+    /// When there is no such input, or its type or length differs.
     pub fn write(&mut self, index: usize, values: &[f32]) -> Result<(), GraphError> {
         self.fill(index, |place: &mut [f32]| {
             let fits = place.len() == values.len();
@@ -134,10 +132,10 @@ impl BoundGraph {
         })
     }
 
-    /// Writes the same whole number all over an input.
+    /// Fills an input with one integer.
     ///
     /// # Errors
-    /// When there is no such input, or it holds others.
+    /// When there is no such input, or its type differs.
     pub fn write_integer(&mut self, index: usize, value: i64) -> Result<(), GraphError> {
         self.fill(index, |place: &mut [i64]| {
             place.fill(value);
@@ -161,7 +159,7 @@ impl BoundGraph {
         }
     }
 
-    /// Runs the graph on what its inputs hold, and hands over its first output.
+    /// Runs the graph on its inputs, and passes on its first output.
     ///
     /// # Errors
     /// When onnxruntime reports an error.
@@ -182,8 +180,8 @@ impl std::fmt::Debug for BoundGraph {
     }
 }
 
-/// One node after the other, on as few threads as requested, none of which spins while idle: the rig's
-/// other tasks need the processor too.
+/// Executes one node after another, on the requested number of threads, none of which spins while idle: the rig's other
+/// tasks need the processor too.
 fn configure(builder: SessionBuilder, name: &str, threads: usize) -> ort::Result<SessionBuilder> {
     Ok(builder
         .with_intra_threads(threads.max(1))?
@@ -211,7 +209,7 @@ fn tensor_shape(outlet: &Outlet) -> TensorShape {
     TensorShape { name: outlet.name().to_owned(), element, dims }
 }
 
-/// The shape of a tensor's memory, and how many elements that is.
+/// The shape of a tensor's memory, and its number of elements.
 fn dims(graph: &str, shape: &TensorShape) -> Result<(Vec<i64>, usize), GraphError> {
     const MOST: usize = 1 << 31;
     let mut dims = Vec::with_capacity(shape.dims.len());

@@ -1,30 +1,30 @@
 //! The receding horizon: which action of which chunk is executed at which tick, or none.
 //!
-//! A policy answers an observation of tick o with a chunk of `horizon` actions, and action
-//! `action_start + (k - o)` of it is the one of tick k. The next observation is sent
-//! `n_action_steps` ticks after o, or at once when a modality comes or goes; the chunk is executed to its end, so
-//! that it bridges the time until the new one arrives. The new one is joined at the action of the tick, never at its beginning: a
-//! chunk stands for moments, and those that have passed are left out.
+//! A policy answers an observation of tick o with a chunk of `horizon` actions, and action `action_start + (k - o)` of
+//! it is the one of tick k. The next observation is sent `n_action_steps` ticks after o, or at once when a modality
+//! comes or goes; the chunk is executed to its end, so that it bridges the time until the new one arrives. The new one
+//! is entered at the action of the current tick, never at its beginning: actions belong to ticks, and those of past
+//! ticks are skipped.
 //!
-//! What can go wrong, and what happens then:
+//! Failures and their handling:
 //!
-//! * NaN or infinity anywhere in a chunk, or not as many values as a chunk has: none of it is used.
-//! * A chunk more than one tick late: used from the action of the tick. So late that none of its
-//!   actions is left: not used.
+//! * NaN or infinity anywhere in a chunk, or a wrong number of values: the whole chunk is rejected.
+//! * A chunk more than one tick late: used from the action of the tick. Too late for any of its
+//!   actions: not used.
 //! * A value beyond the action's limits: the limit is executed.
 //! * An observation too old: no chunk is requested. The current one is executed to its end.
 //! * A required modality missing: hold at once: a robot must not continue blindly with actions that were
 //!   computed when it could see. Another one missing: continue if the policy is mask-aware; otherwise
 //!   hold until it is back, unless configured to continue ([`WithoutMask`]).
-//! * None of several pictures present: hold likewise. In training one of them was always there.
+//! * None of several pictures present: hold likewise. In training one of them was always present.
 //! * No action left: hold.
 //!
 //! Invariant: pure: time comes in as ticks of the control grid, rising. One call a tick to
 //! [`ActionQueue::wants_observation`], then one to [`ActionQueue::step`].
-//! Invariant: no action is given of a chunk whose observation is older than the last hold's
-//! beginning: a plan from before a stop may not fit the world after it.
+//! Invariant: no action is taken from a chunk whose observation is older than the beginning of the last hold: a plan
+//! from before a stop may not fit the world after it.
 //! Invariant: at most one observation is with the policy at a time.
-//! Invariant: nothing here allocates after construction, and no input makes it panic.
+//! Invariant: nothing here allocates after construction, and no input causes a panic.
 
 use std::time::Duration;
 
@@ -35,8 +35,7 @@ use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::Registry;
 
-/// What a policy that was not trained with modalities left out does when one leaves that it does not
-/// require.
+/// What a policy that was not trained with absent modalities does when an optional one disappears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum WithoutMask {
     /// Hold until it is back.
@@ -46,7 +45,7 @@ pub enum WithoutMask {
     GoOn,
 }
 
-/// What is known at a tick.
+/// The situation at a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Situation {
     /// The modalities present.
@@ -60,13 +59,13 @@ pub struct Situation {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum HoldReason {
-    /// A modality without which the policy must not run is not there.
+    /// A required modality is absent.
     RequiredMissing,
-    /// A modality is not there, and the policy was not trained to do without.
+    /// A modality is absent, and the policy was not trained without it.
     NotMaskAware,
-    /// None of the pictures that the policy observes is there.
+    /// None of the pictures that the policy observes is present.
     NoPicture,
-    /// What the sensors last saw is older than the bundle allows.
+    /// The newest samples are older than the bundle allows.
     ObservationOld,
     /// The policy is computing, and no action is left of its last chunk.
     Waiting,
@@ -93,22 +92,22 @@ impl std::fmt::Display for HoldReason {
     }
 }
 
-/// What to do at a tick.
+/// The decision for a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Step<'a> {
-    /// The values to execute, within the limits; none means hold.
+    /// The values to execute, within the limits; `None` means hold.
     pub action: Option<&'a [f32]>,
-    /// Why there are none.
+    /// Why there is no action.
     pub hold: Option<HoldReason>,
-    /// Does a hold begin here, or its reason change? Reported once.
+    /// Whether a hold begins here, or its reason changes. Reported once.
     pub hold_is_news: bool,
     /// The modality whose absence is the reason.
     pub missing: Option<&'a str>,
     /// The index of the action in its chunk.
     pub index: Option<usize>,
-    /// Ticks since the observation the action follows from.
+    /// Ticks since the observation on which the action is based.
     pub chunk_age_ticks: Option<u64>,
-    /// Was this the first action of its chunk that went beyond the limits? Reported once.
+    /// Whether this is the first action of its chunk beyond the limits. Reported once.
     pub clamped_is_news: bool,
 }
 
@@ -116,7 +115,7 @@ pub struct Step<'a> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, thiserror::Error)]
 #[serde(rename_all = "snake_case")]
 pub enum ChunkError {
-    /// No such observation is with the policy.
+    /// The policy has no such request.
     #[error("actions for an observation that was not asked about")]
     Unasked,
     /// Not `horizon` actions.
@@ -125,32 +124,32 @@ pub enum ChunkError {
     /// NaN or infinity.
     #[error("a chunk with values that are no finite numbers")]
     NotFinite,
-    /// Its observation was made before the last hold began.
+    /// Its observation precedes the start of the last hold.
     #[error("actions that were decided before the policy had to hold")]
     BeforeHold,
-    /// None of its actions is left.
+    /// All of its actions are in the past.
     #[error("actions so late that the time for all of them has passed")]
     Expired,
 }
 
-/// What has happened so far.
+/// Counts of events so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct Counts {
     /// Ticks with an action.
     pub actions: u64,
-    /// Ticks without.
+    /// Ticks without an action.
     pub held_ticks: u64,
-    /// Holds that began, the one at the start among them.
+    /// Number of holds, including the one at the start.
     pub holds: u64,
     /// Observations sent to the policy.
     pub requests: u64,
     /// Chunks that were used.
     pub chunks: u64,
-    /// Those of them that came more than one tick after their observation.
+    /// Those that arrived more than one tick after their observation.
     pub late_chunks: u64,
-    /// Their actions that were skipped for it.
+    /// Actions of late chunks that were skipped.
     pub skipped_actions: u64,
-    /// Chunks of which no action was left.
+    /// Chunks whose actions were all in the past.
     pub expired_chunks: u64,
     /// Chunks with NaN or infinity.
     pub not_finite_chunks: u64,
@@ -158,11 +157,11 @@ pub struct Counts {
     pub wrong_length_chunks: u64,
     /// Chunks for an observation that was not requested.
     pub unasked_chunks: u64,
-    /// Chunks of before a hold.
+    /// Chunks from before a hold.
     pub before_hold_chunks: u64,
-    /// Observations the policy had no answer to.
+    /// Observations for which the policy had no answer.
     pub failed_requests: u64,
-    /// Executed actions with a value at a limit because it lay beyond.
+    /// Executed actions with a value clamped to a limit.
     pub clamped_actions: u64,
     /// Ticks at which an observation was due but too old.
     pub old_observations: u64,
@@ -181,16 +180,16 @@ pub struct ActionQueue {
     max: Vec<f32>,
     /// `[Tp, Da]`.
     chunk: Vec<f32>,
-    /// The observation of what is in `chunk`; `None` if nothing usable is.
+    /// The tick of the observation of `chunk`; `None` if `chunk` holds nothing usable.
     observed: Option<u64>,
     clamp_reported: bool,
-    /// The observation that is with the policy.
+    /// The observation that the policy is computing.
     in_flight: Option<u64>,
-    /// What of the policy's modalities was present in the last observation sent.
+    /// The policy's modalities that were present in the last request.
     asked_with: Option<PhysicalMask>,
     /// Chunks of earlier observations are not used.
     fence: u64,
-    /// The first tick that no step was made for.
+    /// The first tick without a step so far.
     next: u64,
     hold: Option<HoldReason>,
     too_old: bool,
@@ -198,11 +197,11 @@ pub struct ActionQueue {
     counts: Counts,
 }
 
-/// What must be there beside the modalities that are required.
+/// What must be present besides the required modalities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Needs {
     Nothing,
-    /// One picture at least, of several.
+    /// At least one of several pictures.
     APicture,
     All,
 }
@@ -210,15 +209,14 @@ enum Needs {
 #[derive(Debug)]
 struct Modality {
     name: String,
-    /// `None` if the registry does not know it: then it is never there.
+    /// `None` if the registry does not have it: it is then never present.
     id: Option<ModalityId>,
     required: bool,
     is_picture: bool,
 }
 
 impl ActionQueue {
-    /// For a bundle that fits the registry, with nothing computed yet.
-    #[must_use]
+    /// For a bundle that matches the registry, with nothing computed yet.
     pub fn new(bundle: &Bundle, registry: &Registry, without_mask: WithoutMask) -> Self {
         let modality = |observation: &super::bundle::ObservationSpec| Modality {
             name: observation.modality.clone(),
@@ -257,13 +255,13 @@ impl ActionQueue {
         }
     }
 
-    /// Is the observation of `tick` to be sent to the policy? If so, it counts as sent:
-    /// [`Self::take`] or [`Self::failed`] must follow before there is another.
+    /// Whether the observation of `tick` must be sent to the policy. If so, it counts as sent: [`Self::take`] or
+    /// [`Self::failed`] must follow before the next one.
     pub fn wants_observation(&mut self, tick: u64, situation: Situation) -> bool {
         self.too_old = false;
         let seen = self.relevant(situation.mask);
         let due = self.observed.is_none_or(|observed| tick.saturating_sub(observed) >= self.n_action_steps);
-        // What was decided with other senses is to be decided again, at once.
+        // A decision made with other modalities is repeated at once.
         let due = due || self.asked_with != Some(seen);
         if self.in_flight.is_some() || !due || self.missing(situation.mask).is_some() {
             return false;
@@ -283,7 +281,7 @@ impl ActionQueue {
     /// Returns how many actions were skipped because it came more than one tick late.
     ///
     /// # Errors
-    /// Why none of it is used; the chunk in use stays in use.
+    /// Why the chunk is rejected; the previous chunk stays in use.
     pub fn take(&mut self, observed: u64, values: &[f32]) -> Result<u64, ChunkError> {
         let taken = self.check(observed, values);
         if self.in_flight == Some(observed) {
@@ -325,7 +323,7 @@ impl ActionQueue {
         if passed >= self.horizon.saturating_sub(self.action_start) {
             return Err(ChunkError::Expired);
         }
-        // The action of the observation's own tick is not expected to be there in time.
+        // The action of the observation's own tick is not expected in time.
         Ok(passed.saturating_sub(1))
     }
 
@@ -337,7 +335,7 @@ impl ActionQueue {
         }
     }
 
-    /// What to do at `tick`.
+    /// The decision for `tick`.
     pub fn step(&mut self, tick: u64, situation: Situation) -> Step<'_> {
         self.next = self.next.max(tick.saturating_add(1));
         let missing = self.missing(situation.mask);
@@ -347,8 +345,7 @@ impl ActionQueue {
         }
     }
 
-    /// What has happened so far.
-    #[must_use]
+    /// Counts of events so far.
     pub const fn counts(&self) -> Counts {
         self.counts
     }
@@ -371,7 +368,7 @@ impl ActionQueue {
         }
     }
 
-    /// The position of the first modality that must be there and is not.
+    /// The index of the first modality that must be present and is not.
     fn missing(&self, mask: PhysicalMask) -> Option<(usize, HoldReason)> {
         let absent = |modality: &Modality| !modality.id.is_some_and(|id| mask.contains(id));
         let first =
@@ -412,7 +409,7 @@ impl ActionQueue {
     fn hold(&mut self, tick: u64, reason: HoldReason, missing: Option<usize>) -> Step<'_> {
         let begins = self.hold.is_none();
         let news = self.hold != Some(reason);
-        // What is computed while nothing is missing may be used when only the wait changes its name.
+        // An answer computed while nothing is missing stays usable if only the reason for waiting changes.
         if begins || (news && reason.is_missing()) {
             // What is missing now is missing in this tick's observation.
             self.fence = tick.saturating_add(u64::from(reason.is_missing()));

@@ -1,11 +1,11 @@
-//! onnxruntime: which library is used, and how it is loaded.
+//! Chooses and loads the onnxruntime library.
 //!
 //! The program carries the library, packed by `build.rs`. It is unpacked into memory that has no
 //! name in any file system (`memfd_create`) and loaded from there, so that nothing is installed and
-//! nothing is left behind. Another library is taken when it is named, by `--ort-lib` or, as other
-//! programs with onnxruntime do it, by `ORT_DYLIB_PATH`.
+//! nothing is left behind. Another library is used if it is named by `--ort-lib` or, as in other
+//! programs with onnxruntime, by `ORT_DYLIB_PATH`.
 //!
-//! The C++ library that it needs comes first, see [`loader`].
+//! The C++ library that it needs comes first, see `loader`.
 //!
 //! Invariant: nothing is unpacked, loaded or started before [`Environment::open`] is called.
 //! Invariant: a named library is used or the error gives the reason; no other one is used
@@ -21,20 +21,20 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use ort::logging::LogLevel;
-/// The packed library; empty in a build without.
+/// The packed library; empty in a build without one.
 static INSIDE: &[u8] = include_bytes!(env!("RAPID_ONNXRUNTIME"));
 /// The variable that names another library.
 const VARIABLE: &str = "ORT_DYLIB_PATH";
 /// The oldest usable onnxruntime: feature `api-24` of the crate `ort`.
 const OLDEST: u32 = ort::MINOR_VERSION;
 
-/// What this process has loaded. Only one environment may ever be made in a process.
+/// The library loaded in this process. Only one environment may be created per process.
 static LOADED: Mutex<Option<Environment>> = Mutex::new(None);
 
 /// The loaded library, ready for graphs. Clones share it.
 #[derive(Debug, Clone)]
 pub struct Environment {
-    /// For graphs.
+    /// Used by graphs.
     pub(super) ort: ort::environment::Environment,
     /// Where the library comes from.
     pub origin: Origin,
@@ -61,7 +61,7 @@ impl std::fmt::Display for Origin {
     }
 }
 
-/// Why there is no onnxruntime.
+/// Why onnxruntime is unavailable.
 #[derive(Debug, thiserror::Error)]
 #[error("onnxruntime: {origin}: {cause}; {}", cause.fix(origin))]
 pub struct LibraryError {
@@ -71,7 +71,7 @@ pub struct LibraryError {
     pub cause: Cause,
 }
 
-/// What can be wrong with a library.
+/// Why a library cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Cause {
     /// This program was built without one.
@@ -80,7 +80,7 @@ pub enum Cause {
     /// There is no such file.
     #[error("there is no such file")]
     Missing,
-    /// Something that it needs is not on this machine.
+    /// A library that it needs is not on this machine.
     #[error("it needs {library}, which this machine does not have{}", install(*package))]
     Needs {
         /// The name of a library.
@@ -91,13 +91,13 @@ pub enum Cause {
     /// It cannot be loaded, in the loader's words.
     #[error("it cannot be loaded: {0}")]
     Unloadable(String),
-    /// It is older than this program can use.
+    /// It is too old for this program.
     #[error("it is version {0}, and 1.{OLDEST} is the oldest that serves")]
     TooOld(String),
-    /// There is no memory that code may be loaded from.
+    /// No memory may be mapped as executable.
     #[error("it cannot be unpacked into memory: {0}")]
     Memory(#[source] io::Error),
-    /// It was loaded and does not start.
+    /// It was loaded but does not start.
     #[error("it does not start: {0}")]
     Unusable(String),
 }
@@ -121,7 +121,7 @@ impl Cause {
 
 impl Environment {
     /// Loads onnxruntime: the file `named` by `--ort-lib`, else the one that `ORT_DYLIB_PATH` names,
-    /// else the one inside. A process loads it once: later calls get what the first one loaded.
+    /// else the embedded one. A process loads it once: later calls return the first one.
     ///
     /// # Errors
     /// When that library cannot be used. The message gives the attempts and the fix.
@@ -140,7 +140,7 @@ impl Environment {
     }
 }
 
-/// Which library is meant. An empty variable is one that is not set.
+/// Which library to use. An empty variable counts as unset.
 fn choose(named: Option<&Path>, variable: Option<PathBuf>) -> Origin {
     match (named, variable.filter(|path| !path.as_os_str().is_empty())) {
         (Some(path), _) => Origin::Option(path.to_owned()),
@@ -159,7 +159,7 @@ fn load(origin: &Origin) -> Result<ort::environment::Environment, Cause> {
             if !path.exists() {
                 return Err(Cause::Missing);
             }
-            // One of another make may need none.
+            // A library from another vendor may need none.
             let _ = loader::load_libstdcxx();
             // `ort` looks for a relative path beside the program first.
             start(&std::path::absolute(path).unwrap_or_else(|_| path.clone()))
@@ -175,7 +175,7 @@ fn load(origin: &Origin) -> Result<ort::environment::Environment, Cause> {
 }
 
 fn start(path: &Path) -> Result<ort::environment::Environment, Cause> {
-    // Before `ort` does it, whose error does not name what is missing.
+    // Checked here because the error of `ort` does not say what is missing.
     let name = CString::new(path.as_os_str().as_bytes()).map_err(|_| Cause::Missing)?;
     loader::load_onnxruntime(&name)?;
     let builder = ort::init_from(path).map_err(|error| match error {
@@ -191,7 +191,7 @@ fn start(path: &Path) -> Result<ort::environment::Environment, Cause> {
         .with_logger(Arc::new(log))
         .build()
         .map_err(|error| Cause::Unusable(error.to_string()))?;
-    // Anything below would be formatted at every run only to be thrown away.
+    // Messages of lower levels would be formatted at every run only to be discarded.
     environment.set_log_level(LogLevel::Warning);
     Ok(environment)
 }
@@ -209,7 +209,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_named_library_comes_before_the_variable_and_that_before_the_one_inside() {
+    fn the_option_precedes_the_variable_which_precedes_the_embedded_library() {
         let variable = || Some(PathBuf::from("/v/libonnxruntime.so"));
         let named = Path::new("/n/libonnxruntime.so");
         assert_eq!(choose(Some(named), variable()), Origin::Option(named.to_owned()));
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn the_library_inside_is_whole_and_is_loaded_once() {
+    fn the_embedded_library_is_whole_and_loaded_once() {
         assert!(!INSIDE.is_empty(), "built without onnxruntime, which `make setup` fetches");
         let memory = loader::unpack(c"libonnxruntime.so", INSIDE).unwrap();
         assert!(memory.metadata().unwrap().len() > 10_000_000);

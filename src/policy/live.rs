@@ -1,11 +1,11 @@
 //! A policy at the controls of a rig in real time.
 //!
-//! Thread `grid` keeps the control grid: at each tick it takes what the bus brought, looks, hands a
-//! request over when one is due, and publishes the action of the tick. Thread `policy` computes: a chunk may
-//! take as long as it takes, and no tick waits for it. One request goes back and forth between them.
+//! Thread `grid` keeps the control grid: at each tick it takes samples from the bus, observes, hands over a request
+//! when one is due, and publishes the action of the tick. Thread `policy` computes chunks: however long one takes, no
+//! tick waits for it. One request goes back and forth between them.
 //!
-//! The grid begins a few milliseconds after the capture of the newest sample that was needed to see everything: the
-//! samples of devices that run at the rate of the grid are fresh at each tick.
+//! The grid begins a few milliseconds after the capture of the last sample that completed the first observation:
+//! samples of devices that run at the rate of the grid are then fresh at each tick.
 //!
 //! Invariant: between two ticks nothing here allocates, locks or logs; a chunk is announced as an event.
 //! Invariant: once the handle is stopped, nothing more is published.
@@ -31,12 +31,12 @@ use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Board, Hold, Level, PolicyEnd, PolicyStatus, What};
 use crate::time::Stamp;
 
-/// Of the thread that computes, beside 0 of all others.
+/// Nice value of the computing thread; all others have 0.
 const NICE: i32 = 5;
-/// Latencies up to a minute, in us, to three digits.
+/// Latencies up to a minute, in us, with three digits.
 const LONGEST_US: u64 = 60_000_000;
 
-/// The longest time between two looks at the bus, at any rate of the grid.
+/// The longest time between two reads of the bus, at any rate of the grid.
 const LOOK: Duration = Duration::from_millis(20);
 /// How often the board is updated.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
@@ -46,9 +46,9 @@ const STATUS_EVERY: Duration = Duration::from_millis(200);
 pub struct LiveOptions {
     /// The policy.
     pub bundle: Arc<Bundle>,
-    /// What it does without a modality it was not trained to do without.
+    /// What it does without a modality that was always present in training.
     pub without_mask: WithoutMask,
-    /// Of the noise.
+    /// Seed of the noise.
     pub seed: u64,
     /// Nothing is published.
     pub dry_run: bool,
@@ -67,7 +67,7 @@ impl Live {
     /// Starts both threads. `actions` is where actions are published.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// When the system provides no thread.
     pub fn start(
         options: LiveOptions,
         model: Model,
@@ -115,27 +115,25 @@ impl Live {
     }
 
     /// Cancelled when the policy no longer runs, for any reason.
-    #[must_use]
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
     }
 
-    /// Ends both threads and waits for them, for a chunk that is being computed too. A panic of one of
-    /// them is an error.
+    /// Ends both threads and waits for them, including a chunk being computed. A panic of either thread is an error.
     ///
     /// # Errors
     /// The thread that panicked.
     pub fn stop(self) -> Result<(), &'static str> {
         self.stop.cancel();
         let control = self.control.join();
-        // The end of the first ends the second: what it waits on is gone.
+        // The end of the first ends the second, which waits on its channel.
         let policy = self.policy.join();
         policy.map_err(|_| "the policy")?;
         control.map_err(|_| "the control loop")
     }
 }
 
-/// What goes back and forth between the threads.
+/// The message exchanged between the threads.
 struct Exchange {
     request: Request,
     chunk: Vec<f32>,
@@ -144,8 +142,8 @@ struct Exchange {
 }
 
 fn compute(mut model: Model, requests: &Receiver<Exchange>, answers: &SyncSender<Exchange>) {
-    // A tick is not to wait until a chunk has had its share of the processor; without the permission it computes
-    // with the priority of the rest. Of the calling thread alone, on Linux.
+    // A tick must not wait until a chunk has used its time slice; without permission for this, the chunk is computed at
+    // normal priority. On Linux this affects only the calling thread.
     if let Err(error) = rustix::process::setpriority_process(None, NICE) {
         tracing::debug!(%error, "thread `policy` keeps its priority");
     }
@@ -165,21 +163,21 @@ struct Control {
     options: LiveOptions,
     pilot: Pilot,
     inbox: Inbox,
-    /// Where actions are published; none in a dry run.
+    /// Where actions are published; `None` in a dry run.
     actions: Option<Arc<Writer>>,
     board: Arc<Board>,
     requests: SyncSender<Exchange>,
     answers: Receiver<Exchange>,
-    /// How many are registered: digits of the mask.
+    /// Number of registered modalities: digits of the mask.
     devices: usize,
-    /// Here, unless it is with the policy.
+    /// `None` while the policy is computing it.
     exchange: Option<Exchange>,
     payload: Vec<u8>,
     action: Vec<f32>,
     latencies: Histogram<u64>,
     last_latency_ms: Option<f64>,
     chunk_age: Option<u64>,
-    /// Why nothing is done.
+    /// Why no action is executed.
     hold: Option<Hold>,
     acting: bool,
     complained: Option<Stamp>,
@@ -187,7 +185,7 @@ struct Control {
 }
 
 impl Control {
-    /// Keeps the grid until it is stopped, or the thread `policy` has ended.
+    /// Runs the grid until it is stopped, or the thread `policy` has ended.
     fn run(mut self, stop: &CancellationToken) {
         let Some(begin) = self.first_sight(stop) else { return self.end() };
         let period = Duration::from_secs_f64(1.0 / self.options.bundle.control_hz);
@@ -203,7 +201,7 @@ impl Control {
                 break;
             }
             self.tick(tick, at);
-            // Ticks that have passed altogether are left out: actions are for their moments.
+            // Missed ticks are skipped: actions belong to their ticks.
             let behind = Stamp::now().since(at).as_secs_f64() / period.as_secs_f64();
             #[expect(
                 clippy::cast_possible_truncation,
@@ -216,9 +214,9 @@ impl Control {
         self.end();
     }
 
-    /// Waits until everything present is seen; returns when the grid begins.
+    /// Waits until every present device has sent a sample; returns when the grid begins.
     fn first_sight(&mut self, stop: &CancellationToken) -> Option<Stamp> {
-        // What came while the policy was loaded and waited is of no interest now, save for the mask.
+        // Samples from before the start are discarded, except for the mask.
         self.drain();
         self.pilot.observer.clear();
         while !stop.is_cancelled() {
@@ -239,7 +237,7 @@ impl Control {
                 break;
             }
             std::thread::sleep(left.min(LOOK));
-            // Not right before the tick, which is to come on time and looks by itself.
+            // Not right before the tick, which must be on time and reads by itself.
             if at.since(Stamp::now()) > Duration::from_millis(2) {
                 self.drain();
                 self.report();
@@ -255,12 +253,12 @@ impl Control {
         }
     }
 
-    /// Takes the answer, if it has come; returns whether the thread `policy` still runs.
+    /// Takes the answer, if it has arrived; returns whether the thread `policy` still runs.
     fn take_answer(&mut self) -> bool {
         let exchange = match self.answers.try_recv() {
             Ok(exchange) => exchange,
             Err(TryRecvError::Empty) => return true,
-            // It panicked. What it was asked has gone with it.
+            // It panicked, and its request is lost.
             Err(TryRecvError::Disconnected) => return false,
         };
         let request = &exchange.request;
@@ -272,7 +270,7 @@ impl Control {
                 self.last_latency_ms = Some(latency_ms);
                 let us = u64::try_from(latency.as_micros()).unwrap_or(LONGEST_US);
                 self.latencies.saturating_record(us.clamp(1, LONGEST_US));
-                // Also of one that is not used: its pictures may have become the reference of all later ones.
+                // Also for an unused chunk: its pictures may have become the reference of all later ones.
                 let (bundle, chunk) = (&self.options.bundle, &exchange.chunk);
                 self.board.announce(request.answered(bundle, self.devices, latency_ms, answered, chunk));
                 if let Err(refused) = answered {
@@ -291,7 +289,7 @@ impl Control {
 
     fn tick(&mut self, tick: u64, at: Stamp) {
         self.drain();
-        // While a request is with the policy there is none to be made.
+        // While the policy works on a request, no new one is made.
         if self.pilot.look(tick, at, Stamp::now())
             && let Some(mut exchange) = self.exchange.take()
         {
@@ -392,7 +390,7 @@ impl Control {
     }
 }
 
-/// Answers that were not used, or never came.
+/// Answers that were not used, or never arrived.
 const fn unused(counts: &Counts) -> u64 {
     counts.expired_chunks
         + counts.not_finite_chunks

@@ -1,7 +1,6 @@
-//! A policy that answers: requests in, action chunks out.
+//! The complete policy: requests in, action chunks out.
 //!
-//! Invariant: the same request gives the same chunk, given the same pictures before the first one of each
-//! modality that is compared with a reference.
+//! Invariant: the same request gives the same chunk, given the same reference pictures.
 //! Invariant: samples of an absent modality are not read: its numbers are zeros and its element of the mask is 0.
 
 use super::bundle::{Bundle, ObservationInput};
@@ -37,7 +36,7 @@ pub enum SampleError {
     /// It is a vector.
     #[error(transparent)]
     Vector(#[from] VectorError),
-    /// It is of a kind that no policy takes.
+    /// Its encoding is not accepted by any policy.
     #[error("samples of an unknown encoding")]
     Encoding,
 }
@@ -53,17 +52,17 @@ pub struct Model {
 #[derive(Debug)]
 struct Lane {
     modality: String,
-    /// None of a vector.
+    /// `None` for a vector.
     pictures: Option<Preprocessor>,
-    /// Of a vector.
+    /// Values of a vector.
     numbers: Vec<f64>,
 }
 
 impl Model {
-    /// Loads the graphs of a bundle. `steps` of denoising instead of the bundle's own.
+    /// Loads the graphs of a bundle, with `steps` denoising steps instead of the bundle's own.
     ///
     /// # Errors
-    /// When the graphs are not those of the bundle.
+    /// When the graphs do not match the bundle.
     pub fn load(bundle: &Bundle, environment: &Environment, steps: Option<usize>) -> Result<Self, PolicyError> {
         let lanes = bundle.observations.iter().map(|observation| Lane {
             modality: observation.modality.clone(),
@@ -77,13 +76,12 @@ impl Model {
         Ok(Self { lanes: lanes.collect(), tensors: ObservationTensors::new(bundle), sampler })
     }
 
-    /// Numbers of a chunk.
-    #[must_use]
+    /// Values of a chunk.
     pub fn chunk_len(&self) -> usize {
         self.sampler.chunk_len()
     }
 
-    /// Another episode: the next picture of each camera is its reference.
+    /// A new episode: the next picture of each camera is its reference.
     pub fn reset(&mut self) {
         for lane in &mut self.lanes {
             if let Some(reference) = lane.pictures.as_mut().and_then(Preprocessor::reference) {

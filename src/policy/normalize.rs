@@ -3,7 +3,7 @@
 //! `min_max`: `(v - min) / (max - min) * 2 - 1`. `mean_std`: `(v - mean) / (std + eps)`. `identity`:
 //! `v`. Arithmetic is that of 32-bit floats, as in training.
 //!
-//! Invariant: nothing here allocates after construction, and no input makes it panic.
+//! Invariant: nothing here allocates after construction, and no input causes a panic.
 
 use super::bundle::{BundleAction, Normalization};
 
@@ -15,7 +15,7 @@ pub struct Normalizer {
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Dimension {
-    /// Taken off first: what is near it must not lose its digits.
+    /// Subtracted first, so that values near it keep their digits.
     offset: f32,
     width: f32,
     low: f32,
@@ -37,15 +37,13 @@ impl Dimension {
 impl Normalizer {
     /// For `len` dimensions: channels of a picture, values of a vector. Dimensions without statistics are
     /// left unchanged; those of a checked bundle are complete.
-    #[must_use]
     pub fn new(normalization: &Normalization, len: usize) -> Self {
         let mut dimensions = vec![Dimension::IDENTITY; len];
         fill(&mut dimensions, normalization);
         Self { dimensions }
     }
 
-    /// For an action, slice by slice.
-    #[must_use]
+    /// For an action, composed of its slices.
     pub fn of_action(action: &BundleAction) -> Self {
         let mut dimensions = vec![Dimension::IDENTITY; action.len()];
         for part in &action.normalization {
@@ -54,7 +52,7 @@ impl Normalizer {
         Self { dimensions }
     }
 
-    /// Maps vectors that lie one after the other, as in a denoiser's output `[Tp, Da]`, back in place.
+    /// Denormalises consecutive vectors, as in a denoiser's output `[Tp, Da]`, in place.
     pub fn invert(&self, values: &mut [f32]) {
         for vector in values.chunks_exact_mut(self.dimensions.len().max(1)) {
             for (dimension, value) in self.dimensions.iter().zip(vector) {
@@ -63,7 +61,7 @@ impl Normalizer {
         }
     }
 
-    /// Normalises a picture whose channels lie one after the other, `[C, H * W]`, in place.
+    /// Normalises a picture with consecutive channels, `[C, H * W]`, in place.
     pub fn normalize_planes(&self, picture: &mut [f32]) {
         let plane = (picture.len() / self.dimensions.len().max(1)).max(1);
         for (dimension, plane) in self.dimensions.iter().zip(picture.chunks_exact_mut(plane)) {
@@ -152,7 +150,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn back_is_where_it_came_from(value in -10.0_f32..10.0, min in -5.0_f32..5.0, width in 0.01_f32..10.0) {
+        fn the_inverse_restores_the_value(value in -10.0_f32..10.0, min in -5.0_f32..5.0, width in 0.01_f32..10.0) {
             for normalization in [
                 Normalization::MinMax { min: vec![min], max: vec![min + width] },
                 Normalization::MeanStd { mean: vec![min], std: vec![width], eps: 1e-8 },

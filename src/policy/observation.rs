@@ -1,30 +1,30 @@
 //! The input of a policy for one chunk: numbers of every observation key, and the mask.
 //!
-//! Invariant: the memory is made once, with the length that the bundle gives.
+//! Invariant: the memory is allocated once, with the length given by the bundle.
 //! Invariant: an absent modality is zeros after normalisation, and its element of the mask is 0.
 
 use super::bundle::{Bundle, ObservationInput, VectorSpec};
 use super::normalize::Normalizer;
 
-/// Why a sample's numbers are no observation.
+/// Why the numbers of a sample cannot be an observation.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum VectorError {
     /// The observation is made of pictures.
     #[error("observation `{0}` is made of pictures, not of numbers")]
     Pictures(String),
-    /// The sample has other numbers than the policy takes.
+    /// The sample has another shape than the policy requires.
     #[error("a sample of {found} numbers, where observation `{key}` takes {wanted}: see its `slice` in policy.json")]
     Length {
         /// The observation.
         key: String,
         /// Numbers in the sample.
         found: usize,
-        /// Those that are wanted, in words.
+        /// The expected numbers, in words.
         wanted: String,
     },
 }
 
-/// The observations of one chunk. An observation is named by its place in the bundle's list.
+/// The observations of one chunk. An observation is identified by its index in the bundle's list.
 #[derive(Debug, Clone)]
 pub struct ObservationTensors {
     tensors: Vec<Tensor>,
@@ -34,9 +34,9 @@ pub struct ObservationTensors {
 #[derive(Debug, Clone)]
 struct Tensor {
     key: String,
-    /// Observation steps one after the other, the oldest first.
+    /// Observation steps in order, the oldest first.
     values: Vec<f32>,
-    /// Numbers of one step.
+    /// Values per step.
     step: usize,
     vector: Option<(VectorSpec, Normalizer)>,
     /// Its modality's element of the mask.
@@ -44,8 +44,7 @@ struct Tensor {
 }
 
 impl ObservationTensors {
-    /// Zeros, everything absent.
-    #[must_use]
+    /// All zeros, with every modality absent.
     pub fn new(bundle: &Bundle) -> Self {
         let order = bundle.mask.as_ref().map_or(&[][..], |mask| &mask.order);
         let tensors = bundle.observations.iter().map(|observation| {
@@ -67,19 +66,19 @@ impl ObservationTensors {
         Self { tensors: tensors.collect(), mask: vec![0.0; order.len()] }
     }
 
-    /// Where to write step `step`, 0 the oldest, of an observation, as a
-    /// [`Preprocessor`](super::picture::Preprocessor) does. `None` if there is no such place.
+    /// The memory of step `step`, 0 the oldest, of an observation, for a
+    /// [`Preprocessor`](super::picture::Preprocessor). `None` if there is no such step.
     pub fn step_mut(&mut self, observation: usize, step: usize) -> Option<&mut [f32]> {
         let tensor = self.tensors.get_mut(observation)?;
         let begin = tensor.step.checked_mul(step)?;
         tensor.values.get_mut(begin..begin.checked_add(tensor.step)?)
     }
 
-    /// Writes step `step` of an observation that is a vector, from the numbers of a sample. A place
-    /// that there is not stays unwritten.
+    /// Writes step `step` of an observation that is a vector, from the numbers of a sample. A nonexistent step is
+    /// ignored.
     ///
     /// # Errors
-    /// When the sample does not have the shape that the bundle gives.
+    /// When the sample does not have the shape given by the bundle.
     pub fn write_vector(&mut self, observation: usize, step: usize, sample: &[f64]) -> Result<(), VectorError> {
         let Some(tensor) = self.tensors.get_mut(observation) else { return Ok(()) };
         let Some((spec, normalizer)) = &tensor.vector else { return Err(VectorError::Pictures(tensor.key.clone())) };
@@ -106,8 +105,8 @@ impl ObservationTensors {
         Ok(())
     }
 
-    /// Sets whether an observation's modality is present. An absent one is zeros from here on, until
-    /// it is written again.
+    /// Sets whether an observation's modality is present. An absent one is zeros from now on, until it is written
+    /// again.
     pub fn set_present(&mut self, observation: usize, present: bool) {
         let Some(tensor) = self.tensors.get_mut(observation) else { return };
         if !present {
@@ -119,13 +118,11 @@ impl ObservationTensors {
     }
 
     /// The numbers of an observation, all steps.
-    #[must_use]
     pub fn values(&self, observation: usize) -> &[f32] {
         self.tensors.get(observation).map_or(&[], |tensor| &tensor.values)
     }
 
     /// The mask, in the order of the bundle; empty if it has none.
-    #[must_use]
     pub fn mask(&self) -> &[f32] {
         &self.mask
     }

@@ -1,8 +1,8 @@
-//! What a policy sees at a tick of the control grid: the samples that `sync` chooses, of the last ticks.
+//! The observation of a policy at a tick of the control grid: the samples of the last ticks chosen by `sync`.
 //!
-//! Samples are kept as they came, one copy of each; what a tick chose is remembered for as many ticks as an
-//! observation has steps. A step without a sample of its own (before the first tick, or before a modality
-//! was plugged in) is given the sample of the step after it, as in training.
+//! Samples are kept unchanged, one copy of each; the choices of as many ticks are remembered as an observation has
+//! steps. A step without its own sample (before the first tick, or before a modality was plugged in) uses the sample of
+//! the next step, as in training.
 //!
 //! Invariant: nothing here allocates once the places of the samples have grown to the largest.
 
@@ -30,10 +30,10 @@ pub struct Observer {
 #[derive(Debug)]
 struct Lane {
     id: Option<ModalityId>,
-    /// The newest samples, each in the place that the ring's entry names.
+    /// The newest samples, each at the index of its ring entry.
     places: Vec<Place>,
     next: usize,
-    /// What the last ticks chose, the newest first.
+    /// The choices of the last ticks, the newest first.
     chosen: Vec<Option<Chosen>>,
 }
 
@@ -50,15 +50,14 @@ struct Chosen {
 }
 
 impl Observer {
-    /// For the observations of a bundle that fits the registry.
-    #[must_use]
+    /// For the observations of a bundle that matches the registry.
     pub fn new(bundle: &Bundle, registry: &Registry) -> Self {
         let devices = || bundle.observations.iter().map(|observation| registry.named(&observation.modality));
         let modalities: Vec<SyncModality> = devices()
             .flatten()
             .map(|device| SyncModality {
                 id: device.id,
-                // Whether a sample is too old is the policy's to judge.
+                // The policy decides whether a sample is too old.
                 when_stale: WhenStale::Hold,
                 latency: device.latency,
                 capacity: device.depth,
@@ -77,14 +76,14 @@ impl Observer {
         }
     }
 
-    /// Keeps a sample; one of a modality that the policy does not observe, or that its device marks as
-    /// damaged, is not kept.
+    /// Stores a sample; ignores samples of modalities that the policy does not observe, and samples marked as damaged
+    /// by their device.
     pub fn push(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) {
         if header.flags & FLAG_ERROR != 0 {
             return;
         }
-        // Observations of one modality (two ways to look at one camera) take their places in step: the first
-        // of them is the ring's.
+        // Observations of one modality (two ways to process one camera) use the same index: the first of them
+        // determines it.
         let mut kept = None;
         for lane in self.lanes.iter_mut().filter(|lane| lane.id == Some(id)) {
             let at = lane.next;
@@ -100,18 +99,17 @@ impl Observer {
         self.sync.push(id, SyncSample { capture, recv, seq: header.seq, epoch, keep });
     }
 
-    /// The capture of the newest sample, once every modality that is present has sent one.
-    #[must_use]
+    /// The capture time of the newest sample, once every present modality has sent one.
     pub fn first_sight(&self, mask: PhysicalMask) -> Option<Stamp> {
         let present = self.lanes.iter().filter(|lane| lane.id.is_some_and(|id| mask.contains(id)));
         let newest = |lane: &Lane| lane.places.iter().map(|place| place.header.capture_ns).max().filter(|ns| *ns > 0);
-        // One that has sent nothing makes all of it nothing.
+        // `None` if any present modality has no sample.
         let newest = present.map(newest).collect::<Option<Vec<u64>>>()?;
         newest.into_iter().max().map(Stamp)
     }
 
-    /// Looks at a tick, by what is known `now`. Returns the age of the oldest sample of what is present;
-    /// `None` if something present has no sample at all, or nothing is present.
+    /// Observes a tick with the samples known at `now`. Returns the age of the oldest chosen sample of the present
+    /// modalities; `None` if one of them has no sample at all, or none is present.
     pub fn look(&mut self, tick: Stamp, now: Stamp, mask: PhysicalMask) -> Option<Duration> {
         self.sync.observe(tick, now, mask);
         let mut oldest = None;
@@ -132,7 +130,7 @@ impl Observer {
         oldest.filter(|_| whole)
     }
 
-    /// Fills `request` with what the last ticks chose, the newest of which is its tick.
+    /// Fills `request` with the samples chosen in the last ticks, up to its own tick.
     pub fn fill(&self, request: &mut Request) {
         for (at, lane) in self.lanes.iter().enumerate() {
             let present = lane.chosen.first().is_some_and(Option::is_some);
@@ -141,8 +139,8 @@ impl Observer {
                 continue;
             }
             let mut chosen = None;
-            // From the newest step back: a step without a sample takes that of the step after it, and one whose
-            // sample has been overwritten since.
+            // From the newest step back: a step without a sample uses that of the following step, and so does one whose
+            // sample has been overwritten.
             for (back, step) in (0..self.steps).rev().enumerate() {
                 let kept = lane.chosen.get(back).copied().flatten();
                 let kept =
@@ -156,7 +154,7 @@ impl Observer {
         }
     }
 
-    /// Forgets what was seen.
+    /// Discards all samples.
     pub fn clear(&mut self) {
         self.sync.clear();
         for lane in &mut self.lanes {

@@ -1,10 +1,10 @@
-//! Pictures: from what a camera sent to what an encoder reads.
+//! Pictures: from the payload of a camera to the input of an encoder.
 //!
 //! Decoded to 8-bit colours, divided by 255, resized (bilinear, half-pixel centres, no antialiasing),
 //! cropped to the middle, compared with a reference if the policy was trained so, normalised. All of
 //! it in memory allocated once; only the JPEG decoder allocates for every picture.
 //!
-//! Invariant: a picture that is refused has changed nothing: not the observation, not the reference.
+//! Invariant: a refused picture changes neither the observation nor the reference.
 
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -20,10 +20,10 @@ const CHANNELS: usize = 3;
 /// Pixels a picture may have along a side, as in the registry.
 const LARGEST: usize = 8192;
 
-/// Why a picture is no observation.
+/// Why a picture cannot be an observation.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PictureError {
-    /// The samples are none.
+    /// The samples are not pictures.
     #[error("the samples are no pictures but {0:?}")]
     NoPicture(Encoding),
     /// It cannot be decoded.
@@ -36,7 +36,7 @@ pub enum PictureError {
         found: usize,
         /// Bytes there should be.
         expected: usize,
-        /// Pixels a row.
+        /// Pixels per row.
         width: usize,
         /// Rows.
         height: usize,
@@ -47,23 +47,23 @@ pub enum PictureError {
          or `resize` in policy.json"
     )]
     Size {
-        /// Pixels a row.
+        /// Pixels per row.
         width: usize,
         /// Rows.
         height: usize,
-        /// Pixels a row that are wanted, at least so many if the picture is cropped.
+        /// Required pixels per row; the minimum if the picture is cropped.
         wanted_width: usize,
-        /// Rows that are wanted.
+        /// Required rows, likewise.
         wanted_height: usize,
     },
 }
 
-/// A picture as the bus brings it.
+/// A picture as received from the bus.
 #[derive(Debug, Clone, Copy)]
 pub struct Picture<'a> {
     /// How `bytes` are encoded.
     pub encoding: Encoding,
-    /// Pixels a row.
+    /// Pixels per row.
     pub width: u32,
     /// Rows.
     pub height: u32,
@@ -71,13 +71,13 @@ pub struct Picture<'a> {
     pub bytes: &'a [u8],
 }
 
-/// Makes observations of one camera's pictures.
+/// Converts pictures of one camera to observations.
 #[derive(Debug)]
 pub struct Preprocessor {
     spec: ImageSpec,
     normalizer: Normalizer,
     reference: Option<Reference>,
-    /// The picture with the mark that its decoder looks for.
+    /// The picture with the marker that its decoder requires.
     jpeg: Vec<u8>,
     /// Red, green, blue, row by row.
     pixels: Vec<u8>,
@@ -87,7 +87,7 @@ pub struct Preprocessor {
     rows: Vec<Tap>,
 }
 
-/// Where along an axis a value comes from: the share of `high`, the rest of `low`.
+/// The source of a value along an axis: the share of `high`, the rest of `low`.
 #[derive(Debug, Clone, Copy)]
 struct Tap {
     low: usize,
@@ -126,7 +126,6 @@ impl Reference {
 
 impl Preprocessor {
     /// For pictures of `spec`, whose normalisation has one entry a channel.
-    #[must_use]
     pub fn new(spec: ImageSpec, normalization: &Normalization) -> Self {
         let len = CHANNELS * spec.height * spec.width;
         Self {
@@ -142,7 +141,6 @@ impl Preprocessor {
     }
 
     /// Numbers of one observation: 3 x height x width.
-    #[must_use]
     pub fn output_len(&self) -> usize {
         CHANNELS * self.spec.height * self.spec.width
     }
@@ -208,7 +206,7 @@ impl Preprocessor {
 
     fn decode_jpeg(&mut self, bytes: &[u8], width: usize, height: usize) -> Result<(), PictureError> {
         with_mark(bytes, &mut self.jpeg);
-        // Strict: a truncated picture is refused, and not completed with grey.
+        // Strict: a truncated picture is refused, not padded with grey.
         let options = DecoderOptions::default()
             .jpeg_set_out_colorspace(ColorSpace::RGB)
             .set_max_width(LARGEST)

@@ -24,19 +24,18 @@ pub const FIRST_TICK_AFTER: Duration = Duration::from_millis(10);
 /// See the module's comment.
 #[derive(Debug)]
 pub struct Pilot {
-    /// What is seen; takes samples.
+    /// The observations; takes samples.
     pub observer: Observer,
-    /// What is done; takes the answers to requests.
+    /// The actions; takes the answers to requests.
     pub queue: ActionQueue,
-    /// The mask in force, as it was published last.
+    /// The mask published last.
     pub mask: PhysicalMask,
     seed: u64,
     situation: Situation,
 }
 
 impl Pilot {
-    /// A policy that has seen nothing. `seed` chooses its noise.
-    #[must_use]
+    /// A policy without samples. `seed` determines its noise.
     pub fn new(bundle: &Bundle, registry: &Registry, without_mask: WithoutMask, seed: u64) -> Self {
         let mask = PhysicalMask::EMPTY;
         Self {
@@ -48,7 +47,7 @@ impl Pilot {
         }
     }
 
-    /// Takes what the bus brought.
+    /// Takes a sample from the bus.
     pub fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         match topic {
             TopicId::Modality(id) => self.observer.push(id, header, payload),
@@ -62,12 +61,11 @@ impl Pilot {
     }
 
     /// The capture of the newest sample, once every modality that is present has sent one.
-    #[must_use]
     pub fn first_sight(&self) -> Option<Stamp> {
         self.observer.first_sight(self.mask)
     }
 
-    /// Looks at tick number `number` of the control grid, which is at `tick`. Returns whether a request to the policy
+    /// Observes tick number `number` of the control grid, at `tick`. Returns whether a request to the policy
     /// is due; if so, [`Self::fill`] fills it, and [`ActionQueue::take`] or [`ActionQueue::failed`] must follow.
     pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp) -> bool {
         let observation_age = self.observer.look(tick, now, self.mask);
@@ -75,15 +73,15 @@ impl Pilot {
         self.queue.wants_observation(number, self.situation)
     }
 
-    /// Makes `request` the question of tick `number`, which was looked at last and is at `tick`.
+    /// Fills `request` for tick `number` at `tick`, the last one observed.
     pub fn fill(&self, number: u64, tick: Stamp, request: &mut Request) {
         (request.tick, request.stamp, request.mask) = (number, tick, self.mask);
-        // Of each request its own, so that a chunk can be computed again without those before it.
+        // Each request has its own seed, so that a chunk can be recomputed without the earlier ones.
         request.seed = self.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(number);
         self.observer.fill(request);
     }
 
-    /// What is to be done at tick `number`, which was looked at.
+    /// The action of tick `number`, after it was observed.
     pub fn step(&mut self, number: u64) -> Step<'_> {
         self.queue.step(number, self.situation)
     }

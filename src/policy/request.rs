@@ -1,7 +1,6 @@
-//! A request to a policy: the samples of the last ticks, as they came from the devices.
+//! A request to a policy: the samples of the last ticks, as received from the devices.
 //!
-//! The control loop fills it, the thread that computes reads it; it goes back and forth between them and is
-//! never allocated again.
+//! The control loop fills it, the computing thread reads it; it goes back and forth between them and is allocated once.
 //!
 //! Invariant: nothing here allocates once its cells have grown to the largest samples.
 
@@ -45,7 +44,7 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// Becomes this sample.
+    /// Copies this sample.
     pub fn set(&mut self, header: &SampleHeader, bytes: &[u8]) {
         self.seq = header.seq;
         self.encoding = Encoding::from_raw(header.encoding);
@@ -57,7 +56,6 @@ impl Cell {
 
 impl Request {
     /// Room for the observations of a bundle.
-    #[must_use]
     pub fn new(bundle: &Bundle) -> Self {
         let mut cells = Vec::new();
         cells.resize_with(bundle.observations.len() * bundle.n_obs_steps, Cell::default);
@@ -65,7 +63,6 @@ impl Request {
     }
 
     /// The sample of step `step`, 0 the oldest, of observation `observation`.
-    #[must_use]
     pub fn cell(&self, observation: usize, step: usize) -> Option<&Cell> {
         self.cells.get(observation * self.steps + step)
     }
@@ -76,7 +73,6 @@ impl Request {
     }
 
     /// Is the modality of an observation present, with samples for every step?
-    #[must_use]
     pub fn is_present(&self, observation: usize) -> bool {
         self.present.get(observation).copied().unwrap_or(false)
     }
@@ -89,14 +85,12 @@ impl Request {
     }
 
     /// Steps of an observation.
-    #[must_use]
     pub const fn steps(&self) -> usize {
         self.steps
     }
 
     /// The event that it was answered with `actions`. `devices` are registered; `answered` gives how many of the actions
     /// came too late, or why none is used.
-    #[must_use]
     pub fn answered(
         &self,
         bundle: &Bundle,
@@ -119,7 +113,6 @@ impl Request {
     }
 
     /// Which samples these are.
-    #[must_use]
     pub fn samples(&self, bundle: &Bundle) -> Vec<ObservedSamples> {
         let samples = |(at, observation): (usize, &ObservationSpec)| {
             let seqs =

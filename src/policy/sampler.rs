@@ -5,7 +5,7 @@
 //!
 //! Invariant: the same observations and the same seed give the same chunk, on the same machine with
 //! the same onnxruntime and number of threads.
-//! Invariant: a number that is not finite is passed on as it is: the action queue refuses it.
+//! Invariant: non-finite values are passed on unchanged: the action queue refuses them.
 //! Invariant: a chunk is computed without an allocation on this side of onnxruntime.
 
 use super::bundle::{Bundle, BundleErrors, Graph};
@@ -65,7 +65,7 @@ impl Sampler {
     /// more.
     ///
     /// # Errors
-    /// When the graphs are not those of the bundle, or the schedule has not so many steps.
+    /// When the graphs do not match the bundle, or the schedule has fewer steps.
     pub fn new(
         bundle: &Bundle,
         environment: &Environment,
@@ -95,13 +95,11 @@ impl Sampler {
     }
 
     /// Numbers of a chunk: horizon x values of an action.
-    #[must_use]
     pub fn chunk_len(&self) -> usize {
         self.noise.len()
     }
 
     /// Steps of denoising.
-    #[must_use]
     pub fn steps(&self) -> usize {
         self.scheduler.timesteps().count()
     }
@@ -110,7 +108,7 @@ impl Sampler {
     ///
     /// # Errors
     /// When onnxruntime fails, the observations are of another bundle, or `out` is not
-    /// [`Self::chunk_len`] long. `out` is then of no use.
+    /// [`Self::chunk_len`] long. `out` is then invalid.
     pub fn chunk(
         &mut self,
         observation: &ObservationTensors,

@@ -70,7 +70,7 @@ impl Scheduler {
     /// Works out the tables for `steps` steps; the bundle's own number is `num_inference_steps`.
     ///
     /// # Errors
-    /// When there are not so many timesteps, or the betas make no sense.
+    /// When there are fewer timesteps than that, or the betas are invalid.
     pub fn new(spec: &SchedulerSpec, steps: usize) -> Result<Self, SchedulerError> {
         let train = spec.num_train_timesteps;
         if steps == 0 || steps > train {
@@ -107,15 +107,13 @@ impl Scheduler {
     }
 
     /// Does step `at` add noise? It does in DDPM, but for timestep 0.
-    #[must_use]
     pub fn wants_noise(&self, at: usize) -> bool {
         self.steps.get(at).is_some_and(|step| step.from_noise > 0.0)
     }
 
     /// Takes `sample` from step `at` to the next, given what the denoiser predicted for it.
-    /// `noise`, standard normal, is looked at only if [`Self::wants_noise`]; without it none is
-    /// added. All are as long as the sample; what is shorter ends the step there. Beyond the last
-    /// step nothing happens.
+    /// `noise`, standard normal, is used only if [`Self::wants_noise`]; without it none is added. All slices are as
+    /// long as the sample; a shorter one ends the step early. Beyond the last step nothing happens.
     pub fn step(&self, at: usize, sample: &mut [f32], prediction: &[f32], noise: Option<&[f32]>) {
         let Some(step) = self.steps.get(at) else { return };
         for (x, prediction) in sample.iter_mut().zip(prediction) {

@@ -1,6 +1,6 @@
 //! Faults reported while an episode is recorded, early enough to act on them.
 //!
-//! Invariant: at most one announcement a modality a second, however fast things go wrong.
+//! Invariant: at most one announcement per modality and second, however many faults occur.
 
 use std::time::Duration;
 
@@ -9,9 +9,9 @@ use crate::registry::{DeviceSpec, Limits, Registry};
 use crate::status::{Board, Level, What};
 use crate::time::{Stamp, nanoseconds};
 
-/// How often a modality's troubles are announced at most.
+/// Shortest time between announcements of a modality.
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
-/// So many samples make a trouble that is announced; fewer may be chance, and the verdict has them.
+/// Fewer affected samples are not announced: they may be chance, and are in the verdict.
 const LEAST_SAMPLES: u64 = 3;
 
 /// What has been announced of a modality.
@@ -25,8 +25,8 @@ pub(super) struct Announced {
     at: Option<Stamp>,
 }
 
-/// Announces what is new and was not announced within the last second; at the end all that is new. `announced` has an entry
-/// a modality.
+/// Announces new faults, at most once a second per modality; at the end all that are left. `announced` has an entry per
+/// modality.
 pub(super) fn look(
     announced: &mut [Announced],
     measures: &Measures,
@@ -58,7 +58,7 @@ impl Announced {
             news.push(format!("{} samples lost on the way to the file", counts.dropped - self.dropped));
             self.dropped = counts.dropped;
         }
-        // Of these some are normal: what is announced would make the episode suspect by now.
+        // A few are normal: only what would already make the episode suspect is announced.
         let expected = counts.expected();
         for (count, reported, limit, what) in [
             (counts.lost, &mut self.lost, lost, "lost by the device"),

@@ -22,21 +22,21 @@ use crate::{text, time};
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
 /// bytes a file name may have.
 const SLUG_BYTES: usize = 64;
-/// Numbers tried beyond the highest one seen, or names of a file that is written again, while other processes take them.
+/// Numbers, or names of a rewritten file, that are tried while other processes take them.
 const ATTEMPTS: u32 = 100;
-/// Beyond every number of an episode.
+/// Above every number of an episode.
 const LARGEST: u32 = 1_000_000;
 
 /// What to record.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct EpisodeRequest {
-    /// The folder, made if the one above it exists.
+    /// The folder, created if its parent exists.
     pub out: PathBuf,
     /// The task, in the user's words.
     pub task: String,
     /// `key=value` pairs of the user.
     pub tags: Vec<(String, String)>,
-    /// Names of the modules that are mounted, where only the user knows.
+    /// Names of mounted modules that only the user knows.
     pub modules: Vec<String>,
     /// The episode ends by itself after exactly this time of capture, if given.
     pub duration: Option<Duration>,
@@ -45,7 +45,7 @@ pub struct EpisodeRequest {
 /// How an episode ended.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EpisodeReport {
-    /// The file; `.partial` remains at its end if it could not be finished.
+    /// The file; its name still ends in `.partial` if it could not be finished.
     #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
     /// Length in seconds.
@@ -58,7 +58,7 @@ pub struct EpisodeReport {
     pub dropped: u64,
     /// Why the file, or the episode in it, is not whole, if it is not.
     pub error: Option<String>,
-    /// What it is worth.
+    /// The verdict.
     #[serde(flatten)]
     pub verdict: Verdict,
 }
@@ -68,11 +68,11 @@ pub struct EpisodeReport {
 #[derive(Debug)]
 pub(super) struct EpisodePath {
     pub(super) folder: Folder,
-    /// Once it is finished.
+    /// The name once finished.
     pub(super) finished: PathBuf,
-    /// While it is written.
+    /// The name while written.
     pub(super) partial: PathBuf,
-    /// The open file itself, whatever becomes of its names; it holds the lock.
+    /// The open file itself, independent of its names; it holds the lock.
     pub(super) file: Arc<File>,
     /// Names that other programs know as another episode's.
     pub(super) dropped: Vec<PathBuf>,
@@ -99,7 +99,7 @@ impl EpisodePath {
         Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
     }
 
-    /// Gives the finished file its name, or the next free one where another file took that meanwhile; returns it.
+    /// Gives the finished file its name, or the next free one if another file took it meanwhile; returns it.
     pub(super) fn publish(&self) -> io::Result<PathBuf> {
         match rename(&self.folder, &self.partial, &self.finished) {
             Ok(()) => Ok(self.finished.clone()),
@@ -139,9 +139,9 @@ impl EpisodePath {
     }
 }
 
-/// Makes the partial file of the episode `name` in `folder`, which is at `out`, and locks it before there is anything in
-/// it that could be repaired: the file, its finished name and its partial one. `None`: a name is taken, or another program
-/// took the empty file for one that was left behind.
+/// Creates the partial file of the episode `name` in `folder`, which is at `out`, and locks it before there is anything
+/// in it that could be repaired: the file, its finished name and its partial one. `None`: a name is taken, or another
+/// program took the empty file for one that was left behind.
 fn claim(folder: &Folder, out: &Path, name: &str) -> io::Result<Option<(File, PathBuf, PathBuf)>> {
     if folder.has(name) {
         return Ok(None);
@@ -156,10 +156,10 @@ fn claim(folder: &Folder, out: &Path, name: &str) -> io::Result<Option<(File, Pa
     Ok(is_ours.then_some((file, finished, partial)))
 }
 
-/// Opens the folder for episodes; makes it if the one above it exists.
+/// Opens the folder for episodes; creates it if its parent exists.
 ///
 /// # Errors
-/// When it cannot be made or entered, or lies behind another user's symbolic link.
+/// When it cannot be created or entered, or lies behind another user's symbolic link.
 pub fn open_folder(out: &Path) -> Result<Folder, RecordError> {
     Folder::open(out, Links::Own, Missing::Last).map_err(|error| match error {
         FolderError::Io { error, .. } if error.kind() == io::ErrorKind::NotFound => {
@@ -173,7 +173,7 @@ pub fn open_folder(out: &Path) -> Result<Folder, RecordError> {
 /// One more than the highest number of any file, finished, repaired or not, whose name begins with
 /// `stem`.
 ///
-/// A number that no count of ours reaches does not count: another program made that name.
+/// Numbers too high for our count are ignored: another program made that name.
 fn next_number(folder: &Folder, stem: &str) -> io::Result<u32> {
     let mut highest = 0;
     for entry in rustix::fs::Dir::read_from(folder.descriptor())? {
@@ -186,7 +186,7 @@ fn next_number(folder: &Folder, stem: &str) -> io::Result<u32> {
 }
 
 /// The task as part of a file name: letters and digits of any script in lower case, one hyphen for
-/// everything between them; `episode` if nothing is left. Underscores stay free to part the fields.
+/// everything between them; `episode` if nothing is left. Underscores separate only the fields.
 pub(super) fn slug(task: &str) -> String {
     let mut slug = String::new();
     for c in task.chars().flat_map(char::to_lowercase) {
@@ -214,7 +214,7 @@ fn date(wall_ns: u64) -> String {
 /// and a file that was removed is written again. A name that means another file is left alone.
 ///
 /// # Errors
-/// When it keeps its partial name, or cannot be kept.
+/// When it keeps its partial name, or cannot be saved.
 pub(super) fn keep(path: &EpisodePath) -> io::Result<PathBuf> {
     match whereabouts(path)? {
         Whereabouts::Here => path.publish(),
@@ -237,8 +237,8 @@ pub(super) fn keep(path: &EpisodePath) -> io::Result<PathBuf> {
     }
 }
 
-/// Where a file is that could not be finished; one that was removed is written again. Behind it is written `why` it is
-/// BAD, so that a later reader finds that again: its summary may be GOOD by then.
+/// The place of a file that could not be finished; a removed one is written again. The reason `why` it is BAD is
+/// appended for later readers: its summary may be GOOD by then.
 pub(super) fn failed(path: &EpisodePath, why: &str) -> PathBuf {
     let mut file = &*path.file;
     let marked = file.seek(SeekFrom::End(0)).and_then(|_| file.write_all(&Failed::mark(why)));
@@ -321,7 +321,7 @@ fn write_into(out: &Path, stem: &str, content: Content, path: &EpisodePath) -> i
         let mut source = &*path.file;
         let copied = source.seek(SeekFrom::Start(0)).and_then(|_| io::copy(&mut source, &mut copy));
         if let Err(error) = copied.and_then(|_| copy.sync_all()) {
-            // Half of it is of no use while the whole may go elsewhere.
+            // A partial copy is useless; the whole may fit elsewhere.
             let _ = fs::remove_file(&partial);
             return Err(error);
         }
@@ -381,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_go_up_and_no_file_is_touched() {
+    fn numbers_increase_and_no_existing_file_is_touched() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("made");
         let first = EpisodePath::create(&out, "t", WALL, &[]).unwrap();
@@ -412,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_that_others_planted_is_written_to() {
+    fn files_planted_by_others_are_not_written_to() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("out");
         fs::create_dir(&out).unwrap();

@@ -1,9 +1,9 @@
 //! The MCAP file of an episode: its channels and what is written to them.
 //!
-//! Invariant: every channel the registry lets expect is in the file from the start, so that a
-//! modality that never appears is still named.
-//! Invariant: only whole chunks reach the file: what a crash leaves ends between two records, save
-//! for a write that the crash cut in two. Each of them can be read without the others.
+//! Invariant: every channel that the registry declares is in the file from the start, so that a modality that never
+//! appears is still named.
+//! Invariant: only whole chunks reach the file: after a crash it ends between two records, unless the crash interrupted
+//! a write. Each chunk can be read without the others.
 //! Invariant: only [`EpisodeFile::finish`] gives a file its end; after an error it never gets one.
 
 use std::collections::BTreeMap;
@@ -32,13 +32,13 @@ use crate::time::{Stamp, WallClock};
 
 /// See the module's comment.
 pub(super) struct EpisodeFile {
-    /// Before the writer, which writes an end of its own when it is dropped.
+    /// Declared before the writer, which writes its own end when dropped.
     #[expect(dead_code, reason = "held to be dropped")]
     shut: Shut,
     writer: ChunkWriter<Latch>,
     /// Bytes that the sink took.
     written: Arc<AtomicU64>,
-    /// Looks at every flush and at the end whether another program has damaged the file.
+    /// Checks at every flush and at the end whether another program has damaged the file.
     guard: Guard,
     clock: WallClock,
     message: Vec<u8>,
@@ -65,9 +65,8 @@ impl Drop for Shut {
     }
 }
 
-/// A sink that takes nothing more after its first error, or once it is shut: the writer and the
-/// buffer before it try again when they are dropped, and a footer behind a hole makes a file look
-/// whole.
+/// A sink that accepts nothing after its first error, or once it is shut: the writer and its buffer retry when dropped,
+/// and a footer after a gap would make the file look whole.
 struct Latch {
     sink: Box<dyn Sink>,
     shut: Arc<AtomicBool>,
@@ -111,7 +110,7 @@ struct Track {
     topic: String,
     metadata: BTreeMap<String, String>,
     channels: [Option<u16>; SampleSchema::COUNT],
-    /// Its newest message, and where the sample lies in it.
+    /// Its newest message, and the position of the sample in it.
     message: Vec<u8>,
     newest: Option<Range<usize>>,
 }
@@ -183,7 +182,7 @@ impl EpisodeFile {
                 ("kind".to_owned(), kind),
             ]);
             let (name, topic) = (device.name.clone(), device.topic.clone());
-            // Grows to the largest sample: what a registry allows is mostly far more.
+            // Grows to the largest sample: the maximum of the registry is usually far more.
             let (message, newest) = (Vec::new(), None);
             let mut track = Track { name, topic, metadata, channels: [None; SampleSchema::COUNT], message, newest };
             track.channel(&mut file.writer, SampleSchema::expected(device))?;
@@ -194,8 +193,8 @@ impl EpisodeFile {
         Ok(file)
     }
 
-    /// Is this, byte for byte, the newest sample of the modality? Compared with what was written, of which a
-    /// copy would cost as much as writing it.
+    /// Is this, byte for byte, the newest sample of the modality? Compared with the written message; a copy would cost
+    /// as much as writing it.
     pub(super) fn repeats(&self, id: ModalityId, payload: &[u8]) -> bool {
         let Some(Some(track)) = self.tracks.get(id.index()) else { return false };
         track.newest.clone().and_then(|place| track.message.get(place)) == Some(payload)

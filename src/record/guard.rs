@@ -2,14 +2,14 @@
 //!
 //! 1. The file is only appended to, so that its size is what was written, unless another program cut it or wrote
 //!    behind it: then the size stays wrong, and every look sees it.
-//! 2. A file without a name whose name means another file was replaced.
-//! 3. The kernel reports that another program opened the file (inotify(7), `IN_OPEN`). Whether all that opened it have
-//!    closed it is not known, as equal events are merged, and what they wrote within it is not visible from outside.
-//!    Such a file is read back once it is finished, and all its check values must be right. Others are not read back.
+//! 2. If the name of the file now means another file, the file was replaced.
+//! 3. The kernel reports that another program opened the file (inotify(7), `IN_OPEN`). Whether every program has closed
+//!    it is unknown, as equal events are merged, and what they changed inside is not visible from outside. Such a file
+//!    is read back once it is finished, and all its check values must be right. Others are not read back.
 //!
-//! A removed file is no damage: it is written again when the episode ends (`episode_path::keep`).
+//! Removal is not damage: the file is written again when the episode ends (`episode_path::keep`).
 //!
-//! Invariant: between two samples nothing here runs: a look belongs to a flush.
+//! Invariant: nothing here runs between two samples: checks belong to flushes.
 
 use std::fs::File;
 use std::io;
@@ -24,14 +24,14 @@ use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl, fstat, stat};
 use super::episode_path::EpisodePath;
 use crate::episode::record_iter::RecordIter;
 
-/// Room for the events of one look; more are read by another read.
+/// Room for the events of one read; more need another.
 const EVENT_BYTES: usize = 1024;
 
 /// See the module's comment.
 pub(super) struct Guard {
     file: Arc<File>,
     partial: PathBuf,
-    /// None where the system gives no inotify: then damage within the file is found by its reader.
+    /// None without inotify: then damage inside the file is found by its reader.
     events: Option<OwnedFd>,
     /// Another program opened the file, for reading or for writing.
     was_opened: bool,
@@ -61,7 +61,7 @@ impl Guard {
         }
     }
 
-    /// Is the file what was written, `written` bytes of which the kernel has?
+    /// Is the file unchanged, with `written` bytes?
     ///
     /// # Errors
     /// When another program cut, extended or replaced it; the text is the reason.
@@ -86,7 +86,7 @@ impl Guard {
         Ok(())
     }
 
-    /// Is the finished file sound, as far as there is reason for doubt?
+    /// Is the finished file undamaged? Read back only if there is reason for doubt.
     ///
     /// # Errors
     /// When it is not; the text is the reason.
@@ -108,7 +108,7 @@ impl Guard {
         let Some(events) = &self.events else { return };
         let mut buffer = [MaybeUninit::uninit(); EVENT_BYTES];
         let mut reader = Reader::new(events, &mut buffer);
-        // Empty, or broken: then there is nothing to be learned.
+        // Empty, or broken: nothing to read.
         while let Ok(event) = reader.next() {
             let what = event.events();
             let written = what.intersects(ReadFlags::CLOSE_WRITE | ReadFlags::QUEUE_OVERFLOW);

@@ -4,9 +4,9 @@
 //! ([`Source`]), `session` decides what belongs to the episode and which frame it belongs to,
 //! `file` writes it. `inspect` reads such a file back.
 //!
-//! Invariant: only the `writer` thread touches a file of an episode of a run, and nothing waits for it but
-//! the caller that starts or stops it. On a virtual clock there is no thread: `stepped` writes when it is called.
-//! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
+//! Invariant: only the `writer` thread touches the file of an episode in a run, and only the caller that starts or
+//! stops it waits for it. On a virtual clock there is no thread: `stepped` writes when it is called.
+//! Invariant: a file whose name does not end in `.partial` is finished; no existing file is ever replaced.
 //! Invariant: losses are counted and reported.
 
 mod announce;
@@ -41,10 +41,10 @@ use crate::text;
 /// Why an episode cannot be recorded.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// The folder to write to is not there, and neither is the one above it.
+    /// Neither the folder to write to nor its parent exists.
     #[error("{}: no such folder, and none above it to make it in: create it or choose another with --out", .0.display())]
     NoFolder(PathBuf),
-    /// What is there is no folder.
+    /// The path is not a folder.
     #[error("{}: not a folder; choose another with --out", .0.display())]
     NotAFolder(PathBuf),
     /// The folder or a file in it cannot be used.
@@ -58,7 +58,7 @@ pub enum RecordError {
     /// The folder lies behind another user's link, or cannot be entered.
     #[error("{0}, or choose another with --out")]
     Folder(crate::folder::FolderError),
-    /// There is no room for an episode.
+    /// There is not enough disk space for an episode.
     #[error(
         "{}: the disk is full: {} free, and an episode needs more than {}, which are kept free (disk_reserve under \
          [rig] in devices.toml): remove or move recordings, choose another folder with --out, or lower disk_reserve",
@@ -67,9 +67,9 @@ pub enum RecordError {
     NoRoom {
         /// The folder.
         folder: PathBuf,
-        /// What is free on its disk, bytes.
+        /// Free space on its disk, bytes.
         free: u64,
-        /// What is to stay free, bytes.
+        /// Space to be left free, bytes.
         reserve: u64,
     },
     /// There is an episode in progress.

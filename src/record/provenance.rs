@@ -1,8 +1,7 @@
-//! Which unit each modality's samples come from, and which policy is at the controls: what runs now, and
-//! what ran in an episode.
+//! Which unit each modality's samples come from, and which policy is in control: now, and in an episode.
 //!
-//! An epoch begins when the device is opened and ends when its slot runs no more. All of it follows from
-//! events, which are in the file too.
+//! An epoch begins when the device is opened and ends when its slot stops running. All of it follows from events, which
+//! are in the file too.
 //!
 //! Invariant: pure: all knowledge comes from events.
 
@@ -33,7 +32,7 @@ struct Incarnation {
     provenance: Provenance,
 }
 
-/// What is attached and what runs at this moment, recording or not.
+/// What is attached and running now, recording or not.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Attached(Units);
 
@@ -137,10 +136,10 @@ const fn has_ended(state: SlotState) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::device::UsbIdentity;
     use crate::mask::SizedMask;
     use crate::modality::ModalityId;
     use crate::provenance::Negotiated;
-    use crate::registry::UsbIdentity;
     use crate::sample::Epoch;
     use crate::status::PolicyEnd;
 
@@ -240,7 +239,7 @@ mod tests {
         let mut units = Units::new(&attached);
         let reported = |name: &str| Some(json!({"name": name, "hash": "ff", "dry_run": true}));
         assert_eq!(units.policy(), reported("before"));
-        // It ran, although it does no more.
+        // It ran, although it has ended.
         units.take(&end);
         assert_eq!(units.policy(), reported("before"));
         units.take(&policy("within"));

@@ -1,9 +1,9 @@
-//! Other programs that published on topics of ours: which, and how many samples.
+//! Other programs that published on our topics: which, and how many samples.
 //!
-//! A rig has one publisher a topic. On the topic of a modality or of the mask the samples of another are kept out of the
-//! episode ([`crate::bus::Inbox`]); on `/action`, while a policy runs, they are recorded, as the actuator carries them
-//! out. Either way the episode is SUSPECT, with the program as the reason: when a file is read, by the event
-//! `publisher`, and by the summary, which counts the samples.
+//! A rig has one publisher per topic. On the topic of a modality or of the mask, samples of another publisher are kept
+//! out of the episode ([`crate::bus::Inbox`]); on `/action`, while a policy runs, they are recorded, because the
+//! actuator executes them. Either way the episode is SUSPECT and the program is the reason. A reader of the file knows
+//! it from the event `publisher` and from the summary, which counts the samples.
 
 use std::collections::BTreeMap;
 
@@ -15,12 +15,12 @@ use crate::text;
 
 /// Key of the metadata record at the end: JSON, a list of [`Publisher`].
 pub(super) const KEY: &str = "publishers";
-/// Programs kept apart: a program that is started over and over again must not fill the memory.
+/// Most programs distinguished: a program that is restarted repeatedly must not fill the memory.
 const MOST: usize = 64;
 /// Characters of a command line that are kept.
 const COMMAND: usize = 200;
 
-/// A program that published on a topic of ours.
+/// A program that published on one of our topics.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Publisher {
     /// The topic.
@@ -47,12 +47,12 @@ impl Publisher {
     }
 }
 
-/// Those of an episode, or of the time without one.
+/// The foreign publishers of an episode, or of the time without one.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Publishers(Vec<Publisher>);
 
 impl Publishers {
-    /// Counts samples. Gives the event of a program that was not known.
+    /// Counts samples. Returns the event of a program seen for the first time.
     pub(super) fn note(&mut self, seen: Foreign<'_>) -> Option<What> {
         let known = |known: &&mut Publisher| known.process == seen.process && known.topic == seen.topic;
         if let Some(known) = self.0.iter_mut().find(known) {
@@ -78,7 +78,7 @@ impl Publishers {
         }
     }
 
-    /// Those that the summary of a file counts, or else those of its events.
+    /// Those counted in the summary of a file, otherwise those of its events.
     pub(super) fn or_summed_up(self, summary: &BTreeMap<String, String>) -> Self {
         let counted = summary.get(KEY).and_then(|json| serde_json::from_str(json).ok());
         counted.map_or(self, Self)

@@ -1,7 +1,7 @@
 //! The quality of an episode: what is counted while it is recorded, or while its file is read.
 //!
 //! Samples, masks and frames go in, one [`Quality`] a modality comes out. The recorder and `inspect`
-//! use the same code: on one file both agree, as far as the file holds what they count.
+//! use the same code and agree on a file, as far as it holds what they count.
 //!
 //! Invariant: pure: no clock, no input or output; times are ns on whatever clock the caller uses.
 //! Invariant: taking a sample, a mask that has not changed or a frame allocates nothing, unless the
@@ -22,14 +22,14 @@ use crate::registry::{DeviceSpec, Registry, VerdictSpec};
 use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
 
-/// Room for intervals without a sample until the mask of their time is known; a reader that is further
-/// behind has a disk that stands still, and may allocate.
+/// Room for intervals without a sample until the mask of their time is known. A reader that is further behind waits for
+/// a stalled disk, and may allocate.
 const PENDING: usize = 32;
-/// Most of them; then they are judged by the masks there are. A sensor at 1 kHz has so many in four seconds, in which the
-/// mask is published two thousand times.
+/// Most of these intervals; beyond, they are judged by the known masks. A sensor at 1 kHz has this many in four
+/// seconds, in which the mask is published two thousand times.
 const MOST_PENDING: usize = 4096;
 
-/// A modality as it is to be measured.
+/// A modality to be measured.
 #[derive(Debug, Clone)]
 pub(super) struct Measured {
     /// Its name.
@@ -38,7 +38,7 @@ pub(super) struct Measured {
     pub(super) id: ModalityId,
     /// Its limits: whether payloads are compared, and its nominal rate.
     pub(super) limits: VerdictSpec,
-    /// How long before its capture what a sample shows happened, ns.
+    /// Time from the event that a sample shows to its capture, ns.
     pub(super) latency_ns: u64,
 }
 
@@ -55,7 +55,7 @@ impl Measured {
     }
 }
 
-/// When frames are, and how long they wait.
+/// The times of frames, and how long each waits for samples.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Frames {
     /// Beginning of the episode and of the grid, ns.
@@ -76,7 +76,7 @@ impl Frames {
     }
 }
 
-/// What a modality was like over an episode.
+/// The quality of a modality over an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct Quality {
     /// Samples in the file.
@@ -93,7 +93,7 @@ pub struct Quality {
     pub truncated: u64,
     /// Samples with a non-increasing sequence number or capture time.
     pub duplicates: u64,
-    /// Samples that are byte for byte the one before; absent where that is not looked at.
+    /// Samples that equal the previous one byte for byte; not counted if payloads are not compared.
     pub repeated: u64,
     /// Repetitions in the longest run of such samples.
     pub frozen_samples: u64,
@@ -103,10 +103,10 @@ pub struct Quality {
     pub late: u64,
     /// Time from capture to receipt, ms.
     pub lateness: Option<Spread>,
-    /// How much later than at the beginning samples arrived at the end, measured by the earliest of
-    /// each, ms: the device's clock runs slow, or fast if negative. Unknown of few samples.
+    /// Growth of the shortest lateness from the beginning to the end, ms: the device's clock runs slow, or fast if
+    /// negative. Unknown with few samples.
     pub clock_drift: Option<f64>,
-    /// Furthest capture time after the receipt, ms: a clock that is ahead.
+    /// Largest excess of a capture time over its receipt, ms: the clock is ahead.
     pub clock_ahead: f64,
     /// Distance between a tick and its sample, ms.
     pub offset: Option<Spread>,
@@ -128,8 +128,8 @@ pub struct Quality {
     pub frames_present: u64,
     /// Frames with a sample of it in the window.
     pub frames_valid: u64,
-    /// Frames in which it was present without such a sample; the first and the last of a presence are not
-    /// counted: the sample that belongs to them may lie outside of it, or of the episode.
+    /// Frames in which it was present without such a sample. The first and the last of a presence are not counted:
+    /// their sample may lie outside the presence or the episode.
     pub frames_missed: u64,
 }
 
@@ -147,10 +147,10 @@ pub(super) struct Measures {
     window_ns: u64,
     wait_ns: u64,
     begin_ns: u64,
-    presence: Presence,
+    presence: PresenceHistory,
     lanes: Vec<Option<Lane>>,
     /// Between the earliest and the latest sample of a frame.
-    skew: Tally,
+    skew: DurationHistogram,
 }
 
 #[derive(Debug)]
@@ -183,9 +183,9 @@ impl Measures {
             window_ns: nanoseconds(frames.window),
             wait_ns: nanoseconds(frames.wait),
             begin_ns: frames.begin_ns,
-            presence: Presence::new(frames.begin_ns),
+            presence: PresenceHistory::new(frames.begin_ns),
             lanes,
-            skew: Tally::default(),
+            skew: DurationHistogram::default(),
         }
     }
 
@@ -194,7 +194,7 @@ impl Measures {
         let Some(Some(lane)) = self.lanes.get(id.index()) else { return };
         let shown = seen.capture_ns.saturating_sub(lane.measured.latency_ns);
         let tick = self.nearest_tick(shown);
-        // No frame waits for one between the windows: it has the time that its own would give it.
+        // No frame waits for a sample between the windows: it has the deadline that its own frame would have.
         let due = if shown.abs_diff(tick) <= self.window_ns { tick } else { shown };
         let deadline = due.saturating_add(self.wait_ns);
         let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
@@ -222,15 +222,15 @@ impl Measures {
         self.presence.push(at_ns, mask);
     }
 
-    /// Takes that a device was plugged in, or out; one that was there before from the beginning.
+    /// Records that a device was plugged in or out; one that was there before counts from the beginning.
     pub(super) fn plugged(&mut self, id: ModalityId, at_ns: u64, there: bool) {
         if let Some(Some(lane)) = self.lanes.get_mut(id.index()) {
             lane.plugged.push(at_ns, there);
         }
     }
 
-    /// Takes a frame: of each modality its number, whether it is present, and the age in ns of its
-    /// sample if there is one in the window.
+    /// Takes a frame: per modality its number, whether it is present, and the age in ns of its sample in the window, if
+    /// any.
     pub(super) fn frame(&mut self, slots: impl Iterator<Item = (ModalityId, bool, Option<i64>)>) {
         let mut ages: Option<(i64, i64)> = None;
         for (id, present, age) in slots {
@@ -245,14 +245,14 @@ impl Measures {
         }
     }
 
-    /// Every mask published before the samples taken so far has been taken.
+    /// Call once every mask published before the samples so far has been taken.
     pub(super) fn settle(&mut self) {
         for lane in self.lanes.iter_mut().flatten() {
             lane.settle(&self.presence);
         }
     }
 
-    /// What there is of a modality so far.
+    /// The counts of a modality so far.
     pub(super) fn meter(&self, id: ModalityId) -> Option<&Meter> {
         self.lanes.get(id.index())?.as_ref().map(|lane| &lane.meter)
     }
@@ -267,8 +267,7 @@ impl Measures {
         self.skew.spread()
     }
 
-    /// What a modality was like in an episode that ended at `end_ns`; `None` of one that is not
-    /// measured.
+    /// The quality of a modality in an episode that ended at `end_ns`; `None` if it is not measured.
     pub(super) fn quality(&self, id: ModalityId, end_ns: u64) -> Option<Quality> {
         let Lane { measured, meter, longest_gap_ns, pending, plugged } = self.lanes.get(id.index())?.as_ref()?;
         let gaps = pending.iter().copied().chain([(meter.latest_ns, end_ns)]);
@@ -306,7 +305,7 @@ impl Measures {
 }
 
 impl Lane {
-    fn settle(&mut self, presence: &Presence) {
+    fn settle(&mut self, presence: &PresenceHistory) {
         for (from, to) in self.pending.drain(..) {
             let gap = without_samples(presence, self.measured.id, from, to);
             self.longest_gap_ns = self.longest_gap_ns.max(gap);
@@ -314,15 +313,15 @@ impl Lane {
     }
 }
 
-/// Longest time between `from` and `to` in which the modality was there: an absence is no gap.
-fn without_samples(presence: &Presence, id: ModalityId, from: u64, to: u64) -> u64 {
+/// Longest time between `from` and `to` in which the modality was present: an absence is not a gap.
+fn without_samples(presence: &PresenceHistory, id: ModalityId, from: u64, to: u64) -> u64 {
     if !presence.is_known() {
         return to.saturating_sub(from);
     }
     presence.spans(id, from, to).map(|(begin, end)| end - begin).max().unwrap_or(0)
 }
 
-/// What is looked at of a sample.
+/// The measured properties of a sample.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SampleFacts<'a> {
     /// Its number; of a file only the lower 32 bits.
@@ -337,7 +336,7 @@ pub(super) struct SampleFacts<'a> {
     pub(super) jpeg: bool,
     /// Its bytes.
     pub(super) payload: &'a [u8],
-    /// They are those of the sample before; `None`: to be found out here, by a hash of each.
+    /// The bytes equal those of the previous sample; `None`: to be determined here by hashing.
     pub(super) repeated: Option<bool>,
 }
 
@@ -353,19 +352,19 @@ pub(super) struct Run {
 /// What is counted of one modality, sample by sample. Taking a sample neither allocates nor locks nor logs.
 #[derive(Debug, Default)]
 pub(super) struct Meter {
-    /// Of the quality what is counted as samples and frames come.
+    /// The part of the quality that is counted per sample and frame.
     pub(super) counts: Quality,
     /// The run that the newest sample belongs to.
     pub(super) run: Run,
     pub(super) longest_run: Run,
     /// Receipt minus capture.
-    pub(super) lateness: Tally,
-    /// Furthest capture behind its receipt, ns.
+    pub(super) lateness: DurationHistogram,
+    /// Largest excess of a capture time over its receipt, ns.
     pub(super) ahead_ns: u64,
     pub(super) drift: Drift,
     /// Distance of a tick to the sample chosen for it.
-    pub(super) offset: Tally,
-    /// Was it present in the newest frame, and did that lack a sample without being the first of a presence?
+    pub(super) offset: DurationHistogram,
+    /// Was it present in the newest frame? Did that frame lack a sample without being the first of a presence?
     was_present: bool,
     lacked: bool,
     /// Latest capture so far; the beginning before the first sample.
@@ -373,22 +372,21 @@ pub(super) struct Meter {
     begin_ns: u64,
     seq: Option<u64>,
     run_began_ns: u64,
-    /// Are samples compared with the one before?
+    /// Are samples compared with the previous one?
     compares: bool,
-    /// Length and hash of the bytes of the newest sample, unless the source of samples compares them. Samples that are
-    /// equal have equal ones; a collision made on purpose makes an episode worse, never better.
+    /// Length and hash of the bytes of the newest sample, unless the source of samples compares them. Equal samples
+    /// have equal hashes; a deliberate collision makes the verdict worse, never better.
     newest: Option<(usize, u64)>,
 }
 
 impl Meter {
     /// A meter of an episode that begins at `begin_ns`. `compares`: payloads are compared with the
-    /// one before.
+    /// previous one.
     fn new(begin_ns: u64, compares: bool) -> Self {
         Self { latest_ns: begin_ns, begin_ns, run_began_ns: begin_ns, compares, ..Self::default() }
     }
 
-    /// Takes a sample whose frame waits for it until `deadline_ns`. Returns the time since the sample
-    /// before it.
+    /// Takes a sample whose frame waits until `deadline_ns`. Returns the interval since the previous sample.
     fn sample(&mut self, seen: &SampleFacts<'_>, deadline_ns: u64) -> Option<(u64, u64)> {
         let first = self.seq.is_none();
         self.counts.samples += 1;
@@ -412,7 +410,7 @@ impl Meter {
     fn frame(&mut self, present: bool, valid: bool) {
         self.counts.frames_present += u64::from(present);
         self.counts.frames_valid += u64::from(valid);
-        // The frame before this one was not the last of a presence.
+        // The previous frame was not the last of a presence.
         self.counts.frames_missed += u64::from(present && self.lacked);
         self.lacked = present && !valid && self.was_present;
         self.was_present = present;
@@ -455,9 +453,8 @@ impl Meter {
 const SOI: [u8; 2] = [0xff, 0xd8];
 const EOI: [u8; 2] = [0xff, 0xd9];
 
-/// Does a payload begin and end as a JPEG picture does? Not a decoder: two bytes at each end. Some cameras fill a picture
-/// up with zeros: those do not
-/// count.
+/// Does a payload begin and end like a JPEG picture? Checks two bytes at each end; padding of zeros, as of some
+/// cameras, does not count.
 pub(super) fn is_whole_jpeg(payload: &[u8]) -> bool {
     let end = payload.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
     let picture = payload.get(..end).unwrap_or_default();
@@ -465,21 +462,21 @@ pub(super) fn is_whole_jpeg(payload: &[u8]) -> bool {
     picture.len() >= 4 && picture.starts_with(&SOI) && picture.ends_with(&EOI)
 }
 
-/// When each modality was there, by the mask from `begin_ns` on. Memory grows with the changes of the mask, not with its
-/// publications.
+/// When each modality was present, by the mask from `begin_ns` on. Memory grows with the changes of the mask, not with
+/// its publications.
 #[derive(Debug)]
-pub(super) struct Presence {
+pub(super) struct PresenceHistory {
     begin_ns: u64,
     /// Moment and value of the first mask known and of every change, ascending.
     edges: Vec<(u64, PhysicalMask)>,
 }
 
-impl Presence {
+impl PresenceHistory {
     fn new(begin_ns: u64) -> Self {
         Self { begin_ns, edges: Vec::with_capacity(64) }
     }
 
-    /// Takes a publication; one of before the beginning counts from the beginning.
+    /// Takes a publication; an earlier one counts from the beginning.
     fn push(&mut self, at_ns: u64, mask: PhysicalMask) {
         let last = self.edges.last();
         if last.is_some_and(|(_, last)| *last == mask) {
@@ -495,11 +492,11 @@ impl Presence {
     }
 
     /// The spans between `from` and `to` in which the bit of `id` was set, ascending, none empty.
-    /// Before the first mask nothing is known to be there.
+    /// Before the first mask nothing counts as present.
     fn spans(&self, id: ModalityId, from: u64, to: u64) -> impl Iterator<Item = (u64, u64)> {
         // The edge in force at `from` is the last one at or before it.
         let first = self.edges.partition_point(|(at, _)| *at <= from).saturating_sub(1);
-        // None behind `to` is looked at: the work for spans that do not overlap is bounded by the number of edges.
+        // Edges after `to` are skipped: the work for disjoint spans is bounded by the number of edges.
         let end = self.edges.partition_point(|(at, _)| *at < to).max(first);
         let edges = self.edges.get(first..end).unwrap_or_default();
         let mut index = 0;
@@ -537,7 +534,7 @@ pub(super) struct Time {
 }
 
 impl Plugged {
-    /// Takes that it was plugged in or out.
+    /// Records that it was plugged in or out.
     fn push(&mut self, at_ns: u64, there: bool) {
         let (last, state) = self.edges.last().copied().unwrap_or((0, false));
         if state != there {
@@ -545,8 +542,8 @@ impl Plugged {
         }
     }
 
-    /// What it comes to from `begin_ns` to `end_ns`.
-    fn time(&self, presence: &Presence, id: ModalityId, begin_ns: u64, end_ns: u64) -> Time {
+    /// The times from `begin_ns` to `end_ns`.
+    fn time(&self, presence: &PresenceHistory, id: ModalityId, begin_ns: u64, end_ns: u64) -> Time {
         let mut time = Time::default();
         for (index, (at, there)) in self.edges.iter().enumerate() {
             let from = (*at).max(begin_ns);
@@ -566,11 +563,11 @@ impl Plugged {
     }
 }
 
-/// Parts an episode is divided into; the oldest two by two become one when there are more.
+/// Number of parts of an episode; when more are needed, parts are merged in pairs.
 const CELLS: usize = 16;
-/// Length of a part at the beginning.
+/// Initial length of a part.
 const FIRST_WIDTH_NS: u64 = 250_000_000;
-/// Fewer samples may all have been delayed.
+/// Least samples in a quarter: fewer may all have been delayed.
 const LEAST_SAMPLES: u64 = 10;
 
 #[derive(Debug, Clone, Copy)]
@@ -587,10 +584,10 @@ impl Cell {
     }
 }
 
-/// Whether a device's stamps run at the pace of this machine's clock. Memory is fixed, however long an episode is.
+/// Whether the clock of a device runs at the rate of this machine's. Memory is fixed, however long an episode is.
 ///
-/// A sample cannot arrive sooner than it was captured plus the shortest way to us. That shortest
-/// lateness is a property of the device; if it changes over an episode, its clock runs fast or slow.
+/// A sample cannot arrive before its capture plus the shortest transport time. That shortest lateness is a property of
+/// the device; if it changes over an episode, the clock runs fast or slow.
 #[derive(Debug)]
 pub(super) struct Drift {
     width_ns: u64,
@@ -606,7 +603,7 @@ impl Default for Drift {
 impl Drift {
     /// Takes the lateness of a sample received `since_begin_ns` after the beginning.
     fn push(&mut self, since_begin_ns: u64, lateness_ns: i64) {
-        // At most 36 times: by then a part is as long as time itself.
+        // At most 36 times: then a part covers all of u64.
         while since_begin_ns / self.width_ns >= CELLS as u64 {
             self.fold();
         }
@@ -646,13 +643,13 @@ impl Drift {
 
 /// Longest time resolved, microseconds: an hour.
 const LONGEST_US: u64 = 3_600_000_000;
-/// Two digits: values are off by one part in a hundred at most, and a distribution takes 13 KiB.
+/// Two digits: an error of 1 % at most, in 13 KiB per histogram.
 const DIGITS: u8 = 2;
 
-/// Times of one kind.
+/// A histogram of times of one kind.
 #[derive(Debug)]
-pub(super) struct Tally {
-    /// `None` only if the bounds above made no sense.
+pub(super) struct DurationHistogram {
+    /// `None` only if the bounds above were invalid.
     times: Option<Histogram<u32>>,
     longest_ns: u64,
     count: u64,
@@ -671,13 +668,13 @@ pub struct Spread {
     pub max: f64,
 }
 
-impl Default for Tally {
+impl Default for DurationHistogram {
     fn default() -> Self {
         Self { times: Histogram::new_with_bounds(1, LONGEST_US, DIGITS).ok(), longest_ns: 0, count: 0 }
     }
 }
 
-impl Tally {
+impl DurationHistogram {
     pub(super) fn push(&mut self, time_ns: u64) {
         self.longest_ns = self.longest_ns.max(time_ns);
         self.count += 1;
@@ -686,11 +683,11 @@ impl Tally {
         }
     }
 
-    /// What the times come to; `None` without any.
+    /// Percentiles of the times; `None` without any.
     pub(super) fn spread(&self) -> Option<Spread> {
         let times = self.times.as_ref().filter(|_| self.count > 0)?;
         let max = self.longest_ns as f64 / 1e6;
-        // The histogram answers with the upper end of a cell.
+        // The histogram returns the upper end of a cell.
         let at = |quantile| (times.value_at_quantile(quantile) as f64 / 1e3).min(max);
         Some(Spread { p50: at(0.5), p95: at(0.95), p99: at(0.99), max })
     }

@@ -1,8 +1,8 @@
-//! The recorder: the handle to the `writer` thread, what it is made with, what it takes its samples from (an inbox of the
-//! bus, or a test's script), and the thread itself.
+//! The recorder: the handle to the `writer` thread, its configuration, its source of samples (an inbox of the bus, or
+//! the script of a test), and the thread itself.
 //!
-//! The thread takes samples from the bus all the time, so that an episode begins with an empty queue; while
-//! there is no episode it throws them away.
+//! The thread always takes samples from the bus, so that an episode begins with an empty queue; without an episode it
+//! discards them.
 //!
 //! Invariant: an episode in progress is finished whatever ends the thread: the last handle dropped,
 //! an error of the disk, a panic.
@@ -42,16 +42,16 @@ use crate::sample::SampleHeader;
 use crate::status::{Board, Episode, EpisodeWatch, Event, Level, RecordingStatus, ShortEpisode, What};
 use crate::time::{ClockWatch, Stamp, WallClock};
 
-/// Longest wait for samples: what an order, an event or a due frame may have to wait.
+/// Longest wait for samples, which delays a command, an event or a due frame.
 const TURN: Duration = Duration::from_millis(20);
-/// How often what was written is handed to the kernel. A kill may take a second at most: half of it
-/// is for what lies on the bus and for frames that are not due yet.
+/// How often written data is passed to the kernel. A kill may lose a second at most: half of it is for samples on the
+/// bus and for frames that are not due yet.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// How often the board is updated.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
-/// How often it is looked whether the wall clock was set.
+/// How often the wall clock is checked for a step.
 const CLOCK_EVERY: Duration = Duration::from_millis(100);
-/// Least distance of two complaints about the bus.
+/// Shortest time between two complaints about the bus.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(5);
 
 /// A consumer's end of the bus.
@@ -62,18 +62,18 @@ pub trait Source: Send {
     /// When the bus cannot be waited on; the text is the reason.
     fn wait(&mut self, timeout: Duration) -> Result<(), String>;
 
-    /// Hands over every sample that waits, oldest first within a topic; bytes are lent for the call.
+    /// Delivers every pending sample, oldest first within a topic; bytes are borrowed for the call.
     ///
     /// # Errors
     /// When the bus cannot be read; the text is the reason.
     fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String>;
 
-    /// Hands over who else has published on our topics since the last call; none, unless the source can know.
+    /// The foreign publishers on our topics since the last call; none if the source cannot know.
     fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
         let _ = take;
     }
 
-    /// Why what is drained can be relied on no longer.
+    /// Why drained samples can no longer be trusted.
     fn lost(&self) -> Option<String> {
         None
     }
@@ -99,27 +99,25 @@ impl Source for Inbox {
 
 type Opener = Box<dyn FnMut(File) -> Box<dyn Sink> + Send>;
 
-/// What the thread works with.
+/// The configuration of the thread.
 pub struct RecorderConfig {
     /// What may be recorded.
     pub registry: Arc<Registry>,
     /// Where the state of the recording is reported, and events come from.
     pub board: Arc<Board>,
-    /// Makes the sink of an episode of the file opened for it; the file itself unless a test wants
-    /// the disk to fail.
+    /// Creates an episode's sink from its open file: the file itself, unless a test simulates disk failures.
     pub sink: Opener,
-    /// Returns what is free on the disk of an episode's file.
+    /// Returns the free space on the disk of an episode's file.
     pub disk: Asker,
     /// Reads the clocks.
     pub clock: Box<dyn FnMut() -> WallClock + Send>,
-    /// Returns when an episode begins that is requested now: now. A test sends what it means to lie at
-    /// the beginning from here, so that it lies there however long the machine takes.
+    /// Returns the start time of an episode requested now: now. Tests use it to send the samples of the beginning, so
+    /// that they belong to it on machines of any speed.
     pub begin: Box<dyn FnMut() -> Stamp + Send>,
 }
 
 impl RecorderConfig {
     /// Episodes of `registry`, reported on `board`, written to their files.
-    #[must_use]
     pub fn new(registry: Arc<Registry>, board: Arc<Board>) -> Self {
         Self {
             registry,
@@ -132,8 +130,8 @@ impl RecorderConfig {
     }
 }
 
-/// The handle. Dropping it ends an episode in progress and waits for its file, some 150 ms and
-/// what the disk takes, unless the thread was [handed over](Self::hand_over).
+/// The handle. Dropping it ends an episode in progress and waits for its file, some 150 ms plus the time of the disk,
+/// unless the thread was [handed over](Self::hand_over).
 #[derive(Debug)]
 pub struct Recorder {
     orders: Option<Sender<RecorderOrder>>,
@@ -143,10 +141,10 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Starts the `writer` thread. Events are recorded that are announced from now on.
+    /// Starts the `writer` thread. Events announced from now on are recorded.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// When the system provides no thread.
     pub fn spawn(source: impl Source + 'static, config: RecorderConfig) -> io::Result<Self> {
         let (orders, inbox) = mpsc::channel();
         let events = config.board.events();
@@ -162,7 +160,6 @@ impl Recorder {
     }
 
     /// Cancelled when the thread has ended: before the handle is dropped, by a panic.
-    #[must_use]
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
     }
@@ -173,7 +170,6 @@ impl Recorder {
     }
 
     /// The episode in progress: from when its file is open until its last sample is written.
-    #[must_use]
     pub fn episode(&self) -> EpisodeWatch {
         self.episode.clone()
     }
@@ -181,13 +177,13 @@ impl Recorder {
     /// Begins an episode; returns the name its file will have.
     ///
     /// # Errors
-    /// When there is one in progress, or its file cannot be made.
+    /// When there is one in progress, or its file cannot be created.
     pub async fn start(&self, request: EpisodeRequest) -> Result<PathBuf, RecordError> {
         self.ask(|reply| RecorderOrder::Start(request, reply)).await
     }
 
-    /// Fixes the end of the episode in progress, if there is one, to the moment `at`; an earlier end stays. Does
-    /// not wait: its last samples may still be on their way.
+    /// Sets the end of the episode in progress, if any, to the moment `at`; an earlier end stays. Does not wait: its
+    /// last samples may still be in transit.
     pub fn end(&self, at: Stamp) {
         if let Some(orders) = &self.orders {
             // Without its thread there is no episode.
@@ -203,18 +199,18 @@ impl Recorder {
         self.stop_at(Stamp::now()).await
     }
 
-    /// Ends the episode in progress at the moment `at`; returns once its file is closed. An episode
-    /// whose end is fixed already, by its duration or by [`Self::end`], is waited for all the same.
+    /// Ends the episode in progress at the moment `at`; returns once its file is closed. An episode whose end is
+    /// already fixed, by its duration or by [`Self::end`], is still waited for.
     ///
     /// # Errors
-    /// When there is none: one that its duration or the disk ended is reported by `What::Episode` alone.
+    /// When there is none: an episode ended by its duration or the disk is reported by `What::Episode` alone.
     pub async fn stop_at(&self, at: Stamp) -> Result<EpisodeReport, RecordError> {
         self.end(at);
         self.ask(RecorderOrder::Await).await
     }
 
-    /// Drops the last episode, `file`, if it is too short to be used and none has begun since; another file that
-    /// has its name by now, or one that was changed, stays.
+    /// Drops the last episode, `file`, if it is too short to be used and none has begun since. Another file that has
+    /// its name by now, or a changed one, stays.
     ///
     /// # Errors
     /// When it is another episode, or the file cannot be removed.
@@ -240,14 +236,14 @@ impl Drop for Recorder {
     }
 }
 
-/// Where an answer goes.
+/// The sender of an answer.
 type Reply<T> = oneshot::Sender<Result<T, RecordError>>;
 
-/// What the thread is asked for.
+/// Requests to the thread.
 enum RecorderOrder {
     /// Begin an episode now.
     Start(EpisodeRequest, Reply<PathBuf>),
-    /// Fix the end of the episode in progress to this moment: that at which it was asked for.
+    /// Fix the end of the episode in progress to this moment, when it was requested.
     End(Stamp),
     /// Answer when the file of the episode in progress is closed.
     Await(Reply<EpisodeReport>),
@@ -262,12 +258,12 @@ struct Writer {
     events: broadcast::Receiver<Event>,
     streams: Streams,
     attached: Attached,
-    /// Of the episode in progress, or of the time since the last one began.
+    /// Those of the episode in progress, or of the time since the last one began.
     publishers: Publishers,
     session: Option<Session>,
     /// The last episode, if it is too short to be used, until the next one begins.
     short: Option<Short>,
-    /// Files that were dropped: their names are not given again.
+    /// Files that were dropped: their names are not reused.
     dropped: Vec<PathBuf>,
     /// Receives the reports of the session.
     episode: watch::Sender<Option<Arc<Episode>>>,
@@ -310,11 +306,11 @@ impl Writer {
         }
     }
 
-    /// Works until the last handle is dropped and nothing is left to be written, or until it panics.
+    /// Runs until the last handle is dropped and everything is written, or until it panics.
     fn run(mut self, mut source: impl Source) {
         loop {
-            // Unwinding leaves a session whole: it is only ever replaced or taken as a whole, and
-            // what of it was half written is for its file to refuse.
+            // Unwinding leaves a session complete: it is only replaced or taken as a whole, and its file refuses
+            // half-written data.
             match catch_unwind(AssertUnwindSafe(|| self.turn(&mut source))) {
                 Ok(ControlFlow::Continue(())) => {}
                 Ok(ControlFlow::Break(())) => return,
@@ -336,10 +332,10 @@ impl Writer {
         fault::point("writer");
         if let Err(error) = source.wait(TURN) {
             self.complain_about_bus(&error);
-            // What cannot be waited on is looked at regularly instead.
+            // A source that cannot be waited on is polled.
             std::thread::sleep(TURN);
         }
-        // Read before the drain: what was received by then has been taken after it.
+        // Read before the drain: samples received by then are taken by it.
         let now = Stamp::now();
         let Self { streams, session, .. } = self;
         let drained =
@@ -422,13 +418,13 @@ impl Writer {
         let begin = (self.config.begin)();
         let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin), &self.dropped)?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
-        // Nothing was recorded into it, and it was made a moment ago.
+        // Nothing was recorded into it, and it was just created.
         let refuse = |error| {
             let _ = std::fs::remove_file(&partial);
             error
         };
         let failed = |source| refuse(RecordError::Io { path: partial.clone(), source });
-        // One descriptor for the names, the room and the writeback, another for the sink.
+        // One descriptor for the names, the disk space and the writeback, another for the sink.
         let (watched, file) = (Arc::clone(&path.file), path.file.try_clone().map_err(failed)?);
         let reserve = self.config.registry.rig.disk_reserve;
         let space = Space::begin(watched, &request.out, reserve, begin, &mut self.config.disk).map_err(refuse)?;
@@ -443,11 +439,11 @@ impl Writer {
             begin,
         };
         let mut session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
-        // An episode has their state from its beginning, not only changes.
+        // An episode records their state at its beginning, not only changes.
         for stop in self.config.board.stops() {
             session.event(&Event { stamp: begin, what: What::Stop(stop) });
         }
-        // Withdrawn before the next one shows.
+        // Withdrawn before the next episode is shown.
         self.set_short(None);
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
@@ -492,7 +488,7 @@ impl Writer {
                     format!("{file}: removed while it is recorded; it will be written again when the episode ends");
                 self.complain(Level::Error, text);
             }
-            // Without waiting for what may still be on its way: it would need room.
+            // Without waiting for samples in transit: these would need space.
             Finding::Spent(reason) => self.finish(now, Some(reason)),
         }
     }
@@ -536,7 +532,7 @@ impl Writer {
 
     fn drop_short(&mut self, file: PathBuf) -> Result<(), RecordError> {
         let Some(short) = self.short.take_if(|short| short.is(&file)) else { return Err(RecordError::Kept(file)) };
-        // Tried once: what cannot be removed is not offered again.
+        // Tried once: a file that cannot be removed is not offered again.
         self.set_short(None);
         let seconds = short.remove().map_err(|source| RecordError::Io { path: file.clone(), source })?;
         self.config.board.forget_last_episode();
@@ -563,17 +559,17 @@ fn panic_text(panic: &(dyn Any + Send)) -> &str {
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("no message")
 }
 
-/// The last episode, if it is too short to be used: what may be dropped.
+/// The last episode, if it is too short to be used and so may be dropped.
 ///
-/// Only the file that was there when the episode ended is ever removed: one that was changed since, or another of the
-/// same name, stays.
+/// Only the file that existed when the episode ended is ever removed: a changed file, or another of the same name,
+/// stays.
 struct Short {
     path: PathBuf,
     seconds: f64,
     folder: Folder,
     /// Kept open: no other file gets its inode number.
     file: File,
-    /// As the recorder left it.
+    /// Its metadata as the recorder left it.
     left: Metadata,
 }
 
@@ -584,7 +580,7 @@ impl Short {
             return None;
         }
         let path = report.file.clone();
-        // What cannot be opened again is not offered: nothing is lost but a convenience.
+        // A file that cannot be reopened is not offered: only a convenience is lost.
         let folder = Folder::open(path.parent()?, Links::Own, Missing::Refused).ok()?;
         let file = folder.open_file(path.file_name()?).ok()?;
         let left = file.metadata().ok()?;
@@ -596,7 +592,7 @@ impl Short {
         ShortEpisode { file: self.path.clone(), length: Duration::from_secs_f64(self.seconds.max(0.0)) }
     }
 
-    /// Is this its file?
+    /// Whether this is its file.
     fn is(&self, file: &Path) -> bool {
         self.path == file
     }
@@ -617,7 +613,7 @@ impl Short {
     }
 }
 
-/// What differs between two files, and between a file before and after it was written to.
+/// The attributes that differ between two files, and between a file before and after a write.
 fn as_written(file: &Metadata) -> (u64, u64, u64, i64, i64) {
     (file.dev(), file.ino(), file.len(), file.mtime(), file.mtime_nsec())
 }

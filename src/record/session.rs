@@ -1,19 +1,19 @@
-//! An episode in progress: what belongs to it, which frame it belongs to, and how it ends.
+//! An episode in progress: its contents, the frame of each sample, and its end.
 //!
 //! Time, in capture time of the monotonic clock:
 //!
-//! 1. The episode holds what was captured from `begin` on and happened before `end`: a modality's
-//!    latency is how long before its capture what a sample shows happened. `end` is fixed by the
-//!    duration asked for or by the moment of the stop. One mask more is written, captured before
-//!    `begin`: the one in force when the episode began, and those of before it that were still on their way.
+//! 1. The episode contains samples captured from `begin` on that show events before `end`: a modality's latency is the
+//!    time from an event to the capture of the sample that shows it. `end` is fixed by the requested duration or by the
+//!    time of the stop. Also written are the mask in force at `begin`, captured before it, and earlier masks that were
+//!    still in transit.
 //! 2. Tick `k` of the observation grid is `begin + k / observation_hz`; ticks before `end` are
 //!    written.
-//! 3. A tick is evaluated once, of what was received by its deadline, `tick + sync_window +`
-//!    [`SETTLE`] `+` the longest latency of the rig, under the mask last published at or before the tick. The deadline is the frame's
+//! 3. A tick is evaluated once, from the samples received by its deadline, `tick + sync_window +` [`SETTLE`] `+` the
+//!    longest latency of the rig, under the mask last published at or before the tick. The deadline is the frame's
 //!    `publish_time`: a reader of the file can choose the same samples again.
 //! 4. A sample received after its tick's deadline is in the file and in no frame.
-//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] `+` the longest latency after `end`. A sample captured before `end` that
-//!    arrives later than that is lost and cannot be counted.
+//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] `+` the longest latency after `end`. A sample captured before `end`
+//!    that arrives after that is lost and cannot be counted.
 //! 6. A damaged sample is recorded and counted, and belongs to no frame.
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
@@ -43,16 +43,16 @@ use crate::status::{Board, Event, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
 use crate::time::{Stamp, WallClock};
 
-/// Samples of a modality that may arrive while those of a whole queue are being written.
+/// Samples of a modality that may arrive while a full queue is being written.
 const RING_SLACK: usize = 1024;
-/// How long after its capture a sample may arrive and still belong to its frame. The slowest we
-/// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
-/// one frame in the kernel's queue, some 70 ms later.
+/// How long after its capture a sample may arrive and still belong to its frame. The slowest known case: a camera at 15
+/// Hz stamps the start of exposure and delivers after exposure, transfer and one frame in the kernel's queue, some 70
+/// ms later.
 pub(super) const SETTLE: Duration = Duration::from_millis(100);
-/// What has been received may still lie on the bus for this long.
+/// Received samples may stay on the bus for this long.
 pub(super) const GRACE: Duration = Duration::from_millis(20);
 
-/// What a session begins with.
+/// Parameters at the start of a session.
 pub(super) struct Beginning<'a> {
     pub(super) registry: Arc<Registry>,
     pub(super) board: Arc<Board>,
@@ -70,7 +70,7 @@ pub(super) struct Session {
     board: Arc<Board>,
     path: EpisodePath,
     file: EpisodeFile,
-    /// None where there is no thread for it: then only the end of the episode waits for the disk.
+    /// None if it has no thread: then only the end of the episode waits for the disk.
     writeback: Option<Writeback>,
     begin: Stamp,
     end: Option<Stamp>,
@@ -83,14 +83,14 @@ pub(super) struct Session {
     logs: u64,
     events: u64,
     units: Units,
-    /// How long a tick waits for its samples beside the window.
+    /// How long a tick waits for its samples, in addition to the window.
     settle: Duration,
-    /// The first error of the file: from then on nothing is written.
+    /// The first error of the file: nothing is written after it.
     failed: Option<io::Error>,
 }
 
 impl Session {
-    /// Begins an episode and writes what stands at its beginning.
+    /// Begins an episode and writes the file's initial records.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
         let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
         let units = Units::new(attached);
@@ -107,7 +107,7 @@ impl Session {
             file.mask(header, *mask, *sequence)?;
             measures.mask(header.capture_ns, *mask);
         }
-        // Killed in the next moment, it is an episode all the same, of a known task and rig.
+        // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
         let writeback = Writeback::start(Arc::clone(&path.file), &path.folder);
         Ok(Self {
@@ -132,11 +132,11 @@ impl Session {
         })
     }
 
-    /// Takes a sample, and the hole before it.
+    /// Takes a sample, and the gap before it.
     pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
         let latency = self.latency(id);
         if let (Some(hole), None) = (hole, &self.failed) {
-            // Also before a sample that lies beyond the end: a part of the hole may not.
+            // Also for a sample after the end: part of the gap may be before it.
             let (lost, dropped) = (self.share(&hole, hole.lost, latency), self.share(&hole, hole.dropped, latency));
             self.measures.missing(id, lost, dropped);
         }
@@ -172,12 +172,12 @@ impl Session {
         self.sync.push(id, sample);
     }
 
-    /// Takes a publication of the mask, and the hole before it.
+    /// Takes a publication of the mask, and the gap before it.
     pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
             self.missing.masks = self.missing.masks.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
         }
-        // One of before the beginning that comes only now follows the one that the episode began with.
+        // A mask from before the beginning that arrives only now follows the one in force at the beginning.
         let captured = Stamp(header.capture_ns);
         if !(captured < self.begin || self.holds(captured, Duration::ZERO)) || self.failed.is_some() {
             return;
@@ -186,7 +186,7 @@ impl Session {
         self.measures.mask(header.capture_ns, mask);
     }
 
-    /// Takes an action, and the hole before it.
+    /// Takes an action, and the gap before it.
     pub(super) fn action(&mut self, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
             let missing = self.share(&hole, hole.lost.saturating_add(hole.dropped), Duration::ZERO);
@@ -203,7 +203,7 @@ impl Session {
         if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {
             return;
         }
-        // What is no JSON is an event less, and no reason to lose the episode.
+        // An event that is not valid JSON is dropped; it is no reason to lose the episode.
         let json = match serde_json::to_value(event) {
             Ok(json) => json,
             Err(error) => {
@@ -219,13 +219,13 @@ impl Session {
         }
     }
 
-    /// Counts events that came faster than they were read.
+    /// Counts events that were missed because they came too fast.
     pub(super) fn missed_events(&mut self, count: u64) {
         self.missing.events += count;
     }
 
-    /// Writes the frames whose deadline has passed by `now`, everything received before which was
-    /// taken, and announces what goes wrong.
+    /// Writes the frames whose deadline has passed by `now`; all samples received before have been taken. Announces
+    /// faults.
     pub(super) fn advance(&mut self, now: Stamp, masks: &MaskHistory) {
         let ticks = self.end.map_or(u64::MAX, |end| self.grid.ticks_before(end));
         while self.failed.is_none() && self.next_tick < ticks && now >= self.deadline(self.next_tick).after(GRACE) {
@@ -241,17 +241,17 @@ impl Session {
         self.end = Some(self.end.map_or(end, |fixed| fixed.min(end)));
     }
 
-    /// Is it time to [`Self::finish`]?
+    /// Whether it is time to [`Self::finish`].
     pub(super) fn is_over(&self, now: Stamp) -> bool {
         self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(self.settle).after(GRACE))
     }
 
-    /// Is the end of the episode fixed by now?
+    /// Whether the end of the episode is fixed by now.
     pub(super) fn is_ending(&self, now: Stamp) -> bool {
         self.end.is_some_and(|end| now >= end)
     }
 
-    /// Hands what was written to the kernel, and has that bring it to the disk without waiting for it.
+    /// Passes the written data to the kernel and starts its writeback without waiting for it.
     pub(super) fn flush(&mut self) {
         if self.failed.is_none() {
             self.failed = self.file.flush().err();
@@ -266,8 +266,8 @@ impl Session {
         self.failed = self.failed.take().or(ended.err());
     }
 
-    /// Writes what is left, ends the file and gives it its name. `reason`: why the episode is not whole although its file
-    /// may be; `publishers`: other programs that published on topics of ours.
+    /// Writes the remaining frames, ends the file and gives it its name. `reason`: why the episode is not whole
+    /// although its file may be; `publishers`: other programs that published on our topics.
     pub(super) fn finish(
         mut self,
         now: Stamp,
@@ -361,7 +361,7 @@ impl Session {
         self.registry.device(id).map_or(Duration::ZERO, |device| device.latency)
     }
 
-    /// How many of `count` samples missing in `hole` belong to the episode.
+    /// How many of the `count` samples missing in `hole` belong to the episode.
     fn share(&self, hole: &Hole, count: u64, latency: Duration) -> u64 {
         let until_end = self.end.map_or(count, |end| hole.before(end.after(latency), count));
         until_end.saturating_sub(hole.before(self.begin, count))
@@ -396,7 +396,7 @@ impl Session {
     }
 }
 
-/// The modalities of a registry, as frames are made of them.
+/// The modalities of a registry, for building frames.
 fn synchronised(registry: &Registry) -> Vec<SyncModality> {
     let devices = registry.devices.iter();
     let modality = devices.map(|device| SyncModality {

@@ -1,8 +1,7 @@
-//! Room on the disk for the episode in progress.
+//! Disk space for the episode in progress.
 //!
-//! Twice guarded: an episode ends before less than the reserve is free, and what closing it takes is
-//! set aside in the file system beforehand, behind the end of the file, so that it can be closed
-//! even when something else takes the last byte.
+//! Guarded twice: an episode ends before less than the reserve is free, and the space needed to close it is allocated
+//! in advance after the end of the file, so that it can be closed even when another program takes the last byte.
 //!
 //! | free, above the reserve                     | then                                       |
 //! |---------------------------------------------|--------------------------------------------|
@@ -10,7 +9,7 @@
 //! | less, at the rate it is written with        | reported once, shown with the time left    |
 //! | nothing                                     | the episode is closed, no other begins     |
 //!
-//! Invariant: free is what other programs may still take, and what is set aside for the file.
+//! Invariant: free space includes the space set aside for the file.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -27,29 +26,28 @@ use crate::disk::Disk;
 use crate::text;
 use crate::time::Stamp;
 
-/// With less time than this left, it is reported.
+/// Time left below which it is reported.
 const WARN_LEFT: Duration = Duration::from_mins(5);
-/// How often it is looked whether more must be set aside: at 300 MB/s half of [`ASIDE_MOST`] is
-/// written in that time.
+/// How often the space set aside is checked: at 300 MB/s half of [`ASIDE_MOST`] is written in that time.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// How often the disk is asked.
+/// How often the free space of the disk is read.
 const ASK_EVERY: Duration = Duration::from_secs(1);
-/// What is set aside at most: a chunk, what is written between two looks, and the summary, which
-/// takes some 200 bytes for each MiB of the episode.
+/// The most that is set aside: a chunk, the data between two checks, and the summary, some 200 bytes per MiB of the
+/// episode.
 const ASIDE_MOST: u64 = 64 << 20;
-/// What is set aside at least.
+/// The least that is set aside.
 const ASIDE_LEAST: u64 = 4 << 20;
 /// The rate is the mean over this long.
 const RATE_OVER: Duration = Duration::from_secs(10);
 /// No rate is computed over less than this.
 const RATE_LEAST: Duration = Duration::from_secs(2);
-/// Times longer than this are no forecast.
+/// Longer times are not forecast.
 const LEFT_MOST: Duration = Duration::from_hours(100);
 
-/// Asks for the room on the disk of a file; only a test has another answer than the file system's.
+/// Reads the free space on the disk of a file; only tests replace the answer of the file system.
 pub type Asker = Box<dyn FnMut(&File) -> io::Result<Disk> + Send>;
 
-/// What is known of the room an episode has.
+/// The known disk space of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Room {
     Ample,
@@ -76,7 +74,7 @@ pub(super) enum Finding {
         /// Until the episode will be closed.
         left: Duration,
     },
-    /// The episode is to be closed now; why.
+    /// The reason why the episode must be closed now.
     Spent(String),
     /// The file has no name any more; reported once.
     Removed,
@@ -111,7 +109,7 @@ impl Space {
         now: Stamp,
         ask: &mut Asker,
     ) -> Result<Self, RecordError> {
-        // A disk of unknown size is tried.
+        // Without a known size the disk is used anyway.
         let disk = ask(&file).unwrap_or(Disk { free: u64::MAX, size: 0 });
         let reserve = disk.reserve(reserve);
         let mut space = Self {
@@ -201,7 +199,7 @@ impl Space {
         )
     }
 
-    /// Sees to it that at least half of `aside` is set aside behind `size`.
+    /// Ensures that at least half of `aside` is set aside after `size`.
     fn set_aside(&mut self, size: u64) -> Result<(), Errno> {
         let Some(aside) = self.aside else { return Ok(()) };
         if self.allocated >= size.saturating_add(aside / 2) && self.allocated > 0 {
@@ -286,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn reserved_space_lies_behind_the_end_and_is_released() {
+    fn reserved_space_lies_after_the_end_and_is_released() {
         let file = Arc::new(tempfile::tempfile().unwrap());
         let mut ask: Asker = Box::new(Disk::of);
         let blocks = |file: &File| fstat(file).unwrap().st_blocks;

@@ -43,7 +43,6 @@ impl std::fmt::Debug for Stepped {
 
 impl Stepped {
     /// A recorder without an episode. `clock` converts the given moments to the wall clock.
-    #[must_use]
     pub fn new(registry: Arc<Registry>, board: Arc<Board>, clock: WallClock) -> Self {
         Self { registry, board, clock, streams: Streams::new(), attached: Attached::default(), session: None }
     }

@@ -1,5 +1,4 @@
-//! What passes by, recording or not: how far each stream has come, the holes in its sequence numbers, and the mask of
-//! late.
+//! All streams, recording or not: the position of each, the gaps in its sequence numbers, and the recent masks.
 
 use std::collections::VecDeque;
 
@@ -10,7 +9,7 @@ use crate::modality::MAX_MODALITIES;
 use crate::sample::SampleHeader;
 use crate::time::Stamp;
 
-/// What is kept of the samples that pass, recording or not.
+/// What is kept of all samples, recording or not.
 pub(super) struct Streams {
     /// The last publications of the mask.
     pub(super) masks: MaskHistory,
@@ -97,7 +96,7 @@ impl MaskHistory {
 struct Last {
     /// Its number.
     seq: u64,
-    /// What its device lost up to it.
+    /// Samples its device lost up to it.
     lost: u64,
     /// When it was captured.
     captured: Stamp,
@@ -122,7 +121,7 @@ pub(super) struct Hole {
     pub(super) before: Stamp,
     /// Of the missing ones, those that the device lost.
     pub(super) lost: u64,
-    /// Of the missing ones, those that were on their way.
+    /// Of the missing ones, those lost in transit.
     pub(super) dropped: u64,
 }
 
@@ -153,13 +152,13 @@ mod tests {
     }
 
     #[test]
-    fn a_hole_is_the_devices_as_far_as_it_reports_it() {
+    fn a_gap_is_attributed_to_the_device_as_far_as_it_reports_it() {
         let between = |a: Last, b: Last| a.hole(b).map(|hole| (hole.lost, hole.dropped));
         assert_eq!(between(last(4, 1), last(5, 1)), None);
         assert_eq!(between(last(4, 1), last(9, 1)), Some((0, 4)));
         assert_eq!(between(last(4, 1), last(9, 3)), Some((2, 2)));
         assert_eq!(between(last(4, 1), last(9, 5)), Some((4, 0)));
-        // A restarted publisher, one that repeats itself, one with nonsense.
+        // A restarted publisher, a repeated number, a nonsensical one.
         assert_eq!(between(last(4, 1), last(0, 0)), None);
         assert_eq!(between(last(4, 1), last(4, 1)), None);
         assert_eq!(between(last(4, 0), last(u64::MAX / 10, u64::MAX)), Some((u64::MAX / 10 - 5, 0)));
@@ -167,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_samples_lie_at_even_distances() {
+    fn missing_samples_are_evenly_spaced() {
         let hole = Hole { after: Stamp(100), before: Stamp(200), lost: 0, dropped: 9 };
         let before = |moment| hole.before(Stamp(moment), 9);
         assert_eq!([0, 100, 110, 111, 120, 190, 191, 199, 200, 999].map(before), [0, 0, 0, 1, 1, 8, 9, 9, 9, 9]);

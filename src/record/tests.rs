@@ -19,9 +19,10 @@ use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage, Value};
 
 use super::*;
 use crate::bus::TopicId;
+use crate::device::UsbIdentity;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
-use crate::registry::{Registry, UsbIdentity};
+use crate::registry::Registry;
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Grade, Level, What};
 use crate::time::Stamp;

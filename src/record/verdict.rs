@@ -1,18 +1,17 @@
-//! The verdict on an episode: what was measured, held against the limits of the registry.
+//! The verdict on an episode: measurements compared with the limits of the registry.
 //!
-//! 1. Each check of a modality has a limit for SUSPECT and one for BAD; the graver one that is
-//!    exceeded counts. An episode is as good as its worst check.
-//! 2. A modality that was absent by the mask is not missed, unless its device was plugged in all
-//!    the same: longer than a limit, or for half the episode and nothing came of it.
-//! 3. Nothing received from a modality that was there: BAD. So is an episode in which nothing at all
-//!    was received: GOOD has at least one sample.
-//! 4. A file that is not whole, or not proven to be as it was written, is SUSPECT; one that the disk did not
-//!    take is BAD. What could not be measured is a finding of its own check.
-//! 5. An episode in which another program published on a topic of ours is SUSPECT.
-//! 6. One shorter than [`SHORTEST`] is BAD: that is too short for a demonstration.
-//! 7. One without a sample of a modality that `expect` names is SUSPECT.
-//! 8. Of two checks that one fault breaks, the one that names the fault is reported: a frozen camera also
-//!    repeats its pictures, a silent one also has a low rate.
+//! 1. Each check of a modality has a limit for SUSPECT and one for BAD; the more severe one that is exceeded counts. An
+//!    episode is as good as its worst check.
+//! 2. A modality that is absent by the mask is not missing, unless its device was plugged in: longer than a limit, or
+//!    for half the episode without ever starting.
+//! 3. A present modality without a sample is BAD. So is an episode without any sample: GOOD has at least one.
+//! 4. A file that is not whole, or not proven unchanged, is SUSPECT; one that the disk refused is BAD. A check that
+//!    could not be measured has its own finding.
+//! 5. An episode in which another program published on one of our topics is SUSPECT.
+//! 6. An episode shorter than [`SHORTEST`] is BAD: too short for a demonstration.
+//! 7. An episode without a sample of a modality listed in `expect` is SUSPECT.
+//! 8. If one fault fails two checks, only the more specific one is reported: a frozen camera also repeats its pictures,
+//!    a silent one also has a low rate.
 //!
 //! Invariant: pure.
 
@@ -33,14 +32,14 @@ pub(super) struct Judged<'a> {
     pub(super) name: &'a str,
     /// What was measured.
     pub(super) quality: &'a Quality,
-    /// What it is held against.
+    /// Its limits.
     pub(super) limits: VerdictSpec,
 }
 
 /// The state of an episode's file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum FileState<'a> {
-    /// It holds all that was taken.
+    /// It holds everything that was recorded.
     Whole,
     /// Something is missing at its end; the text is the reason.
     NotWhole(&'a str),
@@ -48,16 +47,16 @@ pub(super) enum FileState<'a> {
     Failed(&'a str),
 }
 
-/// Who lost the samples that are missing?
+/// Who lost the missing samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Losses {
-    /// Known: device and `rapid` are counted apart.
+    /// Known: device and `rapid` are counted separately.
     Apart,
-    /// Not known: all are counted as dropped.
+    /// Unknown: all are counted as dropped.
     Together,
 }
 
-/// What of an episode is not in its file, beside samples.
+/// Losses of an episode other than samples.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Missing {
     /// Publications of the mask.
@@ -68,16 +67,16 @@ pub(super) struct Missing {
     pub(super) events: u64,
 }
 
-/// What an episode is judged by.
+/// The facts that an episode is judged by.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Facts<'a> {
     /// Its modalities.
     pub(super) modalities: &'a [Judged<'a>],
-    /// What beside samples is not in the file.
+    /// Losses other than samples.
     pub(super) missing: Missing,
-    /// Names of the modalities that every episode has to have.
+    /// Names of the modalities that every episode must have.
     pub(super) expect: &'a [String],
-    /// Other programs that published on topics of ours.
+    /// Other programs that published on our topics.
     pub(super) publishers: &'a [Publisher],
     /// Its length, seconds.
     pub(super) seconds: f64,
@@ -85,15 +84,15 @@ pub(super) struct Facts<'a> {
     pub(super) losses: Losses,
     /// Its file.
     pub(super) file: FileState<'a>,
-    /// Why else it is SUSPECT, found by something other than the checks here.
+    /// Further reasons for SUSPECT, found outside this module.
     pub(super) findings: &'a [String],
 }
 
-/// Less than this many expected samples, or less than this long, give no rate.
+/// With fewer expected samples, or less time, the rate is not judged.
 const LEAST_SAMPLES: f64 = 10.0;
 const LEAST_PRESENCE: f64 = 1.0;
 
-/// A shorter episode is an accident: a key pressed twice.
+/// A shorter episode is an accident, such as a key pressed twice.
 const SHORTEST: Duration = Duration::from_millis(500);
 
 /// Is an episode of this length, in seconds, too short to be used?
@@ -153,7 +152,7 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
 /// The findings against a modality.
 fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
     let Judged { quality, limits, .. } = judged;
-    // As long as this a device that is there may be silent.
+    // A plugged device may be silent for this long.
     let patience = limits.suspect.gap.map_or(0.0, |gap| gap.as_secs_f64());
     if quality.samples == 0 {
         let silent = quality.present > 0.0 && quality.present >= patience;
@@ -208,7 +207,7 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
         .collect()
 }
 
-/// Of a modality that sent nothing and was present too little to be missed.
+/// The findings of a modality that sent nothing and was present too briefly to be missing.
 fn never_ran(quality: &Quality, limits: &VerdictSpec, length: f64) -> Option<(Grade, String)> {
     let found = longer(limits, |limits| limits.opening, quality.opening).or_else(|| {
         // In a short episode too it is missed.
@@ -254,7 +253,7 @@ fn valid(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
     ))
 }
 
-/// The graver grade whose limit `exceeds` gives, and the limit.
+/// The more severe grade whose limit `exceeds` reports, and the limit.
 fn exceeded<T>(limits: &VerdictSpec, exceeds: impl Fn(&Limits) -> Option<T>) -> Option<(Grade, T)> {
     let bad = exceeds(&limits.bad).map(|limit| (Grade::Bad, limit));
     bad.or_else(|| exceeds(&limits.suspect).map(|limit| (Grade::Suspect, limit)))
@@ -265,13 +264,13 @@ fn longer(limits: &VerdictSpec, limit: impl Fn(&Limits) -> Option<Duration>, len
     Some((grade, seconds(limit.as_secs_f64())))
 }
 
-/// Is `found` graver than every finding of the same fault so far?
+/// Is `found` more severe than every finding of the same fault so far?
 fn unless<const N: usize>(found: &(Grade, String), others: [&Option<(Grade, String)>; N]) -> bool {
     others.iter().all(|other| other.as_ref().is_none_or(|(grade, _)| *grade < found.0))
 }
 
 fn percent(share: f64) -> String {
-    // Three decimals are more than any limit has.
+    // More decimals than any limit has.
     format!("{} %", (share * 1e5).round() / 1e3)
 }
 

@@ -1,7 +1,6 @@
-//! The `writeback` thread of an episode: has the kernel bring to the disk what was written, so that a
-//! loss of power takes little of it.
+//! The `writeback` thread of an episode: syncs written data to the disk, so that a loss of power loses little.
 //!
-//! The writer asks and continues: a disk that is slow is asked less often, and no sample waits for it.
+//! The writer requests a sync and continues: a slow disk is synced less often, and no sample waits for it.
 //!
 //! Invariant: an error of the disk reaches the writer, from [`Writeback::ask`] or [`Writeback::end`]:
 //! the kernel reports each only once.
@@ -43,17 +42,17 @@ impl Writeback {
         Ok(Self { ask, thread })
     }
 
-    /// Asks for what was written so far; never waits. `None` once the disk has refused:
-    /// [`Self::end`] returns it.
+    /// Requests a sync of everything written so far; never waits. `None` once the disk has refused: [`Self::end`]
+    /// returns the error.
     pub(super) fn ask(&self) -> Option<()> {
         match self.ask.try_send(()) {
-            // It is at work, and will look again.
+            // It is busy, and will check again.
             Ok(()) | Err(TrySendError::Full(())) => Some(()),
             Err(TrySendError::Disconnected(())) => None,
         }
     }
 
-    /// Ends the thread; waits for what it is doing.
+    /// Ends the thread; waits for the current sync.
     ///
     /// # Errors
     /// When the disk has refused at any time.

@@ -47,7 +47,6 @@ pub enum ArtifactKind {
 }
 
 /// Every file generated from `registry`.
-#[must_use]
 pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     let artifact = |path: PathBuf, contents, kind| Artifact { path, contents, mode: 0o644, kind };
     let mut all = vec![

@@ -9,7 +9,7 @@
 
 use std::ops::Range;
 
-use toml_edit::{Array, Document, DocumentMut, Item, Table, Value};
+use toml_edit::{Document, DocumentMut, Item, Table, Value};
 
 /// A value of a key.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,8 +18,6 @@ pub enum Setting {
     Text(String),
     /// A whole number.
     Whole(i64),
-    /// A list of texts.
-    Texts(Vec<String>),
     /// As typed by a person: a number, a list, true or false if TOML parses it as one, otherwise text.
     Typed(String),
 }
@@ -166,7 +164,6 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
 
 /// `text` with each table of a serial line that has its old name, `[device.NAME.serial]`, under the present one,
 /// `[device.NAME.tty]`; one that is written as dotted keys stays, and so does a text that is not TOML.
-#[must_use]
 pub fn renamed(text: &str) -> String {
     let Ok(document) = Document::parse(text) else { return text.to_owned() };
     let devices = document.as_table().get("device").and_then(Item::as_table_like);
@@ -186,7 +183,6 @@ pub fn renamed(text: &str) -> String {
 }
 
 /// Whether `text` contains no device yet. False for a text that is not TOML.
-#[must_use]
 pub fn has_no_entries(text: &str) -> bool {
     Document::parse(text).is_ok_and(|document| !document.as_table().contains_key("device"))
 }
@@ -273,7 +269,6 @@ fn value(setting: &Setting) -> Value {
     match setting {
         Setting::Text(text) => text.as_str().into(),
         Setting::Whole(number) => (*number).into(),
-        Setting::Texts(texts) => Value::Array(texts.iter().map(String::as_str).collect::<Array>()),
         Setting::Typed(typed) => match typed.trim().parse::<Value>() {
             Ok(mut value) => {
                 value.decor_mut().clear();

@@ -19,10 +19,10 @@
 use std::collections::VecDeque;
 use std::path::Path;
 
-use super::attachment::{Attachment, DeviceNode, Unit, UsbIdentity};
-use super::scenario::{SimSource, TaskPart};
 use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, Registry};
+use crate::device::{Attachment, DeviceNode, Unit, UsbIdentity};
 use crate::modality::ModalityId;
+use crate::simulation::{SimSource, TaskPart};
 
 /// The result of matching an attached node.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -86,7 +86,6 @@ const MOST_REMEMBERED: usize = 256;
 
 impl Assigner {
     /// Without attached nodes.
-    #[must_use]
     pub fn new(registry: &Registry) -> Self {
         let mut entries: Vec<_> = registry.devices.iter().map(Entry::new).collect();
         entries.sort_by_key(|entry| entry.id);
@@ -95,7 +94,6 @@ impl Assigner {
 
     /// Whether another device is known at this node's path. Then its removal was missed: detach that path first,
     /// to find out which modality ends.
-    #[must_use]
     pub fn replaces(&self, attachment: &Attachment) -> bool {
         self.attached
             .iter()
@@ -142,13 +140,11 @@ impl Assigner {
     }
 
     /// The node that is assigned to entry `id` now.
-    #[must_use]
     pub fn attached_as(&self, id: ModalityId) -> Option<&Attachment> {
         self.attached.iter().find(|node| node.assigned == Some(id)).map(|node| &node.attachment)
     }
 
     /// How a node would be matched if every entry were free.
-    #[must_use]
     pub fn explain(&self, attachment: &Attachment) -> Explanation {
         let fitting = self.fitting(attachment);
         if fitting.is_empty() {

@@ -6,7 +6,6 @@
 
 pub mod ablation;
 pub mod artifacts;
-mod attachment;
 mod diagnostic;
 pub mod edit;
 mod identity;
@@ -20,7 +19,6 @@ pub mod task;
 pub mod trust;
 pub mod units;
 
-pub use attachment::{Attachment, DeviceNode, LanIdentity, LastReceived, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};

@@ -86,7 +86,6 @@ impl Registry {
     ///
     /// # Panics
     /// Never: the text is part of the program, and a test parses it.
-    #[must_use]
     #[expect(clippy::expect_used, reason = "a text fixed at build time, parsed by a test")]
     pub fn builtin() -> Self {
         Self::parse(BUILTIN, None).expect("the built-in devices.toml is valid").registry

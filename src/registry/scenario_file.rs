@@ -1,39 +1,6 @@
 //! Scenario files: TOML that lists simulated devices and events.
 //!
-//! ```toml
-//! repeat = "12s"              # optional: after this time the events begin again
-//!
-//! [[device]]                  # optional: without any, every entry of the registry is simulated
-//! name = "tactile_tip"        # an entry of the registry, whose identity and format it takes
-//! seed = 7                    # chooses the pictures or values; default: the entry's bit
-//! hz = 100                    # rate; default: the camera's fps, 100 for a serial line
-//! bytes = "60kB"              # a camera's pictures are padded to this size, like pictures of real scenes
-//! plugged = false             # when the scenario begins; default true
-//! serial = "OTHER"            # also vid, pid, port, firmware, manufacturer, product: the identity it
-//!                             # reports; serial = "" for none
-//!
-//! [[device]]
-//! name = "spare"              # any name, with
-//! like = "tactile_tip"        # the entry whose format it takes
-//! [device.fault]              # optional: faults of the device above
-//! freeze_at = "3s"            # from then on it sends the same bytes
-//! truncate_every = 10         # one sample in ten is truncated
-//! duplicate_every = 10        # one in ten is sent twice
-//! lose_every = 10             # one in ten is lost, and the device reports it
-//! delay = "200ms"             # samples arrive this long after their capture
-//! latency = "35ms"            # pictures show the light of `rapid calibrate` this long before their capture
-//! clock_ppm = 500             # its clock is fast, or slow if negative
-//! close = "2s"                # time needed to close it, as for ending the recording of a GoPro
-//!
-//! [[event]]                   # exactly one of plug, unplug, silence, resume
-//! at = "3s"
-//! unplug = "tactile_tip"
-//!
-//! [[event]]
-//! at = "6s"
-//! plug = "tactile_tip"
-//! port = "1-4"                # optional, with plug: another port
-//! ```
+//! The format is documented, and run by a test, in docs/scenarios.md.
 //!
 //! An entry without a serial number or port gets an invented one: `SIM-<name>`, a port of bus 9.
 //!
@@ -45,12 +12,13 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use super::attachment::{LanIdentity, UsbIdentity};
 use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::is_port;
-use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
+use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
 use super::section::{Section, file_label, read, read_file};
 use super::spec::{DeviceSpec, LanPicture, NodeSpec, Registry};
+use crate::device::{LanIdentity, UsbIdentity};
+use crate::simulation::{SimFaults, SimSource};
 
 const DEVICE_KEYS: [&str; 14] = [
     "name",
@@ -103,14 +71,12 @@ impl Scenario {
     }
 
     /// Every entry is plugged in, and there are no events.
-    #[must_use]
     pub(super) fn quiet(registry: &Registry) -> Self {
         Self { devices: every_entry(registry), events: Vec::new(), repeat: None }
     }
 
     /// What `rapid --sim` plays without a file: everything is plugged; the second camera, or if
     /// there is none the last device, is unplugged at 3 s and plugged again at 6 s, every 12 s.
-    #[must_use]
     pub fn demo(registry: &Registry) -> Self {
         let mut cameras = registry.devices.iter().filter(|device| matches!(device.node, NodeSpec::Camera(_)));
         let star = cameras.nth(1).or(registry.devices.last());

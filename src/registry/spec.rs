@@ -137,7 +137,6 @@ pub enum IdentitySpec {
 
 impl IdentitySpec {
     /// The USB device, if it is one.
-    #[must_use]
     pub const fn usb(&self) -> Option<&UsbSpec> {
         match self {
             Self::Usb(usb) => Some(usb),
@@ -146,7 +145,6 @@ impl IdentitySpec {
     }
 
     /// Its serial number, if the entry has one.
-    #[must_use]
     pub fn serial(&self) -> Option<&str> {
         self.usb()?.serial.as_deref()
     }
@@ -156,10 +154,10 @@ impl IdentitySpec {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
 pub struct UsbSpec {
     /// USB vendor id.
-    #[serde(serialize_with = "super::attachment::usb_id")]
+    #[serde(serialize_with = "crate::device::usb_id")]
     pub vid: u16,
     /// USB product id.
-    #[serde(serialize_with = "super::attachment::usb_id")]
+    #[serde(serialize_with = "crate::device::usb_id")]
     pub pid: u16,
     /// Serial number as the device reports it. Takes precedence over `port`.
     pub serial: Option<String>,
@@ -303,7 +301,6 @@ pub enum WhenStale {
 
 impl DeviceSpec {
     /// The modality that this device provides.
-    #[must_use]
     pub fn modality(&self) -> Modality {
         Modality { name: self.name.clone(), kind: self.node.modality_kind(), shape: self.node.shape() }
     }
@@ -311,7 +308,6 @@ impl DeviceSpec {
 
 impl NodeSpec {
     /// The shape of a sample, as in [`Modality`].
-    #[must_use]
     pub fn shape(&self) -> Vec<u32> {
         match (self, self.modality_kind()) {
             (Self::Camera(camera), _) => vec![camera.height, camera.width],
@@ -324,7 +320,6 @@ impl NodeSpec {
     }
 
     /// The format of its pictures, if it sends any and the entry states it.
-    #[must_use]
     pub fn picture(&self) -> Option<LanPicture> {
         match self {
             Self::Camera(CameraSpec { width, height, fps, .. }) => {
@@ -336,7 +331,6 @@ impl NodeSpec {
     }
 
     /// Which node of its device it is read from.
-    #[must_use]
     pub fn opens(&self) -> Opens {
         match self {
             Self::Camera(_) => Opens::Video,
@@ -348,7 +342,6 @@ impl NodeSpec {
     }
 
     /// Content of the samples of a device that is read like this.
-    #[must_use]
     pub fn modality_kind(&self) -> ModalityKind {
         match self {
             Self::Camera(_) => ModalityKind::Image,
@@ -363,19 +356,16 @@ impl NodeSpec {
 
 impl Registry {
     /// The entry of a modality.
-    #[must_use]
     pub fn device(&self, id: ModalityId) -> Option<&DeviceSpec> {
         self.devices.iter().find(|device| device.id == id)
     }
 
     /// The actuator, if there is one.
-    #[must_use]
     pub fn actuator(&self) -> Option<(&DeviceSpec, &ActionSpec)> {
         self.devices.iter().find_map(|device| Some((device, device.action.as_ref()?)))
     }
 
     /// The entry of this name.
-    #[must_use]
     pub fn named(&self, name: &str) -> Option<&DeviceSpec> {
         self.devices.iter().find(|device| device.name == name)
     }
@@ -414,7 +404,6 @@ impl Hooks {
     }
 
     /// Whether there is none.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.all().next().is_none()
     }
@@ -530,7 +519,6 @@ pub enum CanProtocol {
 
 impl CanSpec {
     /// Numbers in a sample; 0 if it holds bytes.
-    #[must_use]
     pub fn channels(&self) -> usize {
         match &self.protocol {
             CanProtocol::Raw => 0,
@@ -547,7 +535,6 @@ macro_rules! words {
             pub const WORDS: [(&str, Self); $count] = [$(($word, Self::$value)),+];
 
             /// The word for it.
-            #[must_use]
             pub const fn word(self) -> &'static str {
                 match self {
                     $(Self::$value => $word,)+
@@ -597,7 +584,6 @@ impl fmt::Display for Framing {
 
 impl NodeSpec {
     /// The kind of node: `camera`, `serial`, `can`, `lan` or `process`.
-    #[must_use]
     pub const fn kind(&self) -> &'static str {
         match self {
             Self::Camera(_) => "camera",
@@ -609,7 +595,6 @@ impl NodeSpec {
     }
 
     /// The format on one line: `640x480@30 MJPG`, `115200 baud line csv x3`, `tactile_publisher scalars x16`.
-    #[must_use]
     pub fn format(&self) -> String {
         match self {
             Self::Camera(camera) => format!("{}x{}@{} {}", camera.width, camera.height, camera.fps, camera.format),
@@ -734,7 +719,6 @@ pub enum Bound {
 
 impl Bound {
     /// Whether `value` is on this side. NaN is not.
-    #[must_use]
     pub fn holds(self, value: f64) -> bool {
         match self {
             Self::Above(bound) => value > bound,
@@ -835,7 +819,6 @@ impl VerdictSpec {
     /// * valid 90 %, 50 %: a policy is trained on the content of the frames, and a tick without a valid sample has
     ///   an old one or none. A device slower than twice `sync_window` misses ticks by its phase alone.
     /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
-    #[must_use]
     pub fn of(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
         let image = kind == ModalityKind::Image;
         let suspect = Limits {
@@ -870,7 +853,6 @@ impl VerdictSpec {
     }
 
     /// Whether any check here compares payloads for equality.
-    #[must_use]
     pub fn compares(&self) -> bool {
         [self.suspect, self.bad].iter().any(|limits| limits.frozen.is_some() || limits.repeated.is_some())
     }

@@ -1,9 +1,9 @@
 //! The rig of the simulated task: its registry, and the devices plugged in when a trial begins.
 
-use std::sync::{Arc, OnceLock};
-
-use super::scenario::{Scenario, ScenarioDevice, Scene, SimSource, TaskPart};
+use super::scenario::{Scenario, ScenarioDevice};
 use super::spec::Registry;
+use crate::simulation::task::SharedTrial;
+use crate::simulation::{SimSource, TaskPart};
 
 const TEXT: &str = include_str!("task.toml");
 
@@ -16,7 +16,6 @@ impl Registry {
     ///
     /// # Panics
     /// Never: the text is part of the program, and a test parses it.
-    #[must_use]
     #[expect(clippy::expect_used, reason = "a text fixed at build time, parsed by a test")]
     pub fn task() -> Self {
         Self::parse(TEXT, None).expect("the registry of the simulated task is valid").registry
@@ -25,12 +24,11 @@ impl Registry {
 
 impl Scenario {
     /// Trial `seed` of the simulated task, for [`Registry::task`]: everything is plugged in, and stays plugged in.
-    #[must_use]
     pub fn task(registry: &Registry, seed: u64) -> Self {
-        let scene = Arc::new(Scene { seed, trial: OnceLock::new() });
+        let trial = SharedTrial::new(seed);
         let device = |device: ScenarioDevice| {
             let (_, part) = PARTS.into_iter().find(|(name, _)| *name == device.name)?;
-            Some(ScenarioDevice { source: SimSource::Task { part, scene: Arc::clone(&scene) }, ..device })
+            Some(ScenarioDevice { source: SimSource::Task { part, trial: trial.clone() }, ..device })
         };
         let devices = Self::quiet(registry).devices.into_iter().filter_map(device).collect();
         Self { devices, events: Vec::new(), repeat: None }

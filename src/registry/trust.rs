@@ -46,12 +46,16 @@ enum Why {
 
 impl Distrust {
     /// The fix, with shell commands where possible.
-    #[must_use]
     pub fn fix(&self) -> String {
         let path = shown(&self.path);
         match (self.place, self.why) {
             (Place::Link, _) => "name the real file instead of the link".to_owned(),
             (Place::File, Why::Owner(_)) => format!("chown {} {path}", rustix::process::geteuid().as_raw()),
+            (Place::Folder, Why::Owner(_)) if rustix::process::geteuid().is_root() => {
+                "copy it to where only root may write, and name it there: sudo install -D -m 644 devices.toml \
+                 /etc/rapid/devices.toml, then --config /etc/rapid/devices.toml"
+                    .to_owned()
+            }
             (Place::Folder, Why::Owner(_)) => "copy the file into a folder of your own and name it there".to_owned(),
             (Place::File | Place::Folder, Why::Mode(_)) => format!("chmod go-w {path}"),
         }

@@ -18,7 +18,6 @@ const SIZES: [(&str, u64); 9] = [
 ];
 
 /// `25ms`, `1.5s`, `2 min`. `None` without a unit, or when it is not a duration.
-#[must_use]
 pub fn parse_duration(text: &str) -> Option<Duration> {
     let (number, unit) = split(text)?;
     let (_, seconds) = DURATIONS.into_iter().find(|(name, _)| *name == unit)?;
@@ -29,7 +28,6 @@ pub fn parse_duration(text: &str) -> Option<Duration> {
 }
 
 /// `512MiB`, `64 KiB`, `2MB`. `None` without a unit, or when it is not a size.
-#[must_use]
 pub fn parse_size(text: &str) -> Option<u64> {
     let (number, unit) = split(text)?;
     let (_, bytes) = SIZES.into_iter().find(|(name, _)| name.eq_ignore_ascii_case(unit))?;
@@ -46,7 +44,6 @@ fn split(text: &str) -> Option<(f64, &str)> {
 }
 
 /// A duration in its largest whole unit.
-#[must_use]
 pub fn show_duration(duration: Duration) -> String {
     let nanoseconds = duration.as_nanos();
     for (unit, in_ns) in
@@ -60,7 +57,6 @@ pub fn show_duration(duration: Duration) -> String {
 }
 
 /// A size in the largest binary unit in which it is at least one, to one decimal.
-#[must_use]
 pub fn show_size(bytes: u64) -> String {
     for (unit, shift) in [("TiB", 40), ("GiB", 30), ("MiB", 20), ("KiB", 10)] {
         let one = 1_u64 << shift;

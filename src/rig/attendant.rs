@@ -1,12 +1,12 @@
-//! An attendant: runs the hooks of one attached device, in the order of what happens to it.
+//! An attendant: runs the hooks of one attached device, in the order of the device's events.
 //!
 //! 1. `on_attach` when it is attached.
 //! 2. `on_record_start` when an episode begins, at once if one is in progress; `on_record_stop` when
 //!    that episode is finished, the device is removed, or the run ends.
-//! 3. `on_detach` when it was removed and the program that read it has ended. Not at the end of the run:
-//!    the device stays where it is.
+//! 3. `on_detach` when it was removed and the program that reads it has ended. Not at the end of the run: the device
+//!    stays plugged in.
 //!
-//! Invariant: nothing waits for an attendant but the next one of its entry and, at the very end, the run.
+//! Invariant: only the next attendant of the same entry and, at the very end, the run wait for an attendant.
 //! Invariant: the hooks of an entry run one at a time, each for [`HOOK_LIMIT`] at most.
 //! Invariant: each `on_record_start` is followed by one `on_record_stop`, unless the run ends in a hurry.
 
@@ -20,20 +20,21 @@ use tokio_util::sync::CancellationToken;
 use super::output::Output;
 use super::programs::{Environment, MARGIN, Programs, environment};
 use super::worker::{TERM_LIMIT, describe};
+use crate::device::Attachment;
 use crate::driver::process::Launch;
-use crate::registry::{Attachment, DeviceSpec, Hook};
+use crate::registry::{DeviceSpec, Hook};
 use crate::status::{Episode, EpisodeWatch, Level};
 
 /// A hook that has not ended by then is killed.
 pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
 
-/// Where the attendants of an entry work, one after the other.
+/// Serialises the attendants of an entry.
 #[derive(Debug)]
 pub(super) struct Post {
     programs: Programs,
     spec: Arc<DeviceSpec>,
     prefix: String,
-    /// Held as long as a program reads the device.
+    /// Locked while a program reads the device.
     node: Option<Arc<Mutex<()>>>,
     turn: Arc<Mutex<()>>,
     /// Notified when the device is removed.
@@ -88,7 +89,7 @@ struct Attendant {
 impl Attendant {
     async fn attend(mut self, turn: Arc<Mutex<()>>) {
         let turn = turn.lock_owned().await;
-        // Plugged and pulled before it could be looked after: neither is worth a program.
+        // Plugged and unplugged before its hooks could start: neither hook is run.
         if self.gone.is_cancelled() || self.programs.closing.is_cancelled() {
             return;
         }
@@ -104,7 +105,7 @@ impl Attendant {
         }
         if self.gone.is_cancelled() {
             if let Some(node) = &self.node {
-                // Its successor need not wait for us.
+                // A successor need not wait for this attendant.
                 drop(timeout(TERM_LIMIT + MARGIN, node.lock()).await);
             }
             self.run("on_detach", spec.hooks.detach.as_ref(), None).await;
@@ -112,13 +113,13 @@ impl Attendant {
         drop(turn);
     }
 
-    /// Waits for an episode; `None` when none is to come for this device.
+    /// Waits for an episode; `None` when this device will get none.
     async fn begun(&mut self) -> Option<Arc<Episode>> {
         let begun = async {
             let begun = self.episode.wait_for(Option::is_some).await.ok().and_then(|episode| episode.clone());
             match begun {
                 Some(episode) => Some(episode),
-                // No recorder is left.
+                // No recorder exists any more.
                 None => std::future::pending().await,
             }
         };
@@ -130,7 +131,7 @@ impl Attendant {
         }
     }
 
-    /// Waits until this episode is over, for this device.
+    /// Waits until this episode is over for this device.
     async fn over(&mut self, episode: &Arc<Episode>) {
         let other = |now: &Option<Arc<Episode>>| now.as_ref().is_none_or(|now| !Arc::ptr_eq(now, episode));
         tokio::select! {
@@ -141,19 +142,19 @@ impl Attendant {
         }
     }
 
-    /// An episode that is over, as it ended; for a device that was removed before that, as it is to be.
+    /// The finished episode; for a device that was removed earlier, the episode in progress.
     async fn ended(&self, episode: &Episode) -> Episode {
         let file = tokio::select! {
             biased;
             file = episode.ended() => file,
             () = self.gone.cancelled() => &episode.file,
-            // The disk takes longer, or the recorder has failed.
+            // The disk is slow, or the recorder has failed.
             () = sleep(HOOK_LIMIT) => &episode.file,
         };
         Episode::new(file)
     }
 
-    /// Runs a hook to its end. What goes wrong is reported and changes nothing else.
+    /// Runs a hook to its end. Failures are reported and have no other effect.
     async fn run(&self, key: &str, hook: Option<&Hook>, episode: Option<&Episode>) {
         let Some(hook) = hook else { return };
         if let Err(reason) = self.run_hook(key, hook, episode).await {

@@ -1,24 +1,24 @@
 //! The decisions of a rig without any I/O: slots, assignment of devices to entries, and the mask.
 //!
-//! [`Core::step`] takes one input and the time, and writes down what is to be done. The caller carries the
-//! effects out in their order: the live rig (`owner`) with tasks and shared memory, the lockstep rig with a
-//! virtual clock.
+//! [`Core::step`] takes one input and the time, and lists the effects. The caller carries them out in order: the live
+//! rig (`owner`) with tasks and shared memory, the lockstep rig with a virtual clock.
 //!
 //! Invariant: no clock, no I/O, no lock: the same inputs give the same effects.
-//! Invariant: a step that changes the mask has [`Effect::Publish`] as its first effect, once, with the mask after
-//! the whole step: nothing that allocates or locks stands before it.
+//! Invariant: a step that changes the mask has [`Effect::Publish`] as its first effect, once, with the mask after the
+//! whole step: no effect that allocates or locks precedes it.
 //! Invariant: a bit is set only while its device is attached and a stream of its newest epoch runs.
-//! Invariant: what is attached to a slot is what the assigner has given to its entry.
+//! Invariant: the device attached to a slot is the one that the assigner gave to its entry.
 
 use std::path::Path;
 use std::time::Duration;
 
 use super::slot::{self, End, Slot};
+use crate::device::{Attachment, Unit};
 use crate::hotplug::HotplugEvent;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::provenance::UnplugSource;
-use crate::registry::{Assigner, Assignment, Attachment, Registry, Unit};
+use crate::registry::{Assigner, Assignment, Registry};
 use crate::sample::Epoch;
 use crate::status::SlotState;
 use crate::time::Stamp;
@@ -28,7 +28,7 @@ use crate::time::Stamp;
 pub enum Input {
     /// A device was plugged in or removed.
     Hotplug(HotplugEvent),
-    /// The stream of this epoch reports; an older epoch changes nothing.
+    /// The stream of this epoch reports an event; an older epoch has no effect.
     Stream {
         /// Modality of the stream.
         id: ModalityId,
@@ -37,7 +37,7 @@ pub enum Input {
         /// The report.
         event: StreamEvent,
     },
-    /// A user wants a failed device started again.
+    /// A user requests a restart of a failed device.
     Restart(ModalityId),
     /// Time passed; see [`Core::deadline`].
     Timer,
@@ -46,7 +46,7 @@ pub enum Input {
 /// What a stream reports about its life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StreamEvent {
-    /// The device is not opened before its network link is up.
+    /// The device is opened once its network link is up.
     LinkDown,
     /// The device is open.
     Opened,
@@ -60,7 +60,7 @@ pub enum StreamEvent {
     Ended(End),
 }
 
-/// What is to be done.
+/// An action for the caller.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Effect {
     /// Publish this mask. Always the first effect of a step.
@@ -77,24 +77,24 @@ pub enum Effect {
         /// Why, for people.
         reason: String,
     },
-    /// What concerns one modality.
+    /// An effect on one modality.
     Device(ModalityId, DeviceEffect),
 }
 
-/// What is to be done for one modality.
+/// An action for one modality.
 #[derive(Debug, Clone, PartialEq)]
 pub enum DeviceEffect {
     /// Ask the running stream to end; do not wait for it.
     Stop,
-    /// The stream that ran until now no longer counts: it was asked to stop, or has ended.
+    /// The previous stream no longer counts: it was asked to stop, or has ended.
     Ended,
-    /// Announce that [`Core::attached`] is there.
+    /// Announce that [`Core::attached`] is present.
     AnnounceAttach,
-    /// Announce that the device is gone; once until it is announced as attached again.
+    /// Announce that the device is gone; once until the next announced attachment.
     AnnounceDetach(UnplugSource),
-    /// Hot-plug attached a device: its hooks begin.
+    /// Hot-plug attached a device: start its hooks.
     Plugged,
-    /// Hot-plug removed the device: its hooks end.
+    /// Hot-plug removed the device: end its hooks.
     Unplugged,
     /// Start a stream.
     Start(Epoch, Attachment),
@@ -109,9 +109,9 @@ pub struct Transition {
     pub from: SlotState,
     /// State now.
     pub to: SlotState,
-    /// Until the next start, in [`SlotState::Backoff`].
+    /// Time until the next start, in [`SlotState::Backoff`].
     pub wait: Option<Duration>,
-    /// What noticed the removal, in [`SlotState::Absent`].
+    /// The source that noticed the removal, in [`SlotState::Absent`].
     pub source: Option<UnplugSource>,
 }
 
@@ -130,13 +130,12 @@ struct Lane {
     slot: Slot<Attachment>,
     /// When the newest device was attached.
     attached_at: Stamp,
-    /// A removal was announced, and no attachment after it.
+    /// A removal was announced, with no attachment since.
     is_announced_gone: bool,
 }
 
 impl Core {
-    /// With nothing attached.
-    #[must_use]
+    /// A core with nothing attached.
     pub fn new(registry: &Registry) -> Self {
         let lane = |id| Lane {
             id,
@@ -151,7 +150,7 @@ impl Core {
         }
     }
 
-    /// Takes one input at `now` and appends to `effects`, which is empty, what is to be done, in order.
+    /// Takes one input at `now` and appends the effects, in order, to `effects`, which is empty.
     pub fn step(&mut self, input: Input, now: Stamp, effects: &mut Vec<Effect>) {
         let before = self.mask;
         match input {
@@ -179,37 +178,31 @@ impl Core {
     }
 
     /// The mask in force.
-    #[must_use]
     pub const fn mask(&self) -> PhysicalMask {
         self.mask
     }
 
-    /// When [`Input::Timer`] is to be given, if nothing happens before.
-    #[must_use]
+    /// When [`Input::Timer`] is due, if no other input comes before.
     pub fn deadline(&self) -> Option<Stamp> {
         self.lanes.iter().filter_map(|lane| lane.slot.deadline()).min()
     }
 
-    /// Is this the stream that runs now? What any other reports changes nothing.
-    #[must_use]
+    /// Whether this stream runs now. Reports of any other stream have no effect.
     pub fn is_current(&self, id: ModalityId, epoch: Epoch) -> bool {
         self.lane(id).is_some_and(|lane| lane.slot.is_current(epoch))
     }
 
     /// State and newest epoch of a modality; absent if there is no such modality.
-    #[must_use]
     pub fn state(&self, id: ModalityId) -> (SlotState, Epoch) {
         self.lane(id).map_or((SlotState::Absent, Epoch(0)), |lane| (lane.slot.state(), lane.slot.epoch()))
     }
 
     /// The device that is attached as this modality.
-    #[must_use]
     pub fn attached(&self, id: ModalityId) -> Option<&Attachment> {
         self.lane(id)?.slot.attached()
     }
 
     /// When the newest device of this modality was attached.
-    #[must_use]
     pub fn attached_at(&self, id: ModalityId) -> Stamp {
         self.lane(id).map(|lane| lane.attached_at).unwrap_or_default()
     }
@@ -239,7 +232,7 @@ impl Core {
         }
     }
 
-    /// The assigner gave this device to `id`. Reported twice, it is the same attachment.
+    /// The assigner gave this device to `id`. A repeated report is the same attachment.
     fn attach(&mut self, id: ModalityId, attachment: Attachment, now: Stamp, effects: &mut Vec<Effect>) {
         let Some(lane) = self.lane_mut(id).filter(|lane| lane.slot.attached() != Some(&attachment)) else { return };
         lane.attached_at = now;
@@ -253,7 +246,7 @@ impl Core {
         let mut source = None;
         let input = match event {
             StreamEvent::LinkDown => return self.announce_detach(id, UnplugSource::Link, effects),
-            // A removal that hot-plug did not report: the link is up again, or the device never was gone.
+            // A removal that hot-plug did not report: the link is up again, or the device never left.
             StreamEvent::Opened => {
                 if let Some(lane) = self.lane_mut(id)
                     && std::mem::take(&mut lane.is_announced_gone)
@@ -280,7 +273,7 @@ impl Core {
         self.apply(id, input, source, now, effects);
     }
 
-    /// Announces who noticed a removal, unless it was announced before.
+    /// Announces which source noticed a removal, unless it was already announced.
     fn announce_detach(&mut self, id: ModalityId, source: UnplugSource, effects: &mut Vec<Effect>) {
         if let Some(lane) = self.lane_mut(id)
             && !std::mem::replace(&mut lane.is_announced_gone, true)

@@ -1,11 +1,11 @@
-//! The logbook: what the programs of each device printed, in a file a device, `NAME.log`.
+//! The logbook: the output of each device's programs, one file `NAME.log` per device.
 //!
-//! The files lie in the folder `logs` of the state directory: `$STATE_DIRECTORY`, which systemd sets,
-//! otherwise `rapid` in `$XDG_STATE_HOME` or `~/.local/state`. They are appended to from run to run; one
-//! that has grown to [`LARGEST`] becomes `NAME.log.1`, that one `NAME.log.2`, and so on to [`KEPT`].
+//! The files are in the folder `logs` of the state directory: `$STATE_DIRECTORY`, which systemd sets, otherwise `rapid`
+//! in `$XDG_STATE_HOME` or `~/.local/state`. Each run appends to them; a file that has grown to [`LARGEST`] becomes
+//! `NAME.log.1`, that one `NAME.log.2`, and so on up to [`KEPT`].
 //!
-//! Invariant: who writes never waits for the disk: a thread of its own does. Lines it does not keep up
-//! with are counted and reported.
+//! Invariant: writers never wait for the disk: a separate thread writes. Lines it cannot keep up with are counted and
+//! reported.
 
 use std::collections::HashMap;
 use std::fs::{DirBuilder, File, OpenOptions};
@@ -24,11 +24,11 @@ use crate::folder::state_directory;
 use crate::status::{Board, Level, What};
 use crate::time;
 
-/// Bytes of a file before the next one is begun.
+/// Size in bytes at which a new file is started.
 const LARGEST: u64 = 1 << 20;
-/// Older files of a device.
+/// Number of older files per device.
 const KEPT: u32 = 3;
-/// Lines that may wait for the disk.
+/// Lines that may be queued for the disk.
 const DEPTH: usize = 1024;
 /// How long the end of a run waits for the disk.
 const LAST: Duration = Duration::from_secs(1);
@@ -36,9 +36,9 @@ const LAST: Duration = Duration::from_secs(1);
 /// See the module's comment.
 #[derive(Debug, Clone)]
 pub(super) struct Logbook {
-    /// `None` where there is no folder or no thread for it.
+    /// `None` if there is no folder or no thread for it.
     pages: Option<SyncSender<Page>>,
-    /// Lines there was no room for.
+    /// Lines dropped because the queue was full.
     missing: Arc<AtomicU64>,
 }
 
@@ -54,7 +54,7 @@ enum Page {
 }
 
 impl Logbook {
-    /// Begins to write below the state directory, for one of several rigs of this machine in a folder of its own.
+    /// Starts writing below the state directory; with several rigs on this machine, each in a folder of its own.
     pub(super) fn start(instance: Option<&str>, board: &Arc<Board>) -> Self {
         let folder = state_directory().map(|state| {
             let logs = state.join("logs");
@@ -83,11 +83,11 @@ impl Logbook {
         }
     }
 
-    /// Waits, for a moment, until everything is written.
+    /// Waits briefly until everything is written.
     pub(super) async fn flush(&self) {
         let Some(pages) = &self.pages else { return };
         let (done, is_done) = oneshot::channel();
-        // Where there is no room for this, the disk is not writing.
+        // If this does not fit into the queue, the disk is not writing.
         if pages.try_send(Page::Flush(done)).is_ok() {
             let _ = timeout(LAST, is_done).await;
         }
@@ -120,7 +120,7 @@ fn keep(mut files: Files, inbox: Receiver<Page>, missing: &AtomicU64, board: &Bo
     }
 }
 
-/// The files, one a device.
+/// The open files, one per device.
 #[derive(Debug)]
 struct Files {
     folder: PathBuf,
@@ -142,7 +142,7 @@ impl Files {
         let written = file.write_all(line.as_bytes());
         *size += line.len() as u64;
         if written.is_err() {
-            // The next line may find room again.
+            // The next line may find space again.
             self.open.remove(device);
         }
         written
@@ -151,13 +151,13 @@ impl Files {
 
 fn open(folder: &Path, path: &Path) -> io::Result<(File, u64)> {
     DirBuilder::new().recursive(true).mode(0o755).create(folder)?;
-    // A link would lead elsewhere.
+    // A symbolic link would lead elsewhere.
     let file = OpenOptions::new().append(true).create(true).mode(0o644).custom_flags(libc::O_NOFOLLOW).open(path)?;
     let size = file.metadata()?.len();
     Ok((file, size))
 }
 
-/// Moves each file one place on; the last one is gone.
+/// Renames each file to the next number; the last one is removed.
 fn rotate(path: &Path) {
     let older = |number: u32| path.with_extension(format!("log.{number}"));
     for number in (1..KEPT).rev() {
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_appended_to_and_moved_on_when_they_are_full() {
+    fn files_are_appended_to_and_rotated_when_full() {
         let dir = tempfile::tempdir().unwrap();
         let folder = dir.path().join("state/logs");
         let files = || Files { folder: folder.clone(), open: HashMap::new(), largest: 8 };
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_is_not_followed_and_a_folder_that_cannot_be_is_an_error() {
+    fn a_link_is_not_followed_and_an_impossible_folder_is_an_error() {
         let dir = tempfile::tempdir().unwrap();
         let elsewhere = dir.path().join("elsewhere");
         std::os::unix::fs::symlink(&elsewhere, dir.path().join("cam.log")).unwrap();

@@ -1,11 +1,11 @@
 //! The rig: turns hot-plug events into running device streams and the physical mask.
 //!
-//! One task owns every slot. It takes hot-plug events, the reports and ends of streams, commands and
-//! deadlines, applies them to the slots, and carries out what the slots decide.
+//! One task owns every slot. It takes hot-plug events, the reports and ends of streams, commands and deadlines, applies
+//! them to the slots, and carries out the slots' decisions.
 //!
 //! Invariant: only this module decides the mask.
-//! Invariant: nothing here waits for a device; a stream that is to end is asked to and forgotten.
-//! Invariant: the end of a stream, by value or by panic, is an event like any other.
+//! Invariant: this task never waits for a device; a stream is asked to end and then forgotten.
+//! Invariant: the end of a stream, by return or by panic, is an event like any other.
 
 mod attendant;
 pub mod core;
@@ -27,7 +27,7 @@ use presence::PresenceError;
 /// Why the rig cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum RigError {
-    /// Plugging can no longer be watched.
+    /// Hot-plug events can no longer be monitored.
     #[error(transparent)]
     Hotplug(#[from] HotplugError),
     /// The mask cannot be published.
@@ -35,7 +35,7 @@ pub enum RigError {
     Presence(#[from] PresenceError),
 }
 
-/// What the rig may be asked for.
+/// Commands to the rig.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RigCommand {
     /// Start a failed device again.

@@ -1,8 +1,7 @@
-//! What a child prints, as lines of the log and of its device's file.
+//! A child's output, as lines of the log and of its device's file.
 //!
-//! Invariant: the lines of a child are bounded in length and in rate; what is left out is counted and
-//! reported. A child that prints faster than that is held up by its pipe, as at a slow terminal, and
-//! costs the rig a few reads each [`PAUSE`].
+//! Invariant: the lines of a child are bounded in length and in rate; omitted lines are counted and reported. A child
+//! that prints faster blocks on its pipe, as at a slow terminal, and costs the rig a few reads each [`PAUSE`].
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,24 +15,24 @@ use crate::status::{Board, Level, What};
 use crate::text;
 use crate::time::Stamp;
 
-/// Bytes of a line; what is longer is cut.
+/// Maximum bytes of a line; longer ones are cut.
 const LONGEST: usize = 1000;
 /// Lines that may come at once...
 const BURST: f64 = 100.0;
 /// ...and lines a second in the long run.
 const RATE: f64 = 20.0;
-/// Between two reads of a child that prints too much.
+/// Delay between two reads of a child that prints too much.
 const PAUSE: Duration = Duration::from_millis(10);
 /// How often the count of omitted lines is logged.
 const TELL_EVERY: Duration = Duration::from_secs(5);
-/// Read at once.
+/// Bytes per read.
 const CHUNK: usize = 16 << 10;
 
 /// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Output {
     device: String,
-    /// Which of the device's programs it is, as `hook: `; empty for the one that reads it.
+    /// Which of the device's programs it is, as `hook: `; empty for the program that reads the device.
     whose: String,
     board: Arc<Board>,
     logbook: Logbook,
@@ -45,7 +44,7 @@ pub(super) struct Output {
 }
 
 impl Output {
-    /// `hook` is the key of the hook that is run, if one is.
+    /// `hook` is the key of the hook being run, if any.
     pub(super) fn new(device: &str, hook: Option<&str>, programs: &Programs) -> Self {
         let now = Stamp::now();
         Self {
@@ -60,7 +59,7 @@ impl Output {
         }
     }
 
-    /// Reads both pipes; never returns. Dropped in the middle it has lost nothing.
+    /// Reads both pipes; never returns. Dropping the future loses nothing.
     pub(super) async fn follow(&mut self, stdout: &Receiver, stderr: &Receiver) {
         loop {
             let [out, err] = self.lines.each_ref().map(|lines| !lines.closed);
@@ -78,10 +77,10 @@ impl Output {
         }
     }
 
-    /// Reads what is there and logs the rest.
+    /// Reads the available bytes and logs the rest.
     pub(super) fn finish(&mut self, stdout: &Receiver, stderr: &Receiver) {
         for (index, pipe) in [stdout, stderr].into_iter().enumerate() {
-            // No more than a pipe holds: one that something still writes to would have no end.
+            // At most one pipe's capacity: a pipe that is still written to would never end.
             for _ in 0..4 {
                 self.look(index, Some(pipe));
             }
@@ -94,7 +93,7 @@ impl Output {
         self.notify();
     }
 
-    /// Reads once; without a pipe there is nothing more to read.
+    /// Reads once; does nothing without a pipe.
     fn look(&mut self, index: usize, pipe: Option<&Receiver>) {
         let mut chunk = [0; CHUNK];
         let read = match pipe.map(|pipe| pipe.try_read(&mut chunk)) {
@@ -139,13 +138,13 @@ impl Output {
 #[derive(Debug, Default)]
 struct Lines {
     line: Vec<u8>,
-    /// The rest of the line is thrown away.
+    /// The rest of the line is discarded.
     is_cut: bool,
     closed: bool,
 }
 
 impl Lines {
-    /// The lines that end in `bytes`, without empty ones.
+    /// The non-empty lines that end in `bytes`.
     fn take(&mut self, bytes: &[u8]) -> Vec<String> {
         let mut complete = Vec::new();
         for piece in bytes.split_inclusive(|byte| *byte == b'\n') {
@@ -163,7 +162,7 @@ impl Lines {
         complete
     }
 
-    /// The line so far, as text that is harmless to a terminal.
+    /// The line so far, as text that is safe for a terminal.
     fn rest(&mut self) -> Option<String> {
         let mut line = text::plain(&String::from_utf8_lossy(&self.line)).trim_end().to_owned();
         self.line.clear();
@@ -174,7 +173,7 @@ impl Lines {
     }
 }
 
-/// A bucket of lines that may be logged.
+/// A token bucket for logged lines.
 #[derive(Debug)]
 struct Limit {
     left: f64,
@@ -208,7 +207,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_are_cut_and_harmless() {
+    fn lines_are_cut_and_sanitized() {
         let mut lines = Lines::default();
         assert_eq!(lines.take(b"one\r\n\n\ntw"), ["one"]);
         assert_eq!(lines.take(b"o\n\x1b[31mred\xff\n"), ["two", " [31mred\u{fffd}"]);
@@ -223,18 +222,18 @@ mod tests {
     fn a_flood_is_thinned_to_the_rate() {
         let mut limit = Limit::new(Stamp(0));
         let mut allowed = 0;
-        // Ten seconds, a line each 100 us.
+        // Ten seconds, one line each 100 us.
         for step in 0..100_000_u64 {
             allowed += u32::from(limit.allows(Stamp(step * 100_000)));
         }
         assert_eq!(allowed, 100 + 200 - 1);
         assert!(limit.is_used_up());
-        assert!(limit.allows(Stamp(11_000_000_000)), "quiet for a second, it may speak again");
+        assert!(limit.allows(Stamp(11_000_000_000)), "quiet for a second, its lines pass again");
     }
 
     proptest! {
         #[test]
-        fn however_the_bytes_are_cut_the_lines_are_the_same(bytes: Vec<u8>, at in 0..200_usize) {
+        fn chunking_does_not_change_the_lines(bytes: Vec<u8>, at in 0..200_usize) {
             let (first, second) = bytes.split_at(at.min(bytes.len()));
             let mut whole = Lines::default();
             let mut halves = Lines::default();

@@ -1,7 +1,7 @@
-//! The task that carries out what the core decides: streams, announcements, the published mask.
+//! The task that carries out the core's decisions: streams, announcements, the published mask.
 //!
-//! Invariant: the mask is published before anything is announced, which allocates and locks.
-//! Invariant: nothing here waits for a device; a stream that is to end is notified and forgotten.
+//! Invariant: the mask is published before any announcement, because announcing allocates and locks.
+//! Invariant: this task never waits for a device; a stream is notified to end and then forgotten.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -23,13 +23,14 @@ use super::worker::Seat;
 use super::{RigCommand, RigError};
 use crate::action::{ActuatorNotice, Arming};
 use crate::bus::{Bus, TopicId, Writer};
+use crate::device::Attachment;
 use crate::driver::DriverError;
 use crate::hotplug::HotplugStream;
 use crate::interlocks::tap::Tap;
 use crate::mask::SizedMask;
 use crate::modality::ModalityId;
 use crate::permission::Permission;
-use crate::registry::{Attachment, DeviceSpec, Registry};
+use crate::registry::{DeviceSpec, Registry};
 use crate::sample::Epoch;
 use crate::status::{Board, EpisodeWatch, Level, SlotState, What};
 use crate::time::Stamp;
@@ -38,35 +39,35 @@ use crate::time::Stamp;
 const JSON_PERIOD: Duration = Duration::from_secs(1);
 /// At the end, streams have this long to close their devices before they are abandoned.
 const STOP_LIMIT: Duration = Duration::from_millis(4500);
-/// Reports that may wait; streams report a few times in their life.
+/// Queue length for reports; a stream reports a few times in its life.
 const REPORT_DEPTH: usize = 1024;
-/// Effects for which there is room without an allocation: far more than one event has.
+/// Capacity for effects without an allocation: far more than one event causes.
 const EFFECTS: usize = 64;
 
 /// Executes the rig's core with real devices.
 #[derive(Debug)]
 pub struct Rig {
     core: Core,
-    /// Effects of the step in progress; kept, so that a step allocates nothing.
+    /// Effects of the step in progress; reused, so that a step allocates nothing.
     effects: Vec<Effect>,
     modalities: Vec<Modality>,
     presence: Presence,
     board: Arc<Board>,
-    /// The mask's JSON file is to be written, once for everything that one event changes.
+    /// The mask's JSON file must be written, once for all changes of one event.
     json_is_stale: bool,
     streams: JoinSet<Ended>,
-    /// Which stream a task is.
+    /// The stream of each task.
     tasks: HashMap<Id, (ModalityId, Epoch)>,
     reports: mpsc::Sender<Reported>,
     /// The programs, if an entry needs one.
     programs: Option<Programs>,
     /// The episode in progress.
     episode: EpisodeWatch,
-    /// Cancelled when devices begin to be closed.
+    /// Cancelled when devices start being closed.
     ending: CancellationToken,
 }
 
-/// What the live rig keeps for a modality.
+/// State of the live rig for a modality.
 #[derive(Debug)]
 struct Modality {
     spec: Arc<DeviceSpec>,
@@ -74,23 +75,22 @@ struct Modality {
     numbers: Arc<Numbers>,
     /// Ends the running stream.
     stop: CancellationToken,
-    /// Where its program works, if it has one.
+    /// Runs its program, if it has one.
     seat: Option<Seat>,
     /// Runs its hooks, if the rig runs programs at all.
     post: Option<Post>,
-    /// Its commands, if it is the actuator and no program moves it.
+    /// Its commands, if it is the actuator and no program drives it.
     controls: Option<Controls>,
-    /// Emergency stops and enabling switches that are numbers of its samples.
+    /// Emergency stops and enabling switches that are numbers in its samples.
     taps: Arc<[Tap]>,
     /// What the actuator reported last in this epoch.
     arming: Option<Arming>,
-    /// What was agreed with the device, or why it does not run.
+    /// The settings agreed with the device, or why it does not run.
     detail: String,
 }
 
 impl Rig {
     /// A rig with every slot empty, which publishes through `presence`.
-    #[must_use]
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
         let programs = Programs::new(registry, bus, &board);
         let prefix = bus.membership().prefix();
@@ -105,7 +105,7 @@ impl Rig {
                 writer,
                 numbers: Arc::default(),
                 stop: CancellationToken::new(),
-                // A program that moves its device subscribes to actions itself.
+                // A program that drives its device subscribes to actions itself.
                 controls: spec
                     .action
                     .as_ref()
@@ -122,7 +122,7 @@ impl Rig {
         Self {
             core: Core::new(registry),
             effects: Vec::with_capacity(EFFECTS),
-            // The bus was opened from the same registry: it has a writer for each of them.
+            // The bus was opened from the same registry: it has a writer for each modality.
             modalities: registry.devices.iter().filter_map(modality).collect(),
             presence,
             board,
@@ -136,14 +136,14 @@ impl Rig {
         }
     }
 
-    /// Devices and their hooks follow the episodes of this watch.
+    /// Makes devices and their hooks follow the episodes of this watch.
     #[must_use]
     pub fn following(mut self, episode: EpisodeWatch) -> Self {
         self.episode = episode;
         self
     }
 
-    /// Its actuator moves as `permission` allows; without this nothing arms it.
+    /// Makes its actuator move as `permission` allows; without this nothing arms it.
     #[must_use]
     pub fn obeying(mut self, permission: &Arc<Permission>) -> Self {
         for controls in self.modalities.iter_mut().filter_map(|modality| modality.controls.as_mut()) {
@@ -152,7 +152,7 @@ impl Rig {
         self
     }
 
-    /// Samples of its devices are examined for these emergency stops and enabling switches.
+    /// Makes the samples of its devices be checked for these emergency stops and enabling switches.
     #[must_use]
     pub fn tapped(mut self, taps: &[Tap]) -> Self {
         for modality in &mut self.modalities {
@@ -162,30 +162,28 @@ impl Rig {
     }
 
     /// Cancelled by [`Self::run`] before it closes the first device at its end.
-    #[must_use]
     pub fn ending(&self) -> CancellationToken {
         self.ending.clone()
     }
 
-    /// Cancelled, it kills the programs that are being ended.
-    #[must_use]
+    /// Cancelling it kills the programs that are being ended.
     pub fn hurry(&self) -> CancellationToken {
         self.programs.as_ref().map_or_else(CancellationToken::new, |programs| programs.hurry.clone())
     }
 
-    /// After a run and the episode in it, waits for the programs of its devices, which were notified to end,
-    /// and for their hooks.
+    /// After a run and its episode: waits for the programs of its devices, which were asked to end, and for their
+    /// hooks.
     pub async fn programs_ended(&self) {
         if let Some(programs) = &self.programs {
             programs.ended().await;
         }
     }
 
-    /// Runs until `shutdown`, then ends every stream. The mask stays published, as it was, until
-    /// the rig is dropped: what is recorded to the end has its mask beside it.
+    /// Runs until `shutdown`, then ends every stream. The mask stays published unchanged until the rig is dropped: the
+    /// recording has a mask up to its end.
     ///
     /// # Errors
-    /// When plugging can no longer be watched.
+    /// When hot-plug events can no longer be monitored.
     pub async fn run(
         &mut self,
         mut hotplug: HotplugStream,
@@ -197,7 +195,7 @@ impl Rig {
         let mut json = interval(JSON_PERIOD);
         json.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let result = loop {
-            // Far away if no slot waits.
+            // A distant time if no slot is waiting.
             let deadline = self.core.deadline().unwrap_or_else(|| Stamp::now().after(Duration::from_hours(1)));
             tokio::select! {
                 // Shutdown first, then the earliest sources of an unplug, then the rest.
@@ -218,7 +216,7 @@ impl Rig {
                 },
                 () = sleep(deadline.since(Stamp::now())) => self.step(Input::Timer),
                 _ = json.tick() => self.json_is_stale = true,
-                // The mask it belongs to is not published yet.
+                // The mask that it describes is not published yet.
                 () = sleep(PERIOD), if self.json_is_stale => {}
             }
             self.json_is_stale = self.json_is_stale && !self.write_json();
@@ -305,7 +303,7 @@ impl Rig {
         self.step(Input::Stream { id, epoch, event: StreamEvent::Ended(end) });
     }
 
-    /// Takes what streams reported by now: of one that has ended, all of it.
+    /// Takes the reports that streams have sent so far; all of them for a stream that has ended.
     fn reports_so_far(&mut self, reports: &mut mpsc::Receiver<Reported>) {
         for _ in 0..reports.len() {
             let Ok(reported) = reports.try_recv() else { return };
@@ -314,7 +312,7 @@ impl Rig {
     }
 
     fn report(&mut self, Reported { id, epoch, report }: Reported) {
-        // A report may arrive after the end of its stream, whose reason must stay.
+        // A report may arrive after the end of its stream, whose reason must be kept.
         if !self.core.is_current(id, epoch) {
             return;
         }
@@ -391,8 +389,8 @@ impl Rig {
         self.board.announce(What::State { device, bit: id, state, mask, detail });
     }
 
-    /// Writes the file for people, with mask and sequence of one publication; `false` if the mask of now is still to be
-    /// published.
+    /// Writes the JSON file, with mask and sequence of one publication; `false` if the current mask is not published
+    /// yet.
     fn write_json(&self) -> bool {
         let device = |modality: &Modality| {
             let Modality { spec, .. } = modality;
@@ -408,7 +406,7 @@ impl Rig {
         self.presence.write_json(self.core.mask(), &devices)
     }
 
-    /// Notifies every stream to end and gives them a moment to close their devices.
+    /// Asks every stream to end and gives them a moment to close their devices.
     async fn stop_streams(&mut self) {
         for modality in &self.modalities {
             modality.stop.cancel();
@@ -437,8 +435,8 @@ impl Rig {
 }
 
 impl Modality {
-    /// The stream has ended, or was asked to. What the actuator reported last no longer holds: nothing is sent to it
-    /// until the next arm.
+    /// The stream has ended, or was asked to. The actuator's last report no longer holds: nothing is sent to it until
+    /// the next arm.
     fn disarm(&mut self, board: &Board, is_problem: bool) {
         if self.arming.take().is_some_and(|last| !matches!(last, Arming::Disarmed | Arming::Faulted)) {
             let (device, text) = (self.spec.name.clone(), "disarmed; arm it again to resume".to_owned());

@@ -1,4 +1,4 @@
-//! All child processes of the rig: what starts them, what they are reported to, and what waits for the last.
+//! All child processes of the rig: the spawner, the shared resources they report to, and the wait for the last one.
 
 use std::ffi::OsString;
 use std::sync::Arc;
@@ -12,11 +12,12 @@ use super::attendant::HOOK_LIMIT;
 use super::logbook::Logbook;
 use super::worker::TERM_LIMIT;
 use crate::bus::Bus;
+use crate::device::Attachment;
 use crate::driver::process::Spawner;
-use crate::registry::{Attachment, DeviceSpec, NodeSpec, Registry};
+use crate::registry::{DeviceSpec, NodeSpec, Registry};
 use crate::status::Board;
 
-/// Beyond the time a program has to end, what the kernel and a busy machine may take.
+/// Allowance for the kernel and a busy machine, beyond the time a program has to end.
 pub(super) const MARGIN: Duration = Duration::from_secs(2);
 
 /// See the module's comment.
@@ -25,16 +26,16 @@ pub(super) struct Programs {
     pub(super) spawner: Spawner,
     pub(super) board: Arc<Board>,
     pub(super) logbook: Logbook,
-    /// One task a child, and one an attended device.
+    /// One task per child, and one per attended device.
     pub(super) tasks: TaskTracker,
-    /// The run ends: what is not begun yet is not begun any more.
+    /// The run ends: no further programs are started.
     pub(super) closing: CancellationToken,
-    /// Children that are being ended get no more time.
+    /// Cancelled when children that are being ended get no more time.
     pub(super) hurry: CancellationToken,
 }
 
 impl Programs {
-    /// `None` where no entry needs a program.
+    /// `None` if no entry needs a program.
     pub(super) fn new(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Option<Self> {
         let mut devices = registry.devices.iter();
         devices.any(|device| matches!(device.node, NodeSpec::Process(_)) || !device.hooks.is_empty()).then(|| Self {
@@ -47,13 +48,13 @@ impl Programs {
         })
     }
 
-    /// Waits until every child has ended; the programs of devices have been asked to, and no episode is
-    /// in progress any more.
+    /// Waits until every child has ended. The programs of devices have been asked to end, and no episode is in progress
+    /// any more.
     pub(super) async fn ended(&self) {
         self.closing.cancel();
         self.tasks.close();
-        // Of a device removed a moment ago: the hook that just began, the two that follow it, and between them the wait
-        // for its program.
+        // For a device removed a moment ago: the hook that just started, the two that follow it, and between them the
+        // wait for its program.
         let limit = 3 * HOOK_LIMIT + TERM_LIMIT + 2 * MARGIN;
         if timeout(limit, self.tasks.wait()).await.is_err() {
             tracing::warn!(programs = self.tasks.len(), "did not end even when killed and are abandoned");
@@ -62,16 +63,16 @@ impl Programs {
     }
 }
 
-/// Variables of a child's environment; one without a value is not to be there.
+/// Environment variables of a child; one without a value is unset.
 pub(super) type Environment = Vec<(&'static str, Option<OsString>)>;
 
-/// What every child is given about its device.
+/// The variables that every child gets about its device.
 pub(super) fn environment(spec: &DeviceSpec, attachment: &Attachment, topic: &str, prefix: &str) -> Environment {
     let text = |text: &str| Some(OsString::from(text));
     vec![
         ("DEVICE_NAME", text(&spec.name)),
         ("DEVICE_NODE", text(&attachment.node.label())),
-        // No such variable rather than one with a value that cannot be expressed.
+        // Unset rather than set to a value that cannot be expressed.
         ("DEVICE_SERIAL", attachment.unit.serial().filter(|serial| !serial.contains('\0')).and_then(text)),
         ("DEVICE_ADDR", text(attachment.unit.place())),
         ("RAPID_TOPIC", text(topic)),

@@ -9,11 +9,11 @@
 //! | Backoff   | yes      | no      | 0   | the end of the cooldown or back-off  |
 //! | Failed    | yes      | no      | 0   | a replug, or a restart by hand       |
 //!
-//! (*) When the stream is the first to notice an unplug, the slot is Absent at once while hot-plug
-//! has yet to confirm it. If no removal comes within the cooldown, the device was never gone and is
-//! started again, which counts as a restart: its driver cannot report that for ever.
+//! (*) When the stream notices an unplug first, the slot becomes Absent at once, before hot-plug confirms it. If no
+//! removal comes within the cooldown, the device never left and is started again, which counts as a restart: a driver
+//! that keeps reporting this reaches the limit.
 //!
-//! Invariant: what carries an older epoch changes nothing.
+//! Invariant: an input of an older epoch has no effect.
 //! Invariant: a cooldown delays an attachment and never drops it.
 //! Invariant: no clock, no I/O: time comes in as an argument.
 
@@ -23,29 +23,29 @@ use crate::sample::Epoch;
 use crate::status::SlotState;
 use crate::time::Stamp;
 
-/// A stream that ends while its device is attached is started again this many times...
+/// A stream that ends while its device is attached is restarted this many times...
 const MAX_RESTARTS: usize = 5;
-/// ...within this time, then the slot has failed.
+/// ...within this time; then the slot is Failed.
 const RESTART_WINDOW: Duration = Duration::from_mins(1);
-/// Delay before the first restart; each further one in the window waits twice as long.
+/// Delay before the first restart; each further restart in the window waits twice as long.
 const FIRST_BACKOFF: Duration = Duration::from_millis(500);
 
-/// What happens to a slot. `A` is an attachment.
+/// An input to a slot. `A` is an attachment.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Input<A> {
     /// A device of this modality was plugged in.
     Attached(A),
-    /// It was pulled out.
+    /// It was unplugged.
     Detached,
     /// The stream delivered its first sample.
     Started(Epoch),
     /// Samples have stopped.
     Stalled(Epoch),
-    /// Samples come again.
+    /// Samples arrive again.
     Resumed(Epoch),
     /// The stream ended.
     Ended(Epoch, End),
-    /// A user wants the device started again.
+    /// A user requests a restart of the device.
     Restart,
     /// Time passed; see [`Slot::deadline`].
     Timer,
@@ -54,17 +54,17 @@ pub enum Input<A> {
 /// How a stream ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum End {
-    /// The device is no longer there.
+    /// The device is no longer present.
     Gone,
-    /// It is there and cannot be reached before a link is up again, which its next start waits for.
+    /// It is present but unreachable until a link is up again; its next start waits for the link.
     LinkDown,
-    /// Starting again may help.
+    /// Restarting may help.
     Retry,
-    /// Starting again cannot help.
+    /// Restarting cannot help.
     Fatal,
 }
 
-/// What is to be done after an input.
+/// Actions that follow an input.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Effects<A> {
     /// Ask this stream to end; do not wait for it.
@@ -85,7 +85,7 @@ pub struct Slot<A> {
     attached: Option<A>,
     /// When the last removal was first noticed.
     removed: Option<Stamp>,
-    /// When something must be done without any input.
+    /// When [`Input::Timer`] is due.
     deadline: Option<Stamp>,
     /// Restarts within [`RESTART_WINDOW`], oldest first.
     restarts: Vec<Stamp>,
@@ -94,7 +94,6 @@ pub struct Slot<A> {
 
 impl<A: Clone> Slot<A> {
     /// An empty slot.
-    #[must_use]
     pub fn new(cooldown: Duration) -> Self {
         Self {
             state: SlotState::Absent,
@@ -108,36 +107,31 @@ impl<A: Clone> Slot<A> {
     }
 
     /// The state.
-    #[must_use]
     pub const fn state(&self) -> SlotState {
         self.state
     }
 
     /// Incarnation of the newest stream.
-    #[must_use]
     pub const fn epoch(&self) -> Epoch {
         self.epoch
     }
 
-    /// The bit in the physical mask.
-    #[must_use]
+    /// Its bit in the physical mask.
     pub const fn is_present(&self) -> bool {
         matches!(self.state, SlotState::Streaming | SlotState::Stalled)
     }
 
     /// What hot-plug reported as attached.
-    #[must_use]
     pub const fn attached(&self) -> Option<&A> {
         self.attached.as_ref()
     }
 
-    /// When [`Input::Timer`] is to be applied, if nothing happens before.
-    #[must_use]
+    /// When [`Input::Timer`] is due, if no other input comes before.
     pub const fn deadline(&self) -> Option<Stamp> {
         self.deadline
     }
 
-    /// Takes one input and returns what is to be done.
+    /// Takes one input and returns the resulting actions.
     pub fn apply(&mut self, input: Input<A>, now: Stamp) -> Effects<A> {
         match input {
             Input::Attached(attachment) => self.attach(attachment, now),
@@ -152,8 +146,7 @@ impl<A: Clone> Slot<A> {
         }
     }
 
-    /// Is this the stream that is running now? Reports of any other change nothing.
-    #[must_use]
+    /// Whether this stream runs now. Reports of any other have no effect.
     pub fn is_current(&self, epoch: Epoch) -> bool {
         self.is_running() && epoch == self.epoch
     }
@@ -163,7 +156,7 @@ impl<A: Clone> Slot<A> {
     }
 
     fn attach(&mut self, attachment: A, now: Stamp) -> Effects<A> {
-        // A new attachment over one whose removal was never reported replaces it.
+        // An attachment over one whose removal was never reported replaces it.
         let stop = self.is_running().then_some(self.epoch);
         self.attached = Some(attachment);
         self.restarts.clear();
@@ -177,7 +170,7 @@ impl<A: Clone> Slot<A> {
 
     fn detach(&mut self, now: Stamp) -> Effects<A> {
         let stop = self.is_running().then_some(self.epoch);
-        // The stream may have noticed first: the cooldown counts from the first witness.
+        // The stream may have noticed first: the cooldown starts at the first report.
         if self.attached.is_some() && self.state != SlotState::Absent {
             self.removed = Some(now);
         }
@@ -196,7 +189,7 @@ impl<A: Clone> Slot<A> {
                 self.deadline = Some(now.after(wait));
             }
             End::Fatal => self.enter(SlotState::Failed),
-            // As often as the cable is pulled.
+            // No restart limit: a cable may be pulled any number of times.
             End::LinkDown => {
                 self.restarts.clear();
                 self.wait_until(now.after(FIRST_BACKOFF));
@@ -212,7 +205,7 @@ impl<A: Clone> Slot<A> {
         Effects::NONE
     }
 
-    /// How long the next restart is delayed; `None` when the restart budget is exhausted.
+    /// Delay of the next restart; `None` when the restart budget is exhausted.
     fn backoff(&mut self, now: Stamp) -> Option<Duration> {
         self.restarts.retain(|restart| now.since(*restart) < RESTART_WINDOW);
         (self.restarts.len() < MAX_RESTARTS).then(|| FIRST_BACKOFF * (1 << self.restarts.len()))
@@ -223,7 +216,7 @@ impl<A: Clone> Slot<A> {
             return Effects::NONE;
         }
         self.restarts.clear();
-        // The cooldown protects the electronics and is not the user's to skip.
+        // The cooldown protects the electronics; a user cannot skip it.
         let ready = self.removed.map_or(now, |removed| removed.after(self.cooldown));
         if now < ready {
             self.wait_until(ready);
@@ -237,7 +230,7 @@ impl<A: Clone> Slot<A> {
             return Effects::NONE;
         }
         self.deadline = None;
-        // Reported gone by its driver, and attached all the same.
+        // Its driver reported it gone, yet it is attached.
         if self.state == SlotState::Absent && self.attached.is_some() {
             if self.backoff(now).is_none() {
                 self.enter(SlotState::Failed);

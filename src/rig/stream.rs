@@ -1,7 +1,7 @@
-//! A stream: one device being read, from the opening of its node to its end.
+//! A stream: reads one device, from the opening of its node to its end.
 //!
-//! Invariant: between two samples a stream allocates nothing, locks nothing and logs nothing of its
-//! own; `bus` documents what publishing costs.
+//! Invariant: between two samples a stream itself allocates nothing, locks nothing and logs nothing; `bus` documents
+//! the cost of publishing.
 //! Invariant: a stream that was asked to stop publishes nothing more.
 
 mod controls;
@@ -20,45 +20,46 @@ use super::slot::End;
 use super::worker::Seat;
 use crate::action::ActuatorNotice;
 use crate::bus::Writer;
+use crate::device::Attachment;
 use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
 use crate::interlocks::tap::{Tap, lost_at_the_end};
 use crate::modality::ModalityId;
-use crate::registry::{Attachment, DeviceSpec, NodeSpec};
+use crate::registry::{DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
 use crate::status::{Board, EpisodeWatch, Provenance};
 use crate::time::{Stamp, nanoseconds};
 
-/// A device that does not open within this time is tried again.
+/// A device that does not open within this time is retried.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);
 
-/// A device that is open and has sent nothing for this long is reported silent, once an epoch. It
-/// stays Opening: what sends only when something happens may do so at any time.
+/// A device that is open and has sent nothing for this long is reported silent, once per epoch. It stays Opening: an
+/// event-driven device may send at any time.
 const SILENT_AFTER: Duration = Duration::from_secs(2);
-/// Cameras and programs always send: one that has sent nothing for this long since it was opened is opened
-/// again. Six of these and the delays between them fit into the minute in which five restarts are allowed.
+/// Cameras and programs always send: one that has sent nothing for this long after opening is reopened. Six of these
+/// and the delays between them fit into the minute in which five restarts are allowed.
 const START_LIMIT: Duration = Duration::from_secs(5);
-/// How long a device may take to be closed in order.
+/// How long the orderly closing of a device may take.
 const CLOSE_LIMIT: Duration = Duration::from_secs(4);
 
 use controls::Controlled;
 pub(super) use controls::Controls;
 use source::Source;
 
-/// What a stream reports to the rig while it runs.
+/// Reports of a running stream to the rig.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
-    /// The node is not opened before its link is up.
+    /// The node is opened once its link is up.
     LinkDown,
-    /// The node is open; what was agreed with the device, for people and for the recording.
+    /// The node is open, with the settings agreed with the device, for people and for the recording.
     Opened(String, Box<Provenance>),
-    /// Open for so long, and no sample yet.
+    /// Open for this long without a sample.
     Silent(Duration),
-    /// What concerns the core alone.
+    /// An event for the core alone.
     Event(StreamEvent),
-    /// Samples or actions are lost, and why, reported once an epoch each; or an order.
+    /// Samples or actions are lost, or an order is refused, and why; reported once per epoch each.
     Refused(String),
-    /// What an actuator reports.
+    /// A notice from an actuator.
     Actuator(ActuatorNotice),
 }
 
@@ -78,7 +79,7 @@ pub(super) struct Ended {
     pub(super) reason: String,
 }
 
-/// How far a modality has come, over all its epochs.
+/// Progress of a modality, over all its epochs.
 #[derive(Debug, Default)]
 pub(super) struct Numbers {
     /// Sequence number of the next sample.
@@ -88,10 +89,10 @@ pub(super) struct Numbers {
 }
 
 impl Numbers {
-    /// `seq` and `lost` of a sample before which the device lost `lost` others: these leave a hole,
-    /// so that every consumer can see it.
+    /// `seq` and `lost` of a sample before which the device lost `lost` others. They leave a gap in `seq`, so that
+    /// every consumer can see it.
     fn take(&self, lost: u64) -> (u64, u64) {
-        // One stream at a time counts here: an older one publishes no more.
+        // Only one stream at a time counts here: an older one publishes nothing more.
         let seq = self.next.fetch_add(lost + 1, Ordering::Relaxed) + lost;
         (seq, self.lost.fetch_add(lost, Ordering::Relaxed) + lost)
     }
@@ -102,7 +103,7 @@ impl Numbers {
 pub(super) struct Stream {
     pub(super) spec: Arc<DeviceSpec>,
     pub(super) attachment: Attachment,
-    /// When it was attached.
+    /// When the device was attached.
     pub(super) attached: Stamp,
     pub(super) epoch: Epoch,
     pub(super) writer: Arc<Writer>,
@@ -110,11 +111,11 @@ pub(super) struct Stream {
     pub(super) board: Arc<Board>,
     pub(super) reports: mpsc::Sender<Reported>,
     pub(super) stop: CancellationToken,
-    /// Where the program of the entry works, if it has one.
+    /// Runs the program of the entry, if it has one.
     pub(super) seat: Option<Seat>,
-    /// What it is ordered to do, if it is the actuator.
+    /// Orders and actions, if it is the actuator.
     pub(super) controls: Option<Controls>,
-    /// Emergency stops and enabling switches that are numbers of its samples.
+    /// Emergency stops and enabling switches that are numbers in its samples.
     pub(super) taps: Arc<[Tap]>,
     /// The episode in progress, for devices that record by themselves.
     pub(super) episode: EpisodeWatch,
@@ -123,7 +124,7 @@ pub(super) struct Stream {
 impl Stream {
     /// Reads the device until it ends or the stream is asked to stop.
     pub(super) async fn run(self) -> Ended {
-        // However it ends, a panic included, its samples no longer count.
+        // However the stream ends, even by panic, its last values no longer count.
         let _lost = lost_at_the_end(&self.taps);
         let stopped = || Ended { end: End::Gone, reason: "stopped".to_owned() };
         let open = async {
@@ -148,7 +149,7 @@ impl Stream {
             biased;
             () = self.stop.cancelled() => {}
             ended = self.read(&mut source, &mut notices) => {
-                // What it reported last, before it ended.
+                // The notices that it sent before it ended.
                 self.pass_on_notices(&mut notices).await;
                 return ended;
             }
@@ -169,7 +170,7 @@ impl Stream {
             Ok(controls) => controls.flatten(),
             Err(error) => return error.into(),
         };
-        // An order that is carried out at once is reported before its first sample.
+        // An order that is carried out at once is reported before the first sample.
         self.pass_on_notices(notices).await;
         let mut episode = self.episode.clone();
         if episode.borrow_and_update().is_some() {
@@ -177,7 +178,7 @@ impl Stream {
         }
         let news = changed(episode.clone());
         tokio::pin!(news);
-        // The timer is examined when it fires, not set again at every sample.
+        // The timer is checked when it fires, not reset at every sample.
         let mut newest = Instant::now();
         loop {
             tokio::select! {
@@ -209,7 +210,7 @@ impl Stream {
                         stall.as_mut().reset(due);
                         continue;
                     }
-                    // To start takes longer than to continue: an interpreter has its libraries to load.
+                    // Starting takes longer than continuing: an interpreter has to load its libraries.
                     let least = if progress.pulse == Pulse::Silent { START_LIMIT } else { Duration::ZERO };
                     if patience.is_some_and(|patience| newest.elapsed() >= patience.max(least)) {
                         return Ended::retry(format!("nothing came for {:?}", newest.elapsed()));
@@ -224,7 +225,7 @@ impl Stream {
         }
     }
 
-    /// Publishes a sample, and reports the first of a stream and the first after a stall.
+    /// Publishes a sample, and reports the first one of a stream and the first one after a stall.
     async fn pass_on_sample(&self, reading: &Reading<'_>, progress: &mut StreamProgress) {
         if let Err(reason) = self.publish(reading)
             && !std::mem::replace(&mut progress.has_lost, true)
@@ -240,7 +241,7 @@ impl Stream {
         self.report(Report::Event(event)).await;
     }
 
-    /// Hands the actuator the orders and the newest action that came since the last call.
+    /// Passes the actuator the orders and the newest action since the last call.
     async fn pass_on_orders(&self, source: &mut Source, controls: &mut Controlled, progress: &mut StreamProgress) {
         if let Err(error) = controls.pass_on_orders(source) {
             self.report(Report::Refused(format!("an order is not carried out: {error}"))).await;
@@ -252,7 +253,7 @@ impl Stream {
         }
     }
 
-    /// Notifies the device of a change of the episode in progress, if there was one.
+    /// Notifies the device if the episode in progress has changed.
     async fn pass_on_episode(&self, source: &mut Source, episode: &mut EpisodeWatch) {
         if !episode.has_changed().unwrap_or(false) {
             return;
@@ -264,14 +265,14 @@ impl Stream {
         }
     }
 
-    /// Reports the notices of the actuator that wait.
+    /// Reports the actuator's pending notices.
     async fn pass_on_notices(&self, notices: &mut Notices) {
         while let Some(Ok(notice)) = notices.as_mut().map(mpsc::Receiver::try_recv) {
             self.report(Report::Actuator(notice)).await;
         }
     }
 
-    /// Reports that the device sends nothing; ends, with the reason, when it is to be opened again.
+    /// Reports that the device sends nothing; returns, with the reason, when it must be reopened.
     async fn silence(&self) -> String {
         let opened = Instant::now();
         let print = SILENT_AFTER.max(self.spec.stall_after);
@@ -302,7 +303,7 @@ impl Stream {
     /// One copy, from the driver's buffer into shared memory.
     fn publish(&self, reading: &Reading<'_>) -> Result<(), String> {
         fault::point("stream");
-        // First of all: whatever becomes of the sample, what it stops is stopped.
+        // First of all, so that an emergency stop takes effect whatever happens to the sample.
         for tap in &*self.taps {
             tap.look(reading.encoding, reading.bytes);
         }
@@ -332,7 +333,7 @@ impl Stream {
         }
     }
 
-    /// The rig reads its reports at once; the channel is full only if it has ended.
+    /// The rig reads its reports at once; the channel is full only if the rig has ended.
     async fn report(&self, report: Report) {
         let _ = self.reports.send(Reported { id: self.spec.id, epoch: self.epoch, report }).await;
     }
@@ -357,10 +358,10 @@ enum Pulse {
     Stalled,
 }
 
-/// Of an actuator.
+/// Notices of an actuator.
 type Notices = Option<mpsc::Receiver<ActuatorNotice>>;
 
-/// The next notice. Never, if it has none or has ended.
+/// The next notice. Never returns if there are none or the sender has ended.
 async fn next_notice(notices: &mut Notices) -> ActuatorNotice {
     if let Some(notices) = notices
         && let Some(notice) = notices.recv().await
@@ -370,7 +371,7 @@ async fn next_notice(notices: &mut Notices) -> ActuatorNotice {
     std::future::pending().await
 }
 
-/// Returns when the device is to be given orders or an action.
+/// Returns when orders or an action must be passed to the device.
 async fn changed_controls(controls: Option<&mut Controlled>) {
     match controls {
         Some(controls) => controls.changed().await,
@@ -378,10 +379,10 @@ async fn changed_controls(controls: Option<&mut Controlled>) {
     }
 }
 
-/// Returns when there is news of an episode.
+/// Returns when the episode changes.
 async fn changed(mut episode: EpisodeWatch) {
     if episode.changed().await.is_err() {
-        // No recorder is left.
+        // No recorder exists any more.
         std::future::pending::<()>().await;
     }
 }
@@ -409,7 +410,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_device_lost_leaves_a_hole_that_is_its_own() {
+    fn samples_lost_by_the_device_leave_a_gap_in_the_sequence() {
         let numbers = Numbers::default();
         assert_eq!([0, 2, 0].map(|lost| numbers.take(lost)), [(0, 0), (3, 2), (4, 2)]);
     }

@@ -1,13 +1,12 @@
 //! A worker: a program that reads a device, and the samples it publishes.
 //!
-//! A stream opens a worker as it would a driver. The program is started, kept and ended by a task of
-//! its own (`keeper`); what it prints goes to the log (`output`); what it publishes is judged
-//! (`intake`) and lent to the stream, which publishes it under a header of ours.
+//! A stream opens a worker as it would a driver. A separate task (`keeper`) starts, monitors and ends the program; its
+//! output goes to the log (`output`); its samples are validated (`intake`) and lent to the stream, which publishes them
+//! under the rig's own header.
 //!
-//! Invariant: nothing waits for a program to end, except its successor on the same entry.
+//! Invariant: only a successor on the same entry waits for a program to end.
 //! Invariant: no field of a program's header is passed on unchecked.
-//! Invariant: once the stream is asked to stop, no sample of its program counts, however long the
-//! program lives.
+//! Invariant: once the stream is asked to stop, no sample of its program counts, however long the program lives.
 
 mod intake;
 mod keeper;
@@ -20,9 +19,10 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::programs::{Environment, MARGIN, Programs, environment};
 use crate::bus::{Arrivals, Bus, Given, Ingress, Membership};
+use crate::device::Attachment;
 use crate::driver::process::Launch;
 use crate::driver::{DriverError, Reading};
-use crate::registry::{Attachment, DeviceSpec, ProcessSpec};
+use crate::registry::{DeviceSpec, ProcessSpec};
 use crate::sample::Epoch;
 use crate::status::{Board, Level, What};
 use crate::time::Stamp;
@@ -33,30 +33,30 @@ pub(super) use keeper::{TERM_LIMIT, describe};
 /// A program that is silent for this many heartbeats is started again.
 pub(super) const MOST_SILENT_BEATS: u32 = 5;
 
-/// The place of an entry's programs, one after the other.
+/// The per-entry state that its successive programs share.
 #[derive(Debug, Clone)]
 pub(super) struct Seat {
     programs: Programs,
     membership: Membership,
     ingress: Arc<Ingress>,
-    /// Held as long as a program of this entry lives.
+    /// Locked while a program of this entry lives.
     turn: Arc<Mutex<()>>,
 }
 
 impl Seat {
-    /// Where the program of one entry works; `None` if the entry has none.
+    /// The seat of one entry's program; `None` if the entry has none.
     pub(super) fn new(programs: &Programs, spec: &DeviceSpec, bus: &Bus) -> Option<Self> {
         let ingress = bus.ingress(spec.id)?;
         Some(Self { programs: programs.clone(), membership: bus.membership(), ingress, turn: Arc::default() })
     }
 
-    /// Held as long as a program of the entry lives.
+    /// Locked while a program of the entry lives.
     pub(super) fn turn(&self) -> Arc<Mutex<()>> {
         Arc::clone(&self.turn)
     }
 }
 
-/// A running program, as its stream sees it. Dropped, it asks the program to end.
+/// A running program, as its stream sees it. Dropping it asks the program to end.
 #[derive(Debug)]
 pub(super) struct Worker {
     name: String,
@@ -64,18 +64,18 @@ pub(super) struct Worker {
     ingress: Arc<Ingress>,
     watch: Arrivals,
     intake: Intake,
-    /// The sample that is lent.
+    /// The sample that is lent to the stream.
     given: Option<(Given, Judged)>,
     /// Receives how the program ended.
     ended: oneshot::Receiver<String>,
-    /// How it ended; what it published before is still to be read.
+    /// How it ended; samples published before are still to be read.
     reason: Option<String>,
     description: String,
     _stop: DropGuard,
 }
 
 impl Worker {
-    /// Starts the program of an entry, once its predecessor is gone.
+    /// Starts the program of an entry, once its predecessor has ended.
     pub(super) async fn open(
         seat: &Seat,
         spec: &DeviceSpec,
@@ -90,7 +90,7 @@ impl Worker {
         }
         let wait = timeout(TERM_LIMIT + MARGIN, Arc::clone(&seat.turn).lock_owned());
         let turn = wait.await.map_err(|_| DriverError::Retry("its previous process has not ended".to_owned()))?;
-        // What the predecessor left.
+        // Samples left by the predecessor.
         seat.ingress.clear();
 
         let stop = CancellationToken::new();
@@ -131,7 +131,7 @@ impl Worker {
         self.description.clone()
     }
 
-    /// The next sample that can be passed on. Cancel-safe.
+    /// The next valid sample. Cancel-safe.
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         self.given = None;
         let next = self.next().await?;
@@ -149,7 +149,7 @@ impl Worker {
 
     async fn next(&mut self) -> Result<(Given, Judged), DriverError> {
         loop {
-            // A program that publishes faster than we read must not keep this task from its stop.
+            // A program that publishes faster than this reads must not keep this task from being stopped.
             tokio::task::consume_budget().await;
             let given = self.ingress.take().map_err(|error| DriverError::Retry(error.to_string()))?;
             if let Some(given) = given {

@@ -1,10 +1,10 @@
-//! The board: where stages report what a screen may show.
+//! The board: where stages report the data that a screen may show.
 //!
-//! One writer a fact: the rig writes slots and the mask, streams write their own counters, the
-//! recorder writes the recording. A screen only takes [`Snapshot`]s.
+//! One writer per item: the rig writes slots and the mask, streams write their own counters, the recorder writes the
+//! recording. A screen only takes [`Snapshot`]s.
 //!
-//! Invariant: what is written per sample is an atomic; the locks here guard what changes a few times
-//! a second at most and are never held over anything that waits.
+//! Invariant: per-sample data are atomics; the locks here guard data that changes at most a few times a second, and are
+//! never held while waiting.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -28,10 +28,10 @@ use crate::time::{Stamp, realtime_ns};
 
 /// Log lines kept for the screen.
 const LOG_LINES: usize = 500;
-/// Events a slow reader may fall behind before it misses some, and is notified.
+/// Events a slow reader may fall behind before it misses some; it is then notified.
 const EVENT_DEPTH: usize = 4096;
 
-/// Counters of one stream, written by its task alone.
+/// Counters of one stream, written only by its task.
 #[derive(Debug, Default)]
 pub struct StreamCounters {
     samples: AtomicU64,
@@ -41,7 +41,7 @@ pub struct StreamCounters {
 }
 
 impl StreamCounters {
-    /// Counts one sample of `bytes` bytes captured at `captured`, before which `lost` were lost.
+    /// Counts one sample of `bytes` bytes captured at `captured`, before which `lost` samples were lost.
     pub fn count(&self, bytes: usize, captured: Stamp, lost: u64) {
         self.samples.fetch_add(1, Ordering::Relaxed);
         self.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
@@ -57,7 +57,7 @@ impl StreamCounters {
     }
 }
 
-/// The end of an episode: its file, and why that is not whole, if it is not.
+/// The end of an episode: its file, and why the file is not whole, if it is not.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EpisodeEnd {
     /// As in `What::Episode`.
@@ -67,7 +67,7 @@ pub struct EpisodeEnd {
 }
 
 #[derive(Debug, Clone, Default)]
-struct Slot {
+struct SlotStatus {
     state: SlotState,
     epoch: Epoch,
     detail: String,
@@ -80,7 +80,7 @@ pub struct Board {
     started: Stamp,
     names: Vec<(ModalityId, String, String)>,
     counters: Vec<StreamCounters>,
-    slots: Mutex<Vec<Slot>>,
+    slots: Mutex<Vec<SlotStatus>>,
     mask: AtomicU64,
     mask_sequence: AtomicU64,
     stops: Mutex<Vec<StopStatus>>,
@@ -89,7 +89,7 @@ pub struct Board {
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     short_episode: Mutex<Option<ShortEpisode>>,
     last_end: Mutex<Option<EpisodeEnd>>,
-    /// How many episodes were BAD, and the last of them.
+    /// Number of BAD episodes, and the last of them.
     bad: Mutex<Option<(u64, PathBuf)>>,
     log: Mutex<VecDeque<LogLine>>,
     events: broadcast::Sender<Event>,
@@ -97,7 +97,6 @@ pub struct Board {
 
 impl Board {
     /// An empty board for the devices of `registry`.
-    #[must_use]
     pub fn new(registry: &Registry) -> Self {
         let mut counters = Vec::with_capacity(MAX_MODALITIES);
         counters.resize_with(MAX_MODALITIES, StreamCounters::default);
@@ -106,7 +105,7 @@ impl Board {
             started: Stamp::now(),
             names: registry.devices.iter().map(|d| (d.id, d.name.clone(), d.topic.clone())).collect(),
             counters,
-            slots: Mutex::new(vec![Slot::default(); MAX_MODALITIES]),
+            slots: Mutex::new(vec![SlotStatus::default(); MAX_MODALITIES]),
             mask: AtomicU64::new(0),
             mask_sequence: AtomicU64::new(0),
             stops: Mutex::new(registry.stops.iter().map(unreported).collect()),
@@ -122,7 +121,6 @@ impl Board {
     }
 
     /// The counters of a stream.
-    #[must_use]
     pub fn counters(&self, id: ModalityId) -> &StreamCounters {
         &self.counters[id.index()]
     }
@@ -148,7 +146,6 @@ impl Board {
     }
 
     /// Emergency stops and enabling switches, in the order of the registry.
-    #[must_use]
     pub fn stops(&self) -> Vec<StopStatus> {
         lock(&self.stops).clone()
     }
@@ -160,15 +157,8 @@ impl Board {
     }
 
     /// The mask as published.
-    #[must_use]
     pub fn mask(&self) -> PhysicalMask {
         PhysicalMask(self.mask.load(Ordering::Relaxed))
-    }
-
-    /// Publications of the mask so far.
-    #[must_use]
-    pub fn mask_sequence(&self) -> u64 {
-        self.mask_sequence.load(Ordering::Relaxed)
     }
 
     /// Reports the recording in progress, or that there is none.
@@ -176,33 +166,32 @@ impl Board {
         *lock(&self.recording) = recording;
     }
 
-    /// Is an episode in progress?
-    #[must_use]
+    /// Whether an episode is in progress.
     pub fn is_recording(&self) -> bool {
         lock(&self.recording).is_some()
     }
 
-    /// Reports what the policy does, or that there is none.
+    /// Reports the policy's status, or that there is no policy.
     pub fn set_policy(&self, policy: Option<PolicyStatus>) {
         *lock(&self.policy) = policy;
     }
 
-    /// Reports the last file finished.
+    /// Reports the last finished file.
     pub fn set_last_episode(&self, file: PathBuf, verdict: Verdict) {
         *lock(&self.last_episode) = Some((file, verdict));
     }
 
-    /// Reports that the last file finished is gone.
+    /// Reports that the last finished file was removed.
     pub fn forget_last_episode(&self) {
         *lock(&self.last_episode) = None;
     }
 
-    /// Reports the episode that may be dropped, or that none may.
+    /// Reports the episode that may be dropped, or that there is none.
     pub fn set_short_episode(&self, short: Option<ShortEpisode>) {
         *lock(&self.short_episode) = short;
     }
 
-    /// Adds a line to the log, without what of a device's text could move the cursor of a terminal.
+    /// Adds a line to the log, without characters from a device that could move a terminal's cursor.
     pub fn log(&self, mut line: LogLine) {
         if let Cow::Owned(plain) = text::plain(&line.text) {
             line.text = plain;
@@ -231,26 +220,22 @@ impl Board {
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
     }
 
-    /// How the last episode ended that was announced: for who missed events.
-    #[must_use]
+    /// The last announced end of an episode: for readers that missed events.
     pub fn last_end(&self) -> Option<EpisodeEnd> {
         lock(&self.last_end).clone()
     }
 
-    /// How many episodes of this run were BAD, and the file of the last of them; `None` if none was.
-    #[must_use]
+    /// Number of BAD episodes of this run, and the file of the last; `None` if there was none.
     pub fn bad_episodes(&self) -> Option<(u64, PathBuf)> {
         lock(&self.bad).clone()
     }
 
     /// All events from now on.
-    #[must_use]
     pub fn events(&self) -> broadcast::Receiver<Event> {
         self.events.subscribe()
     }
 
-    /// Everything as it is now.
-    #[must_use]
+    /// The current state of everything.
     pub fn snapshot(&self) -> Snapshot {
         let taken = Stamp::now();
         let slots = lock(&self.slots).clone();
@@ -295,7 +280,7 @@ fn unreported(stop: &InterlockSpec) -> StopStatus {
     StopStatus { stop: stop.name.clone(), kind: stop.kind, state: InputState::Lost, detail }
 }
 
-/// A poisoned lock here guards plain values that are whole at every moment: they remain usable.
+/// A poisoned lock here guards plain values that are always complete: they remain usable.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

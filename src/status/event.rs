@@ -1,5 +1,5 @@
-//! Events: state changes worth a line on a screen and a message in a recording; and as text for people: the one place of
-//! it. The log and a recording have the sentence; lines in columns have its parts.
+//! Events: state changes worth a line on a screen and a message in a recording, and the only place that turns them into
+//! text. The log and a recording contain the sentence; lines in columns contain its parts.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -8,15 +8,15 @@ use serde::Serialize;
 
 use super::{Chunk, Grade, Hold, Level, PolicyEnd, SlotState, StopStatus, Verdict};
 use crate::action::Arming;
+use crate::device::Unit;
 use crate::mask::SizedMask;
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated, UnplugSource};
-use crate::registry::Unit;
 use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
 
-/// A state change, with its moment. As JSON, one object: `{"event":"state","device":...}`.
+/// A state change with its time. As JSON, one object: `{"event":"state","device":...}`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Event {
     /// When it happened, `CLOCK_MONOTONIC` ns.
@@ -41,7 +41,7 @@ pub enum What {
         /// The unit.
         #[serde(flatten)]
         unit: Unit,
-        /// The kernel's driver of it.
+        /// Its kernel driver.
         driver: Option<KernelDriver>,
     },
     /// A registered device was opened, in a new epoch: its samples come from this unit.
@@ -54,13 +54,13 @@ pub enum What {
         #[serde(flatten)]
         provenance: Box<Provenance>,
     },
-    /// A registered device was pulled out.
+    /// A registered device was unplugged.
     Detach {
         /// Modality.
         device: String,
         /// Its bit.
         bit: ModalityId,
-        /// What noticed it first.
+        /// What noticed the removal first.
         #[serde(rename = "witness")]
         source: UnplugSource,
     },
@@ -74,10 +74,10 @@ pub enum What {
         state: SlotState,
         /// The mask after the change, in JSON `0x05`.
         mask: SizedMask,
-        /// Why, or what was agreed with the device.
+        /// Why, or the settings agreed with the device.
         detail: String,
     },
-    /// Something was plugged in that no entry of the registry means.
+    /// A device was plugged in that matches no entry of the registry.
     Unregistered {
         /// `vid:pid`, serial, product as the device reports them.
         device: String,
@@ -92,7 +92,7 @@ pub enum What {
     },
     /// An episode ended and its file is closed.
     Episode {
-        /// The file; `.partial` remains at its end if it could not be finished.
+        /// The file; it keeps the suffix `.partial` if it could not be finished.
         #[serde(serialize_with = "text::lossy")]
         file: PathBuf,
         /// Length in seconds.
@@ -105,11 +105,11 @@ pub enum What {
         dropped: u64,
         /// Why the file is not whole, if it is not.
         error: Option<String>,
-        /// What it is worth.
+        /// The verdict.
         #[serde(flatten)]
         verdict: Verdict,
     },
-    /// An episode too short to be used was dropped, as the user asked: its file is gone.
+    /// An episode too short to be used was removed at the user's request.
     Dropped {
         /// The file.
         #[serde(serialize_with = "text::lossy")]
@@ -117,17 +117,17 @@ pub enum What {
         /// Length in seconds.
         seconds: f64,
     },
-    /// The disk of the episode in progress is nearly full; reported once an episode.
+    /// The disk of the episode in progress is nearly full; reported once per episode.
     DiskLow {
         /// The folder.
         #[serde(serialize_with = "text::lossy")]
         folder: PathBuf,
-        /// What is free on its disk, bytes.
+        /// Free space on its disk, bytes.
         free: u64,
-        /// Until the episode will be closed, at the rate it is written with.
+        /// Time until the episode will be closed at the present write rate.
         seconds: u64,
     },
-    /// The wall clock was set. Capture times of an episode in progress stay on the clock it began with.
+    /// The wall clock was set. Capture times of an episode in progress stay on the previous clock.
     ClockStep {
         /// By how much, forward; back if negative.
         seconds: f64,
@@ -137,36 +137,36 @@ pub enum What {
         /// The repaired file.
         #[serde(serialize_with = "text::lossy")]
         file: PathBuf,
-        /// Length of what was recorded, in seconds.
+        /// Length of the recorded data, in seconds.
         seconds: f64,
         /// Messages.
         messages: u64,
         /// Bytes of the unfinished file that are not in the repaired one.
         unread_bytes: u64,
-        /// Chunks left out because they are not what was written.
+        /// Chunks left out because their contents have changed since they were written.
         damaged_chunks: u64,
-        /// What is there and what is lost, for people.
+        /// What was kept and what is lost, for people.
         text: String,
     },
-    /// A policy was loaded and runs from now on.
+    /// A policy was loaded and starts running.
     Policy {
-        /// What its bundle calls itself.
+        /// Name given in its bundle.
         policy: String,
         /// Folder of the bundle.
         #[serde(serialize_with = "text::lossy")]
         folder: PathBuf,
-        /// Names the bundle's contents.
+        /// Identifies the bundle's contents.
         hash: String,
-        /// Where onnxruntime comes from.
+        /// The origin of onnxruntime.
         library: String,
         /// Ticks of its control grid a second.
         hz: f64,
-        /// Nothing is carried out.
+        /// No action is executed.
         dry_run: bool,
     },
-    /// The policy gave actions.
+    /// The policy returned actions.
     Chunk(Box<Chunk>),
-    /// The policy does nothing from this moment on.
+    /// The policy stops acting at this moment.
     Hold(Hold),
     /// The policy acts again, or for the first time.
     Act {
@@ -181,7 +181,7 @@ pub enum What {
         device: String,
         /// Its bit.
         bit: ModalityId,
-        /// May it move now?
+        /// Whether it may move now.
         arming: Arming,
         /// It needs attention.
         is_problem: bool,
@@ -190,7 +190,7 @@ pub enum What {
     },
     /// The input of an emergency stop or an enabling switch has changed, or is lost.
     Stop(StopStatus),
-    /// Another program publishes on a topic of ours; once an episode for each topic and program.
+    /// Another program publishes on a topic of the rig; reported once per episode for each topic and program.
     Publisher {
         /// The topic.
         topic: String,
@@ -199,7 +199,7 @@ pub enum What {
         /// The command line of the process.
         command: String,
     },
-    /// A line of the log that has no event of its own.
+    /// A log line without an event of its own.
     Log {
         /// Severity.
         level: Level,
@@ -208,19 +208,19 @@ pub enum What {
     },
 }
 
-/// Where the samples of one epoch of a modality come from.
+/// The origin of the samples of one epoch of a modality.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Provenance {
     /// The incarnation; every sample's header names it.
     pub epoch: Epoch,
     /// Node, for example `/dev/video0`.
     pub node: String,
-    /// When the unit was attached: one that was started again is still the same attachment.
+    /// When the unit was attached; a restart does not change it.
     pub attached: Stamp,
     /// The unit.
     #[serde(flatten)]
     pub unit: Unit,
-    /// What was agreed with it. The driver is hot-plug's where the open node names none.
+    /// The settings agreed with it. The driver is the one found by hot-plug if the open node names none.
     #[serde(flatten)]
     pub negotiated: Negotiated,
     /// `latency` of the registry's entry, ns.
@@ -228,41 +228,40 @@ pub struct Provenance {
 }
 
 impl What {
-    /// Did an episode end before its time, with a file that is whole all the same?
-    #[must_use]
+    /// Whether an episode ended early, but with a whole file.
     pub fn is_cut_short(&self) -> bool {
         let Self::Episode { file, error: Some(_), .. } = self else { return false };
         file.extension().is_some_and(|extension| extension == "mcap")
     }
 }
 
-/// Digits by which a bundle is distinguished from another.
+/// Number of digits that identify a bundle.
 const HASH: usize = 12;
 
-/// An event as text. Names of devices and files are in it as they are, control characters included.
+/// An event as text. Names of devices and files are included unchanged, with any control characters.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Description {
-    /// How much it matters.
+    /// Its severity.
     pub level: Level,
     /// The device, or the stage.
     pub subject: String,
     /// The bit of the device, if it has one.
     pub bit: Option<ModalityId>,
-    /// What happened, in a word or two.
+    /// The event, in a word or two.
     pub word: &'static str,
-    /// All of it.
+    /// The complete sentence.
     pub sentence: String,
-    /// Where in `sentence` the detail begins.
+    /// Offset in `sentence` at which the detail starts.
     detail: usize,
 }
 
 impl Description {
-    /// A sentence of its own; it begins neither with `subject` nor with `word`.
+    /// An independent sentence that starts with neither `subject` nor `word`.
     fn of(level: Level, subject: &str, word: &'static str, sentence: String) -> Self {
         Self { level, subject: subject.to_owned(), bit: None, word, sentence, detail: 0 }
     }
 
-    /// The sentence "subject word", and behind `joint` the rest.
+    /// The sentence "subject word", followed by `joint` and the rest.
     fn joined(level: Level, subject: &str, word: &'static str, joint: &str, rest: &str) -> Self {
         let mut sentence = format!("{subject} {word}");
         let detail = sentence.len() + joint.len();
@@ -273,7 +272,7 @@ impl Description {
         Self { level, subject: subject.to_owned(), bit: None, word, sentence, detail }
     }
 
-    /// The detail begins behind `prefix`, with which the sentence begins.
+    /// The detail starts after `prefix`, the start of the sentence.
     fn without(self, prefix: &str) -> Self {
         Self { detail: prefix.len(), ..self }
     }
@@ -283,7 +282,6 @@ impl Description {
     }
 
     /// The sentence without `subject` and `word`.
-    #[must_use]
     pub fn detail(&self) -> &str {
         self.sentence.get(self.detail..).unwrap_or_default()
     }
@@ -291,7 +289,6 @@ impl Description {
 
 impl What {
     /// The event as text.
-    #[must_use]
     pub fn describe(&self) -> Description {
         use Description as D;
         match self {
@@ -336,7 +333,7 @@ impl What {
                 let sentence = format!("episode {} dropped; it was {seconds:.1} s long", file.display());
                 D::of(Level::Info, "episode", "dropped", sentence)
             }
-            // Something was lost before this run began.
+            // Data was lost before this run began.
             Self::Recovered { text, .. } => D::of(Level::Warn, "episode", "repaired", text.clone()),
             Self::DiskLow { folder, free, seconds } => {
                 let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
@@ -365,14 +362,13 @@ impl What {
         }
     }
 
-    /// The event as a line of the log. `None` where the event that follows includes it, and for a chunk in time.
-    #[must_use]
+    /// The event as a log line. `None` if the following event includes it, and for a chunk that was on time.
     pub fn log_line(&self) -> Option<(Level, String)> {
         let described = self.describe();
         let is_silent = match self {
-            // The slot's state changes with it and names the source, or what was agreed.
+            // The slot's state changes with it; that event names the source or the agreed settings.
             Self::Detach { .. } | Self::Opened { .. } => true,
-            // A policy gives them all the time.
+            // A policy produces them continuously.
             Self::Chunk(chunk) => chunk.skipped == 0,
             _ => false,
         };
@@ -394,7 +390,7 @@ impl What {
             Some(_) => "not whole",
         };
         let sensors = verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default();
-        // Where an error has made a reason, it includes the error.
+        // If an error caused a reason, the reason includes the error.
         let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
         let why = if why.is_empty() { why } else { format!(": {why}") };
         let (word, file, size) = (verdict.grade.word(), file.display(), text::size(*bytes));
@@ -427,7 +423,7 @@ mod tests {
     use crate::status::SlotState;
 
     #[test]
-    fn a_state_is_a_sentence_of_the_log() {
+    fn a_state_is_a_sentence_in_the_log() {
         let bit = ModalityId::new(1).expect("below 64");
         let state = |state, detail: &str| What::State {
             device: "tactile_tip".into(),

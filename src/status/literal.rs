@@ -1,4 +1,4 @@
-//! Snapshots and boards written down, for tests of screens.
+//! Literal snapshots and boards, for tests of screens.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -38,7 +38,7 @@ pub(crate) fn device(bit: u8, name: &str, state: SlotState, detail: &str) -> Dev
     }
 }
 
-/// A snapshot of these devices, the mask as their states want it.
+/// A snapshot of these devices; the mask follows from their states.
 pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
     let mask = devices.iter().fold(PhysicalMask::EMPTY, |mask, device| {
         mask.with(device.id, matches!(device.state, SlotState::Streaming | SlotState::Stalled))
@@ -98,7 +98,7 @@ pub(crate) fn recording(dropped: u64) -> RecordingStatus {
     }
 }
 
-/// A policy that acts on an arm of four axes and saw the first and the third modality.
+/// A policy that acts on an arm of four axes and observed the first and the third modality.
 pub(crate) fn policy() -> PolicyStatus {
     let axis = |name: &str, value: f64, unit: &str| (name.to_owned(), value, unit.to_owned());
     PolicyStatus {

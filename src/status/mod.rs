@@ -31,7 +31,7 @@ pub use event::{Event, Provenance, What};
 #[cfg(test)]
 pub(crate) mod literal;
 
-/// Makes an enum whose values have words: `word` gives it, and JSON has it.
+/// Creates an enum whose values have words: `word` returns it, and JSON uses it.
 macro_rules! words {
     ($(#[$meta:meta])* $name:ident { $($(#[$of:meta])* $value:ident = $word:literal,)+ }) => {
         $(#[$meta])*
@@ -41,7 +41,6 @@ macro_rules! words {
 
         impl $name {
             /// The word for it, as in JSON.
-            #[must_use]
             pub const fn word(self) -> &'static str {
                 match self {
                     $(Self::$value => $word,)+
@@ -58,22 +57,21 @@ words! {
         /// Not attached.
         #[default]
         Absent = "absent",
-        /// Attached; its first sample has not come.
+        /// Attached; its first sample has not arrived.
         Opening = "opening",
         /// Samples arrive.
         Streaming = "streaming",
         /// Attached and started, but samples have stopped. The mask bit stays.
         Stalled = "stalled",
-        /// Attached; waits before it is started or started again.
+        /// Attached; waiting for a start or restart.
         Backoff = "backoff",
-        /// Attached; given up until it is replugged or restarted by hand.
+        /// Attached; given up until a replug or a manual restart.
         Failed = "failed",
     }
 }
 
 impl SlotState {
-    /// How much a change to it matters.
-    #[must_use]
+    /// Severity of a change to this state.
     pub const fn level(self) -> Level {
         match self {
             Self::Absent | Self::Opening | Self::Streaming => Level::Info,
@@ -98,11 +96,11 @@ pub struct DeviceStatus {
     pub epoch: Epoch,
     /// Node in use and agreed format, or the reason of the state.
     pub detail: String,
-    /// Samples since start.
+    /// Samples since the start of the run.
     pub samples: u64,
-    /// Samples lost between device and bus, as the device or kernel counts them.
+    /// Samples lost between device and bus, as counted by the device or kernel.
     pub gaps: u64,
-    /// Payload bytes since start.
+    /// Payload bytes since the start of the run.
     pub bytes: u64,
     /// Capture time of the newest sample.
     pub newest: Option<Stamp>,
@@ -114,7 +112,7 @@ pub struct RecordingStatus {
     /// The file being written.
     #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
-    /// Since the episode began.
+    /// Time since the episode began.
     pub elapsed: Duration,
     /// Messages written.
     pub messages: u64,
@@ -122,7 +120,7 @@ pub struct RecordingStatus {
     pub bytes: u64,
     /// Samples the recorder lost because its queue overflowed.
     pub dropped: u64,
-    /// While the disk is nearly full: how long until the episode is closed for want of room.
+    /// While the disk is nearly full: time until the episode is closed for lack of disk space.
     pub room: Option<Duration>,
 }
 
@@ -159,32 +157,32 @@ pub struct Snapshot {
     pub rig: String,
     /// When this was taken.
     pub taken: Stamp,
-    /// Since `rapid` started.
+    /// Time since `rapid` started.
     pub uptime: Duration,
     /// The mask as published.
     pub mask: PhysicalMask,
     /// Publications of the mask so far.
     pub mask_sequence: u64,
-    /// One a modality, ascending by bit.
+    /// One per modality, ascending by bit.
     pub devices: Vec<DeviceStatus>,
     /// Emergency stops and enabling switches, in the order of the registry.
     pub stops: Vec<StopStatus>,
     /// The recording in progress.
     pub recording: Option<RecordingStatus>,
-    /// The policy at the controls, if one is.
+    /// The policy in control, if any.
     pub policy: Option<PolicyStatus>,
-    /// The last file finished.
+    /// The last finished file.
     #[serde(serialize_with = "text::lossy_option")]
     pub last_episode: Option<PathBuf>,
     /// The verdict on it.
     pub last_verdict: Option<Verdict>,
-    /// The last episode, while it may be dropped because it is too short to be used.
+    /// The last episode, while it may still be dropped because it is too short to be used.
     pub short_episode: Option<ShortEpisode>,
     /// The newest log lines, oldest first.
     pub log: Vec<LogLine>,
 }
 
-/// What a screen may ask for.
+/// A request from a screen.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Command {
     /// Begin an episode, or end the one in progress.
@@ -197,22 +195,21 @@ pub enum Command {
     Quit,
 }
 
-/// An emergency stop or an enabling switch, as it is now.
+/// The current state of an emergency stop or an enabling switch.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct StopStatus {
     /// Its name.
     pub stop: String,
-    /// What it is.
+    /// Its kind.
     pub kind: StopKind,
     /// The state of its input.
     pub state: InputState,
-    /// Why it is lost; otherwise empty.
+    /// Why its input is lost; otherwise empty.
     pub detail: String,
 }
 
 impl StopStatus {
-    /// It needs attention; a released enabling switch does not.
-    #[must_use]
+    /// Whether it needs attention; a released enabling switch does not.
     pub fn is_problem(&self) -> bool {
         match self.kind {
             StopKind::Emergency => self.state != InputState::Runs,
@@ -220,14 +217,12 @@ impl StopStatus {
         }
     }
 
-    /// What it is doing, in one word.
-    #[must_use]
+    /// Its state, in one word.
     pub const fn word(&self) -> &'static str {
         self.kind.word(self.state)
     }
 
     /// For people.
-    #[must_use]
     pub fn sentence(&self) -> String {
         let (kind, name, word) = (self.kind.label(), &self.stop, self.word());
         let rest = match self.state {
@@ -240,12 +235,12 @@ impl StopStatus {
 }
 
 words! {
-    /// What an episode is worth, as far as its data show.
+    /// The quality of an episode, as far as its data show.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
     Grade {
         /// No defect was found.
         Good = "GOOD",
-        /// Look at it before it is used.
+        /// Check it before use.
         Suspect = "SUSPECT",
         /// Do not use it.
         Bad = "BAD",
@@ -259,28 +254,25 @@ pub struct Verdict {
     /// The word.
     #[serde(rename = "verdict")]
     pub grade: Grade,
-    /// Why it is not GOOD, the gravest first: sentences for people, each with modality, figure and
-    /// limit. Empty exactly if it is GOOD.
+    /// Why it is not GOOD, the most severe first: sentences for people, each with modality, figure and limit. Empty if
+    /// and only if it is GOOD.
     pub reasons: Vec<String>,
-    /// Which sensors took part; unknown (`null`) where the file does not state which were registered.
+    /// Which sensors took part; unknown (`null`) if the file does not state which were registered.
     pub sensors: Option<Sensors>,
 }
 
 impl Verdict {
     /// The reasons in one line; empty for a good episode.
-    #[must_use]
     pub fn why(&self) -> String {
         self.reasons.join("; ")
     }
 
-    /// Has it the same word for the same reasons?
-    #[must_use]
-    pub fn says_as(&self, other: &Self) -> bool {
+    /// Whether it has the same grade for the same reasons.
+    pub fn agrees_with(&self, other: &Self) -> bool {
         (self.grade, &self.reasons) == (other.grade, &other.reasons)
     }
 
     /// `2 of 3 sensors, without tactile_tip`; empty if unknown.
-    #[must_use]
     pub fn sensors(&self) -> String {
         self.sensors.as_ref().map(ToString::to_string).unwrap_or_default()
     }
@@ -308,13 +300,13 @@ impl std::fmt::Display for Sensors {
 /// An episode in progress.
 #[derive(Debug)]
 pub struct Episode {
-    /// The file it is to be once it is finished, an absolute path.
+    /// The path of its finished file, absolute.
     pub file: PathBuf,
-    /// The file that it has become.
+    /// The file, once the episode has ended.
     ended: SetOnce<PathBuf>,
 }
 
-/// The last episode, while it may be dropped because it is too short to be used.
+/// The last episode, while it may still be dropped because it is too short to be used.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ShortEpisode {
     /// Its file.
@@ -324,17 +316,16 @@ pub struct ShortEpisode {
     pub length: Duration,
 }
 
-/// The episode in progress, if there is one, whenever that changes.
+/// The episode in progress, if any; notifies of changes.
 pub type EpisodeWatch = watch::Receiver<Option<Arc<Episode>>>;
 
 impl Episode {
-    /// The episode that will be `file`.
-    #[must_use]
+    /// An episode whose finished file will be `file`.
     pub fn new(file: &Path) -> Self {
         Self { file: absolute(file), ended: SetOnce::new() }
     }
 
-    /// It has become `file`, which may have another name than it was to get. Only the first call counts.
+    /// The episode has ended as `file`, whose name may differ from the intended one. Only the first call counts.
     pub fn end(&self, file: &Path) {
         let _ = self.ended.set(absolute(file));
     }
@@ -345,7 +336,6 @@ impl Episode {
     }
 
     /// Its name: the name of its file without `.mcap`, or `.mcap.partial`.
-    #[must_use]
     pub fn id(&self) -> String {
         let stem = Path::new(self.file.file_stem().unwrap_or_default());
         let is_whole = stem.extension().is_none_or(|extension| extension != "mcap");
@@ -354,13 +344,12 @@ impl Episode {
     }
 
     /// The folder of its file.
-    #[must_use]
     pub fn folder(&self) -> &Path {
         self.file.parent().unwrap_or(Path::new("/"))
     }
 }
 
-/// Without a working folder there is nothing better than the path as it was given.
+/// Without a working folder the path is used as given.
 fn absolute(file: &Path) -> PathBuf {
     std::path::absolute(file).unwrap_or_else(|_| file.to_owned())
 }
@@ -368,31 +357,31 @@ fn absolute(file: &Path) -> PathBuf {
 /// The policy in control, for a screen.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PolicyStatus {
-    /// What its bundle calls itself.
+    /// Name given in its bundle.
     pub name: String,
-    /// Nothing moves: its actions are shown and recorded, and not carried out.
+    /// Nothing moves: its actions are shown and recorded, but not executed.
     pub dry_run: bool,
-    /// The mask it saw last.
+    /// The mask it observed last.
     pub mask: PhysicalMask,
-    /// From the observation to the chunk, ms, of the newest chunk.
+    /// Time from the observation to the newest chunk, ms.
     pub latency_ms: Option<f64>,
-    /// Ticks since the observation that the action follows from.
+    /// Ticks since the observation on which the action is based.
     pub chunk_age: Option<u64>,
     /// The newest action: name, value and unit of each axis.
     pub action: Vec<(String, f64, String)>,
-    /// Why nothing is done, if nothing is.
+    /// Why the policy holds, if it does.
     pub hold: Option<Hold>,
     /// Ticks with an action.
     pub actions: u64,
-    /// Ticks without.
+    /// Ticks without an action.
     pub held: u64,
     /// Chunks that were used.
     pub chunks: u64,
-    /// Answers that were not used or never came.
+    /// Answers that were not used or never arrived.
     pub unused: u64,
 }
 
-/// Why the policy does nothing.
+/// Why the policy holds.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Hold {
     /// The modality whose absence is the reason; as JSON `""` if there is none.
@@ -421,15 +410,15 @@ fn or_empty<S: Serializer>(device: &Option<String>, serializer: S) -> Result<S::
 pub struct PolicyEnd {
     /// Ticks with an action.
     pub actions: u64,
-    /// Ticks without.
+    /// Ticks without an action.
     pub held: u64,
     /// Chunks that were used.
     pub chunks: u64,
-    /// Answers that were not used or never came.
+    /// Answers that were not used or never arrived.
     pub unused: u64,
-    /// From the observation to the chunk, ms: half of them were faster.
+    /// Median time from the observation to the chunk, ms.
     pub latency_p50_ms: f64,
-    /// Of a hundred one was slower.
+    /// 99th percentile of the same.
     pub latency_p99_ms: f64,
 }
 
@@ -437,7 +426,7 @@ impl fmt::Display for PolicyEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { actions, held, chunks, unused, latency_p50_ms, latency_p99_ms } = self;
         write!(f, "{actions} actions, {held} ticks held, {chunks} chunks, {unused} unused")?;
-        // Without a chunk there is nothing to measure.
+        // Without a chunk there is no latency.
         if *chunks + *unused > 0 {
             write!(f, ", latency p50 {latency_p50_ms:.1} ms p99 {latency_p99_ms:.1} ms")?;
         }
@@ -445,36 +434,36 @@ impl fmt::Display for PolicyEnd {
     }
 }
 
-/// The samples of one modality that a chunk was computed from: with the seed of its noise, enough to compute
-/// it again from the recording.
+/// The samples of one modality from which a chunk was computed: together with the noise seed, enough to recompute it
+/// from the recording.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ObservedSamples {
     /// The modality.
     pub modality: String,
-    /// Numbers of its samples, the oldest step first; none where it was absent.
+    /// Sequence numbers of its samples, the oldest step first; empty if it was absent.
     pub seqs: Vec<u64>,
 }
 
-/// A chunk of actions, from what it was computed, and how long that took.
+/// A chunk of actions, its inputs, and its latency.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Chunk {
     /// Tick of its observation on the control grid.
     pub tick: u64,
-    /// When that was, `CLOCK_MONOTONIC` ns.
+    /// Time of that tick, `CLOCK_MONOTONIC` ns.
     pub observed_ns: u64,
-    /// What was present, in JSON `0x05`.
+    /// The modalities present, in JSON `0x05`.
     pub mask: SizedMask,
-    /// Of the noise.
+    /// Seed of the noise.
     pub seed: u64,
     /// From the tick to the answer, ms.
     pub latency_ms: f64,
-    /// Its actions were fit to be used.
+    /// Whether its actions were valid.
     pub used: bool,
-    /// Its actions whose time had passed when it came.
+    /// Number of its actions whose time had passed when it arrived.
     pub skipped: u64,
     /// The samples.
     pub samples: Vec<ObservedSamples>,
-    /// The actions, one after the other, as the policy gave them.
+    /// The actions in order, as the policy returned them.
     pub actions: Vec<f32>,
 }
 

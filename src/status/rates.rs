@@ -1,6 +1,6 @@
-//! Rates: how many samples and bytes a second, from successive snapshots.
+//! Rates: samples and bytes per second, from successive snapshots.
 //!
-//! Invariant: pure; time comes from the snapshots alone.
+//! Invariant: pure; time comes only from the snapshots.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -9,9 +9,9 @@ use super::{DeviceStatus, Snapshot};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::time::Stamp;
 
-/// Rates are means over this long.
+/// Rates are means over this time.
 const WINDOW: Duration = Duration::from_secs(2);
-/// At most this many measurements a window: snapshots in between replace nothing.
+/// Minimum interval between measurements: snapshots in between are ignored.
 const STEP: Duration = Duration::from_millis(250);
 
 /// The counters of the last two seconds.
@@ -32,7 +32,7 @@ struct Point {
 struct Stream {
     samples: u64,
     newest: Stamp,
-    /// When the count was first seen as it is.
+    /// When the count last changed.
     changed: Stamp,
 }
 
@@ -51,18 +51,17 @@ impl Rates {
         }
         let recorded = snapshot.recording.as_ref().map(|recording| (recording.file.clone(), recording.bytes));
         self.window.push_back(Point { taken: snapshot.taken, publications: snapshot.mask_sequence, recorded, streams });
-        // One measurement at or beyond the window's edge stays: the window is never shorter than full.
+        // One measurement at or beyond the window's edge is kept, so that the window is never shorter than full.
         while self.window.get(1).is_some_and(|second| snapshot.taken.since(second.taken) >= WINDOW) {
             self.window.pop_front();
         }
         true
     }
 
-    /// Samples a second of a modality, 0 when none came.
-    #[must_use]
+    /// Samples per second of a modality, 0 if none arrived.
     pub fn samples(&self, id: ModalityId) -> f64 {
         let index = id.index();
-        // A stream that began within the window is counted from its beginning.
+        // A stream that began within the window is counted from its start.
         let begun = self.window.iter().find(|point| point.streams.get(index).is_some_and(|stream| stream.samples > 0));
         let (Some(first), Some(last)) = (begun, self.window.back()) else { return 0.0 };
         let (Some(a), Some(b)) = (first.streams.get(index), last.streams.get(index)) else { return 0.0 };
@@ -70,8 +69,8 @@ impl Rates {
         if count == 0 {
             return 0.0;
         }
-        // From capture time to capture time a regular stream counts exactly; from snapshot to snapshot
-        // the count is off by up to one. But a stream that has stopped must not keep its rate.
+        // Between capture times a regular stream is counted exactly; between snapshots the count is off by up to one.
+        // But a stream that has stopped must not keep its rate.
         let captured = b.newest.since(a.newest);
         let period = captured / u32::try_from(count).unwrap_or(u32::MAX);
         let stopped = last.taken.since(b.changed) > STEP + period * 3;
@@ -79,15 +78,13 @@ impl Rates {
         per_second(count, if regular { captured } else { last.taken.since(first.taken) })
     }
 
-    /// Publications of the mask a second.
-    #[must_use]
+    /// Publications of the mask per second.
     pub fn publications(&self) -> f64 {
         let Some((first, last)) = self.ends() else { return 0.0 };
         per_second(last.publications.saturating_sub(first.publications), last.taken.since(first.taken))
     }
 
-    /// Payload bytes a second into the episode in progress.
-    #[must_use]
+    /// Payload bytes per second written to the episode in progress.
     pub fn recorded(&self) -> f64 {
         let Some(last) = self.window.back() else { return 0.0 };
         let Some((file, bytes)) = &last.recorded else { return 0.0 };
@@ -164,9 +161,9 @@ mod tests {
     }
 
     #[test]
-    fn a_regular_stream_counts_exactly_whenever_one_looks() {
+    fn the_rate_of_a_regular_stream_is_exact_at_any_moment() {
         let mut rates = Rates::default();
-        // 30 Hz, looked at every 67 ms.
+        // 30 Hz, checked every 67 ms.
         for tick in 0..60_u64 {
             let now = 10_000 + tick * 67;
             let samples = now * 30 / 1000;
@@ -179,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_that_stops_fades_to_nothing() {
+    fn the_rate_of_a_stopped_stream_fades_to_zero() {
         let mut rates = Rates::default();
         for now in (10_000_u64..20_000).step_by(250) {
             let end = now.min(12_000);

@@ -18,7 +18,6 @@ pub struct Grid {
 impl Grid {
     /// A grid from `begin` on, tick 0 being `begin` itself. The rate is taken as a whole number of
     /// micro-hertz, at least one: 29.97 means exactly that.
-    #[must_use]
     pub fn new(begin: Stamp, hz: f64) -> Self {
         // A float cast saturates, and NaN becomes 0.
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
@@ -27,7 +26,6 @@ impl Grid {
     }
 
     /// The moment of tick `index`, at most the end of time.
-    #[must_use]
     pub fn tick(&self, index: u64) -> Stamp {
         // Below 2^64 * 2^50: no overflow in 128 bits.
         let offset = u128::from(index) * MICROHERTZ_NS / u128::from(self.microhertz);
@@ -35,7 +33,6 @@ impl Grid {
     }
 
     /// How many ticks lie before `end`.
-    #[must_use]
     pub fn ticks_before(&self, end: Stamp) -> u64 {
         let span = u128::from(end.0.saturating_sub(self.begin.0));
         // The smallest k with floor(k * N / m) >= span is ceil(span * m / N).

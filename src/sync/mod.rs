@@ -74,7 +74,6 @@ struct Lane<T> {
 impl<T> Synchronizer<T> {
     /// A synchroniser with empty rings. `window` is the half width: 25 ms means within +-25 ms. Of
     /// a modality given twice only the first counts.
-    #[must_use]
     pub fn new(modalities: &[SyncModality], window: Duration) -> Self {
         let mut lane_of = [None; MAX_MODALITIES];
         let mut lanes = Vec::with_capacity(modalities.len());
@@ -118,14 +117,12 @@ impl<T> Synchronizer<T> {
     }
 
     /// The last observation.
-    #[must_use]
     pub fn observation(&self) -> &Observation {
         &self.observation
     }
 
     /// The sample a slot of the last observation names, until the next push.
-    #[must_use]
-    pub fn sample(&self, slot: &Slot) -> Option<&SyncSample<T>> {
+    pub fn sample(&self, slot: &ObservationSlot) -> Option<&SyncSample<T>> {
         let lane = self.lanes.get(self.lane_of[slot.id.index()]?)?;
         lane.ring.get(slot.handle?)
     }
@@ -139,7 +136,7 @@ impl<T> Synchronizer<T> {
 }
 
 impl<T> Lane<T> {
-    fn choose(&self, tick: Stamp, now: Stamp, window_ns: u64, slot: &mut Slot) {
+    fn choose(&self, tick: Stamp, now: Stamp, window_ns: u64, slot: &mut ObservationSlot) {
         // The moment a sample stands for.
         let shown = |s: &SyncSample<T>| Stamp(s.capture.0.saturating_sub(self.latency_ns));
         let known = || self.ring.iter().filter(move |(_, s)| s.recv <= now && shown(s) <= now);
@@ -167,9 +164,9 @@ impl<T> Lane<T> {
     }
 }
 
-/// One modality at one tick.
+/// One modality of an observation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Slot {
+pub struct ObservationSlot {
     /// The modality.
     pub id: ModalityId,
     /// Its bit in the mask at the tick.
@@ -178,16 +175,16 @@ pub struct Slot {
     pub valid: bool,
     /// Present, and no sample lies in the window.
     pub stale: bool,
-    /// The tick minus the moment that the sample chosen stands for (its capture time less the
+    /// The tick minus the moment that the chosen sample stands for (its capture time less the
     /// latency of the modality), ns; negative for one after the tick; 0 without a sample.
     pub age_ns: i64,
-    /// Sequence number of the sample chosen. Without one the modality is to be filled with zeros.
+    /// Sequence number of the chosen sample; `None`: the modality must be filled with zeros.
     pub seq: Option<u64>,
-    /// Where the sample chosen lies in its modality's ring; good until the next push.
+    /// Where the chosen sample lies in its modality's ring; good until the next push.
     pub handle: Option<usize>,
 }
 
-impl Slot {
+impl ObservationSlot {
     fn clear(&mut self, present: bool) {
         *self = Self { present, ..Self::empty(self.id) };
     }
@@ -213,7 +210,7 @@ pub struct Observation {
     /// The mask in force at the tick.
     pub mask: PhysicalMask,
     /// One a registered modality, in the order of registration.
-    pub slots: Vec<Slot>,
+    pub slots: Vec<ObservationSlot>,
 }
 
 impl Observation {
@@ -221,13 +218,12 @@ impl Observation {
         Self {
             tick: Stamp::default(),
             mask: PhysicalMask::EMPTY,
-            slots: ids.iter().map(|id| Slot::empty(*id)).collect(),
+            slots: ids.iter().map(|id| ObservationSlot::empty(*id)).collect(),
         }
     }
 
     /// The slot of a modality.
-    #[must_use]
-    pub fn slot(&self, id: ModalityId) -> Option<&Slot> {
+    pub fn slot(&self, id: ModalityId) -> Option<&ObservationSlot> {
         self.slots.iter().find(|slot| slot.id == id)
     }
 }
@@ -252,13 +248,12 @@ pub struct SyncSample<T> {
 pub struct Ring<T> {
     samples: Vec<SyncSample<T>>,
     capacity: usize,
-    /// Where the next sample goes once the ring is full: the oldest one.
+    /// Where the next sample is stored once the ring is full: the oldest one's place.
     next: usize,
 }
 
 impl<T> Ring<T> {
     /// An empty ring of room for `capacity` samples, at least 1.
-    #[must_use]
     pub fn new(capacity: usize) -> Self {
         let capacity = capacity.max(1);
         Self { samples: Vec::with_capacity(capacity), capacity, next: 0 }
@@ -282,7 +277,6 @@ impl<T> Ring<T> {
     }
 
     /// The sample of a handle.
-    #[must_use]
     pub fn get(&self, handle: usize) -> Option<&SyncSample<T>> {
         self.samples.get(handle)
     }

@@ -19,9 +19,9 @@ fn sample(capture_ms: u64, recv_ms: u64, seq: u64, epoch: u32) -> SyncSample<()>
 }
 
 /// A slot in short: present, valid, stale, age in ms, seq.
-type Said = (bool, bool, bool, i64, Option<u64>);
+type ShortSlot = (bool, bool, bool, i64, Option<u64>);
 
-fn check(when_stale: WhenStale, samples: &[SyncSample<()>], tick_ms: u64, now_ms: u64, mask: u64, expected: Said) {
+fn check(when_stale: WhenStale, samples: &[SyncSample<()>], tick_ms: u64, now_ms: u64, mask: u64, expected: ShortSlot) {
     let mut sync = Synchronizer::new(&[modality(0, when_stale)], Duration::from_millis(25));
     for sample in samples {
         sync.push(id(0), *sample);
@@ -116,7 +116,7 @@ fn synchronizer(samples: &[(u8, SyncSample<()>)]) -> Synchronizer<()> {
 }
 
 /// An observation without the handles, which name places in a ring.
-fn report(observation: &Observation) -> Vec<Said> {
+fn report(observation: &Observation) -> Vec<ShortSlot> {
     observation.slots.iter().map(|s| (s.present, s.valid, s.stale, s.age_ns, s.seq)).collect()
 }
 

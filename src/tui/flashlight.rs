@@ -22,7 +22,6 @@ pub struct Flashlight {
 }
 
 /// Whether there is a terminal to use as a light.
-#[must_use]
 pub fn is_available() -> bool {
     writer().is_ok()
 }

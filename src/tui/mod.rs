@@ -56,7 +56,6 @@ pub enum TuiError {
 }
 
 /// Width of the terminal in columns, if there is one.
-#[must_use]
 pub fn columns() -> Option<usize> {
     crossterm::terminal::size().ok().map(|(columns, _)| usize::from(columns))
 }

@@ -110,7 +110,6 @@ pub struct Model {
 
 impl Model {
     /// A screen that starts with this snapshot.
-    #[must_use]
     pub fn new(snapshot: Snapshot) -> Self {
         let mut rates = Rates::default();
         rates.update(&snapshot);
@@ -286,31 +285,26 @@ impl Model {
     }
 
     /// The snapshot to show: the newest, or that of the moment the view was paused.
-    #[must_use]
     pub fn shown(&self) -> &Snapshot {
         self.frozen.as_deref().unwrap_or(&self.latest)
     }
 
     /// Is the view paused?
-    #[must_use]
     pub fn is_paused(&self) -> bool {
         self.frozen.is_some()
     }
 
     /// Is an episode being recorded now, paused or not?
-    #[must_use]
     pub fn is_recording(&self) -> bool {
         self.latest.recording.is_some()
     }
 
     /// Figures of a device.
-    #[must_use]
     pub fn reading(&self, id: ModalityId) -> Reading {
         self.readings.get(id.index()).copied().unwrap_or_default()
     }
 
     /// Has the bit of `id` just changed?
-    #[must_use]
     pub fn edge(&self, id: ModalityId) -> Edge {
         let changed = self.edges.get(id.index()).copied().flatten();
         match changed {
@@ -322,7 +316,6 @@ impl Model {
     }
 
     /// How long a device has been unplugged; `None` if it is not, or was never seen plugged in.
-    #[must_use]
     pub fn unplugged_for(&self, device: &DeviceStatus) -> Option<Duration> {
         let unplugged = self.unplugged.get(device.id.index()).copied().flatten()?;
         let shown = self.shown().taken;
@@ -330,13 +323,11 @@ impl Model {
     }
 
     /// The selected device.
-    #[must_use]
     pub fn selected_device(&self) -> Option<&DeviceStatus> {
         self.shown().devices.get(self.selected)
     }
 
     /// The answer to the last key, while it is fresh.
-    #[must_use]
     pub fn notice(&self) -> Option<&str> {
         self.notice.as_ref().map(|(text, _)| text.as_str())
     }

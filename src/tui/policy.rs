@@ -288,7 +288,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_value_has_the_decimals_there_is_room_for() {
+    fn a_value_has_as_many_decimals_as_fit() {
         let table = [
             (0.0, "0.000"),
             (-0.000_4, "0.000"),

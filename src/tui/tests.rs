@@ -54,7 +54,7 @@ fn draw(model: &Model, (width, height): (u16, u16), theme: Theme) -> TestBackend
     terminal.backend().clone()
 }
 
-/// The style of the first place where `text` stands.
+/// The style at the first occurrence of `text`.
 fn style_of(buffer: &Buffer, text: &str) -> Style {
     let wanted: Vec<String> = text.chars().map(String::from).collect();
     let columns = usize::from(buffer.area.width);
@@ -120,7 +120,7 @@ fn a_short_episode_is_offered_to_be_dropped() {
     model.update(press(KeyCode::Char('x')));
     let screen = draw(&model, (80, 24), THEME);
     assert!(screen.to_string().contains("y deletes 20231114_cube_003.mcap, any other key keeps it"), "{screen}");
-    // The next episode has begun, and ended as it should.
+    // The next episode has begun, and ended normally.
     end.recording = Some(recording(0));
     end.short_episode = None;
     assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("deletes it"));
@@ -230,7 +230,7 @@ fn a_small_terminal_shows_the_required_size() {
     let model = measured(&three_streaming());
     assert_snapshot!("too_small", draw(&model, (40, 8), THEME));
     assert_snapshot!("smallest", draw(&model, (60, 12), THEME));
-    // Not even that fits: still no panic.
+    // Not even that fits; still no panic.
     for size in [(1, 1), (10, 1), (1, 10), (59, 200), (300, 11), (300, 200)] {
         draw(&model, size, THEME);
     }
@@ -288,7 +288,7 @@ fn an_absent_device_shows_since_when() {
     let screen = draw(&model, (80, 24), THEME).to_string();
     assert!(screen.contains("unplugged 3 s ago · /rapid/cam_top"), "{screen}");
     assert!(screen.contains("not plugged in"), "{screen}");
-    // Plugged in again and pulled again: counted from then.
+    // Plugged in and unplugged again: counted from the second unplug.
     later.devices[1].state = SlotState::Streaming;
     model.update(Msg::Snapshot(Box::new(later.clone())));
     later.devices[1].state = SlotState::Absent;
@@ -381,7 +381,7 @@ async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
     let pasted = vec![Ok(Event::Paste("xyxyaa qq".to_owned())), key('x'), key('y'), key('x'), key('x'), key('y')];
     let (sender, mut commands) = mpsc::channel(16);
     let shutdown = CancellationToken::new();
-    // All of it is there at once, before any frame is due.
+    // All of it arrives at once, before any frame is due.
     let events = futures::stream::iter(pasted).chain(futures::stream::iter([key('q')]));
     let events = events.chain(futures::stream::pending());
     let mut asked = false;
@@ -392,7 +392,7 @@ async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
         Ok(())
     });
     let app = async {
-        assert_eq!(commands.recv().await, Some(Command::Quit), "nothing but what was typed last");
+        assert_eq!(commands.recv().await, Some(Command::Quit), "only what was typed last");
         end.cancel();
     };
     let (outcome, ()) = tokio::join!(screen, app);
@@ -401,7 +401,7 @@ async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
 }
 
 #[test]
-fn the_first_stop_that_is_in_the_way_is_in_the_header() {
+fn the_header_shows_the_first_stop_that_prevents_motion() {
     use InputState::{Lost, Runs, Stopped};
     use StopKind::{Emergency, Enabling};
     let stop = |stop: &str, kind, state| StopStatus { stop: stop.into(), kind, state, detail: String::new() };
@@ -427,6 +427,6 @@ fn the_first_stop_that_is_in_the_way_is_in_the_header() {
     }
     let (_, screen) = head(&[pendant(Stopped)], THEME);
     assert_eq!(style_of(screen.buffer(), "STOP pendant").fg, THEME.alarm().fg);
-    // Without a stop nothing is there.
+    // Without a stop nothing is shown.
     assert_eq!(head(&[], THEME).0.matches("stop").count(), 0);
 }

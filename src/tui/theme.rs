@@ -39,7 +39,6 @@ pub struct Theme {
 impl Theme {
     /// The theme for the environment: `NO_COLOR` (<https://no-color.org>), `TERM`, and the locale in
     /// `LC_ALL`, `LC_CTYPE` or `LANG`, the first that is set.
-    #[must_use]
     pub fn detect(variable: impl Fn(&str) -> Option<String>) -> Self {
         let set = |name: &str| variable(name).filter(|value| !value.is_empty());
         let term = set("TERM").unwrap_or_default();
@@ -51,7 +50,6 @@ impl Theme {
     }
 
     /// The same meaning in Unicode or ASCII.
-    #[must_use]
     pub fn symbol(self, unicode: &'static str, ascii: &'static str) -> &'static str {
         match self.charset {
             Charset::Unicode => unicode,
@@ -60,13 +58,11 @@ impl Theme {
     }
 
     /// The mark at the end of a truncated text.
-    #[must_use]
     pub fn ellipsis(self) -> &'static str {
         self.symbol("…", "~")
     }
 
     /// Untrusted text as this terminal may show it.
-    #[must_use]
     pub fn safe(self, foreign: &str) -> String {
         let plain = text::plain(foreign);
         match self.charset {
@@ -76,7 +72,6 @@ impl Theme {
     }
 
     /// Untrusted text in exactly `columns` columns.
-    #[must_use]
     pub fn column(self, foreign: &str, columns: usize) -> String {
         text::left(&self.safe(foreign), columns, self.ellipsis())
     }
@@ -89,43 +84,36 @@ impl Theme {
     }
 
     /// Labels, rules, secondary text.
-    #[must_use]
     pub fn faint(self) -> Style {
         Style::new().add_modifier(Modifier::DIM)
     }
 
     /// Names of panels and keys.
-    #[must_use]
     pub fn title(self) -> Style {
         self.colour(Color::Cyan).add_modifier(Modifier::BOLD)
     }
 
     /// Something that needs the user's attention.
-    #[must_use]
     pub fn warning(self) -> Style {
         self.colour(Color::Yellow).add_modifier(Modifier::BOLD)
     }
 
     /// Something is wrong.
-    #[must_use]
     pub fn alarm(self) -> Style {
         self.colour(Color::Red).add_modifier(Modifier::BOLD)
     }
 
     /// Everything is in order.
-    #[must_use]
     pub fn good(self) -> Style {
         self.colour(Color::Green)
     }
 
     /// An episode is being written.
-    #[must_use]
     pub fn recording(self) -> Style {
         self.alarm()
     }
 
     /// A verdict.
-    #[must_use]
     pub fn grade(self, grade: Grade) -> Style {
         match grade {
             Grade::Good => self.good(),
@@ -135,7 +123,6 @@ impl Theme {
     }
 
     /// A state of a slot.
-    #[must_use]
     pub fn state(self, state: SlotState) -> Style {
         match state {
             SlotState::Streaming => self.colour(Color::Green),
@@ -147,7 +134,6 @@ impl Theme {
     }
 
     /// The symbol of a state, one column.
-    #[must_use]
     pub fn state_symbol(self, state: SlotState) -> &'static str {
         match state {
             SlotState::Streaming => self.symbol("●", "*"),
@@ -160,7 +146,6 @@ impl Theme {
     }
 
     /// A cell of the mask.
-    #[must_use]
     pub fn mask_cell(self, present: bool, edge: Edge) -> Style {
         let filled = match (present, edge) {
             (_, Edge::Recent) => Some(if present { Color::LightYellow } else { Color::LightRed }),
@@ -178,7 +163,6 @@ impl Theme {
     }
 
     /// A line of the log.
-    #[must_use]
     pub fn level(self, level: Level) -> Style {
         match level {
             Level::Debug => self.faint(),
@@ -189,7 +173,6 @@ impl Theme {
     }
 
     /// Lines of a box.
-    #[must_use]
     pub fn border(self) -> border::Set<'static> {
         match self.charset {
             Charset::Unicode => border::ROUNDED,

@@ -41,7 +41,7 @@ fn valid_files_are_accepted() {
 }
 
 #[test]
-fn every_key_arrives() {
+fn every_key_is_parsed() {
     let bundle = valid("every_key");
     assert_eq!((bundle.n_obs_steps, bundle.horizon, bundle.n_action_steps, bundle.action_start), (2, 16, 15, 1));
     assert_eq!((bundle.max_observation_age.as_millis(), bundle.mask_aware, bundle.mask), (250, false, None));
@@ -82,7 +82,7 @@ fn mutated() -> impl Strategy<Value = String> {
 
 proptest! {
     #[test]
-    fn no_text_makes_it_panic(text in mutated()) {
+    fn no_text_causes_a_panic(text in mutated()) {
         if let Err(errors) = Bundle::parse(&text, "policy.json") {
             prop_assert!(!errors.diagnostics.is_empty());
             prop_assert!(!errors.to_string().chars().any(|c| c.is_control() && c != '\n'));

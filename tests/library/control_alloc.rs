@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::support::allocations::allocations;
 use crate::support::motors::motor_spec;
 use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec::{Feedback, MotorStatus, Order, Ranges};
+use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
 use rapid::control::damiao::parameter::{Parameter, Reply, Value};
 use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 use rapid::time::Stamp;
@@ -31,7 +31,7 @@ fn answer(frame: &CanFrame, enabled: &mut [bool; 8]) -> CanFrame {
         return Reply { slave, written: frame.data[2] == 0x55, parameter, value }.encode(master);
     }
     let on = &mut enabled[usize::from(slave)];
-    *on = *frame == Order::Enable.frame(slave) || *on && *frame != Order::Disable.frame(slave);
+    *on = *frame == StateCommand::Enable.frame(slave) || *on && *frame != StateCommand::Disable.frame(slave);
     let status = if *on { MotorStatus::Enabled } else { MotorStatus::Disabled };
     let id = u8::try_from(slave).unwrap();
     let feedback = Feedback { id, status, q: 0.5, dq: 0.0, tau: 0.1, mos: 40, rotor: 41 };

@@ -11,14 +11,15 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::{Driver, DriverError, sim};
 use rapid::modality::ModalityId;
-use rapid::registry::scenario::{SimDevice, SimSource};
 use rapid::registry::{
-    CameraSpec, DeviceNode, DeviceSpec, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, LastReceived, NodeSpec,
-    Parse, PixelFormat, Probe, SerialSpec, UsbSpec, WhenStale,
+    CameraSpec, DeviceSpec, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, PixelFormat, Probe,
+    SerialSpec, UsbSpec, WhenStale,
 };
 use rapid::sample::Encoding;
+use rapid::simulation::{SimDevice, SimSource};
 use rapid::time::Stamp;
 use tokio::io::AsyncWriteExt as _;
 use tokio_serial::{SerialPort as _, SerialStream};

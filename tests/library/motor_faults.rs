@@ -148,8 +148,8 @@ impl Rig {
     }
 }
 
-/// What it came to.
-struct Outcome {
+/// How a scenario ended.
+struct ScenarioResult {
     named_ms: Option<u64>,
     problems: usize,
     fault: Option<(String, u64)>,
@@ -159,7 +159,7 @@ struct Outcome {
     wrong: Vec<String>,
 }
 
-fn play(scenario: &Scenario) -> Outcome {
+fn play(scenario: &Scenario) -> ScenarioResult {
     let Rig { before, arm, target, .. } = &scenario.rig;
     let mut world = World::new(scenario.rig.spec());
     world.play("block 0 1");
@@ -203,7 +203,7 @@ fn play(scenario: &Scenario) -> Outcome {
         let after = i128::from(at.0) - i128::from(begun.0);
         let _ = writeln!(notices, "  {:6} ms  {words}", after / 1_000_000);
     }
-    Outcome {
+    ScenarioResult {
         named_ms: scenario.expect.named.as_ref().and_then(|words| world.named(words, seen)).map(ms),
         problems: world.notices.iter().filter(|(at, notice, _)| *at >= first && notice.is_problem()).count(),
         fault: world.fault(seen).map(|(words, after)| (words.to_owned(), ms(after))),
@@ -215,7 +215,7 @@ fn play(scenario: &Scenario) -> Outcome {
 }
 
 /// What is not as it is to be.
-fn compare(expect: &Expect, outcome: &Outcome) -> Vec<String> {
+fn compare(expect: &Expect, outcome: &ScenarioResult) -> Vec<String> {
     let mut wrong = outcome.wrong.clone();
     match (outcome.named_ms, expect.within_ms) {
         (Some(ms), Some(most)) if ms <= most => {}
@@ -247,7 +247,7 @@ fn compare(expect: &Expect, outcome: &Outcome) -> Vec<String> {
 const LEAST: usize = 30;
 
 #[test]
-fn every_fault_of_the_table_is_named_and_stops_joints_as_they_are_to_stop() {
+fn every_fault_of_the_table_is_named_and_stops_joints_as_configured() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/faults");
     let mut files: Vec<_> =
         fs::read_dir(&folder).expect("the folder").map(|entry| entry.expect("one").path()).collect();
@@ -259,9 +259,9 @@ fn every_fault_of_the_table_is_named_and_stops_joints_as_they_are_to_stop() {
         let name = path.file_stem().and_then(|stem| stem.to_str()).expect("a name").to_owned();
         let text = fs::read_to_string(&path).expect("readable");
         let scenario: Scenario = toml::from_str(&text).unwrap_or_else(|error| panic!("{name}: {error}"));
-        assert!(!scenario.about.is_empty(), "{name}: what is it about?");
+        assert!(!scenario.about.is_empty(), "{name}: no subject");
         let outcome = play(&scenario);
-        let Outcome { named_ms, fault, joints, moved, .. } = &outcome;
+        let ScenarioResult { named_ms, fault, joints, moved, .. } = &outcome;
         let named = named_ms.map_or("-".to_owned(), |ms| ms.to_string());
         let fault = fault.as_ref().map_or("-".to_owned(), |(words, ms)| format!("{ms} ms: {words}"));
         let _ = writeln!(

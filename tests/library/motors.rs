@@ -61,7 +61,7 @@ async fn until(driven: &mut Driven, target: Option<[f64; 2]>, mut done: impl FnM
             }
         }
     };
-    timeout(PATIENCE, work).await.expect("it comes to that");
+    timeout(PATIENCE, work).await.expect("in time");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -139,7 +139,7 @@ async fn one_motor_that_fails_stops_all() {
         let mut driven = open(&adapter);
         driven.motors.order(Asked::Arm).expect("it listens");
         until(&mut driven, Some([0.1, 0.1]), |_, arming| arming == Some(Arming::Armed)).await;
-        adapter.befall(2, fault);
+        adapter.apply(2, fault);
         // A motor that sends nothing leaves no sample to wait for: only notices.
         let faulted = async {
             let mut ticks = interval(Duration::from_millis(20));
@@ -156,7 +156,7 @@ async fn one_motor_that_fails_stops_all() {
         timeout(PATIENCE, faulted).await.unwrap_or_else(|_| panic!("{fault:?} is not noticed"));
         // One that sends nothing receives nothing either.
         adapter.wait_until_off(if fault == Order::Mute(true) { &[1] } else { &[1, 2] });
-        adapter.befall(2, mend);
+        adapter.apply(2, mend);
         let enabled = adapter.count("motor_enabled");
         let begun = Instant::now();
         until(&mut driven, Some([0.1, 0.1]), |_, _| begun.elapsed() > Duration::from_millis(300)).await;

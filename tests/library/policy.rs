@@ -95,7 +95,7 @@ fn close(found: &[f32], expected: &[f64]) {
 }
 
 #[test]
-fn a_chunk_is_as_its_definition_gives_it() {
+fn a_chunk_matches_its_definition() {
     let (_folder, bundle) = bundle(&[]);
     let mut sampler = sampler(&bundle, None);
     let mut observation = observation(&bundle);
@@ -132,7 +132,7 @@ fn nan_is_passed_on_unless_the_mask_marks_the_modality_absent() {
     observation.set_present(1, false);
     let without = chunk(&mut sampler, &observation, 1);
     observation.step_mut(1, 0).unwrap().fill(f32::NAN);
-    assert_eq!(chunk(&mut sampler, &observation, 1), without, "what the mask calls absent does not count");
+    assert_eq!(chunk(&mut sampler, &observation, 1), without, "modalities that the mask calls absent do not count");
     observation.step_mut(0, 0).unwrap()[0] = f32::NAN;
     assert!(chunk(&mut sampler, &observation, 1).iter().all(|value| value.is_nan()));
     // And nothing of it is left in the next chunk.
@@ -141,7 +141,7 @@ fn nan_is_passed_on_unless_the_mask_marks_the_modality_absent() {
 }
 
 #[test]
-fn with_ddpm_the_noise_of_the_steps_is_the_seeds_too() {
+fn with_ddpm_the_noise_of_the_steps_depends_on_the_seed_too() {
     let (_folder, bundle) = bundle(&[Change { what: "\"DDIM\"", with: "\"DDPM\"" }]);
     let mut sampler = sampler(&bundle, Some(20));
     let observation = observation(&bundle);
@@ -151,7 +151,7 @@ fn with_ddpm_the_noise_of_the_steps_is_the_seeds_too() {
 }
 
 #[test]
-fn invalid_or_foreign_graphs_are_rejected_by_name() {
+fn invalid_or_foreign_graphs_are_rejected_and_named() {
     let environment = Environment::open(None).unwrap();
     let error = LoadedGraph::load(&environment, "encoder.onnx", b"no graph", 1).unwrap_err().to_string();
     assert!(error.starts_with("encoder.onnx: onnxruntime cannot load it: "), "{error}");
@@ -170,7 +170,7 @@ fn invalid_or_foreign_graphs_are_rejected_by_name() {
 }
 
 #[test]
-fn numbers_that_do_not_suit_are_refused_by_name() {
+fn numbers_of_the_wrong_shape_are_rejected_and_named() {
     let (_folder, bundle) = bundle(&[]);
     let mut sampler = sampler(&bundle, None);
     let mut observation = observation(&bundle);
@@ -206,7 +206,7 @@ fn chunks_and_plain_pictures_allocate_nothing_once_warm() {
 
 /// Buffers of the decoder: they grow with the picture's width, and do not with what came before.
 #[test]
-fn a_jpeg_costs_the_decoders_buffers_and_no_more() {
+fn a_jpeg_allocates_only_the_buffers_of_the_decoder() {
     let spec = ImageSpec {
         height: SIDE,
         width: SIDE,
@@ -231,7 +231,7 @@ fn a_jpeg_costs_the_decoders_buffers_and_no_more() {
 
 /// Wherever a tensor can be in a model, its numbers must lie in the model: the SHA-256 covers no other file.
 #[test]
-fn a_tensor_whose_numbers_lie_in_another_file_is_refused_by_name_in_every_place() {
+fn a_tensor_with_external_data_is_rejected_and_named_wherever_it_is() {
     // Fields of messages: ModelProto graph 7, training 20, function 25; GraphProto node 1, initializer 5, sparse 15;
     // NodeProto attribute 5; AttributeProto tensor 5, graph 6, tensors 10, graphs 11, sparse 22 and 23;
     // SparseTensorProto values 1, indices 2; FunctionProto node 7, attribute 11; TrainingInfoProto graphs 1 and 2.
@@ -277,7 +277,7 @@ fn a_tensor_whose_numbers_lie_in_another_file_is_refused_by_name_in_every_place(
 }
 
 #[test]
-fn a_model_that_cannot_be_read_to_its_end_is_refused() {
+fn a_truncated_model_is_rejected() {
     let mut cut = onnx::encoder();
     cut.pop();
     let mut ort = onnx::encoder();

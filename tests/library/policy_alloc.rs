@@ -10,7 +10,6 @@ use std::time::Duration;
 
 use crate::support::allocations::allocations;
 use crate::support::onnx::{ACTION, HORIZON, STEPS, write_bundle};
-use rapid::driver::sim::task::layout;
 use rapid::mask::PhysicalMask;
 use rapid::policy::bundle::Bundle;
 use rapid::policy::horizon::{ActionQueue, Situation, WithoutMask};
@@ -22,6 +21,7 @@ use rapid::policy::request::Request;
 use rapid::registry::Registry;
 use rapid::registry::task::PARTS;
 use rapid::sample::{Encoding, FLAG_ERROR, SampleHeader};
+use rapid::simulation::task::layout;
 use rapid::time::Stamp;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -74,7 +74,7 @@ fn samples(registry: &Registry, tick: u64, large: bool, mut take: impl FnMut(usi
 }
 
 #[test]
-fn a_tick_costs_no_allocation() {
+fn a_tick_does_not_allocate() {
     let (_folder, bundle) = bundle();
     let registry = Registry::task();
     let mut pilot = Pilot::new(&bundle, &registry, WithoutMask::Hold, 0);
@@ -118,7 +118,7 @@ fn a_tick_costs_no_allocation() {
 }
 
 #[test]
-fn a_sample_that_is_kept_costs_no_allocation() {
+fn keeping_a_sample_does_not_allocate() {
     let (_folder, bundle) = bundle();
     let registry = Registry::task();
     let mut observer = Observer::new(&bundle, &registry);
@@ -135,7 +135,7 @@ fn a_sample_that_is_kept_costs_no_allocation() {
 }
 
 #[test]
-fn a_step_of_the_horizon_costs_no_allocation_from_the_first_one_on() {
+fn a_step_of_the_horizon_never_allocates() {
     let (_folder, bundle) = bundle();
     let mut queue = ActionQueue::new(&bundle, &Registry::task(), WithoutMask::Hold);
     // Beyond the limits, so that they are held against it.
@@ -166,7 +166,7 @@ fn jpeg(side: u16, color: u8) -> Vec<u8> {
 }
 
 #[test]
-fn an_answer_costs_what_its_pictures_cost_the_decoder() {
+fn an_answer_allocates_only_for_the_decoder_of_its_pictures() {
     const SIDE: u16 = 8;
     let (_folder, bundle) = bundle();
     let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");

@@ -35,7 +35,7 @@ fn every_mistake_is_reported_in_full() {
 }
 
 #[test]
-fn motors_that_keep_moving_for_long_after_a_kill_are_warned_of() {
+fn motors_that_keep_moving_long_after_a_kill_cause_a_warning() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry/valid/can.toml");
     let text = mistakes::read(&path);
     for (timeout, is_warned) in [("200ms", false), ("500ms", false), ("501ms", true), ("10s", true)] {
@@ -62,7 +62,7 @@ fn valid_registries_are_accepted() {
 }
 
 #[test]
-fn defaults_are_those_of_the_documentation() {
+fn defaults_match_the_documentation() {
     let Loaded { registry, warnings } = valid("minimal");
     let device = &registry.devices[0];
     assert_eq!((device.topic.as_str(), device.depth, device.max_bytes), ("/rapid/camera/cam", 60, 640 * 480 * 2));
@@ -79,7 +79,7 @@ fn defaults_are_those_of_the_documentation() {
 }
 
 #[test]
-fn the_table_of_a_serial_line_has_a_name_beside_the_serial_number_and_the_old_one_is_a_warning() {
+fn the_old_name_of_the_table_of_a_serial_line_causes_a_warning() {
     let (present, old) = (valid("tty"), valid("old_serial_table"));
     assert_eq!((present.warnings.as_slice(), &present.registry.devices), (&[][..], &old.registry.devices));
     let [warning] = old.warnings.as_slice() else { panic!("one warning: {:?}", old.warnings) };
@@ -91,7 +91,7 @@ fn the_table_of_a_serial_line_has_a_name_beside_the_serial_number_and_the_old_on
 }
 
 #[test]
-fn modules_arrive_and_are_mounted_by_name() {
+fn modules_are_parsed_and_mounted_by_name() {
     let modules = valid("modules").registry.modules;
     let [get, soft, pinch] = modules.as_slice() else { panic!("three modules") };
     assert_eq!((get.mount.to_string().as_str(), get.devices.as_slice()), ("tip", &["tactile_tip".to_owned()][..]));
@@ -107,7 +107,7 @@ fn modules_arrive_and_are_mounted_by_name() {
 }
 
 #[test]
-fn a_program_and_its_settings_arrive() {
+fn a_program_and_its_settings_are_parsed() {
     let Loaded { registry, warnings } = valid("process");
     assert_eq!(warnings, []);
     let [_, counter, leds, digit] = registry.devices.as_slice() else { panic!("four devices") };
@@ -124,7 +124,7 @@ fn a_program_and_its_settings_arrive() {
 }
 
 #[test]
-fn hooks_arrive_and_one_of_them_may_be_the_node() {
+fn hooks_are_parsed_and_one_of_them_may_be_the_node() {
     let Loaded { registry, warnings } = valid("hooks");
     assert_eq!(warnings, []);
     let [cam, imu] = registry.devices.as_slice() else { panic!("two devices") };
@@ -145,7 +145,7 @@ fn hooks_arrive_and_one_of_them_may_be_the_node() {
 }
 
 #[test]
-fn devices_on_the_network_arrive() {
+fn devices_on_the_network_are_parsed() {
     let Loaded { registry, warnings } = valid("lan");
     assert_eq!(warnings, []);
     let lan = |name: &str| match &registry.named(name).unwrap().node {
@@ -178,7 +178,7 @@ fn devices_on_the_network_arrive() {
 }
 
 #[test]
-fn every_key_arrives() {
+fn every_key_is_parsed() {
     let Loaded { registry, warnings } = valid("every_key");
     assert_eq!(warnings[0].message, "port has no effect beside a serial number: the unit is recognised in every port");
     let [tof, cam] = registry.devices.as_slice() else { panic!("two devices") };
@@ -196,7 +196,7 @@ fn every_key_arrives() {
 }
 
 #[test]
-fn a_bus_and_its_motors_arrive() {
+fn a_bus_and_its_motors_are_parsed() {
     let Loaded { registry, warnings } = valid("can");
     assert_eq!(warnings, []);
     let [bus, line, hand] = registry.devices.as_slice() else { panic!("three devices") };
@@ -251,7 +251,7 @@ fn a_bus_and_its_motors_arrive() {
 }
 
 #[test]
-fn emergency_stops_and_enabling_switches_arrive() {
+fn emergency_stops_and_enabling_switches_are_parsed() {
     let Loaded { registry, warnings } = valid("stops");
     assert_eq!(warnings, []);
     let [pendant, pedal, panel, door, wrist] = registry.stops.as_slice() else { panic!("five stops") };
@@ -277,7 +277,7 @@ fn emergency_stops_and_enabling_switches_arrive() {
 }
 
 #[test]
-fn stops_that_stop_nothing_are_warned_of() {
+fn stops_that_stop_nothing_cause_a_warning() {
     let stop = "[stop.key]\nkind = \"emergency\"\nkey = { device = \"pad\", code = \"KEY_B\" }\n";
     for (name, words) in [("minimal", "the rig has no actuator"), ("actuator", "[device.arm] is moved by a program")] {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/registry/valid/{name}.toml"));
@@ -317,7 +317,7 @@ fn missing_bits_are_the_lowest_free_in_the_order_of_the_file() {
 }
 
 #[test]
-fn depths_shrink_to_the_budget_but_not_those_that_were_written() {
+fn default_depths_shrink_to_the_budget_and_explicit_ones_do_not() {
     let Loaded { registry, warnings } = valid("depths_within_budget");
     assert_eq!(warnings[0].message, "depth lowered from 60 to 38 to keep all topics within memory_budget = 144MiB");
     assert_eq!(warnings.len(), 1);
@@ -336,7 +336,7 @@ fn a_composite_device_may_have_an_entry_for_each_node() {
 }
 
 #[test]
-fn editors_of_other_systems_are_understood() {
+fn files_of_editors_of_other_systems_are_accepted() {
     let text = "\u{feff}[device.cam]\r\nvid = \"046d\"\r\npid = \"0825\"\r\nnode = \"camera\"\r\n";
     assert_eq!(Registry::parse(text, None).unwrap().registry.devices[0].name, "cam");
     let errors = Registry::parse(&format!("{text}tpoic = \"/ü\" # ü\r\n"), None).unwrap_err();
@@ -400,18 +400,18 @@ fn check_any(text: &str) {
 
 proptest! {
     #[test]
-    fn no_text_makes_it_panic(text in any::<String>()) {
+    fn no_text_causes_a_panic(text in any::<String>()) {
         check_any(&text);
         let _ = Scenario::parse(&text, None, &Registry::builtin());
     }
 
     #[test]
-    fn no_damaged_file_makes_it_panic(text in mutated()) {
+    fn no_damaged_file_causes_a_panic(text in mutated()) {
         check_any(&text);
     }
 
     #[test]
-    fn no_value_makes_it_panic(key in "[a-z_.]{1,12}", value in "[-0-9a-zA-Z_.\"'\\[\\]{}=, ]{0,30}") {
+    fn no_value_causes_a_panic(key in "[a-z_.]{1,12}", value in "[-0-9a-zA-Z_.\"'\\[\\]{}=, ]{0,30}") {
         check_any(&format!("{BUILTIN}\n{key} = {value}\n[device.x]\n{key} = {value}\n"));
         let text = format!("repeat = {value}\n[[device]]\n{key} = {value}\n[[event]]\n{key} = {value}\n");
         let _ = Scenario::parse(&text, None, &Registry::builtin());

@@ -17,7 +17,7 @@ const SCHEMAS: [&str; 8] = [
 ];
 
 #[test]
-fn schemas_are_those_of_their_proto_files() {
+fn schemas_match_their_proto_files() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/episode/proto");
     for schema in SCHEMAS {
         let mut compiler = protox::Compiler::new([&folder]).expect("the folder");
@@ -28,7 +28,7 @@ fn schemas_are_those_of_their_proto_files() {
         if std::env::var_os(WRITE).is_some() {
             std::fs::write(&file, &descriptors).expect("written");
         }
-        let again = format!("{WRITE}=1 make one TEST=schemas_are_those_of_their_proto_files");
+        let again = format!("{WRITE}=1 make one TEST=schemas_match_their_proto_files");
         assert!(std::fs::read(&file).is_ok_and(|read| read == descriptors), "{} is old: {again}", file.display());
     }
     let files = std::fs::read_dir(&folder).expect("the folder").flatten();

@@ -120,7 +120,7 @@ fn files() -> Vec<(&'static str, Vec<u8>)> {
 }
 
 #[test]
-fn what_is_held_and_done_for_a_file_is_bounded_by_its_size() {
+fn memory_and_work_for_a_file_are_bounded_by_its_size() {
     let _alone = alone();
     let mut wrong = Vec::new();
     for (name, bytes) in files() {

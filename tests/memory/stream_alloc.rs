@@ -11,18 +11,24 @@
 //!    first loan. So samples are counted in stretches much shorter than a second: a stretch without
 //!    a JSON file and without a thread's first sample has none.
 
+use std::net::{SocketAddr, UdpSocket};
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::task::Poll;
 use std::time::Duration;
 
+use futures::poll;
 use rapid::bus::{Bus, Inbox, TopicId};
+use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
-use rapid::registry::scenario::{Scenario, SimDevice};
-use rapid::registry::{DeviceNode, Registry};
+use rapid::registry::Registry;
+use rapid::registry::scenario::Scenario;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
 use rapid::sample::SampleHeader;
+use rapid::simulation::SimDevice;
 use rapid::status::Board;
 use rapid::time::Stamp;
 use tokio::sync::mpsc;
@@ -73,7 +79,7 @@ const STRETCH: usize = 50;
 const JSON_PERIOD: Duration = Duration::from_secs(1);
 
 #[test]
-fn a_sample_costs_no_allocation() {
+fn a_sample_does_not_allocate() {
     let _alone = alone();
     let registry = Registry::parse(REGISTRY, None).unwrap().registry;
     let scenario = Scenario::parse(SCENARIO, None, &registry).unwrap();
@@ -133,6 +139,52 @@ fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
     });
     assert_eq!(allocated, 0, "{}: allocations for {SAMPLES} samples", spec.name);
     drop((inbox, writer, bus));
+}
+
+#[test]
+fn a_packet_of_the_network_does_not_allocate() {
+    let _alone = alone();
+    let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let text = format!(
+        "[device.lidar]\nnode = \"lan\"\nbit = 0\n[device.lidar.lan]\nprotocol = \"udp\"\nhost = \"127.0.0.1\"\nport = {port}\n"
+    );
+    let registry = Registry::parse(&text, None).unwrap().registry;
+    let address = SocketAddr::from(([127, 0, 0, 1], port));
+    // Behind an adapter, whose link is watched, and found by its address.
+    for node in [DeviceNode::Lan { address, last_received: LastReceived::default() }, DeviceNode::Net("lo".to_owned())]
+    {
+        let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let allocated = runtime.block_on(async {
+            let mut driver = match Driver::open(&registry.devices[0], &node).await {
+                Ok(driver) => driver,
+                // Only root may bind a socket to an interface.
+                Err(error) => {
+                    println!("NOT CHECKED: {}: {error}", node.label());
+                    return 0;
+                }
+            };
+            for number in 0..WARM_UP + SAMPLES {
+                if number == WARM_UP {
+                    COUNT.store(0, Ordering::Relaxed);
+                    COUNTING.store(true, Ordering::Relaxed);
+                }
+                let mut read = pin!(driver.read());
+                // It waits before the packet is there: that is when the link is looked at, too.
+                while poll!(read.as_mut()).is_pending() {
+                    sender.send_to(&[7; 1206], address).unwrap();
+                    tokio::task::yield_now().await;
+                    if let Poll::Ready(reading) = poll!(read.as_mut()) {
+                        assert_eq!(reading.unwrap().bytes.len(), 1206);
+                        break;
+                    }
+                }
+            }
+            COUNTING.store(false, Ordering::Relaxed);
+            COUNT.load(Ordering::Relaxed)
+        });
+        assert_eq!(allocated, 0, "{}: allocations for {SAMPLES} packets", node.label());
+    }
 }
 
 fn whole_rig(registry: &Registry, scenario: Scenario) {

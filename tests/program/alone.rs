@@ -51,7 +51,7 @@ fn run_in(root: &Path, arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn it_is_linked_with_what_every_installation_has() {
+fn the_program_links_only_to_libraries_of_every_installation() {
     let program = Path::new(env!("CARGO_BIN_EXE_rapid"));
     for library in linked_with(program) {
         let name = library.file_name().expect("a name").to_string_lossy();

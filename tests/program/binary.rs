@@ -52,7 +52,7 @@ fn every_signal_that_asks_to_end_finishes_the_file_and_clears_the_mask() {
 }
 
 #[test]
-fn a_killed_run_leaves_a_partial_file_and_the_next_one_starts_cleanly_and_looks_after_it() {
+fn a_killed_run_leaves_a_partial_file_which_the_next_run_repairs() {
     let place = Place::new();
     let running = place.start(&RECORD, "\"event\":\"recording\"");
     running.signal(Signal::KILL);
@@ -80,7 +80,7 @@ fn a_second_rapid_on_the_same_rig_names_the_first() {
 }
 
 #[test]
-fn an_output_folder_that_cannot_be_made_is_reported_before_anything_is_recorded() {
+fn an_output_folder_that_cannot_be_created_is_reported_before_recording() {
     let place = Place::new();
     let output = place.run(&["--sim", "--headless", "--record", "--out", "no/such/folder", "--duration", "1s"]);
     assert_eq!(output.status.code(), Some(2), "{}", text(&output.stderr));
@@ -115,7 +115,7 @@ fn plugged_devices_are_reported_with_any_registry() {
 }
 
 #[test]
-fn a_file_that_is_no_episode_is_a_bad_argument_and_named_once() {
+fn a_file_that_is_not_an_episode_is_a_bad_argument_and_named_once() {
     let place = Place::new();
     place.write("no.mcap", "hello");
     for arguments in [["inspect", "none.mcap"], ["inspect", "no.mcap"], ["replay", "none.mcap"], ["replay", "no.mcap"]]
@@ -164,11 +164,15 @@ fn check_prints_every_entry_or_every_problem() {
 }
 
 #[test]
-fn the_mask_of_a_running_rig_can_be_read_and_of_none_is_an_error() {
+fn the_mask_can_be_read_while_a_rig_runs_and_is_an_error_otherwise() {
     let place = Place::new();
     let none = place.run(&["mask"]);
     assert_eq!(none.status.code(), Some(1));
-    assert!(text(&none.stderr).contains("no rapid runs on this machine"), "{}", text(&none.stderr));
+    assert!(
+        text(&none.stderr).contains("no rapid of this name (--instance) runs on this machine"),
+        "{}",
+        text(&none.stderr)
+    );
     let mut running = place.start(&["--sim", "--headless", "--json"], "\"mask\":\"0x07\"");
     running.wait_for("\"mask\":\"0x05\"");
     let output = place.run(&["mask", "--json"]);
@@ -197,7 +201,7 @@ fn a_closed_reader_does_not_end_the_recording() {
 }
 
 #[test]
-fn help_and_completions_are_there() {
+fn help_and_completions_are_printed() {
     let place = Place::new();
     let help = text(&place.run(&["--help"]).stdout);
     assert!(help.contains("Examples:") && help.contains("rapid --sim"), "{help}");

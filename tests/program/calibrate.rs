@@ -31,7 +31,7 @@ fn printed(output: &Output) -> String {
 }
 
 #[test]
-fn the_latency_of_a_simulated_camera_comes_out() {
+fn the_latency_of_a_simulated_camera_is_measured() {
     let runs: Vec<_> = [0, 35, 120, 410]
         .into_iter()
         .map(|late_ms: u32| {

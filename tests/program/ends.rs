@@ -114,7 +114,7 @@ fn a_panic_ends_a_run_whose_standard_error_is_not_read() {
 }
 
 #[test]
-fn a_panic_in_one_device_is_its_own() {
+fn a_panic_in_one_device_affects_no_other() {
     let place = Place::new();
     let order = place.path("now");
     let log = File::create(place.path("output.txt")).expect("output file");
@@ -178,7 +178,7 @@ fn two_signals_exit_with_130_and_the_file_is_whole() {
 }
 
 #[test]
-fn one_interrupt_while_a_run_ends_by_itself_is_not_two() {
+fn one_interrupt_while_a_run_ends_by_itself_counts_once() {
     let place = Place::new();
     let child = place.command(&[&RECORD[..], &["--duration", "1s"]].concat()).spawn().expect("rapid runs");
     // The run ends because its episode has; its output is waited for as long as no one reads.
@@ -269,7 +269,7 @@ fn the_monitor_gives_the_terminal_back_after_a_panic() {
 }
 
 #[test]
-fn an_output_that_is_full_costs_the_output_and_not_the_episode() {
+fn a_full_output_loses_output_and_not_the_episode() {
     let place = Place::new();
     let full = File::options().write(true).open("/dev/full").expect("/dev/full");
     let mut command = place.command(&[&RECORD[..], &["--duration", "2s"]].concat());

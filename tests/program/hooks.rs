@@ -125,7 +125,7 @@ fn name_of(file: &str) -> &str {
 }
 
 #[test]
-fn a_hook_that_hangs_or_fails_is_reported_and_holds_up_nothing() {
+fn a_hook_that_hangs_or_fails_is_reported_and_delays_nothing() {
     let place = Place::new();
     registry(
         &place,
@@ -143,7 +143,7 @@ fn a_hook_that_hangs_or_fails_is_reported_and_holds_up_nothing() {
     let asleep = std::fs::read_to_string(place.path("asleep.txt")).expect("a process id");
     // One that is not reaped yet has no command line any more.
     let command = std::fs::read(Path::new("/proc").join(asleep.trim()).join("cmdline")).unwrap_or_default();
-    assert!(command.is_empty(), "what it started outlived it: {}", String::from_utf8_lossy(&command));
+    assert!(command.is_empty(), "a child process outlived it: {}", String::from_utf8_lossy(&command));
 
     // The episode was over, and its file closed, before the hook was killed.
     let stamp = |what: &dyn Fn(&Value) -> bool| {

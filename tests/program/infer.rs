@@ -207,7 +207,7 @@ fn a_policy_not_trained_without_a_sensor_holds_until_it_is_back_or_ignored() {
 }
 
 #[test]
-fn a_policy_that_is_none_or_not_for_this_rig_is_refused_by_name() {
+fn an_invalid_policy_or_one_for_another_rig_is_rejected_and_named() {
     let place = Place::new();
     let (code, _, stderr) = infer(&place, "nowhere", "", &[]);
     assert_eq!(code, Some(2), "{stderr}");
@@ -227,7 +227,7 @@ fn a_policy_that_is_none_or_not_for_this_rig_is_refused_by_name() {
 
 /// A device that does not move is no actuator, whatever the registry states.
 #[test]
-fn what_does_not_move_is_refused_before_anything_starts() {
+fn a_device_that_takes_no_actions_is_refused_before_anything_starts() {
     let place = Place::new();
     let still = "[device.arm]\nvid = \"1209\"\npid = \"7a03\"\nnode = \"serial\"\nbit = 2\n[device.arm.tty]\nchannels = 4\n\
                  [device.arm.action]\nnames = [\"x\", \"y\", \"z\", \"grip\"]\nunits = [\"m\", \"m\", \"m\", \"1\"]\n\
@@ -252,7 +252,7 @@ fn what_does_not_move_is_refused_before_anything_starts() {
 
 /// The policy that the program carries fits the simulated task, and reports it on any other rig.
 #[test]
-fn the_policy_inside_is_there_from_any_folder_and_names_the_rig_it_fits() {
+fn the_embedded_policy_is_available_in_any_folder_and_names_the_rig_it_fits() {
     let place = Place::new();
     let arguments = ["--json", "--infer", "--sim", "task", "--duration", "4s", "--record", "--out", "out"];
     let output = place.run(&arguments);

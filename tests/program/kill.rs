@@ -126,7 +126,7 @@ fn check(place: &Place, killed: &Killed, repaired: &Path) {
 }
 
 #[test]
-fn a_killed_episode_is_whole_after_the_next_start_but_for_its_last_second() {
+fn a_killed_episode_is_whole_after_the_next_start_except_for_its_last_second() {
     for moment in [Moment::Grown(2), Moment::Later(3, 200), Moment::Grown(5), Moment::Later(4, 100)] {
         let place = Place::new();
         let killed = kill(&place, moment);

@@ -44,7 +44,7 @@ fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
 }
 
 #[test]
-fn packets_are_samples_as_they_came() {
+fn packets_become_samples_unchanged() {
     let (place, [port]) = (Place::new(), free_ports());
     let entry = format!(
         "{RIG}[device.lidar]\nnode = \"lan\"\nbit = 0\nmax_bytes = \"1KiB\"\n[device.lidar.lan]\nprotocol = \"udp\"\n\

@@ -70,7 +70,7 @@ fn gopro_at(port: u16) -> (Arc<Gopro>, Server) {
 }
 
 #[test]
-fn a_gopro_is_there_while_it_answers() {
+fn a_gopro_is_attached_while_it_answers() {
     let (place, [port]) = (Place::new(), free_ports());
     place.write("devices.toml", &gopro_entry(port, ""));
     let running = place.start(&RUN, "begin");

@@ -98,7 +98,7 @@ fn sixty_four_devices_are_recorded_without_a_hole() {
 }
 
 #[test]
-fn their_topics_reserve_no_more_than_the_memory_budget() {
+fn the_topics_reserve_no_more_than_the_memory_budget() {
     let place = Place::new();
     let registry = Registry::parse(&registry(64), None).expect("accepted").registry;
     assert_eq!(registry.rig.memory_budget, BUDGET);

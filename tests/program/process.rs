@@ -86,7 +86,7 @@ fn wait_for_programs(running: &Running) -> Vec<u32> {
 }
 
 #[test]
-fn a_deaf_program_is_unplugged_at_once_and_killed_later_and_its_successor_waits() {
+fn an_unresponsive_program_is_unplugged_at_once_and_killed_later_and_its_successor_waits() {
     let place = Place::new();
     registry(&place, ", \"--ignore-sigterm\"", "");
     let scenario = "[[event]]\nat = \"3s\"\nunplug = \"counter\"\n[[event]]\nat = \"4s\"\nplug = \"counter\"\n";
@@ -145,7 +145,7 @@ fn a_deaf_program_is_unplugged_at_once_and_killed_later_and_its_successor_waits(
 }
 
 #[test]
-fn plugging_again_and_again_leaves_no_process_no_descriptor_and_no_memory() {
+fn repeated_plugging_leaves_no_process_no_descriptor_and_no_memory() {
     let place = Place::new();
     registry(&place, "", "");
     let scenario = "repeat = \"1500ms\"\n[[event]]\nat = \"1s\"\nunplug = \"counter\"\n[[event]]\nat = \"1200ms\"\nplug = \"counter\"\n";
@@ -167,7 +167,7 @@ fn plugging_again_and_again_leaves_no_process_no_descriptor_and_no_memory() {
 }
 
 #[test]
-fn a_program_that_crashes_again_and_again_fails() {
+fn a_program_that_crashes_repeatedly_fails() {
     let place = Place::new();
     registry(&place, ", \"--crash-after\", \"3\"", "");
     let mut running = place.start(&sim(&place, ""), "\"failed\"");
@@ -232,7 +232,7 @@ fn a_program_without_a_heartbeat_is_stalled_then_started_again() {
 }
 
 #[test]
-fn the_end_of_a_run_waits_for_a_deaf_program_and_a_second_signal_does_not() {
+fn the_end_of_a_run_waits_for_an_unresponsive_program_and_a_second_signal_does_not() {
     for second in [false, true] {
         let place = Place::new();
         registry(&place, ", \"--ignore-sigterm\"", "");
@@ -256,7 +256,7 @@ fn the_end_of_a_run_waits_for_a_deaf_program_and_a_second_signal_does_not() {
 }
 
 #[test]
-fn a_killed_rapid_takes_its_programs_along() {
+fn killing_rapid_ends_its_programs() {
     let place = Place::new();
     registry(&place, ", \"--ignore-sigterm\"", "");
     let running = place.start(&sim(&place, ""), "\"streaming\"");
@@ -268,7 +268,7 @@ fn a_killed_rapid_takes_its_programs_along() {
 }
 
 #[test]
-fn the_file_of_a_device_continues_over_runs() {
+fn the_file_of_a_device_continues_across_runs() {
     let place = Place::new();
     registry(&place, "", "");
     for run in 1..=2 {

@@ -117,7 +117,7 @@ fn an_episode_names_unit_driver_format_controls_latency_registry_and_software() 
 }
 
 #[test]
-fn the_frames_of_an_episode_take_a_late_camera_s_samples_from_later() {
+fn frames_take_samples_of_a_camera_with_latency_from_later() {
     const PERIOD_NS: i64 = 1_000_000_000 / 30;
     let place = Place::new();
     let episode = recorded(&place);

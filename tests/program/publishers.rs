@@ -39,7 +39,7 @@ fn give(port: &Port, seq: u64, encoding: Encoding, payload: &[u8]) {
 }
 
 #[test]
-fn a_second_publisher_gets_nothing_into_an_episode_and_is_named_in_its_verdict() {
+fn a_second_publisher_adds_nothing_to_an_episode_and_is_named_in_its_verdict() {
     let place = Place::new();
     let arguments = ["--sim", "--headless", "--json", "--record", "--out", "out"];
     let running = place.start(&arguments, "\"event\":\"recording\"");

@@ -51,7 +51,7 @@ fn refused(output: &Output) -> String {
 }
 
 #[test]
-fn an_entry_is_added_and_taken_out_and_every_byte_of_the_others_stays() {
+fn adding_and_removing_an_entry_changes_no_byte_of_the_others() {
     let place = place();
     let add = ["register", "--sim", "scenario.toml", "--serial", "SPARE1", "--name", "tactile_left", "--slot", "tip"];
     let dry = ok(&place.run(&[&add[..], &["--dry-run"]].concat()));
@@ -119,7 +119,7 @@ fn json_lists_candidates_and_registered_devices() {
 }
 
 #[test]
-fn the_first_entry_makes_the_file() {
+fn the_first_entry_creates_the_file() {
     let place = Place::new();
     ok(&place.run(&["register", "--vid", "046d", "--pid", "0825", "--name", "cam", "--node", "camera"]));
     let new = text(&place);
@@ -131,7 +131,7 @@ fn the_first_entry_makes_the_file() {
 }
 
 #[test]
-fn a_registry_that_is_wrong_already_is_not_added_to() {
+fn an_invalid_registry_is_not_added_to() {
     let place = Place::new();
     for wrong in ["[device.cam]\nnode = \"camrea\"\n", "[device.cam\n", "[[device]]\nname = \"a\"\n"] {
         place.write("devices.toml", wrong);

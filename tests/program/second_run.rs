@@ -33,7 +33,7 @@ fn record(place: &Place, out: &str, arguments: &[&str]) -> String {
 }
 
 #[test]
-fn a_replay_recorded_again_holds_the_same_samples_at_the_same_distances() {
+fn a_replay_recorded_again_holds_the_same_samples_at_the_same_intervals() {
     let place = Place::new();
     let file = record(&place, "first", &["--sim", "--duration", "9s"]);
     let original = Episode::read(&place.path(&file));

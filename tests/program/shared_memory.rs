@@ -190,7 +190,7 @@ fn fill_up(file: &mut File) {
 }
 
 #[test]
-fn memory_that_another_program_fills_ends_no_run() {
+fn memory_filled_by_another_program_does_not_end_a_run() {
     if !may_mount() {
         return;
     }
@@ -212,7 +212,7 @@ fn memory_that_another_program_fills_ends_no_run() {
 }
 
 #[test]
-fn memory_in_use_that_is_lost_ends_the_run_in_order() {
+fn losing_memory_in_use_ends_the_run_cleanly() {
     if !may_mount() {
         return;
     }
@@ -263,7 +263,7 @@ fn damage(path: &Path, truncate: bool) {
 }
 
 #[test]
-fn tables_of_the_bus_that_are_damaged_end_the_run_in_order_and_the_file_is_named() {
+fn damaged_tables_of_the_bus_end_the_run_cleanly_and_the_file_is_named() {
     for (suffix, truncate) in [
         ("dynamic", true),
         ("dynamic", false),
@@ -295,7 +295,7 @@ fn tables_of_the_bus_that_are_damaged_end_the_run_in_order_and_the_file_is_named
 }
 
 #[test]
-fn files_that_are_removed_during_a_run_are_named_and_the_mask_is_made_again() {
+fn files_removed_during_a_run_are_named_and_the_mask_is_recreated() {
     let place = Place::new();
     let running = place.start_as(after(&place, "exec 2>log", &RECORD), RECORDING);
     std::fs::remove_file(place.mask_file()).expect("the mask");
@@ -303,8 +303,8 @@ fn files_that_are_removed_during_a_run_are_named_and_the_mask_is_made_again() {
     let dynamic = dynamic.expect("a file of the bus");
     std::fs::remove_file(&dynamic).expect("a file of the bus");
     let log = || std::fs::read_to_string(place.path("log")).expect("standard error");
-    let anew = format!("{}: removed or replaced during the run; created again", place.mask_file().display());
-    until("the mask", || log().contains(&anew) && place.mask_file().exists());
+    let recreated = format!("{}: removed or replaced during the run; created again", place.mask_file().display());
+    until("the mask", || log().contains(&recreated) && place.mask_file().exists());
     until("the warning", || log().contains(&format!("{}: removed during the run", dynamic.display())));
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
@@ -318,7 +318,7 @@ fn among_mounts(place: &Place, first: &str, arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn what_is_not_mounted_is_named_with_the_fix() {
+fn a_missing_mount_is_named_with_the_fix() {
     const NO_MEMORY: &str = "mkdir dev && mount -t tmpfs tmpfs dev && cp -a /dev/null /dev/zero /dev/urandom dev && \
                              mount --move dev /dev";
     if !may_mount() {

@@ -50,7 +50,7 @@ const STOP: u8 = 2;
 
 /// A pendant that sends its line 50 times a second.
 struct Pendant {
-    says: Arc<AtomicU8>,
+    sends: Arc<AtomicU8>,
     thread: Option<JoinHandle<()>>,
     path: String,
 }
@@ -64,11 +64,11 @@ impl Pendant {
         unlockpt(&port).expect("a terminal");
         let path = ptsname(&port, Vec::new()).expect("its name").into_string().expect("UTF-8");
         rustix::fs::fcntl_setfl(&port, OFlags::RDWR | OFlags::NONBLOCK).expect("a flag");
-        let says = Arc::new(AtomicU8::new(RUN));
+        let sends = Arc::new(AtomicU8::new(RUN));
         let thread = std::thread::spawn({
-            let says = Arc::clone(&says);
+            let sends = Arc::clone(&sends);
             move || loop {
-                let line: &[u8] = match says.load(Ordering::SeqCst) {
+                let line: &[u8] = match sends.load(Ordering::SeqCst) {
                     RUN => b"RUN\n",
                     STOP => b"STOP\n",
                     SILENT => b"",
@@ -79,17 +79,17 @@ impl Pendant {
                 std::thread::sleep(Duration::from_millis(20));
             }
         });
-        Self { says, thread: Some(thread), path }
+        Self { sends, thread: Some(thread), path }
     }
 
-    fn say(&self, word: u8) {
-        self.says.store(word, Ordering::SeqCst);
+    fn send(&self, word: u8) {
+        self.sends.store(word, Ordering::SeqCst);
     }
 }
 
 impl Drop for Pendant {
     fn drop(&mut self) {
-        self.say(END);
+        self.send(END);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
@@ -126,7 +126,7 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
     let pendant = Pendant::plug();
     place.write("devices.toml", &RIG.replace("PORT", &pendant.path));
     place.write("sim.toml", PULLED);
-    pendant.say(STOP);
+    pendant.send(STOP);
     let arguments = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json", "--arm", "--record"];
     // What comes before the episode begins is not of it.
     let running = place.start(&[&arguments[..], &["--out", "out"]].concat(), "\"event\":\"recording\"");
@@ -138,13 +138,13 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
     assert!(why.contains("emergency stop pendant is pressed: release it, then arm again"), "{why}");
     assert!(!words(&running.reported()).contains(&"arm armed".to_owned()), "{:?}", running.reported());
 
-    pendant.say(RUN);
+    pendant.send(RUN);
     last(&running, "pendant", "runs");
     assert!(!words(&running.reported()).contains(&"arm armed".to_owned()), "{:?}", running.reported());
     assert_eq!(arm(&place), (Some(0), String::new()));
     last(&running, "arm", "armed");
 
-    pendant.say(STOP);
+    pendant.send(STOP);
     last(&running, "arm", "faulted");
     let reported = running.reported();
     let fault = reported.iter().rfind(|event| event["event"] == "actuator").expect("the fault");
@@ -154,17 +154,17 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
     assert!(took(fault).saturating_sub(took(pressed)) < 500_000_000, "{pressed} {fault}");
 
     // Silent: it is lost.
-    pendant.say(RUN);
+    pendant.send(RUN);
     last(&running, "pendant", "runs");
     assert_eq!(arm(&place).0, Some(0));
     last(&running, "arm", "armed");
-    pendant.say(SILENT);
+    pendant.send(SILENT);
     last(&running, "arm", "faulted");
     last(&running, "pendant", "lost");
     assert!(arm(&place).1.contains("pendant is lost"));
 
     // The device of the switch is pulled out: that disarms.
-    pendant.say(RUN);
+    pendant.send(RUN);
     last(&running, "pendant", "runs");
     if words(&running.reported()).last().is_none_or(|word| word != "buttons lost") {
         let (code, why) = arm(&place);

@@ -126,7 +126,7 @@ fn a_run_in_real_time_captures_a_sample_for_every_tick() {
 }
 
 #[test]
-fn trials_are_the_same_again_and_a_fixed_set_of_sensors_ends_those_in_which_one_is_pulled() {
+fn trials_are_reproducible_and_a_fixed_set_of_sensors_ends_those_in_which_one_is_pulled() {
     let place = Place::new();
     let trials = |more: &[&str]| {
         let condition = ["--trials", "2", "--condition", "hot-unplug", "--condition", "hot-replug"];
@@ -153,7 +153,7 @@ fn trials_are_the_same_again_and_a_fixed_set_of_sensors_ends_those_in_which_one_
 }
 
 #[test]
-fn the_expert_knows_the_task_alone_and_reports_it() {
+fn the_expert_supports_only_the_task_and_reports_it() {
     let place = Place::new();
     let refused = |arguments: &[&str]| {
         let output = place.run(arguments);

@@ -180,7 +180,7 @@ fn counted_as_good(place: &Place, folder: &str) -> u64 {
 }
 
 #[test]
-fn no_changed_file_is_good_by_any_way_to_ask() {
+fn no_changed_file_is_reported_good_by_any_command() {
     let place = Place::new();
     let name = good(&place);
     let whole = std::fs::read(place.path("episodes").join(&name)).expect("episode");
@@ -189,7 +189,7 @@ fn no_changed_file_is_good_by_any_way_to_ask() {
     let mut mutants = mutants(&whole, &foreign(50));
     let (same, edits) = edits::edits(&whole, &other);
     let same = inspect::inspect_bytes(&same).expect("an episode");
-    assert_eq!(same.verdict.reasons(), Vec::<&str>::new(), "written once more, it is what it was");
+    assert_eq!(same.verdict.reasons(), Vec::<&str>::new(), "written again, it is unchanged");
     for (name, bytes) in &edits {
         let printed = inspect::inspect_bytes(bytes).map(|printed| printed.verdict.reasons().join("; "));
         println!("{name}: {}", printed.unwrap_or_default());

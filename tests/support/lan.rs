@@ -1,4 +1,4 @@
-//! Devices on the network: servers on 127.0.0.1, the entries that name them, and what a run reports about them.
+//! Devices on the network: servers on 127.0.0.1, their registry entries, and a run's reports about them.
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 
@@ -10,7 +10,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rapid::driver::sim;
-use rapid::registry::scenario::SimSource;
+use rapid::simulation::SimSource;
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -33,7 +33,7 @@ pub(crate) fn free_ports<const N: usize>() -> [u16; N] {
     held.map(|listener| listener.local_addr().expect("an address").port())
 }
 
-/// A server whose connections are each given to `answer`, until it is dropped: then all of them end.
+/// A server that passes each connection to `answer`; dropping it ends all of them.
 pub(crate) struct Server {
     stop: Arc<AtomicBool>,
     connections: Arc<Mutex<Vec<TcpStream>>>,
@@ -47,7 +47,7 @@ impl Server {
 
     pub(crate) fn start_at(address: SocketAddr, answer: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
         let mut listener = None;
-        // The port of a server that was just killed may still be in use for a moment.
+        // The port of a killed server may still be in use for a moment.
         until("the port", || {
             listener = TcpListener::bind(address).ok();
             listener.is_some()
@@ -86,7 +86,7 @@ impl Drop for Server {
     }
 }
 
-/// The path of a request, which is read to its end; `None` of a connection without one.
+/// The path of a request, which is read to its end; `None` for a connection without one.
 pub(crate) fn request(stream: &mut TcpStream) -> Option<String> {
     let mut text = Vec::new();
     while !text.ends_with(b"\r\n\r\n") {
@@ -98,7 +98,7 @@ pub(crate) fn request(stream: &mut TcpStream) -> Option<String> {
     Some(text.lines().next()?.split(' ').nth(1)?.to_owned())
 }
 
-/// A camera that sends pictures 50 times a second, the boundary as most of them write it.
+/// A camera that sends 50 pictures per second, with the boundary in its most common form.
 pub(crate) fn camera(mut stream: TcpStream) {
     if request(&mut stream).is_none() {
         return;
@@ -127,7 +127,7 @@ pub(crate) fn camera_entry(name: &str, bit: u32, port: u16) -> String {
 
 pub(crate) const RIG: &str = "[rig]\ncooldown = \"100ms\"\n";
 
-/// What was reported of a device: its states, and what reported its removals.
+/// The reports about a device: its states, and the sources of its removals.
 pub(crate) fn life(running: &Running, device: &str) -> Vec<String> {
     life_of(&running.reported(), device)
 }
@@ -148,7 +148,7 @@ pub(crate) fn wait_for(running: &Running, device: &str, word: &str, times: usize
     });
 }
 
-/// Ends a run; all that it reported.
+/// Ends a run; returns all its events.
 pub(crate) fn stop(running: Running) -> Vec<Value> {
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();

@@ -1,4 +1,4 @@
-//! Files with mistakes, and beside each the expected message: `NAME.expected`.
+//! Files with mistakes, each with its expected message in `NAME.expected`.
 
 use std::path::{Path, PathBuf};
 
@@ -16,14 +16,14 @@ pub(crate) fn files(folder: &str, extension: &str) -> Vec<PathBuf> {
     files
 }
 
-/// The text of a file, whose name is reported if there is none.
+/// The text of a file; panics with its name if there is none.
 pub(crate) fn read(path: &Path) -> String {
     std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// Each file of `folder` is refused with exactly the text beside it, and each problem has a fix and moves no
-/// cursor. There are `count` files at least, so that none is lost unseen. `refused` gives the message about a
-/// text and its problems; `None` if it is accepted.
+/// Checks that each file of `folder` is refused with exactly the text beside it, and that each problem has a fix and no
+/// control characters. There must be at least `count` files, so that a lost one is noticed. `refused` returns the
+/// message for a text and its problems; `None` if it is accepted.
 pub(crate) fn check(
     folder: &str,
     extension: &str,

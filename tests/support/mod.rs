@@ -1,4 +1,4 @@
-//! What the tests of the binary share: a run of `rapid` with a folder and an instance of its own.
+//! Code shared by the tests of the binary: a run of `rapid` with its own folder and instance.
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
@@ -11,8 +11,8 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-/// How long a condition may take to be met before a test gives up. It is no requirement: a slow
-/// machine only makes the test slow.
+/// How long a test waits for a condition before it gives up. Not a requirement: a slow machine only makes the test
+/// slow.
 pub(crate) const PATIENCE: Duration = Duration::from_mins(3);
 
 /// Waits for a condition.
@@ -40,13 +40,13 @@ pub(crate) fn python() -> PathBuf {
     python
 }
 
-/// A folder and an instance name of a test's own.
+/// A folder and an instance name for one test.
 pub(crate) struct Place {
     pub(crate) folder: tempfile::TempDir,
     pub(crate) instance: String,
 }
 
-/// A run that was killed leaves what it had in shared memory, and no test leaves it to the next run.
+/// A killed run leaves files in shared memory; they must not reach the next run.
 impl Drop for Place {
     fn drop(&mut self) {
         sweep_bus(&self.instance);
@@ -57,7 +57,7 @@ impl Drop for Place {
     }
 }
 
-/// Removes all that programs of an instance have left of their bus.
+/// Removes all files that programs of an instance have left of their bus.
 pub(crate) fn sweep_bus(instance: &str) {
     for folder in ["/dev/shm", BUS_FILES] {
         sweep(Path::new(folder), &format!("iox2_{instance}_"));
@@ -67,14 +67,14 @@ pub(crate) fn sweep_bus(instance: &str) {
 /// Where iceoryx2 keeps the files of nodes and services.
 const BUS_FILES: &str = "/tmp/iceoryx2";
 
-/// Removes files whose name begins so from a folder and those in it, and the folders that held nothing else.
+/// Removes files with this name prefix from a folder and its subfolders, and the folders that contained nothing else.
 fn sweep(folder: &Path, prefix: &str) {
     for path in std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()) {
         if path.is_dir() {
             sweep(&path, prefix);
         } else if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix)) {
             let _ = std::fs::remove_file(&path);
-            // A folder of others' files stays, and so does that of all services.
+            // Folders with other files stay, and so does the folder of all services.
             if folder.parent().is_some_and(|parent| parent.ends_with("nodes")) {
                 let _ = std::fs::remove_dir(folder);
             }
@@ -106,8 +106,8 @@ impl Place {
         PathBuf::from(format!("/dev/shm/rapid_hardware_mask.{}", self.instance))
     }
 
-    /// Names of the bus's files in shared memory that belong to this instance: iceoryx2 begins all of
-    /// them with the prefix that the bus derives from the instance.
+    /// Names of the bus's files in shared memory that belong to this instance: iceoryx2 starts all of them with the
+    /// prefix that the bus derives from the instance.
     pub(crate) fn shared_memory(&self) -> std::collections::BTreeSet<String> {
         let prefix = format!("iox2_{}_", self.instance);
         let names = std::fs::read_dir("/dev/shm").expect("shared memory").flatten();
@@ -117,7 +117,7 @@ impl Place {
             .collect()
     }
 
-    /// `rapid ARGUMENTS` in this place, with output to the caller and no terminal.
+    /// `rapid ARGUMENTS` in this place, with piped output and no terminal.
     pub(crate) fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_rapid"));
         command
@@ -144,7 +144,7 @@ impl Place {
         self.start_as(self.command(arguments), word)
     }
 
-    /// The same for a command that is started in another way.
+    /// The same for a given command.
     pub(crate) fn start_as(&self, mut command: Command, word: &str) -> Running {
         let log = self.path("output.txt");
         let file = std::fs::File::create(&log).expect("output file");
@@ -154,7 +154,7 @@ impl Place {
         running
     }
 
-    /// What the programs of a device printed, over all runs in this place.
+    /// Output of a device's programs, over all runs in this place.
     pub(crate) fn logbook(&self, device: &str) -> String {
         let folder = self.path(".local/state/rapid/logs").join(&self.instance);
         std::fs::read_to_string(folder.join(format!("{device}.log"))).unwrap_or_default()
@@ -170,7 +170,7 @@ impl Place {
     }
 }
 
-/// A run in progress. It is killed when dropped, so that a failing test leaves nothing behind.
+/// A run in progress. Dropping it kills it, so that a failing test leaves nothing behind.
 pub(crate) struct Running {
     child: Option<Child>,
     log: PathBuf,
@@ -185,7 +185,7 @@ impl Running {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 
-    /// The events so far of a run with `--json`. A line that is half written is none yet.
+    /// The events so far of a run with `--json`. An incomplete line is ignored.
     pub(crate) fn reported(&self) -> Vec<serde_json::Value> {
         events(self.output().rsplit_once('\n').map_or("", |(whole, _)| whole))
     }
@@ -205,7 +205,7 @@ impl Running {
         rustix::process::kill_process(pid, signal).expect("signal");
     }
 
-    /// Waits for the end: exit code, standard output, standard error.
+    /// Waits for the end; returns exit code, standard output and standard error.
     pub(crate) fn end(mut self) -> (Option<i32>, String, String) {
         let child = self.child.take().expect("running");
         let output = child.wait_with_output().expect("wait");
@@ -231,19 +231,19 @@ pub(crate) fn events(output: &str) -> Vec<serde_json::Value> {
         .collect()
 }
 
-/// The exit code of a headless run that recorded and did what it was asked, by what it printed: 4 if an episode is BAD.
+/// The exit code of a headless run that recorded successfully, from its output: 4 if an episode is BAD.
 #[allow(clippy::unnecessary_wraps, reason = "as an exit status gives it")]
 pub(crate) fn recorded_code(output: &str) -> Option<i32> {
     let is_bad = output.lines().any(|line| line.contains("\"verdict\":\"BAD\"") || line.starts_with("BAD "));
     Some(if is_bad { 4 } else { 0 })
 }
 
-/// Texts of the log that hold `words`.
+/// Texts of the log that contain `words`.
 pub(crate) fn logged<'a>(events: &'a [serde_json::Value], words: &str) -> Vec<&'a str> {
     events.iter().filter_map(|event| event["text"].as_str()).filter(|text| text.contains(words)).collect()
 }
 
-/// The content of a recorded episode, read by the mcap crate.
+/// The contents of a recorded episode, read with the mcap crate.
 pub(crate) struct Episode {
     pub(crate) metadata: Vec<mcap::records::Metadata>,
     /// Topics that have a channel, with or without messages.
@@ -315,8 +315,8 @@ impl Message {
         T::decode(self.data.as_slice()).unwrap_or_else(|error| panic!("{}: {error}", self.topic))
     }
 
-    /// The bytes of a sample as its device gave them: of a picture, of a vector of numbers and of
-    /// what was not looked into, field 2.
+    /// The bytes of a sample as received from its device: of a picture, of a vector of numbers, or of raw bytes, field
+    /// 2.
     pub(crate) fn payload(&self) -> Vec<u8> {
         self.decode::<SampleMessage>().payload
     }
@@ -366,8 +366,8 @@ pub(crate) struct EventMessage {
     pub(crate) json: String,
 }
 
-/// What `foxglove.CompressedImage`, `rapid.Scalars` and `rapid.Bytes` have in common; packed doubles
-/// are little-endian bytes.
+/// The common fields of `foxglove.CompressedImage`, `rapid.Scalars` and `rapid.Bytes`; packed doubles are little-endian
+/// bytes.
 #[derive(Clone, PartialEq, prost::Message)]
 struct SampleMessage {
     #[prost(bytes = "vec", tag = "2")]

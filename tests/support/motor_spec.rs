@@ -1,10 +1,10 @@
-//! The entry of a bus of motors, which those who drive one change as they need it.
+//! The entry of a bus of motors, which tests modify as needed.
 
 use std::time::Duration;
 
 use rapid::registry::{BrakeSpec, DamiaoSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
 
-/// A motor in MIT mode that listens to `slave` and answers with 0x10 more.
+/// A motor in MIT mode with the slave id `slave` that answers with 0x10 more.
 pub(crate) fn motor(slave: u16) -> MotorSpec {
     MotorSpec {
         name: format!("joint_{slave}"),
@@ -16,7 +16,7 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
         velocity: 20.0,
         torque: 5.0,
         slew: 5.0,
-        // How a joint starts has tests of its own.
+        // Other tests cover how a joint starts.
         motion: MotionSpec { acceleration: f64::INFINITY, soft_start: Duration::ZERO, first_target: 100.0 },
         watch: WatchSpec::default(),
         stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
@@ -26,7 +26,7 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
     }
 }
 
-/// A brake of its own, which takes some time.
+/// A brake with engaging and releasing times.
 #[allow(dead_code, reason = "not every test has one")]
 pub(crate) fn brake(line: u16) -> BrakeSpec {
     let ms = Duration::from_millis;

@@ -1,6 +1,6 @@
 //! The state machine of motors, simulated motors with bodies, and a judge who sees every frame; in virtual time.
 //!
-//! A world is driven by lines: those about motors of the emulator's script (`vbench::emu::order`, device 0), and
+//! A world is controlled by lines: the emulator's orders for motors (`vbench::emu::order`, device 0), and
 //!
 //! ```text
 //! arm   disarm   stop               what an operator orders, or the end of the program
@@ -15,7 +15,7 @@
 //! stuck 0|1                         brakes stay as they are, at any level of their lines
 //! ```
 //!
-//! MOTOR counts from 1, as its id does.
+//! MOTOR counts from 1, like its id.
 
 #![allow(dead_code, reason = "tests and the bench each use a part")]
 #![allow(clippy::cast_possible_truncation, reason = "numbers of scenarios, and ids of 11 bits")]
@@ -39,29 +39,29 @@ use vbench::emu::can::motor::Motor;
 use vbench::emu::can::registers::Type;
 use vbench::emu::order::{self, Order};
 
-/// Between two steps of the program.
+/// Time between two steps of the program.
 pub(crate) const CYCLE: Duration = Duration::from_millis(5);
-/// Between two actions.
+/// Time between two actions.
 const ACTIONS: Duration = Duration::from_millis(100);
-/// What motors of the kind count in: PMAX, VMAX, TMAX.
+/// Ranges of motors of this kind: PMAX, VMAX, TMAX.
 const RANGES: [f64; 3] = [12.5, 30.0, 10.0];
-/// A motor that can receive is off this long after nothing allows it to be on.
+/// A motor that can receive is off this soon after nothing allows it to be on.
 const OFF_WITHIN: Duration = Duration::from_millis(50);
-/// A joint is stopped in its way this long after a fault.
+/// A joint is stopped in its configured way this soon after a fault.
 const KIND_WITHIN: Duration = Duration::from_millis(20);
 
-/// What a program has to go by in a cycle.
+/// Inputs of a program in a cycle.
 pub(crate) struct Input<'a> {
-    /// What came from the bus.
+    /// Frames received from the bus.
     pub(crate) frames: &'a [CanFrame],
-    /// The action that came.
+    /// The received action.
     pub(crate) action: Option<&'a [f64]>,
-    /// A disarm was ordered, at any time.
+    /// A disarm was ordered at any time.
     pub(crate) is_disarmed: bool,
     pub(crate) now: Stamp,
 }
 
-/// A program that drives the motors in place of the state machine: the frames that it sends in a cycle.
+/// A program that drives the motors instead of the state machine: returns the frames that it sends in a cycle.
 pub(crate) type Program = Box<dyn FnMut(&Input<'_>) -> Vec<CanFrame>>;
 
 /// See the module's comment.
@@ -70,14 +70,14 @@ pub(crate) struct World {
     pub(crate) motors: Vec<Motor>,
     pub(crate) spec: DamiaoSpec,
     pub(crate) now: Stamp,
-    /// When it was reported, and its words.
+    /// Each notice with its time and text.
     pub(crate) notices: Vec<(Stamp, Notice, String)>,
     pub(crate) judge: Judge,
     /// Drives the motors from now on, without a judge.
     pub(crate) instead: Option<Program>,
-    /// The target that is followed.
+    /// The current target.
     pub(crate) followed: Option<Vec<f64>>,
-    /// What reaches the program with its next cycle.
+    /// Frames that reach the program in its next cycle.
     arriving: Vec<CanFrame>,
     target: Option<Vec<f64>>,
     action_due: Stamp,
@@ -85,63 +85,63 @@ pub(crate) struct World {
     killed: Option<Stamp>,
     brakes: Brakes,
     are_brakes_stuck: bool,
-    /// Of each joint, whether its brake lets it turn, and since when its line is set otherwise.
+    /// For each joint, whether its brake lets it turn, and since when its line has the other level.
     turns: Vec<(bool, Option<Stamp>)>,
     damage: Vec<(usize, usize, f64)>,
 }
 
-/// What must never happen, by frames, by the motors themselves, and by what was ordered.
+/// Conditions that must never occur, judged by frames, by the motors themselves, and by the orders.
 #[derive(Default)]
 #[expect(clippy::struct_excessive_bools, reason = "each is a fact of its own")]
 pub(crate) struct Judge {
-    /// What was seen of it.
+    /// The violations seen.
     pub(crate) wrong: Vec<String>,
     pub(crate) axes: Vec<Axis>,
-    /// An arm was asked for, and nothing ended it since.
+    /// An arm was ordered, and nothing has ended it since.
     may_move: bool,
-    /// It was, and no disarm came since: a joint may be kept from falling.
+    /// An arm was ordered, and no disarm came since: a joint may be kept from falling.
     may_keep: bool,
     stopped: bool,
     was_armed: bool,
 }
 
-/// What a motor was sent and what it answered.
+/// The commands to a motor and its answers.
 #[derive(Clone, Default)]
 #[expect(clippy::struct_excessive_bools, reason = "each is a fact of its own")]
 pub(crate) struct Axis {
-    /// Its newest positions that arrived, the newest last, rad.
+    /// Its newest received positions, the newest last, rad.
     reported: Vec<f64>,
     /// Its newest velocity, rad/s.
     pub(crate) velocity: f64,
     /// The newest command: rad or rad/s.
     pub(crate) command: Option<(f64, Stamp)>,
-    /// What the newest MIT frame asks for at its newest position, Nm.
+    /// The torque requested by the newest MIT frame at its newest position, Nm.
     pub(crate) torque: f64,
-    /// Commands that are where the joint is, because it is being enabled.
+    /// Number of commands that may equal the joint's position, because it is being enabled.
     enabling: u8,
-    /// The newest frame is one that damps.
+    /// The newest frame is a damping one.
     is_damped: bool,
     /// It neither receives nor answers.
     pub(crate) is_deaf: bool,
-    /// Another program commands it after the end of ours.
+    /// Another program commands it after ours has ended.
     is_foreign: bool,
     /// Since when nothing has allowed it to be on.
     forbidden: Option<Stamp>,
-    /// How it is to be stopped, by when.
+    /// How it must be stopped, and by when.
     kind: Option<(Stop, Stamp)>,
-    /// It is stopping by its brake.
+    /// It is stopping with its brake.
     brakes: bool,
 }
 
 impl Axis {
-    /// Its newest position that arrived, rad.
+    /// Its newest received position, rad.
     pub(crate) fn position(&self) -> Option<f64> {
         self.reported.last().copied()
     }
 }
 
 impl World {
-    /// Motors that listen to 1, 2, ... and have a body, none of which has answered yet.
+    /// Motors with the slave ids 1, 2, ... and a body; none has answered yet.
     pub(crate) fn new(spec: DamiaoSpec) -> Self {
         let now = Stamp(1_000_000_000_000);
         let kind = Type::named("DM4310").expect("the emulator knows it");
@@ -172,7 +172,7 @@ impl World {
         world
     }
 
-    /// Lets so many milliseconds pass.
+    /// Advances this many milliseconds.
     pub(crate) fn run(&mut self, ms: u64) {
         let until = self.now.after(Duration::from_millis(ms));
         while self.now < until {
@@ -180,7 +180,7 @@ impl World {
         }
     }
 
-    /// Waits until the motors have answered, and arms them, with the joints held from outside until they hold themselves.
+    /// Waits until the motors have answered, and arms them; joints are held from outside until they hold themselves.
     ///
     /// # Panics
     /// When they are not armed within a second.
@@ -201,7 +201,7 @@ impl World {
     /// Executes a line.
     ///
     /// # Panics
-    /// When it sends nothing.
+    /// When the line has no effect.
     pub(crate) fn play(&mut self, line: &str) {
         let words: Vec<&str> = line.split_whitespace().collect();
         let number = |at: usize| words.get(at).and_then(|word| word.parse::<f64>().ok()).expect(line);
@@ -242,7 +242,7 @@ impl World {
                 bytes[4..].copy_from_slice(&(whole(3) as u32).to_le_bytes());
                 let now = self.now.0;
                 for motor in &mut self.motors {
-                    let _unheard = motor.hear(&Frame::data(0x7ff, bytes), now);
+                    let _no_answer = motor.receive(&Frame::data(0x7ff, bytes), now);
                 }
             }
             ["chip", flag] => {
@@ -251,20 +251,20 @@ impl World {
             }
             ["stuck", flag] => self.are_brakes_stuck = flag == "1",
             ["damage", ..] => self.damage.push((whole(1) - 1, whole(2), number(3))),
-            _ => self.befall(line),
+            _ => self.apply_line(line),
         }
     }
 
-    fn befall(&mut self, line: &str) {
+    fn apply_line(&mut self, line: &str) {
         let mut words = line.split_whitespace();
         let (target, order) = words.next().and_then(|name| order::parse(name, &mut words)).expect(line);
         for (motor, axis) in self.motors.iter_mut().zip(&mut self.judge.axes) {
             if target.motor.is_none_or(|wanted| u32::from(wanted) == motor.slave()) {
-                motor.befall(order, self.now.0);
+                motor.apply(order, self.now.0);
                 match order {
                     Order::Mute(is_deaf) => axis.is_deaf = is_deaf,
                     Order::Power(is_powered) => axis.is_deaf = !is_powered,
-                    // It turns itself off.
+                    // The motor disables itself.
                     Order::Fault(_) | Order::Hot(_) => {}
                     _ => continue,
                 }
@@ -277,8 +277,8 @@ impl World {
         self.arriving.push(CanFrame::standard(id, bytes));
         let frame = Frame::data(id, bytes);
         for (motor, axis) in self.motors.iter_mut().zip(&mut self.judge.axes) {
-            if let Some(answer) = motor.hear(&frame, self.now.0) {
-                // Who turned it on, or off, is another.
+            if let Some(answer) = motor.receive(&frame, self.now.0) {
+                // Another program enabled or disabled it.
                 (axis.forbidden, axis.kind) = (None, None);
                 axis.is_foreign = self.judge.stopped;
                 self.arriving.push(CanFrame::standard(answer.id as u16, answer.padded()));
@@ -286,11 +286,11 @@ impl World {
         }
     }
 
-    /// A frame of the program reaches the motors.
+    /// Delivers a frame of the program to the motors.
     fn deliver(&mut self, frame: &CanFrame) {
         let sent = Frame::data(frame.id as u16, frame.data);
         for motor in &mut self.motors {
-            if let Some(answer) = motor.hear(&sent, self.now.0) {
+            if let Some(answer) = motor.receive(&sent, self.now.0) {
                 self.arriving.push(CanFrame::standard(answer.id as u16, answer.padded()));
             }
         }
@@ -375,12 +375,12 @@ impl World {
             let takes = if is_released { brake.releases_in } else { brake.engages_in };
             if *turns != is_released && since.is_some_and(|since| self.now.since(since) >= takes) {
                 (*turns, *since) = (is_released, None);
-                self.motors[index].befall(Order::Block(!is_released), self.now.0);
+                self.motors[index].apply(Order::Block(!is_released), self.now.0);
             }
         }
     }
 
-    /// What the guard of a killed program sends. A program that is no machine of ours has none.
+    /// The frames that the guard of a killed program sends. A program other than ours has none.
     fn guard(&mut self) {
         let Some(killed) = self.killed.filter(|_| self.instead.is_none()) else { return };
         let is_late = self.now.since(killed) + BrakeSpec::SLOWEST >= KEEP_FOR;
@@ -388,16 +388,16 @@ impl World {
         self.drive_brakes(self.brakes.released & !engages);
         let mut will: Vec<CanFrame> = self.bus.last_will().into_iter().flatten().collect();
         if self.now.since(killed) >= KEEP_FOR {
-            will = self.spec.motors.iter().map(|motor| codec::Order::Disable.frame(motor.slave)).collect();
+            will = self.spec.motors.iter().map(|motor| codec::StateCommand::Disable.frame(motor.slave)).collect();
         }
         for frame in will {
             self.deliver(&frame);
         }
-        // The program reads no answer.
+        // The program no longer reads answers.
         self.arriving.clear();
     }
 
-    /// A frame reaches the program.
+    /// Delivers a frame to the program.
     fn arrive(&mut self, frame: &mut CanFrame) {
         if Reply::decode(frame).is_none() {
             let sender = self.spec.motors.iter().position(|motor| u32::from(motor.master) == frame.id);
@@ -419,7 +419,7 @@ impl World {
         }
     }
 
-    /// A cycle of a program that is in place of the state machine.
+    /// A cycle of a program that replaces the state machine.
     fn cycle_instead(&mut self) {
         let frames = std::mem::take(&mut self.arriving);
         let is_due = self.now >= self.action_due && self.target.is_some();
@@ -434,19 +434,19 @@ impl World {
         }
     }
 
-    /// How a joint is stopped, or that it is not.
+    /// How a joint is stopped, if it is.
     pub(crate) fn kind(&self, motor: usize) -> &'static str {
         if !self.motors[motor].is_on() {
             return "limp";
         }
         if self.killed.is_some() {
-            // Its guard sends this alone.
+            // Its guard sends only this.
             let frame = self.bus.last_will().and_then(|mut will| will.nth(motor)).expect("it is on");
             let damps = frame.id == self.motors[motor].slave() && Mit::decode(frame.data, RANGES).kp == 0.0;
             return if damps { "damp" } else { "hold" };
         }
         match self.bus.state() {
-            // It continues as it was commanded last.
+            // It continues with its last command.
             _ if self.judge.axes[motor].is_deaf => "on",
             BusState::Following => "follow",
             BusState::Faulted(_) if self.judge.axes[motor].is_damped => "damp",
@@ -455,13 +455,13 @@ impl World {
         }
     }
 
-    /// The first notice since `since` with these words, and how long after.
+    /// The first notice since `since` with these words: how long after.
     pub(crate) fn named(&self, words: &str, since: Stamp) -> Option<Duration> {
         let found = self.notices.iter().find(|(at, _, text)| *at >= since && text.contains(words));
         found.map(|(at, ..)| at.since(since))
     }
 
-    /// The first fault since `since`, in words, and how long after.
+    /// The first fault since `since`: its text, and how long after.
     pub(crate) fn fault(&self, since: Stamp) -> Option<(&str, Duration)> {
         let is_fault = |notice: &Notice| matches!(notice, Notice::Fault(_));
         let found = self.notices.iter().find(|(at, notice, _)| *at >= since && is_fault(notice));
@@ -486,7 +486,7 @@ impl Judge {
         }
     }
 
-    /// A frame of the program.
+    /// Examines a frame of the program.
     fn look(&mut self, frame: &CanFrame, spec: &DamiaoSpec, now: Stamp) {
         if self.stopped {
             self.note(now, &format!("{frame:x?} after a stop"));
@@ -499,7 +499,7 @@ impl Judge {
         let mut wrong = Vec::new();
         if place == 0 && frame.data.starts_with(&[0xff; 7]) {
             (axis.command, axis.is_damped, axis.torque) = (None, false, 0.0);
-            // That with the order, and the first one after the motor reports that it is enabled.
+            // The command with the order, and the first one after the motor reports that it is enabled.
             axis.enabling = if frame.data[7] == 0xfc { 2 } else { 0 };
             if frame.data[7] == 0xfc && !self.may_move {
                 wrong.push("it is enabled without an arm".to_owned());
@@ -558,7 +558,7 @@ impl Judge {
             for (at, (axis, motor)) in self.axes.iter_mut().zip(motors).enumerate() {
                 let stop = spec.motors[at].stop;
                 let kind = if Some(at) == own { stop.own_fault } else { stop.other_fault };
-                // A motor stopped before stays so; one that is off, or does not receive, cannot be kept.
+                // A motor that was stopped before stays so; one that is off, or does not receive, cannot be held.
                 if place == 0 && self.was_armed && motor.is_on() && !axis.is_deaf && self.may_keep {
                     axis.kind = Some((kind, now.after(KIND_WITHIN)));
                     axis.brakes = kind == Stop::Brake;
@@ -574,11 +574,11 @@ impl Judge {
         self.judge_joints(motors, spec, now);
     }
 
-    /// No joint that stops by its brake is let go before that holds it.
+    /// Checks that a joint that stops with its brake is held until the brake is engaged.
     fn judge_brakes(&mut self, let_go: &[bool], are_stuck: bool, spec: &DamiaoSpec, now: Stamp) {
         for (at, motor) in spec.motors.iter().enumerate().filter(|(_, motor)| motor.brake.is_some()) {
             let axis = &mut self.axes[at];
-            // A disarm lets go at once, and who turns itself off is not asked.
+            // A disarm releases at once, and a motor that disables itself cannot be held.
             let is_braking = axis.brakes && self.may_keep && !axis.is_deaf && !are_stuck;
             if is_braking && let_go[at] && axis.command.is_none() && motor.stop.hold_for.is_none() {
                 axis.brakes = false;
@@ -605,7 +605,7 @@ impl Judge {
                     Stop::Brake => Stop::Hold,
                     kind => kind,
                 };
-                // A motor that disabled itself by then is no fault of the program.
+                // A motor that disabled itself by then is not the program's mistake.
                 if is != expected && !(is == Stop::Limp && axis.command.is_none()) {
                     wrong.push(format!("{name} stops {is:?} and not {expected:?}"));
                 }
@@ -624,7 +624,7 @@ impl Judge {
 }
 
 impl Axis {
-    /// What is wrong with a command.
+    /// The violation of a command.
     fn judge_command(&mut self, value: f64, kp: f64, motor: &rapid::registry::MotorSpec, now: Stamp) -> Option<String> {
         const ROUNDING: f64 = 2.0 * 25.0 / 65_535.0;
         if motor.mode == MotorMode::Velocity {

@@ -1,5 +1,5 @@
-//! Motors on a serial line: the simulated motors of the virtual bench behind an adapter of Damiao's or one that uses
-//! slcan, on a pseudo-terminal.
+//! Motors on a serial line: the simulated motors of the virtual bench behind a Damiao or slcan adapter, on a
+//! pseudo-terminal.
 
 #![allow(dead_code, reason = "each who uses it needs a part of it")]
 
@@ -27,7 +27,7 @@ use vbench::emu::can::slcan::{Received, Slcan};
 use vbench::emu::order::Order;
 use vbench::emu::reported::Reported;
 
-/// Actions of a test, in the place of the topic.
+/// Actions of a test, in place of the topic.
 #[derive(Debug, Default)]
 pub(crate) struct Hand {
     bell: Bell,
@@ -35,7 +35,7 @@ pub(crate) struct Hand {
 }
 
 impl Hand {
-    /// Publishes an action, as of now.
+    /// Publishes an action with the current time.
     pub(crate) fn point(&self, target: &[f64]) {
         *self.action.lock().expect("whole") = Some((target.to_vec(), Stamp::now()));
         self.bell.ring();
@@ -56,12 +56,12 @@ impl ActionSource for Hand {
     }
 }
 
-/// The longest that something is waited for.
+/// Upper limit for all waits.
 pub(crate) const PATIENCE: Duration = Duration::from_mins(2);
 
-/// An adapter with motors behind it. Dropped, it is pulled out.
+/// An adapter with motors behind it. Dropping it unplugs it.
 pub(crate) struct Adapter {
-    /// The line it is on.
+    /// Path of its line.
     pub(crate) path: PathBuf,
     shared: Arc<Mutex<Shared>>,
     pulled: Arc<AtomicBool>,
@@ -70,23 +70,23 @@ pub(crate) struct Adapter {
 
 struct Shared {
     bus: Bus,
-    /// What motors reported, and when.
+    /// Reports of the motors, with their times.
     reported: Vec<(Stamp, Reported)>,
 }
 
 /// The adapter's protocol on its line.
-enum Speech {
+enum Codec {
     Damiao(Damiao),
     Slcan(Slcan),
 }
 
-impl Speech {
-    /// What the bus answers to bytes of the host is written to `answers`.
-    fn hear(&mut self, bytes: &[u8], bus: &mut Bus, answers: &mut Vec<u8>) {
+impl Codec {
+    /// Writes the bus's answers to bytes from the host into `answers`.
+    fn receive(&mut self, bytes: &[u8], bus: &mut Bus, answers: &mut Vec<u8>) {
         let mut frames = Vec::new();
         match self {
-            Self::Damiao(damiao) => damiao.hear(bytes, answers, |frame| frames.push(frame)),
-            Self::Slcan(slcan) => slcan.hear(bytes, answers, |received| {
+            Self::Damiao(damiao) => damiao.receive(bytes, answers, |frame| frames.push(frame)),
+            Self::Slcan(slcan) => slcan.receive(bytes, answers, |received| {
                 if let Received::Frame(frame) = received {
                     frames.push(frame);
                 }
@@ -94,24 +94,24 @@ impl Speech {
         }
         for frame in frames {
             bus.send(&frame, Stamp::now().0, |answer| match self {
-                Self::Damiao(_) => damiao::tell(&answer, answers),
-                Self::Slcan(slcan) => slcan.tell(&answer, answers),
+                Self::Damiao(_) => damiao::send_to_host(&answer, answers),
+                Self::Slcan(slcan) => slcan.send_to_host(&answer, answers),
             });
         }
     }
 }
 
 impl Adapter {
-    /// Damiao's, with `count` motors, which listen to 1, 2, ... and answer with 0x11, 0x12, ...
+    /// A Damiao adapter with `count` motors, with the slave ids 1, 2, ... and the master ids 0x11, 0x12, ...
     pub(crate) fn plug(count: u16) -> Self {
         Self::plug_as(CanAdapter::Damiao, count)
     }
 
-    /// One that uses slcan, or Damiao's.
+    /// An adapter that uses slcan or Damiao's protocol.
     pub(crate) fn plug_as(adapter: CanAdapter, count: u16) -> Self {
-        let speech = match adapter {
-            CanAdapter::Slcan => Speech::Slcan(Slcan::default()),
-            _ => Speech::Damiao(Damiao::default()),
+        let codec = match adapter {
+            CanAdapter::Slcan => Codec::Slcan(Slcan::default()),
+            _ => Codec::Damiao(Damiao::default()),
         };
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
         grantpt(&master).expect("terminal");
@@ -124,27 +124,27 @@ impl Adapter {
         let pulled = Arc::new(AtomicBool::new(false));
         let thread = std::thread::spawn({
             let (shared, pulled) = (Arc::clone(&shared), Arc::clone(&pulled));
-            move || serve(master, speech, &shared, &pulled)
+            move || serve(master, codec, &shared, &pulled)
         });
         Self { path, shared, pulled, thread: Some(thread) }
     }
 
-    /// Something befalls a motor.
-    pub(crate) fn befall(&self, motor: u16, order: Order) {
-        self.shared.lock().expect("whole").bus.befall(Some(motor), order, Stamp::now().0);
+    /// Applies an event to a motor.
+    pub(crate) fn apply(&self, motor: u16, order: Order) {
+        self.shared.lock().expect("whole").bus.apply(Some(motor), order, Stamp::now().0);
     }
 
-    /// What the motors have reported so far, oldest first.
+    /// The motors' reports so far, oldest first.
     pub(crate) fn reported(&self) -> Vec<&'static str> {
         self.shared.lock().expect("whole").reported.iter().map(|(_, reported)| reported.action).collect()
     }
 
-    /// How often the motors reported this.
+    /// How many times the motors reported this.
     pub(crate) fn count(&self, action: &str) -> usize {
         self.reported().iter().filter(|reported| **reported == action).count()
     }
 
-    /// When a motor reported this first, after `since`.
+    /// When a motor first reported this after `since`.
     pub(crate) fn reported_at(&self, motor: u16, action: &str, since: Stamp) -> Option<Stamp> {
         let shared = self.shared.lock().expect("whole");
         let mut of = shared
@@ -154,8 +154,8 @@ impl Adapter {
         of.find(|(at, _)| *at >= since).map(|(at, _)| *at)
     }
 
-    /// Waits until each of these motors was turned off after the last time that it was enabled. One motor
-    /// may report several times that it was turned off.
+    /// Waits until each of these motors was disabled after it was last enabled. A motor may report several times that
+    /// it was disabled.
     pub(crate) fn wait_until_off(&self, motors: &[u16]) {
         let begun = Instant::now();
         while !motors.iter().all(|motor| self.is_off(*motor)) {
@@ -164,7 +164,7 @@ impl Adapter {
         }
     }
 
-    /// It was enabled, and turned off after that.
+    /// Whether it was enabled and then disabled.
     fn is_off(&self, motor: u16) -> bool {
         let reported = &self.shared.lock().expect("whole").reported;
         let last = |action| {
@@ -183,7 +183,7 @@ impl Drop for Adapter {
     }
 }
 
-fn serve(master: OwnedFd, mut speech: Speech, shared: &Mutex<Shared>, pulled: &AtomicBool) {
+fn serve(master: OwnedFd, mut codec: Codec, shared: &Mutex<Shared>, pulled: &AtomicBool) {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
     let mut line = File::from(master);
     let mut piece = [0; 4096];
@@ -199,9 +199,9 @@ fn serve(master: OwnedFd, mut speech: Speech, shared: &Mutex<Shared>, pulled: &A
             let mut shared = shared.lock().expect("whole");
             if ready.contains(PollFlags::IN) {
                 let count = line.read(&mut piece).unwrap_or(0);
-                speech.hear(&piece[..count], &mut shared.bus, &mut answers);
+                codec.receive(&piece[..count], &mut shared.bus, &mut answers);
             } else if ready.contains(PollFlags::HUP) {
-                // No one has it open: it may be opened again.
+                // Nobody has it open: it may be opened again.
                 std::thread::sleep(Duration::from_millis(1));
             }
             shared.bus.tend(Stamp::now().0);
@@ -209,12 +209,12 @@ fn serve(master: OwnedFd, mut speech: Speech, shared: &Mutex<Shared>, pulled: &A
             let reported: Vec<_> = shared.bus.reported().map(|reported| (now, reported)).collect();
             shared.reported.extend(reported);
         }
-        // A reader that does not read is its own loss.
+        // Data that is not read is lost.
         let _ = line.write_all(&answers);
     }
 }
 
-/// The entry of `count` motors, position driven, at 200 Hz.
+/// The entry of `count` motors in position mode, at 200 Hz.
 pub(crate) fn spec(count: u16) -> DamiaoSpec {
     let motor = |id| MotorSpec {
         mode: MotorMode::Mit { kp: 20.0, kd: 1.0 },
@@ -226,7 +226,7 @@ pub(crate) fn spec(count: u16) -> DamiaoSpec {
         ..motor_spec::motor(id)
     };
     DamiaoSpec {
-        // A busy machine may not run a test, or the terminal between, for a second.
+        // On a busy machine a test, or the terminal, may not run for a second.
         disable_after: Some(Duration::from_secs(5)),
         timeout: Duration::from_secs(2),
         silent_after: Duration::from_secs(2),

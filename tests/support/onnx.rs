@@ -1,10 +1,10 @@
-//! Bundles small enough to work out by hand, written byte by byte: no tool is needed to make them.
+//! Bundles small enough to compute by hand, written byte by byte, without any tool.
 //!
-//! The encoder gives one number for each observation, the mean of its input; for one that the mask
-//! calls absent it gives 0, whatever the input holds. The denoiser's prediction is
+//! The encoder returns one number per observation, the mean of its input; for one that is absent according to the mask
+//! it returns 0, whatever the input. The denoiser's prediction is
 //! `SAMPLE_SHARE * sample + CONDITION_SHARE * mean(global_cond) + TIMESTEP_SHARE * timestep`.
 //!
-//! Numbers of fields and of types are those of `onnx.proto`.
+//! Field and type numbers are those of `onnx.proto`.
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
@@ -18,18 +18,18 @@ pub(crate) const SAMPLE_SHARE: f32 = 0.75;
 pub(crate) const CONDITION_SHARE: f32 = 0.5;
 pub(crate) const TIMESTEP_SHARE: f32 = 0.001;
 
-/// Observation steps, actions of a chunk, numbers of an action.
+/// Observation steps, actions per chunk, values per action.
 pub(crate) const STEPS: usize = 2;
 pub(crate) const HORIZON: usize = 16;
 pub(crate) const ACTION: usize = 4;
-/// Sides of a picture.
+/// Side of a picture.
 pub(crate) const SIDE: usize = 8;
 
 const FLOAT: u64 = 1;
 const INT64: u64 = 7;
 const BOOL: u64 = 9;
 
-/// What can be changed of the bundle: `with` stands in place of `what` in policy.json.
+/// A change of the bundle: `with` replaces `what` in policy.json.
 pub(crate) struct Change<'a> {
     pub(crate) what: &'a str,
     pub(crate) with: &'a str,
@@ -146,14 +146,14 @@ pub(crate) fn denoiser() -> Vec<u8> {
     model(graph)
 }
 
-/// The encoder with something more in the model (`field` of `ModelProto`).
+/// The encoder with an additional field in the model (`field` of `ModelProto`).
 pub(crate) fn encoder_with(field: u64, more: &Message) -> Vec<u8> {
     let mut model = Message(encoder());
     model.message(field, more);
     model.0
 }
 
-/// `TensorProto` whose four floats lie in the file `weights.bin`.
+/// `TensorProto` whose four floats are in the file `weights.bin`.
 pub(crate) fn external(name: &str) -> Message {
     let mut entry = Message::default();
     entry.bytes(1, b"location").bytes(2, b"weights.bin");
@@ -169,7 +169,7 @@ pub(crate) fn within(field: u64, inside: &Message) -> Message {
     message
 }
 
-/// A message of protobuf as it is written: fields one after the other.
+/// An encoded protobuf message: its fields in order.
 #[derive(Default)]
 pub(crate) struct Message(Vec<u8>);
 
@@ -226,14 +226,14 @@ fn node(operator: &str, inputs: &[&str], output: &str, attributes: &[Message]) -
     node
 }
 
-/// `AttributeProto` of one whole number.
+/// `AttributeProto` of one integer.
 fn integer(name: &str, value: u64) -> Message {
     let mut attribute = Message::default();
     attribute.bytes(1, name.as_bytes()).number(3, value).number(20, 2);
     attribute
 }
 
-/// `AttributeProto` of whole numbers.
+/// `AttributeProto` of integers.
 fn integers(name: &str, values: &[u64]) -> Message {
     let mut attribute = Message::default();
     attribute.bytes(1, name.as_bytes());
@@ -250,7 +250,7 @@ fn floats(name: &str, dims: &[u64], values: &[f32]) -> Message {
     constant(name, FLOAT, dims, &raw)
 }
 
-/// `TensorProto` of whole numbers.
+/// `TensorProto` of integers.
 fn whole_numbers(name: &str, dims: &[u64], values: &[i64]) -> Message {
     let raw: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
     constant(name, INT64, dims, &raw)
@@ -265,7 +265,7 @@ fn constant(name: &str, element: u64, dims: &[u64], raw: &[u8]) -> Message {
     tensor
 }
 
-/// `ValueInfoProto`; a dimension of 0 is the open one, "B".
+/// `ValueInfoProto`; dimension 0 is the open one, "B".
 fn tensor(name: &str, element: u64, dims: &[u64]) -> Message {
     let mut shape = Message::default();
     for dim in dims {

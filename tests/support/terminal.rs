@@ -1,4 +1,4 @@
-//! A terminal of a test's own.
+//! A pseudo-terminal for one test.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -7,15 +7,15 @@ use std::process::{Child, Command};
 
 use super::Place;
 
-/// A terminal, and `rapid` in a session of its own on it.
+/// A terminal with `rapid` in its own session on it.
 pub(crate) struct OnTerminal {
-    /// What the terminal shows is read from here; closing it closes the terminal.
+    /// Output of the terminal; closing it closes the terminal.
     pub(crate) master: Option<OwnedFd>,
     pub(crate) child: Child,
 }
 
 impl OnTerminal {
-    /// `fault` is for `RAPID_FAULT`.
+    /// `fault` is the value of `RAPID_FAULT`.
     pub(crate) fn start(place: &Place, arguments: &[&str], fault: &str) -> Self {
         use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
@@ -38,7 +38,7 @@ impl OnTerminal {
         Self { master: Some(master), child }
     }
 
-    /// Reads what is shown until this appears, and returns it.
+    /// Reads the output until this appears, and returns it.
     pub(crate) fn read_until(&mut self, word: &str) -> String {
         let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
         let (mut shown, mut piece) = (Vec::new(), [0; 4096]);
@@ -55,7 +55,7 @@ impl OnTerminal {
         file.write_all(text.as_bytes()).expect("input");
     }
 
-    /// Does the terminal show what is typed? Not while a program has it for itself.
+    /// Whether the terminal echoes typed text. It does not while a program uses it in raw mode.
     pub(crate) fn echoes(&self) -> bool {
         use rustix::termios::{LocalModes, tcgetattr};
         let master = self.master.as_ref().expect("open");

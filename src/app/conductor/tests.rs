@@ -163,7 +163,7 @@ async fn keys_pressed_while_an_episode_ends_are_handled_in_order() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_key_while_devices_settle_begins_the_one_episode() {
+async fn a_key_pressed_while_devices_settle_begins_exactly_one_episode() {
     let mut bench = Bench::new(true, None, |file| Box::new(file));
     let silent = Registry::builtin().devices[0].id;
     bench.board.set_slot(silent, SlotState::Opening, Epoch(1), "");
@@ -223,7 +223,7 @@ async fn an_end_among_missed_events_still_ends_the_run() {
 }
 
 #[tokio::test]
-async fn an_end_that_came_while_the_run_ended_is_found_before_and_after_missed_events() {
+async fn an_end_during_shutdown_is_found_before_and_after_missed_events() {
     for end_first in [true, false] {
         let mut bench = Bench::new(true, None, |file| Box::new(file));
         if end_first {

@@ -1,4 +1,4 @@
-//! What killed processes leave behind, in every state of damage, and what living ones use.
+//! Files of killed processes, in every state of damage, and files in use by live processes.
 
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::OpenOptionsExt;
@@ -13,7 +13,7 @@ use crate::bus::Bus;
 use crate::bus::home::Home;
 use crate::bus::tests::registry;
 
-/// How long a condition may take until it holds: no requirement.
+/// Upper limit for waiting for a condition; not a requirement.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 const HASH: &str = "0354a209029e7d094a819e2d4030ea331e6caaf0";
@@ -21,7 +21,7 @@ const HASH: &str = "0354a209029e7d094a819e2d4030ea331e6caaf0";
 const PORT: &str = "475369541183522065285006754738";
 
 #[test]
-fn a_name_says_whose_a_file_is() {
+fn a_file_name_identifies_its_owner() {
     let owner = process(number(PORT).unwrap());
     for (name, used) in [
         (format!("{HASH}_{PORT}.data"), Some(Use::Ports(vec![owner]))),
@@ -30,7 +30,7 @@ fn a_name_says_whose_a_file_is() {
         (format!("{HASH}_{PORT}.event_mgmt"), Some(Use::Ports(vec![owner]))),
         (format!("{HASH}_{PORT}.dynamic"), Some(Use::Common)),
         (format!("{HASH}_node.0_10_0.global_mgmt"), Some(Use::Common)),
-        // Of another instance, whose prefix begins as ours does.
+        // Of another instance, whose prefix starts with ours.
         (format!("exp_{HASH}_{PORT}.data"), None),
         (format!("12345_{HASH}_{PORT}.data"), None),
         (String::new(), None),
@@ -69,7 +69,7 @@ fn member(name: &str, stays: bool) -> (Child, String) {
     if stays {
         command.env("RAPID_TEST_STAY", "");
     }
-    // A test that fails leaves none behind.
+    // The helper must not outlive a failed test.
     // SAFETY: a system call.
     unsafe {
         command.pre_exec(|| Ok(rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::KILL))?))
@@ -79,7 +79,7 @@ fn member(name: &str, stays: bool) -> (Child, String) {
     let (notify, reported) = mpsc::channel();
     std::thread::spawn(move || {
         for line in output.lines().map_while(Result::ok) {
-            // The harness prints the test's name in front of its first line.
+            // The test harness prints the test's name before its first line.
             let report = line.find("opened").or_else(|| line.find("refused")).map(|at| line[at..].to_owned());
             let _ = report.map(|report| notify.send(report));
         }
@@ -111,7 +111,7 @@ fn files(name: &str) -> Vec<PathBuf> {
     found
 }
 
-/// What can have become of a file.
+/// Kinds of damage to a file.
 #[derive(Debug, Clone, Copy)]
 enum Damage {
     Empty,
@@ -132,7 +132,7 @@ impl Damage {
         self.make(path, &there);
     }
 
-    /// Makes what `there` has become.
+    /// Applies the damage to `path`.
     fn make(self, path: &Path, there: &Metadata) {
         let mode = there.permissions().mode() & 0o777;
         let write = |bytes: &[u8]| {
@@ -153,7 +153,7 @@ impl Damage {
     }
 }
 
-/// One file of each kind, by what comes after its numbers.
+/// One file of each kind, by the part of its name after the numbers.
 fn kinds(name: &str) -> Vec<(String, PathBuf)> {
     let mut kinds: Vec<(String, PathBuf)> = Vec::new();
     for path in files(name) {
@@ -167,14 +167,14 @@ fn kinds(name: &str) -> Vec<(String, PathBuf)> {
     kinds
 }
 
-/// What one test left behind of dead processes is what another one clears.
+/// Serialises the tests: one would clear what another left behind for dead processes.
 fn alone() -> std::sync::MutexGuard<'static, ()> {
     static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
     ALONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 #[test]
-fn what_killed_processes_left_is_removed_in_every_state_of_damage() {
+fn files_of_killed_processes_are_removed_in_every_state_of_damage() {
     let _alone = alone();
     let name = format!("dead{}", std::process::id());
     killed(&name);
@@ -198,7 +198,7 @@ fn what_killed_processes_left_is_removed_in_every_state_of_damage() {
 }
 
 #[test]
-fn a_damaged_file_is_found_whatever_it_has_become() {
+fn a_damaged_file_is_found_whatever_the_damage() {
     let _alone = alone();
     let name = format!("found{}", std::process::id());
     killed(&name);
@@ -218,7 +218,7 @@ fn a_damaged_file_is_found_whatever_it_has_become() {
 }
 
 #[test]
-fn a_start_removes_what_dead_processes_left_of_other_instances_and_nothing_of_living_ones() {
+fn a_start_removes_files_of_dead_processes_of_other_instances_and_none_of_living_ones() {
     let _alone = alone();
     for (name, prefix) in [
         (format!("iox2_{PORT}.node_monitor"), Some("iox2_")),
@@ -243,7 +243,7 @@ fn a_start_removes_what_dead_processes_left_of_other_instances_and_nothing_of_li
     Files::new(format!("iox2_{living}_"), PathBuf::from("/tmp/iceoryx2")).clear(Duration::ZERO).unwrap();
 }
 
-/// A file that is put back when this goes.
+/// A file that is restored on drop.
 struct Kept {
     path: PathBuf,
     aside: PathBuf,
@@ -266,7 +266,7 @@ impl Drop for Kept {
 }
 
 #[test]
-fn what_a_living_process_uses_stays_and_damage_to_it_is_named() {
+fn files_of_a_living_process_are_kept_and_damage_to_them_is_reported() {
     let name = format!("live{}", std::process::id());
     let (mut first, report) = member(&name, true);
     assert_eq!(report, "opened");
@@ -284,14 +284,14 @@ fn what_a_living_process_uses_stays_and_damage_to_it_is_named() {
             let (mut second, report) = member(&name, false);
             second.wait().unwrap();
             let named = report.contains("rm -r /dev/shm/iox2_") || report.contains("rm -r /tmp/iceoryx2/");
-            // What is not there has no name of its own.
+            // A missing file is not reported by name.
             let missing = matches!(damage, Damage::Gone) && report.contains("end the programs that use the bus");
             assert!(report == "opened" || named || missing, "{kind} {damage:?}: {report}");
             drop(kept);
             if files(&name) == before {
                 continue;
             }
-            // To iceoryx2, a process without its lock is dead. It ends, and the next one finds all in order.
+            // To iceoryx2, a process without its lock is dead. It ends, and the next one finds everything in order.
             first.kill().unwrap();
             first.wait().unwrap();
             let (next, report) = member(&name, true);

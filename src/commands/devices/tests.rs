@@ -3,8 +3,8 @@ use std::sync::Arc;
 use insta::assert_snapshot;
 
 use super::*;
-use crate::registry::UsbIdentity;
-use crate::registry::scenario::{SimDevice, SimSource};
+use crate::device::UsbIdentity;
+use crate::simulation::{SimDevice, SimSource};
 
 /// A wrist camera by its serial number, two interchangeable cameras, a serial line by its port.
 const REGISTRY: &str = r#"

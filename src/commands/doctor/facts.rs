@@ -96,7 +96,6 @@ pub(super) struct Interface {
 }
 
 /// Reads everything except the disk, whose rate must be measured.
-#[must_use]
 pub(super) fn collect(root: &Path) -> Facts {
     let usb = devices(root);
     let groups = groups(root);
@@ -254,13 +253,11 @@ pub(super) struct UsbDevice {
 
 impl UsbDevice {
     /// Whether it is a root hub, that is a bus.
-    #[must_use]
     pub(super) fn is_root(&self) -> bool {
         self.port.starts_with("usb")
     }
 
     /// Number of hubs above it, without the root hub.
-    #[must_use]
     pub(super) fn depth(&self) -> usize {
         self.port.matches('.').count()
     }

@@ -12,9 +12,8 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::facts::{Facts, Node, UsbDevice};
-use crate::registry::{
-    Assigner, Attachment, CameraSpec, DeviceNode, DeviceSpec, NodeSpec, Opens, PixelFormat, Registry, UsbIdentity,
-};
+use crate::device::{Attachment, DeviceNode, UsbIdentity};
+use crate::registry::{Assigner, CameraSpec, DeviceSpec, NodeSpec, Opens, PixelFormat, Registry};
 use crate::text;
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
@@ -61,7 +60,6 @@ impl Finding {
 }
 
 /// All findings. `rules` are the rules that `rapid artifacts` would write.
-#[must_use]
 pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&str>) -> Vec<Finding> {
     let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
     let plugged = plugged(registry, &facts.usb);
@@ -79,7 +77,6 @@ pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&s
 }
 
 /// Entries with the connected USB device that matches, as a rig that starts now would assign them.
-#[must_use]
 pub(super) fn plugged<'a>(
     registry: Option<&'a Registry>,
     usb: &'a [UsbDevice],
@@ -526,7 +523,6 @@ pub(super) struct CameraLoad {
 
 impl CameraLoad {
     /// Bytes per second; for compressed pictures an upper limit.
-    #[must_use]
     pub(super) fn bytes_per_second(&self) -> f64 {
         let camera = &self.camera;
         let pixels = f64::from(camera.width) * f64::from(camera.height);
@@ -544,7 +540,6 @@ impl CameraLoad {
     }
 
     /// Whether only an upper limit is known.
-    #[must_use]
     pub(super) fn is_estimated(&self) -> bool {
         self.camera.format == PixelFormat::Mjpg
     }
@@ -579,7 +574,6 @@ impl fmt::Display for CameraLoad {
 }
 
 /// Total payload in bytes per second of the cameras on a bus of this speed.
-#[must_use]
 pub(super) fn budget(mbit: f64) -> f64 {
     match mbit {
         mbit if mbit >= 5000.0 => SUPER_SPEED * (mbit / 5000.0),
@@ -589,7 +583,6 @@ pub(super) fn budget(mbit: f64) -> f64 {
 }
 
 /// The same for one camera.
-#[must_use]
 pub(super) fn endpoint(mbit: f64) -> f64 {
     match mbit {
         mbit if mbit >= 5000.0 => budget(mbit),
@@ -599,14 +592,12 @@ pub(super) fn endpoint(mbit: f64) -> f64 {
 }
 
 /// The part of it that the cameras of one bus of this speed use, bytes per second.
-#[must_use]
 pub(super) fn taken(loads: &[CameraLoad], mbit: f64) -> f64 {
     loads.iter().map(|load| load.reserves(mbit)).sum()
 }
 
 /// Settings that fit a bus of this speed: the most demanding camera is reduced first. Only those that
 /// change; `None` if nothing fits.
-#[must_use]
 pub(super) fn fitting(loads: &[CameraLoad], mbit: f64) -> Option<Vec<CameraLoad>> {
     let mut tried = loads.to_vec();
     let fits = |loads: &[CameraLoad]| {

@@ -93,7 +93,7 @@ async fn a_watch_prints_changes_and_the_publishers_end_and_return() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_publisher_that_no_longer_publishes_is_gone() {
+async fn a_publisher_that_stopped_publishing_is_reported_as_gone() {
     let look = Cell::new(0_u64);
     let stop = CancellationToken::new();
     let read = || {

@@ -7,9 +7,10 @@ use serde::Serialize;
 use super::units::{Candidate, suggested};
 use super::{Dialogue, Format, RegisterError, listen};
 use crate::cli::RegisterArgs;
+use crate::device::{DeviceNode, UsbIdentity};
 use crate::driver::camera::query;
 use crate::registry::edit::Setting;
-use crate::registry::{DeviceNode, Mount, Registry, UsbIdentity, like_a_name, name_problem};
+use crate::registry::{Mount, Registry, like_a_name, name_problem};
 use crate::text;
 
 /// A unit that could be registered, as JSON.

@@ -8,10 +8,11 @@ use std::path::Path;
 use super::Target;
 use super::fields::free_bit;
 use super::units::{kind, suggested};
+use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::driver::camera::query;
 use crate::registry::edit::{NewEntry, Setting};
 use crate::registry::import::{Foreign, devices, layout};
-use crate::registry::{Attachment, DeviceNode, RegistryErrors, UsbIdentity, like_a_name, name_problem, read_file};
+use crate::registry::{RegistryErrors, like_a_name, name_problem, read_file};
 use crate::text;
 
 /// Service types and their protocols (`aod321/iPhoneVIO`; OpenGoPro, "mDNS").

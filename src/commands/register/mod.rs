@@ -21,14 +21,12 @@ use self::units::{lines_look_like, unregistered};
 use super::artifacts::ArtifactsError;
 use super::{Format, artifacts};
 use crate::cli::{RegisterArgs, UnregisterArgs};
+use crate::device::{Attachment, DeviceNode};
 use crate::driver::serial::Serial;
 use crate::driver::{Driver, DriverError};
 use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::registry::edit::{self, EditError, NewEntry, Setting};
-use crate::registry::{
-    Attachment, DeviceNode, DeviceSpec, Framing, Loaded, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec,
-    read_file,
-};
+use crate::registry::{DeviceSpec, Framing, Loaded, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec, read_file};
 use crate::sample::Encoding;
 use crate::text;
 
@@ -90,7 +88,6 @@ pub enum RegisterError {
 
 impl RegisterError {
     /// Whether the arguments are at fault.
-    #[must_use]
     pub const fn is_bad_argument(&self) -> bool {
         !matches!(
             self,
@@ -234,7 +231,7 @@ fn commit(
     if format == Format::Text {
         out.write_all(&written_files)?;
         if !args.dry_run {
-            writeln!(out, "for stable device names: sudo rapid artifacts --install")?;
+            writeln!(out, "for stable device names, install the udev rules: rapid artifacts --help")?;
         }
         return Ok(());
     }

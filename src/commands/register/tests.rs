@@ -7,8 +7,9 @@ use clap::Parser;
 
 use super::*;
 use crate::cli::{Cli, Command};
-use crate::registry::scenario::{SimDevice, SimSource};
-use crate::registry::{BUILTIN, DeviceNode, Registry, Unit, UsbIdentity};
+use crate::device::{DeviceNode, Unit, UsbIdentity};
+use crate::registry::{BUILTIN, Registry};
+use crate::simulation::{SimDevice, SimSource};
 use crate::time::Stamp;
 
 fn serial_line(serial: Option<&str>, port: &str) -> Attachment {
@@ -167,7 +168,7 @@ fn a_file_that_changed_meanwhile_is_not_overwritten() {
 }
 
 #[test]
-fn no_other_entry_gets_another_bit() {
+fn removing_an_entry_never_changes_the_bit_of_another() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("devices.toml");
     let entry = |name: &str, serial: &str| {

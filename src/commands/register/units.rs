@@ -2,10 +2,11 @@
 //!
 //! Pure, except for reads of sysfs that distinguish hubs from devices and CAN adapters from network cards.
 
+use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::driver::camera::{CameraInfo, Rate, Rates, Size};
 use crate::registry::edit::Setting;
-use crate::registry::scenario::{SimSource, TaskPart};
-use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, PixelFormat, Registry, UsbIdentity};
+use crate::registry::{Assigner, Assignment, PixelFormat, Registry};
+use crate::simulation::{SimSource, TaskPart};
 
 /// A USB device and its nodes that no entry reads.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,7 +22,6 @@ pub struct Candidate {
 }
 
 /// Units that could be registered, in the order of their ports; those with data nodes first.
-#[must_use]
 pub fn unregistered(registry: Option<&Registry>, attached: &[Attachment]) -> Vec<Candidate> {
     let mut assigner = registry.map(Assigner::new);
     let taken: Vec<bool> = attached
@@ -83,7 +83,6 @@ fn is_hub(node: &Attachment) -> bool {
 }
 
 /// The value of `node` in an entry that reads this node; `None` if only a program can.
-#[must_use]
 pub fn kind(attachment: &Attachment) -> Option<&'static str> {
     /// `ARPHRD_CAN` of `linux/if_arp.h`.
     const CAN: &str = "280";
@@ -107,19 +106,16 @@ pub fn kind(attachment: &Attachment) -> Option<&'static str> {
 
 impl Candidate {
     /// The word for `node` that its nodes suggest.
-    #[must_use]
     pub fn guess(&self) -> Option<&'static str> {
         self.nodes.iter().find_map(|node| kind(node))
     }
 
     /// The node that an entry of this kind would read.
-    #[must_use]
     pub fn node(&self, word: &str) -> Option<&Attachment> {
         self.nodes.iter().find(|node| kind(node) == Some(word))
     }
 
     /// The key and value by which an entry matches this unit and no other, if there are any.
-    #[must_use]
     pub fn identity(&self) -> Option<(&'static str, String)> {
         match &self.own_serial {
             Some(serial) => Some(("serial", serial.clone())),
@@ -129,7 +125,6 @@ impl Candidate {
 }
 
 /// Settings that the device itself suggests.
-#[must_use]
 pub fn suggested(node: &DeviceNode, camera: Option<&CameraInfo>) -> Vec<(String, Setting)> {
     match (node, camera) {
         (DeviceNode::Sim(device), _) => match device.source {
@@ -189,7 +184,6 @@ fn fps(rates: &Rates) -> u32 {
 
 /// Settings to parse the lines of a serial device: all comma-separated numbers, or all JSON; `None` if
 /// neither.
-#[must_use]
 pub fn lines_look_like(lines: &[Vec<u8>]) -> Option<Vec<(String, Setting)>> {
     // The start of the first line may be missing.
     let whole: Vec<&str> = lines.iter().skip(1).filter_map(|line| std::str::from_utf8(line).ok()).collect();

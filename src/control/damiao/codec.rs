@@ -1,12 +1,11 @@
-//! Frames that command a motor, and what it answers.
+//! Frames that command a motor, and its answers.
 //!
 //! Format: the public drivers `DM_CAN.py` and `damiao.h`, which agree; the codes of a motor's status are
 //! those of the maker's manual. What the drivers compute is pinned by `tests/golden/damiao.json`.
 //!
-//! Invariant: what lies beyond a range is sent as its end, and never wraps; what is no number is not
-//! sent.
-//! Invariant: a MIT frame is never mistaken for an order, whose seven bytes 0xff are those of a command
-//! with everything at its end.
+//! Invariant: a value beyond a range is clamped and never wraps; one that is not finite is not sent.
+//! Invariant: a MIT frame is never mistaken for a state command, whose seven bytes 0xff would be a MIT command with
+//! every value at its upper end.
 
 use std::fmt;
 
@@ -23,7 +22,7 @@ const POSITION_VELOCITY: u16 = 0x100;
 /// Added to a motor's id in velocity mode.
 const VELOCITY: u16 = 0x200;
 
-/// Of a quantum; far more than a 64-bit float is wrong by, and far less than a motor resolves.
+/// Share of a quantum: far more than the error of a 64-bit float, far less than a motor resolves.
 const HAIR: f64 = 1e-6;
 
 /// A value of a command is infinite or not a number.
@@ -31,8 +30,7 @@ const HAIR: f64 = 1e-6;
 #[error("a command to a motor holds a value that is not a finite number")]
 pub struct NotFinite;
 
-/// The ranges a motor counts in: its parameters PMAX, VMAX and TMAX. Each goes from minus this to plus
-/// this.
+/// The ranges that a motor encodes: its parameters PMAX, VMAX and TMAX, each symmetric around 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ranges {
     position: f64,
@@ -42,26 +40,22 @@ pub struct Ranges {
 
 impl Ranges {
     /// `None` unless each is finite and above 0.
-    #[must_use]
     pub fn new(position: f64, velocity: f64, torque: f64) -> Option<Self> {
         let usable = |end: f64| end.is_finite() && end > 0.0;
         [position, velocity, torque].into_iter().all(usable).then_some(Self { position, velocity, torque })
     }
 
     /// PMAX, rad.
-    #[must_use]
     pub const fn position(&self) -> f64 {
         self.position
     }
 
     /// VMAX, rad/s.
-    #[must_use]
     pub const fn velocity(&self) -> f64 {
         self.velocity
     }
 
     /// TMAX, Nm.
-    #[must_use]
     pub const fn torque(&self) -> f64 {
         self.torque
     }
@@ -98,7 +92,7 @@ pub fn mit(slave: u16, command: &Mit, ranges: &Ranges) -> Result<CanFrame, NotFi
     let byte = |bits: u16| bits.to_be_bytes()[1];
     let mut data =
         [q1, q0, byte(dq >> 4), byte((dq & 0xf) << 4 | kp >> 8), kp0, byte(kd >> 4), byte(kd << 4) | tau1, tau0];
-    if data.starts_with(&ORDER) {
+    if data.starts_with(&STATE_COMMAND) {
         // One quantum less of damping.
         data[6] &= 0xef;
     }
@@ -113,7 +107,7 @@ pub fn position_velocity(slave: u16, q: f64, speed: f64) -> Result<CanFrame, Not
     Ok(CanFrame::standard(slave.saturating_add(POSITION_VELOCITY), join(single(q)?, single(speed)?)))
 }
 
-/// The frame of velocity mode, rad/s. It has eight bytes as all others, the last four zero.
+/// The frame of velocity mode, rad/s. It has eight bytes like all others, the last four zero.
 ///
 /// # Errors
 /// The value is not finite, as a 32-bit float.
@@ -121,9 +115,9 @@ pub fn velocity(slave: u16, dq: f64) -> Result<CanFrame, NotFinite> {
     Ok(CanFrame::standard(slave.saturating_add(VELOCITY), join(single(dq)?, [0; 4])))
 }
 
-/// Orders to a motor beside a command.
+/// A command that changes the state of a motor and does not move it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Order {
+pub enum StateCommand {
     /// Turn on.
     Enable,
     /// Turn off.
@@ -134,12 +128,11 @@ pub enum Order {
     ClearError,
 }
 
-/// How the data of an order begins.
-const ORDER: [u8; 7] = [0xff; 7];
+/// How the data of a state command begins.
+const STATE_COMMAND: [u8; 7] = [0xff; 7];
 
-impl Order {
+impl StateCommand {
     /// Its frame.
-    #[must_use]
     pub const fn frame(self, slave: u16) -> CanFrame {
         let last = match self {
             Self::Enable => 0xfc,
@@ -178,7 +171,6 @@ pub enum MotorStatus {
 
 impl MotorStatus {
     /// Of the low four bits of `code`.
-    #[must_use]
     pub const fn from_code(code: u8) -> Self {
         match code & 0xf {
             0x0 => Self::Disabled,
@@ -195,7 +187,6 @@ impl MotorStatus {
     }
 
     /// As it is in a frame, `0..=15`.
-    #[must_use]
     pub const fn code(self) -> u8 {
         match self {
             Self::Disabled => 0x0,
@@ -212,7 +203,6 @@ impl MotorStatus {
     }
 
     /// A fault that the motor latched.
-    #[must_use]
     pub const fn is_fault(self) -> bool {
         self.code() >= 8
     }
@@ -235,7 +225,7 @@ impl fmt::Display for MotorStatus {
     }
 }
 
-/// What a motor answers to a command, an order and a refresh.
+/// What a motor answers to every command and to a refresh.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Feedback {
     /// The low four bits of the motor's id.
@@ -255,8 +245,7 @@ pub struct Feedback {
 }
 
 impl Feedback {
-    /// Reads a frame that a motor sent; `None` if it is no data frame of eight bytes with an 11-bit id.
-    #[must_use]
+    /// Reads a frame that a motor sent; `None` unless it is a data frame of eight bytes with an 11-bit id.
     pub fn decode(frame: &CanFrame, ranges: &Ranges) -> Option<Self> {
         let [d0, d1, d2, d3, d4, d5, mos, rotor] = data_of(frame)?;
         let wide = |high: u8, low: u8| u16::from_be_bytes([high, low]);
@@ -272,7 +261,6 @@ impl Feedback {
     }
 
     /// As a motor would send it from `master`; `None` if a value is not finite. For simulated motors.
-    #[must_use]
     pub fn encode(&self, master: u16, ranges: &Ranges) -> Option<CanFrame> {
         let q = count(self.q, -ranges.position, ranges.position, 16).ok()?;
         let dq = count(self.dq, -ranges.velocity, ranges.velocity, 12).ok()?;
@@ -286,25 +274,24 @@ impl Feedback {
 }
 
 /// The data of a frame as motors send and take it: eight bytes, under an 11-bit identifier.
-#[must_use]
 pub fn data_of(frame: &CanFrame) -> Option<[u8; 8]> {
     (!frame.extended && !frame.remote && !frame.error && frame.len == 8).then_some(frame.data)
 }
 
-/// `value` in quanta from `low`, of which there are 2^bits - 1 up to `high`.
+/// `value` in quanta above `low`; `high` is 2^bits - 1 quanta.
 fn count(value: f64, low: f64, high: f64, bits: u32) -> Result<u16, NotFinite> {
     if !value.is_finite() {
         return Err(NotFinite);
     }
     let quanta = f64::from((1_u32 << bits) - 1);
-    // A position that was read is sent as the count it was read from, though rounding took a hair off it.
+    // A position that was read is sent as the same count, although rounding took a hair off it.
     let counted = (value.clamp(low, high) - low) / (high - low) * quanta + HAIR;
     // In `0..=quanta`, cut off as the public drivers do.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     Ok(counted as u16)
 }
 
-/// What `count` quanta from `-end` are.
+/// The value `count` quanta above `-end`.
 fn value(count: u16, end: f64, bits: u32) -> f64 {
     let quanta = f64::from((1_u32 << bits) - 1);
     f64::from(count) / quanta * (2.0 * end) - end

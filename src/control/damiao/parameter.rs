@@ -1,9 +1,9 @@
 //! A motor's parameters: reading, writing and keeping them, over the id 0x7ff.
 //!
-//! A reply comes with the id that feedback has, and looks like feedback of a motor that stands at the
-//! very beginning of its range and turns backwards at more than a third of its speed range, at one of
-//! two positions of 65,536. While parameters are read such a frame counts as a reply: taking it for
-//! feedback would invent a position, taking feedback for it loses one of hundreds a second.
+//! A reply has the id of feedback. It looks like feedback of a motor at one of the first positions of its range (two of
+//! 65,536) that turns backwards at more than a third of its speed range. While parameters are read, such a frame counts
+//! as a reply: a reply taken for feedback would invent a position; feedback taken for a reply is one lost of hundreds a
+//! second.
 
 use std::fmt;
 
@@ -45,7 +45,7 @@ pub enum Parameter {
     TMax = 23,
 }
 
-/// All that are read here.
+/// All parameters that are read here.
 const ALL: [Parameter; 9] = [
     Parameter::MasterId,
     Parameter::SlaveId,
@@ -60,19 +60,16 @@ const ALL: [Parameter; 9] = [
 
 impl Parameter {
     /// Its number.
-    #[must_use]
     pub const fn rid(self) -> u8 {
         self as u8
     }
 
-    /// The parameter of this number, if it is one of these.
-    #[must_use]
+    /// The parameter of this number, if it is listed here.
     pub fn from_rid(rid: u8) -> Option<Self> {
         ALL.into_iter().find(|parameter| parameter.rid() == rid)
     }
 
     /// Is it a 32-bit float? The others are unsigned whole numbers of 32 bits.
-    #[must_use]
     pub const fn is_float(self) -> bool {
         matches!(self, Self::PMax | Self::VMax | Self::TMax)
     }
@@ -117,7 +114,6 @@ pub enum Value {
 
 impl Value {
     /// As it is in a frame.
-    #[must_use]
     pub const fn to_le_bytes(self) -> [u8; 4] {
         match self {
             Self::Whole(value) => value.to_le_bytes(),
@@ -126,7 +122,6 @@ impl Value {
     }
 
     /// As a number.
-    #[must_use]
     pub fn number(self) -> f64 {
         match self {
             Self::Whole(value) => f64::from(value),
@@ -145,31 +140,21 @@ impl fmt::Display for Value {
 }
 
 /// Asks a motor for a parameter.
-#[must_use]
 pub const fn read(slave: u16, parameter: Parameter) -> CanFrame {
     request(slave, READ, parameter.rid(), [0; 4])
 }
 
-/// Sets a parameter until the motor loses its power. A motor writes while it is disabled.
-#[must_use]
+/// Sets a parameter until the motor loses power. A motor accepts this only while disabled.
 pub const fn write(slave: u16, parameter: Parameter, value: Value) -> CanFrame {
     request(slave, WRITE, parameter.rid(), value.to_le_bytes())
 }
 
-/// Makes all parameters outlast a loss of power. The motor is to be disabled.
-#[must_use]
-pub const fn save(slave: u16) -> CanFrame {
-    request(slave, SAVE, 1, [0; 4])
-}
-
 /// Asks a motor for its feedback, and for nothing else.
-#[must_use]
 pub const fn refresh(slave: u16) -> CanFrame {
     request(slave, REFRESH, 0, [0; 4])
 }
 
 /// The motor whose parameters this frame sets or saves, if it is a request to.
-#[must_use]
 pub const fn is_write(frame: &CanFrame) -> Option<u16> {
     match frame.data {
         [low, high, WRITE | SAVE, ..] if frame.id == BROADCAST as u32 && !frame.extended => {
@@ -185,12 +170,12 @@ const fn request(slave: u16, verb: u8, rid: u8, value: [u8; 4]) -> CanFrame {
     CanFrame::standard(BROADCAST, [low, high, verb, rid, a, b, c, d])
 }
 
-/// A motor's answer: what a parameter is, after it was read or written.
+/// A motor's answer: the value of a parameter after it was read or written.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reply {
     /// The motor.
     pub slave: u16,
-    /// It was written, and not read.
+    /// It was written, not read.
     pub written: bool,
     /// Which one.
     pub parameter: Parameter,
@@ -199,8 +184,7 @@ pub struct Reply {
 }
 
 impl Reply {
-    /// Reads a frame that a motor sent; `None` if it is no reply about a parameter that is known here.
-    #[must_use]
+    /// Reads a frame that a motor sent; `None` unless it is a reply about a parameter listed here.
     pub fn decode(frame: &CanFrame) -> Option<Self> {
         let [low, high, verb @ (READ | WRITE), rid, value @ ..] = codec::data_of(frame)? else { return None };
         let parameter = Parameter::from_rid(rid)?;
@@ -218,7 +202,6 @@ impl Reply {
     }
 
     /// As a motor would send it from `master`. For simulated motors.
-    #[must_use]
     pub const fn encode(&self, master: u16) -> CanFrame {
         let verb = if self.written { WRITE } else { READ };
         let request = request(self.slave, verb, self.parameter.rid(), self.value.to_le_bytes());

@@ -8,7 +8,7 @@ fn at(ms: u64) -> Stamp {
 }
 
 #[test]
-fn actions_that_stop_are_held_and_then_disabled() {
+fn when_actions_stop_the_joint_holds_and_is_then_disabled() {
     let period = Duration::from_millis(100);
     for (configured, hold_ms) in [(None, 200), (Some(Duration::from_millis(50)), 50)] {
         let mut deadman = Deadman::new(configured, Some(Duration::from_secs(1)), CYCLE);
@@ -31,7 +31,7 @@ fn actions_that_stop_are_held_and_then_disabled() {
 }
 
 #[test]
-fn an_armed_motor_without_an_action_holds_and_is_disabled() {
+fn an_armed_motor_without_an_action_holds_and_is_then_disabled() {
     let mut deadman = Deadman::new(None, Some(Duration::from_secs(1)), CYCLE);
     deadman.feed(at(9));
     deadman.arm(at(10));
@@ -41,7 +41,7 @@ fn an_armed_motor_without_an_action_holds_and_is_disabled() {
 }
 
 #[test]
-fn actions_that_come_quicker_than_commands_are_waited_for_all_the_same() {
+fn actions_faster_than_commands_still_have_time_to_arrive() {
     let mut deadman = Deadman::new(None, Some(Duration::from_secs(1)), CYCLE);
     let period = Duration::from_millis(1);
     assert_eq!(deadman.patience(period), Duration::from_millis(30), "two cycles, and 20 ms on its way");
@@ -56,7 +56,7 @@ fn actions_that_come_quicker_than_commands_are_waited_for_all_the_same() {
 }
 
 #[test]
-fn an_arm_that_is_not_to_fall_is_held_for_ever() {
+fn an_arm_without_a_hold_limit_is_held_forever() {
     let mut deadman = Deadman::new(None, None, CYCLE);
     deadman.arm(at(10));
     deadman.feed(at(100));

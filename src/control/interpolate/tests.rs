@@ -54,7 +54,7 @@ fn a_pause_does_not_change_the_rate_and_a_hold_ends_interpolation() {
 
 proptest! {
     #[test]
-    fn nothing_is_beyond_the_targets(
+    fn interpolation_stays_between_its_targets(
         targets in prop::collection::vec((-10.0..10.0, 0_u64..400), 1..20), steps in 1_u64..20,
     ) {
         let mut line = Interpolator::new(1);

@@ -25,7 +25,7 @@ fn values_beyond_the_range_are_clamped() {
 }
 
 #[test]
-fn limits_that_are_none_allow_nothing() {
+fn invalid_limits_allow_only_zero() {
     for (low, high) in [(1.0, -1.0), (f64::NAN, 1.0), (0.0, f64::NAN)] {
         assert_eq!(Limits::new(low, high, 1.0).range(), [0.0, 0.0]);
     }
@@ -57,7 +57,7 @@ fn a_velocity_is_braked_at_the_ends_of_the_positions() {
 }
 
 #[test]
-fn a_joint_braked_like_this_stays_within_the_positions() {
+fn a_braked_joint_stays_within_the_positions() {
     let limits = Limits::new(-5.0, 5.0, 2.0);
     let (mut position, mut velocity) = (0.0, 0.0);
     let step = Duration::from_millis(5);
@@ -70,7 +70,7 @@ fn a_joint_braked_like_this_stays_within_the_positions() {
 }
 
 #[test]
-fn a_stiff_joint_is_commanded_near_to_where_it_is() {
+fn a_stiff_joint_is_commanded_near_its_position() {
     assert_eq!(within_torque(3.0, 0.0, 1.0, 2.0), 0.5);
     assert_eq!(within_torque(-3.0, 0.0, 1.0, 2.0), -0.5);
     assert_eq!(within_torque(0.4, 0.0, 1.0, 2.0), 0.4);

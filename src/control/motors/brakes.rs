@@ -1,6 +1,7 @@
-//! Holding brakes of joints: when each is to be released, and what follows from what they are.
+//! Holding brakes of joints: when each must be released, and what their states imply.
 //!
-//! Invariant: a brake is released only while its motor is on, and engaged before the motor of a joint that stops so is off.
+//! Invariant: a brake is released only while its motor is on. It engages before the motor of a joint that stops by its
+//! brake is turned off.
 //! Invariant: no joint follows an action before its brake is released.
 
 use std::time::Duration;
@@ -10,15 +11,15 @@ use super::{BusState, Fault, Motor, MotorBus, Notice};
 use crate::registry::{DamiaoSpec, Stop};
 use crate::time::Stamp;
 
-/// What brakes are, a bit for each motor, the first one the lowest; those without any are engaged. Bits of motors without
-/// a brake mean nothing.
+/// States of brakes, a bit for each motor, the first one the lowest; without any bit set a brake is engaged. Bits of
+/// motors without a brake mean nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Brakes {
-    /// They are released.
+    /// Released.
     pub released: u16,
-    /// Their lines are being set: what they are is not known.
+    /// Their lines are being set: the state is unknown.
     pub moving: u16,
-    /// They can be neither engaged nor released: what they are is not known.
+    /// They can be neither engaged nor released: the state is unknown.
     pub broken: u16,
 }
 
@@ -43,24 +44,23 @@ pub(super) fn slowest(spec: &DamiaoSpec) -> Duration {
 }
 
 impl MotorBus {
-    /// The brakes that are to be released after the last step, a bit for each motor; all others are to be engaged.
-    #[must_use]
+    /// The brakes that must be released after the last step, one bit per motor; all others must be engaged.
     pub fn releases(&self) -> u16 {
         self.bits(Motor::releases)
     }
 
-    /// The brakes that are to be engaged at once where this program can command no more: those of joints that stop so, and
-    /// of those that are not kept from falling.
-    #[must_use]
+    /// The brakes that are to engage at once when this program can no longer command: those of joints that stop by
+    /// their brake, and of joints that nothing else keeps from falling.
     pub fn engages_at_death(&self) -> u16 {
         self.bits(|motor| matches!(motor.last_stop(), Stop::Limp | Stop::Brake))
     }
 
-    /// Takes what the brakes are; to be called before each step where a motor has one. A brake of a joint that is armed, or
-    /// being armed, and that cannot be driven is a fault.
+    /// Takes the states of the brakes; to be called before each step if a motor has one. It is a fault if the brake of
+    /// a joint that is armed, or being armed, cannot be driven.
     pub fn feed_brakes(&mut self, brakes: Brakes, now: Stamp) {
         for (index, motor) in self.motors.iter_mut().enumerate() {
-            // One that is to be released may be on its way: its line counts as engaged from when that is wanted.
+            // A brake that is to be released may already be moving: it counts as engaged only once engagement is
+            // wanted.
             let is = brakes.of(index);
             motor.take_brake(if is == BrakeIs::Engaged && motor.releases() { BrakeIs::Moving } else { is }, now);
             if motor.misses_brake() {

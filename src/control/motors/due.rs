@@ -15,17 +15,17 @@ use crate::time::Stamp;
 
 /// An arm that took longer has failed...
 const ARM_WITHIN: Duration = Duration::from_secs(1);
-/// ...and more cycles: to read a parameter takes one, to set it another, and answers may take several.
+/// ...and more cycles: reading a parameter takes one, setting it another, and answers may take several.
 const ARM_CYCLES: u32 = 40;
-/// Motors that have not reported their parameters after this are named in a notice.
+/// A motor that has not reported its parameters after this is named in a notice.
 const PROBE_WITHIN: Duration = Duration::from_secs(1);
-/// For this long no other program may have commanded a motor that is armed.
+/// An armed motor must not have been commanded by another program for this long.
 const ONE_MASTER: Duration = Duration::from_secs(1);
-/// Motors that answer have to turn off within this.
+/// Motors that answer must turn off within this.
 const DISABLE_WITHIN: Duration = Duration::from_millis(500);
 
 impl MotorBus {
-    /// Looks after motors that do not answer.
+    /// Handles motors that do not answer.
     pub(super) fn listen(&mut self, now: Stamp) {
         let silent = |motor: &Motor| motor.unanswered(now) >= self.silent_after;
         let Some(motor) = self.motors.iter().position(silent) else { return };
@@ -35,7 +35,7 @@ impl MotorBus {
         }
     }
 
-    /// Is something wrong with a motor, by its reports?
+    /// The fault that a motor reports, if any.
     pub(super) fn judge(&self, index: usize) -> Option<Fault> {
         let motor = self.motors.get(index)?;
         let status = || motor.status_fault();
@@ -43,9 +43,9 @@ impl MotorBus {
             (BusState::Disarmed | BusState::Following | BusState::Holding, _)
             | (BusState::Arming, Phase::Enabling | Phase::On) => status().or_else(|| motor.heat_fault()),
             (BusState::Arming, _) => motor.heat_fault(),
-            // It was stopped for that, in its way.
+            // It was stopped for this fault, as configured.
             (BusState::Faulted(Fault::Hot { motor, .. }), Phase::Kept(_)) if motor == index => status(),
-            // It was stopped, and is on.
+            // It was stopped, and is still on.
             (BusState::Faulted(_), Phase::Kept(_)) => status().or_else(|| motor.heat_fault()),
             _ => None,
         }
@@ -73,7 +73,7 @@ impl MotorBus {
                 Some(motor) if waited >= DISABLE_WITHIN => self.fail(Fault::NotDisabled { motor }, now),
                 Some(_) => {}
             },
-            // It reports the same again.
+            // An arm would find the same fault again.
             BusState::Faulted(Fault::Unusable { .. }) => self.keep(waited, now),
             BusState::Stopped => {}
             BusState::Faulted(_) => {
@@ -84,7 +84,7 @@ impl MotorBus {
         }
     }
 
-    /// Looks after motors that were stopped by a fault and are still on.
+    /// Handles motors that were stopped by a fault and are still on.
     fn keep(&mut self, waited: Duration, now: Stamp) {
         for motor in &mut self.motors {
             if motor.was_kept(waited, now) || motor.is_kept() && motor.unanswered(now) >= self.silent_after {
@@ -93,8 +93,7 @@ impl MotorBus {
         }
     }
 
-    /// Asks motors whose ranges are not known, though the bus is past its probing: they had no power then, or
-    /// an arm came between.
+    /// Queries motors whose ranges are still unknown after probing: they had no power then, or an arm interrupted it.
     fn ask_late(&mut self, now: Stamp) {
         for motor in &mut self.motors {
             let is_silent = motor.unanswered(now) >= self.silent_after;
@@ -107,7 +106,7 @@ impl MotorBus {
         }
     }
 
-    /// Asks motors that are off for their parameters. Returns whether all have reported them.
+    /// Queries the parameters of motors that are off. Returns whether all have reported them.
     fn ask(&mut self) -> bool {
         for motor in &mut self.motors {
             if matches!(motor.phase, Phase::Off { .. }) && motor.is_off() {
@@ -132,7 +131,7 @@ impl MotorBus {
         }
     }
 
-    /// Another program commands a motor: an arm with two masters is a fault.
+    /// Another program commands a motor: an arm with a second master is a fault.
     pub(super) fn received_master(&mut self, motor: usize, now: Stamp) {
         let is_news = self.other_master.replace((motor, now)).is_none_or(|(_, last)| now.since(last) >= ONE_MASTER);
         match self.state {
@@ -180,7 +179,7 @@ impl MotorBus {
         }
     }
 
-    /// What the actions that come ask for, if that is far from where a motor is that has not been enabled yet.
+    /// The target of incoming actions, if it is far from a motor that is not enabled yet.
     fn far_from_actions(&self, now: Stamp) -> Option<Fault> {
         let (target, tick) = &self.asked;
         if now.since(*tick) >= self.deadman.patience(self.line.period()) {
@@ -191,14 +190,14 @@ impl MotorBus {
         Some(Fault::Far { motor, position, target: *target.get(motor)? })
     }
 
-    /// Stays where the last command was, or where it can stop.
+    /// Holds the last command, or stops as soon as it can.
     pub(super) fn hold(&mut self, now: Stamp) {
         let axes = self.targets.iter_mut().zip(&self.commands).zip(&self.motors).zip(&self.ramps).zip(&self.limits);
         for ((((target, command), motor), ramp), limits) in axes {
             let [low, high] = limits.range();
             *target = match motor.spec.mode {
                 MotorMode::Velocity => 0.0,
-                // One that is beyond its limits stays there.
+                // A joint beyond its limits stays there.
                 _ => ramp.stops_at(*command).clamp(low.min(*command), high.max(*command)),
             };
         }
@@ -206,7 +205,7 @@ impl MotorBus {
         self.enter(BusState::Holding, now);
     }
 
-    /// The commands of this cycle, and whether each motor does what it was commanded.
+    /// The commands of this cycle, and whether each motor follows its own.
     fn follow(&mut self, now: Stamp, passed: Duration) {
         let axes = self.motors.iter_mut().zip(&self.limits).zip(&mut self.commands).zip(&mut self.ramps);
         let (mut first, is_led) = (None, self.line.tick().is_some());
@@ -218,7 +217,7 @@ impl MotorBus {
                 _ => ramp.next(limits, before, target, passed),
             };
             let bound = motor.bound(wanted, limits);
-            // What a motor reports moves the command no faster than an action does.
+            // A reported position moves the command no faster than an action does.
             *command = if motor.spec.mode == MotorMode::Velocity { bound } else { limits.slew(before, bound, passed) };
             ramp.took(*command - before, passed, is_led);
             let fault = motor.strange(
@@ -245,10 +244,10 @@ impl MotorBus {
         self.enter(BusState::Disabling, now);
     }
 
-    /// Stops all motors, each as it is to be stopped; of motors that are stopped already only that with the fault.
+    /// Stops all motors, each as configured; of motors that are already stopped only the one with the fault.
     pub(super) fn fail(&mut self, fault: Fault, now: Stamp) {
         let own = fault.own();
-        // What came first is what it is about.
+        // The first fault is the one that is reported.
         let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
         for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {
             motor.stop_at_fault(Some(index) == own, command);
@@ -259,8 +258,8 @@ impl MotorBus {
         self.report_stopped(fault);
     }
 
-    /// Stops all motors at an emergency stop, each as it is to be stopped, and those that a fault has left on. Not
-    /// twice before an arm; motors that are disabled, or are being disabled, stay so.
+    /// Stops all motors at an emergency stop, each as configured, including those that a fault has left on. Only once
+    /// per arm; motors that are disabled, or being disabled, stay so.
     pub(super) fn stop_at_emergency(&mut self, trip: Trip, now: Stamp) {
         let is_news = !matches!(self.state, BusState::Faulted(Fault::EmergencyStop(_)));
         if !(self.is_armed() || self.state == BusState::Arming || is_news && self.is_keeping()) {
@@ -285,7 +284,7 @@ impl MotorBus {
         }
     }
 
-    /// Reports every fault that motors have latched, once: it is for the next arm to clear them.
+    /// Reports every latched fault once; the next arm clears them.
     pub(super) fn name_latched(&mut self, reported: Option<Fault>) {
         for (motor, latching) in self.motors.iter_mut().enumerate() {
             let Some(status) = latching.status.filter(|status| status.is_fault()) else { continue };
@@ -295,7 +294,7 @@ impl MotorBus {
         }
     }
 
-    /// Is a motor on that was stopped by a fault?
+    /// Is any motor still on that was stopped by a fault?
     pub(super) fn is_keeping(&self) -> bool {
         self.motors.iter().any(Motor::is_kept)
     }

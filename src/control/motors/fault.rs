@@ -1,4 +1,4 @@
-//! What can be wrong with a bus of motors, and with whose joint; in words: `words`.
+//! Faults of a bus of motors and of its joints; their text: `words`.
 
 use std::time::Duration;
 
@@ -16,11 +16,11 @@ pub enum Part {
     Rotor,
 }
 
-/// Something that a motor does and should not. Numbers are rad, rad/s and Nm.
+/// Abnormal behaviour of a motor. Numbers are rad, rad/s and Nm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Strange {
-    /// It reports a position to which it cannot have come since its last frame: the frame is damaged, or another
-    /// program set its zero.
+    /// It reports a position that it cannot have reached since its last frame: the frame is damaged, or another program
+    /// set its zero.
     Jump {
         /// Where it was.
         from: f64,
@@ -34,33 +34,33 @@ pub enum Strange {
         /// The limits.
         range: [f64; 2],
     },
-    /// It is faster than it may be.
+    /// It exceeds its speed limit.
     Fast {
         /// How fast it is.
         velocity: f64,
-        /// How fast it may be.
+        /// The limit.
         limit: f64,
     },
-    /// It reports more torque than it may have.
+    /// It exceeds its torque limit.
     Strong {
         /// How much.
         torque: f64,
         /// The limit.
         limit: f64,
     },
-    /// It moves away from its command, though pushed with all the torque that it may have.
+    /// It moves away from its command at the full torque limit.
     Driven {
         /// The limit.
         torque: f64,
     },
-    /// It reports a speed and always the same position: its encoder stands still.
+    /// It reports a speed and an unchanging position: its encoder is frozen.
     Frozen {
         /// The position.
         position: f64,
         /// The speed.
         velocity: f64,
     },
-    /// It stands still, though pushed with all the torque that it may have: it is blocked, or its encoder stands still.
+    /// It stands still at the full torque limit: it is blocked, or its encoder is frozen.
     Blocked {
         /// The limit.
         torque: f64,
@@ -89,7 +89,7 @@ pub enum Fault {
         /// What it reports.
         status: MotorStatus,
     },
-    /// A motor is hotter than it may be.
+    /// A motor is over its temperature limit.
     Hot {
         /// Which.
         motor: usize,
@@ -100,14 +100,14 @@ pub enum Fault {
         /// °C.
         limit: f64,
     },
-    /// A motor did so for too long.
+    /// A motor behaved abnormally for too long.
     Strange {
         /// Which.
         motor: usize,
         /// What.
         what: Strange,
     },
-    /// A motor that is on was set otherwise by another program.
+    /// Another program changed a parameter of a motor that is on.
     Changed {
         /// Which.
         motor: usize,
@@ -121,16 +121,16 @@ pub enum Fault {
         /// Which.
         motor: usize,
     },
-    /// Actions ask for a position that is far from where the joint is.
+    /// Actions request a position far from where the joint is.
     Far {
         /// Which motor.
         motor: usize,
         /// Where it is, rad.
         position: f64,
-        /// What the actions ask for, rad.
+        /// The position requested, rad.
         target: f64,
     },
-    /// This program was held up: no motor was commanded for so long.
+    /// This program stalled: no motor was commanded for this long.
     Stalled {
         /// How long.
         after: Duration,
@@ -150,17 +150,17 @@ pub enum Fault {
         /// Which.
         motor: usize,
     },
-    /// A motor answers, and did not become enabled.
+    /// A motor answers but did not become enabled.
     NotEnabled {
         /// Which.
         motor: usize,
     },
-    /// A motor answers, and did not become disabled.
+    /// A motor answers but did not become disabled.
     NotDisabled {
         /// Which.
         motor: usize,
     },
-    /// A motor answers, but not to the question for a parameter.
+    /// A motor answers, but not to the query of a parameter.
     Unread {
         /// Which.
         motor: usize,
@@ -169,7 +169,7 @@ pub enum Fault {
     },
     /// An emergency stop: nothing is wrong with a motor.
     EmergencyStop(Trip),
-    /// A parameter of a motor is one that nothing can be done with, or stayed so when it was set.
+    /// A parameter of a motor is unusable, or remained so when it was set.
     Unusable {
         /// Which.
         motor: usize,
@@ -181,8 +181,7 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// The motor that it is of, by its position in the entry; `None` where it is of none.
-    #[must_use]
+    /// The motor concerned, by its position in the entry, if any.
     pub const fn motor(&self) -> Option<usize> {
         match *self {
             Self::EmergencyStop(_) | Self::Stalled { .. } => None,
@@ -203,10 +202,9 @@ impl Fault {
         }
     }
 
-    /// The motor whose own joint is at fault, by its position in the entry. A joint that is sound, and overloaded or
-    /// commanded by another program, or whose brake cannot be driven, need not fall for it: with that, its motor is all that
-    /// holds it.
-    #[must_use]
+    /// The motor whose own joint is at fault, by its position in the entry. A healthy joint that is overloaded,
+    /// commanded by another program, or without a working brake need not fall: in the last case only its motor holds
+    /// it.
     pub const fn own(&self) -> Option<usize> {
         match *self {
             Self::OtherMaster { .. }
@@ -218,7 +216,6 @@ impl Fault {
     }
 
     /// In words; `names` are those of the motors.
-    #[must_use]
     pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
         Words::new(self, names)
     }

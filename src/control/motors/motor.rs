@@ -1,4 +1,4 @@
-//! One motor: what is being asked of it, and what it answered.
+//! One motor: its phase, and what it reported.
 //!
 //! | phase    | sent each cycle                        | until                                   |
 //! |----------|----------------------------------------|-----------------------------------------|
@@ -10,8 +10,8 @@
 //! | On       | a command                              | the bus is disarmed, or has a fault     |
 //! | Kept     | damping, or the last command           | the bus is disarmed, or it has a fault  |
 //!
-//! Invariant: a command is sent in `Enabling` and `On` alone, and in `Kept` the last one.
-//! Invariant: who is found enabled without having been armed is disabled.
+//! Invariant: a new command is sent only in `Enabling` and `On`; in `Kept` the last one is repeated.
+//! Invariant: a motor found enabled without an arm is disabled.
 
 mod brake;
 mod judged;
@@ -26,7 +26,7 @@ use super::notice::Notice;
 use super::notices::Notices;
 use super::watch::{Supervision, is_near};
 use crate::control::can::CanFrame;
-use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
+use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Ranges, StateCommand};
 use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
 use crate::control::limits::{Limits, stiffness, within_torque};
 use crate::control::ramp::Ramp;
@@ -36,11 +36,11 @@ use brake::Brake;
 pub(super) use brake::BrakeIs;
 use parameters::PROBE;
 
-/// Ids of commands and orders, from a motor's own.
+/// Ids of commands, relative to the motor's own.
 const COMMANDS: [u32; 4] = [0, 0x100, 0x200, 0x300];
-/// A motor is warm this many °C below its limit...
+/// A motor counts as warm from this many °C below its limit...
 const WARM: f64 = 10.0;
-/// ...until it is this much cooler.
+/// ...until it has cooled by this much.
 const COOLER: f64 = 5.0;
 
 /// See the module's comment.
@@ -50,7 +50,7 @@ pub(super) enum Phase {
     Off {
         reported: bool,
     },
-    /// Asked for `PROBE[at]`, or ordered to set it, from what it was.
+    /// Asked for `PROBE[at]`, or ordered to change it from its old value.
     Asked {
         at: usize,
         setting: Option<Value>,
@@ -79,8 +79,8 @@ pub(super) const fn ramp(spec: &MotorSpec) -> Ramp {
     Ramp::new(spec.motion.acceleration, spec.motion.soft_start)
 }
 
-/// Positions within what a motor counts in, from `-range` to `range`: those beyond can be neither sent nor
-/// seen. The lower end is above the higher one if there are none.
+/// The positions that a motor can encode, `-range` to `range`: those beyond can be neither sent nor reported. The lower
+/// end is above the upper one if there are none.
 fn within([low, high]: [f64; 2], range: f64) -> [f64; 2] {
     [low.max(-range), high.min(range)]
 }
@@ -91,21 +91,21 @@ fn within([low, high]: [f64; 2], range: f64) -> [f64; 2] {
 pub(super) struct Motor {
     pub(super) spec: MotorSpec,
     pub(super) phase: Phase,
-    /// What it counts in; `None` until it was asked.
+    /// The ranges it encodes; `None` until they were read.
     pub(super) ranges: Option<Ranges>,
     /// Its newest feedback, once its ranges are known.
     pub(super) feedback: Option<Feedback>,
-    /// When that came.
+    /// When the feedback arrived.
     pub(super) seen: Stamp,
-    /// It came after the last sample.
+    /// The feedback is newer than the last sample.
     pub(super) is_new: bool,
-    /// What it reported of itself since it was last ordered to turn off.
+    /// Its status since it was last ordered to turn off.
     pub(super) status: Option<MotorStatus>,
-    /// The first frame since its last answer.
+    /// Time of the first frame sent since its last answer.
     asked: Option<Stamp>,
-    /// Frames in a row that report it as not enabled, though it was.
+    /// Consecutive frames that report it as not enabled although it was.
     off_frames: u8,
-    /// Its newest two positions are those of one joint.
+    /// Its newest two positions are consistent.
     agrees: bool,
     index: usize,
     timeout: u32,
@@ -113,16 +113,15 @@ pub(super) struct Motor {
     warm: [bool; 2],
     watch: Supervision,
     brake: Brake,
-    /// When a parameter is read again, and which was.
+    /// When the next parameter is read again, and which.
     look: Option<Stamp>,
     looks: usize,
     differs: bool,
-    /// The fault that it has latched and that was reported: an arm after that clears it.
+    /// Its latched fault, once reported: the next arm clears it.
     pub(super) named: Option<MotorStatus>,
-    /// That it does not answer was reported.
+    /// Its silence was reported.
     pub(super) missed: bool,
-    /// It was ordered to turn on, or reported that it is on, and has not reported since it was ordered to turn off that
-    /// it is not.
+    /// It was ordered or reported to be on, and has not reported off since the last disable.
     pub(super) may_be_on: bool,
 }
 
@@ -162,7 +161,7 @@ impl Motor {
         frame.id == u32::from(self.spec.master) && slave_fits
     }
 
-    /// Is this frame a command or an order to it, or does it set a parameter of it? It is not ours: what we send is not received.
+    /// Does another program command it, or set one of its parameters, by this frame? Our own frames are not received.
     pub(super) fn is_commanded_by(&self, frame: &CanFrame) -> bool {
         let slave = u32::from(self.spec.slave);
         let writes = parameter::is_write(frame) == Some(self.spec.slave);
@@ -176,12 +175,12 @@ impl Motor {
         self.phase = Phase::Off { reported: false };
     }
 
-    /// It was stopped by a fault, and is still enabled.
+    /// It was stopped by a fault and is still enabled.
     pub(super) const fn is_kept(&self) -> bool {
         matches!(self.phase, Phase::Kept(_))
     }
 
-    /// It is being ordered to turn off for the last time.
+    /// Marks it as ordered to turn off for the last time.
     pub(super) const fn stop(&mut self) {
         if !matches!(self.phase, Phase::Off { reported: true }) {
             self.phase = Phase::Off { reported: true };
@@ -198,7 +197,7 @@ impl Motor {
         }
     }
 
-    /// It has had a frame for this long without answering.
+    /// How long it has left our frames unanswered.
     pub(super) fn unanswered(&self, now: Stamp) -> Duration {
         self.asked.map_or(Duration::ZERO, |asked| now.since(asked))
     }
@@ -215,7 +214,7 @@ impl Motor {
         if let Some(ranges) = self.ranges {
             is_possible = self.is_possible(&feedback, &ranges, now, notices)?;
         }
-        // Nothing in a damaged frame is believed.
+        // Nothing in a damaged frame is trusted.
         if !is_possible {
             return Ok(());
         }
@@ -250,11 +249,10 @@ impl Motor {
         ]
     }
 
-    /// Enables it once its parameters are read: faults are cleared before. Until it is, its
-    /// command is where it is.
+    /// Enables it once its parameters are read; faults are cleared first. Until then its command is its position.
     ///
     /// # Errors
-    /// It stands where it may not be armed, or has latched a fault that was not reported yet.
+    /// It must not be armed at its position, or has latched a fault that was not reported yet.
     pub(super) fn enable(
         &mut self,
         command: &mut f64,
@@ -266,7 +264,7 @@ impl Motor {
             return Ok(());
         };
         if self.phase == Phase::Probed {
-            // One of two may be of a damaged frame: where the joint is, is not known.
+            // One of the two frames may be damaged: the position of the joint is unknown.
             if !self.agrees {
                 return Ok(());
             }
@@ -294,13 +292,13 @@ impl Motor {
                 self.phase = Phase::On;
             }
         } else if self.phase == Phase::On {
-            // It waits for the others, and a person may lean on it.
+            // It waits for the others, and a person may push it meanwhile.
             *command = limits.slew(*command, self.bound(*command, limits), passed);
         }
         Ok(())
     }
 
-    /// The command next to `command` that where the joint is allows.
+    /// The command nearest to `command` that the position of the joint allows.
     pub(super) fn bound(&self, command: f64, limits: &Limits) -> f64 {
         let (Some(Feedback { q, .. }), Some(ranges)) = (self.feedback, &self.ranges) else { return command };
         match self.spec.mode {
@@ -310,7 +308,7 @@ impl Motor {
         }
     }
 
-    /// Sends the frames of this cycle. `command` is the position or the velocity of now.
+    /// Sends the frames of this cycle. `command` is the current position or velocity command.
     pub(super) fn step(&mut self, command: f64, now: Stamp, is_silent: bool, send: &mut impl FnMut(CanFrame)) {
         let slave = self.spec.slave;
         if matches!(self.phase, Phase::Asked { .. } | Phase::Probed) && self.status == Some(MotorStatus::Enabled) {
@@ -319,9 +317,9 @@ impl Motor {
         match self.phase {
             Phase::Off { .. } if self.is_off() && !is_silent => send(parameter::refresh(slave)),
             Phase::Off { reported } => {
-                send(Order::Disable.frame(slave));
+                send(StateCommand::Disable.frame(slave));
                 if !reported {
-                    // An earlier report is no answer to this.
+                    // An earlier report does not answer this.
                     self.status = None;
                 }
                 self.phase = Phase::Off { reported: true };
@@ -336,11 +334,11 @@ impl Motor {
             }
             Phase::Probed => send(parameter::refresh(slave)),
             Phase::Clearing => {
-                send(Order::ClearError.frame(slave));
+                send(StateCommand::ClearError.frame(slave));
                 send(parameter::refresh(slave));
             }
             Phase::Enabling => {
-                send(Order::Enable.frame(slave));
+                send(StateCommand::Enable.frame(slave));
                 self.may_be_on = true;
                 self.command(command, send);
             }
@@ -353,7 +351,7 @@ impl Motor {
         self.asked.get_or_insert(now);
     }
 
-    /// Keeps it from falling, or from falling fast.
+    /// Holds or damps it.
     fn keep(&self, stop: Stop, command: f64, send: &mut impl FnMut(CanFrame)) {
         let (MotorMode::Mit { kd, .. }, Stop::Damp) = (self.spec.mode, stop) else {
             return self.command(command, send);

@@ -5,22 +5,22 @@ use super::words::Words;
 use crate::control::damiao::codec::{MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
 
-/// Where a bus of motors stands.
+/// The state of a bus of motors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum BusState {
-    /// Motors are asked for their parameters; none is enabled.
+    /// The parameters of the motors are read; none is enabled.
     Probing,
     /// All have answered, none is enabled.
     Disarmed,
-    /// An arm was asked for: parameters are read again, faults cleared, motors enabled.
+    /// An arm was requested: parameters are read again, faults cleared, motors enabled.
     Arming,
     /// All are enabled and follow actions.
     Following,
-    /// All are enabled and stay where the last command was, for want of an action.
+    /// All are enabled and stay where the last command was, for lack of an action.
     Holding,
     /// All are being disabled.
     Disabling,
-    /// All are being kept disabled, until an arm is asked for.
+    /// All are being kept disabled until an arm is requested.
     Faulted(Fault),
     /// Nothing is sent any more.
     Stopped,
@@ -38,9 +38,9 @@ pub enum Reason {
 /// Why an action moves nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
-    /// It has not one number for each axis.
+    /// It does not have one value per axis.
     Length,
-    /// A number of it is infinite, or none.
+    /// A value of it is infinite or NaN.
     NotFinite,
     /// Its tick is further back than the deadman allows.
     Old,
@@ -48,7 +48,7 @@ pub enum Refusal {
     Early,
     /// Joints are being driven back into their limits.
     Returning,
-    /// It is the first after an arm, and far from where a joint is.
+    /// It is the first after an arm, and far from the position of a joint.
     Far {
         /// Which motor.
         motor: usize,
@@ -65,7 +65,7 @@ pub enum Notice {
         /// Which.
         motor: usize,
     },
-    /// A motor counts in other ranges than its kind is shipped with. Its own are used.
+    /// The ranges of a motor differ from the factory ranges of its kind. Its own are used.
     RangesDiffer {
         /// Which.
         motor: usize,
@@ -85,7 +85,7 @@ pub enum Notice {
         /// What it is.
         is: Value,
     },
-    /// A motor is nearly as hot as it may be.
+    /// A motor is close to its temperature limit.
     Warm {
         /// Which.
         motor: usize,
@@ -101,28 +101,28 @@ pub enum Notice {
         /// Which.
         motor: usize,
     },
-    /// A motor does something that it should not.
+    /// A motor behaves abnormally.
     Strange {
         /// Which.
         motor: usize,
         /// What.
         what: Strange,
     },
-    /// A motor has latched a fault, beside the one that everything was stopped for.
+    /// A motor has latched a fault besides the one that stopped all motors.
     Latched {
         /// Which motor.
         motor: usize,
         /// The fault.
         status: MotorStatus,
     },
-    /// A fault that a motor has latched is cleared, because an arm was asked for.
+    /// A latched fault of a motor is cleared, because an arm was requested.
     Cleared {
         /// Which motor.
         motor: usize,
         /// The fault.
         status: MotorStatus,
     },
-    /// An arm was asked for.
+    /// An arm was requested.
     Arming,
     /// All motors are enabled. They hold until an action comes.
     Armed,
@@ -138,7 +138,7 @@ pub enum Notice {
     Disabled(Reason),
     /// All motors are being stopped.
     Fault(Fault),
-    /// Of motors stopped by a fault, those that are still on, a bit each.
+    /// The motors stopped by a fault that are still on, a bit each.
     Kept {
         /// Bits of motors that are damped.
         damped: u16,
@@ -166,8 +166,7 @@ pub enum Notice {
 }
 
 impl Notice {
-    /// Is it about something that an operator should look after?
-    #[must_use]
+    /// Does it need the attention of an operator?
     pub const fn is_problem(&self) -> bool {
         match self {
             Self::Ready
@@ -196,7 +195,6 @@ impl Notice {
     }
 
     /// In words; `names` are those of the motors.
-    #[must_use]
     pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
         Words::new(self, names)
     }

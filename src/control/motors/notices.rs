@@ -6,10 +6,10 @@ use std::time::Duration;
 use super::notice::Notice;
 use crate::time::Stamp;
 
-/// A notice that may come often comes this seldom at most.
+/// Shortest time between notices of a frequent condition.
 const SELDOM: Duration = Duration::from_secs(1);
 
-/// Something of which there is a notice when it begins, but not more often than [`SELDOM`].
+/// A condition that is reported when it begins, at most once per [`SELDOM`].
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Seldom {
     last: Option<Stamp>,
@@ -17,7 +17,7 @@ pub(super) struct Seldom {
 }
 
 impl Seldom {
-    /// It is the case at `now`, or not. Is there to be a notice of it?
+    /// The condition holds at `now`, or not. Is it to be reported?
     pub(super) fn look(&mut self, is: bool, now: Stamp) -> bool {
         self.is_reported &= is;
         let is_due = is && !self.is_reported && self.last.is_none_or(|last| now.since(last) >= SELDOM);
@@ -28,8 +28,7 @@ impl Seldom {
     }
 }
 
-/// Notices that wait to be taken. The oldest are lost where there is no room, for nothing here
-/// allocates.
+/// Notices that wait to be taken. Without room the oldest are lost: nothing here allocates.
 #[derive(Debug)]
 pub(super) struct Notices {
     waiting: VecDeque<Notice>,

@@ -6,11 +6,11 @@ use super::MotorBus;
 use super::notice::Refusal;
 use crate::time::Stamp;
 
-/// Actions may be this far in the future: clocks are one, ticks are rounded.
+/// Actions may be this far in the future: the clock is the same, but ticks are rounded.
 const EARLY: Duration = Duration::from_millis(100);
 
 impl MotorBus {
-    /// Why an action moves nothing, if it does not.
+    /// Why an action is refused, if it is.
     pub(super) fn refuse(&self, target: &[f64], tick: Stamp, now: Stamp) -> Option<Refusal> {
         if target.len() != self.motors.len() {
             Some(Refusal::Length)

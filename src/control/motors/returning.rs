@@ -1,4 +1,4 @@
-//! Joints outside their limits, on their way back: what an operator asks for with an arm that drives back.
+//! The return of joints outside their limits, which an operator requests with an arm that drives back.
 
 use std::time::Duration;
 
@@ -14,9 +14,9 @@ use crate::time::Stamp;
 pub const RETURN_SPEED: f64 = 0.1;
 
 impl MotorBus {
-    /// Ends the way back once every joint is within its limits.
+    /// Ends the return once every joint is within its limits.
     pub(super) fn look_for_return(&mut self, now: Stamp) {
-        // The way is no want of actions, however long it takes.
+        // The return needs no actions, however long it takes.
         self.deadman.arm(now);
         if self
             .motors
@@ -33,7 +33,7 @@ impl MotorBus {
 }
 
 impl Motor {
-    /// The command of the way back, from the one before.
+    /// The command of the return, from the previous one.
     pub(super) fn way_back(&self, before: f64, limits: &Limits, passed: Duration) -> f64 {
         let step = RETURN_SPEED * passed.as_secs_f64();
         if self.spec.mode == MotorMode::Velocity {

@@ -20,7 +20,7 @@ use crate::registry::MotorMode;
 use world::{MIT, Sim, World, motor, spec};
 
 #[test]
-fn motors_are_asked_set_up_and_watched_without_being_enabled() {
+fn motors_are_queried_configured_and_monitored_without_being_enabled() {
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]));
     world.sims[1].mode = 3;
     world.sims[1].ranges = [12.5, 30.0, 7.0];
@@ -62,7 +62,7 @@ fn motors_are_asked_set_up_and_watched_without_being_enabled() {
 }
 
 #[test]
-fn a_sample_waits_for_all_motors_and_is_as_old_as_its_oldest() {
+fn a_sample_waits_for_all_motors_and_has_the_time_of_the_oldest() {
     let mut world = World::ready();
     world.run(2);
     let mut sample = [0.0; 12];
@@ -105,7 +105,7 @@ fn unpowered_motors_are_awaited_and_reported_once() {
 }
 
 #[test]
-fn parameters_that_nothing_can_be_done_with_are_a_fault() {
+fn unusable_parameters_are_a_fault() {
     for (ranges, parameter) in [
         ([0.0, 30.0, 10.0], Parameter::PMax),
         ([12.5, f64::NAN, 10.0], Parameter::VMax),

@@ -1,8 +1,8 @@
-//! Is what a motor reports possible, and does it do what it is commanded?
+//! Are the reports of a motor possible, and does it follow its command?
 //!
-//! What is wrong is first a notice and, if it lasts, a fault: a frame may be damaged, a joint may be pushed for a moment.
+//! A problem is first a notice and, if it lasts, a fault: a frame may be damaged, a joint may be pushed for a moment.
 //!
-//! Invariant: a position that a motor cannot have come to is used for nothing.
+//! Invariant: a position that a motor cannot have reached is ignored.
 
 use std::time::Duration;
 
@@ -13,52 +13,52 @@ use crate::control::damiao::codec::{Feedback, Ranges};
 use crate::registry::{MotorMode, MotorSpec};
 use crate::time::Stamp;
 
-/// Frames with an impossible position, one after the other, that make a fault: one may be damaged.
+/// Consecutive frames with an impossible position that make a fault: a single one may be damaged.
 const JUMPS: u32 = 3;
-/// Steps of the 16 bits of a position by which it may differ besides.
+/// Additional tolerance of a position, in steps of its 16 bits.
 const STEPS: f64 = 2.0;
-/// The time between two frames may be so much longer than that between their arrivals: adapters hand over several at once.
+/// The time between two frames may exceed that between their arrivals by this much: adapters deliver several at once.
 const JITTER: Duration = Duration::from_millis(20);
-/// A limit of speed or torque may be exceeded by this share: what is measured is noisy, and a command is reached with a
-/// swing.
+/// A limit of speed or torque may be exceeded by this share: measurements are noisy, and motors overshoot.
 const SHARE: f64 = 0.25;
-/// Speed is a few steps of 12 bits exact, rad/s.
+/// Accuracy of a speed, a few steps of 12 bits, rad/s.
 const SLOW: f64 = 0.5;
-/// A joint that moves no faster stands still, rad/s.
+/// A joint below this speed stands still, rad/s.
 const STILL: f64 = 0.05;
 /// How long a joint may be outside its limits, three frames at least at 200 Hz...
 const BEYOND_AFTER: Duration = Duration::from_millis(20);
 /// ...or exceed its speed or torque...
 const EXCEED_AFTER: Duration = Duration::from_millis(100);
-/// ...or be driven away from its command against all the torque that it may have...
+/// ...or be driven away from its command against the full torque limit...
 const DRIVEN_AFTER: Duration = Duration::from_millis(200);
-/// ...or lag behind what its own loop is commanded...
+/// ...or lag behind the command of its own loop...
 const LAG_AFTER: Duration = Duration::from_millis(500);
 /// ...or report a speed and stand still, before there is a notice: a position may be read twice...
 const FROZEN_WORD: Duration = Duration::from_millis(30);
-/// ...and for how long after it.
+/// ...and until a fault after that.
 const FROZEN_AFTER: Duration = Duration::from_millis(70);
-/// How long a joint may stand still though pushed with all the torque that it may have, before there is a notice: what
-/// begins to move, or turns back, is slow for a moment.
+/// How long a joint may stand still at the full torque limit before there is a notice: a joint that starts or reverses
+/// is slow for a moment.
 const BLOCKED_WORD: Duration = Duration::from_millis(40);
-/// Cycles in a row in which it is not the case end a spell: in the one in which an action comes, and by a step of what is
-/// measured, a joint at its highest torque may seem to have less.
+/// This many consecutive cycles without the condition end a spell: in the cycle of a new action, and with measurement
+/// noise, a joint at its highest torque may seem to have less.
 const ABSENT: u8 = 2;
-/// A notice is not repeated within this, though what it is about ceased and came again.
+/// A notice is not repeated within this, even if its condition ended and returned.
 const AGAIN: Duration = Duration::from_secs(1);
 
-/// How long something has been the case.
+/// How long a condition has held.
 #[derive(Debug, Clone, Copy, Default)]
 struct Spell {
     since: Option<Stamp>,
-    /// Cycles in a row in which it was not the case.
+    /// Consecutive cycles without the condition.
     absent: u8,
-    /// When there was a notice of it last.
+    /// When it was last reported.
     reported: Option<Stamp>,
 }
 
 impl Spell {
-    /// It is the case at `now`, or not. Reports it once it has lasted for `word`; returns it when it has lasted for `limit`.
+    /// The condition holds at `now`, or not. Reports it once it has lasted for `word`; returns it once it has lasted
+    /// for `limit`.
     fn look(
         &mut self,
         strange: Option<Strange>,
@@ -89,7 +89,7 @@ impl Spell {
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Supervision {
-    /// When its newest frame came.
+    /// When its newest frame arrived.
     received: Option<Stamp>,
     jumps: u32,
     still: Option<Still>,
@@ -105,28 +105,28 @@ struct Still {
     speed: f64,
 }
 
-/// What a joint is commanded in this cycle, rad or rad/s.
+/// The command of a joint in this cycle, rad or rad/s.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Commanded {
     /// The command.
     pub(super) command: f64,
-    /// What it would be without the bound of the torque.
+    /// The command without the torque bound.
     pub(super) wanted: f64,
-    /// It is outside its limits, and on its way back.
+    /// The joint is outside its limits and returning.
     pub(super) is_returning: bool,
 }
 
 impl Supervision {
-    /// It was turned off: what it did is of the past.
+    /// Forgets everything, when the motor is turned off.
     pub(super) fn reset(&mut self) {
         *self = Self { received: self.received, ..Self::default() };
     }
 
-    /// A frame came at `now` of a motor that is on, after one with the feedback `before`. Is its position one that
-    /// the motor can have come to?
+    /// A frame of a motor that is on arrived at `now`, after one with the feedback `before`. Can the motor have reached
+    /// its position?
     ///
     /// # Errors
-    /// When it is the last of several that are not.
+    /// When it is the last of several impossible positions.
     pub(super) fn receive(
         &mut self,
         before: Option<&Feedback>,
@@ -159,7 +159,7 @@ impl Supervision {
         };
     }
 
-    /// Its encoder stands still, by frames of this long.
+    /// Is its encoder frozen, by frames over this long?
     fn frozen(&self) -> Option<(Strange, Duration)> {
         let still = self.still?;
         let what = Strange::Frozen { position: still.position, velocity: still.speed };
@@ -171,7 +171,7 @@ impl Supervision {
         self.jumps == 1
     }
 
-    /// What is wrong with a motor that is on, for so long that it is a fault.
+    /// The problem of a motor that is on, once it has lasted long enough to be a fault.
     pub(super) fn look(
         &mut self,
         (index, spec): (usize, &MotorSpec),
@@ -183,7 +183,7 @@ impl Supervision {
         let mut notify = |what| notices.notify(Notice::Strange { motor: index, what });
         let at_once = Duration::ZERO;
         let never = Duration::MAX;
-        // Time passes in which no frame comes.
+        // Time passes without a frame.
         let frozen = self.frozen().filter(|(_, lasted)| *lasted >= FROZEN_WORD).map(|(what, _)| what);
         let table = [
             (frozen, [at_once, FROZEN_AFTER]),
@@ -196,7 +196,7 @@ impl Supervision {
         ];
         let looks = self.spells.iter_mut().zip(table);
         let lasting = looks.map(|(spell, (strange, limits))| spell.look(strange, now, limits, &mut notify));
-        // Each is looked at, also behind one that lasts.
+        // Every condition is updated, even after one that lasts.
         lasting.fold(None, Option::or)
     }
 }
@@ -207,8 +207,7 @@ pub(super) fn beyond(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     (outside > spec.watch.margin).then_some(Strange::Beyond { position: feedback.q, range: spec.position })
 }
 
-/// A speed that is none of noise, rad/s.
-/// Can it have come from there to here in the time that passed?
+/// Can it have moved from there to here in the elapsed time?
 pub(super) fn is_near(
     before: &Feedback,
     feedback: &Feedback,
@@ -216,7 +215,7 @@ pub(super) fn is_near(
     passed: Duration,
 ) -> bool {
     let step = 2.0 * ranges.position() / f64::from(u16::MAX);
-    // As fast as it was, and somewhat faster than it may be, which is a fault of its own.
+    // At its last speed, or somewhat above its limit; exceeding the limit is a fault of its own.
     let fastest = (before.dq.abs() + too_fast(spec)).min(ranges.velocity());
     (feedback.q - before.q).abs() <= fastest * (passed + JITTER).as_secs_f64() + STEPS * step
 }
@@ -230,8 +229,8 @@ pub(super) fn fast(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     is_fast.then_some(Strange::Fast { velocity: feedback.dq, limit: spec.velocity })
 }
 
-/// The limit bounds what the stiffness asks for; damping comes on top, as much as the highest speed makes it. The frames of
-/// the motor's own loops have no torque: it is for the motor to bound.
+/// The limit bounds the torque of the stiffness; damping adds as much as the highest speed causes. Frames of the
+/// motor's own loops have no torque: the motor bounds it.
 fn strong(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     let MotorMode::Mit { kd, .. } = spec.mode else { return None };
     let limit = spec.torque;
@@ -239,7 +238,7 @@ fn strong(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     is_strong.then_some(Strange::Strong { torque: feedback.tau, limit })
 }
 
-/// Of a joint whose torque is bounded: how fast it moves towards its command, rad/s.
+/// How fast a joint at its torque bound moves towards its command, rad/s.
 fn approach(spec: &MotorSpec, feedback: &Feedback, commanded: Commanded) -> Option<f64> {
     let MotorMode::Mit { kp, .. } = spec.mode else { return None };
     let error = commanded.wanted - feedback.q;

@@ -1,5 +1,5 @@
-//! What cameras offer, what was agreed with one, how a picture lies in a buffer, and where in the stream it stands: pure,
-//! for people and for pictures.
+//! Formats that cameras offer, settings agreed with one, the layout of a picture in a buffer, and the position in the
+//! stream: pure, for people and for pictures.
 //!
 //! Invariant: nothing here touches a device.
 
@@ -17,15 +17,15 @@ use crate::registry::{CameraSpec, PixelFormat};
 use crate::sample::{Encoding, FLAG_ERROR};
 use crate::time::Stamp;
 
-/// How far a rate may be from the requested one: 30000/1001 is what many cameras call 30.
+/// Tolerance of a rate: many cameras call 30000/1001 30.
 const RATE_TOLERANCE: f64 = 0.005;
 
-/// A camera and what it offers.
+/// A camera with its modes and controls.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CameraInfo {
     /// The node.
     pub path: PathBuf,
-    /// What the camera calls itself.
+    /// Name reported by the camera.
     pub name: String,
     /// Kernel driver.
     pub driver: String,
@@ -35,7 +35,7 @@ pub struct CameraInfo {
     pub controls: Vec<ControlInfo>,
 }
 
-/// A pixel format in a size, and the rates it comes at.
+/// A pixel format in one size, and its rates.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Mode {
     /// V4L2 name of the pixel format, for example `MJPG`.
@@ -46,7 +46,7 @@ pub struct Mode {
     pub rates: Rates,
 }
 
-/// One size, or all within limits.
+/// One size, or a range of sizes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
 pub enum Size {
@@ -109,14 +109,12 @@ pub struct ControlInfo {
 }
 
 impl Rate {
-    /// The rate of pictures `numerator / denominator` seconds apart.
-    #[must_use]
+    /// The rate of pictures that are `numerator / denominator` seconds apart.
     pub const fn of_interval(numerator: u32, denominator: u32) -> Self {
         Self { frames: denominator, seconds: numerator }
     }
 
     /// Pictures per second; 0 if the driver gave no interval.
-    #[must_use]
     pub fn hz(self) -> f64 {
         if self.seconds == 0 { 0.0 } else { f64::from(self.frames) / f64::from(self.seconds) }
     }
@@ -128,7 +126,7 @@ impl Rate {
 
 impl fmt::Display for Rate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // Two digits distinguish 29.97 from 30; whole rates are shown without.
+        // Two digits distinguish 29.97 from 30; whole rates are shown without decimals.
         let text = format!("{:.2}", self.hz());
         f.write_str(text.trim_end_matches('0').trim_end_matches('.'))
     }
@@ -208,7 +206,7 @@ pub(super) fn fourcc_text(fourcc: [u8; 4]) -> String {
     fourcc.iter().map(|&byte| if byte.is_ascii_graphic() { char::from(byte) } else { '?' }).collect()
 }
 
-/// What the driver made of a wish.
+/// The format that the driver agreed to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Agreed {
     pub(super) fourcc: [u8; 4],
@@ -233,7 +231,7 @@ impl Agreed {
     }
 }
 
-/// Names compare without case, and blanks, `_`, `-` and `,` alike: `White Balance, Automatic` is
+/// Normalises a name: case is ignored, and blanks, `_`, `-` and `,` are equal: `White Balance, Automatic` is
 /// `white_balance_automatic`.
 pub(super) fn plain_name(name: &str) -> String {
     name.split(|c: char| !c.is_alphanumeric())
@@ -243,7 +241,7 @@ pub(super) fn plain_name(name: &str) -> String {
         .to_lowercase()
 }
 
-/// The control called `requested`, if it takes `value`; otherwise the message.
+/// The control called `requested` if it accepts `value`, otherwise the error message.
 pub(super) fn find_control<'a>(
     offered: &'a [ControlInfo],
     requested: &str,
@@ -263,7 +261,7 @@ pub(super) fn control_error(name: &str, path: &Path, why: &str) -> DriverError {
     DriverError::Fatal(format!("{}: {why} - set `controls` in [device.{name}.camera]", path.display()))
 }
 
-/// The message for a wish the camera does not fulfil.
+/// The error message for a requested format that the camera does not offer.
 pub(super) fn not_offered(name: &str, spec: &CameraSpec, path: &Path, offered: &[Mode]) -> String {
     format!(
         "{} offers no {} {}x{} at {} fps; it offers {} - set format, width, height and fps in [device.{name}.camera]",
@@ -276,14 +274,14 @@ pub(super) fn not_offered(name: &str, spec: &CameraSpec, path: &Path, offered: &
     )
 }
 
-/// What was agreed, for people.
+/// The agreed settings, for people.
 pub(super) fn describe(card: &Card, layout: Layout, rate: Option<Rate>) -> String {
     let Layout { format, width, height, .. } = layout;
     let rate = rate.map_or_else(|| String::from("its own rate"), |rate| format!("{rate} fps"));
     format!("{} {width}x{height} at {rate}, {} ({})", fourcc_text(fourcc(format)), card.name, card.driver.name)
 }
 
-/// What was agreed, for the recording.
+/// The agreed settings, for the recording.
 pub(super) fn negotiated(
     card: Card,
     layout: Layout,
@@ -295,13 +293,13 @@ pub(super) fn negotiated(
     Negotiated { driver: Some(card.driver), card: Some(card.name), bus: Some(card.bus), format: Some(format), controls }
 }
 
-/// How a picture lies in a buffer.
+/// Layout of a picture in a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
     pub(super) format: PixelFormat,
     pub(super) width: u32,
     pub(super) height: u32,
-    /// Bytes from one row to the next, padding included.
+    /// Bytes from the start of a row to the next, padding included.
     pub(super) stride: usize,
 }
 
@@ -314,7 +312,7 @@ impl Layout {
         }
     }
 
-    /// Bytes of a row's pixels; 0 where pictures are compressed.
+    /// Bytes of a row's pixels; 0 for compressed pictures.
     fn row_bytes(self) -> usize {
         let width = self.width as usize;
         match self.format {
@@ -325,23 +323,23 @@ impl Layout {
         }
     }
 
-    /// Bytes of a picture's pixels; 0 where pictures are compressed.
+    /// Bytes of a picture's pixels; 0 for compressed pictures.
     pub(super) fn picture_bytes(self) -> usize {
         self.row_bytes() * self.height as usize
     }
 
-    /// Do rows end in bytes that are no pixels?
+    /// Whether rows end in padding.
     pub(super) fn is_padded(self) -> bool {
         self.row_bytes() > 0 && self.stride > self.row_bytes()
     }
 
-    /// Is this a whole picture, as far as can be judged without decoding it?
+    /// Whether this is a complete picture, as far as can be judged without decoding it.
     fn is_whole(self, bytes: &[u8]) -> bool {
         match self.format {
             // Start of image marker (ITU-T T.81, table B.1).
             PixelFormat::Mjpg => bytes.starts_with(&[0xff, 0xd8]),
             _ if self.is_padded() => {
-                // Some drivers leave the padding of the last row out.
+                // Some drivers omit the padding of the last row.
                 let most = self.stride * self.height as usize;
                 let least = most - (self.stride - self.row_bytes());
                 (least..=most).contains(&bytes.len())
@@ -364,7 +362,7 @@ fn compact_rows(bytes: &[u8], stride: usize, row: usize, height: usize, into: &m
     }
 }
 
-/// What the kernel reports of a filled buffer.
+/// The kernel's report on a filled buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Frame {
     pub(super) sequence: u32,
@@ -380,13 +378,13 @@ impl Frame {
     }
 }
 
-/// Where in the stream we are.
+/// Position in the stream.
 #[derive(Debug, Default)]
 pub(super) struct Numbering {
     last_sequence: Option<u32>,
     /// The last capture time passed on.
     last_stamp: Stamp,
-    /// The last one of the kernel that was believed.
+    /// The kernel's last accepted capture time.
     last_kernel: Stamp,
     lost: u64,
 }
@@ -407,7 +405,7 @@ impl Numbering {
     fn count(&mut self, sequence: u32) {
         if let Some(last) = self.last_sequence {
             let gap = sequence.wrapping_sub(last.wrapping_add(1));
-            // A number that stands still or goes back is a driver that does not count.
+            // A number that stands still or goes back comes from a driver that does not count.
             if gap < 1 << 31 {
                 self.lost += u64::from(gap);
             }
@@ -415,12 +413,12 @@ impl Numbering {
         self.last_sequence = Some(sequence);
     }
 
-    /// The kernel's capture time, if it can be true: not later than now and later than the one of the kernel
-    /// before (some cameras' own clocks, which the kernel may translate, jump). Otherwise the moment of arrival.
-    /// Capture times passed on always increase: one that would not is moved behind the last and is no longer the kernel's.
+    /// The kernel's capture time if plausible: not later than now and later than the kernel's previous one (some
+    /// cameras' own clocks, which the kernel may translate, jump). Otherwise the moment of arrival. Published capture
+    /// times always increase: one that would not is moved after the last and no longer counts as the kernel's.
     ///
-    /// A moment of arrival lies after the capture times of the next pictures where a picture takes longer than the time
-    /// between two. It therefore refuses none of the kernel's: the camera is back on them as soon as they pass it.
+    /// A moment of arrival is later than the next pictures' capture times if a picture's latency exceeds the frame
+    /// interval. It therefore rejects no capture time of the kernel: these are used again as soon as they pass it.
     pub(super) fn stamp(&mut self, frame: &Frame, arrived: Stamp) -> (Stamp, bool) {
         let kernel = frame.stamp.filter(|stamp| *stamp <= arrived && *stamp > self.last_kernel);
         self.last_kernel = kernel.unwrap_or(self.last_kernel);

@@ -1,10 +1,10 @@
-//! A V4L2 node: opening it, the ioctls that set it up, and the kernel's buffers, mapped into our memory: queue, dequeue,
-//! give back.
+//! A V4L2 node: opening it, the ioctls that configure it, and the kernel's buffers mapped into our memory: queue,
+//! dequeue, return.
 //!
-//! The v4l crate's streams are not used: dropping one panics when the device answers with anything
-//! but ENODEV, and its `next` queues a buffer twice after an interruption.
+//! The v4l crate's streams are not used: dropping one panics when the device answers with anything but ENODEV, and its
+//! `next` queues a buffer twice after an interruption.
 //!
-//! Invariant: at most one buffer is lent; while it is, the kernel does not write into it.
+//! Invariant: at most one buffer is borrowed; the kernel does not write into it meanwhile.
 //!
 //! Invariant: the descriptor is close-on-exec; no child process keeps a camera busy.
 
@@ -41,7 +41,7 @@ pub(super) const CAPTURE: u32 = v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE;
 /// and pointers that may be null.
 pub(super) unsafe trait Plain: Sized {
     fn zeroed() -> Self {
-        // SAFETY: the trait's promise.
+        // SAFETY: guaranteed by the trait.
         unsafe { mem::zeroed() }
     }
 }
@@ -74,14 +74,14 @@ impl Node {
         }
     }
 
-    /// Name and driver of the camera, once it is sure that the node captures pictures.
+    /// Name and driver of the camera, once it is certain that the node captures pictures.
     pub(super) fn capture_card(&self, path: &Path) -> Result<Card, DriverError> {
         let capability = self.capability().map_err(|error| setup_error(path, "capabilities", &error))?;
         let has_own = capability.capabilities & V4L2_CAP_DEVICE_CAPS != 0;
         let able = if has_own { capability.device_caps } else { capability.capabilities };
         if able & V4L2_CAP_VIDEO_CAPTURE == 0 || able & V4L2_CAP_STREAMING == 0 {
-            // It did when hot-plug reported it. Cameras that are plugged and pulled quickly are given each other's
-            // numbers: what has this path by now is another one, and the removal of the first is on its way.
+            // It did when hot-plug reported it. Cameras that are plugged and unplugged quickly take over each other's
+            // numbers: this path now leads to another camera, and the first one's removal has yet to be reported.
             return Err(DriverError::Retry(format!(
                 "{} does not capture pictures (a camera's second node carries metadata only): use its first node",
                 path.display()
@@ -99,14 +99,14 @@ impl Node {
         })
     }
 
-    /// Is the device behind the node gone?
+    /// Whether the device behind the node is gone.
     pub(super) fn is_gone(&self) -> bool {
         self.capability().is_err_and(|error| is_gone(&error))
     }
 
-    /// Sets format and rate as requested and reads back what the driver made of them. What is as requested
-    /// already is left alone: to set it again costs a USB camera half a dozen control transfers, and
-    /// all of them lie between a replug and its first picture.
+    /// Sets format and rate as requested and reads back the driver's result. Settings that already match are not set
+    /// again: that costs a USB camera half a dozen control transfers, all of them between a replug and its first
+    /// picture.
     pub(super) fn negotiate(&self, spec: &CameraSpec) -> io::Result<Agreed> {
         let code = u32::from_le_bytes(fourcc(spec.format));
         let mut format = v4l2_format { type_: CAPTURE, ..v4l2_format::zeroed() };
@@ -134,7 +134,7 @@ impl Node {
         })
     }
 
-    /// The rate the driver reports after being asked for `fps`; `None` if it cannot set one.
+    /// The rate that the driver reports after a request for `fps`; `None` if it cannot set one.
     fn set_rate(&self, fps: u32) -> io::Result<Option<Rate>> {
         let mut parameters = v4l2_streamparm { type_: CAPTURE, ..v4l2_streamparm::zeroed() };
         if let Err(error) = self.ioctl(vidioc::VIDIOC_G_PARM, &mut parameters) {
@@ -157,9 +157,8 @@ impl Node {
         Ok(Some(Rate::of_interval(interval.numerator, interval.denominator)))
     }
 
-    /// The controls that can be set to a number. The v4l crate's own listing, on which nokhwa's
-    /// stands, panics on a control type it does not know and nokhwa's leaves out what it cannot
-    /// read, so they are listed here.
+    /// The controls that can be set to a number. They are listed here because the v4l crate's own listing, which nokhwa
+    /// uses, panics on a control type it does not know, and nokhwa's omits those it cannot read.
     pub(super) fn controls(&self) -> Vec<ControlInfo> {
         const SETTABLE: [u32; 4] = [
             v4l2_ctrl_type_V4L2_CTRL_TYPE_INTEGER,
@@ -167,7 +166,7 @@ impl Node {
             v4l2_ctrl_type_V4L2_CTRL_TYPE_MENU,
             v4l2_ctrl_type_V4L2_CTRL_TYPE_INTEGER_MENU,
         ];
-        // More than any driver has; ends a listing that never ends.
+        // More than any driver has; ends an endless listing.
         const MOST: usize = 1024;
         let mut controls = Vec::new();
         let mut asked = v4l2_query_ext_ctrl::zeroed();
@@ -209,8 +208,8 @@ impl Node {
         Ok(capability)
     }
 
-    /// `request` must be the one that is defined for `T` in linux/videodev2.h: its number carries
-    /// the size of the structure, which is checked here.
+    /// `request` must be the one defined for `T` in linux/videodev2.h: its number contains the size of the structure,
+    /// which is checked here.
     pub(super) fn ioctl<T>(&self, request: vidioc::_IOC_TYPE, argument: &mut T) -> io::Result<()> {
         // Bits 16 to 29 of a request are the size of its argument (asm-generic/ioctl.h).
         let size = usize::try_from(request >> 16 & 0x3fff).unwrap_or(usize::MAX);
@@ -236,7 +235,7 @@ impl AsFd for Node {
     }
 }
 
-/// The camera by its driver's report.
+/// The camera as reported by its driver.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Card {
     pub(super) name: String,
@@ -244,8 +243,8 @@ pub(super) struct Card {
     pub(super) bus: String,
 }
 
-/// Text up to its first zero byte, anything that does not belong into a line of text replaced: it
-/// comes from the device.
+/// Text up to its first zero byte, with anything that does not belong in a line of text replaced, because it comes from
+/// the device.
 fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|&byte| byte == 0).unwrap_or(bytes.len());
     let text = String::from_utf8_lossy(bytes.get(..end).unwrap_or_default());
@@ -290,15 +289,14 @@ fn busy(path: &Path) -> DriverError {
     DriverError::Retry(format!("{shown} is held by another program: end it (`fuser {shown}` names it)"))
 }
 
-/// One lent, one being filled, two waiting: what a reader may be late by at 30 frames a second is
-/// 100 ms.
+/// One borrowed, one being filled, two queued: a reader may be 100 ms late at 30 frames a second.
 const BUFFERS: u32 = 4;
 const MEMORY: u32 = v4l2_memory_V4L2_MEMORY_MMAP;
 
 /// A streaming node and its buffers.
 #[derive(Debug)]
 pub(super) struct Ring {
-    // Before the node: a mapping is undone before the descriptor closes.
+    // Declared before the node: a mapping is removed before the descriptor closes.
     buffers: Vec<Mapping>,
     node: Node,
     lent: Option<Lent>,
@@ -311,12 +309,12 @@ struct Lent {
 }
 
 impl Ring {
-    /// Asks for buffers, maps them, queues them and starts the stream.
+    /// Requests buffers, maps them, queues them and starts the stream.
     pub(super) fn start(node: Node) -> io::Result<Self> {
         let mut request =
             v4l2_requestbuffers { count: BUFFERS, type_: CAPTURE, memory: MEMORY, ..v4l2_requestbuffers::zeroed() };
         node.ioctl(vidioc::VIDIOC_REQBUFS, &mut request)?;
-        // With one buffer the camera would stop while it is lent.
+        // With one buffer the camera would stop while it is borrowed.
         if request.count < 2 {
             return Err(io::Error::from(io::ErrorKind::OutOfMemory));
         }
@@ -332,7 +330,7 @@ impl Ring {
         Ok(ring)
     }
 
-    /// Returns the lent buffer to the kernel.
+    /// Returns the borrowed buffer to the kernel.
     pub(super) fn give_back(&mut self) -> io::Result<()> {
         match self.lent.take() {
             Some(lent) => self.queue(lent.index),
@@ -340,7 +338,7 @@ impl Ring {
         }
     }
 
-    /// Takes the oldest filled buffer; `WouldBlock` if there is none.
+    /// Dequeues the oldest filled buffer; `WouldBlock` if there is none.
     pub(super) fn dequeue(&mut self) -> io::Result<Frame> {
         self.give_back()?;
         let mut filled = buffer(0);
@@ -360,7 +358,7 @@ impl Ring {
         })
     }
 
-    /// The bytes of the lent buffer, as many as the kernel wrote.
+    /// The bytes of the borrowed buffer that the kernel wrote.
     pub(super) fn lent(&self) -> &[u8] {
         let Some(lent) = self.lent else { return &[] };
         self.buffers.get(lent.index as usize).map_or(&[], |mapping| mapping.bytes(lent.bytes_used))
@@ -383,7 +381,7 @@ impl AsRawFd for Ring {
 
 impl Drop for Ring {
     fn drop(&mut self) {
-        // Refused by a node whose device is gone; nothing is left to stop then.
+        // A node whose device is gone refuses this; nothing is left to stop then.
         let _ = self.node.ioctl(vidioc::VIDIOC_STREAMOFF, &mut CAPTURE.cast_signed());
     }
 }
@@ -399,10 +397,10 @@ struct Mapping {
     length: usize,
 }
 
-// SAFETY: the mapping is plain memory, owned by this value alone and not tied to a thread.
+// SAFETY: the mapping is plain memory, owned only by this value and not tied to a thread.
 unsafe impl Send for Mapping {}
-// SAFETY: a shared reference only reads the memory; the kernel writes into a buffer only while it is
-// queued, and `Ring` hands out bytes only of the one that is not.
+// SAFETY: a shared reference only reads the memory; the kernel writes into a buffer only while it is queued, and `Ring`
+// hands out bytes only of the one that is not.
 unsafe impl Sync for Mapping {}
 
 impl Mapping {
@@ -410,8 +408,8 @@ impl Mapping {
         let length = buffer.length as usize;
         // SAFETY: for MMAP buffers QUERYBUF fills `offset`, and any bits are a valid integer.
         let offset = unsafe { buffer.m.offset };
-        // SAFETY: a new mapping at an address of the kernel's choice touches no memory of ours;
-        // the kernel checks length and offset against its buffer.
+        // SAFETY: a new mapping at an address chosen by the kernel touches no memory of ours; the kernel checks length
+        // and offset against its buffer.
         let start = unsafe {
             v4l2::mmap(
                 std::ptr::null_mut(),
@@ -435,7 +433,7 @@ impl Mapping {
 
 impl Drop for Mapping {
     fn drop(&mut self) {
-        // SAFETY: the mapping is ours, its slices borrow from this value and so are gone.
+        // SAFETY: this value owns the mapping, and slices of it borrow from this value, so none exist.
         let _ = unsafe { v4l2::munmap(self.start.as_ptr(), self.length) };
     }
 }

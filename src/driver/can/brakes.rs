@@ -1,12 +1,13 @@
 //! Holding brakes of joints: threads that engage and release them over lines of GPIO chips.
 //!
-//! A line behind USB takes a millisecond, and one whose chip hangs seconds: no cycle of the motors may wait for that, and no
-//! brake of another chip: each chip has a thread of its own.
+//! Setting a line over USB takes a millisecond, and seconds if its chip hangs. No cycle of the motors and no other chip
+//! may wait for that: each chip has its own thread.
 //!
 //! Invariant: a line is opened engaged, and engaged when the thread ends.
-//! Invariant: what is reported engaged or released was taken by the kernel, and nothing else was asked of the line since; a
-//! line that cannot be driven, or is not open yet, is reported broken, and so are all of a chip that is waited for.
-//! Invariant: what the motors' cycle calls neither waits nor allocates.
+//! Invariant: a brake is reported engaged or released only if the kernel accepted that state and no other was requested
+//! since. A line that cannot be driven, or is not open yet, is reported broken, and so are all lines of a chip that
+//! hangs.
+//! Invariant: the functions called in a motor cycle neither wait nor allocate.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -24,16 +25,16 @@ use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::registry::{BrakeSpec, DamiaoSpec};
 use crate::time::Stamp;
 
-/// Every line is set again after this, so that a chip that was unplugged is noticed, and one that is back opened.
+/// Every line is set again after this, so that an unplugged chip is noticed and a replugged one opened.
 const AGAIN: Duration = Duration::from_millis(500);
 /// A chip that takes longer to set a line cannot drive a brake.
 const SET_WITHIN: Duration = Duration::from_millis(200);
-/// Lines are open within this, or are reported broken until they are.
+/// A line that takes longer than this to open is reported broken until it is open.
 const OPENS_WITHIN: Duration = Duration::from_secs(1);
-/// The thread engages all brakes within this at its end, or is left behind.
+/// At its end the thread must engage all brakes within this; otherwise it is abandoned.
 const ENDS_WITHIN: Duration = Duration::from_millis(200);
 
-/// The brakes of a bus. Dropped, they are engaged.
+/// The brakes of a bus. Dropping engages them.
 #[derive(Debug)]
 pub(super) struct Brakes {
     chips: Vec<Chip>,
@@ -43,7 +44,7 @@ pub(super) struct Brakes {
 #[derive(Debug)]
 struct Chip {
     shared: Arc<Shared>,
-    /// Bits of motors whose brakes it has.
+    /// Bits of the motors whose brakes it drives.
     motors: u16,
     /// Has a message once all its lines were tried, and an end when the thread has ended.
     ended: Receiver<()>,
@@ -51,7 +52,7 @@ struct Chip {
 
 #[derive(Debug)]
 struct Shared {
-    /// Bits of motors whose brakes are to be released.
+    /// Bits of motors whose brakes must be released.
     wanted: AtomicU16,
     /// [`State`]: the bits of `released`, `moving` and `broken`, from the lowest on.
     state: AtomicU64,
@@ -122,7 +123,7 @@ impl Brakes {
         Ok((!brakes.chips.is_empty()).then_some(brakes))
     }
 
-    /// These brakes are to be released, a bit for each motor, and all others engaged.
+    /// Requests that these brakes be released, a bit for each motor, and all others engaged.
     pub(super) fn release(&self, motors: u16) {
         for Chip { shared, motors: own, .. } in &self.chips {
             if shared.wanted.swap(motors & own, Ordering::SeqCst) != motors & own {
@@ -131,7 +132,7 @@ impl Brakes {
         }
     }
 
-    /// What they are.
+    /// Their states.
     pub(super) fn state(&self, now: Stamp) -> State {
         self.chips.iter().fold(State::default(), |all, chip| {
             let State { released, moving, broken } = chip.shared.state(now);
@@ -164,7 +165,7 @@ impl Drop for Brakes {
         }
         let end = Stamp::now().after(ENDS_WITHIN);
         for chip in &self.chips {
-            // A message may still be there of its beginning; an error means that the thread has ended.
+            // The message of its start may still be queued; an error means that the thread has ended.
             while chip.ended.recv_timeout(end.since(Stamp::now())).is_ok() {}
         }
     }
@@ -174,7 +175,7 @@ impl Drop for Brakes {
 struct Tender {
     lines: Vec<Line>,
     shared: Arc<Shared>,
-    /// As it was published.
+    /// The published state.
     state: State,
     guard: Option<OwnedFd>,
     /// See [`Chip::ended`].
@@ -183,7 +184,7 @@ struct Tender {
 
 impl Tender {
     fn run(mut self) {
-        // Without the right to it, the motors' thread warns.
+        // Without permission for it, the motors' thread warns.
         let _ = use_fifo(CONTROL_PRIORITY);
         let mut is_first = true;
         loop {
@@ -195,16 +196,16 @@ impl Tender {
                 return;
             }
             if std::mem::take(&mut is_first) {
-                // It may be waited for no more.
+                // Its owner may have stopped waiting.
                 let _ = self.end.send(());
             }
             self.wait();
         }
     }
 
-    /// Sets every line. What one is, is published before it is set otherwise and right after that, not once all are; and
-    /// the wanted state is read again for each, because the one before may have taken seconds. Those come first that are
-    /// open and to be engaged.
+    /// Sets every line. The state of each is published right before and after it is set, not once all are set; the
+    /// wanted state is read again for each, because the previous line may have taken seconds. Open lines to be engaged
+    /// come first.
     fn tend(&mut self) {
         let Self { lines, shared, state, guard, .. } = self;
         lines.sort_by_cached_key(|line| (line.output.is_none(), shared.releases(line.motors)));
@@ -252,9 +253,9 @@ struct Line {
     /// Their names.
     names: String,
     output: Option<Output>,
-    /// The guard has it, or was informed that it is closed.
+    /// The guard has the line, or knows that it is closed.
     is_handed_over: bool,
-    /// Why it cannot be driven, as was logged last.
+    /// Why it cannot be driven, as last logged.
     why: Option<String>,
 }
 

@@ -1,8 +1,8 @@
 //! One master for each bus of motors.
 //!
-//! A process that drives motors over a network interface holds a socket named after it, in the abstract namespace: like the
-//! interface that is one for each network namespace, needs no file, and ends with the process. Serial lines are opened
-//! for one program alone.
+//! A process that drives motors over a network interface holds a socket named after the interface, in the abstract
+//! namespace. Like the interface it belongs to a network namespace; it needs no file and ends with the process. Serial
+//! lines are opened exclusively.
 
 use std::io::ErrorKind;
 use std::os::linux::net::SocketAddrExt;
@@ -19,7 +19,7 @@ impl Claim {
     /// Claims the motors behind the interface `name`.
     ///
     /// # Errors
-    /// When another process has; the text names it.
+    /// When another process holds the claim; the text names it.
     pub(super) fn take(name: &str) -> Result<Self, LinkError> {
         let refused = |error: std::io::Error| LinkError::Retry(format!("claiming {name}: {error}"));
         let address = SocketAddr::from_abstract_name(format!("rapid/can/{name}")).map_err(refused)?;

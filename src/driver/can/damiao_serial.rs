@@ -1,4 +1,4 @@
-//! The serial line of Damiao's USB2CAN adapter: 30 bytes to send a frame, 16 for each that came.
+//! The serial line of Damiao's USB2CAN adapter: 30 bytes to send a frame, 16 for each received.
 //!
 //! Source: the adapter's public host libraries (`DM_CAN.py`, `damiao.h`), which agree. To the adapter, at 921600
 //! baud: `55 AA`, the length 0x1E, command 3 (send without an answer), how many times as u32, the interval as u32 in
@@ -23,8 +23,7 @@ pub const RECEIVED: usize = 16;
 const HEAD: u8 = 0xaa;
 const TAIL: u8 = 0x55;
 
-/// What sends `frame` once. An error frame cannot be sent and gives `None`.
-#[must_use]
+/// The bytes that send `frame` once; `None` for an error frame, which cannot be sent.
 pub fn encode(frame: &CanFrame) -> Option<[u8; SENT]> {
     if frame.error {
         return None;
@@ -39,15 +38,15 @@ pub fn encode(frame: &CanFrame) -> Option<[u8; SENT]> {
     Some(bytes)
 }
 
-/// What a message of the adapter is about.
+/// The kind of a message of the adapter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Kind {
-    /// The adapter is there.
+    /// The adapter is alive.
     Heartbeat = 0x00,
     /// A frame on the bus was not received.
     ReceiveFailed = 0x01,
-    /// A frame came.
+    /// A frame was received.
     Received = 0x11,
     /// A frame was not sent.
     SendFailed = 0x02,
@@ -57,7 +56,7 @@ pub enum Kind {
     BaudFailed = 0x03,
     /// The bit rate was set.
     BaudSet = 0x13,
-    /// The adapter cannot talk to the bus.
+    /// The adapter cannot communicate with the bus.
     BusError = 0xee,
 }
 
@@ -78,7 +77,7 @@ impl Kind {
     }
 }
 
-/// A message of the adapter: what it is about, and the frame it is about where there is one.
+/// A message of the adapter: its kind, and its frame if it has one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Message {
     /// What happened.
@@ -87,7 +86,7 @@ pub struct Message {
     pub frame: CanFrame,
 }
 
-/// Messages out of bytes that come in pieces.
+/// Decodes messages from bytes that arrive in pieces.
 #[derive(Debug, Clone, Default)]
 pub struct Decoder {
     held: [u8; RECEIVED],
@@ -107,7 +106,6 @@ impl Decoder {
     }
 
     /// Bytes so far that belonged to no message.
-    #[must_use]
     pub const fn skipped(&self) -> u64 {
         self.skipped
     }
@@ -131,7 +129,7 @@ impl Decoder {
         message
     }
 
-    /// Lets go of what is held up to the next head at or after `from`.
+    /// Discards held bytes up to the next head at or after `from`.
     fn seek(&mut self, from: usize) {
         let held = self.held.get(from..self.len).unwrap_or_default();
         let gone = from + held.iter().position(|byte| *byte == HEAD).unwrap_or(held.len());

@@ -1,23 +1,23 @@
 //! The guard of a bus of motors: a process that stops them when this one cannot.
 //!
-//! Motors that are enabled follow their last command until their own time limit, and then fall. A process that is killed,
-//! crashes or is stopped sends nothing more; the guard holds the bus too and, within milliseconds of its death or once it
-//! has been silent for [`stalled_after`], sends each motor its last will: the frame that stops it as it is to stop at the
-//! fault of another, again and again for [`KEEP_FOR`], and then the order to disable. The motors' own time limit stays
-//! behind it as the second line.
+//! Motors that are enabled follow their last command until their own time limit, and then fall. A process that is
+//! killed, crashes or is stopped sends nothing more; the guard holds the bus too and, within milliseconds of its death
+//! or once it has been silent for [`stalled_after`], sends each motor its last will: the frame that stops it as
+//! configured for the fault of another motor, repeatedly for [`KEEP_FOR`], and then the command to disable. The motors'
+//! own time limit remains as the second line of defence.
 //!
 //! The guard is this program started once more, under the name [`NAME`], when an adapter with motors is opened. It has one
-//! end of a pair of sockets as its standard input, the adapter as its standard output, and nothing else that is open here.
-//! A message is a byte, [`OFF`], [`ON`], [`DISMISSED`] or [`BRAKE`]. After [`ON`] come the bits of the motors whose brakes are
-//! to be engaged at once (u16, little endian; the others are when the motors are disabled), and a frame of [`FRAME`] bytes
-//! for each motor; after [`BRAKE`] the bits of the motors of a brake, and the level that engages it, 0 or 1, with the open
+//! end of a pair of sockets as its standard input, the adapter as its standard output, and no other open file of ours.
+//! A message is a byte, `OFF`, `ON`, `DISMISSED` or `BRAKE`. After `ON` come the bits of the motors whose brakes are
+//! to be engaged at once (u16, little endian; the others are when the motors are disabled), and a frame of `FRAME` bytes
+//! for each motor; after `BRAKE` the bits of the motors of a brake, and the level that engages it, 0 or 1, with the open
 //! line as a descriptor, or without one when it was closed.
 //!
-//! Invariant: the guard sends nothing while the cycles come, nor while no motor is on.
-//! Invariant: what the motors answer is left to the guarded process as long as that runs.
-//! Invariant: a beat costs one system call, and neither allocates nor waits.
-//! Invariant: the guard has ended, or was killed, before the adapter is closed here: a serial line that it held open would
-//! come back under another name.
+//! Invariant: the guard sends nothing while cycles arrive or no motor is on.
+//! Invariant: the guard leaves the answers of motors to the guarded process while that runs.
+//! Invariant: a cycle costs one system call, and neither allocates nor waits.
+//! Invariant: the guard has ended, or was killed, before the adapter is closed here: a serial line that it kept open
+//! would get another name when replugged.
 
 mod held;
 mod process;
@@ -40,15 +40,16 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open, setsid};
 use super::link::Link;
 use crate::control::can::CanFrame;
 use crate::control::motors::{MotorBus, stalled_after};
+use crate::device::DeviceNode;
 use crate::driver::process::leak_nothing;
-use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
+use crate::registry::{CanSpec, DamiaoSpec, MAX_MOTORS};
 
 pub use process::run;
 
-/// The name that the guard is started under, as its argument 0. It has no "rapid" in it: `pkill rapid` is not meant for it.
+/// Argument 0 of the guard. It does not contain "rapid": `pkill rapid` must not end the guard.
 pub const NAME: &str = "motor-guard";
-/// How long motors that are not to be limp are damped, or hold, before they are disabled: a joint that sinks damped has
-/// come to rest by then, and for longer nothing is kept on that no one watches.
+/// How long motors that are not to be limp are damped, or hold, before they are disabled: a damped joint has sunk to
+/// rest by then, and nothing stays on unattended for longer.
 pub const KEEP_FOR: Duration = Duration::from_secs(5);
 
 /// No motor is on.
@@ -63,7 +64,7 @@ const BRAKE: u8 = 3;
 const FRAME: usize = 16;
 /// Longest message.
 const LONGEST: usize = 3 + MAX_MOTORS * FRAME;
-/// It ends within this when it is dismissed, or is killed.
+/// When dismissed it ends within this, or is killed.
 const ENDS_WITHIN: Duration = Duration::from_millis(200);
 
 /// The guard, as seen from the process that it guards.
@@ -71,9 +72,9 @@ const ENDS_WITHIN: Duration = Duration::from_millis(200);
 pub(super) struct Guard {
     socket: OwnedFd,
     process: Child,
-    /// What it received last.
+    /// The kind of the last message it received.
     received: u8,
-    /// It was reported that it does not listen.
+    /// Its failure to receive was reported.
     is_reported: bool,
 }
 
@@ -103,8 +104,8 @@ impl Guard {
         Ok(Self { socket: ours, process: command.spawn()?, received: OFF, is_reported: false })
     }
 
-    /// A cycle is over. Returns why the guard is of no use any more, the first time that it is.
-    pub(super) fn beat(&mut self, bus: &MotorBus) -> Option<&'static str> {
+    /// Reports a finished cycle. Returns why the guard has become useless, once.
+    pub(super) fn cycle(&mut self, bus: &MotorBus) -> Option<&'static str> {
         let mut message = [0; LONGEST];
         let mut length = 1;
         if let Some(frames) = bus.last_will() {
@@ -134,7 +135,7 @@ impl Guard {
         (!std::mem::replace(&mut self.is_reported, true)).then_some(problem)
     }
 
-    /// Another descriptor of what it listens to, for [`hand_over`].
+    /// Another descriptor of its socket, for [`hand_over`].
     ///
     /// # Errors
     /// When the system gives none.
@@ -142,7 +143,7 @@ impl Guard {
         self.socket.try_clone()
     }
 
-    /// The motors are off, or were ordered to be: it is to end. Returns when it has.
+    /// Ends the guard, once the motors are off or were ordered off. Returns when it has ended.
     pub(super) fn dismiss(mut self) {
         self.end();
     }
@@ -154,7 +155,7 @@ impl Guard {
             let limit = Timespec { tv_sec: 0, tv_nsec: ENDS_WITHIN.subsec_nanos().into() };
             let _ = poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&limit));
         }
-        // One that has ended takes no harm.
+        // Killing a process that has ended does no harm.
         let _ = self.process.kill();
         let _ = self.process.wait();
     }
@@ -168,8 +169,7 @@ impl Drop for Guard {
     }
 }
 
-/// Hands the line of a brake to the guard, or has it closed there. Returns whether that was done: otherwise it is to be tried
-/// again.
+/// Hands the line of a brake to the guard, or has it closed there. Returns whether that succeeded; otherwise retry.
 pub(super) fn hand_over(guard: &OwnedFd, motors: u16, engaged_high: bool, line: Option<BorrowedFd<'_>>) -> bool {
     let [low, high] = motors.to_le_bytes();
     let message = [BRAKE, low, high, engaged_high.into()];
@@ -180,7 +180,7 @@ pub(super) fn hand_over(guard: &OwnedFd, motors: u16, engaged_high: bool, line: 
         return false;
     }
     let sent = sendmsg(guard, &[IoSlice::new(&message)], &mut control, SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
-    // A guard that has ended holds nothing.
+    // A guard that has ended holds no line.
     !matches!(sent, Err(Errno::INTR | Errno::NOMEM | Errno::NOBUFS | Errno::AGAIN))
 }
 

@@ -1,7 +1,7 @@
 //! CAN adapters on serial lines.
 //!
-//! A frame is written whole or not at all: what the kernel takes of it at first goes before anything
-//! else, and the next frame is refused until it has gone.
+//! A frame is written whole or not at all: after a partial write the rest goes first, and the next frame is refused
+//! until it is written.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::Path;
@@ -18,7 +18,7 @@ use crate::time::Stamp;
 
 /// Bytes taken from the kernel at once.
 const INBOX: usize = 4096;
-/// Adapters that are USB devices themselves do not mind; of those behind a UART it is the usual one.
+/// Ignored by adapters that are USB devices themselves; the usual rate of those behind a UART.
 const SLCAN_BAUD: u32 = 115_200;
 /// An adapter that answers does so within a few ms; some never do.
 const ANSWER: Duration = Duration::from_millis(100);
@@ -29,14 +29,14 @@ pub struct Line {
     fd: OwnedFd,
     codec: Codec,
     inbox: Box<[u8; INBOX]>,
-    /// `inbox[taken..filled]` is still to be looked at.
+    /// `inbox[taken..filled]` is still to be decoded.
     taken: usize,
     filled: usize,
     /// When the bytes in `inbox` arrived.
     arrived: Stamp,
-    /// Of the last frame.
+    /// Arrival of the last frame.
     stamped: Stamp,
-    /// `unsent[..left]` is what is still to be written of the last frame.
+    /// `unsent[..left]` is the rest of the last frame.
     unsent: [u8; LONGEST],
     left: usize,
     lost: u64,
@@ -50,10 +50,10 @@ enum Codec {
     Damiao(damiao_serial::Decoder),
 }
 
-/// The longest a frame is.
+/// Bytes of the longest frame.
 const LONGEST: usize = if slcan::LONGEST > damiao_serial::SENT { slcan::LONGEST } else { damiao_serial::SENT };
 
-/// What came of bytes.
+/// The result of decoding bytes.
 enum Decoded {
     Frame(CanFrame),
     Answer { refused: bool },
@@ -70,7 +70,7 @@ impl Line {
         let description = format!("{} (slcan) at {bitrate} bit/s", path.display());
         let fd = serial::open_raw(path, SLCAN_BAUD).map_err(LinkError::of_driver)?;
         let mut line = Self::new(fd, Codec::Slcan(slcan::Decoder::default()), description);
-        // An adapter that was left open takes no bit rate; one that is closed refuses to close.
+        // An open adapter accepts no bit rate; a closed one refuses to close.
         line.order(slcan::Command::Close)?;
         for (command, what) in [(set, "the bit rate"), (slcan::Command::Open, "to open the bus")] {
             if line.order(command)? {
@@ -110,7 +110,7 @@ impl Line {
         }
     }
 
-    /// Gives an order of slcan and waits for the answer; returns whether it was refused. No answer is none.
+    /// Sends a command of slcan and waits for the answer; returns whether it was refused. Silence is not a refusal.
     fn order(&mut self, command: slcan::Command) -> Result<bool, LinkError> {
         let deadline = Stamp::now().after(ANSWER);
         self.put(command.encode().bytes())?;
@@ -126,7 +126,7 @@ impl Line {
                     return Ok(false);
                 }
                 let timeout = Timespec { tv_sec: 0, tv_nsec: left.subsec_nanos().into() };
-                // Whatever it returns, the read and the deadline show it too.
+                // Errors also show in the read and the deadline.
                 let _ = poll(&mut [PollFd::new(&self.fd, PollFlags::IN)], Some(&timeout));
             }
         }
@@ -159,7 +159,7 @@ impl Line {
         Ok(())
     }
 
-    /// Writes what is left of the last frame, as far as there is room.
+    /// Writes the rest of the last frame, as far as there is room.
     pub(super) fn flush(&mut self) -> Result<(), LinkError> {
         if self.left == 0 {
             return Ok(());
@@ -199,7 +199,7 @@ impl Line {
         }
     }
 
-    /// Reads what waits; false if nothing does.
+    /// Reads pending bytes; false if there are none.
     fn fill(&mut self) -> Result<bool, LinkError> {
         match rustix::io::read(&self.fd, &mut self.inbox[..]) {
             Ok(0) => Err(LinkError::Gone),
@@ -279,7 +279,7 @@ impl AsFd for Line {
     }
 }
 
-/// EIO, ENODEV and ENXIO are what a line reports whose device is gone.
+/// A line whose device is gone reports EIO, ENODEV or ENXIO.
 fn ended(what: &str, error: Errno) -> LinkError {
     match error {
         Errno::IO | Errno::NODEV | Errno::NXIO | Errno::BADF | Errno::PIPE => LinkError::Gone,

@@ -1,10 +1,10 @@
 //! An open CAN adapter of any kind.
 //!
-//! Nothing here waits but [`Link::recv_until`], until its deadline at most, and opening. Frames that the
-//! controller or the kernel lost are counted, and so are those that the adapter refused to send.
+//! Only opening and [`Link::recv_until`] wait, the latter until its deadline. Frames that the controller or the kernel
+//! lost are counted, and so are those that the adapter refused to send.
 //!
 //! Invariant: nothing is allocated for a frame.
-//! Invariant: bytes from an adapter never make it panic.
+//! Invariant: no bytes from an adapter cause a panic.
 
 use std::io;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
@@ -18,23 +18,24 @@ use tokio::io::unix::AsyncFd;
 use super::line::Line;
 use super::socket::Socket;
 use crate::control::can::CanFrame;
+use crate::device::DeviceNode;
 use crate::driver::DriverError;
-use crate::registry::{CanAdapter, CanSpec, DeviceNode};
+use crate::registry::{CanAdapter, CanSpec};
 use crate::time::Stamp;
 
-/// What else a thread that waits for the bus can be woken by: orders from two places, and actions.
+/// What else can wake a thread that waits for the bus: orders from two places, and actions.
 pub const BELLS: usize = 3;
 
 /// An interface that goes down reports an error without anything to read.
 const INTEREST: Interest = Interest::READABLE.add(Interest::ERROR);
 
-/// Why a frame cannot be sent or received, by what to do next.
+/// Why a frame cannot be sent or received, classified by what to do next.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LinkError {
     /// The adapter is no longer there: wait for it to be attached again.
     #[error("unplugged")]
     Gone,
-    /// What is to be sent does not leave: the queue to the bus is full. Try again.
+    /// The frame cannot be queued: the queue to the bus is full. Try again.
     #[error("the queue to the bus is full: nothing on the bus acknowledges frames, or more are sent than fit")]
     Full,
     /// The controller left the bus after too many errors. It may return by itself; the link stays open.
@@ -46,14 +47,13 @@ pub enum LinkError {
     /// Opening again later may help.
     #[error("{0}")]
     Retry(String),
-    /// Opening again cannot help before something is changed; the text names it.
+    /// Opening again cannot help until something is changed; the text names it.
     #[error("{0}")]
     Fatal(String),
 }
 
 impl LinkError {
     /// The same error for the reader of the device.
-    #[must_use]
     pub fn into_driver(self) -> DriverError {
         match self {
             Self::Gone => DriverError::Gone,
@@ -72,12 +72,12 @@ impl LinkError {
     }
 }
 
-/// When a frame came.
+/// When a frame arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Arrival {
     /// The moment, from the kernel where it gives one.
     pub at: Stamp,
-    /// The kernel gave it.
+    /// The kernel stamped it.
     pub from_kernel: bool,
 }
 
@@ -96,7 +96,7 @@ impl Link {
     /// Opens the adapter of an entry at its node. May block: keep it off the runtime.
     ///
     /// # Errors
-    /// When the node is gone, no adapter of this kind, or cannot be opened.
+    /// When the node is gone, is not an adapter of this kind, or cannot be opened.
     pub fn open(spec: &CanSpec, node: &DeviceNode) -> Result<Self, LinkError> {
         match (spec.adapter, node) {
             (CanAdapter::SocketCan, DeviceNode::Net(name)) => Self::open_socket(name, spec.bitrate),
@@ -113,7 +113,7 @@ impl Link {
     /// runtime.
     ///
     /// # Errors
-    /// When the interface is gone, no CAN bus, or not up and may not be brought up.
+    /// When the interface is gone, is not a CAN bus, or is down and may not be brought up.
     pub fn open_socket(name: &str, bitrate: u32) -> Result<Self, LinkError> {
         Socket::open(name, bitrate).map(Self::Socket)
     }
@@ -159,7 +159,7 @@ impl Link {
         }
     }
 
-    /// The next frame that waits, error frames of the controller included; `None` if none does.
+    /// The next pending frame, error frames of the controller included; `None` if there is none.
     ///
     /// # Errors
     /// When the link has ended.
@@ -170,8 +170,8 @@ impl Link {
         }
     }
 
-    /// The next frame of the bus, and when it came; `None` if there is none until `deadline`. A frame
-    /// that waits already is given even when the deadline has passed.
+    /// The next frame of the bus and its arrival; `None` if there is none until `deadline`. A pending frame is returned
+    /// even if the deadline has passed.
     ///
     /// # Errors
     /// [`LinkError::BusOff`] when the controller reports it, after which the link may still be used; the
@@ -180,7 +180,7 @@ impl Link {
         self.recv_unless_rung(deadline, frame, [const { None }; BELLS])
     }
 
-    /// As [`Self::recv_until`], until one of `bells` can be read.
+    /// As [`Self::recv_until`], or until one of `bells` can be read.
     ///
     /// # Errors
     /// As [`Self::recv_until`].
@@ -223,7 +223,7 @@ impl Link {
             tv_nsec: longest.subsec_nanos().into(),
         };
         let adapter = self.as_fd();
-        // In the place of a bell that is not there the link stands again, and is asked for nothing.
+        // An absent bell is replaced by the link itself, polled for no event.
         let [first, second, third] = bells.map(|bell| match bell {
             Some(bell) => PollFd::from_borrowed_fd(bell, PollFlags::IN),
             None => PollFd::from_borrowed_fd(adapter, PollFlags::empty()),
@@ -265,7 +265,6 @@ impl Link {
     }
 
     /// After a bus-off it returns to the bus by itself.
-    #[must_use]
     pub const fn restarts(&self) -> bool {
         match self {
             Self::Socket(socket) => socket.restarts(),
@@ -275,7 +274,6 @@ impl Link {
     }
 
     /// What was opened, for people.
-    #[must_use]
     pub fn description(&self) -> &str {
         match self {
             Self::Socket(socket) => socket.description(),
@@ -299,12 +297,12 @@ impl AsRawFd for Link {
     }
 }
 
-/// A frame and when it came.
+/// A frame and its arrival.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Received {
     /// The frame.
     pub frame: CanFrame,
-    /// When it came.
+    /// When it arrived.
     pub arrival: Arrival,
 }
 
@@ -328,8 +326,8 @@ impl AsyncLink {
         Ok(Self { link, ended: None })
     }
 
-    /// The frames that wait, in order, error frames of the controller included: at least one, at most as
-    /// many as `into` has room for. Waits until there is one. Cancel-safe.
+    /// The pending frames in order, error frames of the controller included: at least one, at most as many as `into`
+    /// has room for. Waits until there is one. Cancel-safe.
     ///
     /// # Errors
     /// When the link has ended.
@@ -338,7 +336,7 @@ impl AsyncLink {
             return Ok(0);
         }
         loop {
-            // What came with the bytes of the frame before is in no one's way to become readable.
+            // Frames already in the inbox do not make the descriptor readable.
             let count = self.take_waiting(into)?;
             if count > 0 {
                 return Ok(count);
@@ -360,7 +358,7 @@ impl AsyncLink {
                 first.arrival = arrival?;
                 let [place, rest @ ..] = into else { return Ok(0) };
                 *place = first;
-                // The first one is there, whatever comes after it.
+                // The first frame is delivered, whatever follows.
                 let others = self.take_waiting(rest).unwrap_or_else(|error| {
                     self.ended = Some(error);
                     0
@@ -396,13 +394,11 @@ impl AsyncLink {
 }
 
 /// The controller left the bus (`CAN_ERR_BUSOFF`, linux/can/error.h).
-#[must_use]
 pub const fn is_bus_off(frame: &CanFrame) -> bool {
     frame.error && frame.id & 0x40 != 0
 }
 
-/// The controller had no room for frames that came (`CAN_ERR_CRTL` with `CAN_ERR_CRTL_RX_OVERFLOW`).
-#[must_use]
+/// The controller had no room for received frames (`CAN_ERR_CRTL` with `CAN_ERR_CRTL_RX_OVERFLOW`).
 pub const fn is_overflow(frame: &CanFrame) -> bool {
     frame.error && frame.id & 0x4 != 0 && frame.data[1] & 0x1 != 0
 }

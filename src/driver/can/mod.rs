@@ -3,7 +3,7 @@
 //! [`slcan`] and [`damiao_serial`] are the protocols of two kinds of adapters on a serial line, without I/O;
 //! [`netlink`] brings a network interface up. A [`link::Link`] is an open adapter of any kind, for a
 //! thread of its own; a [`link::AsyncLink`] is one for a task. [`raw`] is the driver of a bus whose frames are
-//! recorded as they come.
+//! recorded unchanged.
 
 mod brakes;
 mod claim;
@@ -19,8 +19,8 @@ mod socket;
 
 use crate::registry::{CanAdapter, NodeSpec, Registry};
 
-/// Has the kernel load what CAN sockets need, if an entry needs one, so that the first plug does not wait for
-/// that. Returns at once; what is wrong is reported when an adapter is opened.
+/// Makes the kernel load its CAN modules if an entry needs them, so that the first plug does not wait for that. Returns
+/// at once; errors are reported when an adapter is opened.
 pub fn prepare(registry: &Registry) {
     let is_socket = |node: &NodeSpec| matches!(node, NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan);
     if registry.devices.iter().any(|device| is_socket(&device.node)) {

@@ -1,13 +1,13 @@
 //! A bus of motors: its state as samples, and its commands.
 //!
-//! Thread `control` owns the adapter. It keeps the beat of the motors, runs [`MotorBus`], which decides, and waits on the
-//! topic of actions itself; here, on the runtime, is only the reading of its samples.
+//! Thread `control` owns the adapter. It runs the cycles of `MotorBus`, which decides, and waits on the topic of
+//! actions itself; only its samples are read here, on the runtime.
 //!
 //! Invariant: whatever ends the driver, the motors are ordered to turn off: see `control_loop`.
 
 mod control_loop;
 mod powered;
-mod tally;
+mod statistics;
 
 use std::io;
 use std::sync::Arc;
@@ -20,15 +20,16 @@ use super::guard::Guard;
 use super::link::{Link, LinkError};
 use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::control::motors::SAMPLE_VALUES;
+use crate::device::DeviceNode;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
 use crate::panics::CONTROL_THREAD;
 use crate::permission::Attended;
 use crate::provenance::{Format, Negotiated};
-use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
+use crate::registry::{CanSpec, DamiaoSpec, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use control_loop::{ControlLoop, Sample, Shared};
 use powered::Powered;
-pub use tally::Punctuality;
+pub use statistics::Punctuality;
 
 /// Samples that may wait to be read, a second of them at 200 Hz.
 const SAMPLES: usize = 256;
@@ -48,7 +49,7 @@ pub struct Motors {
 }
 
 impl Motors {
-    /// Opens the adapter of an entry at its node and starts to ask its motors. None moves.
+    /// Opens the adapter of an entry at its node and starts to query its motors. None moves.
     ///
     /// # Errors
     /// When the adapter cannot be opened, or the system gives no thread.
@@ -165,7 +166,6 @@ impl Motors {
 
     /// Turns the motors off, waits as [`Self::close`] does, and returns how well they were driven; `None` if the thread
     /// panicked. Blocks as dropping does.
-    #[must_use]
     pub fn finish(mut self) -> Option<Punctuality> {
         self.stop();
         self.shared.punctuality.get().cloned()
@@ -181,8 +181,8 @@ impl Motors {
 }
 
 impl Drop for Motors {
-    /// Blocks for the cycle that is under way and until the motors report that they are off: some 20 ms, and a
-    /// tenth of a second more where one is silent.
+    /// Blocks for the current cycle and until the motors report that they are off: some 20 ms, and a tenth of a second
+    /// more if one is silent.
     fn drop(&mut self) {
         self.stop();
     }

@@ -1,8 +1,7 @@
-//! Bringing a CAN interface up, and looking at it.
+//! Brings a CAN interface up and reads its state.
 //!
-//! An interface is up with a bit rate that only its administrator may set. `rapid artifacts --install`
-//! puts a rule in place by which udev does it at each plug; who may do so himself (root, or
-//! `CAP_NET_ADMIN`) has it done here.
+//! An interface is up with a bit rate that only its administrator may set. `rapid artifacts --install` installs a rule
+//! by which udev does it at each plug; for a user with the permission (root, or `CAP_NET_ADMIN`) it is done here.
 //!
 //! Invariant: an interface that was set down while this program used it stays down until it is set up again from outside:
 //! an operator who works on the bus wants no frames on it.
@@ -16,24 +15,24 @@ use socketcan::nl::{CanState, InterfaceDetails, NlError};
 use super::link::LinkError;
 use crate::registry::CAN_RESTART_MS;
 
-/// A CAN interface as it is.
+/// The state of a CAN interface.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Interface {
     /// It is up.
     pub up: bool,
-    /// Bits a second; absent of one without a bus, and before one was set.
+    /// Bits a second; absent without a bus, and before it was set.
     pub bitrate: Option<u32>,
     /// The state of its controller, in the kernel's words.
     pub state: Option<&'static str>,
     /// It left the bus after too many errors.
     pub bus_off: bool,
-    /// It returns to the bus by itself after this many ms; 0 is never.
+    /// It returns to the bus by itself after this many ms; 0 means never.
     pub restart_ms: Option<u32>,
-    /// Errors of sending and of receiving that its controller counts, where it reports them.
+    /// Send and receive errors counted by its controller, if it reports them.
     pub errors: Option<(u16, u16)>,
 }
 
-/// What is to be done before an interface can be used.
+/// The steps needed before an interface can be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Need {
     Nothing,
@@ -43,7 +42,7 @@ enum Need {
     Restart,
 }
 
-/// Interfaces that were set down while they were in use, by their index; 0 is none. One that finds no room is brought up
+/// Indices of interfaces that were set down while in use; 0 is a free place. An interface without a place is brought up
 /// again as if it had just been plugged in.
 static SET_DOWN: [AtomicU32; 16] = [const { AtomicU32::new(0) }; 16];
 
@@ -59,13 +58,13 @@ fn stays_down(index: u32) -> bool {
     SET_DOWN.iter().any(|place| place.load(Ordering::SeqCst) == index)
 }
 
-/// Replaces the first of these numbers that is there.
+/// Replaces the first of these numbers that is present.
 fn replace(index: u32, by: u32) {
     let is_replaced = |place: &AtomicU32| place.compare_exchange(index, by, Ordering::SeqCst, Ordering::SeqCst).is_ok();
     let _ = SET_DOWN.iter().any(is_replaced);
 }
 
-/// Looks at the interface `name`.
+/// Reads the state of the interface `name`.
 ///
 /// # Errors
 /// [`LinkError::Gone`] when there is none.
@@ -80,8 +79,8 @@ pub(super) fn is_gone(name: &str, index: u32) -> bool {
     is_another(details.map(|details| details.index).map_err(|error| refusal(name, &error)), index)
 }
 
-/// Where the kernel did not answer, the interface is taken for the same: as a removed one it would be brought up again,
-/// against the will of an operator who set it down.
+/// Without an answer of the kernel the interface counts as the same: a removed one would be brought up again, against
+/// the will of an operator who set it down.
 fn is_another(found: Result<u32, LinkError>, index: u32) -> bool {
     found.map_or_else(|error| error == LinkError::Gone, |found| found != index)
 }
@@ -95,7 +94,7 @@ pub(super) struct Ready {
     pub(super) restarts: bool,
 }
 
-/// Sees to it that the interface `name` is up with `bitrate`.
+/// Ensures that the interface `name` is up with `bitrate`.
 pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
     let interface = CanInterface::open(name).map_err(|error| refusal(name, &error))?;
     let details = interface.details().map_err(|error| refusal(name, &error))?;
@@ -154,7 +153,7 @@ fn read(details: &InterfaceDetails) -> Interface {
     }
 }
 
-/// The commands that do by hand what was not permitted.
+/// The commands that do by hand what this process may not do.
 fn by_hand(name: &str, bitrate: u32, up: bool) -> String {
     let down = if up { format!("sudo ip link set {name} down && ") } else { String::new() };
     format!("{down}sudo ip link set {name} up type can bitrate {bitrate}")
@@ -225,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_not_as_wished_is_set_up() {
+    fn only_an_interface_in_the_wrong_state_is_set_up() {
         let (active, off) = (CanState::ErrorActive, CanState::BusOff);
         for (state, expected) in [
             (interface(true, Some(500_000), active, 0), Need::Nothing),
@@ -256,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interface_that_is_not_there_is_gone() {
+    fn a_missing_interface_is_reported_as_gone() {
         assert_eq!(look("no-such-can0"), Err(LinkError::Gone));
         assert_eq!(bring_up("no-such-can0", 1_000_000), Err(LinkError::Gone));
         assert!(is_gone("no-such-can0", 1));
@@ -271,13 +270,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_permitted_names_the_command() {
+    fn a_missing_permission_names_the_command() {
         let denied = socketcan::Error::from(std::io::Error::from_raw_os_error(libc::EPERM));
         let down = interface(false, None, CanState::Stopped, 0);
         let LinkError::Fatal(text) = not_set("can0", 1_000_000, &down, &denied) else { panic!("fatal") };
         assert!(text.contains("`sudo ip link set can0 up type can bitrate 1000000`"), "{text}");
         assert!(text.contains("rapid artifacts --install"), "{text}");
-        // What the library makes of the kernel's refusals.
+        // The library's error for refusals of the kernel.
         let refused = socketcan::Error::from(NlError::NoAck);
         let LinkError::Retry(text) = not_set("can0", 1_000_000, &down, &refused) else { panic!("tried again") };
         assert!(text.contains("rapid artifacts --install") && text.contains("`sudo ip link set can0 up"), "{text}");

@@ -1,11 +1,11 @@
-//! `protocol = "raw"`: the frames of a bus as they come.
+//! `protocol = "raw"`: the frames of a bus, unchanged.
 //!
-//! A sample is a batch of the frames that waited, in order, [`CAN_BATCH`] at most. A frame is a record of
+//! A sample is a batch of the pending frames, in order, [`CAN_BATCH`] at most. A frame is a record of
 //! [`CAN_RECORD`] bytes, little endian:
 //!
 //! | offset | type | what |
 //! |---|---|---|
-//! | 0 | u64 | when it came, ns of `CLOCK_MONOTONIC`; from the kernel where it gives the time |
+//! | 0 | u64 | its arrival, ns of `CLOCK_MONOTONIC`; from the kernel where it gives the time |
 //! | 8 | u32 | identifier, with the flags of linux/can.h: bit 31 has 29 bits, bit 30 remote, bit 29 error |
 //! | 12 | u8 | bytes of data, 0 to 8 |
 //! | 13 | 3 | zero |
@@ -14,8 +14,8 @@
 //! Of an error frame (bit 29) the identifier and the data describe what happened, as in linux/can/error.h. The
 //! sample is stamped with its first frame.
 //!
-//! On a busy bus frames are let wait for [`PACE`], so that a sample is worth its handling; a frame of a
-//! quiet one is given at once. Nothing is sent.
+//! On a busy bus frames are collected for `PACE`, to limit the cost per sample; a frame of a quiet bus is delivered
+//! at once. Nothing is sent.
 //!
 //! Invariant: nothing is allocated between two samples.
 
@@ -24,13 +24,14 @@ use std::time::Duration;
 
 use super::link::{AsyncLink, Link, LinkError, Received, is_bus_off};
 use super::socket::can_id;
+use crate::device::DeviceNode;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
 use crate::provenance::{Format, Negotiated};
-use crate::registry::{CAN_BATCH, CAN_RECORD, CanSpec, DeviceNode};
+use crate::registry::{CAN_BATCH, CAN_RECORD, CanSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::Stamp;
 
-/// Between one batch and the look for the next: of 8,000 frames a second 16 make a batch.
+/// Time between batches: at 8,000 frames a second a batch has 16.
 const PACE: Duration = Duration::from_millis(2);
 
 /// An open bus.
@@ -92,7 +93,7 @@ impl Raw {
         if !rest.is_zero() {
             tokio::time::sleep(rest).await;
         }
-        // Nothing waits from here on: a future that is dropped has taken no frame.
+        // Nothing awaits from here on: a dropped future has taken no frame.
         let count = self.link.recv(&mut self.waiting[..]).await.map_err(LinkError::into_driver)?;
         self.taken = Stamp::now();
         let frames = self.waiting.get(..count).unwrap_or_default();

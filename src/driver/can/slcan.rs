@@ -4,8 +4,8 @@
 //! `Z0`/`Z1` time stamps, `t`/`T`/`r`/`R` frames; each line ends with CR. The adapter answers CR for done, BEL for
 //! refused, `z` or `Z` and CR for a frame that was taken.
 //!
-//! A frame begins with a letter that is no hexadecimal digit: with such a letter a new line begins, so that
-//! whatever stood before it costs no frame but its own.
+//! A frame begins with a letter that is not a hexadecimal digit. Such a letter always begins a new line, so that
+//! garbage before it loses no other frame.
 //!
 //! Invariant: no bytes make the decoder panic, and it holds at most [`LONGEST`] of them.
 
@@ -25,22 +25,18 @@ pub enum Command {
     Close,
     /// Bit rate by its digit, an index into [`SLCAN_BITRATES`].
     Bitrate(u8),
-    /// Time stamps after each frame, or none.
-    Timestamps(bool),
     /// Join the bus.
     Open,
 }
 
 impl Command {
     /// The command that sets `bitrate`; `None` if slcan has no name for it.
-    #[must_use]
     pub fn bitrate(bitrate: u32) -> Option<Self> {
         let digit = SLCAN_BITRATES.iter().position(|known| *known == bitrate)?;
         u8::try_from(digit).ok().map(Self::Bitrate)
     }
 
     /// The command as a line.
-    #[must_use]
     pub const fn encode(self) -> Text {
         let mut text = Text::new();
         match self {
@@ -48,10 +44,6 @@ impl Command {
             Self::Bitrate(digit) => {
                 text.push(b'S');
                 text.push(b'0' + digit % 10);
-            }
-            Self::Timestamps(on) => {
-                text.push(b'Z');
-                text.push(if on { b'1' } else { b'0' });
             }
             Self::Open => text.push(b'O'),
         }
@@ -87,14 +79,12 @@ impl Text {
     }
 
     /// Its bytes, CR included.
-    #[must_use]
     pub fn bytes(&self) -> &[u8] {
         self.bytes.get(..self.len).unwrap_or(&self.bytes)
     }
 }
 
-/// `frame` as a line. An error frame has none, and gives an empty text.
-#[must_use]
+/// `frame` as a line; empty for an error frame.
 pub fn encode(frame: &CanFrame) -> Text {
     let mut text = Text::new();
     if frame.error {
@@ -125,7 +115,7 @@ pub enum Event {
     Refused,
 }
 
-/// Frames out of bytes that come in pieces.
+/// Decodes frames from bytes that arrive in pieces.
 #[derive(Debug, Clone)]
 pub struct Decoder {
     line: [u8; LONGEST],

@@ -1,7 +1,7 @@
 //! CAN adapters that are network interfaces (Linux `SocketCAN`).
 //!
 //! Sources: linux/can.h, linux/can/error.h, Documentation/networking/can.rst and timestamping.rst of the
-//! kernel. Its stamps are on the wall clock and are put on the monotonic one as they are read.
+//! kernel. Its stamps are of the wall clock and are converted to the monotonic clock when read.
 
 use std::io;
 use std::mem::{size_of, zeroed};
@@ -16,7 +16,7 @@ use crate::control::can::CanFrame;
 use crate::driver::datagram::{self, Datagram};
 use crate::time::{Stamp, WallClock};
 
-/// A frame that waited longer than this did not: the wall clock was set.
+/// A longer wait of a frame is impossible: the wall clock was set.
 const OLDEST: Duration = Duration::from_secs(10);
 
 /// A bound socket.
@@ -26,7 +26,7 @@ pub struct Socket {
     name: String,
     index: u32,
     restarts: bool,
-    /// The kernel's count of frames that found the queue full.
+    /// The kernel's count of frames lost to a full queue.
     dropped: u32,
     lost: u64,
     description: String,
@@ -39,8 +39,7 @@ impl Socket {
         Ok(Self::of(socket, name, ready, format!("{name} at {bitrate} bit/s")))
     }
 
-    /// Datagrams stand in for frames: the kernel hands over both, their stamps and the count of what found the
-    /// queue full in the same way.
+    /// Datagrams stand in for frames: the kernel delivers both, their stamps and the count of losses in the same way.
     pub(super) fn stand_in(socket: OwnedFd) -> Result<Self, LinkError> {
         let socket = CanSocket::from(socket);
         set_up(&socket).map_err(|error| LinkError::Retry(format!("the stand-in for a bus: {error}")))?;
@@ -76,7 +75,7 @@ impl Socket {
         let (raw, datagram) = loop {
             match receive(&self.bound) {
                 Ok(Some(received)) => break received,
-                // Something else than a classical frame.
+                // Not a classical frame.
                 Ok(None) => {}
                 Err(error) => return self.result_of(&error, "reading from").map_or(Ok(None), Err),
             }
@@ -86,7 +85,7 @@ impl Socket {
         Ok(Some(arrival(datagram.stamp_ns)))
     }
 
-    /// Why the link has ended; `None` if it has not, and trying again is all there is to do.
+    /// Why the link has ended; `None` if it has not: try again.
     fn result_of(&self, error: &io::Error, what: &str) -> Option<LinkError> {
         match error.raw_os_error() {
             Some(libc::EAGAIN | libc::EINTR | libc::ENOBUFS) => None,
@@ -120,7 +119,7 @@ impl AsFd for Socket {
     }
 }
 
-/// Hands a frame to a socket that is not ours alone; how many bytes it took.
+/// Passes a frame to a shared socket; returns how many bytes it took.
 pub(super) fn put(socket: BorrowedFd<'_>, frame: &CanFrame) -> rustix::io::Result<usize> {
     let raw = to_raw(frame);
     // SAFETY: `raw` is a whole can_frame of integers, without gaps, that outlives the slice.
@@ -164,7 +163,7 @@ fn open_error(name: &str, error: &io::Error) -> LinkError {
     }
 }
 
-/// The next frame that waits; `None` if it is no classical frame.
+/// The next pending frame; `None` if it is not a classical frame.
 fn receive(socket: &CanSocket) -> io::Result<Option<(libc::can_frame, Datagram)>> {
     // SAFETY: integers alone, for which zero is a value.
     let mut frame: libc::can_frame = unsafe { zeroed() };
@@ -175,7 +174,7 @@ fn receive(socket: &CanSocket) -> io::Result<Option<(libc::can_frame, Datagram)>
     Ok((datagram.length == size && !datagram.is_cut).then_some((frame, datagram)))
 }
 
-/// Puts a stamp of the wall clock on the monotonic one.
+/// Converts a stamp of the wall clock to the monotonic clock.
 fn arrival(wall_ns: Option<u64>) -> Arrival {
     let now = Stamp::now();
     let stamp = wall_ns.map(|wall_ns| WallClock::now().stamp(wall_ns).min(now));

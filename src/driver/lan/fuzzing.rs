@@ -1,10 +1,10 @@
-//! The readers of strangers' bytes, for the fuzzer.
+//! The parsers of foreign bytes, for the fuzzer.
 
 use super::iphone::packet::{self, Packets};
 use super::multipart::{self, Multipart, boundary};
 use super::{gopro, jpeg};
 
-/// Bodies of a multipart stream that comes in these pieces, and how many were given up.
+/// Bodies of a multipart stream that arrives in these pieces, and the number of discarded parts.
 pub fn multipart<'p>(
     content_type: &str,
     largest: usize,
@@ -29,7 +29,7 @@ pub fn multipart<'p>(
     (parts, malformed)
 }
 
-/// What a phone sends.
+/// Messages of a phone.
 #[derive(Debug, PartialEq)]
 pub enum Sent {
     /// A picture.
@@ -38,7 +38,7 @@ pub enum Sent {
     Session(Vec<u8>),
 }
 
-/// What a phone sends in these pieces, and how many were given up.
+/// The phone's messages in these pieces, and the number of discarded ones.
 pub fn phone<'p>(largest: usize, pieces: impl IntoIterator<Item = &'p [u8]>) -> (Vec<Sent>, u64) {
     let mut packets = Packets::new(largest);
     let (mut sent, mut malformed) = (Vec::new(), 0);
@@ -57,7 +57,7 @@ pub fn phone<'p>(largest: usize, pieces: impl IntoIterator<Item = &'p [u8]>) -> 
     (sent, malformed)
 }
 
-/// What is looked at in a GoPro's answers and in a picture.
+/// Parses a GoPro's answers and a picture's header.
 pub fn answer(bytes: &[u8]) {
     gopro::fuzz(bytes);
     let _ = jpeg::size(bytes);

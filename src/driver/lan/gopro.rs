@@ -1,22 +1,22 @@
 //! GoPro cameras over USB: the camera is a network adapter with an HTTP server behind it.
 //!
-//! The requests are those of Open GoPro (gopro.github.io/OpenGoPro, HTTP, version 2.0): wired control on,
-//! clock set, then every 3 s a keep-alive and a look at the camera's state, which is the sample, in JSON:
-//! `{"recording":bool,"busy":bool,"battery_percent":n,"card_free_kb":n,"remaining_s":n}`, null where the
-//! camera does not report it. With an episode the shutter is started and stopped (`camera`); which clip it made is written
-//! beside the episode, and the clip is fetched if the entry requests it (`clip`), by the next run if this one ends before.
+//! The requests are those of Open GoPro (gopro.github.io/OpenGoPro, HTTP, version 2.0): wired control on, clock set,
+//! then every 3 s a keep-alive and a query of the camera's state, which is the sample, in JSON:
+//! `{"recording":bool,"busy":bool,"battery_percent":n,"card_free_kb":n,"remaining_s":n}`, null for unknown values. The
+//! shutter starts and stops with an episode (`camera`); its clip's name is written beside the episode, and the clip is
+//! fetched if the entry requests it (`clip`), by the next run if this one ends before.
 //!
-//! The camera gives itself 172.2X.1YZ.51 and its host an address in the same network, XYZ being the last
-//! digits of its serial number.
+//! The camera gives itself 172.2X.1YZ.51 and its host an address in the same network; XYZ are the last digits of its
+//! serial number.
 //!
-//! What must outlive a connection to a camera, and the run, is in `gopro/SERIAL.json` in the state directory ([`Books`]):
-//! that its shutter is ours, for which episode, and which clips are still to be fetched. SERIAL is the camera's serial
-//! number; without one the name of its entry. Of a clip only the path of its note is kept: a user who moves or removes an
-//! episode with its note is not sent the clip.
+//! State that must outlive a connection to a camera, and the run, is in `gopro/SERIAL.json` in the state directory
+//! ([`Books`]): that this program started its shutter, for which episode, and which clips must still be fetched. SERIAL
+//! is the camera's serial number, or without one the name of its entry. For a clip only the path of its note is stored:
+//! if a user moves or removes an episode with its note, its clip is not fetched.
 //!
-//! Invariant: a task talks to the camera; readers and senders of requests never wait for it.
-//! Invariant: however the connection or the run ends, the shutter that is ours and the clips that are to be fetched are
-//! known to the next driver of the camera ([`Books`]).
+//! Invariant: a task communicates with the camera; readers and senders of requests never wait for it.
+//! Invariant: however the connection or the run ends, the camera's next driver knows the shutter started by this
+//! program and the clips still to be fetched ([`Books`]).
 
 mod answer;
 mod camera;
@@ -32,7 +32,7 @@ use tokio::time::sleep;
 use tokio_util::task::AbortOnDropHandle;
 
 use self::answer::{Name, State};
-use self::camera::{Camera, Pace, Told};
+use self::camera::{Camera, Pace, ReportedEpisode};
 use self::clip::Clip;
 use super::http;
 use super::place::{Place, Server};
@@ -41,17 +41,17 @@ use crate::folder::{Folder, Links, Missing, Sync, read_text, state_directory};
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
-/// The camera answers within a tenth of a second, while it encodes too.
+/// The camera answers within a tenth of a second, even while encoding.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);
 /// The state is 5 KB of numbers.
 const LARGEST_ANSWER: usize = 256 << 10;
-/// The host asks the camera for its address (DHCP), which takes a moment after the plug.
+/// The host requests its address from the camera (DHCP), which takes a moment after the plug.
 const ADDRESS_LIMIT: Duration = Duration::from_secs(8);
 const LOOK_FOR_ADDRESS: Duration = Duration::from_millis(200);
-/// An answer that did not come is asked for again.
+/// A missing answer is requested again.
 const TRIES: u32 = 2;
 
-/// What becomes of the clips.
+/// How clips are handled.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clips {
     /// They are fetched after the episode.
@@ -64,7 +64,7 @@ pub(super) struct Clips {
 #[derive(Debug)]
 pub(super) struct Gopro {
     states: mpsc::Receiver<Result<State, DriverError>>,
-    reported: watch::Sender<Told>,
+    reported: watch::Sender<ReportedEpisode>,
     task: AbortOnDropHandle<()>,
     model: Option<String>,
     payload: Vec<u8>,
@@ -105,7 +105,7 @@ impl Gopro {
         let ended = || Err(DriverError::Retry("the camera's task ended".to_owned()));
         let state = self.states.recv().await.unwrap_or_else(ended)?;
         self.payload.clear();
-        // A Vec takes every write.
+        // Writing to a Vec cannot fail.
         let _ = serde_json::to_writer(&mut self.payload, &state);
         Ok(Reading {
             bytes: &self.payload,
@@ -118,17 +118,17 @@ impl Gopro {
         })
     }
 
-    /// The episode that will be `episode` begins, or with `None` the one in progress ends.
+    /// The episode that will be saved as `episode` begins, or with `None` the one in progress ends.
     pub(super) fn record(&self, episode: Option<PathBuf>) {
         self.reported.send_replace(Some(episode));
     }
 
-    /// Stops the shutter, if it is ours, and notes the clip.
+    /// Stops the shutter, if this program started it, and notes the clip.
     pub(super) async fn close(self) {
         let Self { reported, task, states, .. } = self;
         reported.send_replace(Some(None));
         drop((reported, states));
-        // Who gives this up leaves the task its time: the camera is not to record on.
+        // If the caller abandons this, the task still runs: the camera must not keep recording.
         let _ = task.detach().await;
     }
 
@@ -174,7 +174,7 @@ fn camera_of(own: Ipv4Addr) -> Ipv4Addr {
     Ipv4Addr::new(a, b, c, 51)
 }
 
-/// What is read of a camera's answers and of a note, for the fuzzer.
+/// Parses a camera's answers and a note, for the fuzzer.
 #[doc(hidden)]
 pub(super) fn fuzz(bytes: &[u8]) {
     let _ = (answer::state(bytes, Stamp::default()), answer::model(bytes), answer::size(bytes));
@@ -193,22 +193,22 @@ pub(super) fn fuzz(bytes: &[u8]) {
 /// Some thousands of notes.
 const LARGEST: u64 = 1 << 20;
 
-/// The shutter that was started for an episode.
+/// A shutter that was started for an episode.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 struct Shutter {
-    /// The file that the episode will be.
+    /// The path that the episode's file will have.
     episode: PathBuf,
     before: Before,
 }
 
-/// The newest clip on the card before the shutter was started: the one that it made is another.
+/// The newest clip on the card before the shutter was started; the episode's clip is a different one.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Before {
     /// There was none.
     Nothing,
     Clip(Name),
-    /// It was not known, and why: no clip can be identified as the episode's.
+    /// Unknown, and why: no clip can be identified as the episode's.
     Unknown(String),
 }
 
@@ -229,7 +229,7 @@ struct Pages {
 }
 
 impl Books {
-    /// Those of the camera of this name, a plain one, below the state directory.
+    /// The books of the camera of this name, a plain one, below the state directory.
     async fn open(state: Option<&Path>, name: &str) -> Self {
         let Some(file) = state.map(|state| state.join("gopro").join(format!("{name}.json"))) else {
             return Self::default();
@@ -257,7 +257,7 @@ impl Books {
         }
     }
 
-    /// Notes of the clips that are still to be fetched.
+    /// Notes of the clips that must still be fetched.
     fn notes(&self) -> &[PathBuf] {
         &self.pages.notes
     }
@@ -277,7 +277,7 @@ impl Books {
         }
     }
 
-    /// Is it on the disk, so that another run continues with it?
+    /// Whether they are on the disk, so that another run can continue with them.
     const fn are_kept(&self) -> bool {
         self.file.is_some() && !self.is_stated
     }

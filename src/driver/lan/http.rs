@@ -1,4 +1,4 @@
-//! HTTP as devices use it: one request a connection, every wait and every size bounded.
+//! HTTP for devices: one request per connection, every wait and every size bounded.
 
 use std::time::Duration;
 
@@ -14,26 +14,26 @@ use tokio_util::task::AbortOnDropHandle;
 use super::place::Server;
 use crate::driver::DriverError;
 
-/// Headers of a reply, bytes.
+/// Maximum bytes of a reply's headers.
 const LONGEST_HEAD: usize = 16 << 10;
 
-/// The beginning of a reply; its body is still to come.
+/// The head of a reply; its body follows.
 #[derive(Debug)]
 pub(super) struct Reply {
     server: Server,
     pub(super) status: StatusCode,
     headers: HeaderMap,
     body: Incoming,
-    /// The task that carries the bytes of the connection, ended with this.
+    /// The task that handles the connection; it ends when this is dropped.
     _connection: AbortOnDropHandle<()>,
 }
 
-/// Asks for `path`, from byte `from` on if that is not 0.
+/// Requests `path`, from byte `from` on if that is not 0.
 pub(super) async fn get(server: &Server, path: &str, from: u64, limit: Duration) -> Result<Reply, DriverError> {
     let ask = async {
         let stream = server.connect().await?;
         let odd = |error: hyper::Error| server.place.lost(format_args!("its answer is not HTTP: {}", causes(&error)));
-        // What cameras' servers are known to get wrong is let pass.
+        // Known mistakes of cameras' servers are tolerated.
         let (mut sender, connection) = http1::Builder::new()
             .max_buf_size(LONGEST_HEAD)
             .ignore_invalid_headers_in_responses(true)
@@ -63,7 +63,7 @@ pub(super) async fn get(server: &Server, path: &str, from: u64, limit: Duration)
     }
 }
 
-/// The whole body of an answer that is good, at most so many bytes.
+/// The whole body of a successful answer, at most `most` bytes.
 pub(super) async fn text(server: &Server, path: &str, most: usize, limit: Duration) -> Result<Vec<u8>, DriverError> {
     match answer(server, path, most, limit).await? {
         (status, body) if status.is_success() => Ok(body),
@@ -71,7 +71,7 @@ pub(super) async fn text(server: &Server, path: &str, most: usize, limit: Durati
     }
 }
 
-/// The status and the whole body of an answer, at most so many bytes.
+/// The status and the whole body of an answer, bounded in size.
 pub(super) async fn answer(
     server: &Server,
     path: &str,
@@ -102,7 +102,7 @@ impl Reply {
             match self.body.frame().await {
                 Some(Ok(frame)) => {
                     self.server.place.received();
-                    // Trailers are nothing to us.
+                    // Trailers are ignored.
                     if let Ok(bytes) = frame.into_data() {
                         return Ok(Some(bytes));
                     }
@@ -121,7 +121,7 @@ impl Reply {
     }
 }
 
-/// An error and what it comes from.
+/// An error and its causes.
 fn causes(error: &hyper::Error) -> String {
     use std::error::Error as _;
     match error.source() {

@@ -1,22 +1,20 @@
-//! Phones that run aod321/iPhoneVIO: the phone connects to us and sends pictures with the pose of its
-//! camera.
+//! Phones that run aod321/iPhoneVIO: the phone connects to this program and sends pictures with the pose of its camera.
 //!
-//! One entry gives one kind of sample. Of `image`, each sample is the picture as it came with a comment
-//! behind its first two bytes: `{"pose":[16 numbers],"device_time":s,"wall_clock":s}`, so that nothing the
-//! phone measured is lost. Of `pose`, each sample is the 16 numbers. The phone makes one connection, so
-//! both at once are not available.
+//! One entry produces one kind of sample. For `image`, each sample is the received picture with a comment inserted
+//! after its first two bytes: `{"pose":[16 numbers],"device_time":s,"wall_clock":s}`, so that no measurement of the
+//! phone is lost. For `pose`, each sample is the 16 numbers. The phone makes one connection, so both at once are not
+//! available.
 //!
-//! A sample's time is the phone's own, brought to our clock by the least delay that was seen
-//! ([`Clock`]).
+//! A sample's time is the phone's own, converted to our clock by the smallest delay seen ([`Clock`]).
 //!
-//! What the phone measured at its time `d` arrives here at `a`, some delay later. The least `a - d` of the
-//! last seconds is the difference of the clocks but for the shortest delay, which on a local network is a
-//! few milliseconds; a delay that is longer than that is thus seen as a delay and not as time, however long it is.
-//! Where the phone's clock goes backwards, or is further ahead than any delay explains, it is another session's.
+//! A measurement at the phone's time `d` arrives here at `a`, after some delay. The least `a - d` of the last seconds
+//! is the difference of the clocks plus the shortest delay, which on a local network is a few milliseconds; a longer
+//! delay, of any length, is thus recognised as delay and does not shift the time. If the phone's clock goes backwards,
+//! or is further ahead than any delay explains, a new session has begun.
 //!
 //! Invariant: a stamp is never later than the arrival.
-//! Invariant: only the phone that is meant is listened to; a new connection of its takes the place of the
-//! old one, which may be dead without a report.
+//! Invariant: only the entry's phone is accepted; a new connection from it replaces the old one, which may be dead
+//! without a report.
 
 pub(super) mod packet;
 
@@ -36,13 +34,13 @@ use crate::registry::{LanPicture, PhoneStream};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
 use crate::time::Stamp;
 
-/// Bytes taken from the kernel at once.
+/// Bytes read from the kernel at once.
 const INBOX: usize = 64 << 10;
-/// A picture that is not the sample has room for this much, or a byte a pixel.
+/// Maximum size of a picture that is not the sample; or a byte per pixel if that is more.
 const LARGEST_UNSEEN: usize = 64 << 10;
-/// So much of what a phone reports of its session is logged.
+/// Logged length of a phone's session report.
 const LONGEST_SESSION: usize = 500;
-/// The comment at its longest: 18 numbers, the longest of which take 330 digits.
+/// Maximum length of the comment: 18 numbers, the longest of which take 330 digits.
 const COMMENT: usize = 2 << 10;
 
 /// See the module's comment.
@@ -64,7 +62,7 @@ struct Connection {
     stream: TcpStream,
     packets: Packets,
     inbox: Box<[u8]>,
-    /// `inbox[taken..filled]` is still to be looked at.
+    /// `inbox[taken..filled]` is unprocessed.
     taken: usize,
     filled: usize,
     arrived: Stamp,
@@ -136,7 +134,7 @@ impl Phone {
         })
     }
 
-    /// Looks at what came, up to the end of a frame.
+    /// Parses received bytes, up to the end of a frame.
     fn parse(&mut self) -> Option<(Frame, Stamp)> {
         let connection = self.connection.as_mut()?;
         while let Some(bytes) = connection.inbox.get(connection.taken..connection.filled)
@@ -162,7 +160,7 @@ impl Phone {
         None
     }
 
-    /// Waits for bytes, or for a connection. Cancel-safe: both are.
+    /// Waits for bytes or for a connection. Cancel-safe, since both waits are.
     async fn receive(&mut self) -> Result<(), DriverError> {
         let patience = self.connection.as_ref().map(|connection| connection.newest + PATIENCE);
         let silent = async {
@@ -208,7 +206,7 @@ impl Phone {
         self.place.received();
         let largest = match self.stream {
             PhoneStream::Image => self.max_bytes.saturating_sub(COMMENT),
-            // The picture is let go, but comes before that.
+            // The picture is discarded, but arrives before the pose.
             PhoneStream::Pose => LARGEST_UNSEEN.max((self.picture.width * self.picture.height) as usize),
         };
         self.connection = Some(Connection {
@@ -225,8 +223,8 @@ impl Phone {
     }
 }
 
-/// The picture with what the phone measured as a comment (JPEG, ITU-T T.81 B.2.4.5: marker FFFE, length of
-/// what follows it as big-endian u16 with its own two bytes). Is it a picture?
+/// The picture with the phone's measurements as a comment (JPEG, ITU-T T.81 B.2.4.5: marker FFFE, length of the rest as
+/// big-endian u16 including its own two bytes). Returns whether it is a picture.
 fn annotate(picture: &[u8], frame: &Frame, output: &mut Vec<u8>) -> bool {
     let Some(rest) = picture.strip_prefix(&jpeg::START) else {
         output.extend_from_slice(picture);
@@ -235,7 +233,7 @@ fn annotate(picture: &[u8], frame: &Frame, output: &mut Vec<u8>) -> bool {
     output.extend_from_slice(&jpeg::START);
     output.extend_from_slice(&[0xff, 0xfe, 0, 0]);
     let at = output.len();
-    // A Vec takes every write.
+    // Writing to a Vec cannot fail.
     let _ = output.write_all(b"{\"pose\":[");
     for (index, value) in frame.pose.iter().enumerate() {
         let _ = output.write_all(if index == 0 { b"" } else { b"," });
@@ -254,7 +252,7 @@ fn annotate(picture: &[u8], frame: &Frame, output: &mut Vec<u8>) -> bool {
     true
 }
 
-/// JSON cannot express what is no number.
+/// JSON cannot express NaN and infinities.
 fn number(value: f64, output: &mut Vec<u8>) {
     let _ = if !value.is_finite() {
         output.write_all(b"null")
@@ -265,14 +263,14 @@ fn number(value: f64, output: &mut Vec<u8>) {
     };
 }
 
-/// The least difference is looked for over so long, twice: clocks drift apart by some 50 us a second at most.
+/// The minimum is taken over this long, twice: clocks drift apart by at most some 50 us a second.
 const WINDOW: Duration = Duration::from_secs(5);
-/// A capture time this much before the shortest delay permits is another clock's: a new session began.
+/// A capture time this far ahead of what the shortest delay permits belongs to another clock: a new session began.
 const LEAP_NS: i128 = 1_000_000_000;
 
 #[derive(Debug, Default)]
 struct Clock {
-    /// The least differences of this window and of the one before, ns.
+    /// The least differences of this window and of the previous one, ns.
     now: Option<i128>,
     before: Option<i128>,
     since: Stamp,
@@ -283,7 +281,7 @@ struct Clock {
 impl Clock {
     /// The moment on our clock at which the phone's clock showed `device` s.
     fn stamp(&mut self, device: f64, arrived: Stamp) -> Stamp {
-        // Beyond 100 years it is no clock.
+        // Beyond 100 years it is not a clock.
         if !(0.0..3.2e9).contains(&device) {
             return arrived;
         }
@@ -327,17 +325,17 @@ mod clock_tests {
     }
 
     #[test]
-    fn a_late_frame_is_not_a_later_one() {
+    fn a_delayed_frame_keeps_its_capture_time() {
         let late = errors(&[5, 5, 5, 40, 200, 5, 90], 0);
         assert!(late.iter().all(|error| (error - 5_000_000).abs() < 1000), "{late:?}");
-        // What comes at first is late: better is known with the first that is not.
+        // The first frames are late: the estimate improves with the first frame that is not.
         let first = errors(&[30, 5, 30], 0);
         assert!(first[0] > 29_000_000 && first[2] < 5_100_000, "{first:?}");
     }
 
     #[test]
     fn samples_after_a_stall_keep_their_age() {
-        // The network stands still for four seconds, and what it held comes at once.
+        // The network stalls for four seconds, and then delivers everything at once.
         let stalled = (0..120).map(|frame| 4005 - frame * 1000 / 30);
         let delays: Vec<u64> = [5; 60].into_iter().chain(stalled).chain([5; 30]).collect();
         let errors = errors(&delays, 0);
@@ -355,15 +353,15 @@ mod clock_tests {
     }
 
     #[test]
-    fn no_number_breaks_it_and_none_is_later_than_the_arrival() {
+    fn any_device_time_is_survived_and_no_stamp_is_later_than_the_arrival() {
         let mut clock = Clock::default();
         for device in [f64::NAN, f64::INFINITY, -1.0, 1e300, 0.0, 12.0, 0.0, 3e9, 5.0] {
             assert!(clock.stamp(device, Stamp(9_000_000_000)) <= Stamp(9_000_000_000), "{device}");
         }
-        // A new session began: its first frame stands at its arrival.
+        // A new session began: its first frame is stamped with its arrival.
         clock.stamp(100.0, Stamp(10_000_000_000));
         assert_eq!(clock.stamp(5.0, Stamp(11_000_000_000)), Stamp(11_000_000_000));
-        // So did this one, whose clock is far ahead.
+        // Here too; its clock is far ahead.
         assert_eq!(clock.stamp(500.0, Stamp(12_000_000_000)), Stamp(12_000_000_000));
     }
 }

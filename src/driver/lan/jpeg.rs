@@ -1,11 +1,11 @@
-//! The little that is looked at in a JPEG picture (ITU-T T.81, annex B).
+//! The few fields of a JPEG picture that are parsed (ITU-T T.81, annex B).
 
 /// Start of image.
 pub(super) const START: [u8; 2] = [0xff, 0xd8];
 
-/// Width and height in pixels; `None` if its first segments do not hold them.
+/// Width and height in pixels; `None` if the first segments do not contain them.
 pub(super) fn size(picture: &[u8]) -> Option<(u32, u32)> {
-    /// More segments than any camera writes before the picture begins.
+    /// More segments than any camera writes before the image data.
     const SEGMENTS: usize = 64;
     let mut rest = picture.strip_prefix(&START)?;
     for _ in 0..SEGMENTS {
@@ -18,12 +18,12 @@ pub(super) fn size(picture: &[u8]) -> Option<(u32, u32)> {
                 rest = rest.get(1..)?;
                 continue;
             }
-            // Frame headers: all of C0..CF but the tables among them.
+            // Frame headers: all of C0..CF except the tables.
             0xc0..=0xcf if !matches!(marker, 0xc4 | 0xc8 | 0xcc) => {
                 let [_, h1, h0, w1, w0, ..] = segment else { return None };
                 return Some((u16::from_be_bytes([*w1, *w0]).into(), u16::from_be_bytes([*h1, *h0]).into()));
             }
-            // The picture itself.
+            // The image data.
             0xda => return None,
             _ => {}
         }
@@ -52,7 +52,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_bytes_break_it(rest in prop::collection::vec(prop_oneof![Just(0xff_u8), any::<u8>()], 0..200)) {
+        fn any_bytes_are_survived(rest in prop::collection::vec(prop_oneof![Just(0xff_u8), any::<u8>()], 0..200)) {
             let _ = size(&[&START[..], &rest].concat());
         }
     }

@@ -1,6 +1,6 @@
 //! Cameras that send pictures over HTTP, one after another (`multipart/x-mixed-replace`).
 //!
-//! A picture's time is the moment its body began to arrive: the nearest to its capture that is known.
+//! A picture's time is the moment its body began to arrive: the closest known to its capture.
 
 use std::time::Duration;
 
@@ -27,7 +27,7 @@ pub(super) struct Camera {
     server: Server,
     reply: Reply,
     parser: Multipart,
-    /// Bytes not looked at yet, and when they came.
+    /// Bytes not yet parsed, and when they arrived.
     chunk: Bytes,
     arrived: Stamp,
     /// When the picture in progress began to arrive.
@@ -65,7 +65,7 @@ impl Camera {
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         while !self.parse()? {
             let patience = self.newest + PATIENCE;
-            // A dropped future leaves the bytes with the connection.
+            // If the future is dropped, the bytes stay with the connection.
             let Ok(chunk) = timeout_at(patience, self.reply.next()).await else {
                 return Err(self.server.place.lost(format_args!("no picture for {} s", PATIENCE.as_secs())));
             };
@@ -89,7 +89,7 @@ impl Camera {
         })
     }
 
-    /// Looks at what came, up to the end of a picture.
+    /// Parses received bytes, up to the end of a picture.
     fn parse(&mut self) -> Result<bool, DriverError> {
         while !self.chunk.is_empty() {
             let (taken, cut) = self.parser.feed(&self.chunk);
@@ -107,7 +107,7 @@ impl Camera {
     }
 }
 
-/// Does the entry give the size of its pictures?
+/// Checks that the picture has the size given in the entry.
 pub(super) fn check_size(name: &str, (width, height): (u32, u32), requested: LanPicture) -> Result<(), DriverError> {
     if (width, height) == (requested.width, requested.height) {
         return Ok(());
@@ -122,7 +122,7 @@ pub(super) fn check_size(name: &str, (width, height): (u32, u32), requested: Lan
 /// The parser of an answer that is a stream of pictures.
 fn accept(name: &str, path: &str, reply: &Reply, max_bytes: usize) -> Result<Multipart, DriverError> {
     let content = reply.header(CONTENT_TYPE).unwrap_or_default();
-    // A boundary has 70 characters; what is longer is shown in part.
+    // A boundary has 70 characters; a longer one is truncated for display.
     let content = content.get(..200).unwrap_or(content);
     let fatal = |text: String| Err(DriverError::Fatal(text));
     match reply.status {

@@ -1,14 +1,14 @@
 //! Devices on the network, and behind network adapters.
 //!
-//! Where a device is reached comes with its attachment: the interface of its USB network adapter, or
-//! an address that was found. Sockets are bound to the interface where there is one, so that a device
-//! behind an adapter is never mistaken for another with the same address elsewhere.
+//! A device's location comes with its attachment: the interface of its USB network adapter, or an address that was
+//! found. Sockets are bound to the interface if there is one, so that a device behind an adapter is never confused with
+//! another of the same address elsewhere.
 //!
-//! Nothing reports that a device on the network is gone: every wait here has an end, and what is received is
-//! noted in the node for the keeper of its lease (`hotplug::lan`).
+//! Nothing reports that a device on the network is gone: every wait here is bounded, and receptions are noted in the
+//! node for the task that tracks its lease (`hotplug::lan`).
 //!
-//! Invariant: what a server sends is bounded: headers, bodies, pictures, packets, and the time they take.
-//! Invariant: only the device the entry means is listened to.
+//! Invariant: everything a server sends is bounded: headers, bodies, pictures, packets, and their duration.
+//! Invariant: only the entry's own device is accepted.
 
 mod gopro;
 mod http;
@@ -22,20 +22,21 @@ mod udp;
 use std::time::Duration;
 
 use super::{Agreed, DriverError, Reading};
+use crate::device::DeviceNode;
+use crate::link::{Link, LinkState, LinkWatch};
 use crate::provenance::{Format, Negotiated};
-use crate::registry::{DeviceNode, DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec};
-use place::Carrier;
+use crate::registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec};
 use place::Place;
 
-/// A camera or a phone that sends nothing whole for this long is reconnected. Six of these and the
-/// delays between them fit into the minute in which five restarts are allowed.
+/// A camera or a phone that sends no complete sample for this long is reconnected. Six of these and the delays between
+/// them fit into the minute in which five restarts are allowed.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// A device on the network.
 #[derive(Debug)]
 pub struct Lan {
     protocol: Protocol,
-    carrier: Carrier,
+    link: LinkWatch,
     pub(super) agreed: Agreed,
 }
 
@@ -48,17 +49,16 @@ enum Protocol {
 }
 
 impl Lan {
-    /// Is the link to the device at `node` down? If so, a future that ends when it is not.
-    #[must_use]
+    /// If the link to the device at `node` is down, a future that ends when it is up again.
     pub fn unlinked(node: &DeviceNode) -> Option<impl Future<Output = ()> + Send + use<>> {
-        let mut carrier = Carrier::of(node);
-        carrier.is_down().then_some(async move { carrier.up().await })
+        let link = link_of(node);
+        (link.state() == LinkState::Down).then_some(async move { link.restored().await })
     }
 
     /// Opens the device of `spec` at `node`.
     ///
     /// # Errors
-    /// When it does not answer, answers something else, or a port of ours is taken.
+    /// When it does not answer, sends an unexpected answer, or a local port is taken.
     pub async fn open(spec: &DeviceSpec, lan: &LanSpec, node: &DeviceNode) -> Result<Self, DriverError> {
         let host = match &lan.find {
             LanFind::Adapter { host } => *host,
@@ -83,7 +83,7 @@ impl Lan {
         let (description, format) = describe(lan, &at);
         let card = if let Protocol::Gopro(gopro) = &protocol { gopro.card() } else { None };
         let negotiated = Negotiated { card, bus: Some(at), format, ..Negotiated::default() };
-        Ok(Self { protocol, carrier: Carrier::of(node), agreed: Agreed { description, negotiated } })
+        Ok(Self { protocol, link: LinkWatch::of(link_of(node)), agreed: Agreed { description, negotiated } })
     }
 
     /// The next sample.
@@ -92,7 +92,7 @@ impl Lan {
     /// [`DriverError::Gone`] when the network adapter was unplugged, [`DriverError::Unlinked`] when its link went
     /// down, [`DriverError::Retry`] when the device ended its stream or fell silent.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        let Self { protocol, carrier, .. } = self;
+        let Self { protocol, link, .. } = self;
         let read = async {
             match protocol {
                 Protocol::Mjpeg(camera) => camera.read().await,
@@ -104,15 +104,15 @@ impl Lan {
         tokio::select! {
             biased;
             reading = read => reading,
-            () = carrier.lost() => Err(DriverError::Unlinked),
+            () = link.lost() => Err(DriverError::Unlinked),
         }
     }
 
-    /// The episode that will be this file begins, or with `None` the one in progress ends: a camera that
-    /// records by itself does so with it. Returns at once.
+    /// The episode with this file begins, or with `None` the one in progress ends: a camera that records by itself
+    /// follows it. Returns at once.
     ///
     /// # Errors
-    /// When the device does not take it.
+    /// When the device does not accept it.
     pub fn record(&mut self, episode: Option<std::path::PathBuf>) -> Result<(), DriverError> {
         if let Protocol::Gopro(gopro) = &self.protocol {
             gopro.record(episode);
@@ -120,7 +120,7 @@ impl Lan {
         Ok(())
     }
 
-    /// Ends in order what the device does by itself.
+    /// Ends in order the device's own activities.
     pub async fn close(self) {
         if let Protocol::Gopro(gopro) = self.protocol {
             gopro.close().await;
@@ -128,10 +128,16 @@ impl Lan {
     }
 }
 
+/// The link of a network adapter, which stays plugged in when its cable, or the device behind it, is pulled. For a
+/// device found on the network, discovery monitors the link.
+fn link_of(node: &DeviceNode) -> Link {
+    if let DeviceNode::Net(interface) = node { Link::of(interface) } else { Link::default() }
+}
+
 fn describe(lan: &LanSpec, at: &str) -> (String, Option<Format>) {
     let pictures = |picture: LanPicture| {
         let LanPicture { width, height, .. } = picture;
-        // How many pictures a second come is not agreed upon.
+        // The rate of pictures is not negotiated.
         Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: None })
     };
     match &lan.protocol {

@@ -1,34 +1,32 @@
-//! Parts of `multipart/x-mixed-replace`, as cameras send them: the parts out of the bytes, without I/O.
+//! Parser of `multipart/x-mixed-replace` as cameras send it: extracts the parts from the bytes, without I/O.
 //!
-//! A part is a line that begins with `--` and the boundary, header lines, an empty line and the body
-//! (RFC 2046, 5.1.1). Cameras take liberties, and these are taken too: a boundary that is announced
-//! with its dashes or sent with more of them, lines that end in a newline alone, no empty line before
-//! a boundary, no `Content-Length`. With a `Content-Length` the body is so long; without one it ends at
-//! the next boundary.
+//! A part is a line of `--` and the boundary, header lines, an empty line and the body (RFC 2046, 5.1.1). Deviations of
+//! cameras are accepted: a boundary announced with its dashes or sent with more of them, lines that end only in a
+//! newline, no empty line before a boundary, no `Content-Length`. A `Content-Length` gives the length of the body;
+//! without it the body ends at the next boundary.
 //!
-//! A part that is too large, or whose headers are, is given up and counted; what follows is looked for
-//! at the next boundary.
+//! A part with a body or headers that are too large is discarded and counted; parsing resumes at the next boundary.
 //!
-//! Invariant: memory is bounded by the largest body permitted and [`LONGEST_HEAD`], whatever comes.
-//! Invariant: nothing is allocated for a part once the largest one has been seen.
+//! Invariant: memory is bounded by the largest permitted body and [`LONGEST_HEAD`], whatever the input.
+//! Invariant: parts cause no allocation once the largest one has been seen.
 
 /// Header lines of a part, bytes: those of a camera are under 200.
 pub(super) const LONGEST_HEAD: usize = 8 << 10;
 /// A boundary has 70 characters at most (RFC 2046, 5.1.1).
 const LONGEST_BOUNDARY: usize = 70;
-/// A line that matters, bytes: twice a boundary leaves room for its dashes, and for the header that is looked for.
+/// Maximum bytes of a relevant line: two boundaries leave space for dashes, and for the header that is parsed.
 const LONGEST_LINE: usize = 2 * LONGEST_BOUNDARY;
 
-/// What came of feeding bytes.
+/// Result of feeding bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Cut {
     /// More bytes are needed.
     Open,
-    /// The headers of a part are over: its body is on its way.
+    /// The headers of a part are complete; its body follows.
     Head,
     /// A part is complete: see [`Multipart::part`].
     Part,
-    /// A part was given up.
+    /// A part was discarded.
     Malformed,
     /// The last part was announced.
     End,
@@ -36,10 +34,10 @@ pub(super) enum Cut {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
-    /// Lines are let go until one is the boundary.
+    /// Lines are skipped up to the boundary.
     Between,
     Head,
-    /// So many bytes of the body are to come.
+    /// This many bytes of the body are still to come.
     Sized(usize),
     /// The body ends at a boundary.
     Unsized,
@@ -48,22 +46,22 @@ enum State {
 /// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Multipart {
-    /// Without the dashes it begins with.
+    /// Without its leading dashes.
     boundary: Vec<u8>,
     state: State,
     line: Vec<u8>,
-    /// The line in progress is longer than any that matters.
+    /// The current line is longer than any relevant one.
     line_is_long: bool,
     head: usize,
     length: Option<usize>,
     body: Vec<u8>,
-    /// The part was handed over, and `body` begins again.
+    /// The part was handed over; `body` starts again.
     reported: bool,
     largest: usize,
 }
 
 impl Multipart {
-    /// `boundary` as the `Content-Type` announces it; `None` if it is none.
+    /// `boundary` as the `Content-Type` announces it; `None` if it is invalid.
     pub(super) fn new(boundary: &str, largest: usize) -> Option<Self> {
         let boundary = boundary.trim_start_matches('-').as_bytes();
         if boundary.is_empty() || boundary.len() > LONGEST_BOUNDARY {
@@ -82,7 +80,7 @@ impl Multipart {
         })
     }
 
-    /// The body of the part that is complete.
+    /// The body of the completed part.
     pub(super) fn part(&self) -> &[u8] {
         &self.body
     }
@@ -119,11 +117,11 @@ impl Multipart {
         (count, self.complete())
     }
 
-    /// Lines are looked at as they come: one that is the boundary was not part of the body.
+    /// Lines are checked as they arrive: the boundary line was not part of the body.
     fn take_unsized(&mut self, bytes: &[u8]) -> (usize, Cut) {
         let end = bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1);
         let count = end.unwrap_or(bytes.len());
-        // The boundary's own line, and the line end before it, are no part of the body.
+        // The boundary's own line, and the line end before it, do not belong to the body.
         if self.body.len() + count > self.largest.saturating_add(LONGEST_LINE + b"\r\n".len()) {
             self.body.clear();
             return (0, self.give_up());
@@ -200,11 +198,11 @@ impl Multipart {
                 }
             };
         }
-        // Of a line that is too long only the beginning is remembered, or nothing.
+        // Of a line that is too long only the beginning is kept, or nothing.
         if !self.line_is_long
             && let Some(value) = header(line, b"content-length")
         {
-            // A length that is no number is none.
+            // A length that is not a number is ignored.
             self.length = std::str::from_utf8(value).ok().and_then(|digits| digits.parse().ok());
         }
         Cut::Open
@@ -217,14 +215,14 @@ impl Multipart {
         Cut::Part
     }
 
-    /// The part is let go, perhaps in the middle of a line. Nothing of what made it too large is taken:
-    /// it may be the boundary that the next part begins with.
+    /// Discards the part, perhaps in the middle of a line. None of the bytes that made it too large are consumed: they
+    /// may be the boundary of the next part.
     fn give_up(&mut self) -> Cut {
         self.state = State::Between;
         Cut::Malformed
     }
 
-    /// After a boundary.
+    /// Starts a part, after a boundary.
     fn begin(&mut self, is_last: bool) {
         (self.head, self.length) = (0, None);
         if !self.reported {
@@ -233,7 +231,7 @@ impl Multipart {
         self.state = if is_last { State::Between } else { State::Head };
     }
 
-    /// Is the line a boundary, and if so the last one?
+    /// Whether the line is a boundary, and if so whether it is the last one.
     fn boundary_line(&self) -> Option<bool> {
         if self.line_is_long {
             return None;
@@ -263,7 +261,7 @@ impl Multipart {
     }
 }
 
-/// The value of a header line, if it is the header of this name.
+/// The value of a header line, if the header has this name.
 fn header<'a>(line: &'a [u8], name: &[u8]) -> Option<&'a [u8]> {
     let colon = line.iter().position(|byte| *byte == b':')?;
     let (key, value) = line.split_at(colon);

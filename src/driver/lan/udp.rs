@@ -1,11 +1,11 @@
-//! Packets that a device sends to a port of ours: LiDARs and the like. One packet is one sample, as it
-//! came, without its IP and UDP headers.
+//! Packets that a device sends to a local port, for example from a LiDAR. One packet is one sample, unchanged, without
+//! its IP and UDP headers.
 //!
-//! A packet's time is the moment the kernel took it from the network (`SO_TIMESTAMPNS`, socket(7)). What
-//! the kernel had to drop because they were not read in time (`SO_RXQ_OVFL`), and packets larger than the entry permits,
+//! A packet's time is the moment the kernel took it from the network (`SO_TIMESTAMPNS`, socket(7)). Packets that the
+//! kernel had to drop because they were not read in time (`SO_RXQ_OVFL`), and packets larger than the entry permits,
 //! are counted as lost.
 //!
-//! Invariant: nothing is allocated for a packet.
+//! Invariant: receiving a packet does not allocate.
 
 use std::io;
 use std::mem::zeroed;
@@ -26,9 +26,9 @@ use crate::registry::own_side;
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, realtime_ns};
 
-/// The interface is looked for after so long without a packet.
+/// The interface is checked after this long without a packet.
 const ASK_AFTER: Duration = Duration::from_millis(500);
-/// A packet that waited longer than this has a time that the wall clock was set in between.
+/// If a packet seems to have waited longer than this, the wall clock was set meanwhile.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
 
 /// See the module's comment.
@@ -38,7 +38,7 @@ pub(super) struct Packets {
     place: Place,
     packet: Vec<u8>,
     filled: usize,
-    /// What the kernel dropped so far.
+    /// Number of packets that the kernel has dropped so far.
     dropped: u32,
     lost: u64,
     /// Time of the newest packet.
@@ -46,10 +46,10 @@ pub(super) struct Packets {
 }
 
 impl Packets {
-    /// Receives what comes to `port`; a packet has at most `max_bytes`.
+    /// Receives packets at `port`; a packet has at most `max_bytes`.
     pub(super) fn open(place: Place, port: u16, max_bytes: usize) -> Result<Self, DriverError> {
         let socket = bind(&place, port).map_err(|error| port_error(port, &error))?;
-        // SAFETY: the descriptor is owned by what is registered.
+        // SAFETY: the registered value owns the descriptor.
         let socket = unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }
             .map_err(|error| DriverError::Retry(format!("port {port}: {}", io::Error::from(error))))?;
         Ok(Self { socket, place, packet: vec![0; max_bytes], filled: 0, dropped: 0, lost: 0, last: Stamp::default() })
@@ -57,9 +57,9 @@ impl Packets {
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         let captured = loop {
-            // Strangers and what is too large may come without end.
+            // Foreign or oversized packets may arrive endlessly.
             consume_budget().await;
-            // A dropped future leaves every packet with the kernel.
+            // If the future is dropped, every packet stays with the kernel.
             let ready = timeout(ASK_AFTER, self.socket.readable()).await;
             let Ok(ready) = ready else {
                 if self.place.is_gone() {
@@ -68,7 +68,7 @@ impl Packets {
                 continue;
             };
             let mut guard = ready.map_err(|error| self.place.lost(error))?;
-            // SAFETY: all zeroes are valid for it.
+            // SAFETY: all zeroes are a valid value.
             let mut from: libc::sockaddr_storage = unsafe { zeroed() };
             let received = match datagram::receive(guard.get_inner().as_fd(), &mut self.packet, Some(&mut from)) {
                 Ok(received) => received,
@@ -112,14 +112,13 @@ impl Packets {
         }
         self.filled = received.length;
         let (stamp, flags) = stamp(received.stamp_ns, Stamp::now(), realtime_ns());
-        // The two clocks are read one after the other, which is not always equally quick.
+        // The two clocks are read one after the other, with a varying delay.
         self.last = self.last.max(stamp);
         Some((self.last, flags))
     }
 }
 
-/// The moment on our clock of a moment on the wall clock, which the kernel gives; the moment of arrival
-/// where that cannot be right.
+/// Converts the kernel's wall-clock time to our clock; the moment of arrival if the kernel's time cannot be right.
 fn stamp(kernel: Option<u64>, now: Stamp, wall: u64) -> (Stamp, u32) {
     let waited = kernel.and_then(|kernel| wall.checked_sub(kernel)).map(Duration::from_nanos);
     match waited.filter(|waited| *waited <= LONGEST_WAIT) {
@@ -143,7 +142,7 @@ fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
 
 fn address(from: &libc::sockaddr_storage) -> Option<IpAddr> {
     let from = &raw const *from;
-    // SAFETY: of either family the storage holds that type, and is large enough and aligned for both.
+    // SAFETY: for either family the storage holds that type, and is large enough and aligned for both.
     unsafe {
         match i32::from((*from).ss_family) {
             libc::AF_INET => {
@@ -160,9 +159,9 @@ mod tests {
     use std::net::UdpSocket;
 
     use super::*;
-    use crate::registry::{DeviceNode, LastReceived};
+    use crate::device::{DeviceNode, LastReceived};
 
-    /// Of UDP and of TCP.
+    /// For UDP and TCP.
     #[tokio::test]
     async fn a_socket_is_bound_to_the_configured_address() {
         let (any, any_v6) = ([0; 4].into(), [0; 16].into());
@@ -170,7 +169,7 @@ mod tests {
             ("127.0.0.1", None),
             ("127.0.0.9", None),
             ("::1", None),
-            // What they broadcast is to be received as well.
+            // Broadcasts must be received as well.
             ("192.0.2.201", Some(any)),
             ("fd00::7", Some(any_v6)),
         ] {
@@ -193,14 +192,14 @@ mod tests {
         }
     }
 
-    /// A machine may be without it, a container often is.
+    /// A machine may lack it; containers often do.
     fn no_ipv6(host: IpAddr, error: &dyn std::fmt::Display) {
         assert!(host.is_ipv6() && UdpSocket::bind("[::1]:0").is_err(), "{host}: {error}");
         println!("NOT CHECKED: {host}: this machine has no IPv6");
     }
 
     #[test]
-    fn the_kernels_time_becomes_ours_where_it_can_be_right() {
+    fn the_kernels_time_is_converted_where_it_is_plausible() {
         let (now, wall) = (Stamp(5_000_000_000), 1_700_000_000_000_000_000);
         for (kernel, expected) in [
             (Some(wall - 1_000), (Stamp(4_999_999_000), FLAG_DEVICE_TIME)),

@@ -23,7 +23,7 @@ fn value(reading: &Reading<'_>) -> f64 {
 }
 
 #[tokio::test(start_paused = true)]
-async fn samples_come_in_order_at_their_recorded_distances_then_silence() {
+async fn samples_are_replayed_in_order_at_their_recorded_intervals_then_silence() {
     for options in layouts() {
         let file = file(&episode(options));
         let device = device(file.path(), "/rapid/tof");

@@ -23,7 +23,7 @@ fn cut(framing: Framing, limit: usize, chunks: &[&[u8]]) -> Vec<Vec<u8>> {
     found
 }
 
-/// Consistent overhead byte stuffing as its paper describes it, for the way there.
+/// Encodes consistent overhead byte stuffing as its paper describes it.
 fn stuff(message: &[u8]) -> Vec<u8> {
     let mut stuffed = Vec::new();
     for block in message.split(|&byte| byte == 0) {

@@ -8,7 +8,7 @@ fn read(parse: Parse, message: &[u8], count: usize) -> Option<Vec<f64>> {
 }
 
 #[test]
-fn csv_takes_exactly_as_many_numbers_as_wished() {
+fn csv_takes_exactly_the_configured_number_of_values() {
     assert_eq!(read(Parse::Csv, b"1, -2.5 ,3e2", 3), Some(vec![1.0, -2.5, 300.0]));
     for wrong in [&b"1,2"[..], b"1,2,3,4", b"1,2,", b"1,,3", b"1,2,x", b"", b"1;2;3", b"\xff,1,2"] {
         assert_eq!(read(Parse::Csv, wrong, 3), None, "{wrong:?}");
@@ -16,14 +16,14 @@ fn csv_takes_exactly_as_many_numbers_as_wished() {
 }
 
 #[test]
-fn numbers_that_are_none_are_passed_on() {
+fn nan_and_infinity_are_passed_on() {
     let values = read(Parse::Csv, b"nan,inf,-inf", 3).unwrap();
     assert!(values[0].is_nan());
     assert_eq!(values[1..], [f64::INFINITY, f64::NEG_INFINITY]);
 }
 
 #[test]
-fn json_arrays_hold_numbers_and_objects_hold_some() {
+fn json_arrays_hold_only_numbers_and_objects_some() {
     assert_eq!(read(Parse::Json, b" [1, -2.5, 3e2] ", 3), Some(vec![1.0, -2.5, 300.0]));
     let object = br#"{"t": 7, "name": "tof\n", "ok": true, "none": null, "raw": [9, 9], "in": {"x": 9}, "z": -1}"#;
     assert_eq!(read(Parse::Json, object, 2), Some(vec![7.0, -1.0]));
@@ -51,7 +51,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_printed_is_read(values in prop::collection::vec(any::<f64>().prop_filter("finite", |v| v.is_finite()), 1..20)) {
+    fn printed_values_are_parsed_back(values in prop::collection::vec(any::<f64>().prop_filter("finite", |v| v.is_finite()), 1..20)) {
         let text = values.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
         prop_assert_eq!(read(Parse::Csv, text.as_bytes(), values.len()), Some(values.clone()));
         let json = serde_json::to_vec(&values).unwrap();

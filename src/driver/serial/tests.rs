@@ -6,7 +6,7 @@ fn spec(framing: Framing, parse: Parse, channels: usize) -> SerialSpec {
     SerialSpec { baud: 115_200, framing, parse, channels }
 }
 
-/// Payloads with the messages lost before each, and what was lost after the last.
+/// Payloads with the number of messages lost before each, and the number lost after the last.
 fn decode(spec: &SerialSpec, chunks: &[&[u8]]) -> (Vec<(Vec<u8>, u64)>, u64) {
     let mut decoder = Decoder::new(spec, 64);
     let (mut found, mut lost) = (Vec::new(), 0);

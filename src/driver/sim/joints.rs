@@ -7,7 +7,7 @@ use tokio::sync::mpsc;
 use crate::action::{ActuatorNotice, Arming, Order};
 use crate::registry::MOTOR_CHANNELS;
 
-/// Notices that may wait.
+/// Queue length for notices.
 const NOTICES: usize = 16;
 
 /// See the module's comment.
@@ -17,22 +17,22 @@ pub(in crate::driver) struct Joints {
     is_armed: bool,
     has_moved: bool,
     notices: Option<mpsc::Sender<ActuatorNotice>>,
-    /// Names of the emergency stops that orders are of.
+    /// Names of the emergency stops to which orders refer.
     stops: Arc<[Arc<str>]>,
 }
 
 impl Joints {
-    /// So many motors, disarmed.
+    /// `count` motors, disarmed.
     pub(super) fn new(count: usize) -> Self {
         Self { positions: vec![0.0; count], ..Self::default() }
     }
 
-    /// How many.
+    /// Number of motors.
     pub(super) const fn count(&self) -> usize {
         self.positions.len()
     }
 
-    /// Takes an action; false if it is not theirs.
+    /// Takes an action; false if it does not fit these motors.
     pub(super) fn command(&mut self, target: &[f64]) -> bool {
         if self.positions.is_empty() || self.positions.len() != target.len() {
             return false;
@@ -62,19 +62,19 @@ impl Joints {
             }
         };
         if let Some(notices) = &self.notices {
-            // Without room its reader has ended.
+            // If the queue is closed, its reader has ended.
             let _ = notices.try_send(ActuatorNotice { arming, text, is_problem: arming == Arming::Faulted });
         }
     }
 
-    /// What orders lead to from now on.
+    /// The results of orders from now on.
     pub(in crate::driver) fn notices(&mut self) -> mpsc::Receiver<ActuatorNotice> {
         let (notices, receiver) = mpsc::channel(NOTICES);
         self.notices = Some(notices);
         receiver
     }
 
-    /// Puts their positions in front of the other values of each in a sample, once there was a target.
+    /// Writes each position before the motor's other values in a sample, once there was a target.
     pub(super) fn write(&self, payload: &mut [u8]) {
         if !self.has_moved {
             return;
@@ -92,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn they_move_when_they_are_armed() {
+    fn joints_move_only_when_armed() {
         let mut joints = Joints::new(2);
         let mut notices = joints.notices();
         let mut payload = [0; 2 * 8 * MOTOR_CHANNELS];

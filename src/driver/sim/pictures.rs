@@ -1,10 +1,10 @@
-//! The pictures of a simulated camera: made once, stamped with their number when they are sent.
+//! The pictures of a simulated camera: encoded once, and numbered when they are sent.
 
 use jpeg_encoder::{ColorType, Encoder};
 
 use super::super::DriverError;
 
-/// Different pictures a simulated camera has.
+/// Number of different pictures of a simulated camera.
 pub(super) const PICTURES: u32 = 8;
 const JPEG_QUALITY: u8 = 80;
 
@@ -15,12 +15,12 @@ pub(super) struct Pictures {
     pub(super) height: u32,
     seed: u64,
     encoded: Vec<Vec<u8>>,
-    /// What it sees while the light in front of it is lit.
+    /// The picture while the light in front of it is on.
     lit: Option<Vec<u8>>,
 }
 
 impl Pictures {
-    /// `has_light`: a light that is switched is in front of it.
+    /// `has_light`: a switched light is in front of the camera.
     pub(super) fn new(width: u32, height: u32, seed: u64, bytes: usize, has_light: bool) -> Result<Self, DriverError> {
         let lit = has_light.then(|| white(width, height)).transpose()?;
         let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed, index));
@@ -29,7 +29,7 @@ impl Pictures {
     }
 
     pub(super) fn largest(&self) -> usize {
-        // 64 bytes hold the comment at its longest.
+        // 64 bytes are enough for the longest comment.
         self.encoded.iter().chain(&self.lit).map(Vec::len).max().unwrap_or(0) + 64
     }
 
@@ -53,7 +53,7 @@ pub(super) fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &
     payload.extend_from_slice(start);
     payload.extend_from_slice(&[0xff, 0xfe, 0, 0]);
     let at = payload.len();
-    // A Vec takes every write.
+    // Writing to a Vec cannot fail.
     let _ = write!(payload, "rapid-sim {seed} {sequence}");
     let length = u16::try_from(payload.len() - at + 2).unwrap_or(u16::MAX).to_be_bytes();
     if let Some(place) = payload.get_mut(at - 2..at) {
@@ -62,10 +62,10 @@ pub(super) fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &
     payload.extend_from_slice(rest);
 }
 
-/// The picture with comment segments after its start of image that bring it to `bytes` at least, filled with
-/// noise that does not compress, as the coefficients of a real scene do not.
+/// The picture with comment segments after its start of image that extend it to at least `bytes`, filled with noise
+/// that does not compress, as the coefficients of a real scene do not.
 pub(super) fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec<u8> {
-    // Marker and length beside this many bytes of content.
+    // Content bytes per segment, besides marker and length.
     const SEGMENT: usize = 65_533;
     if picture.len() >= bytes {
         return picture;
@@ -73,7 +73,7 @@ pub(super) fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec
     let (start, rest) = picture.split_at(picture.len().min(2));
     let mut filled = Vec::with_capacity(bytes + SEGMENT);
     filled.extend_from_slice(start);
-    // xorshift64 (Marsaglia 2003), which needs a seed that is not zero.
+    // xorshift64 (Marsaglia 2003), which needs a non-zero seed.
     let mut state = seed.wrapping_mul(u64::from(PICTURES)).wrapping_add(u64::from(index)) | 1 << 63;
     while filled.len() + rest.len() < bytes {
         let content = (bytes - filled.len() - rest.len()).saturating_sub(4).clamp(1, SEGMENT);

@@ -32,7 +32,7 @@ fn a_picture_is_a_jpeg_that_names_seed_and_sequence() {
 }
 
 #[test]
-fn a_picture_is_filled_up_with_segments_that_a_decoder_skips() {
+fn a_picture_is_padded_with_segments_that_a_decoder_skips() {
     for bytes in [0, 5_000, 65_600, 150_000] {
         let picture = frame(&SimSource::Camera { width: 64, height: 48, fps: 30, seed: 7, bytes }, 12).unwrap();
         let plain = frame(&CAMERA, 12).unwrap();
@@ -42,7 +42,7 @@ fn a_picture_is_filled_up_with_segments_that_a_decoder_skips() {
         while picture[at..at + 2] == [0xff, 0xfe] {
             at += 2 + usize::from(u16::from_be_bytes([picture[at + 2], picture[at + 3]]));
         }
-        assert!(picture[at..] == plain[20..], "{bytes}: the picture goes on where the comments end");
+        assert!(picture[at..] == plain[20..], "{bytes}: the picture continues where the comments end");
     }
 }
 
@@ -69,7 +69,7 @@ async fn samples_lie_on_the_grid() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_late_reader_is_told_what_it_lost() {
+async fn a_late_reader_gets_the_number_of_lost_samples() {
     let mut sim = Sim::open(device(CAMERA)).await.unwrap();
     sim.read().await.unwrap();
     tokio::time::sleep(Duration::from_secs(2)).await;
@@ -81,7 +81,7 @@ async fn a_late_reader_is_told_what_it_lost() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_silent_device_sends_nothing_and_goes_on_where_it_was() {
+async fn a_silent_device_sends_nothing_and_then_continues_its_sequence() {
     let device = device(CAMERA);
     let mut sim = Sim::open(Arc::clone(&device)).await.unwrap();
     let before = sim.read().await.unwrap().captured;
@@ -95,7 +95,7 @@ async fn a_silent_device_sends_nothing_and_goes_on_where_it_was() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn the_sequence_goes_on_over_a_replug() {
+async fn the_sequence_continues_across_a_replug() {
     let first = device(CAMERA);
     let mut sim = Sim::open(Arc::clone(&first)).await.unwrap();
     for _ in 0..3 {

@@ -90,7 +90,7 @@ fn jpeg() -> Vec<u8> {
 }
 
 #[test]
-fn compressed_pictures_come_back_with_their_size() {
+fn compressed_pictures_are_decoded_with_their_size() {
     let image = CompressedImage { timestamp: Some(now()), data: jpeg(), format: "jpeg".into(), frame_id: "cam".into() };
     let shape = Shape { encoding: Encoding::Mjpeg, width: 640, height: 480 };
     assert_eq!(read(SampleSchema::CompressedImage, &image.encode_to_vec()), Some((jpeg(), shape)));
@@ -99,7 +99,7 @@ fn compressed_pictures_come_back_with_their_size() {
 }
 
 #[test]
-fn raw_pictures_come_back_without_padding() {
+fn raw_pictures_are_decoded_without_padding() {
     let mut image = RawImage {
         width: 2,
         height: 2,
@@ -117,7 +117,7 @@ fn raw_pictures_come_back_without_padding() {
 }
 
 #[test]
-fn numbers_come_back_packed_or_not() {
+fn packed_and_unpacked_numbers_are_decoded() {
     let values = vec![1.5, -2.0, f64::INFINITY];
     let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
     let shape = Shape { encoding: Encoding::F64, width: 3, height: 0 };

@@ -1,7 +1,6 @@
-//! Copying: from what can be read of a file to a whole one.
+//! Copies the readable parts of a file into a whole one.
 //!
-//! Channels and schemas keep their numbers, messages their order; what the reader of the file leaves out is
-//! counted.
+//! Channels and schemas keep their numbers, messages their order; everything that the reader leaves out is counted.
 
 use std::cell::{Cell, RefCell};
 use std::fs::File;
@@ -20,7 +19,7 @@ use super::{ProgressFn, Repaired, summary::Summary};
 use crate::episode::{Failed, RECOVERED, ReadAt, SUMMARY, own};
 use crate::{text, time};
 
-/// Bytes read between two calls of a [`ProgressFn`]; what is read in vain, in search of a chunk, counts too.
+/// Bytes read between two calls of a [`ProgressFn`], including those searched in vain for a chunk.
 const WATCH_EVERY: u64 = 1 << 20;
 /// Bytes read at once where only their hash is wanted.
 const PIECE: usize = 256 << 10;
@@ -42,9 +41,9 @@ pub(super) struct About<'a> {
     pub(super) sha256: String,
     /// Wall time now.
     pub(super) time_ns: u64,
-    /// The present boot, if that is to prove what was written last: see [`RecordIter::of_boot`].
+    /// The present boot, if it is to prove the last writes: see [`RecordIter::of_boot`].
     pub(super) boot: Option<String>,
-    /// What the original's recorder wrote behind it.
+    /// The mark that the original's recorder appended, if any.
     pub(super) failed: Option<&'a Failed>,
 }
 
@@ -52,13 +51,13 @@ pub(super) struct About<'a> {
 #[derive(Debug)]
 pub(super) struct Copied {
     pub(super) summary: Summary,
-    /// What it holds and lacks; the caller adds its name and that of the original.
+    /// Its content and losses; the caller adds its name and that of the original.
     pub(super) repaired: Repaired,
     /// Nothing of the original is left out but a torn end.
     pub(super) is_lossless: bool,
 }
 
-/// What a file holds. `None`: no MCAP file.
+/// The content of a file. `None`: not an MCAP file.
 pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut ProgressFn<'_>) -> Result<Option<Summary>, Error> {
     let file = Watched::new(file, size, watch);
     let Some(mut records) = RecordIter::new(&file, size).map_err(|error| file.error(error))? else { return Ok(None) };
@@ -73,8 +72,8 @@ pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut ProgressFn<'_>) 
     Ok(Some(summary))
 }
 
-/// Writes to `sink` a whole file of what can be read of `file`, `size` bytes long. Returns once it is on the disk.
-/// `None`: no MCAP file.
+/// Writes a whole file with the readable parts of `file`, `size` bytes long, to `sink`. Returns once it is on the disk.
+/// `None`: not an MCAP file.
 pub(super) fn copy(
     file: impl ReadAt,
     size: u64,
@@ -88,7 +87,7 @@ pub(super) fn copy(
     let mut records = records.of_boot(about.boot.clone());
     let mut copy = Copy::new(sink, about.failed.map(|failed| failed.why.clone()))?;
     while records.advance().map_err(|error| file.error(error))? {
-        // As in the original, one damaged byte costs no more than one of its chunks.
+        // As in the original, a damaged byte loses at most one of its chunks.
         if records.integrity().bytes != file.done.get() {
             copy.writer.part().map_err(|error| Error::Write(io_error(error)))?;
         }
@@ -119,7 +118,7 @@ pub(super) fn copy(
     Ok(Some(copied))
 }
 
-/// Writes what stands at the end of a repaired file, and the end itself.
+/// Writes the records at the end of a repaired file, and the end itself.
 fn finish<S: Sink>(mut writer: ChunkWriter<S>, copied: &Copied, about: &About<'_>, size: u64) -> Result<(), Error> {
     let finished = (|| {
         if !copied.summary.has_end {
@@ -153,9 +152,8 @@ pub(super) fn sha256(file: &File, size: u64, watch: &mut ProgressFn<'_>) -> Resu
     Ok(text::hexadecimal(&hasher.finalize()))
 }
 
-/// The whole file that repair makes of `bytes`, which may be any; `None` if they are no MCAP file.
-/// Nothing of it touches a disk, and nothing proves what a torn chunk holds.
-#[must_use]
+/// The whole file that repair makes of `bytes`, which may be any; `None` if they are not an MCAP file.
+/// Nothing is written to a disk, and messages of a torn chunk are unproven.
 pub fn recover_bytes(bytes: &[u8]) -> Option<Vec<u8>> {
     let size = bytes.len() as u64;
     let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None, failed: None };
@@ -183,7 +181,7 @@ impl<'a, 'w, R> Watched<'a, 'w, R> {
         Self { file, size, done, read, interrupted, watch: RefCell::new(watch) }
     }
 
-    /// What an error of reading means.
+    /// Classifies a read error.
     fn error(&self, error: io::Error) -> Error {
         if self.interrupted.get() { Error::Interrupted } else { Error::Read(error) }
     }
@@ -198,7 +196,7 @@ impl<R: ReadAt> ReadAt for Watched<'_, '_, R> {
             let called = self.watch.try_borrow_mut().map(|mut watch| watch(self.done.get(), self.size));
             self.interrupted.set(matches!(called, Ok(ControlFlow::Break(()))));
         }
-        // Not the kind that is tried again.
+        // Not a kind that is retried.
         if self.interrupted.get() { Err(io::Error::other("interrupted")) } else { Ok(read) }
     }
 }
@@ -218,7 +216,7 @@ impl<S: Sink> Copy<S> {
         Ok(Self { writer, failed, summary: Summary::default(), refused: 0 })
     }
 
-    /// Writes a record; one that makes no sense as it stands is counted.
+    /// Writes a record; an invalid one is counted.
     fn take(&mut self, record: Record<'_>) -> Result<(), Error> {
         let Some(entry) = Entry::read(record) else {
             self.refused += 1;
@@ -267,7 +265,7 @@ impl<S: Sink> Copy<S> {
 
     fn channel(&mut self, id: u16, channel: &Channel<'_>) -> Result<(), McapError> {
         let added = match self.writer.channel(Some(id), channel) {
-            // Better a channel that cannot be decoded than none.
+            // A channel that cannot be decoded is better than none.
             Err(McapError::UnknownSchema(..)) => {
                 self.refused += 1;
                 self.writer.channel(Some(id), &Channel { schema: 0, ..*channel })

@@ -9,7 +9,7 @@ use std::os::unix::ffi::OsStringExt;
 use super::super::chunk_writer::{Channel, ChunkWriter};
 use super::copy::recover_bytes;
 use super::tests::{keep_going, names, put, recorded};
-use super::{FileEnd, Outcome, RecoverError, left_behind, recover};
+use super::{FileEnd, RecoverError, RepairOutcome, left_behind, recover};
 use crate::episode::op;
 use crate::episode::own::EpisodeId;
 use crate::episode::record_iter::MAGIC;
@@ -123,7 +123,7 @@ fn memchr<'a>(bytes: &'a [u8], part: &'a [u8]) -> impl Iterator<Item = usize> + 
 }
 
 #[tokio::test]
-async fn of_every_file_every_message_of_every_right_chunk_is_kept_and_none_is_made() {
+async fn every_message_of_every_intact_chunk_is_kept_and_none_is_invented() {
     let (_folder, own) = recorded().await;
     let mut files = vec![("recorded", own)];
     files.extend(["zstd", "lz4", "plain"].into_iter().zip(testing::layouts().map(testing::episode)));
@@ -180,7 +180,7 @@ pub(super) fn unfinished(bytes: &[u8]) -> &[u8] {
 }
 
 #[tokio::test]
-async fn of_a_torn_chunk_nothing_is_taken_after_a_reboot() {
+async fn nothing_is_taken_from_a_torn_chunk_after_a_reboot() {
     let (folder, mut bytes) = recorded().await;
     let boot = crate::episode::boot_id().unwrap();
     let at = bytes.windows(boot.len()).position(|part| part == boot.as_bytes()).unwrap();
@@ -197,7 +197,7 @@ async fn of_a_torn_chunk_nothing_is_taken_after_a_reboot() {
         partial[page..page + 4096].fill(0);
         let path = put(&folder, "a_001.mcap.partial", &partial);
         let report = recover(&path, &mut keep_going).unwrap();
-        let Outcome::Repaired(repaired) = &report.outcome else { panic!("{report:?}") };
+        let RepairOutcome::Repaired(repaired) = &report.outcome else { panic!("{report:?}") };
         let kept = strictly(&fs::read(&repaired.to).unwrap());
         assert_eq!((kept.len(), repaired.ordered_messages), (whole, 0));
         assert!(original.starts_with(&kept));
@@ -218,14 +218,14 @@ async fn of_a_torn_chunk_nothing_is_taken_after_a_reboot() {
 }
 
 #[tokio::test]
-async fn damage_before_the_first_chunk_is_not_emptiness() {
+async fn a_file_damaged_before_its_first_chunk_is_not_empty() {
     let (folder, bytes) = recorded().await;
     let all = strictly(&bytes);
     let mut partial = unfinished(&bytes).to_vec();
     partial[11] ^= 1;
     let path = put(&folder, "a_001.mcap.partial", &partial);
     let report = recover(&path, &mut keep_going).unwrap();
-    let Outcome::Repaired(repaired) = report.outcome else { panic!("{report:?}") };
+    let RepairOutcome::Repaired(repaired) = report.outcome else { panic!("{report:?}") };
     let whole = fs::read(&repaired.to).unwrap();
     assert_eq!((strictly(&whole), repaired.left_out.gaps), (all, 1));
     assert_eq!(metadata(&whole)["rapid"], metadata(&bytes)["rapid"]);
@@ -237,8 +237,8 @@ async fn damage_before_the_first_chunk_is_not_emptiness() {
         let path = put(&folder, &format!("{name}_001.mcap.partial"), &partial);
         let report = recover(&path, &mut keep_going).unwrap();
         let kept = match report.outcome {
-            Outcome::Repaired(repaired) if name == "b" => repaired.original.unwrap(),
-            Outcome::Unreadable { kept, .. } if name == "c" => kept,
+            RepairOutcome::Repaired(repaired) if name == "b" => repaired.original.unwrap(),
+            RepairOutcome::Unreadable { kept, .. } if name == "c" => kept,
             other => panic!("{other:?}"),
         };
         assert_eq!((fs::read(&kept).unwrap(), kept.extension().unwrap().to_str()), (partial, Some("damaged")));
@@ -246,32 +246,34 @@ async fn damage_before_the_first_chunk_is_not_emptiness() {
 }
 
 #[tokio::test]
-async fn a_file_is_already_repaired_by_its_content_not_by_its_name_and_size() {
+async fn a_file_counts_as_repaired_by_its_content_not_by_its_name_and_size() {
     let (folder, bytes) = recorded().await;
     let partial = unfinished(&bytes).to_vec();
     let path = put(&folder, "a_001.mcap.partial", &partial);
-    let Outcome::Repaired(first) = recover(&path, &mut keep_going).unwrap().outcome else { panic!() };
+    let RepairOutcome::Repaired(first) = recover(&path, &mut keep_going).unwrap().outcome else { panic!() };
     let mut other = partial.clone();
     other[largest(&chunks(&bytes)).1.end - 500] ^= 1;
     fs::write(&path, &other).unwrap();
     let report = recover(&path, &mut keep_going).unwrap();
-    let Outcome::Repaired(second) = &report.outcome else { panic!("{report:?}") };
+    let RepairOutcome::Repaired(second) = &report.outcome else { panic!("{report:?}") };
     assert!(second.to != first.to && second.damaged_chunks == 1);
     assert_eq!(fs::read(second.original.as_ref().unwrap()).unwrap(), other);
     fs::write(&path, &partial).unwrap();
     let report = recover(&path, &mut keep_going).unwrap();
-    assert_eq!(report.outcome, Outcome::AlreadyRepaired { to: first.to, kept: None });
+    assert_eq!(report.outcome, RepairOutcome::AlreadyRepaired { to: first.to, kept: None });
 }
 
 #[tokio::test]
-async fn names_that_are_no_text_are_repaired_too() {
+async fn files_with_non_utf8_names_are_repaired_too() {
     let (folder, bytes) = recorded().await;
     let name = |ending: &str| {
         folder.path().join(std::ffi::OsString::from_vec([b"a_\xff_001.mcap", ending.as_bytes()].concat()))
     };
     fs::write(name(".partial"), unfinished(&bytes)).unwrap();
     assert_eq!(left_behind(folder.path()).unwrap(), [name(".partial")]);
-    let Outcome::Repaired(repaired) = recover(&name(".partial"), &mut keep_going).unwrap().outcome else { panic!() };
+    let RepairOutcome::Repaired(repaired) = recover(&name(".partial"), &mut keep_going).unwrap().outcome else {
+        panic!()
+    };
     assert_eq!(repaired.to, name(""));
 }
 
@@ -371,7 +373,7 @@ fn nested(payload: &[u8], has: fn(u8) -> bool, random: &mut Random) -> (usize, u
 /// The index of a chunk's messages has no check value, and one that lacks bytes is as long as it claims to be: by the
 /// bytes of what follows. Wherever it then ends, at the end of a record or of the file, no chunk within is lost.
 #[test]
-fn an_index_that_lacks_bytes_takes_no_chunk_along() {
+fn an_index_with_missing_bytes_loses_no_chunk() {
     let payloads = |count: u8| (0..count).map(|value| vec![value; 12]).collect::<Vec<_>>();
     let (many, few) = (payloads(40), payloads(3));
     let bytes = own_in(1, &[&many, &few, &few]);
@@ -400,7 +402,7 @@ fn an_index_that_lacks_bytes_takes_no_chunk_along() {
 
 /// A record with fields of a later version is longer than they are: what it claims to hold may be a chunk's beginning.
 #[test]
-fn a_record_that_claims_to_be_longer_takes_no_chunk_along() {
+fn a_record_with_a_wrong_length_loses_no_chunk() {
     let payloads = |count: u8| (0..count).map(|value| vec![value; 12]).collect::<Vec<_>>();
     let bytes = own_in(1, &[&payloads(40), &payloads(40), &payloads(3)]);
     let (all, chunks) = (strictly(&bytes).len(), chunks(&bytes));
@@ -431,7 +433,7 @@ fn a_record_that_claims_to_be_longer_takes_no_chunk_along() {
 }
 
 #[test]
-fn a_file_that_is_the_payload_of_a_message_is_not_taken_for_part_of_the_episode() {
+fn a_file_inside_a_message_is_not_taken_for_part_of_the_episode() {
     // Another program's, and one of ours that began in the same moment and has the same channels.
     let later = |sequence: u8| vec![0x80 | sequence; 40];
     let payloads = [foreign(), own(2, &(0..4).map(later).collect::<Vec<_>>())];
@@ -445,7 +447,7 @@ fn a_file_that_is_the_payload_of_a_message_is_not_taken_for_part_of_the_episode(
 }
 
 #[tokio::test]
-async fn an_episode_behind_other_bytes_is_found_and_of_several_the_first() {
+async fn an_episode_after_other_bytes_is_found_and_the_first_of_several() {
     let (folder, bytes) = recorded().await;
     let (all, right) = (strictly(&bytes), chunks(&bytes));
     let mail = b"Content-Type: application/octet-stream\r\n\r\n".repeat(40);
@@ -459,7 +461,7 @@ async fn an_episode_behind_other_bytes_is_found_and_of_several_the_first() {
                 let archive = [prefix, state, behind].concat();
                 let path = put(&folder, "a_001.mcap.partial", &archive);
                 let report = recover(&path, &mut keep_going).unwrap();
-                let Outcome::Repaired(repaired) = &report.outcome else { panic!("{report:?}") };
+                let RepairOutcome::Repaired(repaired) = &report.outcome else { panic!("{report:?}") };
                 let whole = fs::read(&repaired.to).unwrap();
                 assert_eq!(strictly(&whole), all, "{} and {} bytes", prefix.len(), behind.len());
                 assert_eq!(metadata(&whole)["rapid"], metadata(&bytes)["rapid"]);
@@ -484,7 +486,7 @@ async fn an_episode_behind_other_bytes_is_found_and_of_several_the_first() {
         let (number, place) = largest(&right);
         damaged[prefix.len() + place.start + 500] ^= 1;
         let left = all.len() - right[number].messages.len();
-        assert_eq!(strictly(&recover_bytes(&damaged).unwrap()).len(), left, "behind {} bytes", prefix.len());
+        assert_eq!(strictly(&recover_bytes(&damaged).unwrap()).len(), left, "after {} bytes", prefix.len());
         // What is not ours is not taken for it.
         let stranger = [&[0; 512][..], &foreign()].concat();
         assert_eq!(recover_bytes(&stranger), None);
@@ -515,7 +517,7 @@ async fn every_chunk_repeats_the_channels_as_the_summary_has_them() {
     assert_eq!(found, summary.channels.len() + summary.schemas.len());
 }
 
-/// A file of what may be chunks, and none is: each is to be tried.
+/// A file full of possible chunks, none of them valid: each has to be tried.
 fn hostile() -> Vec<u8> {
     let mut bytes = MAGIC.to_vec();
     bytes.extend([0x10; 30]);
@@ -536,7 +538,7 @@ fn a_long_search_is_watched_and_ends_when_it_is_interrupted() {
         calls += 1;
         ControlFlow::Continue(())
     });
-    assert!(matches!(report.unwrap().outcome, Outcome::Unreadable { .. }));
+    assert!(matches!(report.unwrap().outcome, RepairOutcome::Unreadable { .. }));
     println!("{calls} calls for {} bytes", hostile().len());
     // The hash alone reads each byte once; the search reads every candidate.
     assert!(calls > 8 + 16);

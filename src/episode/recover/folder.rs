@@ -1,7 +1,7 @@
-//! A folder of episodes: which of them were not finished, and their repair in the background.
+//! The unfinished episodes of a folder, and their repair in the background.
 //!
-//! Invariant: nothing waits for a repair in the background, which works half of the time at most and
-//! leaves so much room on the disk that an episode being recorded is neither closed nor warned of.
+//! Invariant: nothing waits for a repair in the background. It works at most half of the time and leaves enough disk
+//! space that an episode being recorded is neither closed nor warned about.
 
 use std::fs::{self, DirEntry, File};
 use std::io;
@@ -15,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use rustix::process::setpriority_process;
 
-use super::{Names, Outcome, ProgressFn, RecoverError, Recovered, Source, recover};
+use super::{Names, ProgressFn, RecoverError, Recovered, RepairOutcome, Source, recover};
 use crate::disk::Disk;
 use crate::episode::{self, Failed};
 use crate::status::{Board, Level, What};
@@ -25,7 +25,7 @@ use crate::text;
 const NOTICE: Duration = Duration::from_millis(20);
 /// How long the end of a run waits for it: it may be in the middle of writing to the disk.
 const PATIENCE: Duration = Duration::from_millis(500);
-/// Below everything else of this machine that wants to compute.
+/// Lower priority than everything else on this machine.
 const NICE: i32 = 15;
 
 /// The episodes of `folder` that were not finished, by name.
@@ -44,7 +44,7 @@ pub fn finished(folder: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(entries(folder, b".mcap")?.into_iter().map(|entry| entry.path()).collect())
 }
 
-/// Is this finished file damaged, and was no whole one made of it yet? Nothing is written.
+/// Is this finished file damaged and not yet repaired? Nothing is written.
 ///
 /// # Errors
 /// When it cannot be read, or `watch` ends it.
@@ -100,13 +100,13 @@ impl Repairs {
 impl Drop for Repairs {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        // What it is doing then can be ended at any moment.
+        // It can be ended at any moment.
         let _ = self.ended.recv_timeout(PATIENCE);
     }
 }
 
 fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Board, stop: &AtomicBool) {
-    // Of this thread alone; refused, it is a neighbour like any other.
+    // Of this thread alone; if refused, it runs at normal priority.
     let _ = setpriority_process(None, NICE);
     let log = |level, text| board.announce(What::Log { level, text });
     let entries = match entries(folder, b".mcap.partial") {
@@ -115,7 +115,7 @@ fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Bo
         Err(error) => return log(Level::Warn, format!("{}: {error}; nothing in it is repaired", folder.display())),
     };
     for entry in entries {
-        // What was made since is ours, or is cleaned up by the next start.
+        // Newer files are ours, or are handled by the next start.
         let metadata = entry.metadata();
         let is_new = metadata.as_ref().is_ok_and(|metadata| metadata.created().is_ok_and(|made| made >= begun));
         if is_new || stop.load(Ordering::Relaxed) {
@@ -141,7 +141,7 @@ fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Bo
         let mut watch = |done, size: u64| {
             rest(worked.elapsed(), stop);
             worked = Instant::now();
-            // What is being recorded takes its part meanwhile.
+            // The episode being recorded takes disk space meanwhile.
             full = room(size.saturating_sub(done));
             if full.is_some() || stop.load(Ordering::Relaxed) {
                 ControlFlow::Break(())
@@ -161,7 +161,7 @@ fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Bo
     }
 }
 
-/// As much rest as there was work.
+/// Rests for as long as it worked.
 fn rest(time: Duration, stop: &AtomicBool) {
     let end = Instant::now() + time;
     while let Some(left) = end.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
@@ -175,7 +175,7 @@ fn rest(time: Duration, stop: &AtomicBool) {
 fn event(recovered: Recovered) -> What {
     let (level, text) = recovered.sentence();
     match recovered.outcome {
-        Outcome::Repaired(repaired) => What::Recovered {
+        RepairOutcome::Repaired(repaired) => What::Recovered {
             file: repaired.to,
             seconds: repaired.seconds,
             messages: repaired.messages,

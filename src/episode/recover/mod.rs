@@ -1,26 +1,25 @@
 //! Repair of episodes that were not finished: a `.partial` left by a kill or a full disk, a file cut
 //! or damaged later.
 //!
-//! `copy` reads what is there and writes a whole file of it, `names` has the names of the files,
-//! `folder` goes through a folder, in the background if asked. What becomes of a file is an
-//! [`Outcome`]:
+//! `copy` writes the readable parts into a whole file, `names` has the names of the files, `folder` repairs a folder,
+//! in the background on request. The result for a file is a [`RepairOutcome`]:
 //!
 //! 1. Not whole, with something recorded: repaired into a file of the finished name. The `.partial`
 //!    is removed once that file has its name, or kept as `.damaged` if anything of it was left out. A finished file is
 //!    never touched: the repaired one stands beside it, `.recovered.mcap`.
-//! 2. Whole, and only its name is missing (a kill at the very end): it gets its name, or a free one beside the file
-//!    that has it by now, and stays as it is otherwise.
-//! 3. Of no bytes: removed, and reported. Whole as far as it goes and without a sample: set aside as `.empty`. No MCAP file,
-//!    or damaged and without a message: set aside as `.damaged`. Both are reported once, and their number stays taken.
+//! 2. Whole, but without its final name (a kill at the very end): it gets its name, or a free one if another file has
+//!    it by now, and is not changed otherwise.
+//! 3. Zero bytes: removed and reported. Undamaged but without a sample: set aside as `.empty`. Not an MCAP file, or
+//!    damaged and without a message: set aside as `.damaged`. Both are reported once, and their number stays taken.
 //!
-//! Invariant: the check value of every chunk of ours that is taken is right. Messages of a last chunk that is cut have
-//! none: they are taken only while the kernel runs that kept the order of their writes, which proves that they were
-//! written, not that no bit of them changed since. They are counted, reported, and a reason not to call the file GOOD.
+//! Invariant: every chunk of ours that is taken has a right check value. Messages of a cut last chunk have none: they
+//! are taken only while the kernel that ordered their writes still runs, which proves that they were written, not that
+//! no bit has changed since. They are counted, reported, and a reason not to call the file GOOD.
 //! Invariant: what the recorder called BAD stays BAD.
-//! Invariant: at every moment all that was recorded is in a file that a later repair finds or in the
-//! repaired file; a repair that ends in its middle leaves a `.recovering`, which the next one replaces.
+//! Invariant: at every moment all recorded data is in the repaired file or in one that a later repair finds; an
+//! interrupted repair leaves a `.recovering` file, which the next one replaces.
 //! Invariant: a file that another process writes or repairs is left alone.
-//! Invariant: memory does not grow with the file, but for the index of its chunks.
+//! Invariant: memory does not grow with the file, except for the index of its chunks.
 
 mod copy;
 #[cfg(test)]
@@ -62,28 +61,27 @@ pub struct Recovered {
     pub file: PathBuf,
     /// What became of it.
     #[serde(flatten)]
-    pub outcome: Outcome,
+    pub outcome: RepairOutcome,
 }
 
 /// What became of a file.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "outcome", rename_all = "snake_case")]
-pub enum Outcome {
-    /// A whole file was made of it.
+pub enum RepairOutcome {
+    /// It was repaired into a whole file.
     Repaired(Box<Repaired>),
-    /// Nothing was missing but its name, which it has now; or nothing at all.
+    /// Only its name was missing, which it has now; or nothing.
     Whole {
         /// Its name.
         #[serde(serialize_with = "text::lossy")]
         to: PathBuf,
     },
-    /// An earlier repair was ended after its work was done; of the original nothing is left that the
-    /// repaired file does not hold.
+    /// An earlier repair was ended after its work was done; the repaired file holds all of the original.
     AlreadyRepaired {
         /// The repaired file.
         #[serde(serialize_with = "text::lossy")]
         to: PathBuf,
-        /// The original, where it holds more than the repaired file.
+        /// The original, if it holds more than the repaired file.
         #[serde(serialize_with = "text::lossy_option")]
         kept: Option<PathBuf>,
     },
@@ -93,7 +91,7 @@ pub enum Outcome {
         #[serde(serialize_with = "text::lossy_option")]
         kept: Option<PathBuf>,
     },
-    /// It is no MCAP file, or none of its messages can be read.
+    /// It is not an MCAP file, or none of its messages can be read.
     Unreadable {
         /// What it is called now.
         #[serde(serialize_with = "text::lossy")]
@@ -118,14 +116,14 @@ pub struct Repaired {
     pub end: FileEnd,
     /// Bytes of the original that could not be read.
     pub unread_bytes: u64,
-    /// Chunks left out because they are not what was written.
+    /// Chunks left out because their check value is wrong.
     pub damaged_chunks: u64,
     /// What else is left out.
     #[serde(flatten)]
     pub left_out: LeftOut,
     /// Messages left out because the definition of their channel is lost, by the channel's number.
     pub nameless: BTreeMap<u16, u64>,
-    /// Messages taken without a check value from a chunk that the end of the file cuts: they were written since this
+    /// Messages taken without a check value from a chunk cut by the end of the file: they were written since this
     /// machine was started.
     pub ordered_messages: u64,
     /// Records left out because they contradict others.
@@ -134,15 +132,15 @@ pub struct Repaired {
     pub failed: Option<String>,
     /// Time of the last message, RFC 3339.
     pub last: String,
-    /// The original, where it holds more than the repaired file, or where it is no `.partial`.
+    /// The original, if it holds more than the repaired file, or is not a `.partial`.
     #[serde(serialize_with = "text::lossy_option")]
     pub original: Option<PathBuf>,
 }
 
-/// What is asked between two pieces of a long work: `done` of `size` bytes are read. It may wait.
+/// Called regularly during long work: `done` of `size` bytes are read. It may block.
 pub type ProgressFn<'a> = dyn FnMut(u64, u64) -> ControlFlow<()> + 'a;
 
-/// Why a file was not repaired. It is as it was.
+/// Why a file was not repaired. It is unchanged.
 #[derive(Debug, thiserror::Error)]
 pub enum RecoverError {
     /// The system refuses.
@@ -162,7 +160,7 @@ pub enum RecoverError {
     /// Whether it is being written cannot be known.
     #[error("{}: its file system knows no locks, so it may still be written; copy it to another disk and repair it there", .0.display())]
     NoLock(PathBuf),
-    /// A finished file that is no MCAP file.
+    /// A finished file that is not an MCAP file.
     #[error("{}: not an MCAP file", .0.display())]
     NotMcap(PathBuf),
     /// A finished file in which nothing can be read.
@@ -184,8 +182,7 @@ impl From<ReadError> for RecoverError {
 }
 
 impl RecoverError {
-    /// Was something named that cannot be meant?
-    #[must_use]
+    /// Was the argument something that cannot be repaired?
     pub fn is_bad_argument(&self) -> bool {
         match self {
             Self::NotFile(_) | Self::NotMcap(_) => true,
@@ -198,7 +195,7 @@ impl RecoverError {
 /// Repairs the file at `path`; blocks for as long as it takes to copy it.
 ///
 /// # Errors
-/// See [`RecoverError`]; the file is as it was.
+/// See [`RecoverError`]; the file is unchanged.
 pub fn recover(path: &Path, watch: &mut ProgressFn<'_>) -> Result<Recovered, RecoverError> {
     let io = |source| io_of(path, source);
     if fs::symlink_metadata(path).map_err(io)?.is_symlink() {
@@ -232,16 +229,16 @@ struct Source<'a> {
 }
 
 impl Source<'_> {
-    fn partial(&mut self, names: &Names, watch: &mut ProgressFn<'_>) -> Result<Outcome, RecoverError> {
+    fn partial(&mut self, names: &Names, watch: &mut ProgressFn<'_>) -> Result<RepairOutcome, RecoverError> {
         if self.size == 0 {
             fs::remove_file(self.path).map_err(|source| self.io(source))?;
-            return Ok(Outcome::Empty { kept: None });
+            return Ok(RepairOutcome::Empty { kept: None });
         }
         // A footer at the end: perhaps the whole episode, perhaps one that was repaired already.
         let known = if self.ends_with_magic()? { self.read(watch)? } else { None };
         if self.failed.is_none() && known.is_some_and(|known| known.is_whole()) {
             let to = names.publish(self.path).map_err(|source| self.io(source))?;
-            return Ok(Outcome::Whole { to });
+            return Ok(RepairOutcome::Whole { to });
         }
         let path = self.path;
         let aside = |ending| set_aside(path, &names.finished, ending).map_err(|source| io_of(path, source));
@@ -251,7 +248,7 @@ impl Source<'_> {
             if is_all {
                 fs::remove_file(path).map_err(|source| self.io(source))?;
             }
-            return Ok(Outcome::AlreadyRepaired { to, kept });
+            return Ok(RepairOutcome::AlreadyRepaired { to, kept });
         }
         let Some(copied) = self.copy(&names.recovering, sha256, watch)? else {
             return Ok(self.unreadable(aside("damaged")?));
@@ -259,13 +256,13 @@ impl Source<'_> {
         let is_all = copied.is_lossless;
         if copied.summary.is_empty() && (is_all || copied.summary.messages == 0) {
             remove(&names.recovering);
-            // Damage before the first message is not emptiness.
+            // A file damaged before its first message is not empty.
             let ending = if is_all { "empty" } else { "damaged" };
             let kept = aside(ending)?;
-            return Ok(if is_all { Outcome::Empty { kept: Some(kept) } } else { self.unreadable(kept) });
+            return Ok(if is_all { RepairOutcome::Empty { kept: Some(kept) } } else { self.unreadable(kept) });
         }
         let to = self.publish(names)?;
-        // Removed only where nothing is lost by it: what follows a torn end is less than one record.
+        // Removed only if nothing is lost: a torn end is less than one record.
         let original = if is_all {
             fs::remove_file(self.path).err().map(|error| {
                 tracing::warn!(file = %self.path.display(), %error, "repaired, but not removed");
@@ -274,21 +271,21 @@ impl Source<'_> {
         } else {
             Some(aside("damaged")?)
         };
-        Ok(Outcome::Repaired(Box::new(Repaired { to, original, ..copied.repaired })))
+        Ok(RepairOutcome::Repaired(Box::new(Repaired { to, original, ..copied.repaired })))
     }
 
-    fn unreadable(&self, kept: PathBuf) -> Outcome {
-        Outcome::Unreadable { kept, failed: self.failed.as_ref().map(|failed| failed.why.clone()) }
+    fn unreadable(&self, kept: PathBuf) -> RepairOutcome {
+        RepairOutcome::Unreadable { kept, failed: self.failed.as_ref().map(|failed| failed.why.clone()) }
     }
 
-    fn finished(&mut self, names: &Names, watch: &mut ProgressFn<'_>) -> Result<Outcome, RecoverError> {
+    fn finished(&mut self, names: &Names, watch: &mut ProgressFn<'_>) -> Result<RepairOutcome, RecoverError> {
         let Some(known) = self.read(watch)? else { return Err(RecoverError::NotMcap(self.path.to_owned())) };
         if self.failed.is_none() && known.is_whole() {
-            return Ok(Outcome::Whole { to: self.path.to_owned() });
+            return Ok(RepairOutcome::Whole { to: self.path.to_owned() });
         }
         let sha256 = self.sha256(watch)?;
         if let Some((to, _)) = self.repaired(names, &sha256, watch)? {
-            return Ok(Outcome::AlreadyRepaired { to, kept: None });
+            return Ok(RepairOutcome::AlreadyRepaired { to, kept: None });
         }
         let Some(copied) = self.copy(&names.recovering, sha256, watch)? else {
             return Err(RecoverError::NotMcap(self.path.to_owned()));
@@ -299,10 +296,10 @@ impl Source<'_> {
         }
         let to = self.publish(names)?;
         let original = Some(self.path.to_owned());
-        Ok(Outcome::Repaired(Box::new(Repaired { to, original, ..copied.repaired })))
+        Ok(RepairOutcome::Repaired(Box::new(Repaired { to, original, ..copied.repaired })))
     }
 
-    /// Copies what can be read into a whole file of the name `to`; `None` if this is no MCAP file.
+    /// Copies what can be read into a whole file of the name `to`; `None` if this is not an MCAP file.
     /// After an error there is no such file.
     fn copy(&self, to: &Path, sha256: String, watch: &mut ProgressFn<'_>) -> Result<Option<Copied>, RecoverError> {
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
@@ -327,7 +324,7 @@ impl Source<'_> {
         copy::sha256(&self.file, self.size, watch).map_err(|error| self.error(error, self.path))
     }
 
-    /// What an error means that came of reading this file or of writing `to`.
+    /// Classifies an error of reading this file or writing `to`.
     fn error(&self, error: copy::Error, to: &Path) -> RecoverError {
         match error {
             copy::Error::Read(source) => self.io(source),
@@ -336,8 +333,8 @@ impl Source<'_> {
         }
     }
 
-    /// A whole file that was made of this one, whose hash is `sha256`, under one of the names for it, and whether it holds all
-    /// of it but a torn end.
+    /// A whole file repaired from this one, whose hash is `sha256`, under one of its candidate names, and whether it
+    /// holds all except a torn end.
     fn repaired(
         &self,
         names: &Names,
@@ -380,7 +377,7 @@ fn io_of(path: &Path, source: io::Error) -> RecoverError {
     RecoverError::Io { path: path.to_owned(), source }
 }
 
-/// What is left of it is replaced by the next repair.
+/// Its remains are replaced by the next repair.
 fn remove(recovering: &Path) {
     if let Err(error) = fs::remove_file(recovering) {
         tracing::warn!(file = %recovering.display(), %error, "not removed");

@@ -1,4 +1,4 @@
-//! How the files of a repair are called.
+//! The names of the files of a repair.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
@@ -14,13 +14,13 @@ const ATTEMPTS: u32 = 100;
 /// The names around one file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Names {
-    /// It is a file that was being written.
+    /// The file was being written.
     pub(super) is_partial: bool,
     /// The repaired file.
     pub(super) finished: PathBuf,
     /// The repaired file while it is written.
     pub(super) recovering: PathBuf,
-    /// What other names for the repaired file are made of.
+    /// The stem of other names for the repaired file.
     base: PathBuf,
 }
 
@@ -73,12 +73,12 @@ fn with_ending(path: &Path, ending: &str) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// Creates the file a repair writes; what an ended one left of it goes. Only who holds the original's
-/// lock does.
+/// Creates the file that a repair writes, in place of one that an interrupted repair left. The caller must hold the
+/// lock of the original.
 pub(super) fn create(recovering: &Path) -> io::Result<File> {
     match fs::remove_file(recovering) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
-        // Never one that is there: it may have another name elsewhere.
+        // Never an existing file: it may have another name elsewhere.
         _ => File::create_new(recovering),
     }
 }
@@ -107,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_stand_beside_one_another() {
+    fn repaired_files_get_names_beside_the_original() {
         let names = Names::of(Path::new("out/20261121_t_003.mcap.partial"));
         assert!(names.is_partial);
         assert_eq!(names.finished, Path::new("out/20261121_t_003.mcap"));

@@ -7,7 +7,7 @@ use std::path::Path;
 use super::super::chunk_writer::{Channel, ChunkWriter};
 use super::damage::{Chunk, chunks, largest, unfinished};
 use super::tests::{keep_going, names, put, recorded, repaired};
-use super::{FileEnd, Outcome, RecoverError, recover};
+use super::{FileEnd, RecoverError, RepairOutcome, recover};
 use crate::episode::own::EpisodeId;
 use crate::episode::record_iter::MAGIC;
 use crate::episode::testing::{Message, metadata, strictly};
@@ -36,7 +36,7 @@ async fn a_whole_episode_whose_name_is_taken_gets_a_free_one_and_stays_as_it_is(
             let partial = put(&folder, "a_001.mcap.partial", &bytes);
             let report = recover(&partial, &mut keep_going).unwrap();
             let to = folder.path().join(free);
-            assert_eq!(report.outcome, Outcome::Whole { to: to.clone() }, "{what}");
+            assert_eq!(report.outcome, RepairOutcome::Whole { to: to.clone() }, "{what}");
             assert!(report.sentence().1.contains(free), "{what}: {}", report.sentence().1);
             assert_eq!(fs::read(&to).unwrap(), bytes, "{what}");
             let seen = inspect(&to).unwrap();
@@ -77,7 +77,7 @@ fn without_check_values<'a>(
 }
 
 #[tokio::test]
-async fn no_chunk_of_ours_is_believed_without_its_check_value() {
+async fn no_chunk_of_ours_is_accepted_without_its_check_value() {
     let (folder, whole) = recorded().await;
     let chunks = chunks(&whole);
     let all = strictly(&whole);
@@ -88,11 +88,11 @@ async fn no_chunk_of_ours_is_believed_without_its_check_value() {
             let file = put(&folder, name, &bytes);
             let report = recover(&file, &mut keep_going).unwrap();
             let kept = match &report.outcome {
-                Outcome::Repaired(repaired) => {
+                RepairOutcome::Repaired(repaired) => {
                     assert_eq!((repaired.damaged_chunks, repaired.original.is_some()), (1, true), "{what}");
                     strictly(&fs::read(&repaired.to).unwrap())
                 }
-                Outcome::Unreadable { .. } => Vec::new(),
+                RepairOutcome::Unreadable { .. } => Vec::new(),
                 other => panic!("{what}: {other:?}"),
             };
             let expected: Vec<&Message> = all.iter().filter(|message| !chunk.messages.contains(message)).collect();
@@ -119,7 +119,7 @@ fn records(bytes: &[u8], chunk: &Chunk) -> Vec<(usize, bool)> {
 }
 
 #[tokio::test]
-async fn of_a_torn_chunk_every_byte_is_counted_and_messages_are_reported_as_unproven() {
+async fn every_byte_of_a_torn_chunk_is_counted_and_its_messages_are_reported_as_unproven() {
     let (folder, whole) = recorded().await;
     let chunks = chunks(&whole);
     let (index, _) = largest(&chunks);
@@ -134,7 +134,7 @@ async fn of_a_torn_chunk_every_byte_is_counted_and_messages_are_reported_as_unpr
             let partial = put(&folder, "a_001.mcap.partial", &bytes);
             let seen = inspect(&partial).unwrap();
             let report = recover(&partial, &mut keep_going).unwrap();
-            let Outcome::Repaired(made) = &report.outcome else { panic!("{report:?}") };
+            let RepairOutcome::Repaired(made) = &report.outcome else { panic!("{report:?}") };
             let what = format!("{count} records, {left} bytes");
             assert_eq!(
                 (made.ordered_messages, made.unread_bytes, made.end),
@@ -262,7 +262,7 @@ async fn recover_and_inspect_agree_on_whole_files() {
             let reasons = inspect(&file).unwrap();
             let is_whole = !reasons.verdict.reasons().iter().any(|reason| reason.contains("not whole"));
             let report = recover(&file, &mut keep_going).unwrap();
-            assert_eq!(matches!(report.outcome, Outcome::Whole { .. }), is_whole, "{what}, {name}: {report:?}");
+            assert_eq!(matches!(report.outcome, RepairOutcome::Whole { .. }), is_whole, "{what}, {name}: {report:?}");
             for name in names(folder.path()) {
                 fs::remove_file(folder.path().join(name)).unwrap();
             }
@@ -292,7 +292,7 @@ async fn the_repair_of_a_file_without_one_of_its_chunks_reports_it() {
     let report = recover(&put(&folder, "a_001.mcap", &bytes), &mut keep_going).unwrap();
     assert!(report.sentence().1.contains("parts of it may be missing"), "{report:?}");
     // A file of which nothing is missing has no such word.
-    let Outcome::Repaired(made) = report.outcome else { panic!("{report:?}") };
+    let RepairOutcome::Repaired(made) = report.outcome else { panic!("{report:?}") };
     let report = recover(&made.to, &mut keep_going).unwrap();
     assert!(!report.sentence().1.contains("missing"), "{report:?}");
 }
@@ -330,7 +330,7 @@ async fn unread_bytes_are_reported_and_the_original_is_kept() {
             assert!(reasons.contains("not readable") || reasons.contains("left out"), "{what}: {reasons}");
             let original = match recover(&file, &mut keep_going) {
                 Ok(report) => match &report.outcome {
-                    Outcome::Repaired(made) => {
+                    RepairOutcome::Repaired(made) => {
                         let kept = strictly(&fs::read(&made.to).unwrap());
                         let is_second = cut < is_known && !kept.is_empty() && other.starts_with(&kept);
                         assert!(is_second || all.starts_with(&kept), "{what}: {report:?}");
@@ -347,7 +347,7 @@ async fn unread_bytes_are_reported_and_the_original_is_kept() {
                         assert!(is_second || counts.iter().any(|count| sentence.contains(count)), "{what}: {sentence}");
                         made.original.clone().unwrap_or_else(|| panic!("{what}: not kept: {report:?}"))
                     }
-                    Outcome::Unreadable { kept, .. } => kept.clone(),
+                    RepairOutcome::Unreadable { kept, .. } => kept.clone(),
                     other => panic!("{what}: {other:?}"),
                 },
                 Err(RecoverError::Nothing(_)) => file,

@@ -6,14 +6,14 @@ use serde_json::{Map, Value, json};
 
 use super::copy::{About, Copied};
 use super::summary::{LOSSLESS, SHA256, Summary};
-use super::{FileEnd, LeftOut, Outcome, Recovered, Repaired};
+use super::{FileEnd, LeftOut, Recovered, RepairOutcome, Repaired};
 use crate::episode::{FAILED, text_map};
 use crate::status::{Grade, Level};
 use crate::text;
 use crate::time;
 
 /// The metadata record `rapid/summary` of an episode whose recorder wrote none, as far as it is
-/// known. Same keys as the recorder's; what only the recorder could count is not there.
+/// known. Same keys as the recorder's, without those that only the recorder could count.
 ///
 /// JSON: `modalities` `{name: {samples}}`.
 pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
@@ -31,9 +31,9 @@ pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
     ])
 }
 
-/// The metadata record `rapid/recovered`: what was repaired when and by whom, what is there and what
-/// is not: the keys of [`LeftOut`](super::LeftOut), and as JSON `nameless` `{channel: messages}`. `ordered_messages` were
-/// taken without a check value, because the machine has not been restarted since they were written.
+/// The metadata record `rapid/recovered`: what was repaired when and by which program, with its content and losses: the
+/// keys of [`LeftOut`](super::LeftOut), and as JSON `nameless` `{channel: messages}`. `ordered_messages` were taken
+/// without a check value, because the machine has not been restarted since they were written.
 pub(super) fn recovered(copied: &Copied, about: &About<'_>, size: u64) -> BTreeMap<String, String> {
     let Repaired { unread_bytes, refused_records, nameless, failed, .. } = &copied.repaired;
     let Repaired { messages, seconds, damaged_chunks, ordered_messages, .. } = copied.repaired;
@@ -68,12 +68,11 @@ pub(super) fn failed(why: &str) -> BTreeMap<String, String> {
 }
 
 impl Recovered {
-    /// What became of the file, for people, and how bad that is.
-    #[must_use]
+    /// The result for the file, for people, and its level.
     pub fn sentence(&self) -> (Level, String) {
         let name = |path: &std::path::Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         let (level, text) = match &self.outcome {
-            Outcome::Repaired(repaired) => {
+            RepairOutcome::Repaired(repaired) => {
                 let whole = repaired.original.is_none() && repaired.failed.is_none();
                 let mut report = repaired.sentence();
                 if repaired.to != self.file.with_extension("") {
@@ -84,18 +83,20 @@ impl Recovered {
                 }
                 (if whole { Level::Info } else { Level::Warn }, report)
             }
-            Outcome::Whole { to } if *to == self.file => (Level::Info, "whole; nothing to repair".to_owned()),
-            Outcome::Whole { to } => (Level::Info, format!("whole; it only lacked its name, {}", name(to))),
-            Outcome::AlreadyRepaired { to, kept: None } => (Level::Info, format!("already repaired: {}", name(to))),
-            Outcome::AlreadyRepaired { to, kept: Some(kept) } => {
+            RepairOutcome::Whole { to } if *to == self.file => (Level::Info, "whole; nothing to repair".to_owned()),
+            RepairOutcome::Whole { to } => (Level::Info, format!("whole; it only lacked its name, {}", name(to))),
+            RepairOutcome::AlreadyRepaired { to, kept: None } => {
+                (Level::Info, format!("already repaired: {}", name(to)))
+            }
+            RepairOutcome::AlreadyRepaired { to, kept: Some(kept) } => {
                 let (to, kept) = (name(to), name(kept));
                 (Level::Warn, format!("already repaired: {to}; all of it is kept in {kept}"))
             }
-            Outcome::Empty { kept: None } => (Level::Info, "of no bytes; removed".to_owned()),
-            Outcome::Empty { kept: Some(kept) } => {
+            RepairOutcome::Empty { kept: None } => (Level::Info, "of no bytes; removed".to_owned()),
+            RepairOutcome::Empty { kept: Some(kept) } => {
                 (Level::Info, format!("nothing was recorded in it; set aside as {}", name(kept)))
             }
-            Outcome::Unreadable { kept, failed } => {
+            RepairOutcome::Unreadable { kept, failed } => {
                 let why = failed.as_ref().map(|why| format!("; BAD: {why}")).unwrap_or_default();
                 (Level::Warn, format!("no message in it can be read{why}; set aside as {}", name(kept)))
             }
@@ -105,7 +106,7 @@ impl Recovered {
 }
 
 impl Repaired {
-    /// Is nothing left out, although the original was not whole? Then something of it is gone, or a check value is wrong.
+    /// Is nothing left out although the original was not whole? Then data is missing, or a check value is wrong.
     fn is_unexplained(&self) -> bool {
         let counted = [self.unread_bytes, self.damaged_chunks, self.ordered_messages, self.refused_records];
         self.failed.is_none() && counted.iter().all(|count| *count == 0) && self.left_out == LeftOut::default()

@@ -1,4 +1,4 @@
-//! What is counted of a file while it is read.
+//! Counts of a file, taken while it is read.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use super::super::reader::Entry;
 use super::super::record_iter::Integrity;
 use crate::episode::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY};
 
-/// Key of `rapid/recovered`: "true" where nothing of the original is left out but a torn end.
+/// Key of `rapid/recovered`: "true" if only a torn end of the original is left out.
 pub(super) const LOSSLESS: &str = "lossless";
 /// Key of `rapid/recovered`: SHA-256 of the original.
 pub(super) const SHA256: &str = "source_sha256";
@@ -26,23 +26,22 @@ pub(super) struct Summary {
     pub(super) frames: u64,
     /// The recorder wrote its own summary.
     pub(super) has_end: bool,
-    /// The file is whole, as a container, and what proves it is there.
+    /// The file is provably whole, as a container.
     is_sound: bool,
     is_proven: bool,
-    /// Why the recorder of the file that this one was made of called it BAD.
+    /// Why the original's recorder called it BAD.
     pub(super) failed: Option<String>,
     /// Channels, by number.
     pub(super) channels: BTreeMap<u16, Channel>,
     /// When the episode began, by the recorder.
     begin_ns: Option<u64>,
-    /// Messages that belong to the episode itself: not events or lines of the log, nor what was so
-    /// before it began.
+    /// Messages that belong to the episode itself: not events, lines of the log, or earlier state.
     captured: u64,
-    /// The file this one was made of.
+    /// The original of this file.
     origin: Option<Origin>,
 }
 
-/// What a file was made of.
+/// The original of a repaired file.
 #[derive(Debug)]
 struct Origin {
     sha256: String,
@@ -50,7 +49,7 @@ struct Origin {
     lossless: bool,
 }
 
-/// A channel and what came on it.
+/// A channel and its counts.
 #[derive(Debug, Default)]
 pub(super) struct Channel {
     pub(super) topic: String,
@@ -85,8 +84,8 @@ impl Summary {
         self.captured == 0
     }
 
-    /// Was it made, to its end, by repair of a file of so many bytes? Then that file's SHA-256, and whether this one holds
-    /// all that it held but a torn end.
+    /// If it is the complete repair of a file of this many bytes: the SHA-256 of that file, and whether this one holds
+    /// all of it except a torn end.
     pub(super) fn made_of(&self, bytes: u64) -> Option<(&str, bool)> {
         let origin = self.origin.as_ref().filter(|origin| self.is_whole() && origin.bytes == bytes)?;
         Some((&origin.sha256, origin.lossless))
@@ -98,7 +97,7 @@ impl Summary {
     }
 
     /// Is the file whole, and an episode of ours to its end, with every check value? A recorder that gave up has written
-    /// no summary, whatever became of the file's end.
+    /// no summary, even if the file has an end.
     pub(super) fn is_whole(&self) -> bool {
         self.is_sound && (self.has_end && self.is_proven || self.begin_ns.is_none())
     }

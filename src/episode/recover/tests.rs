@@ -19,7 +19,7 @@ pub(super) fn keep_going(_: u64, _: u64) -> ControlFlow<()> {
 
 pub(super) fn repaired(path: &Path) -> Repaired {
     match recover(path, &mut keep_going).unwrap().outcome {
-        Outcome::Repaired(repaired) => *repaired,
+        RepairOutcome::Repaired(repaired) => *repaired,
         other => panic!("{other:?}"),
     }
 }
@@ -46,13 +46,13 @@ pub(super) fn put(folder: &tempfile::TempDir, name: &str, bytes: &[u8]) -> PathB
 }
 
 #[tokio::test]
-async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
+async fn a_torn_episode_becomes_a_whole_one_with_all_its_content() {
     let (folder, bytes) = recorded().await;
     let original = strictly(&bytes);
     let cut = bytes.len() * 3 / 5;
     let partial = put(&folder, "20261121_t_003.mcap.partial", &bytes[..cut]);
     let report = recover(&partial, &mut keep_going).unwrap();
-    let Outcome::Repaired(ref repaired) = report.outcome else { panic!("{report:?}") };
+    let RepairOutcome::Repaired(ref repaired) = report.outcome else { panic!("{report:?}") };
     assert_eq!(names(folder.path()), ["20261121_t_003.mcap"]);
     assert_eq!(repaired.to, folder.path().join("20261121_t_003.mcap"));
     let whole = fs::read(&repaired.to).unwrap();
@@ -128,7 +128,7 @@ async fn cut_at_any_byte_everything_before_the_cut_is_kept() {
 }
 
 #[test]
-fn a_flipped_bit_costs_messages_and_never_makes_any() {
+fn a_flipped_bit_loses_messages_and_never_invents_any() {
     for (layout, bytes) in testing::layouts().map(testing::episode).into_iter().enumerate() {
         // The last is a file without chunks: it has no check value but that of the whole.
         let is_checked = layout < 3;
@@ -193,12 +193,12 @@ async fn a_file_being_written_is_left_alone() {
 async fn files_without_messages_are_reported_and_kept() {
     let (folder, bytes) = recorded().await;
     let empty = put(&folder, "a_001.mcap.partial", b"");
-    assert_eq!(recover(&empty, &mut keep_going).unwrap().outcome, Outcome::Empty { kept: None });
+    assert_eq!(recover(&empty, &mut keep_going).unwrap().outcome, RepairOutcome::Empty { kept: None });
     let noise = put(&folder, "a_002.mcap.partial", b"no MCAP file");
     let kept = folder.path().join("a_002.mcap.damaged");
     assert_eq!(
         recover(&noise, &mut keep_going).unwrap().outcome,
-        Outcome::Unreadable { kept: kept.clone(), failed: None }
+        RepairOutcome::Unreadable { kept: kept.clone(), failed: None }
     );
     assert_eq!(fs::read(kept).unwrap(), b"no MCAP file");
     // Header, metadata and channels, as they are on the disk when an episode has just begun.
@@ -207,7 +207,7 @@ async fn files_without_messages_are_reported_and_kept() {
     bare.truncate(bytes.windows(first.len()).position(|window| window == first).unwrap());
     let bare = put(&folder, "a_003.mcap.partial", &bare);
     let kept = folder.path().join("a_003.mcap.empty");
-    assert_eq!(recover(&bare, &mut keep_going).unwrap().outcome, Outcome::Empty { kept: Some(kept) });
+    assert_eq!(recover(&bare, &mut keep_going).unwrap().outcome, RepairOutcome::Empty { kept: Some(kept) });
     assert_eq!(names(folder.path()), ["a_002.mcap.damaged", "a_003.mcap.empty"]);
     // A second one of that name does not replace the first.
     let noise = put(&folder, "a_002.mcap.partial", b"other");
@@ -216,7 +216,7 @@ async fn files_without_messages_are_reported_and_kept() {
 }
 
 #[tokio::test]
-async fn a_repair_that_was_ended_is_made_again() {
+async fn an_interrupted_repair_is_repeated() {
     let (folder, bytes) = recorded().await;
     let many = bytes[..bytes.len() * 9 / 10].to_vec();
     let partial = put(&folder, "a_001.mcap.partial", &many);
@@ -234,7 +234,7 @@ async fn a_repair_that_was_ended_is_made_again() {
     // By a kill between the two last steps: the repaired file has its name, the original is there too.
     fs::write(&partial, &many).unwrap();
     let again = recover(&partial, &mut keep_going).unwrap();
-    assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: first.to.clone(), kept: None });
+    assert_eq!(again.outcome, RepairOutcome::AlreadyRepaired { to: first.to.clone(), kept: None });
     assert_eq!(names(folder.path()), ["a_001.mcap"]);
     // A file of that name that is something else is not taken for it, nor replaced.
     fs::write(&partial, &many[..many.len() - 1]).unwrap();
@@ -257,13 +257,13 @@ fn unread_parts_of_an_interrupted_repair_are_kept_by_the_next() {
     fs::rename(first.original.unwrap(), &partial).unwrap();
     let report = recover(&partial, &mut keep_going).unwrap();
     let kept = folder.path().join("a_001.mcap.damaged");
-    assert_eq!(report.outcome, Outcome::AlreadyRepaired { to: first.to, kept: Some(kept.clone()) });
+    assert_eq!(report.outcome, RepairOutcome::AlreadyRepaired { to: first.to, kept: Some(kept.clone()) });
     assert_eq!((report.sentence().0, fs::read(&kept).unwrap()), (Level::Warn, damaged));
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_001.mcap.damaged"]);
 }
 
 #[test]
-fn bytes_behind_the_end_of_a_file_are_kept() {
+fn bytes_after_the_end_of_a_file_are_kept() {
     let whole = testing::episode(testing::options());
     let other = testing::episode(testing::options().compression(None));
     for behind in [&b"x"[..], &[0; 5000], &whole, &other] {
@@ -278,7 +278,7 @@ fn bytes_behind_the_end_of_a_file_are_kept() {
     }
 }
 
-/// A disk that takes so many bytes.
+/// A disk with space for this many bytes.
 struct SmallDisk(Vec<u8>, usize);
 
 impl Write for SmallDisk {
@@ -319,15 +319,15 @@ async fn an_episode_that_only_lacks_its_name_gets_it() {
     let (folder, bytes) = recorded().await;
     let partial = put(&folder, "a_001.mcap.partial", &bytes);
     let to = folder.path().join("a_001.mcap");
-    assert_eq!(recover(&partial, &mut keep_going).unwrap().outcome, Outcome::Whole { to: to.clone() });
+    assert_eq!(recover(&partial, &mut keep_going).unwrap().outcome, RepairOutcome::Whole { to: to.clone() });
     assert_eq!(names(folder.path()), ["a_001.mcap"]);
     assert_eq!(fs::read(&to).unwrap(), bytes);
-    assert_eq!(recover(&to, &mut keep_going).unwrap().outcome, Outcome::Whole { to: to.clone() });
+    assert_eq!(recover(&to, &mut keep_going).unwrap().outcome, RepairOutcome::Whole { to: to.clone() });
     assert_eq!(fs::read(&to).unwrap(), bytes);
 }
 
 #[tokio::test]
-async fn a_repair_is_found_again_under_whatever_name_it_has() {
+async fn a_repair_is_found_again_under_any_name() {
     let (folder, bytes) = recorded().await;
     let cut = put(&folder, "a_001.mcap", &bytes[..bytes.len() - 30]);
     for number in [1, 2] {
@@ -336,14 +336,14 @@ async fn a_repair_is_found_again_under_whatever_name_it_has() {
         let made = repaired(&cut);
         for _ in 0..2 {
             let again = recover(&cut, &mut keep_going).unwrap();
-            assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: made.to.clone(), kept: None });
+            assert_eq!(again.outcome, RepairOutcome::AlreadyRepaired { to: made.to.clone(), kept: None });
         }
         fs::remove_file(&made.to).unwrap();
     }
 }
 
 #[tokio::test]
-async fn of_a_damaged_finished_file_a_whole_one_is_made_beside_it() {
+async fn a_damaged_finished_file_gets_a_whole_one_beside_it() {
     let (folder, bytes) = recorded().await;
     let original = strictly(&bytes);
     let cut = put(&folder, "a_001.mcap", &bytes[..bytes.len() - 30]);
@@ -352,7 +352,7 @@ async fn of_a_damaged_finished_file_a_whole_one_is_made_beside_it() {
     assert_eq!(strictly(&fs::read(&made.to).unwrap()), original);
     assert_eq!(fs::read(&cut).unwrap(), bytes[..bytes.len() - 30]);
     let again = recover(&cut, &mut keep_going).unwrap();
-    assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: made.to.clone(), kept: None });
+    assert_eq!(again.outcome, RepairOutcome::AlreadyRepaired { to: made.to.clone(), kept: None });
     // The recorder had written its summary: that one is kept, and there is no second one.
     assert_eq!(metadata(&fs::read(&made.to).unwrap())["rapid/summary"], metadata(&bytes)["rapid/summary"]);
 
@@ -377,7 +377,7 @@ async fn of_a_damaged_finished_file_a_whole_one_is_made_beside_it() {
 }
 
 #[test]
-fn other_things_than_files_are_errors_and_not_touched() {
+fn anything_but_a_file_is_an_error_and_not_touched() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     fs::create_dir(at("folder.mcap.partial")).unwrap();

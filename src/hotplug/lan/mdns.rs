@@ -1,13 +1,12 @@
 //! Devices that announce a service (mDNS, RFC 6762; DNS-SD, RFC 6763).
 //!
-//! The library keeps what was announced until it expires, which by default is after two minutes. So a
-//! device that its driver does not receive from is queried again once a lease (RFC 6762, 10.4), and what does not
-//! answer by the end of the next is reported as removed. A goodbye is reported one second after it came: the
-//! library keeps to RFC 6762, 10.1, in which that is the time for another host to object. mdns-sd 0.21
-//! cannot query an instance with a dot in its name again: that one is gone when it says goodbye, when its
-//! driver receives nothing more, or after two minutes.
+//! The library keeps announcements until they expire, by default after two minutes. So a device from which its driver
+//! receives nothing is queried again once per lease (RFC 6762, 10.4), and one that does not answer by the end of the
+//! next lease is reported as removed. A goodbye is reported after one second: the library follows RFC 6762, 10.1, which
+//! gives another host that time to object. mdns-sd 0.21 cannot query again an instance with a dot in its name: such a
+//! device is gone when it sends a goodbye, when its driver receives nothing more, or after two minutes.
 //!
-//! Invariant: of an announcement only the names and numbers are taken, each bounded.
+//! Invariant: only names and numbers of an announcement are used, each bounded.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -18,54 +17,54 @@ use mdns_sd::{Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, 
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::super::UnplugSource;
-use super::watch::Link;
-use super::watch::{LOOK_EVERY, Watch};
+use super::watch::Watch;
+use crate::link::{LOOK_EVERY, Link, LinkState};
 use crate::registry::LanSpec;
 use crate::time::Stamp;
 
 /// More devices of one service than a rig has.
 const MOST_INSTANCES: usize = 64;
-/// Addresses of an instance that are looked at.
+/// Maximum number of addresses of an instance that are used.
 const MOST_ADDRESSES: usize = 8;
-/// A name of an instance has 63 bytes (RFC 6763, 4.1.1).
+/// The name of an instance has at most 63 bytes (RFC 6763, 4.1.1).
 const LONGEST_NAME: usize = 63;
 /// The library reports a missing answer at the end of the lease, give or take this.
 const MARGIN: Duration = Duration::from_millis(100);
-/// From the end of a lease to the next question, so that a report of the one is not taken for the other.
+/// From the end of a lease to the next query, so that a report on one is not attributed to the other.
 const PAUSE: Duration = Duration::from_millis(200);
-/// What the app on the phone looks for, to know where to connect to.
+/// The service that the phone app searches for, to know where to connect.
 const VIO_SERVER: &str = "_vioserver._tcp.local.";
 
-/// The mDNS thread, which ends with this.
+/// The mDNS thread, which ends when this is dropped.
 pub(super) struct Browser {
     daemon: ServiceDaemon,
 }
 
-/// An entry that is found by a service.
+/// An entry that is found by its service.
 #[derive(Debug)]
 pub(super) struct Wanted {
     watch: Watch,
-    /// Only the instance of this name is meant.
+    /// Only the instance of this name matches.
     instance: Option<String>,
     /// The port at which the device is reached, if not the announced one.
     port: Option<u16>,
     /// The instance that is the entry's device now.
     current: Option<String>,
-    /// Since when the device has been asked again.
+    /// When the device was queried again.
     asked: Option<Stamp>,
 }
 
 /// An instance that is announced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Found {
-    /// Its own name, without that of the service.
+    /// Its own name, without the service's.
     name: String,
-    /// The best first, at least one.
+    /// At least one; the best first.
     addresses: Vec<SocketAddr>,
 }
 
 impl Browser {
-    /// `phones` are the ports of ours that phones connect to; they are announced.
+    /// `phones` are the local ports that phones connect to; they are announced.
     pub(super) fn open(phones: &[u16]) -> Option<Self> {
         let daemon = match ServiceDaemon::new() {
             Ok(daemon) => daemon,
@@ -82,7 +81,7 @@ impl Browser {
         Some(Self { daemon })
     }
 
-    /// Looks after the entries of a service.
+    /// Tracks the entries of a service.
     pub(super) fn watch(&self, service: &str, wanted: Vec<Wanted>) -> impl Future<Output = ()> + use<> {
         let domain = format!("{service}.local.");
         let daemon = self.daemon.clone();
@@ -99,7 +98,7 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // Sends a goodbye for what was announced, without waiting for it.
+        // Sends a goodbye for the announced services, without waiting for it.
         let _ = self.daemon.shutdown();
     }
 }
@@ -110,14 +109,14 @@ impl Wanted {
     }
 }
 
-/// The entries of one service, and what is announced of it.
+/// The entries of one service, and its announced instances.
 struct Service {
     domain: String,
     wanted: Vec<Wanted>,
-    /// What is announced, by full name.
+    /// Announced instances, by full name.
     known: BTreeMap<String, Found>,
-    /// Instances whose link went down, with that link: they are reported again when it is up. The library reports nothing
-    /// then, as they are announced as they were.
+    /// Instances whose link went down, with that link: they are reported again when it is up. The library reports
+    /// nothing then, because their announcements have not changed.
     cut: BTreeMap<String, Link>,
 }
 
@@ -141,7 +140,7 @@ impl Service {
                     }
                 },
                 _ = look.tick() => for (full, limit) in self.look(Stamp::now()).await {
-                    // Refused only while the library is busy: asked again a lease later.
+                    // Refused only while the library is busy; queried again a lease later.
                     let _ = daemon.verify(full, limit);
                 },
             }
@@ -157,7 +156,7 @@ impl Service {
         self.assign(Some(&full), now).await;
     }
 
-    /// Gives what is known to the entries, each to one. `announced` was announced just now: its lease begins again.
+    /// Assigns the known instances to the entries, one each. `announced` was announced just now: its lease restarts.
     async fn assign(&mut self, announced: Option<&str>, now: Stamp) {
         for index in 0..self.wanted.len() {
             let Some(wanted) = self.wanted.get(index) else { continue };
@@ -169,7 +168,7 @@ impl Service {
                 let names = |wanted: &Wanted, found: &Found| {
                     wanted.instance.as_ref().is_some_and(|name| name.eq_ignore_ascii_case(&found.name))
                 };
-                // What another entry names is that one's, though it may be announced first.
+                // An instance that another entry names belongs to that entry, even if it is announced first.
                 let fits = |found: &Found| match wanted.instance {
                     Some(_) => names(wanted, found),
                     None => !self.wanted.iter().any(|other| names(other, found)),
@@ -183,7 +182,7 @@ impl Service {
                 address
             };
             let kept = wanted.watch.address.filter(|kept| found.addresses.iter().any(|found| at(found) == *kept));
-            // Announcements come in parts: an address that is good enough stays.
+            // Announcements come in parts: an address that is good enough is kept.
             let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
             let Some(wanted) = self.wanted.get_mut(index) else { continue };
             if wanted.current != full || announced == full.as_deref() {
@@ -200,7 +199,7 @@ impl Service {
         for wanted in self.wanted.iter_mut().filter(|wanted| wanted.current.as_deref() == Some(full)) {
             let source = wanted.source(now);
             wanted.asked = None;
-            // Announcements get lost in the air; what the driver receives is better evidence.
+            // Announcements get lost on wireless links; the driver's reception is better evidence.
             if source == UnplugSource::Lease && wanted.watch.is_sending(wanted.watch.length, now) {
                 tracing::debug!(
                     device = wanted.watch.entry,
@@ -214,7 +213,7 @@ impl Service {
         self.assign(None, now).await;
     }
 
-    /// Looks at leases and links; returns which instances are to be queried again, and how long they have.
+    /// Checks leases and links; returns which instances must be queried again, and how long they have.
     async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
         let mut questions = Vec::new();
         for wanted in &mut self.wanted {
@@ -239,7 +238,7 @@ impl Service {
             }
         }
         let before = self.cut.len();
-        self.cut.retain(|_, link| link.is_down());
+        self.cut.retain(|_, link| link.state() != LinkState::Up);
         if self.cut.len() != before {
             self.assign(None, now).await;
         }
@@ -248,7 +247,7 @@ impl Service {
 }
 
 impl Wanted {
-    /// The evidence that its device is gone: an answer that did not come, or a goodbye.
+    /// The evidence that its device is gone: a missing answer, or a goodbye.
     fn source(&self, now: Stamp) -> UnplugSource {
         match self.asked {
             Some(asked) if now.since(asked).abs_diff(self.watch.length) <= MARGIN => UnplugSource::Lease,
@@ -263,8 +262,8 @@ fn found(service: &ResolvedService, domain: &str) -> Option<(String, Found)> {
     (!addresses.is_empty()).then(|| (service.fullname.clone(), Found { name: unescaped(name), addresses }))
 }
 
-/// An address with the scope that a link-local one needs. Of this computer's own only what was announced
-/// on it: no other entry has a device there.
+/// An address, with the scope that a link-local one needs. Of this computer's own addresses only those announced on it:
+/// no other entry has a device there.
 fn scoped(ip: &ScopedIp) -> Option<(IpAddr, u32)> {
     let is_own = match ip {
         ScopedIp::V4(v4) => v4.interface_ids().iter().any(|interface| interface.name == "lo"),
@@ -280,8 +279,8 @@ fn scoped(ip: &ScopedIp) -> Option<(IpAddr, u32)> {
     })
 }
 
-/// Of others before our own, IPv4 first, then what needs no scope, then the rest; in the order of numbers,
-/// so that it is the same one each time.
+/// Remote addresses before our own, IPv4 first, then those that need no scope, then the rest; in numeric order, so that
+/// the choice is the same each time.
 fn ordered(addresses: impl Iterator<Item = (IpAddr, u32)>, port: u16) -> Vec<SocketAddr> {
     let mut usable: Vec<_> = addresses.filter(|(ip, _)| !ip.is_unspecified() && !ip.is_multicast()).collect();
     usable.sort_by_key(|(ip, scope)| (ip.is_loopback(), ip.is_ipv6(), *scope, *ip));
@@ -316,7 +315,7 @@ fn unescaped(label: &str) -> String {
     String::from_utf8_lossy(&name).into_owned()
 }
 
-/// Announces to phones where to connect to.
+/// Announces to phones where they should connect.
 fn announce(daemon: &ServiceDaemon, port: u16) -> mdns_sd::Result<()> {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let legal = |c: &char| c.is_ascii_alphanumeric() || *c == '-';
@@ -327,7 +326,7 @@ fn announce(daemon: &ServiceDaemon, port: u16) -> mdns_sd::Result<()> {
     daemon.register(info.enable_addr_auto())
 }
 
-/// Whatever a label is, its name is bounded.
+/// The resulting name is bounded, whatever the label is.
 pub(super) fn fuzz(label: &str) {
     assert!(unescaped(label).len() <= 3 * LONGEST_NAME, "a name of an instance is too long");
 }

@@ -1,6 +1,6 @@
-//! Devices at a fixed address: asked once a second whether they are there.
+//! Devices at a fixed address: queried once a second.
 //!
-//! Invariant: a device that its driver receives from is not queried; it may take one connection alone.
+//! Invariant: a device from which its driver receives is not queried; it may accept only one connection.
 
 use std::future::Future;
 use std::io;
@@ -13,25 +13,27 @@ use tokio::net::{TcpStream, UdpSocket};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use super::super::UnplugSource;
-use super::watch::{LOOK_EVERY, Watch};
-use crate::registry::{LastReceived, Probe, own_side};
+use super::watch::Watch;
+use crate::device::LastReceived;
+use crate::link::LOOK_EVERY;
+use crate::registry::{Probe, own_side};
 use crate::time::Stamp;
 
-/// From one question to the next; also how long an answer may take.
+/// Interval between queries; also the time limit of an answer.
 const EVERY: Duration = Duration::from_secs(1);
 
-/// What came of asking.
+/// Result of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Answer {
-    /// It is there.
+    /// The device is present.
     Here,
     /// Its address answers, and the port is closed.
     Nobody,
-    /// None.
+    /// No answer.
     Silence,
 }
 
-/// Looks after an entry, whose device is at `server` and is asked at `asked`.
+/// Monitors an entry whose device is at `server` and is queried at `asked`.
 pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAddr, probe: Probe) {
     let mut look = interval(LOOK_EVERY);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -42,7 +44,7 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
                 let now = Stamp::now();
                 match answered {
                     Answer::Here => watch.found(server, None, now).await,
-                    // A server that takes one connection refuses the next, while its driver has the one.
+                    // A server that accepts one connection refuses the next while the driver holds it.
                     Answer::Nobody if watch.is_sending(watch.length, now) => {}
                     Answer::Nobody => watch.gone(UnplugSource::Lease, now).await,
                     Answer::Silence => {}
@@ -55,7 +57,7 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
     }
 }
 
-/// The next question, or none if the device's driver receives from it, or has the port it sends to.
+/// The next query; none if the driver receives from the device, or holds the port it sends to.
 async fn next(last_received: LastReceived, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
     sleep(EVERY).await;
     let is_received = Stamp::now().since(last_received.at()) < EVERY;
@@ -81,7 +83,7 @@ async fn ask(probe: Probe, asked: SocketAddr) -> Answer {
     }
 }
 
-/// Whatever its status is, an answer is one.
+/// An answer counts whatever its status.
 async fn http(asked: SocketAddr) -> io::Result<Answer> {
     const BEGINNING: &[u8] = b"HTTP/1.";
     let mut stream = TcpStream::connect(asked).await?;
@@ -91,7 +93,7 @@ async fn http(asked: SocketAddr) -> io::Result<Answer> {
     Ok(if beginning == BEGINNING { Answer::Here } else { Answer::Silence })
 }
 
-/// Receives a packet of the device at a port of ours, which is given back at once.
+/// Receives a packet of the device at a local port, which is released at once.
 async fn udp(asked: SocketAddr) -> io::Result<Answer> {
     let socket = UdpSocket::bind((own_side(Some(asked.ip())), asked.port())).await?;
     loop {

@@ -1,4 +1,4 @@
-//! A whole bundle for tests.
+//! A complete bundle for tests.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use crate::text::hexadecimal;
 /// four numbers; 10 DDIM steps.
 pub(crate) const POLICY: &str = include_str!("../../../tests/bundle/valid/tactile.json");
 
-/// Writes a bundle with these graphs into `folder`, which must be there, and loads it.
+/// Writes a bundle with these graphs into `folder`, which must exist, and loads it.
 pub(crate) fn write(folder: &Path, encoder: &[u8], denoiser: &[u8]) -> Bundle {
     write_changed(folder, encoder, denoiser, |_| {})
 }

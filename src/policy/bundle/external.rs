@@ -1,20 +1,20 @@
-//! Tensors of a graph whose numbers lie in other files: a bundle has none, for its SHA-256 would not cover them.
+//! Tensors of a graph stored in other files: refused in a bundle, because its SHA-256 would not cover them.
 //!
-//! A tensor can be in many places of a model: as an initializer, sparse or not, of the graph or of a subgraph,
-//! in an attribute of a node, in a function, in what is there for training. All of them are looked at. Field numbers
-//! are those of [`onnx.proto`](https://github.com/onnx/onnx/blob/v1.20.0/onnx/onnx.proto).
+//! A tensor can occur in many places of a model: as an initializer, sparse or not, of the graph or of a subgraph, in an
+//! attribute of a node, in a function, in training data. All of them are checked. Field numbers are those of
+//! [`onnx.proto`](https://github.com/onnx/onnx/blob/v1.20.0/onnx/onnx.proto).
 //!
-//! Invariant: what cannot be read to its end is refused: another reader might find more in it.
+//! Invariant: a file that cannot be parsed to its end is refused: another parser might find more in it.
 //! Invariant: the work grows with the number of fields; no nesting makes it recurse.
 
 use crate::episode::wire::{Proto, protobuf, whole_protobuf};
 
-/// Largest number of a field; a reader of 32-bit keys would take a larger one for another.
+/// Largest field number; a parser with 32-bit keys would misread a larger one.
 const LAST_FIELD: u64 = (1 << 29) - 1;
-/// Where onnxruntime's own format, which is no protobuf, has its mark.
+/// Offset and value of the mark in onnxruntime's own format, which is not protobuf.
 const ORT_MARK: (usize, &[u8]) = (4, b"ORTM");
 
-/// A kind of message.
+/// A message type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Model,
@@ -27,7 +27,7 @@ enum Kind {
     Tensor,
 }
 
-/// What lies in what: a message, the number of a field, and the message in it.
+/// Nesting: a message, a field number, and the message in that field.
 const PARTS: &[(Kind, u64, Kind)] = &[
     (Kind::Model, 7, Kind::Graph),
     (Kind::Model, 20, Kind::Training),
@@ -54,24 +54,24 @@ const PARTS: &[(Kind, u64, Kind)] = &[
 const NAME: u64 = 8;
 const EXTERNAL_DATA: u64 = 13;
 const DATA_LOCATION: u64 = 14;
-/// The first output of a `NodeProto`, which names the tensor of a node `Constant`.
+/// The first output of a `NodeProto`, which names the tensor of a `Constant` node.
 const OUTPUT: u64 = 2;
 
 /// Why a graph is refused.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum GraphError {
-    /// It is not a model of ONNX, from its beginning to its end.
+    /// It is not an ONNX model from start to end.
     NoModel,
-    /// The numbers of a tensor lie in another file.
+    /// The values of a tensor are in another file.
     External {
-        /// The tensor's name, or that of the node that has it.
+        /// The name of the tensor, or of the node that contains it.
         tensor: String,
         /// The file, as the graph names it.
         file: String,
     },
 }
 
-/// Do all numbers of this model lie in it?
+/// Checks that the model contains all of its tensors' values.
 pub(super) fn check(model: &[u8]) -> Result<(), GraphError> {
     let (at, mark) = ORT_MARK;
     if model.get(at..).is_some_and(|rest| rest.starts_with(mark)) {
@@ -95,7 +95,7 @@ pub(super) fn check(model: &[u8]) -> Result<(), GraphError> {
     Ok(())
 }
 
-/// Either the flag or the name of a file is enough.
+/// Either the flag or a file name is sufficient.
 fn is_external(number: u64, value: Proto<'_>) -> bool {
     number == EXTERNAL_DATA || (number == DATA_LOCATION && value.number() != 0)
 }

@@ -1,5 +1,5 @@
-//! The contents of `policy.json` as serde reads them: objects that the file describes differently from `spec`, and
-//! values with a smaller range than their types.
+//! The contents of `policy.json` as serde reads them: objects that differ between the file and `spec`, and values with
+//! a smaller range than their types.
 
 use std::ops::Range;
 
@@ -10,14 +10,14 @@ use serde_json::{Map, Value};
 use super::spec::{ColorOrder, Operation};
 use crate::text;
 
-/// Most actions in a chunk, and values of an action.
+/// Maximum number of actions in a chunk, and of values in an action.
 const MAX_ACTION: i64 = 1024;
 /// Longest side of a picture, pixels.
 type Side = Whole<1, 8192>;
-/// Numbers of a vector.
+/// Maximum length of a vector.
 const MAX_VALUES: i64 = 4096;
 
-/// The file without the objects in it, which are read one by one.
+/// The file without its nested objects, which are read separately.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Head {
@@ -45,7 +45,7 @@ pub(super) struct Head {
     pub(super) training: Map<String, Value>,
 }
 
-/// One of `observations`, by its `kind`.
+/// One of `observations`, selected by its `kind`.
 #[derive(Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum ObservationFile {
@@ -91,7 +91,7 @@ pub(super) struct VectorFile {
     /// Observations are one tick of the control grid apart.
     #[serde(default, rename = "down_sample_steps")]
     _down_sample_steps: Option<Whole<1, 1>>,
-    /// Null: values are taken as they are.
+    /// Null: values are used unchanged.
     #[serde(default, rename = "rotation")]
     _rotation: (),
 }
@@ -128,7 +128,7 @@ pub(super) struct ActionFile {
     pub(super) representation: Representation,
     pub(super) limits: Value,
     pub(super) normalization: Vec<Value>,
-    /// Null: values are taken as they are.
+    /// Null: values are used unchanged.
     #[serde(default, rename = "rotation")]
     _rotation: (),
 }
@@ -151,7 +151,7 @@ pub(super) struct Limits {
     pub(super) max: Vec<f32>,
 }
 
-/// The `slice` of a normalisation of an action, which is read apart from the rest.
+/// The `slice` of an action's normalisation, which is read separately.
 #[derive(Deserialize)]
 pub(super) struct Sliced {
     #[serde(deserialize_with = "slice")]
@@ -188,7 +188,7 @@ impl<const MIN: i64, const MAX: i64> TryFrom<i64> for Whole<MIN, MAX> {
     }
 }
 
-/// A number that an f32 can hold.
+/// A number that fits into an f32.
 #[derive(Deserialize)]
 #[serde(try_from = "f64")]
 struct Float(f32);
@@ -206,7 +206,7 @@ impl TryFrom<f64> for Float {
     }
 }
 
-/// Text that can be shown and is not empty.
+/// Printable, non-empty text.
 #[derive(Deserialize)]
 #[serde(try_from = "String")]
 struct Name(String);
@@ -254,12 +254,12 @@ pub(super) fn whole<'de, D: Deserializer<'de>, const MIN: i64, const MAX: i64>(v
     Whole::<MIN, MAX>::deserialize(value).map(Whole::get)
 }
 
-/// A variant of an enum without values, by its name; serde alone would take `{name: null}` as well.
+/// A variant of an enum without values, by its name; serde alone would also accept `{name: null}`.
 pub(super) fn word<'de, D: Deserializer<'de>, T: Deserialize<'de>>(value: D) -> Result<T, D::Error> {
     T::deserialize(String::deserialize(value)?.into_deserializer())
 }
 
-/// The same, or null. Without such a function a key of type `Option` could be left out.
+/// The same, or null. Without such a function serde would let a key of type `Option` be omitted.
 fn word_or_null<'de, D: Deserializer<'de>, T: Deserialize<'de>>(value: D) -> Result<Option<T>, D::Error> {
     let given = Option::<String>::deserialize(value)?;
     given.map(|given| T::deserialize(given.into_deserializer())).transpose()
@@ -281,7 +281,7 @@ pub(super) fn sha256<'de, D: Deserializer<'de>>(value: D) -> Result<String, D::E
     Ok(sha256.to_ascii_lowercase())
 }
 
-/// For a variant without keys of its own: none may be given.
+/// For a variant without keys of its own: no key is allowed.
 pub(super) fn no_keys<'de, D: Deserializer<'de>>(value: D) -> Result<(), D::Error> {
     #[derive(Deserialize)]
     #[serde(deny_unknown_fields)]

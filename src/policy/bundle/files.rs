@@ -1,7 +1,7 @@
-//! The files of a bundle: `policy.json`, and the graphs, whose SHA-256 it gives. The program carries one bundle,
-//! `models/tactile-id` of the repository as it was when the program was built.
+//! The files of a bundle: `policy.json` and the graphs, whose SHA-256 it contains. The program includes one bundle,
+//! `models/tactile-id` of the repository at build time.
 //!
-//! Invariant: the hash of the bundle inside is that of the folder it was made from, so that a recording names the same
+//! Invariant: the hash of the included bundle equals that of its source folder, so that a recording names the same
 //! policy either way.
 
 use std::fs::File;
@@ -24,10 +24,10 @@ const MAX_POLICY_BYTES: u64 = 4 << 20;
 const POLICY: &str = include_str!("../../../models/tactile-id/policy.json");
 static ENCODER: &[u8] = include_bytes!("../../../models/tactile-id/encoder.onnx");
 static DENOISER: &[u8] = include_bytes!("../../../models/tactile-id/denoiser.onnx");
-/// Its folder, in messages and recordings.
+/// Its folder name, in messages and recordings.
 const LABEL: &str = "inside rapid";
 
-/// Which of the two graphs.
+/// One of the two graphs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Graph {
     /// Observations to a condition.
@@ -38,7 +38,6 @@ pub enum Graph {
 
 impl Graph {
     /// The key under `graphs`.
-    #[must_use]
     pub const fn key(self) -> &'static str {
         match self {
             Self::Encoder => "encoder",
@@ -48,7 +47,7 @@ impl Graph {
 }
 
 impl Bundle {
-    /// The bundle in `folder`, or without one that [inside the program](Self::inside).
+    /// The bundle in `folder`, or without a folder the one [inside the program](Self::inside).
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -56,11 +55,10 @@ impl Bundle {
         folder.map_or_else(Self::inside, Self::load)
     }
 
-    /// Reads the bundle in `folder` and checks that its graphs are there, byte for byte, and that all their
-    /// numbers lie in them.
+    /// Reads the bundle in `folder` and checks that its graphs match byte for byte and contain all their tensors.
     ///
     /// # Errors
-    /// Everything that is wrong with `policy.json`, or else with the graphs' files.
+    /// All mistakes in `policy.json`, or otherwise those in the graphs' files.
     pub fn load(folder: &Path) -> Result<Self, BundleErrors> {
         let path = folder.join(POLICY_FILE);
         let label = path.display().to_string();
@@ -82,7 +80,7 @@ impl Bundle {
     /// The policy inside the program.
     ///
     /// # Errors
-    /// When the program was built with a policy that is none.
+    /// When the included policy is invalid.
     pub fn inside() -> Result<Self, BundleErrors> {
         let mut bundle = Self::parse(POLICY, LABEL)?;
         (bundle.folder, bundle.inside) = (PathBuf::from(LABEL), true);
@@ -98,11 +96,10 @@ impl Bundle {
         Ok(self)
     }
 
-    /// Reads the text of a `policy.json`; `file` is how it is named in messages. The bundle's folder
-    /// is empty, and no graph is looked at.
+    /// Parses the text of a `policy.json`; messages name it `file`. The bundle's folder is empty, and no graph is read.
     ///
     /// # Errors
-    /// Everything that is wrong with it.
+    /// All mistakes in it.
     pub fn parse(text: &str, file: &str) -> Result<Self, BundleErrors> {
         let mut bundle = parse(text, file)?;
         let mut hasher = Sha256::new();
@@ -113,11 +110,10 @@ impl Bundle {
         Ok(bundle)
     }
 
-    /// The bytes of a graph: those that were hashed, even if the file has changed since the
-    /// bundle was loaded.
+    /// The bytes of a graph: those that were hashed, even if the file has changed since the bundle was loaded.
     ///
     /// # Errors
-    /// When it cannot be read or is no longer the one that `policy.json` means.
+    /// When it cannot be read or no longer matches `policy.json`.
     pub fn read_graph(&self, graph: Graph) -> Result<Vec<u8>, BundleErrors> {
         let mut problems = Problems::new(&self.label());
         let bytes = self.verified(graph, &mut problems);
@@ -125,7 +121,7 @@ impl Bundle {
         Ok(bytes)
     }
 
-    /// The bytes of a graph, if they are those that are meant and nothing of it lies elsewhere; empty otherwise.
+    /// The bytes of a graph if their hash matches and all tensors are inside; otherwise empty.
     fn verified(&self, graph: Graph, problems: &mut Problems) -> Vec<u8> {
         let file = self.graph(graph);
         let mut bytes = Vec::new();
@@ -147,8 +143,7 @@ impl Bundle {
         Vec::new()
     }
 
-    /// Where a graph lies and what its bytes are.
-    #[must_use]
+    /// File name and hash of a graph.
     pub const fn graph(&self, graph: Graph) -> &GraphFile {
         match graph {
             Graph::Encoder => &self.encoder,
@@ -156,7 +151,7 @@ impl Bundle {
         }
     }
 
-    /// How the file is named in messages.
+    /// The file's name in messages.
     pub(super) fn label(&self) -> String {
         self.folder.join(POLICY_FILE).display().to_string()
     }
@@ -171,8 +166,7 @@ fn read_policy(path: &Path) -> io::Result<String> {
     Ok(text)
 }
 
-/// An ordinary file, or a link to one: model hubs keep bundles as links. Nothing else: a pipe would
-/// have us wait.
+/// A regular file, or a link to one: model hubs store bundles as links. Nothing else: opening a pipe would block.
 fn open(path: &Path) -> io::Result<File> {
     if !std::fs::metadata(path)?.is_file() {
         return Err(io::Error::other("it is not a file"));
@@ -180,11 +174,11 @@ fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// What is wrong with the bytes of a graph, and the fix.
+/// The mistake in the bytes of a graph, and its fix.
 fn wrong(file: &GraphFile, bytes: &[u8]) -> Option<(String, String)> {
     let (name, found) = (&file.file, text::hexadecimal(&Sha256::digest(bytes)));
     if found != file.sha256 {
-        let message = format!("{name} has the SHA-256 {found}, policy.json says {}", file.sha256);
+        let message = format!("{name} has the SHA-256 {found}, policy.json has {}", file.sha256);
         let fix = "copy the whole bundle again: this graph is not the one that belongs to it";
         return Some((message, fix.to_owned()));
     }

@@ -1,7 +1,7 @@
-//! A part of `policy.json` to a type that derives `Deserialize`, with every mistake reported under its path.
+//! Reads a part of `policy.json` into a type that derives `Deserialize`, and reports every mistake with its path.
 //!
-//! serde stops at the first mistake. So that one reading reports all of them, a wrong value is replaced by the
-//! example of its key (see [`KEYS`]) and the part is read again; the result of such a reading is thrown away.
+//! serde stops at the first mistake. To report all of them in one pass, a wrong value is replaced by the example of its
+//! key (see [`KEYS`]) and the part is read again; the result of such a pass is discarded.
 //!
 //! Invariant: text taken from the file is shown without control characters.
 
@@ -16,7 +16,7 @@ use super::spec::BundleErrors;
 use crate::registry::{Diagnostic, did_you_mean};
 use crate::text;
 
-/// Problems reported of one file; one with more was not written by an exporter of policies.
+/// Maximum number of reported problems; a file with more was not written by a policy exporter.
 const MOST_PROBLEMS: usize = 100;
 
 /// The problems found so far.
@@ -31,12 +31,12 @@ impl Problems {
         Self { file: text::plain(file).into_owned(), found: Vec::new() }
     }
 
-    /// Reports a problem at the path `entry`; of the whole file if that is empty.
+    /// Reports a problem at the path `entry`; with an empty path, of the whole file.
     pub(super) fn report(&mut self, entry: &str, message: impl AsRef<str>, fix: impl AsRef<str>) {
         self.report_at((0, 0), entry, message.as_ref(), fix.as_ref());
     }
 
-    /// Reports that the value at the path `entry` is wrong; the fix is what to write there.
+    /// Reports a wrong value at the path `entry`; the fix names what to write there.
     pub(super) fn wrong(&mut self, entry: &str, message: impl AsRef<str>) {
         self.report(entry, message, fix_at(entry));
     }
@@ -68,7 +68,7 @@ impl Problems {
     }
 }
 
-/// Reads the object `value` at the path `entry`. `None` if anything in it is wrong, and it is reported.
+/// Reads the object `value` at the path `entry`. `None` if any part of it is wrong, which is reported.
 pub(super) fn read<T: DeserializeOwned>(entry: &str, value: &Value, problems: &mut Problems) -> Option<T> {
     let keys = object(entry, value, problems)?;
     read_part(entry, "", Value::Object(keys), problems)
@@ -84,7 +84,7 @@ pub(super) fn read_tagged<T: DeserializeOwned>(
     let mut keys = object(entry, value, problems)?;
     match keys.remove(tag) {
         Some(Value::String(variant)) => {
-            // As serde tags enums by itself: in this form it keeps the path to what is wrong.
+            // The form in which serde itself tags enums: it preserves the path to the mistake.
             let tagged = Value::Object(Map::from_iter([(variant, Value::Object(keys))]));
             return read_part(entry, tag, tagged, problems);
         }
@@ -94,7 +94,7 @@ pub(super) fn read_tagged<T: DeserializeOwned>(
     None
 }
 
-/// serde takes a list for a struct as well.
+/// serde also accepts a list for a struct.
 fn object(entry: &str, value: &Value, problems: &mut Problems) -> Option<Map<String, Value>> {
     let object = Map::deserialize(value);
     object.map_err(|error| problems.wrong(entry, plain(&error.to_string()))).ok()
@@ -123,7 +123,7 @@ struct Mistake {
     entry: String,
     message: String,
     fix: String,
-    /// From the part that is read to the key or the value.
+    /// Path from the part being read to the key or the value.
     path: Vec<Segment>,
     /// A valid value of the key; `None` if there is none.
     example: Option<Value>,
@@ -133,7 +133,7 @@ impl Mistake {
     fn new(entry: &str, tag: &str, error: &serde_path_to_error::Error<serde_json::Error>) -> Self {
         let mut path: Vec<Segment> = error.path().iter().cloned().collect();
         let cause = error.inner().to_string();
-        // The name that the message is about, and after it those that are known.
+        // The name that the message concerns, followed by the known ones.
         let names: Vec<&str> = cause.split('`').skip(1).step_by(2).collect();
         let (name, known) = names.split_first().map_or(("", [].as_slice()), |(name, known)| (*name, known));
         let mut known = known.to_vec();
@@ -169,7 +169,7 @@ impl Mistake {
         Self { entry: place, message, fix, path, example }
     }
 
-    /// Removes the key from `value`, or gives it the example. `None` where that is not possible.
+    /// Removes the key from `value`, or replaces its value by the example. `None` if that is not possible.
     fn repair(self, value: &mut Value) -> Option<()> {
         let mut path = self.path;
         let last = path.pop()?;
@@ -185,7 +185,7 @@ impl Mistake {
             (Segment::Seq { index }, Some(example)) => {
                 let example = example.get(0).cloned().unwrap_or(example);
                 let replaced = std::mem::replace(at.get_mut(index)?, example.clone());
-                // An example that is refused itself would be refused for ever.
+                // If the example itself is refused, the loop would never end.
                 (replaced != example).then_some(())
             }
             (Segment::Map { key }, Some(example)) => {
@@ -198,13 +198,13 @@ impl Mistake {
     }
 }
 
-/// The path `entry`, and `name` in it.
+/// The path of `name` below `entry`.
 fn join(entry: &str, name: &str) -> String {
     let point = if entry.is_empty() || name.is_empty() { "" } else { "." };
     format!("{entry}{point}{name}")
 }
 
-/// serde's words for a value of the wrong type or length, without those of Rust.
+/// serde's message about a value of the wrong type or length, without Rust terms.
 fn plain(cause: &str) -> String {
     if let Some((found, expected)) =
         cause.strip_prefix("invalid length ").and_then(|cause| cause.split_once(", expected an array of length "))
@@ -302,18 +302,18 @@ impl<'de> Visitor<'de> for Reader {
 /// The fix for a path without a key here.
 const EXPORT: &str = "export the bundle again";
 
-/// A key and its value.
+/// A key and an example of its value.
 #[derive(Debug, Clone, Copy)]
 struct Key {
-    /// The end of its path, without the numbers of list elements.
+    /// The end of its path, without list indices.
     path: &'static str,
     what: &'static str,
-    /// A value that is accepted there, as JSON.
+    /// A valid value, as JSON.
     example: &'static str,
 }
 
 impl Key {
-    /// What to write.
+    /// What to write there.
     fn fix(&self) -> String {
         match self.path.rsplit('.').next().unwrap_or_default() {
             "[]" | "" => format!("write {}", self.what),

@@ -16,32 +16,31 @@ use crate::status::What;
 /// A checked bundle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bundle {
-    /// The folder it was read from; of the one inside the program a word for it.
+    /// The folder it was read from; for the bundle inside the program, a label.
     pub folder: PathBuf,
-    /// It is the one inside the program.
+    /// It is the bundle included in the program.
     pub inside: bool,
-    /// SHA-256 over the bytes of `policy.json` and the hashes of both graphs as it gives them,
-    /// encoder first; lower-case hexadecimal. Names in a recording what has run.
+    /// SHA-256 over the bytes of `policy.json` and the hashes of both graphs as stated in it, encoder first; lower-case
+    /// hexadecimal. Identifies in a recording the policy that ran.
     pub hash: String,
-    /// `name`: what the bundle calls itself.
+    /// `name` given in the bundle.
     pub name: String,
-    /// `mask_aware`: trained with modalities left out, so that it can run without one. One that
-    /// was not gains nothing from zeros in place of a missing modality.
+    /// `mask_aware`: trained with modalities left out, so that it can run without one. A policy that was not gains
+    /// nothing from zeros in place of a missing modality.
     pub mask_aware: bool,
-    /// `n_obs_steps`, To: observations a chunk is computed from, `1..=64`. Step i of To is tick
-    /// k - (To - 1) + i of the control grid.
+    /// `n_obs_steps`, To: observations from which a chunk is computed, `1..=64`. Step i of To is tick k - (To - 1) + i
+    /// of the control grid.
     pub n_obs_steps: usize,
     /// `horizon`, Tp: actions in a chunk, `1..=1024`.
     pub horizon: usize,
-    /// `n_action_steps`: actions executed before the next chunk is asked for,
-    /// `1..=horizon - action_start`.
+    /// `n_action_steps`: actions executed before the next chunk is requested, `1..=horizon - action_start`.
     pub n_action_steps: usize,
     /// `action_start`: the index in a chunk of the action of the tick of its last observation, below
     /// `horizon`. To - 1 in the original diffusion policy and in `LeRobot`, 0 in UMI.
     pub action_start: usize,
-    /// `control_hz`: ticks of the control grid a second, `0.1..=1000`.
+    /// `control_hz`: ticks of the control grid per second, `0.1..=1000`.
     pub control_hz: f64,
-    /// `max_observation_age_ms`: of an observation older than this no chunk is computed.
+    /// `max_observation_age_ms`: no chunk is computed from an observation older than this.
     pub max_observation_age: Duration,
     /// `observations`: at least one, keys unique, in the order of the file.
     pub observations: Vec<ObservationSpec>,
@@ -55,13 +54,12 @@ pub struct Bundle {
     pub encoder: GraphFile,
     /// `graphs.denoiser`.
     pub denoiser: GraphFile,
-    /// `training`: where the bundle comes from, free in form.
+    /// `training`: the origin of the bundle, in free form.
     pub training: serde_json::Value,
 }
 
 impl Bundle {
-    /// The event that it begins, on the onnxruntime called `library`.
-    #[must_use]
+    /// The event that announces its start, on the onnxruntime named `library`.
     pub fn begins(&self, library: String, dry_run: bool) -> What {
         What::Policy {
             policy: self.name.clone(),
@@ -81,15 +79,15 @@ pub struct ObservationSpec {
     pub key: String,
     /// `modality`: the name of the entry in `devices.toml`.
     pub modality: String,
-    /// `required`: without this modality the policy does not start, and holds when it leaves.
+    /// `required`: without this modality the policy does not start, and holds when it disappears.
     pub required: bool,
-    /// `kind` and what goes with it.
+    /// `kind` and its settings.
     pub input: ObservationInput,
     /// `normalization`, one entry per channel of a picture or per value of a vector.
     pub normalization: Normalization,
 }
 
-/// What kind of samples an observation is made of, and how.
+/// The kind of samples in an observation, and their processing.
 #[derive(Debug, Clone, PartialEq)]
 pub enum ObservationInput {
     /// `"image"`: f32 `[B, To, 3, height, width]`.
@@ -98,11 +96,11 @@ pub enum ObservationInput {
     Vector(VectorSpec),
 }
 
-/// How a picture becomes an observation: decoded to 8 bits in the order of `color`, divided by 255,
-/// resized, cropped, `operation`, normalised.
+/// The conversion of a picture to an observation: decoded to 8 bits in the order of `color`, divided by 255, resized,
+/// cropped, `operation`, normalised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageSpec {
-    /// `shape`: pixels after all of this, `1..=8192`. The channels are always 3.
+    /// `shape`: pixels after all these steps, `1..=8192`. There are always 3 channels.
     pub height: usize,
     /// See `height`.
     pub width: usize,
@@ -111,19 +109,18 @@ pub struct ImageSpec {
     /// `resize`: [height, width] to resize to, bilinear with half-pixel centres and no antialiasing.
     /// `None` leaves the device's size.
     pub resize: Option<[usize; 2]>,
-    /// `crop`: [height, width] of the middle to keep, after the resize. `None` keeps all.
+    /// `crop`: [height, width] of the centre to keep, after the resize. `None` keeps all.
     pub crop: Option<[usize; 2]>,
     /// `operation`.
     pub operation: Option<Operation>,
 }
 
-/// How a sample's numbers become an observation.
+/// The conversion of a sample's numbers to an observation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct VectorSpec {
-    /// `shape`: how many numbers, `1..=4096`.
+    /// `shape`: the number of values, `1..=4096`.
     pub len: usize,
-    /// `slice`: which of the sample's numbers, `len` of them. `None` is all, and the sample has
-    /// `len`.
+    /// `slice`: which numbers of the sample are used, `len` of them. `None` uses all, and the sample has `len`.
     pub slice: Option<Range<usize>>,
 }
 
@@ -133,11 +130,11 @@ pub struct VectorSpec {
 pub enum ColorOrder {
     /// Red first.
     Rgb,
-    /// Blue first, as `OpenCV` reads pictures.
+    /// Blue first, as `OpenCV` loads pictures.
     Bgr,
 }
 
-/// What is done to a picture before it is normalised.
+/// An operation on a picture before it is normalised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Operation {
@@ -176,20 +173,20 @@ pub enum Normalization {
     Identity,
 }
 
-/// `mask`: the encoder's mask input, f32 `[B, M]`, 1.0 for what is present. What an absent modality
-/// means is done inside the encoder: its embedding is replaced by zeros.
+/// `mask`: the encoder's mask input, f32 `[B, M]`, 1.0 for a present modality. The encoder itself handles absent
+/// modalities: it replaces their embeddings by zeros.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MaskSpec {
     /// `input`: the name of the encoder's input.
     pub input: String,
-    /// `order`: the modality of each element, each once, each one of an observation.
+    /// `order`: the modality of each element, each once and each belonging to an observation.
     pub order: Vec<String>,
 }
 
-/// `action`: what the denoiser's output means, once it is normalised back.
+/// `action`: the meaning of the denoiser's output after denormalisation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BundleAction {
-    /// `actuator`: the name of the entry in `devices.toml` that is moved.
+    /// `actuator`: the name of the actuator's entry in `devices.toml`.
     pub actuator: String,
     /// `names` of the values, Da of them. `shape` is `[Da]`, `1..=1024`.
     pub names: Vec<String>,
@@ -204,14 +201,12 @@ pub struct BundleAction {
 }
 
 impl BundleAction {
-    /// Values of one action, Da.
-    #[must_use]
+    /// Number of values of one action, Da.
     pub fn len(&self) -> usize {
         self.names.len()
     }
 
-    /// Never true of a checked bundle.
-    #[must_use]
+    /// Never true for a checked bundle.
     pub fn is_empty(&self) -> bool {
         self.names.is_empty()
     }
@@ -226,8 +221,8 @@ pub struct SliceNormalization {
     pub normalization: Normalization,
 }
 
-/// `scheduler`: the diffusion process the denoiser was trained with, in the words of the
-/// `diffusers` library, and how it is run backwards.
+/// `scheduler`: the diffusion process with which the denoiser was trained, in the terms of the `diffusers` library, and
+/// how it is reversed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SchedulerSpec {
@@ -242,29 +237,29 @@ pub struct SchedulerSpec {
     pub beta_schedule: BetaSchedule,
     /// First beta, `1e-6..=0.999`; not used by `squaredcos_cap_v2`.
     pub beta_start: f64,
-    /// Last beta, within the same and not below the first; not used by `squaredcos_cap_v2`.
+    /// Last beta, in the same range and not below the first; not used by `squaredcos_cap_v2`.
     pub beta_end: f64,
     /// What the denoiser predicts.
     #[serde(deserialize_with = "file::word")]
     pub prediction_type: PredictionType,
-    /// Is the predicted clean sample clipped?
+    /// Whether the predicted clean sample is clipped.
     pub clip_sample: bool,
-    /// To plus and minus this, above 0.
+    /// Clipped to plus and minus this, above 0.
     pub clip_sample_range: f32,
-    /// DDIM: is the last step's alpha 1 rather than that of timestep 0?
+    /// DDIM: whether the last step's alpha is 1 rather than that of timestep 0.
     pub set_alpha_to_one: bool,
     /// Added to every timestep with `leading` spacing.
     #[serde(deserialize_with = "file::whole::<_, 0, 10_000>")]
     pub steps_offset: usize,
-    /// Which timesteps are visited.
+    /// How the timesteps are spaced.
     #[serde(deserialize_with = "file::word")]
     pub timestep_spacing: TimestepSpacing,
-    /// How many are visited, `1..=num_train_timesteps`.
+    /// Number of denoising steps, `1..=num_train_timesteps`.
     #[serde(deserialize_with = "file::whole::<_, 1, 10_000>")]
     pub num_inference_steps: usize,
 }
 
-/// How a sample is taken from one timestep to the one before.
+/// How a sample is computed from one timestep to the previous one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum SchedulerKind {
     /// Deterministic (Song et al., "Denoising Diffusion Implicit Models", eta = 0).
@@ -285,7 +280,7 @@ pub enum BetaSchedule {
     SquaredcosCapV2,
     /// Betas evenly spaced.
     Linear,
-    /// Their roots evenly spaced.
+    /// Their square roots evenly spaced.
     ScaledLinear,
 }
 
@@ -301,13 +296,13 @@ pub enum PredictionType {
     VPrediction,
 }
 
-/// Which timesteps are visited.
+/// Spacing of the timesteps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TimestepSpacing {
-    /// From 0 up in strides of the integer T / n.
+    /// From 0 upwards in strides of the integer T / n.
     Leading,
-    /// From the last down in strides of T / n.
+    /// From the last downwards in strides of T / n.
     Trailing,
     /// From the first to the last.
     Linspace,
@@ -325,7 +320,7 @@ pub struct GraphFile {
     pub sha256: String,
 }
 
-/// Everything that is wrong with a bundle. Never empty.
+/// All mistakes of a bundle. Never empty.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", self.diagnostics.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
 pub struct BundleErrors {

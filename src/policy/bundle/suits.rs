@@ -1,4 +1,4 @@
-//! A bundle against the rig it is to run on, and against the inputs and outputs that its graphs declare.
+//! Compares a bundle with its rig, and with the inputs and outputs that its graphs declare.
 
 use std::fmt;
 
@@ -29,7 +29,7 @@ pub struct TensorShape {
     pub name: String,
     /// The type of its elements.
     pub element: Element,
-    /// Its dimensions; `None` is one that the graph leaves open.
+    /// Its dimensions; `None` is a dimension that the graph leaves open.
     pub dims: Vec<Option<u64>>,
 }
 
@@ -40,7 +40,7 @@ pub enum Element {
     F32,
     /// 64-bit signed integers.
     I64,
-    /// Any other, by a name for people: `f16`. No graph of a bundle has such inputs or outputs.
+    /// Any other, by a name for people: `f16`. No graph of a bundle may have such inputs or outputs.
     Other(String),
 }
 
@@ -56,10 +56,10 @@ impl fmt::Display for Element {
 
 /// What a tensor of a bundle's graph must be.
 struct Wanted<'a> {
-    /// Any name will do if there is none.
+    /// `None` accepts any name.
     name: Option<&'a str>,
     element: Element,
-    /// After the batch dimension; `None` is one that the file does not give.
+    /// Without the batch dimension; `None` is a dimension that the file does not specify.
     dims: Vec<Option<u64>>,
 }
 
@@ -74,7 +74,7 @@ impl<'a> Wanted<'a> {
         format!("{} [{}]", self.element, dims.collect::<Vec<_>>().join(", "))
     }
 
-    /// A batch of one must be possible; a dimension left open fits.
+    /// A batch of one must be possible; an open dimension matches.
     fn fits(&self, found: &TensorShape) -> bool {
         let batch = std::iter::once(Some(1));
         let wanted = batch.chain(self.dims.iter().copied());
@@ -85,10 +85,10 @@ impl<'a> Wanted<'a> {
 }
 
 impl Bundle {
-    /// Are all the modalities it observes in the registry, of the kind and size it expects?
+    /// Checks that all observed modalities are in the registry, with the expected kind and size.
     ///
     /// # Errors
-    /// Every observation that is not.
+    /// Every observation that does not match.
     pub fn check_registry(&self, registry: &Registry) -> Result<(), BundleErrors> {
         let mut problems = Problems::new(&self.label());
         let known: Vec<&str> = registry.devices.iter().map(|device| device.name.as_str()).collect();
@@ -128,10 +128,10 @@ impl Bundle {
         problems.check()
     }
 
-    /// Is what it moves among `actuators`, each with the number of values of an action?
+    /// Checks that its actuator is one of `actuators`, which are given with the number of values of an action.
     ///
     /// # Errors
-    /// When it is not, or its actions are of another length.
+    /// When it is not, or its actions have another length.
     pub fn check_actuators(&self, actuators: &[(&str, usize)]) -> Result<(), BundleErrors> {
         let mut problems = Problems::new(&self.label());
         let (wanted, len) = (self.action.actuator.as_str(), self.action.len());
@@ -158,8 +158,8 @@ impl Bundle {
         problems.check()
     }
 
-    /// Are the graphs' inputs and outputs those that this bundle describes? The batch dimension is
-    /// open or 1; the length of `global_cond` is the graphs' own affair, if they agree on it.
+    /// Checks that the graphs' inputs and outputs are those that this bundle describes. The batch dimension is open or
+    /// 1; any length of `global_cond` is accepted if the graphs agree on it.
     ///
     /// # Errors
     /// Every input and output that is missing, superfluous, or of another type or shape.
@@ -197,7 +197,7 @@ impl Bundle {
     }
 }
 
-/// Notes where the inputs or outputs (`what`) of a graph are not those `wanted`.
+/// Reports where the inputs or outputs (`what`) of a graph differ from those `wanted`.
 fn compare(graph: Graph, shape: &GraphShape, what: &str, wanted: &[Wanted], problems: &mut Problems) {
     let entry = format!("graphs.{}", graph.key());
     let (name, found) = (&shape.name, if what == "input" { &shape.inputs } else { &shape.outputs });
@@ -225,7 +225,7 @@ fn compare(graph: Graph, shape: &GraphShape, what: &str, wanted: &[Wanted], prob
     }
     let superfluous =
         |tensor: &&TensorShape| wanted.iter().all(|wanted| wanted.name.is_some_and(|name| name != tensor.name));
-    // Under any name, the one output of a denoiser is the first.
+    // The only output of a denoiser is the first one, whatever its name.
     let unnamed = usize::from(wanted.iter().any(|wanted| wanted.name.is_none()));
     let others = found.iter().skip(unnamed).filter(|tensor| unnamed == 1 || superfluous(tensor));
     for tensor in others {
@@ -239,7 +239,7 @@ fn shown(dim: Option<u64>) -> String {
 }
 
 fn picture(entry: &str, name: &str, image: &ImageSpec, shape: &[u32], problems: &mut Problems) {
-    // Resized, any size will do.
+    // If it is resized, any size is accepted.
     let (None, [height, width]) = (image.resize, shape) else { return };
     let (height, width) = (*height as usize, *width as usize);
     let wanted = image.crop.unwrap_or([image.height, image.width]);

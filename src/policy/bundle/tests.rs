@@ -1,11 +1,11 @@
-//! A bundle against its files, its rig and its graphs. The contents of the file are tested in
+//! Compares a bundle with its files, its rig and its graphs. The contents of the file are tested in
 //! `tests/library/bundle.rs`.
 
 use super::example::{POLICY, write, write_changed};
 use super::*;
 use crate::registry::Registry;
 
-/// Models as small as can be: `ModelProto` with a version and nothing else.
+/// The smallest possible models: `ModelProto` with only a version.
 const ONE: &[u8] = &[8, 1];
 const TWO: &[u8] = &[8, 2];
 
@@ -38,7 +38,7 @@ fn the_hash_depends_on_the_file_and_on_the_graphs() {
 }
 
 #[test]
-fn graphs_that_are_not_those_of_the_file_are_refused() {
+fn graphs_that_differ_from_those_of_the_file_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let bundle = write(folder.path(), ONE, TWO);
     std::fs::write(folder.path().join("encoder.onnx"), b"One").unwrap();
@@ -48,7 +48,7 @@ fn graphs_that_are_not_those_of_the_file_are_refused() {
     assert!(errors[0].contains("[graphs.encoder] encoder.onnx has the SHA-256 "), "{}", errors[0]);
     assert!(errors[1].contains("[graphs.denoiser] denoiser.onnx cannot be read: No such file"), "{}", errors[1]);
     assert_eq!(problems(bundle.read_graph(Graph::Encoder)).len(), 1, "changed after it was loaded");
-    // Only files are read: a pipe would have us wait.
+    // Only regular files are read: a pipe would block.
     std::fs::create_dir(folder.path().join("denoiser.onnx")).unwrap();
     assert!(problems(Bundle::load(folder.path()))[1].contains("it is not a file"));
 }
@@ -61,7 +61,7 @@ fn a_folder_without_a_bundle_is_an_error_with_its_fix() {
     assert!(errors[0].contains("fix: name the folder of a policy bundle"), "{}", errors[0]);
 }
 
-/// The rig of the example; `cam` and `arm` are what follows in those entries.
+/// The rig of the example; `cam` and `arm` are appended to those entries.
 fn registry(cam: &str, arm: &str) -> Registry {
     let text = format!(
         "[device.cam_wrist]\nvid = \"1\"\npid = \"1\"\nnode = \"camera\"\n[device.cam_wrist.camera]\n{cam}\n\
@@ -76,9 +76,9 @@ const CAM: &str = "width = 96\nheight = 96";
 const ARM: &str = "node = \"serial\"\n[device.arm.tty]\nchannels = 4";
 
 #[test]
-fn a_rig_with_all_of_it_is_accepted() {
+fn a_matching_rig_is_accepted() {
     bundle().check_registry(&registry(CAM, ARM)).unwrap();
-    // More numbers than the slice wants, and a picture that is resized or cropped, will do.
+    // More numbers than the slice needs, and a picture that is resized or cropped, are accepted.
     let mut resized = bundle();
     let ObservationInput::Image(image) = &mut resized.observations[0].input else { panic!("an image") };
     image.resize = Some([96, 96]);
@@ -125,7 +125,7 @@ fn every_difference_from_the_rig_is_reported() {
 }
 
 #[test]
-fn the_actuator_must_be_there_and_take_as_many_values() {
+fn the_actuator_must_exist_and_take_the_same_number_of_values() {
     bundle().check_actuators(&[("other", 2), ("arm", 4)]).unwrap();
     let one = |actuators| problems(bundle().check_actuators(actuators)).remove(0);
     assert!(one(&[("arm", 6)]).starts_with("[action] has 4 values, but \"arm\" takes 6"));
@@ -134,7 +134,7 @@ fn the_actuator_must_be_there_and_take_as_many_values() {
 }
 
 fn tensor(name: &str, element: Element, dims: &[u64]) -> TensorShape {
-    // 0 stands for an open dimension.
+    // 0 represents an open dimension.
     let dims = dims.iter().map(|dim| (*dim > 0).then_some(*dim)).collect();
     TensorShape { name: name.to_owned(), element, dims }
 }

@@ -1,4 +1,4 @@
-//! The text of `policy.json` to a [`Bundle`]: what the types cannot express is checked here, such as lengths that must agree.
+//! Converts the text of `policy.json` to a [`Bundle`], and checks what types cannot express, such as matching lengths.
 
 use std::ops::{Range, RangeInclusive};
 use std::path::PathBuf;
@@ -21,10 +21,10 @@ use crate::registry::did_you_mean;
 const FORMAT: &str = "rapid-policy/1";
 /// Channels of every picture.
 const CHANNELS: usize = 3;
-/// Smaller ones are lost in a 32-bit float's 1 - beta.
+/// Smaller ones are lost in the 1 - beta of a 32-bit float.
 const BETAS: RangeInclusive<f64> = 1e-6..=0.999;
 
-/// Reads `text`; `file` is how it is named in messages. The folder and the hash are the caller's.
+/// Parses `text`; messages name it `file`. The caller sets the folder and the hash.
 pub(super) fn parse(text: &str, file: &str) -> Result<Bundle, BundleErrors> {
     let mut problems = Problems::new(file);
     let bundle = match serde_json::from_str(text) {
@@ -35,7 +35,7 @@ pub(super) fn parse(text: &str, file: &str) -> Result<Bundle, BundleErrors> {
         }
     };
     if bundle.is_none() {
-        // Of what is not there the reason has been reported; should it not have been, this is it.
+        // The cause of a missing part has been reported; if it has not, this is the report.
         problems.report_first("cannot be read", "compare it with the description of the format");
     }
     problems.check()?;
@@ -55,7 +55,7 @@ fn report_syntax(text: &str, error: &serde_json::Error, problems: &mut Problems)
 }
 
 fn root(value: &Value, problems: &mut Problems) -> Option<Bundle> {
-    // Of another format nothing else is known.
+    // Nothing is known about other formats.
     if let Some(format) = value.get("format").filter(|format| *format != FORMAT) {
         let fix = format!("this program reads \"{FORMAT}\": export the bundle for it");
         problems.report("format", format!("is {format}"), fix);
@@ -197,13 +197,13 @@ fn check_image(entry: &str, file: &ImageFile, problems: &mut Problems) -> ImageS
 fn check_vector(entry: &str, file: &VectorFile, problems: &mut Problems) -> VectorSpec {
     let len = file.shape[0].get();
     if let Some(slice) = file.slice.as_ref().filter(|slice| slice.len() != len) {
-        let message = format!("[{}, {}] holds {} numbers, shape says {len}", slice.start, slice.end, slice.len());
+        let message = format!("[{}, {}] holds {} numbers, shape has {len}", slice.start, slice.end, slice.len());
         problems.wrong(&format!("{entry}.slice"), message);
     }
     VectorSpec { len, slice: file.slice.clone() }
 }
 
-/// A normalisation of `len` dimensions, if their number is known.
+/// A normalisation of `len` dimensions, if that is known.
 fn normalization(entry: &str, value: &Value, len: Option<usize>, problems: &mut Problems) -> Option<Normalization> {
     let found = read_tagged(entry, "mode", value, problems)?;
     let place = |name: &str| format!("{entry}.{name}");
@@ -258,7 +258,7 @@ fn check_mask(mask: MaskFile, problems: &mut Problems) -> MaskSpec {
     MaskSpec { input: mask.input, order: mask.order }
 }
 
-/// The mask must be about the modalities that are observed.
+/// The mask must cover the observed modalities.
 fn check_mask_fits(
     observations: &[ObservationSpec],
     mask: Option<&MaskSpec>,
@@ -319,7 +319,7 @@ fn slices(list: &[Value], len: usize, problems: &mut Problems) -> Option<Vec<Sli
     let entry = "action.normalization";
     let read = |(at, value)| sliced(&format!("{entry}[{at}]"), value, problems);
     let found: Vec<Option<SliceNormalization>> = list.iter().enumerate().map(read).collect();
-    // Which values one covers that could not be read is not known.
+    // The range of a slice that could not be read is unknown.
     let mut found: Vec<SliceNormalization> = found.into_iter().collect::<Option<_>>()?;
     for end in found.iter().map(|part| part.slice.end).filter(|end| *end > len) {
         problems.wrong(entry, format!("covers values up to {end}, but an action has {len}"));

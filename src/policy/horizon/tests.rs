@@ -59,7 +59,7 @@ fn lockstep(queue: &mut ActionQueue, tick: u64, situation: Situation) -> Result<
 }
 
 #[test]
-fn answered_at_once_every_chunk_is_executed_for_n_action_steps() {
+fn with_immediate_answers_every_chunk_is_executed_for_n_action_steps() {
     let mut queue = queue();
     let values: Vec<f32> = (0..7).map(|tick| lockstep(&mut queue, tick, FRESH).unwrap()).collect();
     assert_eq!(values, [1.0, 2.0, 3.0, 301.0, 302.0, 303.0, 601.0]);
@@ -68,7 +68,7 @@ fn answered_at_once_every_chunk_is_executed_for_n_action_steps() {
 }
 
 #[test]
-fn the_old_chunk_bridges_the_time_until_the_new_one_is_there() {
+fn the_old_chunk_bridges_the_time_until_the_new_one_arrives() {
     let mut queue = queue();
     assert!(queue.wants_observation(0, FRESH));
     assert_eq!(at(&mut queue, 0, FRESH), Err(HoldReason::Waiting));
@@ -120,7 +120,7 @@ fn a_chunk_of_another_length_or_tick_is_not_used() {
 }
 
 #[test]
-fn a_request_that_fails_is_made_again() {
+fn a_failed_request_is_repeated() {
     let mut queue = queue();
     assert!(queue.wants_observation(0, FRESH));
     queue.failed(1);
@@ -132,7 +132,7 @@ fn a_request_that_fails_is_made_again() {
 }
 
 #[test]
-fn a_chunk_of_which_no_action_is_left_is_dropped() {
+fn a_chunk_without_remaining_actions_is_dropped() {
     let mut queue = queue();
     assert!(queue.wants_observation(0, FRESH));
     for tick in 0..5 {
@@ -251,7 +251,7 @@ fn a_policy_that_is_not_mask_aware_holds_unless_configured_to_continue() {
 }
 
 #[test]
-fn the_longest_ticks_do_no_harm() {
+fn the_highest_tick_numbers_cause_no_overflow() {
     let mut queue = queue();
     lockstep(&mut queue, 0, FRESH).unwrap();
     assert!(queue.wants_observation(u64::MAX, FRESH));

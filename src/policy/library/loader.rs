@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_machine_lacks_is_named_with_its_package() {
+    fn a_missing_library_is_named_with_its_package() {
         let shown = |text: &str| cause(text).to_string();
         let none = ": cannot open shared object file: No such file or directory";
         assert_eq!(

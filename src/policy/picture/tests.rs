@@ -88,7 +88,7 @@ proptest! {
     }
 
     #[test]
-    fn damaged_pictures_are_refused_or_shown_and_nothing_panics(
+    fn damaged_pictures_are_refused_or_decoded_without_a_panic(
         places in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..20),
         cut in any::<prop::sample::Index>(),
     ) {
@@ -109,7 +109,7 @@ proptest! {
 }
 
 #[test]
-fn channels_come_one_after_the_other_in_the_order_of_the_bundle() {
+fn channels_are_planar_in_the_order_of_the_bundle() {
     // Red, green, blue, white; a JPEG of large even patches keeps their colours.
     let patches = [[250, 10, 20], [10, 250, 20], [20, 10, 250], [255, 255, 255]];
     let (size, mut pixels) = ([64, 64], Vec::new());
@@ -210,7 +210,7 @@ fn unsuitable_pictures_are_refused_with_their_reason() {
 }
 
 #[test]
-fn a_picture_that_ends_early_is_not_filled_up_with_grey() {
+fn a_truncated_picture_is_not_padded_with_grey() {
     let pixels: Vec<u8> = (0..3 * 64 * 64).map(|at| u8::try_from(at * 31 % 253).unwrap()).collect();
     let whole = jpeg(&pixels, [64, 64]);
     let mut preprocessor = identity(ImageSpec { resize: Some([2, 2]), ..PLAIN });

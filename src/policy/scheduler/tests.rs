@@ -125,7 +125,7 @@ fn unsupported_schedulers_are_rejected() {
 }
 
 #[test]
-fn every_number_of_steps_falls_through_timesteps_that_exist() {
+fn every_number_of_steps_descends_through_existing_timesteps() {
     for spacing in [TimestepSpacing::Leading, TimestepSpacing::Trailing, TimestepSpacing::Linspace] {
         for kind in [SchedulerKind::Ddim, SchedulerKind::Ddpm] {
             for steps in 1..=100 {

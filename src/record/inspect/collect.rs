@@ -1,12 +1,13 @@
-//! Gathering an [`Inspection`] from the records of a file, in the order they lie in it.
+//! Collects an [`Inspection`] from the records of a file, in file order.
 //!
-//! Invariant: memory is bounded, whatever the file holds; what is not kept and would be judged is counted, and is a reason.
+//! Invariant: memory is bounded, whatever the file holds; facts that are dropped and would be judged are counted, and
+//! are a reason.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use super::super::metadata::{CONFIGURATION, POLICY};
-use super::super::quality::Tally;
+use super::super::quality::DurationHistogram;
 use super::super::verdict::Missing;
 use super::judge::{Ending, Judge, Numbers, without_metadata};
 use super::policy::Gathered;
@@ -86,7 +87,7 @@ impl Collected {
         match name {
             ABOUT => {
                 self.counted.abouts += 1;
-                // Of two the first: it was there when the episode began.
+                // The first of two: it was written when the episode began.
                 if self.counted.abouts == 1 {
                     self.judge = Judge::of(&map);
                     self.about = map;
@@ -195,7 +196,7 @@ impl Collected {
         }
     }
 
-    /// What was gathered, as a report on the file at `path`.
+    /// The report on the file at `path`.
     pub(super) fn report(mut self, path: &Path, size: u64, integrity: Integrity, failed: Option<Failed>) -> Inspection {
         let recorded = failed.as_ref().map_or(size, |failed| failed.at);
         let failed = failed.map(|failed| failed.why).or_else(|| self.recovered.get(FAILED).cloned());
@@ -228,7 +229,7 @@ impl Collected {
         let ending = Ending { file: integrity, seconds, about, summary, repaired, failed, damage, counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
-            // What is damaged and has no name of its writer may be an episode.
+            // A damaged file without the name of its writer may be an episode.
             None if !is_ours && (integrity.sound || integrity.writer == Writer::Another) => Judgement::NotOurs,
             None => Judgement::Episode(without_metadata(&ending)),
         };
@@ -326,7 +327,7 @@ fn from(begin_ns: u64, at_ns: u64) -> f64 {
     if at_ns < begin_ns { -distance } else { distance }
 }
 
-/// The modules and the modalities that were there when the episode began.
+/// The modules and the modalities that were present when the episode began.
 fn configured(about: &BTreeMap<String, String>) -> (Vec<String>, Option<BTreeSet<String>>) {
     #[derive(serde::Deserialize)]
     struct Configuration {
@@ -342,7 +343,7 @@ fn configured(about: &BTreeMap<String, String>) -> (Vec<String>, Option<BTreeSet
     (Vec::new(), serials.map(|serials| serials.into_keys().collect()))
 }
 
-/// A channel and what came on it; memory is fixed, however many messages there are.
+/// A channel and its statistics; memory is fixed, however many messages there are.
 #[derive(Debug, Default)]
 struct TopicCounter {
     topic: String,
@@ -356,7 +357,7 @@ struct TopicCounter {
     longest_gap: u64,
     numbers: Numbers,
     /// Receipt minus capture. Absent without messages: a file may define thousands of channels.
-    lateness: Option<Tally>,
+    lateness: Option<DurationHistogram>,
 }
 
 impl TopicCounter {
@@ -376,7 +377,7 @@ impl TopicCounter {
         self.previous = captured;
         self.first = self.first.min(captured);
         self.latest = self.latest.max(captured);
-        self.lateness.get_or_insert_with(Tally::default).push(received.saturating_sub(captured));
+        self.lateness.get_or_insert_with(DurationHistogram::default).push(received.saturating_sub(captured));
     }
 
     fn report(&self) -> TopicReport {
@@ -396,8 +397,8 @@ impl TopicCounter {
 }
 
 impl Lateness {
-    /// Of the times of a tally; `None` without any.
-    pub(super) fn of(times: &Tally) -> Option<Self> {
+    /// Of some durations; `None` without any.
+    pub(super) fn of(times: &DurationHistogram) -> Option<Self> {
         times.spread().map(|spread| Self { p50: spread.p50, p99: spread.p99, max: spread.max })
     }
 }

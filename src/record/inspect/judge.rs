@@ -1,11 +1,11 @@
-//! The verdict on a file, by what it holds.
+//! The verdict on a file, by its content.
 //!
-//! What the file does not hold is taken from the recorder's summary where there is one: which of the
-//! missing samples the device lost, which samples the driver called damaged, and what the recorder found.
+//! Facts that the file does not hold come from the recorder's summary, if there is one: which of the missing samples
+//! the device lost, which samples the driver called damaged, and the recorder's findings.
 //!
 //! GOOD is earned. The file is finished, every byte of it is under a check value that is there and right, its
 //! metadata `rapid` and `rapid/summary` were read, the registry in it was understood, what the recorder counted is in
-//! it, and no check of `record::verdict` speaks against it. Whatever of this is missing is a reason.
+//! it, and no check of `record::verdict` objects to it. Anything missing is a reason.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -30,10 +30,10 @@ use crate::status::{Grade, Verdict};
 
 /// No registry is longer; the text of a hostile file may be.
 const LONGEST_REGISTRY: usize = 1 << 20;
-/// Patience with a modality that the registry gives none.
+/// Patience with a modality without one in the registry.
 const STALL_AFTER: Duration = Duration::from_millis(500);
 
-/// How a file came to its end.
+/// How a file ended.
 #[derive(Debug)]
 pub(super) struct Ending<'a> {
     /// What was found in it.
@@ -44,7 +44,7 @@ pub(super) struct Ending<'a> {
     pub(super) about: &'a BTreeMap<String, String>,
     /// The recorder's summary; empty without one.
     pub(super) summary: &'a BTreeMap<String, String>,
-    /// It was made of one that was not whole: the reason.
+    /// It was repaired from one that was not whole: the reason.
     pub(super) repaired: Option<&'a str>,
     /// Why its recorder called it BAD after it had written its summary, or without one.
     pub(super) failed: Option<&'a str>,
@@ -77,9 +77,9 @@ pub(super) struct Judge {
     begin_ns: u64,
     /// The registered modalities, ascending by bit.
     modalities: Vec<Measured>,
-    /// The limits are not those of the registry in the file, which is not understood.
+    /// The registry in the file is not understood: the limits are not its own.
     usual_limits: bool,
-    /// Names of the modalities that every episode has to have.
+    /// Names of the modalities that every episode must have.
     expect: Vec<String>,
     /// Next number of each modality, and how many are missing.
     numbers: Vec<Numbers>,
@@ -111,7 +111,7 @@ impl Judge {
         Some(judge)
     }
 
-    /// Takes that a device was plugged in, or out.
+    /// Records that a device was plugged in or out.
     pub(super) fn plugged(&mut self, device: &str, at_ns: u64, there: bool) {
         if let Some(known) = self.modalities.iter().find(|known| known.name == device) {
             self.measures.plugged(known.id, at_ns, there);
@@ -177,7 +177,7 @@ impl Judge {
             .iter()
             .map(|(known, quality)| Judged { name: &known.name, quality, limits: known.limits })
             .collect();
-        // Of a file that lacks something the recorder did not count all that is missing.
+        // The recorder's count does not include later losses of the file.
         let is_complete = counted.count("messages") == Some(ending.counted.messages) && ending.repaired.is_none();
         let count = |key: &str, numbers: u64| {
             let recorded = counted.count(key);
@@ -205,7 +205,7 @@ impl Judge {
         judge(&facts)
     }
 
-    /// What a modality was like: what the file holds, and what the recorder alone could count.
+    /// The quality of a modality: what the file holds, and what only the recorder could count.
     fn quality(&self, known: &Measured, counted: &Recorded<'_>, end_ns: u64) -> Option<Quality> {
         let id = known.id;
         let mut quality = self.measures.quality(id, end_ns)?;
@@ -223,7 +223,7 @@ impl Judge {
         Some(quality)
     }
 
-    /// What of the file could not be judged.
+    /// The parts of the file that could not be judged.
     fn not_judged(&self, channels: &[ModalityReport], ending: &Ending<'_>) -> Vec<String> {
         let mut findings = Vec::new();
         if self.usual_limits {
@@ -275,7 +275,7 @@ impl<'a> Recorded<'a> {
         self.modalities.as_ref()?.get(modality)?.get(key)?.as_u64()
     }
 
-    /// In what a finished file is not what its recorder counted.
+    /// How a finished file differs from the recorder's counts.
     fn differences(&self, qualities: &[(&Measured, Quality)], ending: &Ending<'_>) -> Vec<String> {
         // Without a summary the file is not whole, and that which a repair wrote counts what is there: it has no verdict.
         if self.summary.is_empty() || ending.repaired.is_some() && !self.summary.contains_key("verdict") {
@@ -324,7 +324,7 @@ impl<'a> Recorded<'a> {
 fn registered(about: &BTreeMap<String, String>) -> Option<(Vec<Measured>, Vec<String>)> {
     let text = about.get("registry").filter(|text| text.len() <= LONGEST_REGISTRY)?;
     let registry = Registry::parse(text, None).ok()?.registry;
-    // Nothing is reserved: how large payloads are, a file is not believed.
+    // Nothing is reserved: payload sizes stated in a file are not trusted.
     Some((Measured::all(&registry), registry.rig.expect))
 }
 

@@ -17,7 +17,7 @@ pub struct Listed {
     /// The file.
     #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
-    /// What it is worth.
+    /// The verdict.
     #[serde(flatten)]
     pub verdict: Judgement,
     /// Length in seconds.
@@ -70,7 +70,6 @@ fn is_episode(path: &Path) -> bool {
 }
 
 /// One episode of a list.
-#[must_use]
 pub fn list(file: &Path) -> Listed {
     match inspect(file) {
         Ok(Inspection { file, bytes, end, verdict, task, seconds, messages, .. }) => {
@@ -95,7 +94,6 @@ pub fn list(file: &Path) -> Listed {
 }
 
 /// The episode, called `name`, in a line without its end; `columns` are those of the longest name.
-#[must_use]
 pub fn render_list(listed: &Listed, name: &str, columns: usize, paint: Paint) -> String {
     let name = text::left(&clean(name), columns, "...");
     let (word, shade) = match &listed.verdict {

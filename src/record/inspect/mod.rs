@@ -1,10 +1,9 @@
-//! What a recorded file holds: counts, rates, gaps, lateness and presence of every modality, and the
-//! verdict on it, by the same code as the recorder's. Every command that has to know what an episode is worth
-//! asks [`inspect`].
+//! The report on a recorded file: counts, rates, gaps, lateness and presence of every modality, and the verdict on it,
+//! by the recorder's code. Every command that needs the verdict on an episode calls [`inspect`].
 //!
 //! Reads any file the recorder wrote, finished or not, from its beginning to where it ends.
 //!
-//! Invariant: GOOD is proven: see [`judge`]. What cannot be read or judged is never GOOD.
+//! Invariant: GOOD is proven: see `judge`. What cannot be read or judged is never GOOD.
 //! Invariant: no file makes this panic, and memory does not grow with what it holds.
 
 mod collect;
@@ -49,16 +48,16 @@ pub struct Inspection {
     pub bytes: u64,
     /// How it ends.
     pub end: FileEnd,
-    /// What it is worth, by what it holds.
+    /// The verdict, by its content.
     #[serde(flatten)]
     pub verdict: Judgement,
     /// The recorder's verdict when it finished the file.
     pub recorded_verdict: Option<Verdict>,
     /// Bytes of it that could not be understood.
     pub unread_bytes: u64,
-    /// Chunks whose content is not what was written; nothing of them is counted below.
+    /// Chunks with a wrong check value; nothing of them is counted below.
     pub damaged_chunks: u64,
-    /// What else of the file is left out.
+    /// Other parts of the file that are left out.
     #[serde(flatten)]
     pub left_out: LeftOut,
     /// Messages of a chunk that the end of the file cuts, taken without a check value because they were written since this
@@ -106,7 +105,7 @@ pub struct Inspection {
     pub modalities: Vec<ModalityReport>,
     /// By modality, the unit behind each epoch and what was agreed with it, as recorded.
     pub units: BTreeMap<String, Vec<serde_json::Value>>,
-    /// What the policy did that was at the controls, if one was.
+    /// What the policy in control did, if there was one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub policy: Option<PolicyReport>,
     /// The other topics.
@@ -190,7 +189,7 @@ pub struct EventReport {
     pub text: String,
 }
 
-/// What a file is worth. As JSON `verdict`, which is `null` without one, `reasons` and `sensors`.
+/// The judgement of a file. As JSON `verdict`, which is `null` without one, `reasons` and `sensors`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Judgement {
     /// It is an episode.
@@ -203,7 +202,6 @@ pub enum Judgement {
 
 impl Judgement {
     /// The verdict, if there is one.
-    #[must_use]
     pub fn verdict(&self) -> Option<&Verdict> {
         match self {
             Self::Episode(verdict) => Some(verdict),
@@ -212,13 +210,11 @@ impl Judgement {
     }
 
     /// Its word, if there is one.
-    #[must_use]
     pub fn grade(&self) -> Option<Grade> {
         self.verdict().map(|verdict| verdict.grade)
     }
 
     /// Why it is not GOOD, or has no verdict.
-    #[must_use]
     pub fn reasons(&self) -> Vec<&str> {
         match self {
             Self::Episode(verdict) => verdict.reasons.iter().map(String::as_str).collect(),
@@ -244,14 +240,13 @@ impl Serialize for Judgement {
 /// Reads a file and reports what it holds.
 ///
 /// # Errors
-/// When it cannot be read or is no MCAP file. An unfinished or damaged one is no error.
+/// When it cannot be read or is not an MCAP file. An unfinished or damaged one is not an error.
 pub fn inspect(path: &Path) -> Result<Inspection, ReadError> {
     let (file, size) = episode::open(path)?;
     inspect_from(file, size, path, episode::boot_id())
 }
 
 /// What a file of these bytes, which may be any, holds; `None` if they are no MCAP file.
-#[must_use]
 pub fn inspect_bytes(bytes: &[u8]) -> Option<Inspection> {
     inspect_from(bytes, bytes.len() as u64, Path::new("bytes.mcap"), None).ok()
 }

@@ -1,14 +1,14 @@
 //! What a policy did in an episode, by its events.
 //!
 //! Invariant: memory is bounded: texts are those of events, which are short, and of few reasons.
-//! Invariant: no text of a file makes this panic; what is not as the recorder writes it is left out.
+//! Invariant: no text of a file causes a panic; data in an unexpected format is omitted.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 use serde_json::Value;
 
-use super::super::quality::Tally;
+use super::super::quality::DurationHistogram;
 use super::Lateness;
 use crate::text;
 
@@ -59,7 +59,7 @@ pub(super) struct Gathered {
     late: u64,
     /// From the observation to the chunk, microseconds: of the first [`MAX_LATENCIES`] chunks, and of all.
     latencies: Vec<u32>,
-    all_latencies: Option<Tally>,
+    all_latencies: Option<DurationHistogram>,
     chunks: u64,
     /// How often each reason, and how long together, ns.
     holds: BTreeMap<String, (u64, u64)>,
@@ -98,7 +98,7 @@ impl Gathered {
         if self.latencies.len() < MAX_LATENCIES {
             self.latencies.push(us);
         }
-        self.all_latencies.get_or_insert_with(Tally::default).push(u64::from(us) * 1000);
+        self.all_latencies.get_or_insert_with(DurationHistogram::default).push(u64::from(us) * 1000);
         self.chunks += 1;
         self.late += u64::from(answer.get("skipped").and_then(Value::as_u64).is_some_and(|skipped| skipped > 0));
     }

@@ -24,7 +24,6 @@ const EVENTS: usize = 40;
 const TIMELINE: usize = 10;
 
 /// The report in lines of at most `width` characters, as far as names allow.
-#[must_use]
 pub fn render(inspection: &Inspection, width: usize, paint: Paint) -> String {
     let mut out = String::new();
     // Writing to a string cannot fail.
@@ -170,7 +169,7 @@ fn write_verdict(out: &mut String, inspection: &Inspection, paint: Paint) -> std
     if verdict.sensors.is_some() {
         write!(line, "   {}", clean(&verdict.sensors()))?;
     }
-    if let Some(recorded) = inspection.recorded_verdict.as_ref().filter(|recorded| !recorded.says_as(verdict)) {
+    if let Some(recorded) = inspection.recorded_verdict.as_ref().filter(|recorded| !recorded.agrees_with(verdict)) {
         let other = colour(paint, grade_colour(Some(recorded.grade)), recorded.grade.word());
         write!(line, "   when it was recorded: {other} {}", clean(&recorded.why()))?;
     }

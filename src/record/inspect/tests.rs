@@ -138,7 +138,7 @@ async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
             actions: vec![0.5; 4],
         }))
     };
-    // Announced before the episode: its name and hash are in the metadata all the same.
+    // Announced before the episode: its name and hash are still in the metadata.
     let file = bench
         .half_a_second(
             vec![announced],
@@ -208,7 +208,7 @@ fn chunks_of_other_writers_are_opened_and_their_damage_survived() {
 }
 
 #[test]
-fn other_files_are_reported_as_no_mcap_file() {
+fn other_files_are_reported_as_not_mcap() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.mcap");
     assert!(matches!(inspect(&path), Err(ReadError::Io { .. })));
@@ -327,7 +327,7 @@ fn the_report_on_a_screen() {
 }
 
 #[tokio::test]
-async fn a_folder_is_a_line_for_each_of_its_episodes() {
+async fn a_folder_is_listed_with_one_line_per_episode() {
     let (bench, file) = episode().await;
     let folder = file.parent().unwrap();
     std::fs::write(folder.join("20231114_t_001.mcap"), "no").unwrap();
@@ -359,7 +359,7 @@ async fn a_folder_is_a_line_for_each_of_its_episodes() {
     let why = "not an MCAP file";
     assert_eq!((&json["verdict"], &json["error"]), (&serde_json::Value::Null, &why.into()));
     assert_eq!(json["reasons"], serde_json::json!([why]));
-    assert!(matches!(episodes(&[folder.join("none")]).map(|files| files.len()), Ok(1)), "said when it is read");
+    assert!(matches!(episodes(&[folder.join("none")]).map(|files| files.len()), Ok(1)), "reported when it is read");
     drop(bench);
 }
 

@@ -1,6 +1,6 @@
 //! The units that an episode's samples come from, by its file.
 //!
-//! Invariant: no text of a file makes this panic; what is not as the recorder writes it is left out.
+//! Invariant: no text of a file causes a panic; data in an unexpected format is omitted.
 
 use std::collections::BTreeMap;
 
@@ -9,8 +9,8 @@ use serde_json::Value;
 /// The epochs of each modality, in the order of time.
 pub(super) type Units = BTreeMap<String, Vec<Value>>;
 
-/// From the summary; in a file without one, from the record at its beginning and the events
-/// `opened`, which came `at` so many seconds after the beginning.
+/// From the summary; in a file without one, from the record at its beginning and the events `opened`, each with its
+/// time in seconds after the beginning.
 pub(super) fn reported(summary: &str, beginning: &str, opened: Vec<(f64, String)>) -> Units {
     if let Ok(units) = serde_json::from_str(summary) {
         return units;
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_epoch_is_a_line_without_its_unknown_fields() {
+    fn the_line_of_an_epoch_omits_unknown_fields() {
         let full = json!({
             "epoch": 2, "from_s": 6.21, "to_s": 9.0, "vid": "046d", "pid": "0825", "serial": "A", "port": "1-2",
             "firmware": "4.18", "driver": {"name": "uvcvideo", "version": "6.1.0"},

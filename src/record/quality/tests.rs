@@ -46,7 +46,7 @@ fn quality_at(measures: &Measures, end_ms: u64) -> Quality {
 }
 
 #[test]
-fn a_picture_is_whole_when_it_begins_and_ends_as_one() {
+fn a_picture_is_whole_if_it_begins_and_ends_with_the_jpeg_markers() {
     for (payload, whole) in [
         (&b"\xff\xd8\xff\xd9"[..], true),
         (b"\xff\xd8 picture \xff\xd9", true),
@@ -122,7 +122,7 @@ fn plugged_time_comes_from_events_and_opening_is_its_longest_part_outside_the_ma
 #[test]
 fn a_non_increasing_number_or_time_is_a_duplicate() {
     let mut measures = measures(ModalityKind::Scalars);
-    // A new number at an old time, an old number at a new time; a restarted publisher is none.
+    // A new number at an old time, an old number at a new time; a restarted publisher is neither.
     for (seq, at, duplicates) in [(7, 10, 0), (8, 20, 0), (9, 20, 1), (9, 30, 2), (10, 25, 3), (0, 40, 3), (1, 50, 3)] {
         measures.sample(id(0), &seen(seq, at, 1, b""));
         assert_eq!(quality_at(&measures, 100).duplicates, duplicates, "{seq} at {at} ms");
@@ -160,7 +160,7 @@ fn late_samples_miss_the_deadline_of_the_nearest_tick() {
 
 /// A frame waits for the samples of its window; those between the windows of a slow grid are in none.
 #[test]
-fn a_sample_that_no_frame_waits_for_has_the_time_that_a_frame_would_give_it() {
+fn a_sample_between_frame_windows_has_its_own_deadline() {
     for hz in [0.1, 1.0, 4.0, 10.0] {
         for at in (0..1000).step_by(7) {
             for (late_by, late) in [(2, 0), (99, 0), (200, 1)] {
@@ -173,7 +173,7 @@ fn a_sample_that_no_frame_waits_for_has_the_time_that_a_frame_would_give_it() {
 }
 
 #[test]
-fn an_absence_is_no_gap_and_no_loss_of_rate() {
+fn an_absence_counts_neither_as_a_gap_nor_as_a_loss_of_rate() {
     let mut measures = measures(ModalityKind::Scalars);
     measures.mask(BEGIN - MS, PhysicalMask(0b1001));
     for (seq, at) in (0..).zip((0..1000).step_by(10).chain((4000..5000).step_by(10))) {
@@ -196,7 +196,7 @@ fn an_absence_is_no_gap_and_no_loss_of_rate() {
 }
 
 #[test]
-fn gaps_at_both_ends_count_and_a_mask_that_comes_after_its_samples_is_waited_for() {
+fn gaps_at_both_ends_count_and_samples_wait_for_a_late_mask() {
     let mut late_mask = measures(ModalityKind::Scalars);
     late_mask.mask(BEGIN, PhysicalMask(1));
     // A backlog: all samples first, then all masks.
@@ -211,7 +211,7 @@ fn gaps_at_both_ends_count_and_a_mask_that_comes_after_its_samples_is_waited_for
 }
 
 #[test]
-fn a_clock_that_runs_differently_drifts_and_one_that_is_ahead_is_in_the_future() {
+fn a_clock_at_another_rate_drifts_and_one_that_is_ahead_is_in_the_future() {
     let run = |ppm: i64, jitter_ms: u64, seconds: u64| {
         let mut measures = measures(ModalityKind::Scalars);
         for n in 0..seconds * 30 {
@@ -315,9 +315,9 @@ proptest! {
         prop_assert!((report.longest_gap - f64::from(longest) / 1e3).abs() < 1e-6, "{} {longest}", report.longest_gap);
     }
 
-    /// Hostile numbers: nothing panics, no count exceeds what came.
+    /// Hostile numbers: nothing panics, and no count exceeds the number of samples.
     #[test]
-    fn no_sample_makes_it_panic(samples in prop::collection::vec(any::<(u64, u64, u64, bool)>(), 0..40), end in any::<u64>()) {
+    fn no_sample_causes_a_panic(samples in prop::collection::vec(any::<(u64, u64, u64, bool)>(), 0..40), end in any::<u64>()) {
         let mut measures = measures(ModalityKind::Image);
         for (seq, capture_ns, recv_ns, jpeg) in &samples {
             let seen = SampleFacts { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, jpeg: *jpeg, payload: b"", repeated: None };
@@ -334,7 +334,7 @@ proptest! {
 }
 
 #[test]
-fn a_frame_at_the_edge_of_a_presence_may_lack_a_sample_and_no_other() {
+fn only_a_frame_at_the_edge_of_a_presence_may_lack_a_sample() {
     // Present with (v) and without (-) a valid sample, absent (.).
     for (frames, missed) in [
         ("vvvvvv", 0),

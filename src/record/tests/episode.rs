@@ -159,7 +159,7 @@ fn check_frames(read: &Read, begin: u64) {
 }
 
 #[tokio::test]
-async fn orders_out_of_turn_are_refused_and_a_stop_reports() {
+async fn commands_out_of_order_are_refused_and_a_stop_returns_a_report() {
     let bench = Bench::new();
     assert!(matches!(bench.recorder.stop().await, Err(RecordError::Idle)));
     let missing = EpisodeRequest { out: bench.folder.path().join("a/b/c"), ..bench.request(None) };

@@ -79,7 +79,7 @@ impl Sink for Recovering {
 }
 
 #[tokio::test]
-async fn nothing_is_written_behind_a_write_that_failed() {
+async fn nothing_is_written_after_a_failed_write() {
     let bench = Bench::with_sink(|file| Box::new(Recovering(SmallDisk(file, 100_000))));
     let mut events = bench.board.events();
     bench.recorder.start(bench.request(None)).await.unwrap();
@@ -117,7 +117,7 @@ impl Sink for Loose {
 }
 
 #[tokio::test]
-async fn a_file_that_failed_gets_no_end_that_makes_it_look_whole() {
+async fn a_failed_file_gets_no_end_that_makes_it_look_whole() {
     let bench = Bench::with_sink(|file| Box::new(Loose(file, 0)));
     let mut events = bench.board.events();
     bench.recorder.start(bench.request(None)).await.unwrap();
@@ -138,11 +138,11 @@ async fn a_file_that_failed_gets_no_end_that_makes_it_look_whole() {
     assert_eq!((answer.end, answer.recorded_verdict), (inspect::FileEnd::Unfinished, None));
     assert_ne!(answer.verdict.grade().unwrap(), Grade::Good);
     let repaired = recover::recover(&file, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
-    assert!(matches!(repaired.outcome, recover::Outcome::Repaired(_)), "{repaired:?}");
+    assert!(matches!(repaired.outcome, recover::RepairOutcome::Repaired(_)), "{repaired:?}");
 }
 
 #[tokio::test]
-async fn a_footer_without_our_summary_makes_no_episode_whole() {
+async fn a_footer_without_our_summary_does_not_make_an_episode_whole() {
     // As a version before this one left it: the writer was dropped, and ended the file itself.
     let bench = Bench::new();
     let (file, _) = bench.one_second().await;
@@ -166,7 +166,7 @@ async fn a_footer_without_our_summary_makes_no_episode_whole() {
     assert_eq!(answer.end, inspect::FileEnd::Finished);
     assert!(answer.verdict.reasons().contains(&reason), "{:?}", answer.verdict);
     let answer = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
-    let recover::Outcome::Repaired(repaired) = answer.outcome else { panic!("{answer:?}") };
+    let recover::RepairOutcome::Repaired(repaired) = answer.outcome else { panic!("{answer:?}") };
     // Nothing of it is left out, and nothing of it is kept.
     assert!(repaired.original.is_none() && !partial.exists());
     let answer = inspect::inspect(&repaired.to).unwrap();
@@ -194,7 +194,7 @@ impl Sink for Unsure {
 }
 
 #[tokio::test]
-async fn a_file_that_is_not_on_the_disk_keeps_its_partial_name() {
+async fn a_file_not_yet_on_the_disk_keeps_its_partial_name() {
     let bench = Bench::with_sink(|file| Box::new(Unsure(file)));
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     let report = bench.recorder.stop().await.unwrap();

@@ -44,7 +44,7 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     }
     free.store(GIB - (128 << 20), Ordering::Relaxed);
     let closed = until(&mut events, |what| {
-        assert!(!matches!(what, What::DiskLow { .. }), "told twice");
+        assert!(!matches!(what, What::DiskLow { .. }), "reported twice");
         matches!(what, What::Episode { .. })
     });
     let What::Episode { file, error, .. } = closed.await else { unreachable!() };
@@ -79,7 +79,7 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
 }
 
 #[tokio::test]
-async fn a_disk_that_does_not_answer_is_written_to() {
+async fn a_disk_that_does_not_report_its_space_is_written_to() {
     let bench = Bench::with(|config| config.disk = Box::new(|_| Err(io::ErrorKind::Unsupported.into())));
     bench.recorder.start(bench.request(None)).await.unwrap();
     assert_eq!(bench.recorder.stop().await.unwrap().error, None);
@@ -96,7 +96,7 @@ async fn reserved_space_is_released() {
 }
 
 #[tokio::test]
-async fn a_folder_that_is_removed_comes_back_with_the_episode() {
+async fn a_removed_folder_is_recreated_with_the_episode() {
     let bench = Bench::new();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     bench.sample(TOF, 1, 0, Stamp::now().0, 0);
@@ -128,7 +128,7 @@ async fn a_file_removed_on_a_file_system_that_only_hides_it_is_written_again() {
 }
 
 #[tokio::test]
-async fn a_folder_whose_name_is_no_utf_8_holds_episodes_like_any_other() {
+async fn a_folder_with_a_non_utf8_name_holds_episodes_like_any_other() {
     use std::os::unix::ffi::OsStrExt;
     let bench = Bench::new();
     let mut request = bench.request(None);

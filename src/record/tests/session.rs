@@ -135,7 +135,7 @@ fn losses_are_announced_once_a_second_and_counted_all() {
 }
 
 #[test]
-fn of_a_hole_across_the_beginning_or_the_end_only_the_part_within_counts() {
+fn only_the_part_of_a_gap_within_the_episode_counts() {
     let folder = tempfile::tempdir().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let masks = MaskHistory::new();
@@ -159,7 +159,7 @@ fn of_a_hole_across_the_beginning_or_the_end_only_the_part_within_counts() {
 }
 
 #[test]
-fn a_slow_sensor_makes_its_frame_and_every_frame_waits_for_it() {
+fn every_frame_waits_for_a_slow_sensor() {
     let folder = tempfile::tempdir().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let mut masks = MaskHistory::new();
@@ -202,7 +202,7 @@ fn attach(name: &str, bit: u8) -> What {
 }
 
 #[tokio::test]
-async fn a_device_that_is_plugged_in_and_never_sends_is_missed_by_recorder_and_inspect_alike() {
+async fn a_plugged_device_that_never_sends_is_reported_by_recorder_and_inspect_alike() {
     let silent = "never: plugged in for";
     // In before the episode, in it, and out again in it.
     for (before, missed) in [(true, true), (true, false), (false, false)] {
@@ -276,7 +276,7 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
         ("two holes", &[(7, 1000), (9, 1100), (12, 1900)], Some(3)),
         ("lost before the episode", &[(3, 910), (7, 990), (8, 1100)], None),
         ("lost after it", &[(7, 1100), (8, 2000), (12, 2100)], None),
-        ("a publisher that began anew", &[(70, 1100), (0, 1200), (1, 1300)], None),
+        ("a restarted publisher", &[(70, 1100), (0, 1200), (1, 1300)], None),
     ];
     for (what, actions, lost) in table {
         let folder = tempfile::tempdir().unwrap();

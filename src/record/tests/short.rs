@@ -71,7 +71,7 @@ async fn only_the_last_episode_can_be_dropped_and_only_if_it_is_short() {
 }
 
 #[tokio::test]
-async fn a_file_that_is_not_the_recorders_any_more_is_not_removed() {
+async fn a_file_that_no_longer_belongs_to_the_recorder_is_not_removed() {
     let deeds: [(&str, Deed); 5] = [
         ("replaced by a longer one", |file| std::fs::rename(file.with_file_name("other"), file).unwrap()),
         ("overwritten in place", |file| std::fs::write(file, "precious").unwrap()),

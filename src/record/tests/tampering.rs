@@ -87,7 +87,8 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
         let (bench, finished, _, mut events) = recorded(deed).await;
         // The end is not requested.
         let closed = tokio::time::timeout(PATIENCE, bench.until_closed(&mut events)).await;
-        let What::Episode { file, error, verdict, .. } = closed.unwrap_or_else(|_| panic!("{what}: goes on")) else {
+        let What::Episode { file, error, verdict, .. } = closed.unwrap_or_else(|_| panic!("{what}: does not end"))
+        else {
             unreachable!()
         };
         let error = error.unwrap_or_else(|| panic!("{what}: no error"));
@@ -95,7 +96,7 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
         assert_eq!(verdict.grade, Grade::Bad, "{what}");
         assert!(verdict.why().contains(why), "{what}: {}", verdict.why());
         assert!(!finished.exists() && file.extension().is_some_and(|extension| extension == "partial"), "{what}");
-        assert_eq!(error.matches(".mcap").count(), 0, "{what}: whoever shows it names the file beside it: {error}");
+        assert_eq!(error.matches(".mcap").count(), 0, "{what}: the caller names the file: {error}");
         found_again(what, why, &file);
         if why.contains("place") {
             let partial = finished.with_extension("mcap.partial");
@@ -107,7 +108,7 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
 }
 
 #[tokio::test]
-async fn a_file_that_is_changed_within_while_it_is_recorded_is_not_called_good() {
+async fn a_file_modified_while_it_is_recorded_is_not_called_good() {
     let deeds: [(&str, Deed); 4] = [
         ("overwritten by one that has it open, after another has read it", |file| {
             let mut writer = writable(file);
@@ -169,9 +170,9 @@ fn found_again(what: &str, why: &str, file: &Path) {
     let answer = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
     assert!(answer.sentence().1.contains(why), "{what}: {}", answer.sentence().1);
     let repaired = match &answer.outcome {
-        recover::Outcome::Repaired(repaired) => repaired,
+        recover::RepairOutcome::Repaired(repaired) => repaired,
         // What the other program left of it ends within the first chunk.
-        recover::Outcome::Unreadable { kept, .. } if !has_chunk(&std::fs::read(file).unwrap()) => {
+        recover::RepairOutcome::Unreadable { kept, .. } if !has_chunk(&std::fs::read(file).unwrap()) => {
             return is_found(kept);
         }
         _ => panic!("{what}: {answer:?}"),
@@ -179,12 +180,12 @@ fn found_again(what: &str, why: &str, file: &Path) {
     is_found(&repaired.to);
     // Once more, as it is repaired again or given its name.
     let again = recover::recover(&repaired.to, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
-    assert!(matches!(again.outcome, recover::Outcome::Whole { .. }), "{what}: {again:?}");
+    assert!(matches!(again.outcome, recover::RepairOutcome::Whole { .. }), "{what}: {again:?}");
     is_found(&repaired.to);
 }
 
 #[test]
-fn an_episode_of_which_nothing_is_left_but_the_reason_is_bad_for_it() {
+fn an_episode_with_nothing_left_but_its_reason_is_bad_for_that_reason() {
     let folder = tempfile::tempdir().unwrap();
     let why = "another program cut it while it was recorded: all of it is gone";
     let file = folder.path().join("a_001.mcap.partial");
@@ -262,7 +263,7 @@ async fn an_episode_whose_name_was_taken_gets_the_next_one_and_keeps_its_verdict
 }
 
 #[tokio::test]
-async fn a_file_that_others_only_look_at_or_touch_is_recorded_as_ever() {
+async fn a_file_that_others_only_read_or_touch_is_recorded_as_usual() {
     let deeds: [(&str, Deed); 4] = [
         ("read", |file| {
             File::open(file).unwrap().read_to_end(&mut Vec::new()).unwrap();

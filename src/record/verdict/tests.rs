@@ -67,7 +67,7 @@ fn an_absence_that_the_mask_explains_is_good() {
 }
 
 #[test]
-fn every_check_has_its_words_and_its_two_limits() {
+fn every_check_has_its_text_and_its_two_limits() {
     use Grade::{Bad, Good, Suspect};
     is(|q| q.dropped = 1, Suspect, &["cam: 1 of 211 samples dropped on the way to the file (limit 0 %)"]);
     is(|q| q.dropped = 30, Bad, &["cam: 30 of 240 samples dropped on the way to the file (limit 5 %)"]);
@@ -133,7 +133,7 @@ fn every_check_has_its_words_and_its_two_limits() {
 }
 
 #[test]
-fn an_episode_of_a_moment_is_bad_and_so_many_actions_are_missing() {
+fn a_very_short_episode_is_bad_and_missing_actions_are_suspect() {
     let quality = good();
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
     let of = |seconds, actions| {
@@ -166,7 +166,7 @@ fn an_expected_sensor_without_samples_is_suspect_and_verdicts_name_missing_ones(
 }
 
 #[test]
-fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not_missed() {
+fn a_present_modality_without_samples_is_bad_and_an_absent_one_is_not_missed() {
     let silent = |present: f64| Quality { samples: 0, present, longest_gap: present, hz: Some(0.0), ..good() };
     let both = |quiet: &Quality| {
         let talks = good();
@@ -188,7 +188,7 @@ fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not
 }
 
 #[test]
-fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is_not() {
+fn a_plugged_device_that_never_runs_is_missed_and_one_that_starts_is_not() {
     use Grade::{Good, Suspect};
     let states = |seconds: f64, quality: Quality, limits: VerdictSpec| {
         let talks = good();
@@ -221,7 +221,7 @@ fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is
 }
 
 #[test]
-fn the_file_and_its_losses_count_and_the_gravest_reason_comes_first() {
+fn the_file_and_its_losses_count_and_the_most_severe_reason_comes_first() {
     let quality = Quality { lost: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
     let of = |file| Facts { missing: Missing { masks: 2, actions: 0, events: 1 }, ..facts(&modalities, file) };
@@ -281,7 +281,7 @@ fn a_disabled_check_gives_no_reason() {
 proptest! {
     /// More of a fault never makes a better episode, and a word other than GOOD has a reason.
     #[test]
-    fn worse_is_never_better(counts in prop::array::uniform6(0_u64..300), more in prop::array::uniform6(0_u64..300), gap in 0.0_f64..9.0) {
+    fn a_worse_measurement_never_improves_the_verdict(counts in prop::array::uniform6(0_u64..300), more in prop::array::uniform6(0_u64..300), gap in 0.0_f64..9.0) {
         let with = |add: [u64; 6], gap: f64| Quality {
             lost: counts[0] + add[0],
             dropped: counts[1] + add[1],

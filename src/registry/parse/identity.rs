@@ -9,7 +9,6 @@ use crate::registry::spec::{IdentitySpec, UsbSpec};
 const LONGEST_NAME: usize = 64;
 
 /// Why `name` cannot be a modality's name, and what to do about it; `None` if it can.
-#[must_use]
 pub fn name_problem(name: &str) -> Option<(String, String)> {
     let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
     if begins && name.len() <= LONGEST_NAME && name.chars().all(in_a_name) {
@@ -27,7 +26,6 @@ pub fn name_problem(name: &str) -> Option<(String, String)> {
 }
 
 /// The valid name nearest to a text, if there is one.
-#[must_use]
 pub fn like_a_name(text: &str) -> Option<String> {
     let better: String =
         text.to_lowercase().chars().map(|c| if in_a_name(c) { c } else { '_' }).take(LONGEST_NAME).collect();

@@ -117,14 +117,12 @@ const POSE: u32 = 16;
 
 impl LanFind {
     /// Whether the device is a network adapter, or behind one.
-    #[must_use]
     pub const fn is_adapter(&self) -> bool {
         matches!(self, Self::Adapter { .. })
     }
 
     /// Whether sockets of IPv4, and whether those of IPv6, are opened for such a device. Behind an adapter without a
     /// `host` the addresses are IPv4; mDNS uses both.
-    #[must_use]
     pub const fn families(&self) -> [bool; 2] {
         match self {
             Self::Mdns { .. } => [true, true],
@@ -137,7 +135,6 @@ impl LanFind {
 /// The local address at which a device at `peer` reaches this computer. A device on this machine has a loopback
 /// address, and so does the local side: nothing from outside gets there. For any other device it is the wildcard
 /// address: a broadcast, as LiDARs send, is not received at a specific one.
-#[must_use]
 pub fn own_side(peer: Option<IpAddr>) -> IpAddr {
     match peer {
         Some(peer) if peer.to_canonical().is_loopback() => peer,
@@ -162,7 +159,6 @@ impl LanSpec {
     }
 
     /// Content of its samples.
-    #[must_use]
     pub const fn modality_kind(&self) -> ModalityKind {
         match &self.protocol {
             LanProtocol::Mjpeg { .. } | LanProtocol::Iphone { stream: PhoneStream::Image, .. } => ModalityKind::Image,
@@ -172,7 +168,6 @@ impl LanSpec {
     }
 
     /// Image: `[height, width]`. Scalars: how many. Bytes: empty.
-    #[must_use]
     pub fn shape(&self) -> Vec<u32> {
         match (self.modality_kind(), self.picture()) {
             (ModalityKind::Image, Some(picture)) => vec![picture.height, picture.width],
@@ -182,7 +177,6 @@ impl LanSpec {
     }
 
     /// The format of its pictures, if it sends any.
-    #[must_use]
     pub const fn picture(&self) -> Option<LanPicture> {
         match &self.protocol {
             LanProtocol::Mjpeg { picture, .. } | LanProtocol::Iphone { picture, .. } => Some(*picture),
@@ -191,7 +185,6 @@ impl LanSpec {
     }
 
     /// The format on one line: `udp port 2368`.
-    #[must_use]
     pub fn format(&self) -> String {
         match &self.protocol {
             LanProtocol::Mjpeg { path, picture: LanPicture { width, height, fps }, .. } => {
@@ -227,7 +220,6 @@ impl LanSpec {
     }
 
     /// The port at which the device is reached, or at which it reaches this computer, if the entry states it.
-    #[must_use]
     pub const fn port(&self) -> Option<u16> {
         match &self.protocol {
             LanProtocol::Mjpeg { port, .. } => *port,
@@ -238,13 +230,11 @@ impl LanSpec {
     }
 
     /// The socket address of a device at this address.
-    #[must_use]
     pub fn server(&self, host: IpAddr) -> SocketAddr {
         SocketAddr::new(host, self.port().unwrap_or(HTTP_PORT))
     }
 
     /// The port of this computer that it needs: whether it is UDP, and its number.
-    #[must_use]
     pub const fn own_port(&self) -> Option<(bool, u16)> {
         match &self.protocol {
             LanProtocol::Udp { port } => Some((true, *port)),

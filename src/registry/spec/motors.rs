@@ -140,7 +140,6 @@ impl MotionSpec {
     const SPEEDS_UP_IN: f64 = 0.05;
 
     /// For a command that changes by `slew` (rad/s) at most.
-    #[must_use]
     pub fn of_slew(slew: f64) -> Self {
         Self { acceleration: slew / Self::SPEEDS_UP_IN, soft_start: Duration::from_secs(1), first_target: 0.5 }
     }
@@ -197,7 +196,6 @@ macro_rules! motor_kinds {
             pub const ALL: [Self; [$($name),+].len()] = [$(Self::$kind),+];
 
             /// As it is written in `devices.toml`.
-            #[must_use]
             pub const fn name(self) -> &'static str {
                 match self {
                     $(Self::$kind => $name),+
@@ -226,7 +224,6 @@ motor_kinds! {
 impl MotorKind {
     /// PMAX in rad, VMAX in rad/s and TMAX in Nm of the factory settings. Source: the tables of the
     /// public drivers `DM_CAN.py` and of `LeRobot`.
-    #[must_use]
     pub const fn shipped(self) -> [f64; 3] {
         match self {
             Self::Dm3507 | Self::Dm4310 => [12.5, 30.0, 10.0],
@@ -244,7 +241,6 @@ impl MotorKind {
     }
 
     /// The motor of this name.
-    #[must_use]
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|kind| kind.name() == name)
     }

@@ -11,20 +11,20 @@ use tokio::sync::{broadcast, watch};
 
 use super::*;
 use crate::action::Order;
+use crate::device::{DeviceNode, UsbIdentity};
 use crate::hotplug::{HotplugError, HotplugEvent};
 use crate::provenance::UnplugSource;
-use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
-    DeviceNode, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec,
-    UsbIdentity, UsbSpec, WhenStale,
+    Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
 };
 use crate::rig::presence::{Claim, read_mask};
+use crate::simulation::{SimDevice, SimSource};
 use crate::status::Event;
 
 mod actuator;
 
 const CHANNELS: usize = 2;
-/// How long a condition may take before a test gives up; no requirement.
+/// Upper limit for waiting for a condition; not a requirement.
 const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Two interchangeable entries, `a` and `b`.
@@ -81,15 +81,15 @@ enum Step {
     Restart(u8),
     /// The operator gives an order.
     Give(Order),
-    /// Takes events until this one.
+    /// Receives events up to this one.
     Until(&'static str),
-    /// The mask other processes read becomes this.
+    /// The mask that other processes read becomes this.
     Mask(u64),
-    /// A network adapter is reported as attached, whose carrier is in a file of this folder.
+    /// A network adapter is reported as attached; its carrier is in a file of this folder.
     Adapter(PathBuf),
-    /// Takes events until one that is logged holds this.
+    /// Receives events until a logged one contains this.
     Logged(&'static str),
-    /// The link of the adapter is up again, this much later.
+    /// The adapter's link comes up after this delay.
     Link(PathBuf, Duration),
 }
 use Step::{Adapter, Give, Link, Logged, Mask, Plug, Pull, Removed, Restart, Resume, Silence, Until};
@@ -200,7 +200,7 @@ async fn reported(cooldown: Duration, stall_after: Duration, steps: &[Step]) -> 
     reported_of(&registry(cooldown, stall_after), false, steps).await
 }
 
-/// What was reported after these steps and to the end of the run, by a rig that is to be armed at the start or not.
+/// The reports from these steps to the end of the run, by a rig that is armed at the start or not.
 async fn reported_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let name = format!("owner{}x{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
@@ -347,7 +347,7 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn devices_are_told_of_the_episode_in_progress() {
+async fn devices_are_notified_of_the_episode_in_progress() {
     let name = format!("ownere{}", std::process::id());
     let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
     let registry = registry(Duration::from_millis(100), Duration::from_millis(150));
@@ -386,14 +386,14 @@ async fn devices_are_told_of_the_episode_in_progress() {
     assert_eq!(first.recordings(), (0, 0), "there is no episode");
     begin(1);
     come_to(&first, (1, 0)).await;
-    // A silent one is reported as well.
+    // A silent device is reported as well.
     first.set_silent(true);
     bench.step(&Until("a stalled")).await;
     notify.send_replace(None);
     come_to(&first, (1, 1)).await;
     begin(2);
     come_to(&first, (2, 1)).await;
-    // One that comes during the episode, while another is pulled.
+    // One is plugged in during the episode, while another is pulled.
     for step in [Plug("2", CHANNELS), Until("b streaming"), Removed("1", UnplugSource::Kernel), Until("a absent")] {
         bench.step(&step).await;
     }
@@ -424,7 +424,7 @@ async fn a_device_behind_an_adapter_is_not_opened_before_its_cable_is_in() {
         Logged("the network link is down"),
         // Several times as long as the first restarts would take.
         Link(path, Duration::from_secs(2)),
-        // It is no interface of this machine.
+        // This machine has no such interface.
         Until("a absent"),
     ];
     assert_eq!(reported_of(&registry, false, &steps).await[..4], ["a at 1", "a opening", "a gone link", "a absent"]);
@@ -432,7 +432,7 @@ async fn a_device_behind_an_adapter_is_not_opened_before_its_cable_is_in() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_failed_device_is_started_again_by_hand() {
-    // It sends three numbers and the entry wants two.
+    // It sends three numbers; the entry expects two.
     let steps = [Plug("1", 3), Until("a failed"), Mask(0), Restart(0), Until("a failed"), Restart(1)];
     let got = reported(Duration::from_millis(100), Duration::from_millis(150), &steps).await;
     assert_eq!(got, ["a at 1", "a opening", "a failed", "a opening", "a failed"]);
@@ -440,15 +440,15 @@ async fn a_failed_device_is_started_again_by_hand() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stream_that_panics_is_started_again_and_its_bit_stays_clear() {
-    // A time no clock can hold, which the registry refuses, makes the stream panic once it is open.
+    // A time that no clock can hold, which the registry refuses, makes the stream panic once it is open.
     let steps = [Plug("1", CHANNELS), Until("a backoff"), Mask(0), Until("a backoff"), Mask(0)];
     let got = reported(Duration::from_millis(100), Duration::MAX, &steps).await;
     assert_eq!(got, ["a at 1", "a opening", "a backoff", "a opening", "a backoff"]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_end_is_announced_before_a_device_that_is_slow_to_close() {
-    use crate::registry::scenario::SimFaults;
+async fn the_end_is_announced_before_a_slow_device_has_closed() {
+    use crate::simulation::SimFaults;
     let registry = registry(Duration::ZERO, Duration::from_secs(1));
     let name = format!("ending{}", std::process::id());
     let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
@@ -479,7 +479,7 @@ async fn the_end_is_announced_before_a_device_that_is_slow_to_close() {
         sleep(Duration::from_millis(1)).await;
     }
     assert!(!ending.is_cancelled());
-    // Plugging can no longer be watched: the rig ends by itself.
+    // Hot-plug events can no longer be monitored: the rig ends by itself.
     drop(hotplug);
     ending.cancelled().await;
     let announced = Stamp::now();
@@ -488,7 +488,7 @@ async fn the_end_is_announced_before_a_device_that_is_slow_to_close() {
     assert!(at.since(announced) >= closes_in / 2, "{:?}", at.since(announced));
 }
 
-/// Takes events inside the call that announces them: what it sees is the state of that moment.
+/// Receives events inside the announcing call, and so sees the state at that moment.
 struct Witnessing {
     task: Mutex<BoxFuture<'static, ()>>,
 }
@@ -501,10 +501,10 @@ impl Wake for Witnessing {
     }
 }
 
-/// Plugs a device and pulls it out, over and over: what other threads see at the moment of each announcement, and what
-/// the JSON file holds after each change.
+/// Plugs and unplugs a device repeatedly, and checks what other threads see at each announcement and what the JSON file
+/// holds after each change.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_mask_comes_before_the_announcement_and_its_file_says_one_publication() {
+async fn the_mask_is_published_before_the_announcement_and_its_file_agrees_with_one_publication() {
     const ROUNDS: usize = 60;
     let registry = registry(Duration::ZERO, Duration::from_secs(1));
     let name = format!("order{}", std::process::id());

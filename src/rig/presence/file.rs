@@ -1,4 +1,4 @@
-//! The mask's file: made without following links, locked, written so that no reader sees half.
+//! The mask's file: created without following links, locked, and written so that no reader sees half a record.
 
 use std::fs::{File, Metadata};
 use std::io::ErrorKind;
@@ -15,12 +15,11 @@ use crate::folder::FolderError;
 use crate::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
 use crate::time::{Stamp, realtime_ns};
 
-/// A publisher that dies between making and locking a file leaves the next one to try again.
+/// If a publisher dies between creating and locking a file, the next one tries again.
 const TRIES: usize = 10;
-/// A reader that meets a write in progress tries again for this long: its writer may be waiting for
-/// a busy core.
+/// A reader that meets a write in progress retries for this long: the writer may be waiting for a busy core.
 const READ_PATIENCE: Duration = Duration::from_secs(1);
-/// Looks in quick succession before a reader lets time pass between them.
+/// Immediate retries before a reader sleeps between them.
 const QUICK_LOOKS: u32 = 50;
 const PAUSE: Duration = Duration::from_micros(100);
 
@@ -35,10 +34,10 @@ pub enum PresenceError {
     Taken {
         /// The file.
         path: PathBuf,
-        /// Who, if it can be found out.
+        /// Its process id, if it can be determined.
         pid: Option<u32>,
     },
-    /// Something other than our own file lies there.
+    /// The path holds something other than our own file.
     #[error("{path}: {what}; remove it: rm -r {path}")]
     Foreign {
         /// The file.
@@ -58,12 +57,12 @@ pub enum PresenceError {
         error: std::io::Error,
     },
     /// No process publishes there.
-    #[error("{path}: there is no physical mask: no rapid runs on this machine")]
+    #[error("{path}: there is no physical mask: no rapid of this name (--instance) runs on this machine")]
     NotPublished {
         /// The file.
         path: PathBuf,
     },
-    /// The file was made, and its process has not published a mask yet.
+    /// The file was created, but its process has not published a mask yet.
     #[error("{path}: no mask yet: rapid is starting; try again")]
     Starting {
         /// The file.
@@ -77,7 +76,7 @@ pub enum PresenceError {
         /// Why not.
         error: MaskRecordError,
     },
-    /// It is shorter than a mask.
+    /// It is shorter than a mask record.
     #[error(
         "{path}: only part of a mask is there: it was cut, or its disk was full; the next start of rapid writes it again"
     )]
@@ -85,7 +84,7 @@ pub enum PresenceError {
         /// The file.
         path: PathBuf,
     },
-    /// A write was in progress at every look: its writer died in it.
+    /// A write was in progress at every read: its writer died during it.
     #[error("{path}: the record is torn: its writer died while writing")]
     Torn {
         /// The file.
@@ -102,17 +101,17 @@ pub(super) struct MaskFile {
 }
 
 impl MaskFile {
-    /// Makes the file, or takes over one whose process died.
+    /// Creates the file, or takes over that of a dead process.
     pub(super) fn create(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
         // First the file that shows whether another process owns the rig.
         let file = take(path)?;
         json::claim(&json_path(path)).inspect_err(|_| {
-            // Under its lock, and empty or of a dead process.
+            // We hold its lock, and it is empty or belongs to a dead process.
             let _ = std::fs::remove_file(path);
         })?;
         let record = MaskRecord { device_count, generation: 0, mask: PhysicalMask::EMPTY, realtime_ns: 0, sequence: 0 };
         let io = |error| PresenceError::Io { path: path.to_owned(), error };
-        // A whole record of the dead process stays readable until it is overwritten.
+        // A complete record of the dead process stays readable until it is overwritten.
         if file.metadata().map_err(io)?.len() != RECORD_LEN as u64 {
             file.set_len(0).map_err(io)?;
             file.write_all_at(&record.to_bytes(), 0).map_err(io)?;
@@ -120,8 +119,8 @@ impl MaskFile {
         Ok(Self { path: path.to_owned(), file, record })
     }
 
-    /// Creates the file again where it was removed or replaced; returns whether it did. What is published next is in
-    /// it.
+    /// Creates the file again if it was removed or replaced; returns whether it did. The next publication goes to the
+    /// new file.
     pub(super) fn restore(&mut self) -> Result<bool, PresenceError> {
         if self.is_there() {
             return Ok(false);
@@ -134,13 +133,13 @@ impl MaskFile {
         &self.path
     }
 
-    /// Does the name lead to our file?
+    /// Whether the path still leads to our file.
     fn is_there(&self) -> bool {
         let (Ok(ours), Ok(named)) = (self.file.metadata(), std::fs::symlink_metadata(&self.path)) else { return false };
         (ours.dev(), ours.ino()) == (named.dev(), named.ino())
     }
 
-    /// Publishes `mask`; the sequence number it got.
+    /// Publishes `mask` and returns its sequence number.
     pub(super) fn publish(&mut self, mask: PhysicalMask, realtime_ns: u64) -> std::io::Result<u64> {
         self.record.generation = self.record.generation.wrapping_add(2);
         self.record.mask = mask;
@@ -148,8 +147,8 @@ impl MaskFile {
         self.record.sequence += 1;
         let bytes = self.record.to_bytes();
         let odd = self.record.generation.wrapping_sub(1).to_le_bytes();
-        // A reader maps the page or reads it on another core: the order of the three writes is what
-        // makes the generation mean something. The head, with the magic, goes with the first.
+        // A reader maps the page or reads it on another core: the generation is meaningful only because of the order of
+        // the three writes. The head, with the magic, goes with the first.
         let mut head = [0; 8];
         head.copy_from_slice(&bytes[..8]);
         head[6..8].copy_from_slice(&odd);
@@ -164,13 +163,13 @@ impl MaskFile {
 
 impl Drop for MaskFile {
     fn drop(&mut self) {
-        // For readers that hold it open.
+        // For readers that have it open.
         let _ = self.publish(PhysicalMask::EMPTY, realtime_ns());
         if !self.is_there() {
             return;
         }
-        // While the lock is held, so that no other process's files are removed. Another user's stays: it may not
-        // be removed where everybody may write.
+        // Under the lock, so that no other process's files are removed. Another user's file stays: in a folder where
+        // everybody may write, it cannot be removed.
         let _ = std::fs::remove_file(json_path(&self.path));
         let _ = std::fs::remove_file(&self.path);
     }
@@ -194,7 +193,7 @@ fn take(path: &Path) -> Result<File, PresenceError> {
         if !opened.is_file() || opened.nlink() > 1 {
             return Err(foreign("it is not an ordinary file of its own"));
         }
-        // Its owner may write to it at any time, even if we may, too.
+        // Its owner may write to it at any time, even if we may as well.
         if opened.uid() != rustix::process::geteuid().as_raw() {
             return Err(refused(path, Errno::ACCESS));
         }
@@ -205,9 +204,9 @@ fn take(path: &Path) -> Result<File, PresenceError> {
             }
             Err(error) => return Err(io(error)),
         }
-        // A publisher that ended meanwhile has removed the name: what we locked is no longer there.
+        // A publisher that ended meanwhile has removed the name: the locked file is no longer at the path.
         if std::fs::symlink_metadata(path).is_ok_and(|named| named.ino() == opened.ino()) {
-            // The mode asked for at creation is subject to the umask; readers need all of it.
+            // The mode given at creation is subject to the umask; readers need all of it.
             rustix::fs::fchmod(&file, mode).map_err(io)?;
             return Ok(file);
         }
@@ -215,8 +214,8 @@ fn take(path: &Path) -> Result<File, PresenceError> {
     Err(PresenceError::Taken { path: path.to_owned(), pid: None })
 }
 
-/// Why a file that is there may not be opened: it is another user's. In a folder like /dev/shm not
-/// even root may open it for writing (`fs.protected_regular`, see proc(5)).
+/// Why an existing file may not be opened: it belongs to another user. In a folder like /dev/shm not even root may open
+/// it for writing (`fs.protected_regular`, see proc(5)).
 pub(super) fn refused(path: &Path, error: Errno) -> PresenceError {
     match std::fs::symlink_metadata(path) {
         Ok(there) if holder(&there).is_some() => PresenceError::Taken { path: path.to_owned(), pid: holder(&there) },
@@ -228,7 +227,7 @@ pub(super) fn refused(path: &Path, error: Errno) -> PresenceError {
     }
 }
 
-/// Who holds a lock on this file, from /proc/locks (proc(5)): the fifth field is the pid, the sixth
+/// The holder of a lock on this file, from /proc/locks (proc(5)): the fifth field is the pid, the sixth
 /// `major:minor:inode`, the device in hexadecimal.
 fn holder(file: &Metadata) -> Option<u32> {
     let (major, minor) = (rustix::fs::major(file.dev()), rustix::fs::minor(file.dev()));
@@ -241,10 +240,10 @@ fn holder(file: &Metadata) -> Option<u32> {
     })
 }
 
-/// Reads the published record, whole.
+/// Reads the complete published record.
 ///
 /// # Errors
-/// When no process publishes at `path`, or what lies there is not a mask.
+/// When no process publishes at `path`, or the file does not hold a mask.
 pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
     let io = |error: std::io::Error| match error.kind() {
         ErrorKind::NotFound => PresenceError::NotPublished { path: path.to_owned() },
@@ -255,7 +254,7 @@ pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
         _ => io(error),
     };
     let foreign = |what: &str| PresenceError::Foreign { path: path.to_owned(), what: what.to_owned() };
-    // Nothing that was planted there is followed or waited for.
+    // Never follows a planted link or waits for a planted pipe.
     let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
     let file = match rustix::fs::open(path, flags, Mode::empty()) {
         Ok(file) => File::from(file),

@@ -40,14 +40,13 @@ struct Document<'a> {
 }
 
 /// The JSON file that belongs to a mask file.
-#[must_use]
 pub fn json_path(mask: &Path) -> PathBuf {
     let mut name = mask.as_os_str().to_owned();
     name.push(".json");
     PathBuf::from(name)
 }
 
-/// Writes the document whole: a reader sees a whole document or the one before.
+/// Writes the document atomically: a reader sees this document or the previous one, never a part.
 pub(super) fn write(
     path: &Path,
     mask: PhysicalMask,
@@ -70,10 +69,10 @@ pub(super) fn write(
     folder(path)?.replace(path.file_name().unwrap_or_default(), &text, 0o644, Sync::Skip).map_err(io)
 }
 
-/// Is the name free, or what lies there ours to replace?
+/// Whether the name is free, or held by a file of ours that may be replaced.
 pub(super) fn claim(path: &Path) -> Result<(), PresenceError> {
     let foreign = |what| Err(PresenceError::Foreign { path: path.to_owned(), what });
-    // What is planted between this look and the first document is found by the write.
+    // Anything planted between this check and the first document is found by the write.
     match std::fs::symlink_metadata(path) {
         Ok(there) if !there.is_file() => foreign("it is not an ordinary file".to_owned()),
         Ok(there) if there.uid() != rustix::process::geteuid().as_raw() => {

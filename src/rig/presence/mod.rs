@@ -1,12 +1,11 @@
 //! Presence: publishes the physical mask for other processes, at 500 Hz and at every change.
 //!
-//! A named thread, `mask`, keeps the beat on absolute deadlines of 2 ms; it owns the file in shared
-//! memory and the mask's topic on the bus. The rig passes it a new mask by an atomic and a wake-up
-//! and never waits for it.
+//! A thread named `mask` runs on absolute deadlines of 2 ms; it owns the file in shared memory and the mask's topic on
+//! the bus. The rig passes it a new mask by an atomic and a wake-up and never waits for it.
 //!
-//! Invariant: nothing the thread does can be held up by a device, a disk or a child process.
+//! Invariant: no device, disk or child process can hold up the thread.
 //! Invariant: a reader that compares the generation before and after never sees a torn record.
-//! Invariant: one publisher a file: a lock ensures it, and dies with its process.
+//! Invariant: one publisher per file, ensured by a lock that ends with its process.
 
 mod file;
 mod json;
@@ -34,9 +33,9 @@ use file::MaskFile;
 
 /// Time between two publications: 500 Hz (paper, section "Physical Mask Generator").
 pub const PERIOD: Duration = Duration::from_millis(2);
-/// Beats between two looks whether the file is still there: a second.
+/// Periods between two checks whether the file still exists: a second.
 const LOOK_EVERY: u32 = 500;
-/// `SampleHeader::id` of a mask sample: no modality.
+/// `SampleHeader::id` of a mask sample: not a modality.
 pub const MASK_ID: u32 = u32::MAX;
 
 /// The publisher. Dropping it publishes an empty mask and removes the files.
@@ -56,7 +55,7 @@ struct Shared {
     stop: AtomicBool,
 }
 
-/// The right to publish the mask of this rig, and with it to be its one `rapid`.
+/// The right to publish the mask of this rig, and so to be its only `rapid`.
 #[derive(Debug)]
 pub struct Claim {
     path: PathBuf,
@@ -74,7 +73,7 @@ impl Claim {
 }
 
 impl Presence {
-    /// Begins to publish an empty mask.
+    /// Starts publishing an empty mask.
     ///
     /// # Errors
     /// When the thread cannot be started.
@@ -92,20 +91,19 @@ impl Presence {
         Ok(Self { shared, thread: Some(thread), ended, path, json, json_failed: AtomicBool::new(false) })
     }
 
-    /// Cancelled when the thread has ended: before this is dropped, by a panic.
-    #[must_use]
+    /// Cancelled when the thread has ended; a panic can end it before this is dropped.
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
     }
 
-    /// The mask that is to be published, at any moment.
+    /// Reads, at any moment, the mask that should be published.
     #[cfg(test)]
     pub(super) fn wanted(&self) -> impl Fn() -> PhysicalMask + Send + use<> {
         let shared = Arc::clone(&self.shared);
         move || PhysicalMask(shared.mask.load(Ordering::Acquire))
     }
 
-    /// Publishes `mask` at once, and from then on at every beat. Does not wait.
+    /// Publishes `mask` at once, and then at every period. Does not wait.
     pub fn publish(&self, mask: PhysicalMask) {
         self.shared.mask.store(mask.0, Ordering::Release);
         if let Some(thread) = &self.thread {
@@ -113,10 +111,10 @@ impl Presence {
         }
     }
 
-    /// Writes the file for people, whole, with the sequence of the last publication if that was of `mask`; `false` if
-    /// `mask` is still to be published. Why it cannot be written is logged, once until it can again.
+    /// Writes the whole JSON file, with the sequence of the last publication if that was of `mask`; `false` if `mask`
+    /// is not published yet. A failure is logged once until the file can be written again.
     pub fn write_json(&self, mask: PhysicalMask, devices: &[JsonDevice]) -> bool {
-        // The thread's panic has freed the name for another rapid.
+        // A panic of the thread has freed the name for another rapid.
         if self.ended.is_cancelled() {
             return true;
         }
@@ -140,16 +138,15 @@ impl Drop for Presence {
         self.shared.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
             thread.thread().unpark();
-            // The thread never waits for anything but its deadline. The holder of `ended` learns of a
-            // panic of its own.
+            // The thread never waits for anything but its deadline. The holder of `ended` learns of a panic.
             let _ = thread.join();
         }
     }
 }
 
-/// What the thread owns.
+/// The thread's state.
 struct Heartbeat {
-    /// Dropped by a panic too, and before the file: nothing writes beside it once it is gone.
+    /// Dropped even by a panic, and before the file: nothing else writes there once it is gone.
     _ended: DropGuard,
     shared: Arc<Shared>,
     file: MaskFile,
@@ -199,7 +196,7 @@ impl Heartbeat {
             if now >= due {
                 due = due.after(PERIOD);
                 if due <= now {
-                    // Held up for a period or more: continue from here rather than in a burst.
+                    // Delayed by a period or more: continue from now rather than in a burst.
                     due = now.after(PERIOD);
                 }
             }

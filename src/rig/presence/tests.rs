@@ -99,7 +99,7 @@ fn links_are_not_followed() {
 }
 
 #[test]
-fn what_others_planted_is_named_and_neither_waited_for_nor_written_to() {
+fn files_planted_by_others_are_named_and_neither_waited_for_nor_written_to() {
     let (path, victim) = (path(), path());
     let json = json_path(&path);
     std::fs::write(&victim, "precious").expect("victim");
@@ -124,7 +124,7 @@ fn what_others_planted_is_named_and_neither_waited_for_nor_written_to() {
         assert!(!path.exists(), "the mask was made all the same");
         std::fs::remove_file(&json).or_else(|_| std::fs::remove_dir(&json)).expect("clean");
     }
-    // After the claim: a link is replaced, what it led to is not touched.
+    // After the claim: a link is replaced, and its target is not touched.
     let _claim = Claim::new(&path, 1).expect("claim");
     std::os::unix::fs::symlink(&victim, &json).expect("link");
     json::write(&json, PhysicalMask(0), 1, &[]).expect("write");
@@ -203,7 +203,7 @@ fn the_json_document_has_the_papers_fields() {
 }
 
 #[test]
-fn a_part_of_a_mask_is_named_with_its_cause() {
+fn an_incomplete_mask_is_named_with_its_cause() {
     let folder = tempfile::tempdir().expect("folder");
     let path = folder.path().join("mask");
     for bytes in [0, 1, crate::mask::RECORD_LEN / 2, crate::mask::RECORD_LEN - 1] {

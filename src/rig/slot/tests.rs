@@ -40,8 +40,8 @@ fn every_transition_of_the_current_epoch() {
     let e = Epoch(1);
     let none = Effects::NONE;
     let replace = Effects { stop: Some(e), start: Some((Epoch(2), 'b')) };
-    // (from, input, to, effects), every state with every input, all at 10 ms. The back-off of the
-    // state Backoff ends at 500 ms.
+    // (from, input, to, effects), every state with every input, all at 10 ms. The back-off in state Backoff ends at 500
+    // ms.
     let table = [
         (Absent, Input::Attached('b'), Opening, start(1, 'b')),
         (Absent, Input::Detached, Absent, none.clone()),
@@ -180,7 +180,7 @@ fn a_stream_that_was_wrong_about_an_unplug_is_started_again() {
 }
 
 #[test]
-fn a_stream_that_is_wrong_about_an_unplug_again_and_again_fails_until_a_replug() {
+fn a_stream_that_is_repeatedly_wrong_about_an_unplug_fails_until_a_replug() {
     let mut slot = slot_in(Opening);
     let mut now = 0;
     for (n, wait) in [2000, 2000, 2000, 4000, 8000].into_iter().enumerate() {
@@ -199,7 +199,7 @@ fn a_stream_that_is_wrong_about_an_unplug_again_and_again_fails_until_a_replug()
     slot.apply(Input::Detached, ms(now + 3000));
     slot.apply(Input::Attached('b'), ms(now + 3100));
     assert_eq!(slot.apply(Input::Timer, ms(now + 5000)), start(7, 'b'));
-    // A stream that held for a minute is believed again.
+    // A stream that ran for a minute resets the back-off.
     slot.apply(Input::Ended(Epoch(7), End::Gone), ms(now + 70_000));
     assert_eq!(slot.deadline(), Some(ms(now + 72_000)));
 }
@@ -220,7 +220,7 @@ fn restarts_back_off_and_give_up_after_five_in_a_minute() {
 }
 
 #[test]
-fn a_cable_may_be_pulled_as_often_as_one_likes() {
+fn a_cable_may_be_pulled_any_number_of_times() {
     let mut slot = slot_in(Opening);
     for n in 1..20 {
         let now = 600 * u64::from(n);
@@ -239,9 +239,9 @@ fn a_stream_stable_for_a_minute_resets_the_backoff() {
     assert_eq!(slot.deadline(), Some(ms(61_500)));
 }
 
-/// What the world does to a slot.
+/// An event that a slot reacts to.
 #[derive(Debug, Clone)]
-enum Happens {
+enum Event {
     Attach(char),
     Detach,
     Report(u32, u8),
@@ -249,17 +249,17 @@ enum Happens {
     Wait(u64),
 }
 
-fn happens() -> impl Strategy<Value = Happens> {
+fn event() -> impl Strategy<Value = Event> {
     prop_oneof![
-        proptest::char::range('a', 'd').prop_map(Happens::Attach),
-        Just(Happens::Detach),
-        (0_u32..6, 0_u8..7).prop_map(|(age, kind)| Happens::Report(age, kind)),
-        Just(Happens::Restart),
-        (0_u64..4000).prop_map(Happens::Wait),
+        proptest::char::range('a', 'd').prop_map(Event::Attach),
+        Just(Event::Detach),
+        (0_u32..6, 0_u8..7).prop_map(|(age, kind)| Event::Report(age, kind)),
+        Just(Event::Restart),
+        (0_u64..4000).prop_map(Event::Wait),
     ]
 }
 
-/// Lets a slot settle with a device that works: timers run, a started stream delivers.
+/// Lets a slot settle with a working device: timers run, a started stream delivers samples.
 fn settle(slot: &mut Slot<char>, now: &mut Stamp) {
     for _ in 0..32 {
         let effects = match (slot.state(), slot.deadline()) {
@@ -277,11 +277,11 @@ fn settle(slot: &mut Slot<char>, now: &mut Stamp) {
 }
 
 proptest! {
-    /// Whatever happened, in whatever order, with reports of streams old and new: once a device
-    /// that works has been attached, it streams; once it is gone, the slot is absent.
+    /// After any sequence of events, with reports of old and new streams: once a working device has been attached, the
+    /// slot streams; once it is gone, the slot is Absent.
     #[test]
     fn the_settled_state_depends_only_on_the_attachments(
-        history in proptest::collection::vec(happens(), 0..60),
+        history in proptest::collection::vec(event(), 0..60),
         last in proptest::option::of(proptest::char::range('a', 'd')),
     ) {
         let mut slot = Slot::new(COOLDOWN);
@@ -290,12 +290,12 @@ proptest! {
         let mut attached = None;
         for event in history {
             let input = match event {
-                Happens::Attach(device) if attached.is_none() => { attached = Some(device); Input::Attached(device) }
-                Happens::Attach(_) => continue,
-                Happens::Detach => { attached = None; Input::Detached }
-                Happens::Restart => Input::Restart,
-                Happens::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
-                Happens::Report(age, kind) => {
+                Event::Attach(device) if attached.is_none() => { attached = Some(device); Input::Attached(device) }
+                Event::Attach(_) => continue,
+                Event::Detach => { attached = None; Input::Detached }
+                Event::Restart => Input::Restart,
+                Event::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
+                Event::Report(age, kind) => {
                     let epoch = Epoch(slot.epoch().0.saturating_sub(age));
                     match kind {
                         0 => Input::Started(epoch),
@@ -321,7 +321,7 @@ proptest! {
             prop_assert!(attached.is_some() || slot.state() == Absent, "nothing attached, yet {:?}", slot.state());
             prop_assert!(!slot.is_present() || attached.is_some());
         }
-        // The last word: the device is pulled, and perhaps one is plugged in.
+        // The final events: the device is unplugged, and perhaps one is plugged in.
         slot.apply(Input::Detached, now);
         if let Some(device) = last { slot.apply(Input::Attached(device), now); }
         settle(&mut slot, &mut now);
@@ -329,25 +329,25 @@ proptest! {
         prop_assert_eq!(slot.state(), if last.is_some() { Streaming } else { Absent });
     }
 
-    /// As above without the last word: a history in which no stream failed needs none.
+    /// As above without the final events: a history in which no stream failed needs none.
     #[test]
-    fn no_replug_is_lost_however_fast(history in proptest::collection::vec(happens(), 0..60)) {
+    fn no_replug_is_lost_however_fast(history in proptest::collection::vec(event(), 0..60)) {
         let mut slot = Slot::new(COOLDOWN);
         let mut now = ms(0);
         let mut attached = None;
         for event in history {
             let input = match event {
-                Happens::Attach(device) => { attached = Some(device); Input::Attached(device) }
-                Happens::Detach => { attached = None; Input::Detached }
-                Happens::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
-                Happens::Report(age, 3) => Input::Ended(Epoch(slot.epoch().0.saturating_sub(age)), End::Gone),
-                Happens::Report(age, _) => Input::Started(Epoch(slot.epoch().0.saturating_sub(age))),
-                Happens::Restart => Input::Restart,
+                Event::Attach(device) => { attached = Some(device); Input::Attached(device) }
+                Event::Detach => { attached = None; Input::Detached }
+                Event::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
+                Event::Report(age, 3) => Input::Ended(Epoch(slot.epoch().0.saturating_sub(age)), End::Gone),
+                Event::Report(age, _) => Input::Started(Epoch(slot.epoch().0.saturating_sub(age))),
+                Event::Restart => Input::Restart,
             };
             slot.apply(input, now);
         }
         settle(&mut slot, &mut now);
-        // Given up after its driver reported too often that it is gone: only the user can end that.
+        // Failed after its driver reported too often that it is gone: only the user can end that.
         if slot.state() == Failed {
             slot.apply(Input::Restart, now);
             settle(&mut slot, &mut now);

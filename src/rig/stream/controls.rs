@@ -1,10 +1,10 @@
-//! What an actuator is ordered: where to go, and whether it may.
+//! The commands of an actuator: where to move, and whether it may.
 //!
-//! Actions come by the bus, orders from the run's [`Permission`].
+//! Actions come from the bus, orders from the run's [`Permission`].
 //!
-//! Invariant: what was given before the device was there is not for it.
-//! Invariant: a run that is to arm its actuator does so once, when the device is there for the first time, and
-//! not at all after another order, whatever its origin and whether or not the device was there.
+//! Invariant: commands given before the device was present do not apply to it.
+//! Invariant: a run that arms its actuator does so once, when the device is first present, and not at all after any
+//! other order, whatever its origin and whether or not the device was present.
 
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use tokio::io::unix::AsyncFd;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use super::source::Source;
-use crate::action::{ActionSource, MAX_ACTION, Order};
+use crate::action::{ActionSource, MAX_ACTION};
 use crate::bus::{Actions, watch};
 use crate::driver::DriverError;
 use crate::permission::{Attended, Permission};
@@ -26,10 +26,10 @@ pub(in crate::rig) struct Controls {
     permission: Arc<Permission>,
 }
 
-/// The longest that an action of a program that does not notify waits.
+/// The longest time that an action without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);
 
-/// The controls of a device that is there, and does not take its orders and actions itself.
+/// The controls of a device that is present and does not take its orders and actions itself.
 #[derive(Debug)]
 pub(super) struct Controlled {
     actions: Arc<Actions>,
@@ -44,12 +44,12 @@ impl Controls {
         Self { actions, permission: Arc::default() }
     }
 
-    /// Whose orders it carries out from now on.
+    /// Sets whose orders it carries out from now on.
     pub(in crate::rig) fn obey(&mut self, permission: &Arc<Permission>) {
         self.permission = Arc::clone(permission);
     }
 
-    /// Its device is there. `None` if it takes its orders and actions itself.
+    /// Called when its device is present. `None` if the device takes its orders and actions itself.
     ///
     /// # Errors
     /// When it cannot be armed.
@@ -58,10 +58,8 @@ impl Controls {
         let orders = Arc::new(self.permission.attend());
         let actions = Arc::clone(&self.actions);
         let takes_itself = source.attend(&orders, &(actions as Arc<dyn ActionSource>));
-        match orders.is_to_be_armed() {
-            Ok(true) => source.order(Order::Arm).inspect_err(|_| orders.was_not_armed())?,
-            Ok(false) => {}
-            Err(blocked) => tracing::warn!("not armed at the start: {blocked}"),
+        if let Some(blocked) = orders.arm_at_first_plug(|order| source.order(order))? {
+            tracing::warn!("not armed at the start: {blocked}");
         }
         if takes_itself {
             return Ok(None);
@@ -74,7 +72,7 @@ impl Controls {
     }
 }
 
-/// Returns when a bell rings. It is to be silenced then.
+/// Returns when an event is signalled. The caller then has to clear it.
 async fn rings(bell: Option<&AsyncFd<OwnedFd>>) {
     let Some(bell) = bell else { return std::future::pending().await };
     match bell.readable().await {
@@ -84,7 +82,7 @@ async fn rings(bell: Option<&AsyncFd<OwnedFd>>) {
 }
 
 impl Controlled {
-    /// Returns when an order or an action may have come. Cancel-safe.
+    /// Returns when an order or an action may have arrived. Cancel-safe.
     pub(super) async fn changed(&mut self) {
         let [orders, actions] = &self.bells;
         tokio::select! {
@@ -94,18 +92,18 @@ impl Controlled {
         }
     }
 
-    /// Hands the device the orders that came since the last call.
+    /// Passes the device the orders since the last call.
     ///
     /// # Errors
-    /// When it does not take one.
+    /// When it does not accept one.
     pub(super) fn pass_on_orders(&mut self, source: &mut Source) -> Result<(), DriverError> {
         self.orders.take().try_for_each(|order| source.order(order))
     }
 
-    /// Hands the device the newest action that came since the last call, if any did.
+    /// Passes the device the newest action since the last call, if any.
     ///
     /// # Errors
-    /// When it does not take it, or what came is not to be followed.
+    /// When it does not accept the action, or the action must not be followed.
     pub(super) fn pass_on_action(&mut self, source: &mut Source) -> Result<(), DriverError> {
         match self.actions.newest(&mut self.action) {
             Ok(Some((target, _))) => source.command(target),

@@ -1,4 +1,4 @@
-//! Where the samples of a stream come from: a driver, or a program.
+//! The source of a stream's samples: a driver, or a program.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,7 +15,7 @@ use crate::registry::NodeSpec;
 use crate::rig::worker::{MOST_SILENT_BEATS, Worker};
 use crate::status::Episode;
 
-/// Where the samples of a stream come from.
+/// The source of a stream's samples.
 #[derive(Debug)]
 pub(super) enum Source {
     Driver(Driver),
@@ -48,45 +48,34 @@ impl Source {
         }
     }
 
+    /// The driver, unless a program sends: a program that moves something subscribes to actions itself, and learns of
+    /// episodes by its hooks.
+    const fn driver(&mut self) -> Option<&mut Driver> {
+        if let Self::Driver(driver) = self { Some(driver) } else { None }
+    }
+
     pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
-        match self {
-            Self::Driver(driver) => driver.command(target),
-            // A program that moves something subscribes to actions itself.
-            Self::Worker(_) => Ok(()),
-        }
+        self.driver().map_or(Ok(()), |driver| driver.command(target))
     }
 
     pub(super) fn order(&mut self, order: Order) -> Result<(), DriverError> {
-        match self {
-            Self::Driver(driver) => driver.order(order),
-            Self::Worker(_) => Ok(()),
-        }
+        self.driver().map_or(Ok(()), |driver| driver.order(order))
     }
 
-    /// Has it carry out these orders and actions. Returns whether it takes them itself.
+    /// Makes it carry out these orders and actions. Returns whether it takes them itself.
     pub(super) fn attend(&mut self, orders: &Arc<Attended>, actions: &Arc<dyn ActionSource>) -> bool {
-        match self {
-            Self::Driver(driver) => driver.attend(orders, actions),
-            Self::Worker(_) => false,
-        }
+        self.driver().is_some_and(|driver| driver.attend(orders, actions))
     }
 
     pub(super) fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
-        match self {
-            Self::Driver(driver) => driver.notices(),
-            Self::Worker(_) => None,
-        }
+        self.driver()?.notices()
     }
 
-    /// Passes episodes on to the hooks of a program.
     pub(super) fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
-        match self {
-            Self::Driver(driver) => driver.record(episode),
-            Self::Worker(_) => Ok(()),
-        }
+        self.driver().map_or(Ok(()), |driver| driver.record(episode))
     }
 
-    /// The stream was asked to stop.
+    /// Called when the stream was asked to stop.
     pub(super) async fn close(self) {
         match self {
             Self::Driver(driver) => drop(timeout(CLOSE_LIMIT, driver.close()).await),
@@ -97,12 +86,12 @@ impl Source {
     pub(super) fn negotiated(&self) -> Negotiated {
         match self {
             Self::Driver(driver) => driver.negotiated(),
-            // What a program agrees with its device, only the program knows.
+            // Only the program knows what it agrees with its device.
             Self::Worker(worker) => Negotiated { card: Some(worker.description()), ..Negotiated::default() },
         }
     }
 
-    /// A source that is silent for this long is opened again.
+    /// A source that is silent for this long is reopened.
     pub(super) fn patience(&self, stall_after: Duration) -> Option<Duration> {
         match self {
             Self::Driver(_) => None,

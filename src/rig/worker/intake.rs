@@ -1,12 +1,12 @@
-//! Judging what a program publishes: its header is untrusted.
+//! Validates what a program publishes: its header is untrusted.
 //!
-//! 1. Modality and epoch must be ours: the sample of an earlier process is not one of this device.
+//! 1. Modality and epoch must be ours: a sample of an earlier process does not belong to this device.
 //! 2. The payload must be what the entry declares, or the sample is refused.
-//! 3. A capture time that cannot be is replaced by the time of arrival; time never goes back.
-//! 4. A hole in `seq` is a loss; a counter that jumps or begins again is none.
+//! 3. An impossible capture time is replaced by the time of arrival; time never goes back.
+//! 4. A gap in `seq` is a loss; a counter that jumps or restarts is not.
 //!
-//! Invariant: pure; nothing a program can write makes this panic, or lets a number through that a
-//! driver of ours would not have given.
+//! Invariant: pure; nothing a program can write makes this panic, or passes a number that our own driver would not have
+//! sent.
 
 use std::time::Duration;
 
@@ -17,10 +17,10 @@ use crate::time::Stamp;
 
 /// A sample that claims to be older than this is not believed.
 const OLDEST: Duration = Duration::from_secs(10);
-/// A larger hole is a counter that was set.
+/// A larger gap means that the counter was set.
 const LARGEST_HOLE: u64 = 1_000_000;
 
-/// What of a sample is passed on.
+/// The part of a sample that is passed on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Judged {
     pub(super) encoding: Encoding,
@@ -49,7 +49,7 @@ enum Refusal {
     NotJpeg,
 }
 
-/// What the entry declares of a sample.
+/// The sample format that the entry declares.
 #[derive(Debug, Clone, Copy)]
 enum Expected {
     Scalars { channels: u32 },
@@ -65,7 +65,7 @@ pub(super) struct Intake {
     expected: Expected,
     last: Option<u64>,
     newest: Stamp,
-    /// A complaint that has not been fetched, and whether there was one of its kind before.
+    /// A complaint that has not been fetched, and whether one of its kind came before.
     complaint: Option<String>,
     has_refused: bool,
     has_doubted: bool,
@@ -120,7 +120,7 @@ impl Intake {
         Some(Judged { encoding, captured, flags, width, height, lost })
     }
 
-    /// What the user should know, the first time it is to be known.
+    /// A complaint for the user, the first time it occurs.
     pub(super) fn complaint(&mut self) -> Option<String> {
         self.complaint.take()
     }

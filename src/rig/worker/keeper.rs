@@ -1,7 +1,7 @@
 //! The task of one child process: starts it, waits for its end or ends it, and reaps it.
 //!
-//! Asked to stop, the group of the child gets SIGTERM, 5 s, then SIGKILL; what outlives its leader gets
-//! SIGKILL at once.
+//! On a stop request the child's process group gets SIGTERM, then after 5 s SIGKILL; processes that outlive the group's
+//! leader get SIGKILL at once.
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::ExitStatus;
@@ -20,7 +20,7 @@ use crate::status::Level;
 
 /// How long a child has to end after SIGTERM.
 pub(in crate::rig) const TERM_LIMIT: Duration = Duration::from_secs(5);
-/// How long what a child published last is left for its reader.
+/// How long a child's last samples are kept for their reader.
 const LAST_SAMPLES: Duration = Duration::from_secs(1);
 
 /// Everything the task owns.
@@ -29,9 +29,9 @@ pub(super) struct Keeper {
     pub(super) name: String,
     pub(super) programs: Programs,
     pub(super) membership: Membership,
-    /// The child is to end.
+    /// Cancelled when the child must end.
     pub(super) stop: CancellationToken,
-    /// The entry's turn: given back when the child is gone.
+    /// The entry's turn: released when the child is gone.
     pub(super) turn: OwnedMutexGuard<()>,
     /// Receives the process id, or why there is none.
     pub(super) started: oneshot::Sender<Result<u32, DriverError>>,
@@ -58,7 +58,7 @@ impl Keeper {
             }
         };
         let id = child.id();
-        // Where the stream has been asked to stop meanwhile, nothing listens, here and below.
+        // If the stream has been asked to stop meanwhile, there is no receiver, here and below.
         let _ = started.send(Ok(id));
         programs.logbook.write(&name, &format!("started as process {id}"));
         let mut output = Output::new(&name, None, &programs);
@@ -78,15 +78,15 @@ impl Keeper {
         programs.logbook.write(&name, &reason);
         tracing::debug!(device = %name, process = id, "{reason}");
         let _ = ended.send(reason);
-        // What the child published last goes with its memory.
+        // The child's last samples are lost with its memory.
         let _ = timeout(LAST_SAMPLES, stop.cancelled()).await;
-        // A panic in there is reported by the runtime and leaves only files behind.
+        // The runtime reports a panic in there; it only leaves files behind.
         let _ = tokio::task::spawn_blocking(move || membership.sweep()).await;
         drop(turn);
     }
 }
 
-/// Waits for the child's end, and brings it about when asked to.
+/// Waits for the child's end, and causes it on request.
 async fn until_end(child: &Child, stop: &CancellationToken, hurry: &CancellationToken) -> End {
     tokio::select! {
         biased;
@@ -139,7 +139,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_end_is_told_in_words() {
+    fn an_exit_status_is_described_in_words() {
         // As wait(2) encodes them: the code in the second byte, a signal in the first.
         for (raw, reported) in [
             (0, "its process ended with code 0"),

@@ -79,7 +79,7 @@ fn keys_become_commands() {
 }
 
 #[test]
-fn what_stops_motion_does_so_at_any_moment() {
+fn keys_that_stop_motion_work_at_any_moment() {
     let questions: [(&str, Vec<Msg>); 6] = [
         ("nothing", vec![]),
         ("the help", vec![press(KeyCode::Char('?'))]),
@@ -108,17 +108,17 @@ fn what_stops_motion_does_so_at_any_moment() {
             }
             let what = format!("{key:?} while {question} is asked");
             let effect = model.update(key);
-            // Ctrl-C is the answer to the question whether to leave.
+            // Ctrl-C confirms the question whether to leave.
             let leaves = question == "leaving" && what.contains("'c'");
             assert_eq!(effect, if leaves { Effect::Leave } else { Effect::Order(Order::Disarm) }, "{what}");
             assert!(!model.help || what.contains("'c'"), "{what}");
-            // The question is not answered by what comes next.
+            // The next key does not answer the question.
             assert_eq!(model.update(control('y')), Effect::None, "{what}");
         }
     }
 }
 
-/// Keys, and when each came, ms.
+/// Keys with their times, ms.
 type Keys = Vec<(u64, Msg)>;
 
 #[test]
@@ -130,7 +130,11 @@ fn only_two_different_keys_within_two_seconds_arm() {
         ("a, ctrl-y", vec![(0, a()), (300, control('y'))], &arm),
         ("a, a, ctrl-y", vec![(0, a()), (100, a()), (300, control('y'))], &arm),
         ("a twice", vec![(0, a()), (300, a())], &Effect::None),
-        ("a held down, as a terminal without repeats tells", (0..50).map(|at| (30 * at, a())).collect(), &Effect::None),
+        (
+            "a held down, as a terminal without repeat events reports it",
+            (0..50).map(|at| (30 * at, a())).collect(),
+            &Effect::None,
+        ),
         ("pasted text", "aay ay\nay".chars().map(|letter| (0, press(KeyCode::Char(letter)))).collect(), &Effect::None),
         ("ctrl-y alone", vec![(0, control('y'))], &Effect::None),
         ("ctrl-y held down", vec![(0, a()), (300, repeated_y)], &Effect::None),
@@ -187,7 +191,7 @@ fn a_paused_view_is_frozen_but_commands_use_current_state() {
     model.update(after(&later, 100));
     assert_eq!(model.shown().mask, every_state().mask);
     assert_eq!(model.edge(id(0)), Edge::None);
-    // The episode that began meanwhile is known to the question.
+    // The question knows about the episode that began meanwhile.
     assert!(model.is_recording());
     assert_eq!(model.update(press(KeyCode::Char('q'))), Effect::None);
     model.update(press(KeyCode::Char('p')));
@@ -203,7 +207,7 @@ fn a_log_scrolled_back_stays_where_it_is_when_lines_come() {
     let mut model = Model::new(snapshot.clone());
     model.update(press(KeyCode::PageUp));
     assert_eq!(model.scroll, SCROLL_STEP);
-    // Two lines come, the two oldest go.
+    // Two lines are added, the two oldest are removed.
     snapshot.log.drain(..2);
     snapshot.log.extend((50..52).map(|second| line(second, Level::Info, "tick")));
     model.update(after(&snapshot, 100));
@@ -229,10 +233,10 @@ fn an_answer_fades() {
     assert_eq!(model.notice(), None);
 }
 
-/// A key, its time in ms since the first one, and the snapshot of then.
+/// A key, its time in ms since the first one, and the snapshot at that time.
 type Timed = (u64, Msg, Snapshot);
 
-/// After an episode that was too short.
+/// The state after an episode that was too short.
 fn with_short(file: &str) -> Snapshot {
     let mut snapshot = three_streaming();
     snapshot.short_episode = Some(ShortEpisode { file: file.into(), length: Duration::from_millis(200) });

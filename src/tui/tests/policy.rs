@@ -1,4 +1,4 @@
-//! The policy panel: acting, holding, dry, and with more than there is room for.
+//! The policy panel: acting, holding, dry, and with more content than fits.
 
 use super::*;
 use crate::status::literal::policy;
@@ -44,7 +44,7 @@ fn a_holding_policy_shows_its_reason_with_and_without_colour() {
     assert_snapshot!("policy_holds_60x12", draw(&model, SMALL, THEME));
     let screen = draw(&model, USUAL, THEME);
     assert_eq!(style_of(screen.buffer(), "▲ holds: a modality").fg, Some(Color::Yellow));
-    // Also where the reason does not fit whole, it names the device.
+    // It names the device even if the reason does not fit completely.
     assert!(draw(&model, SMALL, THEME).to_string().contains("…: arm"));
     assert!(style_of(screen.buffer(), " 0.123").add_modifier.contains(Modifier::DIM), "is not carried out");
     assert_snapshot!("policy_holds_80x24", screen);

@@ -1,4 +1,4 @@
-//! The bare beat: a thread that wakes on absolute deadlines and does nothing else. What the machine can do.
+//! The bare loop: a thread that wakes on absolute deadlines and does nothing else. The machine's own limit.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,25 +18,25 @@ use crate::child::thread_cpu_s;
 /// The priority of `rapid`'s mask thread.
 const FIFO_PRIORITY: u8 = 40;
 
-/// What a beat was like.
+/// Measurements of a loop.
 #[derive(Debug, Default)]
 pub(crate) struct Beaten {
-    /// `CLOCK_REALTIME` of every beat, ns.
+    /// `CLOCK_REALTIME` of every wake-up, ns.
     stamps: Vec<u64>,
     /// It ran under `SCHED_FIFO`.
     pub(crate) fifo: bool,
-    /// Share of a core it took, %.
+    /// Share of a core that it used, %.
     pub(crate) cpu: f64,
 }
 
 impl Beaten {
-    /// From one beat to the next, ms.
+    /// Time between consecutive wake-ups, ms.
     pub(crate) fn intervals(&self) -> impl Iterator<Item = f64> {
         self.stamps.windows(2).map(|pair| pair[1].saturating_sub(pair[0]) as f64 / 1e6)
     }
 }
 
-/// A running beat.
+/// A running loop.
 #[derive(Debug)]
 pub(crate) struct Beat {
     stop: Arc<AtomicBool>,
@@ -44,7 +44,7 @@ pub(crate) struct Beat {
 }
 
 impl Beat {
-    /// Starts a beat of the mask's period.
+    /// Starts a loop with the mask's period.
     pub(crate) fn start() -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let thread = std::thread::spawn({
@@ -73,13 +73,13 @@ impl Beat {
     }
 }
 
-/// Sleeps until a moment of `CLOCK_MONOTONIC`.
+/// Sleeps until a time of `CLOCK_MONOTONIC`.
 pub(crate) fn sleep_until(due: Stamp) {
     let request = Timespec {
         tv_sec: i64::try_from(due.0 / 1_000_000_000).unwrap_or(i64::MAX),
         tv_nsec: i64::try_from(due.0 % 1_000_000_000).unwrap_or_default(),
     };
-    // A signal ends a sleep early; then it is slept on.
+    // A signal ends a sleep early; then the sleep is repeated.
     while clock_nanosleep_absolute(ClockId::Monotonic, &request).is_err() {}
 }
 
@@ -88,7 +88,7 @@ pub(crate) fn sleep(time: Duration) {
     sleep_until(Stamp::now().after(time));
 }
 
-/// Puts the calling thread where `rapid` puts its mask thread; true if that is permitted.
+/// Gives the calling thread the priority of `rapid`'s mask thread; true if that is permitted.
 pub(crate) fn use_fifo() -> bool {
     let Ok(priority) = ThreadPriorityValue::try_from(FIFO_PRIORITY) else { return false };
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);

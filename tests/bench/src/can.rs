@@ -1,7 +1,7 @@
-//! A full CAN bus: 8,000 frames a second, received without a loss, and what that costs.
+//! A full CAN bus: 8,000 frames a second, received without a loss, and the cost of that.
 //!
-//! Behind Damiao's adapter on a pseudo-terminal the frames go the whole way: driver, rig, bus, recorder, file. A kernel
-//! without CAN has no interface to bring up: there datagrams of the same size come to the same driver.
+//! With Damiao's adapter on a pseudo-terminal the frames take the whole path: driver, rig, bus, recorder, file. A
+//! kernel without CAN has no interface to bring up: there datagrams of the same size go to the same driver.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -12,9 +12,10 @@ use std::time::Duration;
 
 use futures::StreamExt;
 use rapid::bus::TopicId;
+use rapid::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid::driver::can::raw::Raw;
 use rapid::hotplug::HotplugEvent;
-use rapid::registry::{Attachment, CAN_RECORD, DeviceNode, Registry, UsbIdentity};
+use rapid::registry::{CAN_RECORD, Registry};
 use rapid::time::Stamp;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use vbench::emu::can::Frame;
@@ -27,12 +28,12 @@ use crate::frame::play;
 use crate::stats::median;
 use crate::{Bench, Failure};
 
-/// What a classic bus at 1 Mbit/s carries of frames with eight bytes, about.
+/// Approximate capacity of a classic bus at 1 Mbit/s for frames of eight bytes.
 const HZ: usize = 8_000;
-/// An adapter hands over what came in a millisecond.
+/// An adapter delivers the frames of a millisecond at once.
 const BURST: Duration = Duration::from_millis(1);
 const EACH: usize = HZ / 1_000;
-/// Until the line is open, and until the last frame is in the file.
+/// Time until the line is open, and until the last frame is in the file.
 const MARGIN: Duration = Duration::from_millis(700);
 const ID: u32 = 0x123;
 const REGISTRY: &str = "[rig]\nname = \"can\"\n[device.bus]\nvid = \"1209\"\npid = \"0001\"\nnode = \"can\"\nbit = 0\n\
@@ -42,10 +43,10 @@ const REGISTRY: &str = "[rig]\nname = \"can\"\n[device.bus]\nvid = \"1209\"\npid
 #[derive(Clone, Copy)]
 struct Run {
     sent: usize,
-    /// What found no room in the line.
+    /// Frames that did not fit into the line's buffer.
     refused: usize,
     received: usize,
-    /// Of one core, %, without what it took to send.
+    /// Share of one core, %, without the sending.
     cpu: f64,
 }
 
@@ -79,7 +80,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     ])
 }
 
-/// The whole way, with the bus full or silent.
+/// The whole path, with the bus full or silent.
 fn whole(bench: &Bench, length: Duration, full: bool) -> Result<Run, Failure> {
     let registry = Registry::parse(REGISTRY, None)?.registry;
     let topic = TopicId::Modality(registry.named("bus").ok_or("the registry has no bus")?.id);
@@ -99,14 +100,14 @@ fn whole(bench: &Bench, length: Duration, full: bool) -> Result<Run, Failure> {
     let sender = std::thread::spawn(move || send(length, full, |bytes| (&line).write(bytes)));
     let passed = play(bench, &registry, plugged, length + 2 * MARGIN)?;
     let (sent, refused, cpu) = sender.join().map_err(|_| "the sender panicked")?;
-    // Hung up before, the line would lose what was not read yet.
+    // Closed earlier, the line would lose unread data.
     drop(adapter);
     let bytes: usize = passed.iter().filter(|one| one.topic == topic).map(|one| one.bytes).sum();
     Ok(Run { sent, refused, received: bytes / CAN_RECORD, cpu })
 }
 
-/// Writes frames as an adapter does. How many there were, how many found no room, and the share of a core that the rest of
-/// this process took meanwhile, %.
+/// Writes frames as an adapter does. Returns how many there were, how many did not fit, and the share of a core that
+/// the rest of this process used meanwhile, %.
 fn send(length: Duration, full: bool, mut write: impl FnMut(&[u8]) -> io::Result<usize>) -> (usize, usize, f64) {
     sleep(MARGIN);
     let (mut sent, mut refused, mut waiting) = (0, 0, Vec::new());
@@ -119,13 +120,13 @@ fn send(length: Duration, full: bool, mut write: impl FnMut(&[u8]) -> io::Result
             continue;
         }
         for number in sent..sent + EACH {
-            // What the line did not take goes first; a frame that then has no room is lost, as in an adapter.
+            // The unwritten rest goes first; a frame that does not fit then is lost, as in an adapter.
             let taken = write(&waiting).unwrap_or(0);
             waiting.drain(..taken);
             if waiting.is_empty()
                 && let Some(frame) = Frame::new(ID, false, false, 8, &number.to_le_bytes())
             {
-                damiao::tell(&frame, &mut waiting);
+                damiao::send_to_host(&frame, &mut waiting);
             } else {
                 refused += 1;
             }
@@ -138,7 +139,7 @@ fn send(length: Duration, full: bool, mut write: impl FnMut(&[u8]) -> io::Result
     (sent, refused, 100.0 * others / Stamp::now().since(begun).as_secs_f64())
 }
 
-/// The adapter's end of a line, which never waits, and the path of the host's.
+/// The adapter's end of a line, which never blocks, and the path of the host's end.
 fn terminal() -> Result<(File, PathBuf), Failure> {
     let ours = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
     grantpt(&ours)?;
@@ -148,7 +149,7 @@ fn terminal() -> Result<(File, PathBuf), Failure> {
     Ok((File::from(ours), path))
 }
 
-/// Datagrams to the driver of a raw bus, or to a loop that only receives.
+/// Datagrams to the driver of a raw bus, or to a bare receive loop.
 fn datagrams(length: Duration, driver: bool) -> Result<Run, Failure> {
     let (ours, theirs) = (UdpSocket::bind("127.0.0.1:0")?, UdpSocket::bind("127.0.0.1:0")?);
     ours.connect(theirs.local_addr()?)?;
@@ -165,7 +166,7 @@ fn datagrams(length: Duration, driver: bool) -> Result<Run, Failure> {
                 frame[..4].copy_from_slice(&ID.to_ne_bytes());
                 frame[4] = 8;
                 frame[8..].copy_from_slice(&number.to_le_bytes());
-                // One that finds no room is counted as not received.
+                // A datagram that does not fit is counted as not received.
                 let _ = theirs.send(&frame);
             }
             sent += EACH;
@@ -178,7 +179,7 @@ fn datagrams(length: Duration, driver: bool) -> Result<Run, Failure> {
     Ok(Run { sent, refused: 0, received, cpu: 100.0 * spent / length.as_secs_f64() })
 }
 
-/// Frames received and time spent on them, s.
+/// Frames received and time used for them, s.
 fn by_driver(socket: UdpSocket, until: Stamp) -> Result<(usize, f64), Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {

@@ -1,4 +1,4 @@
-//! What the bench runs in processes of its own, so that the kernel accounts for each alike.
+//! Measurements in separate processes, so that the kernel accounts for each in the same way.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -12,9 +12,9 @@ use clap::Subcommand;
 use mcap::WriteOptions;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
+use rapid::device::DeviceNode;
 use rapid::driver::Driver;
-use rapid::registry::DeviceNode;
-use rapid::registry::scenario::SimDevice;
+use rapid::simulation::SimDevice;
 use rapid::time::Stamp;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
@@ -24,10 +24,10 @@ use crate::feed::{self, Feed};
 use crate::heap;
 use crate::process::Running;
 
-/// Bytes of a chunk, as the recorder has it.
+/// Chunk size in bytes, as in the recorder.
 pub(crate) const CHUNK_BYTES: u64 = 1 << 20;
 const BUFFER_BYTES: usize = 64 << 10;
-/// What a child may take beside its task.
+/// Time limit of a child in addition to its task.
 const LIMIT: Duration = Duration::from_secs(120);
 
 /// See the module's comment. Not for use by hand.
@@ -58,14 +58,14 @@ pub(crate) enum Child {
     },
 }
 
-/// What a child reports it took.
+/// Resources that a child reports.
 #[derive(Debug, Default, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Spent {
     /// Time on processors, s.
     pub cpu_s: f64,
     /// Wall time, s.
     pub seconds: f64,
-    /// Peak of resident memory, bytes; filled in by who watches.
+    /// Peak of resident memory, bytes; filled in by the parent.
     #[serde(default)]
     pub resident: u64,
 }
@@ -80,7 +80,7 @@ impl Spent {
 }
 
 impl Child {
-    /// Does it and reports what it took.
+    /// Runs the task and reports the resources used.
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let printed = match self {
             Self::Mcap { folder, seconds } => serde_json::to_string(&mcap_alone(folder, *seconds)?)?,
@@ -91,17 +91,17 @@ impl Child {
     }
 }
 
-/// Options of a file as the recorder has them.
+/// Options of a file, as in the recorder.
 pub(crate) fn options() -> WriteOptions {
     WriteOptions::new().compression(None).chunk_size(Some(CHUNK_BYTES)).disable_seeking(true)
 }
 
-/// Time this process was on processors, s.
+/// Processor time of this process, s.
 pub(crate) fn process_cpu_s() -> f64 {
     seconds_of(ClockId::ProcessCPUTime)
 }
 
-/// Time this thread was on a processor, s.
+/// Processor time of this thread, s.
 pub(crate) fn thread_cpu_s() -> f64 {
     seconds_of(ClockId::ThreadCPUTime)
 }
@@ -119,7 +119,7 @@ pub(crate) struct Plain {
 }
 
 impl Plain {
-    /// Begins the file.
+    /// Creates the file.
     pub(crate) fn create(path: &Path, feed: &Feed, options: WriteOptions) -> Result<Self, Failure> {
         let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, File::create(path)?));
         let mut writer = mcap::Writer::with_options(sink, options)?;
@@ -143,7 +143,7 @@ impl Plain {
         Ok(())
     }
 
-    /// Ends the file; the disk is not waited for.
+    /// Finishes the file without waiting for the disk.
     pub(crate) fn finish(mut self) -> Result<(), Failure> {
         self.writer.finish()?;
         self.writer.into_inner().into_inner().flush()?;
@@ -176,7 +176,7 @@ fn peak() -> u64 {
 
 fn devices_alone(seconds: u64) -> Result<Spent, Failure> {
     let (registry, scenario) = feed::rig()?;
-    // As the program's own.
+    // Configured as in the program.
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
         let begun = Stamp::now();
@@ -191,7 +191,7 @@ fn devices_alone(seconds: u64) -> Result<Spent, Failure> {
         let readers = drivers.into_iter().map(|mut driver| {
             tokio::spawn(async move {
                 let work = async { while driver.read().await.is_ok() {} };
-                // Running out of time is how it ends.
+                // It ends by reaching its time limit.
                 let _ = tokio::time::timeout_at(end, work).await;
             })
         });

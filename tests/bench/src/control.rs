@@ -1,6 +1,6 @@
-//! How well a control loop keeps its grid while chunks are computed, against a bare thread at the same time.
+//! How well a control loop keeps its grid while chunks are computed, compared with a bare thread at the same time.
 //!
-//! A recorded action holds when its tick was due (`log_time`) and when it was published (`publish_time`).
+//! A recorded action contains when its tick was due (`log_time`) and when it was published (`publish_time`).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -18,21 +18,21 @@ use crate::process::Running;
 use crate::stats::{Sorted, median};
 use crate::{Bench, Failure, LIMIT};
 
-/// Ticks a second.
+/// Ticks per second.
 const HZ: u32 = 30;
-/// More than usual: a chunk takes longer than a tick, and the next one is asked for as soon as it is there.
+/// More than usual: a chunk takes longer than a tick, and the next one is requested as soon as it has arrived.
 const DENOISING_STEPS: &str = "25";
 /// The program's topic of actions.
 const ACTIONS: &str = "/action";
 
-/// What one run came to; times in ms.
+/// Results of one run; times in ms.
 struct Run {
     late: Sorted,
     bare: Sorted,
     /// Ticks without an action.
     missing: u64,
     chunks: usize,
-    /// Of the time in which a chunk was computed, %.
+    /// Share of the time in which a chunk was computed, %.
     computing: f64,
 }
 
@@ -66,8 +66,8 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(figures.collect())
 }
 
-/// The policy with a control grid of [`HZ`], asked at every tick that it is free. Its cameras stay as they are: it sees
-/// older pictures.
+/// The policy with a control grid of [`HZ`], queried at every tick at which it is free. Its cameras are unchanged: it
+/// observes older pictures.
 fn faster(bench: &Bench) -> Result<PathBuf, Failure> {
     let folder = bench.scratch.path().join("faster");
     std::fs::create_dir_all(&folder)?;
@@ -111,7 +111,7 @@ fn one(bench: &Bench, folder: &Path, length: Duration) -> Result<Run, Failure> {
     };
     let missing = u64::from(last - first + 1).saturating_sub(ticks.len() as u64);
     let chunks: Vec<f64> = usage.output.lines().filter_map(latency_ms).collect();
-    // Chunks are counted from the start of the loop, a little before the first tick seen here.
+    // Chunks are counted from the start of the loop, shortly before the first tick recorded here.
     let computing = (chunks.iter().sum::<f64>() / 10.0 / seconds).min(100.0);
     let late = Sorted::new(ticks.into_iter().map(|(_, late)| late));
     Ok(Run { late, bare: Sorted::new(bare), missing, chunks: chunks.len(), computing })
@@ -130,7 +130,7 @@ fn ticks(episode: &Path, begun: u64) -> Result<Vec<(u32, f64)>, Failure> {
     Ok(ticks)
 }
 
-/// Wakes at every tick, and nothing else: how late each time, ms.
+/// Only wakes at every tick: how late each time, ms.
 fn beat(stop: &AtomicBool) -> Vec<f64> {
     let mut late = Vec::with_capacity(1 << 12);
     let mut due = Stamp::now();
@@ -142,7 +142,7 @@ fn beat(stop: &AtomicBool) -> Vec<f64> {
     late
 }
 
-/// Of a line about a chunk.
+/// The latency in a line about a chunk.
 fn latency_ms(line: &str) -> Option<f64> {
     let line: Value = serde_json::from_str(line).ok()?;
     (line.get("event")?.as_str()? == "chunk").then(|| line.get("latency_ms")?.as_f64())?

@@ -1,17 +1,18 @@
-//! From `rapid disarm` to the last motor that is off.
+//! Time from `rapid disarm` until the last motor is off.
 //!
-//! The rig, the thread that takes orders and thread `control` are those of a run; the motors are those of the virtual bench,
-//! behind Damiao's adapter on a pseudo-terminal. The time begins before the command's process is started.
+//! The rig, the thread for orders and thread `control` are those of a run; the motors are those of the virtual bench,
+//! behind Damiao's adapter on a pseudo-terminal. Time starts before the command's process does.
 
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rapid::bus::{Bus, TopicId};
+use rapid::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid::hotplug::{HotplugEvent, HotplugStream};
 use rapid::orders::receive::Orders;
 use rapid::permission::Permission;
-use rapid::registry::{Attachment, DeviceNode, Registry, UsbIdentity};
+use rapid::registry::Registry;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
 use rapid::status::Board;
@@ -25,7 +26,7 @@ use crate::{Bench, Failure, LIMIT};
 
 const AXES: u16 = 6;
 
-/// An arm of six motors, as `devices.toml` has it.
+/// An arm of six motors, as in `devices.toml`.
 pub(crate) fn registry() -> Result<Registry, Failure> {
     let motors: Vec<String> = (1..=AXES)
         .map(|id| {
@@ -85,7 +86,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(vec![figure("p50", 0.5).note(note), figure("p99", 0.99).target("< 30"), figure("max", 1.0)])
 }
 
-/// How long each disarm took, and the program alone, ms.
+/// The duration of each disarm, and of the program alone, ms.
 fn disarms(bench: &Bench, adapter: &Adapter, instance: &str, count: usize) -> Result<(Sorted, Sorted), Failure> {
     let rapid = |arguments: &[&str]| {
         Command::new(&bench.rapid).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).status()
@@ -94,12 +95,12 @@ fn disarms(bench: &Bench, adapter: &Adapter, instance: &str, count: usize) -> Re
     for _ in 0..count {
         let begun = Stamp::now();
         until("they are armed", || {
-            // Refused until the motors have been found.
+            // Orders are refused until the motors have been found.
             let all = |action| (1..=AXES).all(|motor| adapter.reported_at(motor, action, begun).is_some());
             let enabled = all("motor_enabled");
             Ok(enabled || rapid(&["arm", "--instance", instance])?.success() && all("motor_enabled"))
         })?;
-        // Commands flow.
+        // Commands are being sent.
         std::thread::sleep(Duration::from_millis(30));
         let begun = Stamp::now();
         if !rapid(&["disarm", "--instance", instance])?.success() {

@@ -1,4 +1,4 @@
-//! The same chunk in PyTorch, eager, by `models/torch_latency.py` in the environment of the training.
+//! The same chunk in eager PyTorch, computed by `models/torch_latency.py` in the training environment.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,11 +10,11 @@ use crate::stats::{Sorted, median};
 use crate::{Absent, Bench, Failure};
 
 const SCRIPT: &str = "models/torch_latency.py";
-/// What makes the environment, and everything that is trained with it.
+/// The command that creates the environment, with everything that is trained in it.
 const REMEDY: &str = "`make train-test` makes it (5 GB)";
 
-/// PyTorch's chunk beside ours, `own` giving times of some of ours and the processor's share of them, ms: theirs and ours in
-/// turn, as often as there are runs.
+/// PyTorch's chunk compared with ours; `own` returns some of our times and the processor time in them, ms. Both are
+/// measured alternately, as often as there are runs.
 pub(crate) fn figures(bench: &Bench, own: impl FnMut() -> Result<(Vec<f64>, Vec<f64>), Failure>) -> Vec<Figure> {
     const NAME: &str = "policy/PyTorch eager";
     let Some(python) = python() else {
@@ -24,7 +24,7 @@ pub(crate) fn figures(bench: &Bench, own: impl FnMut() -> Result<(Vec<f64>, Vec<
     compare(bench, &python, own).unwrap_or_else(|error| vec![Figure::of_failure(NAME, &error)])
 }
 
-/// One chunk of PyTorch, ms: the median by the wall, and by the processor's own time.
+/// One chunk in PyTorch, ms: the median of wall time, and of processor time.
 struct Eager {
     wall: f64,
     cpu: f64,
@@ -67,7 +67,7 @@ fn eager(bench: &Bench, python: &Path, chunks: &str) -> Result<Eager, Failure> {
     let bundle = std::path::absolute(&bench.bundle)?;
     let mut command = Command::new(python);
     command.arg(SCRIPT).arg(bundle).args(["--json", "--threads", "1", "--chunks", chunks]);
-    // As the training sets it: threads that wait do not spin.
+    // As in the training: waiting threads do not spin.
     let output = command.env("OMP_WAIT_POLICY", "PASSIVE").output()?;
     if !output.status.success() {
         return Err(format!("{SCRIPT}: {}", String::from_utf8_lossy(&output.stderr).trim()).into());
@@ -78,7 +78,7 @@ fn eager(bench: &Bench, python: &Path, chunks: &str) -> Result<Eager, Failure> {
     Ok(Eager { wall: number("p50")?, cpu: number("cpu_p50")?, version })
 }
 
-/// The environment that `scripts/train.sh` makes, if it is whole.
+/// The environment created by `scripts/train.sh`, if it is complete.
 fn python() -> Option<PathBuf> {
     let cache = std::env::var_os("XDG_CACHE_HOME").filter(|path| !path.is_empty()).map(PathBuf::from);
     let cache = cache.or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")))?;

@@ -1,18 +1,18 @@
-//! The policy in closed loop on the simulated task, against the same with a static configuration.
+//! The policy in closed loop on the simulated task, compared with a static configuration.
 
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use rapid::driver::sim::task::STEP_HZ;
+use rapid::simulation::task::STEP_HZ;
 use serde_json::Value;
 
 use crate::figure::Figure;
 use crate::process::Running;
 use crate::{Bench, Failure};
 
-/// Trials take seconds; a machine that does other things may need minutes.
+/// Trials take seconds; a busy machine may need minutes.
 const LIMIT: Duration = Duration::from_secs(1800);
-/// Conditions of `rapid eval`, and what their score is to be.
+/// Conditions of `rapid eval`, and their target scores.
 const CONDITIONS: [(&str, &[&str]); 5] = [
     ("full", &[">= 0.95"]),
     ("no-tactile", &[">= 0.4", "<= 0.6"]),
@@ -20,14 +20,14 @@ const CONDITIONS: [(&str, &[&str]); 5] = [
     ("hot-replug", &[">= 0.9"]),
     ("no-wrist", &[]),
 ];
-/// Those in which a sensor goes.
+/// Those in which a sensor is unplugged.
 const PULLED: [&str; 2] = ["hot-unplug", "hot-replug"];
 
-/// What `rapid eval` printed.
+/// The output of `rapid eval`.
 struct Evaluated {
     conditions: Vec<Value>,
     trials: f64,
-    /// Of the task, all trials.
+    /// Steps of the task, all trials.
     steps: f64,
     seconds: f64,
 }

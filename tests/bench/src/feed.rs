@@ -1,4 +1,4 @@
-//! The messages of the full load, made once: what the recorder and the `mcap` crate are fed with from memory.
+//! The messages of the full load, created once: the recorder and the `mcap` crate read them from memory.
 
 use std::sync::Arc;
 
@@ -8,8 +8,9 @@ use rapid::episode::encode;
 use rapid::episode::schema::{self, SampleSchema};
 use rapid::modality::ModalityId;
 use rapid::registry::Registry;
-use rapid::registry::scenario::{Scenario, SimSource};
+use rapid::registry::scenario::Scenario;
 use rapid::sample::{Encoding, SampleHeader};
+use rapid::simulation::SimSource;
 
 use crate::Failure;
 
@@ -34,24 +35,24 @@ pub(crate) struct Lane {
     pub topic: TopicId,
     /// Topic's name in a file.
     pub name: String,
-    /// How it is written.
+    /// Its schema.
     pub schema: SampleSchema,
-    /// All but times and numbers.
+    /// All fields except times and numbers.
     pub header: SampleHeader,
-    /// What it sends, in turn.
+    /// Its payloads, sent in turn.
     pub payloads: Vec<Vec<u8>>,
     /// The same as messages of a file.
     pub messages: Vec<Vec<u8>>,
-    /// Messages a second.
+    /// Messages per second.
     pub hz: u64,
 }
 
-/// All lanes and the order of one second.
+/// All lanes and the message order of one second.
 #[derive(Debug, Clone)]
 pub(crate) struct Feed {
     /// See [`Lane`].
     pub lanes: Arc<Vec<Lane>>,
-    /// Which lane is next, for every message of a second.
+    /// The lane of every message of a second.
     pub second: Arc<Vec<usize>>,
 }
 
@@ -91,7 +92,7 @@ impl Feed {
         Ok(Self { second: Arc::new(order(&lanes)), lanes: Arc::new(lanes) })
     }
 
-    /// Bytes of messages a second.
+    /// Message bytes per second.
     pub(crate) fn bytes(&self) -> u64 {
         let of = |lane: &Lane| lane.messages.iter().map(Vec::len).sum::<usize>() / lane.messages.len().max(1);
         self.lanes.iter().map(|lane| of(lane) as u64 * lane.hz).sum()
@@ -110,7 +111,7 @@ fn lane(id: ModalityId, topic: &str, frame_id: &str, header: SampleHeader, paylo
     Lane { topic: TopicId::Modality(id), name, schema, header, payloads, messages, hz }
 }
 
-/// The messages of a second by the time at which they are due.
+/// The messages of a second, ordered by due time.
 fn order(lanes: &[Lane]) -> Vec<usize> {
     let mut due: Vec<(u64, usize)> = lanes
         .iter()

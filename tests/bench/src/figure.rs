@@ -1,7 +1,7 @@
-//! Figures: what was measured, beside its baseline and its target, as a table or as JSON.
+//! Figures: measurements with baseline and target, as a table or as JSON.
 //!
-//! Invariant: a figure that could not be measured is shown with the reason, and states whether the machine lacks what it
-//! needs; nothing here fails on a value.
+//! Invariant: a figure that could not be measured is shown with the reason, and states whether the machine lacks a
+//! requirement; no value causes a failure here.
 
 use std::fmt::Write as _;
 
@@ -10,29 +10,29 @@ use serde_json::Value;
 
 use crate::{Absent, Failure};
 
-/// One figure; as JSON one object a line.
+/// One figure; as JSON one object per line.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Figure {
     /// `section/what`.
     pub name: String,
-    /// Of value, baseline and target; may be empty.
+    /// Unit of value, baseline and target; may be empty.
     #[serde(default)]
     pub unit: String,
-    /// `None` if it was not measured; then the note gives the reason.
+    /// `None` if it was not measured; the note then gives the reason.
     pub value: Option<f64>,
-    /// The same of something simpler, measured in the same run.
+    /// The same measurement of something simpler, in the same run.
     #[serde(default)]
     pub baseline: Option<f64>,
-    /// What is wanted of the value: `"< 200"`, `">= 0.9"`, `"= 0"`; a bare number is an upper bound.
+    /// The target: `"< 200"`, `">= 0.9"`, `"= 0"`; a bare number is an upper bound.
     #[serde(default)]
     pub target: Option<Value>,
     /// How it was measured, for people.
     #[serde(default)]
     pub note: String,
-    /// Does the value meet the target? `None` without either.
+    /// Whether the value meets the target; `None` if either is missing.
     #[serde(default)]
     pub met: Option<bool>,
-    /// There is no value because the machine lacks what the note names.
+    /// There is no value because the machine lacks the requirement named in the note.
     #[serde(default)]
     pub absent: bool,
 }
@@ -44,12 +44,12 @@ impl Figure {
         Self { name, unit, value, baseline: None, target: None, note: String::new(), met: None, absent: false }
     }
 
-    /// A figure there is no value of.
+    /// A figure without a value.
     pub(crate) fn missing(name: impl Into<String>, why: impl Into<String>) -> Self {
         Self::new(name, "", None).note(why)
     }
 
-    /// A figure there is no value of, as what was to measure it failed.
+    /// A figure without a value because its measurement failed.
     pub(crate) fn of_failure(name: impl Into<String>, why: &Failure) -> Self {
         Self { absent: why.is::<Absent>(), ..Self::missing(name, why.to_string()) }
     }
@@ -59,28 +59,28 @@ impl Figure {
         self.value.is_none_or(f64::is_nan) && !self.absent
     }
 
-    /// With its baseline.
+    /// Adds the baseline.
     #[must_use]
     pub(crate) fn baseline(mut self, baseline: Option<f64>) -> Self {
         self.baseline = baseline;
         self
     }
 
-    /// With its target, as [`Figure::target`] is written.
+    /// Adds the target, in the notation of [`Figure::target`].
     #[must_use]
     pub(crate) fn target(mut self, target: &str) -> Self {
         self.target = Some(Value::from(target));
         self.judged()
     }
 
-    /// With a note.
+    /// Adds a note.
     #[must_use]
     pub(crate) fn note(mut self, note: impl Into<String>) -> Self {
         self.note = note.into();
         self
     }
 
-    /// With `met` as value and target have it.
+    /// Sets `met` according to value and target.
     #[must_use]
     pub(crate) fn judged(mut self) -> Self {
         self.met = self.target.as_ref().and_then(|target| is_met(self.value?, &target_text(target)));
@@ -151,7 +151,7 @@ pub(crate) fn table(title: &str, figures: &[Figure]) -> String {
     text
 }
 
-/// Three digits that mean something, and no more than three after the point.
+/// Three significant digits, and at most three decimals.
 fn number(value: f64) -> String {
     let decimals = match value.abs() {
         0.0 => 0,
@@ -163,7 +163,7 @@ fn number(value: f64) -> String {
     if value.fract() == 0.0 { format!("{value:.0}") } else { format!("{value:.decimals$}") }
 }
 
-/// Reads what another program of the bench printed: lines that are figures; others are its own affair.
+/// Parses the output of another program of the bench: lines that are figures; other lines are ignored.
 pub(crate) fn read(text: &str) -> Vec<Figure> {
     text.lines().filter_map(|line| serde_json::from_str::<Figure>(line).ok()).map(Figure::judged).collect()
 }
@@ -173,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn targets_are_held_against_the_value() {
+    fn values_are_compared_with_their_targets() {
         for (value, target, met) in [
             (1.0, "< 1", Some(false)),
             (1.0, "<= 1", Some(true)),
@@ -217,7 +217,7 @@ load
     }
 
     #[test]
-    fn only_what_the_machine_lacks_may_go_unmeasured() {
+    fn only_figures_beyond_the_machine_may_be_unmeasured() {
         let failed = |why: Failure| Figure::of_failure("a/all", &why);
         assert!(failed("topic /rapid/mask: ExceedsMaxSupportedPublishers".into()).is_unmeasured());
         assert!(Figure::new("a/b", "ms", None).is_unmeasured());

@@ -1,4 +1,4 @@
-//! How long a picture takes from the driver's hands into the recorder's.
+//! How long a picture takes from the driver to the recorder.
 
 use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -23,13 +23,13 @@ use crate::figure::Figure;
 use crate::stats::{Sorted, median};
 use crate::{Bench, Failure};
 
-/// Between two pictures of one camera.
+/// Time between two pictures of one camera.
 const PERIOD: Duration = Duration::from_micros(16_667);
-/// Samples before this time are left out: threads and memory come to rest.
+/// Samples before this time are left out: threads and memory settle.
 const WARM_UP: Duration = Duration::from_millis(500);
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    // Beyond the warm-up, and beyond what a busy machine needs to begin.
+    // Longer than the warm-up, and than the start on a busy machine.
     let length = bench.length(10, 2).max(Duration::from_secs(2));
     let (mut alone, mut bare, mut loaded) = (Vec::new(), Vec::new(), Vec::new());
     for run in 0..bench.runs {
@@ -62,18 +62,18 @@ pub(crate) struct Passed {
     pub topic: TopicId,
     /// Its header.
     pub header: SampleHeader,
-    /// Bytes behind it.
+    /// Size of its payload in bytes.
     pub bytes: usize,
-    /// When the recorder was handed it.
+    /// When it was passed to the recorder.
     pub handed: Stamp,
     /// When the recorder had written it.
     pub written: Stamp,
 }
 
-/// Everything that passed.
+/// All samples that passed.
 pub(crate) type Log = Arc<Mutex<Vec<Passed>>>;
 
-/// The recorder's inbox, with a note of when a sample passes.
+/// The recorder's inbox, which also records when a sample passes.
 pub(crate) struct Noting {
     inbox: Inbox,
     log: Log,
@@ -95,20 +95,20 @@ impl Source for Noting {
     }
 }
 
-/// A bus with a recorder that writes to a file what is published.
+/// A bus with a recorder that writes published samples to a file.
 pub(crate) struct Recording {
     /// The bus.
     pub bus: Bus,
-    /// What passed.
+    /// The samples that passed.
     pub log: Log,
-    /// Where it is reported.
+    /// The board for its reports.
     pub board: Arc<Board>,
     recorder: Recorder,
     _out: tempfile::TempDir,
 }
 
 impl Recording {
-    /// Opens the bus and begins an episode.
+    /// Opens the bus and starts an episode.
     pub(crate) fn begin(
         bench: &Bench,
         registry: &Registry,
@@ -130,7 +130,7 @@ impl Recording {
         Ok(Self { bus, log, board, recorder, _out: out })
     }
 
-    /// Ends the episode: everything that passed.
+    /// Ends the episode; returns all samples that passed.
     pub(crate) fn end(self, runtime: &tokio::runtime::Runtime) -> Result<Vec<Passed>, Failure> {
         let report = runtime.block_on(self.recorder.stop())?;
         if let Some(error) = report.error {
@@ -141,7 +141,7 @@ impl Recording {
     }
 }
 
-/// Runs the rig on a scenario for a while, recorded.
+/// Runs the rig on a scenario for some time, recorded.
 pub(crate) fn play(
     bench: &Bench,
     registry: &Registry,
@@ -168,7 +168,7 @@ pub(crate) fn play(
     recording.end(&runtime)
 }
 
-/// From the driver to the recorder, us, of the pictures among what passed.
+/// Time from the driver to the recorder, us, of the pictures among `passed`.
 fn delays(passed: &[Passed], pictures: impl Fn(TopicId) -> bool) -> Sorted {
     let begin = passed.first().map_or(Stamp::default(), |first| first.handed.after(WARM_UP));
     let pictures = passed.iter().filter(|one| pictures(one.topic) && one.handed > begin);
@@ -204,7 +204,7 @@ fn full_load(bench: &Bench, length: Duration) -> Result<Sorted, Failure> {
     Ok(delays(&passed, |topic| topic != TopicId::Mask && Some(topic) != state))
 }
 
-/// One copy into memory that both threads see, and an eventfd.
+/// One copy into shared memory, and an eventfd.
 fn bare_hop(length: Duration) -> Result<Sorted, Failure> {
     let feed = Feed::full_load()?;
     let lane = &feed.lanes[0];

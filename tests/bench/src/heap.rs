@@ -1,7 +1,7 @@
-//! Whether computing chunks keeps memory: in a process of its own, which does nothing else.
+//! Whether computing chunks leaks memory: in a separate process, which does nothing else.
 //!
 //! Sources: proc(5), `/proc/PID/status` (`RssAnon`) and `/proc/PID/smaps_rollup` (`Pss_Anon`): heap, stacks and other
-//! memory without a file behind it, onnxruntime's too.
+//! memory not backed by a file, including onnxruntime's.
 
 use std::path::Path;
 use std::process::Command;
@@ -16,22 +16,22 @@ use crate::figure::Figure;
 use crate::process::Running;
 use crate::{Bench, Failure, policy};
 
-/// Chunks until memory has grown to what it needs.
+/// Chunks until memory has reached its working size.
 const WARM_UP: usize = 200;
 const LIMIT: Duration = Duration::from_secs(1800);
 
-/// What a child reports of its memory.
+/// A child's report on its memory.
 #[derive(Debug, Default, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Memory {
     /// `RssAnon` after the warm-up and at the end, KiB.
     rss: [f64; 2],
     /// `Pss_Anon`, likewise.
     pss: [f64; 2],
-    /// The largest growth at any look in between, KiB.
+    /// The largest growth at any check in between, KiB.
     most: f64,
 }
 
-/// Memory kept over many chunks.
+/// Memory growth over many chunks.
 pub(crate) fn figure(bench: &Bench) -> Result<Figure, Failure> {
     let chunks = bench.choose(10_000, 300);
     bench.progress(&format!("policy: the memory of {chunks} chunks"));

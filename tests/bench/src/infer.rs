@@ -1,4 +1,4 @@
-//! From the start of the program to a policy that is loaded, and to its first action.
+//! Time from the start of the program until a policy is loaded, and until its first action.
 
 use std::process::Command;
 use std::time::Instant;
@@ -35,7 +35,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     ])
 }
 
-/// From the start to the events `policy` and `act`, ms.
+/// Time from the start to the events `policy` and `act`, ms.
 fn to_policy(bench: &Bench) -> Result<[f64; 2], Failure> {
     let mut command = Command::new(&bench.rapid);
     command.arg("--infer").arg(&bench.bundle);

@@ -1,7 +1,7 @@
 //! The full load: four cameras at 60 Hz, a state at 1 kHz, the mask at 500 Hz, recorded to a file by the real program.
 //!
-//! Beside it, in processes of their own so that the kernel accounts for them alike: the `mcap` crate writing the same
-//! messages, and the simulated devices read by a loop alone.
+//! For comparison, in separate processes so that the kernel accounts for them in the same way: the `mcap` crate writing
+//! the same messages, and the simulated devices read by a bare loop.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -21,7 +21,7 @@ use crate::{Bench, Failure};
 const REGISTRY: &str = include_str!("../scenarios/load.devices.toml");
 const LOAD: &str = include_str!("../scenarios/load.toml");
 const IDLE: &str = include_str!("../scenarios/idle.toml");
-/// What starting, ending and a slow disk may take beside the recording.
+/// Allowance for start, end and a slow disk in addition to the recording.
 const SLACK: Duration = Duration::from_secs(60);
 
 /// Options that make `rapid` play a scenario of this folder.
@@ -37,9 +37,9 @@ pub(crate) fn scenario(bench: &Bench, name: &str) -> Result<Vec<OsString>, Failu
 struct Run {
     usage: Usage,
     seen: Seen,
-    /// Samples, masks included, that did not come from the driver into the file.
+    /// Samples, masks included, that were lost between driver and file.
     dropped: f64,
-    /// Samples that a simulated camera did not keep, because no one read them in time.
+    /// Samples that a simulated camera dropped because they were not read in time.
     lost: f64,
     messages: f64,
     bytes: f64,
@@ -88,7 +88,7 @@ fn one(bench: &Bench) -> Result<Run, Failure> {
         return Err(format!("rapid ended with an error: {}", usage.output).into());
     }
     let Episode { dropped, lost, messages, bytes, seconds: recorded } = Episode::inspect(bench, out.path())?;
-    // The file goes before the next one is written: a disk need not hold two.
+    // Deleted before the next one is written: a disk need not hold two.
     drop(out);
     bench.progress("load: the baselines");
     let seconds = bench.load.as_secs().to_string();
@@ -105,7 +105,7 @@ fn one(bench: &Bench) -> Result<Run, Failure> {
     })
 }
 
-/// Of an event's line, which event it is.
+/// The kind of event in a line.
 pub(crate) fn kind(line: &str) -> Option<String> {
     Some(serde_json::from_str::<Value>(line).ok()?.get("event")?.as_str()?.to_owned())
 }
@@ -117,15 +117,15 @@ pub(crate) fn only_episode(folder: &Path) -> Result<PathBuf, Failure> {
     Ok(file.ok_or("rapid wrote no episode")?)
 }
 
-/// What `rapid inspect` reports about an episode.
+/// The report of `rapid inspect` on an episode.
 pub(crate) struct Episode {
-    /// Samples, masks included, that did not come from the driver into the file.
+    /// Samples, masks included, that were lost between driver and file.
     pub dropped: f64,
-    /// Samples that a device did not keep, because no one read them in time.
+    /// Samples that a device dropped because they were not read in time.
     pub lost: f64,
     /// Messages in the file.
     pub messages: f64,
-    /// Of the file.
+    /// Bytes of the file.
     pub bytes: f64,
     /// Its length.
     pub seconds: f64,
@@ -192,7 +192,7 @@ fn own(runs: &[Run]) -> Vec<Figure> {
     ]
 }
 
-/// Where the time goes, by the names of threads.
+/// Processor time by thread name.
 fn threads(runs: &[Run]) -> Vec<Figure> {
     let Some(run) = runs.last() else { return Vec::new() };
     let samples = run.messages.max(1.0);

@@ -1,10 +1,10 @@
-//! `rapid-bench`: figures of `rapid` on this machine, each beside a baseline measured in the same run.
+//! `rapid-bench`: figures of `rapid` on this machine, each with a baseline measured in the same run.
 //!
-//! One file a section; `stats` computes, `figure` shows, `process` starts and watches children. A section that cannot be
-//! measured gives its reason and the next one follows.
+//! One file per section; `stats` computes, `figure` shows, `process` starts and monitors children. A section that
+//! cannot be measured gives its reason, and the next one follows.
 //!
-//! Invariant: no value makes the program fail. Wrong arguments do, and so does a figure that was not measured for another
-//! reason than an environment that it names ([`Absent`]).
+//! Invariant: no value makes the program fail. Wrong arguments do, and so does a figure that was not measured for any
+//! other reason than a missing requirement that it names ([`Absent`]).
 
 mod beat;
 mod can;
@@ -42,13 +42,13 @@ use clap::{Parser, ValueEnum};
 use figure::Figure;
 use rapid::driver::can::guard;
 
-/// What goes wrong in a section ends it, with its text as the reason.
+/// An error in a section ends it, with its text as the reason.
 type Failure = Box<dyn std::error::Error>;
 
-/// The longest wait for something that the measured program does by itself: a watchdog, no figure.
+/// Upper limit for waiting for the measured program: a watchdog, not a figure.
 const LIMIT: Duration = Duration::from_mins(5);
 
-/// What a section needs and this machine lacks, with the remedy.
+/// A requirement of a section that this machine lacks, with the remedy.
 #[derive(Debug, thiserror::Error)]
 #[error("this machine has no {0}")]
 struct Absent(String);
@@ -113,14 +113,15 @@ enum Section {
     Can,
     Eval,
     Unplug,
+    Capture,
     Cycles,
     Sweep,
     Deaf,
 }
 
 impl Section {
-    /// In this order: what must not be disturbed comes before what leaves dirty pages behind.
-    const ALL: [Self; 21] = [
+    /// In this order: measurements that must not be disturbed come before those that leave dirty pages behind.
+    const ALL: [Self; 22] = [
         Self::Start,
         Self::Infer,
         Self::Sync,
@@ -139,6 +140,7 @@ impl Section {
         Self::Many,
         Self::Load,
         Self::Write,
+        Self::Capture,
         Self::Cycles,
         Self::Sweep,
         Self::Deaf,
@@ -164,13 +166,14 @@ impl Section {
             Self::Can => "can",
             Self::Eval => "eval",
             Self::Unplug => "unplug",
+            Self::Capture => "capture",
             Self::Cycles => "cycles",
             Self::Sweep => "sweep",
             Self::Deaf => "deaf",
         }
     }
 
-    /// Trials in closed loop take a minute however few: of quick runs only if they are named.
+    /// Closed-loop trials take at least a minute: quick runs include them only if they are named.
     fn is_asked_for(self, cli: &Cli) -> bool {
         if cli.only.is_empty() { !(cli.quick && self == Self::Eval) } else { cli.only.contains(&self) }
     }
@@ -195,6 +198,7 @@ impl Section {
             Self::Can => can::measure(bench),
             Self::Eval => eval::measure(bench),
             Self::Unplug => others::unplug(bench),
+            Self::Capture => others::capture(bench),
             Self::Cycles => others::cycles(bench),
             Self::Sweep => others::sweep(bench),
             Self::Deaf => others::deaf(bench),
@@ -202,11 +206,11 @@ impl Section {
     }
 }
 
-/// What every section works with.
+/// Shared by all sections.
 #[derive(Debug)]
 pub(crate) struct Bench {
     rapid: PathBuf,
-    /// Where this program and its siblings lie.
+    /// Folder of this program and its siblings.
     programs: PathBuf,
     scratch: tempfile::TempDir,
     /// The policy's folder.
@@ -239,17 +243,17 @@ impl Bench {
         })
     }
 
-    /// One of two, by the length of the runs asked for.
+    /// Selects by the requested length of the runs.
     fn choose<T>(&self, full: T, quick: T) -> T {
         if self.quick { quick } else { full }
     }
 
-    /// Length of one measurement, from seconds of a full run and of a quick one.
+    /// Length of one measurement, in seconds for a full run and for a quick one.
     fn length(&self, full: u64, quick: u64) -> Duration {
         Duration::from_secs(if self.smoke { 1 } else { self.choose(full, quick) })
     }
 
-    /// Reports on standard error how far a long measurement has come.
+    /// Reports the progress of a long measurement on standard error.
     fn progress(&self, text: &str) {
         let mut out = io::stderr();
         let _ = if out.is_terminal() { write!(out, "\r\x1b[K{text}") } else { writeln!(out, "{text}") };
@@ -264,7 +268,7 @@ impl Bench {
     }
 }
 
-/// One of three, by the length of the runs asked for.
+/// Selects by the requested length of the runs.
 fn by_length<T>(cli: &Cli, full: T, quick: T, smoke: T) -> T {
     match (cli.smoke, cli.quick) {
         (true, _) => smoke,
@@ -276,7 +280,7 @@ fn by_length<T>(cli: &Cli, full: T, quick: T, smoke: T) -> T {
 fn main() -> ExitCode {
     let mut args = std::env::args_os();
     if args.next().is_some_and(|name| name == guard::NAME) {
-        // Motors that are driven here have their guard from here.
+        // Motors driven by this program have their guard started from it.
         return guard::run(args);
     }
     let cli = Cli::parse();
@@ -297,7 +301,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Runs the sections; what was not measured and should have been, a line each.
+/// Runs the sections; returns one line per figure that should have been measured but was not.
 fn run(cli: &Cli) -> Result<Vec<String>, Failure> {
     let bench = Bench::new(cli)?;
     let sections: Vec<Section> = Section::ALL.into_iter().filter(|section| section.is_asked_for(cli)).collect();
@@ -336,7 +340,7 @@ fn show(cli: &Cli, title: &str, figures: &[Figure]) -> Result<(), Failure> {
     Ok(out.flush()?)
 }
 
-/// What else the machine does, which every figure stands under.
+/// The load of the machine, which affects every figure.
 fn host(bench: &Bench, when: &str) -> Vec<Figure> {
     let processors = std::thread::available_parallelism().map_or(0, usize::from);
     let kernel = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();

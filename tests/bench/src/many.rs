@@ -1,4 +1,4 @@
-//! Devices of mixed kinds: what 4, 8 and 16 of them cost, recorded by the real program, and what they do to the mask.
+//! Devices of mixed kinds: the cost of 4, 8 and 16 of them, recorded by the real program, and their effect on the mask.
 
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -14,11 +14,11 @@ use crate::process::Running;
 use crate::stats::median;
 use crate::{Bench, Failure};
 
-/// Numbers of devices, in which each kind has the same share. The least is what the others are held against.
+/// Numbers of devices, with equal shares of each kind. The smallest is the baseline of the others.
 const COUNTS: [usize; 3] = [4, 8, 16];
 const SLACK: Duration = Duration::from_secs(60);
 
-/// Tables of the kinds, in turn: a camera, a serial line, a CAN bus, a device on the network.
+/// Entries of the kinds, in turn: a camera, a serial line, a CAN bus, a device on the network.
 const KINDS: [&str; 4] = [
     "node = \"camera\"\n[device.NAME.camera]\nwidth = 640\nheight = 480\nfps = 30\n",
     "node = \"serial\"\n[device.NAME.tty]\nbaud = 115200\nparse = \"csv\"\nchannels = 6\n",
@@ -28,7 +28,7 @@ const KINDS: [&str; 4] = [
 
 /// One run.
 struct Run {
-    /// Of one core, %.
+    /// Share of one core, %.
     cpu: f64,
     episode: Episode,
     seen: Seen,
@@ -92,7 +92,7 @@ fn one(bench: &Bench, count: usize, length: u64) -> Result<Run, Failure> {
     Ok(Run { cpu: 100.0 * (usage.cpu_s - usage.cpu_before_mark_s) / episode.seconds, episode, seen })
 }
 
-/// Options that make `rapid` play so many devices.
+/// Options that make `rapid` play this many devices.
 fn scenario(bench: &Bench, count: usize) -> Result<Vec<OsString>, Failure> {
     let folder = bench.scratch.path();
     let (mut registry, mut played) = ("[rig]\nname = \"many\"\n".to_owned(), String::new());

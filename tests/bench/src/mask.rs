@@ -1,4 +1,4 @@
-//! How evenly the mask is published, as a reader of `/dev/shm` sees it, against a bare thread at the same time.
+//! How evenly the mask is published, as seen by a reader of `/dev/shm`, compared with a bare thread at the same time.
 
 use std::path::Path;
 use std::process::Command;
@@ -18,27 +18,27 @@ use crate::start::await_mask;
 use crate::stats::{Sorted, median, steps};
 use crate::{Bench, Failure};
 
-/// How often the reader looks: four times a period, so that it misses none unless it is held up itself.
+/// Polling interval of the reader: four times per period, so that it misses nothing unless it is delayed itself.
 const LOOK: Duration = Duration::from_micros(500);
-/// From the first mask until the program has started.
+/// Time from the first mask until the program has started.
 const SETTLE: Duration = Duration::from_secs(1);
 
-/// What a reader saw.
+/// Observations of a reader.
 #[derive(Debug, Default)]
 pub(crate) struct Seen {
-    /// Intervals between publications that follow one another, by their own stamps, ms.
+    /// Intervals between consecutive publications, by their own stamps, ms.
     intervals: Sorted,
-    /// Publications between two that were seen.
+    /// Publications that the reader missed.
     unseen: u64,
     baseline: Sorted,
     baseline_fifo: bool,
-    /// Share of a core that the bare thread took, %.
+    /// Share of a core that the bare thread used, %.
     pub(crate) baseline_cpu: f64,
     /// The mask's thread runs under FIFO.
     fifo: bool,
 }
 
-/// A reader and a bare beat at work.
+/// A running reader and a bare loop.
 #[derive(Debug)]
 pub(crate) struct Watch {
     stop: Arc<AtomicBool>,
@@ -47,13 +47,13 @@ pub(crate) struct Watch {
 }
 
 impl Watch {
-    /// Starts to look at the mask at `path`.
+    /// Starts to poll the mask at `path`.
     pub(crate) fn start(path: &Path) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let reader = std::thread::spawn({
             let (stop, path) = (Arc::clone(&stop), path.to_owned());
             move || {
-                // A reader that is late sees less: it runs as the publisher does, and does next to nothing.
+                // A delayed reader misses publications: it has the publisher's priority, and does almost nothing.
                 beat::use_fifo();
                 let mut seen: Vec<(u64, u64)> = Vec::with_capacity(1 << 16);
                 while !stop.load(Ordering::Relaxed) {
@@ -70,7 +70,7 @@ impl Watch {
         Self { stop, reader, beat: Beat::start() }
     }
 
-    /// Ends it. `usage` is that of the program watched.
+    /// Ends it. `usage` is that of the measured program.
     pub(crate) fn end(self) -> Seen {
         self.stop.store(true, Ordering::Relaxed);
         let numbered = self.reader.join().unwrap_or_default();
@@ -83,7 +83,7 @@ impl Watch {
 }
 
 impl Seen {
-    /// With the kernel's figures of the program's threads.
+    /// Adds the kernel's figures of the program's threads.
     #[must_use]
     pub(crate) fn of(mut self, usage: &Usage) -> Self {
         self.fifo = usage.threads.iter().any(|thread| thread.name == "mask" && thread.policy == 1);

@@ -1,4 +1,4 @@
-//! How well thread `control` keeps its beat, how soon an action is on the wire, and what an answer of a motor costs.
+//! How well thread `control` keeps its cycle, how soon an action is on the wire, and the cost of a motor's answer.
 //!
 //! Actions are published on the bus, as a policy of this process does. The motors are those of the virtual bench, behind
 //! Damiao's adapter on a pseudo-terminal.
@@ -75,7 +75,7 @@ fn beat(length: Duration) -> Sorted {
     Sorted::new(late)
 }
 
-/// Drives motors for so long, with an action every `period`, more or less.
+/// Drives motors for this long, with an action about every `period`.
 fn drive(length: Duration, period: Duration) -> Result<Punctuality, Failure> {
     let adapter = Adapter::plug(AXES);
     let link = Link::open_damiao(&adapter.path)?;
@@ -111,7 +111,7 @@ fn drive(length: Duration, period: Duration) -> Result<Punctuality, Failure> {
     Ok(punctuality)
 }
 
-/// Publishes an action every `period`, up to a tenth of it later, so that it meets every phase of the motors' cycle.
+/// Publishes an action every `period`, up to a tenth later, so that it occurs at every phase of the motors' cycle.
 fn publish(writer: &Writer, period: Duration, ends: &AtomicBool) {
     let begun = Instant::now();
     let mut random = Random::new(1, 0);
@@ -124,14 +124,14 @@ fn publish(writer: &Writer, period: Duration, ends: &AtomicBool) {
         let payload = angle.to_le_bytes().repeat(usize::from(AXES));
         let header =
             SampleHeader { seq, capture_ns: Stamp::now().0, encoding: Encoding::F64 as u32, ..SampleHeader::default() };
-        // One that is lost is missing in the count.
+        // A lost action is missing from the count.
         let _ = writer.publish(header, &payload);
         due = due.after(period);
         sleep_until(due.after(period.mul_f64(random.uniform(0.0, 0.1))));
     }
 }
 
-/// What an answer of a motor costs, from frame to state.
+/// The cost of a motor's answer, from frame to state.
 fn feedback(count: u32) -> Figure {
     let mut bus = MotorBus::new(&spec(AXES), Stamp::now());
     let mut frame =

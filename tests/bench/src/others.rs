@@ -1,4 +1,4 @@
-//! Figures that other programs of the project measure: run, and their lines taken over.
+//! Figures measured by other programs of the project: runs them and adopts their lines.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ use crate::{Absent, Bench, Failure};
 /// A guest that boots, plugs and records takes minutes.
 const LIMIT: Duration = Duration::from_secs(1800);
 
-/// Our own share of the time from an unplug to its bit.
+/// The program's share of the time from an unplug to its bit.
 pub(crate) fn unplug(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let unplugs = bench.choose("200", "20");
     let program = bench.programs.join("examples").join("unplug_latency");
@@ -27,13 +27,19 @@ pub(crate) fn cycles(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     vbench(bench, "vbench-cycles", &[cycles.into()])
 }
 
-/// Nine configurations, one after the other, on the virtual bench; the first of them to see that it works.
+/// A camera through nokhwa and through the driver, on the virtual bench.
+pub(crate) fn capture(bench: &Bench) -> Result<Vec<Figure>, Failure> {
+    let frames = if bench.smoke { "10" } else { bench.choose("600", "60") };
+    vbench(bench, "vbench-capture", &[frames.into()])
+}
+
+/// Nine configurations, one after the other, on the virtual bench; only the first of them for a smoke run.
 pub(crate) fn sweep(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let configurations = if bench.smoke { "1" } else { "9" };
     vbench(bench, "vbench-sweep", &[configurations.into()])
 }
 
-/// A child process that does not listen, on the virtual bench.
+/// A child process that ignores SIGTERM, on the virtual bench.
 pub(crate) fn deaf(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     vbench(bench, "vbench-deaf", &[])
 }

@@ -1,15 +1,15 @@
-//! What pictures cost on their way into a policy, and what those of the simulated task cost.
+//! The cost of pictures on their way into a policy, and of those of the simulated task.
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
-use rapid::driver::sim::task::{Expert, SIDE, Trial};
 use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid::policy::picture::{Picture, Preprocessor};
 use rapid::random::Random;
-use rapid::registry::scenario::TaskPart;
 use rapid::sample::Encoding;
+use rapid::simulation::TaskPart;
+use rapid::simulation::task::{Expert, SIDE, Trial};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 
@@ -21,15 +21,15 @@ use crate::{Bench, Failure};
 
 const WIDTH: u16 = 640;
 const HEIGHT: u16 = 480;
-/// What a camera's own encoder takes, about.
+/// Approximate quality of a camera's own encoder.
 const QUALITY: u8 = 80;
-/// Noise of a sensor in a lit room, of 255; it decides how long a picture is: 50 to 60 kB.
+/// Sensor noise in a lit room, of 255; it determines the size of a picture: 50 to 60 kB.
 const NOISE: f32 = 6.5;
 /// Different pictures of each camera.
 const FRAMES: u64 = 8;
-/// Pairs before the first one that counts.
+/// Pairs before the first one that is measured.
 const WARM_UP: usize = 10;
-/// As `driver/sim/task` encodes.
+/// The quality used by `simulation/task`.
 const TASK_QUALITY: u8 = 95;
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
@@ -97,7 +97,7 @@ fn decode(jpeg: &[u8], pixels: &mut Vec<u8>) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What a camera might see: light that falls off, a few things with edges, and its sensor's noise; colours at half the
+/// A realistic camera picture: light that falls off, a few objects with edges, and sensor noise; colours at half the
 /// resolution, as cameras send them.
 fn frame(number: u64) -> Result<Vec<u8>, Failure> {
     let mut random = Random::new(number, 0);
@@ -119,7 +119,7 @@ fn frame(number: u64) -> Result<Vec<u8>, Failure> {
             let noise = NOISE * random.normal();
             for channel in 0..3 {
                 let value = thing.map_or(light, |thing| thing[3 + channel] * shade);
-                // Out of range is what a sensor cuts off too.
+                // A sensor clips values out of range, too.
                 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
                 pixels.push((value + f64::from(noise)).clamp(0.0, 255.0) as u8);
             }

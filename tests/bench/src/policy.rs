@@ -1,11 +1,10 @@
-//! From an observation to a chunk of actions, against onnxruntime alone on the same graphs.
+//! From an observation to a chunk of actions, compared with onnxruntime alone on the same graphs.
 //!
-//! What is compared runs in turn, one chunk each, so that whatever else the machine does hits both.
+//! The two alternate, one chunk each, so that other load on the machine affects both.
 
 use std::hint::black_box;
 use std::time::Instant;
 
-use rapid::driver::sim::task::{Expert, Trial, layout};
 use rapid::policy::bundle::{Bundle, Graph};
 use rapid::policy::graphs::{BoundGraph, LoadedGraph};
 use rapid::policy::library::Environment;
@@ -16,6 +15,7 @@ use rapid::policy::sampler::Sampler;
 use rapid::random::Random;
 use rapid::registry::task::PARTS;
 use rapid::sample::SampleHeader;
+use rapid::simulation::task::{Expert, Trial, layout};
 
 use crate::child::thread_cpu_s;
 use crate::figure::Figure;
@@ -23,9 +23,9 @@ use crate::start::ms;
 use crate::stats::Sorted;
 use crate::{Bench, Failure, eager, heap};
 
-/// Chunks before the first one that counts.
+/// Chunks before the first one that is measured.
 const WARM_UP: usize = 20;
-/// The trial whose samples are observed, and the step at which: on the way to the block.
+/// The trial and the step that are observed: on the way to the block.
 const SEED: u64 = 50_000;
 const STEPS: usize = 20;
 
@@ -66,10 +66,10 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(figures)
 }
 
-/// The policy, and the bare graphs beside it.
+/// The policy, and the bare graphs.
 struct Subject {
     model: Model,
-    /// The parts of an answer by themselves.
+    /// The parts of an answer.
     observer: Model,
     sampler: Sampler,
     bare: Bare,
@@ -77,7 +77,7 @@ struct Subject {
     chunk: Vec<f32>,
 }
 
-/// What each time took, ms.
+/// The durations, ms.
 #[derive(Default)]
 struct Seen {
     answer: Vec<f64>,
@@ -105,7 +105,7 @@ impl Subject {
             if number == WARM_UP {
                 seen = Seen::default();
             }
-            // Neither comes always first.
+            // Alternates which one comes first.
             if number.is_multiple_of(2) {
                 self.own(&mut seen)?;
                 self.alone(&mut seen)?;
@@ -187,7 +187,7 @@ impl Bare {
     }
 }
 
-/// A question as the simulated task puts it: everything present.
+/// A request of the simulated task, with all modalities present.
 pub(crate) fn request(bundle: &Bundle) -> Result<Request, Failure> {
     let mut request = Request::new(bundle);
     let (mut trial, mut expert) = (Trial::new(SEED), Expert::new(SEED));

@@ -1,9 +1,9 @@
-//! Child processes: started, watched from outside and ended; what they cost, as the kernel accounts it.
+//! Child processes: starts, monitors and ends them; their cost as accounted by the kernel.
 //!
 //! Sources: proc(5), `/proc/PID/stat` fields 14 and 15 (user and system time in ticks of 10 ms),
 //! `/proc/PID/task/TID/schedstat` (ns on a processor), `status` (`VmHWM`, `voluntary_ctxt_switches`).
 //!
-//! Invariant: a child never outlives the bench's interest in it: dropping it kills it.
+//! Invariant: a child never outlives its handle: dropping it kills the child.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -15,36 +15,36 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process, waitid};
 
-/// How often a child is looked at.
+/// Polling interval of a child.
 const LOOK: Duration = Duration::from_millis(100);
-/// A child asked to end that does not is killed after this time.
+/// A child that does not end on request is killed after this time.
 const END_LIMIT: Duration = Duration::from_mins(1);
 /// Length of a tick of `/proc/PID/stat`, s: USER_HZ is 100 on every Linux that `rapid` runs on.
 const TICK_S: f64 = 0.01;
 
-/// What a thread took.
+/// Resources used by a thread.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct ThreadUse {
     /// Its name.
     pub name: String,
     /// Time on a processor, s.
     pub cpu_s: f64,
-    /// How often it went to sleep by itself.
+    /// Number of voluntary context switches.
     pub sleeps: u64,
     /// Scheduling policy: 0 ordinary, 1 FIFO.
     pub policy: u32,
 }
 
-/// What a process took, from its beginning to its end.
+/// Resources used by a process, from start to end.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Usage {
     /// User and system time, s.
     pub cpu_s: f64,
-    /// Of it, until the first look after [`Running::mark`].
+    /// Part of it used up to the first check after [`Running::mark`].
     pub cpu_before_mark_s: f64,
     /// Peak of resident memory, bytes.
     pub resident: u64,
-    /// Of the resident memory at the last look: private, and shared with others through files in memory.
+    /// Parts of the resident memory at the last check: private, and shared with others through files in memory.
     pub anonymous: u64,
     /// See `anonymous`.
     pub shared: u64,
@@ -52,13 +52,13 @@ pub(crate) struct Usage {
     pub threads: Vec<ThreadUse>,
     /// Everything it wrote to standard output.
     pub output: String,
-    /// It ended with success. Code 4 is an episode that is BAD, as one without a device must be: what a section measures is
-    /// for the section to judge.
+    /// It ended with success. Code 4 means a BAD episode, which an episode without a device must be: the section judges
+    /// its own measurements.
     pub success: bool,
 }
 
 impl Usage {
-    /// Threads of one name taken together: time and sleeps, by name.
+    /// Threads grouped by name: time and sleeps.
     pub(crate) fn by_name(&self) -> Vec<ThreadUse> {
         let mut names: BTreeMap<&str, ThreadUse> = BTreeMap::new();
         for thread in &self.threads {
@@ -86,7 +86,7 @@ pub(crate) struct Running {
 }
 
 impl Running {
-    /// Starts `command`; its standard output is taken, its standard error shown.
+    /// Starts `command`; its standard output is captured, its standard error shown.
     ///
     /// # Errors
     /// When it cannot be started.
@@ -95,10 +95,10 @@ impl Running {
             io::Error::new(error.kind(), format!("{}: {error}", command.get_program().to_string_lossy()))
         })?;
         let output = child.stdout.take().ok_or_else(|| io::Error::other("no standard output"))?;
-        let (tell, lines) = channel();
+        let (sender, lines) = channel();
         std::thread::spawn(move || {
             for line in BufReader::new(output).lines().map_while(Result::ok) {
-                if tell.send(line).is_err() {
+                if sender.send(line).is_err() {
                     return;
                 }
             }
@@ -131,19 +131,19 @@ impl Running {
         }
     }
 
-    /// What was taken until now is distinguished from what follows.
+    /// Separates the resources used until now from those that follow.
     pub(crate) fn mark(&mut self) {
         self.usage.cpu_before_mark_s = cpu_s(self.pid).unwrap_or_default();
     }
 
-    /// Lets the child run to its end, at most `limit`; `progress` is called now and then.
+    /// Waits for the child's end, at most `limit`; `progress` is called regularly.
     ///
     /// # Errors
     /// When it does not end in time.
     pub(crate) fn finish(mut self, limit: Duration, mut progress: impl FnMut()) -> io::Result<Usage> {
         let deadline = Instant::now() + limit;
         loop {
-            // Left as it is: a process that has ended still has its times.
+            // Not reaped: an ended process still has its times.
             let options = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
             if waitid(WaitId::Pid(self.pid), options)?.is_some() {
                 break;
@@ -202,7 +202,7 @@ impl Running {
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // One that has ended is not there any more.
+        // It may have ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -228,7 +228,7 @@ fn field(status: &str, name: &str) -> Option<u64> {
 
 fn cpu_s(pid: Pid) -> Option<f64> {
     let stat = fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
-    // The second field, the name in parentheses, may hold anything.
+    // The second field, the name in parentheses, may contain anything.
     let mut fields = stat.rsplit_once(')')?.1.split_whitespace().skip(11);
     let (user, system): (u64, u64) = (fields.next()?.parse().ok()?, fields.next()?.parse().ok()?);
     Some((user + system) as f64 * TICK_S)
@@ -240,7 +240,7 @@ pub(crate) fn host_load(span: Duration) -> Option<(f64, f64)> {
     let times = || {
         let stat = fs::read_to_string("/proc/stat").ok()?;
         let ticks: Vec<u64> = stat.lines().next()?.split_whitespace().skip(1).filter_map(|n| n.parse().ok()).collect();
-        // Fields 4 and 5 are idle and waiting for a disk.
+        // Fields 4 and 5 are idle time and time waiting for a disk.
         Some((ticks.iter().take(8).sum::<u64>(), ticks.get(3)? + ticks.get(4)?))
     };
     let (all, idle) = times()?;
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn a_child_that_ends_early_is_no_success() {
+    fn a_child_that_ends_early_is_a_failure() {
         let mut child = Running::start(Command::new("sh").args(["-c", "exit 3"])).unwrap();
         assert!(child.wait_for(Duration::from_secs(10), |_| true).is_err());
         assert!(!child.finish(Duration::from_secs(10), || {}).unwrap().success);

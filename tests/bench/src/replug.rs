@@ -1,5 +1,5 @@
-//! From a plug to the first sample recorded, on the simulated rig: our own share. What the kernel and a real device take
-//! before is measured on the virtual bench.
+//! Time from a plug to the first recorded sample on the simulated rig: the program's share. The share of the kernel and
+//! of a real device before that is measured on the virtual bench.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -9,12 +9,13 @@ use std::time::{Duration, Instant};
 
 use futures::Stream;
 use rapid::bus::TopicId;
+use rapid::device::DeviceNode;
 use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
 use rapid::hotplug::{HotplugError, HotplugEvent};
-use rapid::registry::DeviceNode;
-use rapid::registry::scenario::{ScenarioAction, ScenarioEvent, SimDevice};
+use rapid::registry::scenario::{ScenarioAction, ScenarioEvent};
 use rapid::sample::Epoch;
+use rapid::simulation::SimDevice;
 use rapid::time::Stamp;
 
 use crate::feed;
@@ -23,13 +24,13 @@ use crate::frame::play;
 use crate::stats::Sorted;
 use crate::{Bench, Failure};
 
-/// From one plug to the next.
+/// Time from one plug to the next.
 const ROUND: Duration = Duration::from_millis(100);
 const UNPLUGGED: Duration = Duration::from_millis(50);
-/// The device that is pulled: what it needs itself to open and to send its first sample is next to nothing.
+/// The device that is unplugged: it needs almost no time to open and send its first sample.
 const DEVICE: &str = "state";
 
-/// Reports when a plug passes on its way to the rig.
+/// Reports when a plug event passes on its way to the rig.
 struct Tap {
     script: Script,
     plugs: Sender<Stamp>,
@@ -41,7 +42,7 @@ impl Stream for Tap {
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let polled = Pin::new(&mut self.script).poll_next(context);
         if let Poll::Ready(Some(Ok(HotplugEvent::Added(_)))) = &polled {
-            // Read once the run is over.
+            // Read after the run.
             let _ = self.plugs.send(Stamp::now());
         }
         polled

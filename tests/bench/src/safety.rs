@@ -1,7 +1,7 @@
-//! What befalls motors, how soon they stop, and what loaded joints do meanwhile.
+//! Faults of motors: how soon motors stop, and how loaded joints move meanwhile.
 //!
-//! In virtual time: the state machine of `rapid` in cycles of 5 ms over simulated motors with bodies. Nothing here depends on
-//! the machine.
+//! In virtual time: the state machine of `rapid` in cycles of 5 ms with simulated motors with bodies. Nothing here
+//! depends on the machine.
 
 #[path = "../../support/motor_world.rs"]
 mod motor_world;
@@ -11,7 +11,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
+use rapid::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Ranges, StateCommand};
 use rapid::control::damiao::parameter::Reply;
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use rapid::time::Stamp;
@@ -23,25 +23,25 @@ use crate::{Bench, Failure};
 
 /// Stiffness and damping of the joints, Nm/rad and Nm s/rad.
 const GAINS: [f64; 2] = [30.0, 1.0];
-/// What they carry, Nm.
+/// Their load, Nm.
 const LOAD: f64 = 1.5;
-/// Until when a stop is waited for.
+/// Time limit of a stop.
 const WINDOW: Duration = Duration::from_secs(3);
-/// What a joint does is looked at for so long.
+/// Time over which a joint's motion is measured.
 const FIRST: Duration = Duration::from_secs(1);
-/// Without an action for this long the plain loop holds, and disables the motors so much later.
+/// Without an action for this long the bare loop holds, and disables the motors after the second time.
 const DEADMAN: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
-/// A motor that leaves frames unanswered for this long is silent for it.
+/// A motor that leaves frames unanswered for this long counts as silent in the bare loop.
 const SILENT: Duration = Duration::from_millis(50);
 
-/// Something that befalls the first of two joints.
+/// An event at the first of two joints.
 struct Event {
     name: &'static str,
     /// Lines of `motor_world`.
     lines: &'static [&'static str],
-    /// The torque limit, Nm, and the load before, Nm.
+    /// The torque limit, Nm, and the load before the event, Nm.
     torque: [f64; 2],
-    /// The motors are to stop.
+    /// The motors must stop.
     stops: bool,
     /// How the other joint stops.
     other: Stop,
@@ -106,12 +106,12 @@ pub(crate) fn measure(_bench: &Bench) -> Result<Vec<Figure>, Failure> {
 }
 
 struct Outcome {
-    /// From the event until both joints are off, damped or held.
+    /// Time from the event until both joints are off, damped or held.
     stopped: Option<Duration>,
-    /// How far each joint went from where it was.
+    /// How far each joint moved from its position.
     moved: [f64; 2],
     joints: [&'static str; 2],
-    /// What names it.
+    /// The notice that names the event.
     words: Option<String>,
 }
 
@@ -170,7 +170,7 @@ fn play(event: &Event, is_plain: bool) -> Outcome {
     outcome
 }
 
-/// What the plain loop knows of a motor.
+/// The bare loop's state of a motor.
 #[derive(Clone)]
 struct Axis {
     feedback: Option<Feedback>,
@@ -179,7 +179,7 @@ struct Axis {
     target: Option<f64>,
 }
 
-/// The baseline: takes what motors report as it is. `holds`: for want of an action.
+/// The baseline: trusts the motors' reports. `holds`: because no action arrived.
 fn plain(spec: DamiaoSpec, holds: Rc<Cell<bool>>) -> Program {
     let mut axes = vec![Axis { feedback: None, asked: None, command: None, target: None }; spec.motors.len()];
     let mut acted: Option<Stamp> = None;
@@ -215,17 +215,17 @@ fn plain(spec: DamiaoSpec, holds: Rc<Cell<bool>>) -> Program {
         let axes = axes.iter_mut().zip(&spec.motors);
         axes.filter_map(|(axis, motor)| {
             axis.asked.get_or_insert(now);
-            if is_off { Some(Order::Disable.frame(motor.slave)) } else { axis.follow(motor, &ranges) }
+            if is_off { Some(StateCommand::Disable.frame(motor.slave)) } else { axis.follow(motor, &ranges) }
         })
         .collect()
     })
 }
 
 impl Axis {
-    /// The frame of a cycle: towards the target, as far from the motor's reported position as the torque allows.
+    /// The frame of a cycle: towards the target, as far from the motor's reported position as the torque limit allows.
     fn follow(&mut self, motor: &rapid::registry::MotorSpec, ranges: &Ranges) -> Option<CanFrame> {
         let [kp, kd] = GAINS;
-        // The first frame asks for the position: without gains nothing moves, and a joint held by hand stays.
+        // The first frame queries the position: without gains nothing moves, and a joint held by hand stays.
         let Some(feedback) = self.feedback else {
             return codec::mit(motor.slave, &Mit { kp: 0.0, kd, ..Mit::default() }, ranges).ok();
         };

@@ -1,4 +1,4 @@
-//! From the start of the program to the first mask, and the size of the program.
+//! Time from the start of the program to the first mask, and the size of the program.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -13,7 +13,7 @@ use crate::process::Running;
 use crate::stats::Sorted;
 use crate::{Bench, Failure, LIMIT};
 
-/// Between two looks.
+/// Polling interval.
 const LOOK: Duration = Duration::from_micros(100);
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
@@ -43,7 +43,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(figures)
 }
 
-/// From the start of `rapid` with `options` to its first mask, ms.
+/// Time from the start of `rapid` with `options` to its first mask, ms.
 pub(crate) fn to_mask(bench: &Bench, options: &[&str]) -> Result<f64, Failure> {
     let instance = format!("bench-start-{}", std::process::id());
     let path = mask_path(Some(&instance));
@@ -69,7 +69,7 @@ pub(crate) fn await_mask(path: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Time since then, ms.
+/// Time since `begun`, ms.
 pub(crate) fn ms(begun: Instant) -> f64 {
     begun.elapsed().as_secs_f64() * 1e3
 }

@@ -5,31 +5,31 @@
 pub(crate) struct Sorted(Vec<f64>);
 
 impl Sorted {
-    /// Sorts; what is not a number is left out.
+    /// Sorts; NaN is left out.
     pub(crate) fn new(samples: impl IntoIterator<Item = f64>) -> Self {
         let mut samples: Vec<f64> = samples.into_iter().filter(|sample| !sample.is_nan()).collect();
         samples.sort_by(f64::total_cmp);
         Self(samples)
     }
 
-    /// How many there are.
+    /// Number of samples.
     pub(crate) fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// The least sample that this share of all does not exceed (nearest rank), share in `0..=1`; `None` without samples.
+    /// The least sample not exceeded by this share of all (nearest rank), share in `0..=1`; `None` without samples.
     pub(crate) fn quantile(&self, share: f64) -> Option<f64> {
         let rank = (share.clamp(0.0, 1.0) * self.0.len() as f64).ceil() as usize;
         self.0.get(rank.max(1) - 1).copied()
     }
 
-    /// The greatest sample.
+    /// The largest sample.
     pub(crate) fn max(&self) -> Option<f64> {
         self.0.last().copied()
     }
 }
 
-/// The middle one of all runs, the mean of the two in the middle if their number is even; `None` without runs.
+/// The median of all runs, the mean of the middle two if their number is even; `None` without runs.
 pub(crate) fn median(runs: &[f64]) -> Option<f64> {
     let sorted = Sorted::new(runs.iter().copied()).0;
     let middle = sorted.len() / 2;
@@ -37,13 +37,13 @@ pub(crate) fn median(runs: &[f64]) -> Option<f64> {
     if sorted.len().is_multiple_of(2) { Some((sorted.get(middle - 1)? + upper) / 2.0) } else { Some(upper) }
 }
 
-/// Least and greatest of all runs.
+/// Smallest and largest of all runs.
 pub(crate) fn range(runs: &[f64]) -> Option<(f64, f64)> {
     let sorted = Sorted::new(runs.iter().copied()).0;
     Some((*sorted.first()?, *sorted.last()?))
 }
 
-/// Differences of neighbours whose numbers follow one another; how many numbers are missing between the others.
+/// Differences of neighbours with consecutive numbers; how many numbers are missing between the others.
 pub(crate) fn steps(numbered: &[(u64, u64)]) -> (Vec<u64>, u64) {
     let mut steps = Vec::with_capacity(numbered.len());
     let mut missing = 0;
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn the_median_stands_between_two_if_there_is_no_middle_one() {
+    fn the_median_of_an_even_count_lies_between_the_middle_two() {
         assert_eq!(median(&[9.0, 1.0, 2.0]), Some(2.0));
         assert_eq!(median(&[4.0, 1.0, 2.0, 9.0]), Some(3.0));
         assert_eq!((median(&[]), range(&[])), (None, None));
@@ -83,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_over_a_missing_number_is_no_interval() {
+    fn a_step_over_a_missing_number_is_not_an_interval() {
         let (steps, missing) = steps(&[(1, 10), (1, 10), (2, 12), (5, 30), (6, 33)]);
         assert_eq!((steps, missing), (vec![2, 3], 2));
     }

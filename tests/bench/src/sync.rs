@@ -1,4 +1,4 @@
-//! What an observation costs, in rings as full as those of a session.
+//! The cost of an observation, with rings as full as in a session.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -14,15 +14,15 @@ use crate::figure::Figure;
 use crate::stats::{Sorted, median, range};
 use crate::{Bench, Failure};
 
-/// Modalities of an observation.
+/// Numbers of modalities in an observation.
 const COUNTS: [u8; 3] = [4, 16, 64];
-/// Rates of the modalities in turn, Hz, and samples their rings hold: the recorder keeps the topic's depth and 1024 more.
+/// Rates of the modalities in turn, Hz, and capacities of their rings: the recorder keeps the topic's depth plus 1024.
 const RATES: [(u64, usize); 4] = [(30, 60 + 1024), (60, 120 + 1024), (60, 120 + 1024), (1000, 2048 + 1024)];
 /// Half width of the window.
 const WINDOW: Duration = Duration::from_millis(25);
-/// A tick is evaluated this long after its moment, as the recorder does it.
+/// Delay of a tick's evaluation, as in the recorder.
 const BEHIND: Duration = Duration::from_millis(125);
-/// Ticks come at 30 Hz.
+/// Time between ticks at 30 Hz.
 const TICK_NS: u64 = 33_333_333;
 const SECOND_NS: u64 = 1_000_000_000;
 
@@ -76,7 +76,7 @@ fn one(count: u8, ticks: u64) -> Result<(f64, f64), Failure> {
         .collect();
     let mut sync = Synchronizer::new(&modalities, WINDOW);
     let mut pushed = vec![0_u64; ids.len()];
-    // Long enough that every ring has gone round.
+    // Long enough that every ring has wrapped around.
     let start = 60 * SECOND_NS;
     let mut observations = Vec::new();
     let mut headers: Vec<Vec<SampleHeader>> =

@@ -1,5 +1,5 @@
-//! What the recorder writes a second, fed from memory, against the `mcap` crate alone on the same messages; and what
-//! compression would cost and save.
+//! The recorder's write rate, fed from memory, compared with the `mcap` crate alone on the same messages; and the cost
+//! and savings of compression.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -21,11 +21,11 @@ use crate::figure::Figure;
 use crate::stats::median;
 use crate::{Bench, Failure};
 
-/// Messages handed over in one turn: what gathers in a few ms of the full load, and more.
+/// Messages passed at once: more than accumulate in a few ms of the full load.
 const BATCH: usize = 64;
-/// Sizes of chunks tried.
+/// Chunk sizes that are measured.
 const CHUNKS_KIB: [u64; 4] = [128, 256, 512, 1024];
-/// Content of the sets that are compressed, bytes.
+/// Size of the sets that are compressed, bytes.
 const SET_BYTES: usize = 64 << 20;
 const QUICK_SET_BYTES: usize = 16 << 20;
 
@@ -35,7 +35,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let (mut own, mut plain) = (Vec::new(), Vec::new());
     for run in 0..bench.runs {
         bench.progress(&format!("write: run {} of {}", run + 1, bench.runs));
-        // Neither is always the first to find a clean disk.
+        // Alternates which one finds a clean disk first.
         if run % 2 == 0 {
             own.push(recorder(bench, &feed, seconds)?);
             plain.push(mcap_alone(bench.scratch.path(), &feed, seconds, child::options())?);
@@ -64,7 +64,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(figures)
 }
 
-/// What a run took.
+/// Resources used by a run.
 #[derive(Debug, Clone, Copy)]
 struct Taken {
     wall_s: f64,
@@ -90,7 +90,7 @@ impl Sink for Unsynced {
     }
 }
 
-/// Hands over the feed as fast as it is taken.
+/// Passes the feed as fast as it is accepted.
 struct Fed {
     feed: Feed,
     left: usize,
@@ -130,7 +130,7 @@ impl Source for Fed {
         }
         if self.left == 0 {
             let taken = Taken { wall_s: begun.elapsed().as_secs_f64(), cpu_s: thread_cpu_s() - cpu };
-            // No one waits any more if the recorder ended early.
+            // Nobody receives if the recorder ended early.
             let _ = self.done.send(taken);
         }
         Ok(())
@@ -178,8 +178,8 @@ fn mcap_alone(folder: &Path, feed: &Feed, seconds: u64, options: WriteOptions) -
     Ok(taken)
 }
 
-/// What the size of a chunk does to the crate's own rate: a chunk that fits a core's cache is cheaper to hand over, and the
-/// writer is away from its queue for a shorter time.
+/// The effect of chunk size on the crate's own rate: a chunk that fits into a core's cache is cheaper to pass on, and
+/// the writer is away from its queue for a shorter time.
 fn chunks(bench: &Bench, feed: &Feed, seconds: u64) -> Result<Vec<Figure>, Failure> {
     let mut runs: [Vec<f64>; CHUNKS_KIB.len()] = Default::default();
     for run in 0..bench.runs {
@@ -197,7 +197,7 @@ fn chunks(bench: &Bench, feed: &Feed, seconds: u64) -> Result<Vec<Figure>, Failu
     Ok(figures.collect())
 }
 
-/// What each codec makes of each kind of content.
+/// The result of each codec for each kind of content.
 fn compression(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let bytes = bench.choose(SET_BYTES, QUICK_SET_BYTES);
     let sets = [("JPEG", lane_of(jpeg())), ("YUYV", lane_of(yuyv())), ("scalars", lane_of(scalars()))];
@@ -247,14 +247,14 @@ fn compress(folder: &Path, feed: &Feed, codec: Option<Compression>, least: usize
         content += length;
     }
     plain.finish()?;
-    // Codecs may use threads of their own: the process's time, not the thread's.
+    // Codecs may use threads of their own: process time, not thread time.
     let (wall_s, cpu_s) = (begun.elapsed().as_secs_f64(), process_cpu_s() - cpu);
     let file = std::fs::metadata(&path)?.len() as f64;
     std::fs::remove_file(path)?;
     Ok(Compressed { content: content as f64, file, wall_s, cpu_s })
 }
 
-/// Pictures of 60 kB that do not compress, as what an encoder has left does not; more than a chunk holds.
+/// Pictures of 60 kB that do not compress, like an encoder's output; more than a chunk holds.
 fn jpeg() -> Vec<Vec<u8>> {
     let mut noise = Noise(5);
     (0..64).map(|_| (0..60_000).map(|_| noise.below(256).to_le_bytes()[0]).collect()).collect()
@@ -273,7 +273,7 @@ fn lane_of(messages: Vec<Vec<u8>>) -> Feed {
     Feed { lanes: Arc::new(vec![lane]), second: Arc::default() }
 }
 
-/// Raw pictures of 640x480: soft shades and a hard edge, with the noise of a sensor, two steps up or down.
+/// Raw pictures of 640x480: soft shades and a hard edge, with sensor noise of up to two steps.
 fn yuyv() -> Vec<Vec<u8>> {
     const WIDTH: usize = 640;
     const HEIGHT: usize = 480;
@@ -294,7 +294,7 @@ fn yuyv() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Vectors of 14 numbers as a motor controller sends them: slow curves with noise in the low digits.
+/// Vectors of 14 numbers like those of a motor controller: slow curves with noise in the low digits.
 fn scalars() -> Vec<Vec<u8>> {
     let mut noise = Noise(11);
     (0..4096_u32)

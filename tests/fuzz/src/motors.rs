@@ -1,4 +1,4 @@
-//! Motors: frames that strangers send on their bus, and numbers that strangers want of them.
+//! Motors: foreign frames on their bus, and actions of arbitrary numbers.
 
 #[path = "../../support/motor_spec.rs"]
 mod motor_spec;
@@ -6,7 +6,7 @@ mod motor_spec;
 use std::time::Duration;
 
 use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec::{Feedback, MotorStatus, Order, Ranges};
+use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
 use rapid::control::damiao::parameter::{Parameter, Reply, Value};
 use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 use rapid::registry::{DamiaoSpec, MotorMode, MotorSpec};
@@ -44,7 +44,7 @@ pub fn motors(bytes: &[u8]) {
                     assert_eq!(reply.encode(u16::from(*number)), frame, "a reply is what was sent");
                 }
                 bus.feed(&frame, now);
-                axes.iter_mut().for_each(|axis| axis.hear(&frame));
+                axes.iter_mut().for_each(|axis| axis.receive(&frame));
             }
             STEP => {
                 now = now.after(Duration::from_millis(ms));
@@ -101,7 +101,7 @@ fn is_on(state: BusState) -> bool {
 
 /// Requests for parameters and feedback, and orders to turn off.
 fn is_harmless(frame: &CanFrame) -> bool {
-    frame.id == 0x7ff || *frame == Order::Disable.frame(u16::try_from(frame.id).unwrap_or_default())
+    frame.id == 0x7ff || *frame == StateCommand::Disable.frame(u16::try_from(frame.id).unwrap_or_default())
 }
 
 /// What is known of a motor from the frames alone.
@@ -121,7 +121,7 @@ impl Axis {
         Self { spec: spec.clone(), reported: [[f64::INFINITY, 0.0]; 3], measured: Vec::new(), span: spec.position }
     }
 
-    fn hear(&mut self, frame: &CanFrame) {
+    fn receive(&mut self, frame: &CanFrame) {
         if frame.id != u32::from(self.spec.master) {
             return;
         }
@@ -200,7 +200,7 @@ impl Axis {
             MotorMode::Velocity if frame.id == u32::from(self.spec.slave) + 0x200 => {
                 self.judge(f64::from(f32::from_le_bytes([a, b, c, d])));
             }
-            // Seven such bytes begin an order.
+            // Seven such bytes begin a state command.
             MotorMode::Mit { .. } if frame.id == u32::from(self.spec.slave) && !frame.data.starts_with(&[0xff; 7]) => {
                 let Some(quantum) = self.quantum() else { return };
                 let command = f64::from(u16::from_be_bytes([a, b])) * quantum - self.reported[0][1];
@@ -318,7 +318,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_session_gets_to_motors_that_follow() {
+    fn the_session_reaches_motors_that_follow() {
         let mut now = Stamp(1_000_000_000_000);
         let mut bus = MotorBus::new(&spec(), now);
         let mut states = Vec::new();

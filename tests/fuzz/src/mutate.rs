@@ -22,7 +22,7 @@ impl Random {
 }
 
 /// Bytes that formats give a meaning to.
-const TELLING: [&[u8]; 20] = [
+const MEANINGFUL: [&[u8]; 20] = [
     b"\0",
     b"\n",
     b"\r\n",
@@ -56,7 +56,7 @@ pub fn mutate(random: &mut Random, seed: &[u8], other: &[u8]) -> Vec<u8> {
             1 if at < bytes.len() => bytes[at] = random.number().to_le_bytes()[0],
             2 => drop(bytes.drain(at..at + length)),
             3 => bytes.truncate(at),
-            4 => drop(bytes.splice(at..at + length, TELLING[random.below(TELLING.len())].iter().copied())),
+            4 => drop(bytes.splice(at..at + length, MEANINGFUL[random.below(MEANINGFUL.len())].iter().copied())),
             5 => {
                 let again = bytes[at..at + length].to_vec();
                 drop(bytes.splice(at..at, again));

@@ -15,7 +15,7 @@ pub fn bundle(bytes: &[u8]) {
             assert!(bundle.control_hz.is_finite() && bundle.control_hz > 0.0);
             let covered: usize = bundle.action.normalization.iter().map(|slice| slice.slice.len()).sum();
             assert_eq!(covered, bundle.action.len());
-            assert!(bundle.mask_aware <= bundle.mask.is_some(), "who knows of the mask reads it");
+            assert!(bundle.mask_aware <= bundle.mask.is_some(), "a reader that knows the mask reads it");
         }
         Err(errors) => assert!(!errors.diagnostics.is_empty()),
     }
@@ -57,7 +57,7 @@ pub fn bundles() -> Vec<Vec<u8>> {
 #[must_use]
 pub fn pictures() -> Vec<Vec<u8>> {
     let raw = |kind: u8, bytes: usize| [&[kind, 16, 12][..], &vec![0x80; bytes]].concat();
-    let source = rapid::registry::scenario::SimSource::Camera { width: 16, height: 12, fps: 30, seed: 1, bytes: 0 };
+    let source = rapid::simulation::SimSource::Camera { width: 16, height: 12, fps: 30, seed: 1, bytes: 0 };
     let jpeg = rapid::driver::sim::frame(&source, 0).unwrap_or_default();
     vec![[&[0, 16, 12][..], &jpeg].concat(), raw(1, 16 * 12 * 2), raw(2, 16 * 12)]
 }

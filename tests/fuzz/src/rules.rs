@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn globs_match_as_a_shells_do() {
+    fn globs_match_as_in_a_shell() {
         for (pattern, text, expected) in [
             ("abc", "abc", true),
             ("a*c", "abbc", true),

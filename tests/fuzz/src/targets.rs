@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid::commands;
+use rapid::device::{Attachment, DeviceNode, Unit, UsbIdentity};
 use rapid::driver;
 use rapid::episode::recover::recover_bytes;
 use rapid::headless::style::Palette;
@@ -14,10 +15,7 @@ use rapid::mask::{MaskRecord, RECORD_LEN};
 use rapid::record::inspect as inspection;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
-use rapid::registry::{
-    Assigner, Assignment, Attachment, DeviceNode, Framing, Parse, Registry, RegistryErrors, SerialSpec, Unit,
-    UsbIdentity,
-};
+use rapid::registry::{Assigner, Assignment, Framing, Parse, Registry, RegistryErrors, SerialSpec};
 use rapid::text as shown;
 
 use crate::artifacts;
@@ -245,7 +243,6 @@ pub fn text(bytes: &[u8]) {
     for columns in [0, 1, 7, 80] {
         assert!(shown::width(&shown::cut(&plain, columns, "…")) <= columns);
         assert_eq!(shown::width(&shown::left(&plain, columns, "…")), columns);
-        assert_eq!(shown::width(&shown::right(&plain, columns, "…")), columns);
     }
     let json = shown::json(&text).expect("a text has a form in JSON");
     harmless(&json);

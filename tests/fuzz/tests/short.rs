@@ -37,7 +37,7 @@ fn feed(target: &Target, name: &str, input: &[u8]) {
 }
 
 #[test]
-fn no_reader_breaks_a_promise() {
+fn no_parser_violates_its_properties() {
     for target in TARGETS {
         let inputs = inputs(target);
         assert!(!inputs.is_empty(), "{} has no seeds", target.name);

@@ -1,13 +1,13 @@
-# The words a guest script is written in. The harness writes run.sh, which names the programs and sources this file.
-# Results belong in $out; whatever lies there when the script ends goes back to the host.
+# The functions used by guest scripts. The harness writes run.sh, which names the programs and sources this file.
+# Results belong in $out; all files there when the script ends are copied to the host.
 set -u
 out=/tmp/bench/out
 
-# Seconds after which a wait is given up, however few it names: a watchdog for what hangs. How fast anything comes is the
-# machine's affair and no scenario's.
+# Seconds after which a wait gives up, however few it names: a watchdog for hangs. Speed depends on the machine, and no
+# scenario judges it.
 watchdog=300
 
-# wait_for SECONDS COMMAND...: until the command succeeds; SECONDS is what it may take on an idle machine.
+# wait_for SECONDS COMMAND...: until the command succeeds; SECONDS is the time it may take on an idle machine.
 wait_for() {
   local limit=$(($1 > watchdog ? $1 : watchdog)) end; shift
   end=$((SECONDS + limit))
@@ -17,14 +17,14 @@ wait_for() {
   done
 }
 
-# has_line FILE FRAGMENT...: one line of FILE holds every fragment.
+# has_line FILE FRAGMENT...: one line of FILE contains every fragment.
 has_line() {
   local file=$1 lines fragment; shift
   lines=$(cat "$file" 2>/dev/null)
   for fragment in "$@"; do lines=$(grep -F -- "$fragment" <<<"$lines") || return 1; done
 }
 
-# emu_start SPEC...: the emulator. It opens its FIFO for writing too: at end of file it would unplug everything and quit.
+# emu_start SPEC...: the emulator. It also opens its FIFO for writing: at its end it would unplug everything and quit.
 emu_start() {
   mkfifo /tmp/emu.ctl
   "${usbemu[@]}" "$@" 0<>/tmp/emu.ctl >"$out/emu.jsonl" 2>"$out/emu.err" &
@@ -43,7 +43,7 @@ emu_done() {
   wait_for "$1" has_line "$out/emu.jsonl" "\"word\":\"done-$emu_asked\"" || fail "the emulator is not done: $(tail -n 1 "$out/emu.jsonl")"
 }
 
-# emu_quit: what is still plugged is pulled, and the log is complete.
+# emu_quit: devices still plugged in are unplugged, and the log is complete.
 emu_quit() { emu quit; wait "$emu_pid"; }
 
 # attached PORT... / detached PORT...: the kernel has, or no longer has, a device in each of these ports.
@@ -59,7 +59,7 @@ rapid_start() {
   rapid_pid=$!
 }
 
-# await_rapid SECONDS FRAGMENT...: until rapid has printed a line with all of them, or has ended without.
+# await_rapid SECONDS FRAGMENT...: until rapid has printed a line with all of them, or has ended.
 await_rapid() {
   local limit=$(($1 > watchdog ? $1 : watchdog)) end; shift
   end=$((SECONDS + limit))
@@ -70,13 +70,13 @@ await_rapid() {
   done
 }
 
-# rapid_wait: waits for its end and keeps its exit code.
+# rapid_wait: waits for its end and stores its exit code.
 rapid_wait() {
   wait "$rapid_pid"
   echo $? >"$out/rapid.rc"
 }
 
-# rapid_stop: asks it to end, as systemd and a user would.
+# rapid_stop: asks it to end, as systemd and a user do.
 rapid_stop() { kill -TERM "$rapid_pid"; rapid_wait; }
 
 # published KEY: a value of the mask's JSON file, or the state of a device: `published mask`, `published cam_wrist`.
@@ -91,7 +91,7 @@ is() { local value=$1; shift; [ "$("$@")" = "$value" ]; }
 # can_up NAME: brings a CAN interface up at the bus's rate.
 can_up() { ip link set "$1" up type can bitrate 1000000 || fail "$1 does not come up"; }
 
-# lan_rule N ADDRESS/BITS: the interface of network adapter N gets this address at each plug, as a DHCP client would see to.
+# lan_rule N ADDRESS/BITS: the interface of network adapter N gets this address at each plug, as from a DHCP client.
 lan_rule() {
   local mac name='$name'
   printf -v mac '00:00:5e:00:53:%02x' "$1"
@@ -100,7 +100,7 @@ lan_rule() {
   udevadm control --reload
 }
 
-# mark WORD: the emulator's log has the word; what is logged from now on comes after it.
+# mark WORD: writes the word to the emulator's log; later log lines come after it.
 mark() {
   emu "say $1"
   wait_for 20 has_line "$out/emu.jsonl" "\"word\":\"$1\"" || fail "the emulator did not log $1"
@@ -114,13 +114,13 @@ logged() {
   for fragment in "$@"; do lines=$(grep -F -- "$fragment" <<<"$lines") || return 1; done
 }
 
-# states N DEVICE STATE: rapid has reported this state of the device N times at least.
+# states N DEVICE STATE: rapid has reported this state of the device at least N times.
 states() { [ "$(grep -F '"event":"state"' $out/rapid.jsonl | grep -F "\"device\":\"$2\"" | grep -cF "\"state\":\"$3\"")" -ge "$1" ]; }
 
-# held fd|task: descriptors or threads rapid has.
+# held fd|task: number of rapid's descriptors or threads.
 held() { ls "/proc/$rapid_pid/$1" | wc -l; }
 
-# sample NAME: what rapid holds now, as a line of samples.jsonl. Sizes in KiB; `anon` is memory of its own, `pss` its share of all.
+# sample NAME: rapid's resources, as a line of samples.jsonl. Sizes in KiB; `anon` is private memory, `pss` its share of all.
 sample() {
   local rollup status
   rollup=$(cat "/proc/$rapid_pid/smaps_rollup") status=$(cat "/proc/$rapid_pid/status")

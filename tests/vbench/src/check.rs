@@ -1,6 +1,6 @@
-//! What scenarios assert alike.
+//! Assertions shared by scenarios.
 //!
-//! Invariant: a failed check panics with what was found, as `assert!` does; nothing is merely reported.
+//! Invariant: a failed check panics and prints the value found, as `assert!` does; it is never merely reported.
 
 use std::ops::RangeBounds;
 
@@ -8,14 +8,14 @@ use crate::outcome::Outcome;
 use crate::recording::{Edge, Recording, missing, rises};
 use crate::scenario::Scenario;
 
-/// The bench's own troubles end a test with a sentence that names what to do.
+/// Plays a scenario; problems of the bench itself end the test with a message that names the fix.
 pub fn play(scenario: Scenario) -> Outcome {
     let outcome = scenario.run().unwrap_or_else(|error| panic!("{error}"));
     println!("{:.1} s wall", outcome.wall.as_secs_f64());
     outcome
 }
 
-/// Plays a scenario in which `rapid` records to its end without an error on any side.
+/// Plays a scenario in which `rapid` records to the end, without an error on any side.
 pub fn recorded(scenario: Scenario) -> Outcome {
     let outcome = play(scenario);
     ended(&outcome);
@@ -24,22 +24,22 @@ pub fn recorded(scenario: Scenario) -> Outcome {
     outcome
 }
 
-/// The guest's script and `rapid` ended without an error. A BAD episode is for the scenario to judge; the exit code is to
-/// say so.
+/// The guest's script and `rapid` ended without an error. The scenario judges a BAD episode; the exit code must report
+/// it.
 pub fn ended(outcome: &Outcome) {
     assert_eq!(outcome.code, 0, "the guest's script: {}", outcome.log);
     let is_bad = outcome.rapid.iter().any(|line| line["event"] == "episode" && line["verdict"] == "BAD");
     assert_eq!(outcome.rapid_code, Some(if is_bad { 4 } else { 0 }), "rapid's exit code: {}", outcome.log);
 }
 
-/// The one episode there must be.
+/// The only episode; there must be exactly one.
 pub fn episode(outcome: &Outcome) -> Recording {
     outcome.episode().unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Frames in this span are there, whole, and each number once. The emulator gives numbers to what it sends alone, so a number
-/// that is missing was lost behind it: it must be among those that `rapid` reports. `uvcvideo` copies pictures on several threads
-/// and on a busy machine hands out two of them in the other order.
+/// Frames in this span are present and whole, and each number occurs once. The emulator numbers only what it sends, so
+/// a missing number was lost after it and must be among those that `rapid` reports. `uvcvideo` copies pictures on
+/// several threads, and on a busy machine may deliver two of them in reverse order.
 pub fn assert_whole(episode: &Recording, topic: &str, span: impl RangeBounds<u64> + Clone) {
     let frames = episode.frames(topic);
     let damaged =
@@ -48,8 +48,8 @@ pub fn assert_whole(episode: &Recording, topic: &str, span: impl RangeBounds<u64
     assert_accounted(episode, topic, episode.numbers(topic, span));
 }
 
-/// These numbers of a topic are there, each once, and `rapid` has reported at least as many losses as are missing: on a
-/// machine that is too busy samples are lost, but none in silence.
+/// These numbers of a topic are present once each, and `rapid` has reported at least as many losses as are missing: on
+/// a machine that is too busy samples are lost, but never silently.
 pub fn assert_accounted(episode: &Recording, topic: &str, numbers: Vec<u64>) {
     let (count, reported) = (numbers.len(), episode.reported_lost(topic));
     let missing = missing(numbers);
@@ -58,7 +58,7 @@ pub fn assert_accounted(episode: &Recording, topic: &str, numbers: Vec<u64>) {
     assert!(missing <= reported, "{topic}: {missing} of {count} samples are missing, {reported} are reported as lost");
 }
 
-/// The lines of a serial device that sends the emulator's four numbers, the first of which counts them.
+/// The lines of a serial device that sends the emulator's four numbers, the first of which is a counter.
 pub fn assert_lines(episode: &Recording, topic: &str) {
     let numbers = episode.rows(topic).iter().map(|row| row[0] as u64).collect();
     assert_accounted(episode, topic, numbers);
@@ -69,7 +69,7 @@ pub fn rises_after(edges: &[Edge], bit: u32, after: u64) -> Vec<u64> {
     rises(edges, bit).into_iter().filter(|time| *time > after).collect()
 }
 
-/// The one time there must be.
+/// The only time; there must be exactly one.
 pub fn only(times: &[u64]) -> u64 {
     assert_eq!(times.len(), 1, "expected one edge");
     times[0]

@@ -1,4 +1,4 @@
-//! The two clocks every printed line carries.
+//! The two clocks in every printed line.
 
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ pub fn real_ns() -> u64 {
     nanoseconds(clock_gettime(ClockId::Realtime))
 }
 
-/// What is left until `due_ns` on CLOCK_MONOTONIC; zero when it has passed.
+/// The time left until `due_ns` on CLOCK_MONOTONIC; zero if it has passed.
 pub fn until(due_ns: u64) -> Duration {
     Duration::from_nanos(due_ns.saturating_sub(mono_ns()))
 }

@@ -1,7 +1,7 @@
-//! Devices read by programs that behave badly, while a sampler reads the mask: two are unplugged one after the other, and the
-//! program of the second ignores SIGTERM; of two that are plugged later, one program crashes again and again, one floods its stderr.
+//! Devices read by misbehaving programs, while a sampler reads the mask: two are unplugged in turn, and the program of
+//! the second ignores SIGTERM; of two plugged in later, one program crashes repeatedly, one floods stderr.
 //!
-//! Invariant: spans of equal length are compared, of one guest: nothing happens, or one of the above.
+//! Invariant: spans of equal length in one guest are compared: an idle one, and one for each of the above.
 
 use crate::emu::spec::DeviceSpec;
 use crate::figure::Figure;
@@ -9,16 +9,16 @@ use crate::outcome::Outcome;
 use crate::rhythm::Rhythm;
 use crate::scenario::Scenario;
 
-/// Length of each span: SIGTERM has 5 s to work, and then the program is killed.
+/// Length of each span: SIGTERM may take 5 s, after which the program is killed.
 pub const SPAN_MS: u64 = 7_000;
 const IDLE_MS: u64 = 2_000;
 const PROMPT_MS: u64 = 10_000;
 const DEAF_MS: u64 = 18_000;
 const CRASH_MS: u64 = 26_000;
 const FLOOD_MS: u64 = 34_000;
-/// Until the end of the last span.
+/// Time until the end of the last span.
 const SECONDS: u32 = 42;
-/// Between the first crash and the fifth are 7.5 s of waiting and four starts, which take seconds in the guest.
+/// Between the first and the fifth crash are 7.5 s of waiting and four starts, which take seconds in the guest.
 const CRASHED: &str = r#"eval '[ "$(grep -c "crashes after 50 samples" $out/rapid.jsonl)" -ge 5 ]'"#;
 const REGISTRY: &str = r#"
 [rig]
@@ -76,11 +76,11 @@ pub enum Span {
     Idle,
     /// The device of the program that ends on SIGTERM is unplugged at its beginning.
     Prompt,
-    /// The device of the program that does not.
+    /// The device of the program that ignores SIGTERM is unplugged.
     Deaf,
-    /// A device is plugged at its beginning whose program crashes after half a second, each time.
+    /// A device is plugged at its start whose program crashes after half a second, each time.
     Crashing,
-    /// One whose program writes to its stderr as fast as it can.
+    /// A device whose program writes to its stderr as fast as it can.
     Flooding,
 }
 
@@ -92,7 +92,7 @@ pub fn scenario() -> Scenario {
         .spare(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("C1"))
         .spare(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("F1"))
         .registry(REGISTRY)
-        .node_program()
+        .example("process_node")
         .record(SECONDS, &["prompt", "deaf"])
         .watch_mask()
         .at(PROMPT_MS, "unplug 0")
@@ -102,7 +102,7 @@ pub fn scenario() -> Scenario {
         .until(CRASHED)
 }
 
-/// The mask's rhythm in a span; `None` when the sampler saw nothing of it.
+/// The mask's timing in a span; `None` if the sampler recorded nothing of it.
 pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
     let offset = match span {
         Span::Idle => IDLE_MS,
@@ -115,7 +115,7 @@ pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
     Rhythm::between(outcome, from, from + SPAN_MS * 1_000_000)
 }
 
-/// The longest silence of the mask in each span, beside that of the idle one.
+/// The longest silence of the mask in each span, next to that of the idle one.
 pub fn figures(outcome: &Outcome) -> Vec<Figure> {
     let idle = rhythm(outcome, Span::Idle).map(|rhythm| rhythm.longest_ms);
     let spans = [

@@ -1,4 +1,4 @@
-//! Text of `devices.toml` for the bench's devices.
+//! `devices.toml` entries for the bench's devices.
 
 /// A registry of these entries.
 pub fn registry(entries: &[String]) -> String {

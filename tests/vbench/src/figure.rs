@@ -1,4 +1,4 @@
-//! A measured figure beside what it is to be judged by, as a line of a table or as a JSON object.
+//! A measured figure with its baseline and target, as a line of a table or as a JSON object.
 
 use std::fmt;
 
@@ -7,17 +7,17 @@ use serde_json::{Value, json};
 /// One figure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Figure {
-    /// What was measured, in words of letters, digits and `_`.
+    /// Name of the measurement: letters, digits and `_`.
     pub name: String,
     /// Unit of all three values.
     pub unit: &'static str,
-    /// What was measured; `None` when there was nothing to measure.
+    /// The measured value; `None` if nothing could be measured.
     pub value: Option<f64>,
-    /// The same of the plainest program there can be, measured in the same run.
+    /// The same measurement of the simplest possible program, in the same run.
     pub baseline: Option<f64>,
-    /// What the value should not exceed, where there is such a wish.
+    /// The value that should not be exceeded, if there is one.
     pub target: Option<f64>,
-    /// What was measured how, for people.
+    /// What was measured and how, for people.
     pub note: String,
 }
 
@@ -27,28 +27,28 @@ impl Figure {
         Self { name: name.into(), unit, value, baseline: None, target: None, note: String::new() }
     }
 
-    /// With the plainest program's value.
+    /// Adds the value of the simplest possible program.
     #[must_use]
     pub fn baseline(mut self, baseline: Option<f64>) -> Self {
         self.baseline = baseline;
         self
     }
 
-    /// With what it should not exceed.
+    /// Adds the value that should not be exceeded.
     #[must_use]
     pub fn target(mut self, target: f64) -> Self {
         self.target = Some(target);
         self
     }
 
-    /// With a sentence.
+    /// Adds a note.
     #[must_use]
     pub fn note(mut self, note: impl Into<String>) -> Self {
         self.note = note.into();
         self
     }
 
-    /// As a JSON object: `name`, `unit`, `value`, `baseline`, `target` and `note`; what is not there is null.
+    /// As a JSON object: `name`, `unit`, `value`, `baseline`, `target` and `note`; missing values are null.
     pub fn json(&self) -> Value {
         let rounded = |value: Option<f64>| value.map(|value| (value * 1e3).round() / 1e3);
         json!({
@@ -79,7 +79,7 @@ impl fmt::Display for Figure {
     }
 }
 
-/// The line above a table of figures.
+/// The header of a table of figures.
 pub fn heading() -> String {
     format!("{:<34} {:>9} {:>9} {:>7} {:<5} {}", "figure", "value", "baseline", "target", "unit", "what it is")
 }

@@ -1,7 +1,7 @@
 //! The guest: its image in the cache, and one boot of it under QEMU.
 //!
-//! Invariant: one guest at a time on a machine, whichever process starts it: timings under software emulation mean little
-//! when two share the processors.
+//! Invariant: one guest at a time per machine, whichever process starts it: two guests sharing the processors under
+//! software emulation would distort the timings.
 //! Invariant: never KVM, which hangs on some nested hosts; figures stay comparable between machines that have it and not.
 
 use std::fs::{self, File};
@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use thiserror::Error;
 
 const BUILD_SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/image/build.sh");
-/// On top of the script's own limit: boot, copying, power off.
+/// Added to the script's own limit: boot, copying, power off.
 const OVERHEAD: Duration = Duration::from_mins(5);
 /// `usbcore.autosuspend=-1`: resuming an emulated camera resets it, which can look like a replug.
 const KERNEL_ARGUMENTS: &str = "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off nokaslr audit=0 \
@@ -26,7 +26,7 @@ pub enum GuestError {
     /// The image has not been built for these scripts.
     #[error("{0}")]
     NoImage(String),
-    /// QEMU is not there.
+    /// QEMU was not found.
     #[error("qemu-system-x86_64 does not start: {0}: run `make setup`")]
     NoQemu(#[source] io::Error),
     /// A file of the bench could not be read or written.
@@ -35,7 +35,7 @@ pub enum GuestError {
     /// The guest neither finished nor powered off.
     #[error("the guest did not end within {limit:?} ({qemu}); console: {console}")]
     Unfinished {
-        /// What it was given.
+        /// The time limit.
         limit: Duration,
         /// How QEMU ended.
         qemu: String,
@@ -51,17 +51,17 @@ pub struct Image {
     suite: String,
 }
 
-/// What a boot left behind.
+/// Results of a boot.
 #[derive(Clone, Copy, Debug)]
 pub struct Boot {
-    /// Exit code of the guest's script; 124 when it ran into its own limit.
+    /// Exit code of the guest's script; 124 if it reached its own time limit.
     pub code: i32,
-    /// From starting QEMU to its end.
+    /// From the start of QEMU to its end.
     pub wall: Duration,
 }
 
 impl Image {
-    /// The image that belongs to the scripts of this checkout.
+    /// The image built from the scripts of this checkout.
     pub fn locate() -> Result<Self, GuestError> {
         let script = Path::new(BUILD_SCRIPT);
         let check =
@@ -81,7 +81,7 @@ impl Image {
         &self.suite
     }
 
-    /// Boots with `share` as the guest's share, until its script has ended and the machine is off.
+    /// Boots with `share` as the guest's share, and waits until its script has ended and the machine is off.
     pub fn boot(&self, share: &Path, limit: Duration) -> Result<Boot, GuestError> {
         let _alone = self.lock()?;
         let file = |name: &str, text: String| {
@@ -169,7 +169,7 @@ impl Drop for Machine {
     }
 }
 
-/// The last lines of a file; empty when it is not there.
+/// The last lines of a file; empty if there is no file.
 pub fn tail(path: &Path, lines: usize) -> String {
     let bytes = fs::read(path).unwrap_or_default();
     let text = String::from_utf8_lossy(&bytes);

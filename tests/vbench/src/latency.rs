@@ -1,6 +1,6 @@
-//! Delays between what was done to a device and what came of it, and between one event and the next.
+//! Delays between actions on a device and their effects, and between one event and the next.
 //!
-//! Invariant: an effect counts for a cause only before the next cause; what never came is counted, not left out.
+//! Invariant: an effect counts for a cause only before the next cause; missing effects are counted, not left out.
 
 use std::fmt;
 
@@ -12,7 +12,7 @@ pub struct Delays {
 }
 
 impl Delays {
-    /// For each cause the first effect at or after it, before the next cause. Times are ns on one clock; effects are sorted.
+    /// For each cause the first effect at or after it, before the next cause. Times in ns on one clock; effects sorted.
     pub fn between(causes: &[u64], effects: &[u64]) -> Self {
         let mut delays = Self::default();
         for (place, cause) in causes.iter().enumerate() {
@@ -26,8 +26,8 @@ impl Delays {
         delays
     }
 
-    /// The first effect of each cause, as in [`Self::between`], as time from the cause's own `moment`; negative where the
-    /// effect came first. So two listeners to one event are compared: neither always receives it before the other.
+    /// The first effect of each cause, as in [`Self::between`], as time from the cause's own `moment`; negative if the
+    /// effect came first. This compares two listeners to one event, neither of which always receives it first.
     pub fn beside(causes: &[u64], moments: &[u64], effects: &[u64]) -> Self {
         let (mut found, mut missing) = (Vec::new(), 0);
         for (place, (cause, moment)) in causes.iter().zip(moments).enumerate() {
@@ -40,7 +40,7 @@ impl Delays {
         Self { missing, ..Self::of(found) }
     }
 
-    /// These, ms.
+    /// Delays given in ms.
     pub fn of(mut found: Vec<f64>) -> Self {
         found.sort_by(f64::total_cmp);
         Self { found, missing: 0 }
@@ -52,7 +52,7 @@ impl Delays {
         Self::of(gaps.map(|gap| gap as f64 / 1e6).collect())
     }
 
-    /// How many came, of how many: `n=19/20`.
+    /// How many effects arrived, of how many: `n=19/20`.
     pub fn count(&self) -> String {
         format!("n={}/{}", self.found.len(), self.found.len() + self.missing)
     }
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn moments_have_one_gap_less_than_there_are_moments() {
+    fn moments_have_one_gap_fewer_than_their_number() {
         let gaps = Delays::apart(&[1_000_000, 3_000_000, 4_000_000, 9_000_000]);
         assert_eq!(gaps.to_string(), "n=3/3 min=1.0 p50=2.0 p95=5.0 max=5.0 ms");
         assert_eq!(Delays::apart(&[7]).to_string(), "n=0/0 ms");

@@ -1,4 +1,4 @@
-//! `usbemu`: emulated USB devices, and the bench's eyes inside the guest.
+//! `usbemu`: emulated USB devices, and the bench's probes inside the guest.
 
 use std::io;
 use std::path::Path;
@@ -80,7 +80,7 @@ fn emulate(specs: &[&str]) -> Result<(), Failure> {
             spec.port.or(u8::try_from(index).ok()).filter(|port| *port < PORTS).ok_or("more devices than ports")?;
         devices.push(Device::new(index, port, function, Arc::clone(&log)));
     }
-    log.say("ready", Moment::now(), serde_json::json!({"devices": devices.len()}));
+    log.write("ready", Moment::now(), serde_json::json!({"devices": devices.len()}));
     script::run(io::stdin().lock(), &mut devices, &log);
     Ok(())
 }

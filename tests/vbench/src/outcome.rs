@@ -1,4 +1,4 @@
-//! What a scenario left behind: exit codes, what each program printed, recorded files.
+//! Results of a scenario: exit codes, the output of each program, recorded files.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,16 +21,16 @@ pub enum EpisodeError {
     Recording(#[from] RecordingError),
 }
 
-/// What the emulator logs about one stream of a camera.
+/// The emulator's log about one stream of a camera.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stream {
-    /// Frames that were sent whole.
+    /// Frames that were sent completely.
     pub sent: u64,
-    /// Beats at which none was sent: no one read, or the machine was busy.
+    /// Ticks without a frame: nobody was reading, or the machine was busy.
     pub skipped: u64,
 }
 
-/// The end of a scenario. Its folder is deleted with it, unless a test is failing or `RAPID_VBENCH_KEEP` is set.
+/// The results of a scenario. Dropping it deletes its folder, unless a test is failing or `RAPID_VBENCH_KEEP` is set.
 #[derive(Debug)]
 pub struct Outcome {
     name: String,
@@ -40,13 +40,13 @@ pub struct Outcome {
     pub code: i32,
     /// Exit code of `rapid`, if it ran and ended.
     pub rapid_code: Option<i32>,
-    /// From starting QEMU to its end.
+    /// From the start of QEMU to its end.
     pub wall: Duration,
-    /// What the guest's script printed.
+    /// Output of the guest's script.
     pub log: String,
-    /// What the emulator did.
+    /// The emulator's log.
     pub emu: Vec<Value>,
-    /// JSON lines `rapid` printed.
+    /// JSON lines printed by `rapid`.
     pub rapid: Vec<Value>,
     /// Changes of the mask in shared memory, if they were watched.
     pub mask: Vec<Value>,
@@ -69,13 +69,13 @@ impl Outcome {
         }
     }
 
-    /// When the emulator did `action` to `device`, in order.
+    /// When the emulator applied `action` to `device`, in order.
     pub fn actions(&self, action: &str, device: usize) -> Vec<Moment> {
         let of_device = |line: &&Value| line["action"] == action && line["device"] == device;
         self.emu.iter().filter(of_device).filter_map(moment).collect()
     }
 
-    /// Frames that a camera sent, and beats at which it sent none, in each of its streams that have ended.
+    /// Frames that a camera sent, and ticks without a frame, in each of its finished streams.
     pub fn streams(&self, device: usize) -> Vec<Stream> {
         let of_device = |line: &&Value| line["device"] == device;
         let lines: Vec<&Value> = self.emu.iter().filter(of_device).collect();
@@ -93,7 +93,7 @@ impl Outcome {
         self.emu.iter().filter(|line| line["action"] == "t0").filter_map(moment).collect()
     }
 
-    /// What went wrong in the emulator.
+    /// Errors of the emulator.
     pub fn emulator_errors(&self) -> Vec<&Value> {
         self.emu.iter().filter(|line| line["action"] == "error" || line["action"] == "protocol_error").collect()
     }
@@ -110,7 +110,7 @@ impl Outcome {
         line["bit"].as_u64().and_then(|bit| u32::try_from(bit).ok())
     }
 
-    /// Text of a file the guest wrote to `$out`; empty when there is none.
+    /// Text of a file the guest wrote to `$out`; empty if there is none.
     pub fn file(&self, name: &str) -> String {
         fs::read_to_string(self.share.join("out").join(name)).unwrap_or_default()
     }
@@ -128,7 +128,7 @@ impl Outcome {
         }
     }
 
-    /// What a person needs to see why a scenario failed.
+    /// Information for finding out why a scenario failed.
     pub fn diagnosis(&self) -> String {
         let mut text = format!(
             "scenario {}: guest exit {}, rapid exit {:?}, {:.1} s wall; everything is in {}\n",

@@ -1,4 +1,4 @@
-//! The programs a guest runs: found on the host, slimmed, and put where the guest can run them.
+//! The programs a guest runs: found on the host, stripped, and placed where the guest can run them.
 
 use std::fs;
 use std::io;
@@ -15,7 +15,7 @@ pub enum ProgramError {
     Missing {
         /// Its name.
         name: &'static str,
-        /// Where it was looked for.
+        /// Where it was searched for.
         tried: String,
         /// The variable that overrides the search.
         variable: &'static str,
@@ -33,14 +33,10 @@ pub fn rapid() -> Result<PathBuf, ProgramError> {
     find("rapid", "RAPID_BIN", built("rapid"))
 }
 
-/// The example of a program as a node: `PROCESS_NODE_BIN`, else the newer of the workspace's builds.
-pub fn process_node() -> Result<PathBuf, ProgramError> {
-    find("process_node", "PROCESS_NODE_BIN", built("examples/process_node"))
-}
-
-/// The example of a program that publishes targets of an actuator: `PUBLISH_ACTION_BIN`, else the newer of the workspace's builds.
-pub fn publish_action() -> Result<PathBuf, ProgramError> {
-    find("publish_action", "PUBLISH_ACTION_BIN", built("examples/publish_action"))
+/// An example: in `RAPID_EXAMPLES`, else the newer of the workspace's builds.
+pub fn example(name: &'static str) -> Result<PathBuf, ProgramError> {
+    let folder = std::env::var_os("RAPID_EXAMPLES").map(|folder| PathBuf::from(folder).join(name));
+    newest(name, "RAPID_EXAMPLES", folder.map_or_else(|| built(&format!("examples/{name}")), |path| vec![path]))
 }
 
 /// Where the workspace's builds of a program may be.
@@ -59,7 +55,10 @@ pub fn usbemu() -> Result<PathBuf, ProgramError> {
 }
 
 fn find(name: &'static str, variable: &'static str, candidates: Vec<PathBuf>) -> Result<PathBuf, ProgramError> {
-    let candidates = std::env::var_os(variable).map_or(candidates, |path| vec![path.into()]);
+    newest(name, variable, std::env::var_os(variable).map_or(candidates, |path| vec![path.into()]))
+}
+
+fn newest(name: &'static str, variable: &'static str, candidates: Vec<PathBuf>) -> Result<PathBuf, ProgramError> {
     let changed = |path: &PathBuf| fs::metadata(path).and_then(|meta| meta.modified()).ok();
     let newest = candidates.iter().filter(|path| path.is_file()).max_by_key(|path| changed(path));
     newest.cloned().ok_or_else(|| {
@@ -68,10 +67,10 @@ fn find(name: &'static str, variable: &'static str, candidates: Vec<PathBuf>) ->
     })
 }
 
-/// Copies `program` into `share` (what the guest sees as `/tmp/bench`) and returns the words that run it there.
+/// Copies `program` into `share` (`/tmp/bench` in the guest) and returns the command that runs it there.
 ///
-/// Where host and guest are the same Debian release the guest's own libraries serve. Otherwise the host's are taken along
-/// and the program is run through the host's loader, because a binary built against a newer glibc does not start on an older one.
+/// If host and guest are the same Debian release, the guest's own libraries are used. Otherwise the host's are copied
+/// and its loader is used, because a binary built against a newer glibc does not start on an older one.
 pub fn install(program: &Path, share: &Path, guest_suite: &str) -> Result<Vec<String>, ProgramError> {
     let name = program.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let target = share.join("bin").join(&name);
@@ -84,7 +83,7 @@ pub fn install(program: &Path, share: &Path, guest_suite: &str) -> Result<Vec<St
     Ok(vec![format!("/tmp/bench/lib/{loader}"), "--library-path".into(), "/tmp/bench/lib".into(), inside])
 }
 
-/// Debug information would cost the guest memory and start-up time. Without `strip` the program goes as it is.
+/// Debug information would cost the guest memory and start-up time. Without `strip` the program is copied unchanged.
 fn copy_stripped(program: &Path, target: &Path) -> Result<(), ProgramError> {
     let failed = |error| ProgramError::Copy(program.into(), error);
     fs::create_dir_all(target.parent().unwrap_or(target)).map_err(failed)?;

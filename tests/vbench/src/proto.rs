@@ -1,8 +1,8 @@
-//! Just enough protobuf to read recorded messages: a walk over the fields of a message.
+//! The subset of protobuf needed to read recorded messages: iterates over the fields of a message.
 //!
-//! Invariant: damaged input ends the walk; it never panics and never invents a field.
+//! Invariant: damaged input ends the iteration; it never causes a panic and never yields an invented field.
 
-/// A field's value, still encoded where it has parts.
+/// A field's value, still encoded if it has parts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value<'a> {
     /// int, uint, bool, enum.
@@ -33,12 +33,12 @@ pub fn fields(mut message: &[u8]) -> impl Iterator<Item = (u32, Value<'_>)> {
     })
 }
 
-/// The last occurrence of field `number`, which is the one that counts.
+/// The last occurrence of field `number`, which takes precedence.
 pub fn field(message: &[u8], number: u32) -> Option<Value<'_>> {
     fields(message).filter(|(found, _)| *found == number).map(|(_, value)| value).last()
 }
 
-/// Field `number` as bytes; empty when absent, as protobuf has it.
+/// Field `number` as bytes; empty if absent, as in protobuf.
 pub fn bytes(message: &[u8], number: u32) -> &[u8] {
     match field(message, number) {
         Some(Value::Bytes(bytes)) => bytes,
@@ -46,7 +46,7 @@ pub fn bytes(message: &[u8], number: u32) -> &[u8] {
     }
 }
 
-/// Field `number` as a number, whatever its width; 0 when absent, as protobuf has it.
+/// Field `number` as a number of any width; 0 if absent, as in protobuf.
 pub fn number(message: &[u8], number: u32) -> u64 {
     match field(message, number) {
         Some(Value::Varint(value) | Value::Fixed64(value)) => value,

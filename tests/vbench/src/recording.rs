@@ -1,6 +1,6 @@
-//! A recorded episode, read back: messages by topic, and what the bench's devices put into them.
+//! A recorded episode, read back: messages by topic, and the data of the bench's devices in them.
 //!
-//! Invariant: reads the file with the public `mcap` crate and the documented schemas only, never with `rapid`'s own code.
+//! Invariant: reads the file only with the public `mcap` crate and the documented schemas, not with `rapid`'s code.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeBounds;
@@ -14,13 +14,13 @@ use crate::proto;
 
 /// Topic of the mask.
 const MASKS: &str = "/rapid/mask";
-/// The metadata record that counts.
+/// Name of the metadata record with the counts.
 const SUMMARY: &str = "rapid/summary";
 
 /// Why a recording could not be read.
 #[derive(Debug, Error)]
 pub enum RecordingError {
-    /// The file is not there or not readable.
+    /// The file is missing or not readable.
     #[error("reading {0}: {1}")]
     Io(PathBuf, #[source] std::io::Error),
     /// It is not a whole MCAP file.
@@ -31,7 +31,7 @@ pub enum RecordingError {
 /// All messages of one file, in file order.
 #[derive(Debug)]
 pub struct Recording {
-    /// Where it was read from.
+    /// The file it was read from.
     pub path: PathBuf,
     /// Its messages.
     pub messages: Vec<Message>,
@@ -63,7 +63,7 @@ pub struct Message {
 pub struct Edge {
     /// Which bit.
     pub bit: u32,
-    /// It became 1.
+    /// Whether the bit became 1.
     pub rises: bool,
     /// Wall clock, ns.
     pub log_time: u64,
@@ -72,7 +72,7 @@ pub struct Edge {
 /// A camera frame in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Frame {
-    /// What the emulator wrote into it; `None` when it cannot be read.
+    /// The identity written by the emulator; `None` if it cannot be read.
     pub id: Option<FrameId>,
     /// Wall clock, ns.
     pub log_time: u64,
@@ -107,7 +107,7 @@ impl Recording {
         Ok(Self { path: path.into(), messages, metadata })
     }
 
-    /// Samples of a topic that `rapid` itself reports as lost: by the device's driver, or between driver and file. Masks, too.
+    /// Samples of a topic, also masks, that `rapid` itself reports as lost: by the driver, or between driver and file.
     pub fn reported_lost(&self, topic: &str) -> u64 {
         let value = |record: &str, key: &str| self.metadata.get(record).and_then(|record| record.get(key));
         let json = |record: &str, key: &str| -> Value {
@@ -128,7 +128,7 @@ impl Recording {
         self.messages.iter().filter(move |message| message.topic == topic)
     }
 
-    /// The numbers of the channels a topic was written on; one, unless something reconnected wrongly.
+    /// The numbers of the channels of a topic; one, unless a reconnection was wrong.
     pub fn channels(&self, topic: &str) -> BTreeSet<u16> {
         self.topic(topic).map(|message| message.channel).collect()
     }
@@ -178,17 +178,16 @@ pub fn falls(edges: &[Edge], bit: u32) -> Vec<u64> {
     edges.iter().filter(|edge| edge.bit == bit && !edge.rises).map(|edge| edge.log_time).collect()
 }
 
-/// How many numbers are missing between the first and the last, in whichever order they came; a number that is there twice
-/// is a panic.
+/// Number of values missing between the first and the last, in any order; panics if a number occurs twice.
 pub fn missing(numbers: impl IntoIterator<Item = u64>) -> u64 {
     let mut numbers: Vec<u64> = numbers.into_iter().collect();
     numbers.sort_unstable();
     let holes = holes(numbers);
-    assert!(holes.iter().all(|(before, after)| before != after), "a number is there twice: {holes:?}");
+    assert!(holes.iter().all(|(before, after)| before != after), "a number appears twice: {holes:?}");
     holes.iter().map(|(before, after)| after - before - 1).sum()
 }
 
-/// Places where a sequence does not go up by exactly one, as (before, after).
+/// Places where a sequence does not increase by exactly one, as (before, after).
 pub fn holes(numbers: impl IntoIterator<Item = u64>) -> Vec<(u64, u64)> {
     let mut last = None;
     let mut holes = Vec::new();
@@ -226,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn holes_are_jumps_and_repeats() {
+    fn gaps_are_jumps_and_repeats() {
         assert_eq!(holes([3, 4, 5]), []);
         assert_eq!(holes([3, 5, 5, 6]), [(3, 5), (5, 5)]);
         assert_eq!(missing([5, 3, 4, 9]), 3);

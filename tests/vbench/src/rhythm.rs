@@ -1,30 +1,30 @@
-//! How the mask beat, as a sampler in the guest saw it.
+//! The timing of the mask, as recorded by a sampler in the guest.
 
 use serde_json::Value;
 
 use crate::outcome::Outcome;
 
-/// A sampler that looked this often in a tenth of a second had the processor, and so could the publisher.
+/// A sampler that read this often in a tenth of a second had the processor, so the publisher could have had it, too.
 const OFTEN: u64 = 10;
 
-/// How the mask beat in a span.
+/// The timing of the mask in a span.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Rhythm {
-    /// Longest time in which a sampler that looks every 0.5 ms saw no new publication, ms.
+    /// Longest time in which a sampler that reads every 0.5 ms saw no new publication, ms.
     pub longest_ms: f64,
-    /// Longest pause between two looks of the sampler itself, ms: what the guest's processors do to any program.
+    /// Longest pause between two reads of the sampler itself, ms: the guest's processors delay every program like this.
     pub pause_ms: f64,
     /// Publications.
     pub publications: u64,
-    /// Tenths of a second in which the sampler looked often and saw no publication at all.
+    /// Tenths of a second in which the sampler read often and saw no publication.
     pub silent_tenths: usize,
 }
 
 impl Rhythm {
-    /// Between two moments (ns of the guest's CLOCK_MONOTONIC); `None` when the sampler saw nothing of it.
+    /// Between two moments (ns of the guest's CLOCK_MONOTONIC); `None` if the sampler recorded nothing of it.
     pub fn between(outcome: &Outcome, from: u64, until: u64) -> Option<Self> {
         let number = |line: &Value, key: &str| line[key].as_u64().unwrap_or_default();
-        // A line belongs to the span if it ended in it: so does the silence in it.
+        // A line belongs to the span in which it ended, and so does the silence in it.
         let inside = |line: &&Value| line["action"] == "beat" && (from..until).contains(&number(line, "mono_ns"));
         let mut rhythm = None;
         for line in outcome.mask.iter().filter(inside) {

@@ -1,9 +1,9 @@
 //! A scenario as data, and its outcome.
 //!
-//! Devices, a registry and a timeline become a guest script; after the boot the outcome holds what the emulator, `rapid`
-//! and the kernel printed, and the recorded files.
+//! Devices, a registry and a timeline become a guest script; after the boot the outcome contains the output of the
+//! emulator, `rapid` and the kernel, and the recorded files.
 //!
-//! Invariant: the timeline's clock starts when `rapid` records and every device named in `streaming` streams, never after a guess.
+//! Invariant: the timeline's clock starts when `rapid` records and all of `streaming` stream, not after a fixed delay.
 //! Invariant: an outcome dropped by a failing assertion prints the logs and keeps its folder.
 
 use std::fmt::Write as _;
@@ -18,7 +18,7 @@ use crate::outcome::Outcome;
 use crate::programs::{self, ProgramError};
 
 const WORDS: &str = include_str!("../guest/bench.sh");
-/// For each thing waited for before the timeline starts. Generous: the host may be busy, and nothing is measured by it.
+/// Time limit per condition before the timeline starts. Generous: the host may be busy; it affects no measurement.
 const READY_WITHIN_S: u32 = 60;
 
 /// Why a scenario gave no outcome.
@@ -35,7 +35,7 @@ pub enum ScenarioError {
     Share(PathBuf, #[source] std::io::Error),
 }
 
-/// What happens in the guest.
+/// A scenario to be played in the guest.
 #[derive(Clone, Debug)]
 pub struct Scenario {
     name: String,
@@ -46,8 +46,7 @@ pub struct Scenario {
     timeline: Vec<(u64, String)>,
     until: Vec<String>,
     watch_mask: bool,
-    node_program: bool,
-    action_program: bool,
+    examples: Vec<&'static str>,
     systemd: bool,
     limit: Duration,
 }
@@ -61,7 +60,7 @@ enum Play {
 }
 
 impl Scenario {
-    /// An empty scenario. The name ends up in the folder's name.
+    /// An empty scenario. Its name becomes part of the folder's name.
     pub fn new(name: &str) -> Self {
         Self {
             name: name.into(),
@@ -72,8 +71,7 @@ impl Scenario {
             timeline: Vec::new(),
             until: Vec::new(),
             watch_mask: false,
-            node_program: false,
-            action_program: false,
+            examples: Vec::new(),
             systemd: false,
             limit: Duration::from_mins(10),
         }
@@ -86,7 +84,7 @@ impl Scenario {
         self
     }
 
-    /// Adds a device that only the timeline plugs.
+    /// Adds a device that only the timeline plugs in.
     #[must_use]
     pub fn spare(mut self, spec: DeviceSpec) -> Self {
         self.devices.push((spec, false));
@@ -100,30 +98,30 @@ impl Scenario {
         self
     }
 
-    /// Runs this script (bash with the words of `guest/bench.sh`). Devices are defined and not plugged.
-    /// With a registry, `"${rapid[@]}"` is there to be run.
+    /// Runs this script (bash with the functions of `guest/bench.sh`). Devices are defined but not plugged in. With a
+    /// registry, `"${rapid[@]}"` is available.
     #[must_use]
     pub fn script(mut self, script: &str) -> Self {
         self.play = Play::Script(script.into());
         self
     }
 
-    /// Runs `rapid` recording; the timeline starts when these registry entries stream, and so many seconds of it later the
-    /// recording ends, or when everything given to [`Scenario::until`] is met, if that is later.
+    /// Makes `rapid` record; the timeline starts when these registry entries stream, and the recording ends `seconds`
+    /// later, or once all conditions of [`Scenario::until`] are met, if that is later.
     #[must_use]
     pub fn record(mut self, seconds: u32, streaming: &[&str]) -> Self {
         self.play = Play::Record { seconds, streaming: streaming.iter().map(ToString::to_string).collect() };
         self
     }
 
-    /// Gives the emulator a command at this time of the timeline. Times must not go back.
+    /// Sends the emulator a command at this time of the timeline. Times must not decrease.
     #[must_use]
     pub fn at(mut self, ms: u64, command: &str) -> Self {
         self.timeline.push((ms, command.into()));
         self
     }
 
-    /// The recording does not end before this is so: a condition in the words of `guest/bench.sh`.
+    /// The recording does not end before this condition, in the functions of `guest/bench.sh`, is met.
     #[must_use]
     pub fn until(mut self, condition: &str) -> Self {
         self.until.push(condition.into());
@@ -137,17 +135,10 @@ impl Scenario {
         self
     }
 
-    /// Puts `process_node`, the example of a program as a node, beside `devices.toml`.
+    /// Puts this example beside `devices.toml`.
     #[must_use]
-    pub fn node_program(mut self) -> Self {
-        self.node_program = true;
-        self
-    }
-
-    /// Puts `publish_action`, the example of a program that publishes targets of an actuator, beside `devices.toml`.
-    #[must_use]
-    pub fn action_program(mut self) -> Self {
-        self.action_program = true;
+    pub fn example(mut self, name: &'static str) -> Self {
+        self.examples.push(name);
         self
     }
 
@@ -165,7 +156,7 @@ impl Scenario {
         self
     }
 
-    /// How long the guest's script may take, at least: a watchdog, which ends what hangs.
+    /// Minimum time limit of the guest's script: a watchdog, which ends a hanging script.
     #[must_use]
     pub fn limit(mut self, limit: Duration) -> Self {
         self.limit = self.limit.max(limit);
@@ -190,13 +181,8 @@ impl Scenario {
             let written = fs::create_dir_all(path.parent().unwrap_or(&path)).and_then(|()| fs::write(&path, contents));
             written.map_err(|error| ScenarioError::Share(path, error))
         };
-        let examples = [
-            ("process_node", self.node_program.then(programs::process_node)),
-            ("publish_action", self.action_program.then(programs::publish_action)),
-        ];
-        for (name, program) in examples {
-            let Some(program) = program else { continue };
-            let words = install(&program?)?;
+        for name in &self.examples {
+            let words = install(&programs::example(name)?)?;
             // It may have to be run through a loader; a registry names one file.
             write(name, format!("#!/bin/sh\nexec {} \"$@\"\n", self::words(&words)).as_bytes())?;
             let path = inside.join(name);
@@ -251,13 +237,13 @@ impl Scenario {
                     line(format!("emu at {ms} {command}"));
                 }
                 line(format!("emu at {}", u64::from(*seconds) * 1_000));
-                // The emulator takes as long as the timeline is.
+                // The emulator runs for as long as the timeline.
                 line(format!("emu_done {}", seconds + READY_WITHIN_S));
                 for condition in &self.until {
                     let why = words(&[format!("not so at the end: {condition}")]);
                     line(format!("wait_for {READY_WITHIN_S} {condition} || fail {why}"));
                 }
-                // Of what came back in the last moment some is recorded as well.
+                // Also records some samples of devices that returned at the last moment.
                 line("sleep 1\nrapid_stop\nemu_quit".into());
                 if self.watch_mask {
                     line("kill $watch_pid".into());

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::*;
+use crate::device::Unit;
 use crate::driver::camera::Mode;
-use crate::registry::scenario::SimDevice;
-use crate::registry::{BUILTIN, Unit};
+use crate::registry::BUILTIN;
+use crate::simulation::SimDevice;
 
 fn usb(ids: (u16, u16), serial: Option<&str>, port: &str) -> UsbIdentity {
     UsbIdentity {
@@ -112,7 +113,7 @@ fn a_camera_is_configured_with_a_format_it_offers() {
 }
 
 #[test]
-fn lines_are_numbers_or_not() {
+fn lines_are_recognised_as_numbers_or_not() {
     let look = |lines: &[&str]| {
         let lines: Vec<Vec<u8>> = lines.iter().map(|line| line.as_bytes().to_vec()).collect();
         lines_look_like(&lines)

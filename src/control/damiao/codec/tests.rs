@@ -20,7 +20,7 @@ fn dmh3510() -> Ranges {
 }
 
 #[test]
-fn commands_are_those_of_the_public_drivers() {
+fn commands_match_the_public_drivers() {
     let golden = golden();
     let cases = golden["mit"].as_array().unwrap();
     assert_eq!(cases.len(), 5);
@@ -32,14 +32,14 @@ fn commands_are_those_of_the_public_drivers() {
 }
 
 #[test]
-fn orders_and_requests_are_those_of_the_public_drivers() {
+fn state_commands_and_requests_match_the_public_drivers() {
     let mode = parameter::Value::Whole(parameter::ControlMode::Mit as u32);
     for case in golden()["frames"].as_array().unwrap() {
         let frame = match case["what"].as_str().unwrap() {
-            "enable" => Order::Enable.frame(5),
-            "disable" => Order::Disable.frame(5),
-            "set zero" => Order::SetZero.frame(5),
-            "clear error" => Order::ClearError.frame(5),
+            "enable" => StateCommand::Enable.frame(5),
+            "disable" => StateCommand::Disable.frame(5),
+            "set zero" => StateCommand::SetZero.frame(5),
+            "clear error" => StateCommand::ClearError.frame(5),
             "set MIT mode" => parameter::write(5, parameter::Parameter::ControlMode, mode),
             "refresh" => parameter::refresh(5),
             other => panic!("{other}"),
@@ -49,7 +49,7 @@ fn orders_and_requests_are_those_of_the_public_drivers() {
 }
 
 #[test]
-fn modes_of_the_motor_have_ids_of_their_own_and_floats() {
+fn each_mode_of_the_motor_has_its_own_id_and_floats() {
     let frame = position_velocity(5, 1.0, -2.5).unwrap();
     assert_eq!((frame.id, frame.data), (0x105, [0, 0, 0x80, 0x3f, 0, 0, 0x20, 0xc0]));
     let frame = velocity(5, -2.5).unwrap();
@@ -62,7 +62,7 @@ fn modes_of_the_motor_have_ids_of_their_own_and_floats() {
 }
 
 #[test]
-fn feedback_is_read_to_its_last_bit() {
+fn every_bit_of_feedback_is_read() {
     // ERR 8 of motor 5; position 0xffff, velocity 0x000, torque 0xfff, 41 and 57 °C.
     let frame = CanFrame::standard(0x15, [0x85, 0xff, 0xff, 0x00, 0x0f, 0xff, 41, 57]);
     let feedback = Feedback::decode(&frame, &dmh3510()).unwrap();
@@ -80,7 +80,7 @@ fn feedback_is_read_to_its_last_bit() {
 }
 
 #[test]
-fn a_status_is_its_code_and_has_words_of_its_own() {
+fn each_status_has_its_own_code_and_text() {
     let mut words: Vec<String> = (0..16)
         .map(|code| {
             let status = MotorStatus::from_code(code);
@@ -104,11 +104,11 @@ fn ranges_are_finite_and_above_zero() {
 }
 
 #[test]
-fn a_command_with_everything_at_its_end_is_no_order() {
+fn an_extreme_mit_command_is_never_a_state_command() {
     for tau in [1.0, 0.999, 0.9985, 0.998, 0.997] {
         let most = Mit { kp: 500.0, kd: 5.0, q: 12.5, dq: 280.0, tau };
         let data = mit(5, &most, &dmh3510()).unwrap().data;
-        assert_ne!(data[..7], ORDER, "{tau}");
+        assert_ne!(data[..7], STATE_COMMAND, "{tau}");
         assert_eq!(data[..6], [0xff; 6]);
     }
 }
@@ -147,7 +147,7 @@ proptest! {
     }
 
     #[test]
-    fn feedback_survives_a_frame(
+    fn feedback_round_trips_through_a_frame(
         id in 0_u8..16, code in 0_u8..16, q in -12.5..12.5, dq in -45.0..45.0, tau in -20.0..20.0,
         mos in any::<u8>(), rotor in any::<u8>(),
     ) {
@@ -161,7 +161,7 @@ proptest! {
     }
 
     #[test]
-    fn any_frame_is_read_within_the_ranges_or_not_at_all(data in any::<[u8; 8]>(), len in any::<u8>(), kinds in 0_u8..8) {
+    fn any_frame_decodes_within_the_ranges_or_is_rejected(data in any::<[u8; 8]>(), len in any::<u8>(), kinds in 0_u8..8) {
         let frame = CanFrame {
             id: 0x11, extended: kinds & 1 != 0, remote: kinds & 2 != 0, error: kinds & 4 != 0, len, data,
         };

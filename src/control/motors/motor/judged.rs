@@ -40,7 +40,7 @@ impl Motor {
         Ok(received.is_none())
     }
 
-    /// What is wrong with a motor that is to be enabled, or disabled, by the state it reports.
+    /// What is wrong with a motor that should be enabled, or disabled, according to its reported state.
     pub(in crate::control::motors) fn status_fault(&self) -> Option<Fault> {
         let motor = self.index;
         match self.status? {
@@ -94,7 +94,7 @@ impl Motor {
     pub(in crate::control::motors) fn is_far(&self, target: f64, limits: &Limits) -> bool {
         let Some(feedback) = self.feedback else { return false };
         let [low, high] = limits.range();
-        // A target beyond the limits is none: the limit is used.
+        // A target beyond the limits is replaced by the limit.
         let far = (target.clamp(low, high) - feedback.q).abs() > self.spec.motion.first_target;
         far && self.spec.mode != MotorMode::Velocity
     }

@@ -2,7 +2,7 @@
 
 use super::{Motor, Phase};
 use crate::control::can::CanFrame;
-use crate::control::damiao::codec::{self, Feedback, Mit, Order};
+use crate::control::damiao::codec::{self, Feedback, Mit, StateCommand};
 use crate::registry::{MotorMode, Stop};
 
 impl Motor {
@@ -26,7 +26,7 @@ impl Motor {
             (Stop::Damp | Stop::Hold | Stop::Brake, MotorMode::Velocity, ..) => codec::velocity(slave, 0.0).ok(),
             _ => None,
         };
-        frame.unwrap_or_else(|| Order::Disable.frame(slave))
+        frame.unwrap_or_else(|| StateCommand::Disable.frame(slave))
     }
 
     /// How it stops when this program can command it no more.

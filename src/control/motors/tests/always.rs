@@ -3,12 +3,12 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::control::damiao::codec::Order;
+use crate::control::damiao::codec::StateCommand;
 use crate::registry::Stop;
 
 /// What happens next.
 #[derive(Debug, Clone)]
-enum Happening {
+enum Event {
     Cycles(usize),
     Arm,
     Disarm,
@@ -19,7 +19,7 @@ enum Happening {
     Push(usize, f64),
     Stuck(usize, bool),
     Heat(usize, u8),
-    Deaf(usize, Option<Order>),
+    Deaf(usize, Option<StateCommand>),
     PowerCycle(usize),
     StuckBrakes(bool),
     BrokenBrakes(u16),
@@ -32,8 +32,8 @@ fn target() -> impl Strategy<Value = f64> {
     prop_oneof![8 => -2.5..2.5, 1 => any::<f64>(), 1 => Just(f64::NAN)]
 }
 
-fn happening() -> impl Strategy<Value = Happening> {
-    use Happening::*;
+fn event() -> impl Strategy<Value = Event> {
+    use Event::*;
     let motor = 0..2_usize;
     prop_oneof![
         12 => (1..40_usize).prop_map(Cycles),
@@ -47,8 +47,8 @@ fn happening() -> impl Strategy<Value = Happening> {
         2 => (motor.clone(), any::<bool>()).prop_map(|(motor, on)| Stuck(motor, on)),
         1 => (motor.clone(), 20..110_u8).prop_map(|(motor, celsius)| Heat(motor, celsius)),
         1 => (motor.clone(), prop_oneof![
-            Just(None), Just(Some(Order::Enable)), Just(Some(Order::Disable)), Just(Some(Order::ClearError)),
-        ]).prop_map(|(motor, order)| Deaf(motor, order)),
+            Just(None), Just(Some(StateCommand::Enable)), Just(Some(StateCommand::Disable)), Just(Some(StateCommand::ClearError)),
+        ]).prop_map(|(motor, command)| Deaf(motor, command)),
         1 => motor.prop_map(PowerCycle),
         1 => any::<bool>().prop_map(StuckBrakes),
         1 => (0..4_u16).prop_map(BrokenBrakes),
@@ -58,8 +58,8 @@ fn happening() -> impl Strategy<Value = Happening> {
     ]
 }
 
-impl Happening {
-    fn happen(self, world: &mut World) {
+impl Event {
+    fn apply(self, world: &mut World) {
         match self {
             Self::Cycles(cycles) => world.run(cycles),
             Self::Arm => world.arm(),
@@ -75,7 +75,7 @@ impl Happening {
             Self::Push(motor, q) => world.sims[motor].q = q,
             Self::Stuck(motor, on) => world.sims[motor].stuck = on,
             Self::Heat(motor, celsius) => world.sims[motor].mos = celsius,
-            Self::Deaf(motor, order) => world.sims[motor].deaf = order,
+            Self::Deaf(motor, command) => world.sims[motor].deaf = command,
             Self::PowerCycle(motor) => {
                 let Sim { slave, master, .. } = world.sims[motor];
                 world.sims[motor] = Sim { mode: 2, ..Sim::new(slave, master) };
@@ -98,8 +98,8 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(ProptestConfig::default().cases / 2))]
 
     #[test]
-    fn motors_move_only_as_they_may(
-        happenings in prop::collection::vec(happening(), 1..60), torque in prop_oneof![Just(1000.0), 0.5..5.0],
+    fn motors_move_only_as_permitted(
+        events in prop::collection::vec(event(), 1..60), torque in prop_oneof![Just(1000.0), 0.5..5.0],
         stop in prop::sample::select(vec![Stop::Limp, Stop::Damp, Stop::Hold, Stop::Brake]),
         has_brakes in any::<bool>(),
         modes in prop::sample::select(vec![
@@ -112,8 +112,8 @@ proptest! {
         spec.motors[1].stop.own_fault = stop;
         spec.motors.iter_mut().for_each(|motor| motor.brake = has_brakes.then(world::brake));
         let mut world = World::new(spec);
-        for happening in happenings {
-            happening.happen(&mut world);
+        for event in events {
+            event.apply(&mut world);
         }
         // What was broken is repaired: from anywhere within the limits, an arm works.
         for sim in &mut world.sims {
@@ -139,8 +139,8 @@ proptest! {
             world.run(60);
         }
         prop_assert!(world.bus.is_armed(), "{:?} {:?}", world.bus.state(), world.sims);
-        let orders: Vec<CanFrame> = world.stop();
-        prop_assert_eq!(orders.len(), 2);
+        let commands: Vec<CanFrame> = world.stop();
+        prop_assert_eq!(commands.len(), 2);
         world.run(5);
     }
 }

@@ -1,7 +1,7 @@
 //! Arming, and what ends it.
 
 use super::*;
-use crate::control::damiao::codec::Order;
+use crate::control::damiao::codec::StateCommand;
 
 #[test]
 fn an_arm_starts_where_the_joints_are() {
@@ -20,7 +20,7 @@ fn an_arm_starts_where_the_joints_are() {
 }
 
 #[test]
-fn an_arm_at_the_start_is_an_arm() {
+fn an_arm_at_the_start_takes_effect() {
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT)]));
     world.arm();
     world.run_until(BusState::Holding);
@@ -33,7 +33,7 @@ fn an_arm_clears_a_fault_and_fails_while_it_lasts() {
     let fault = Fault::Latched { motor: 1, status: MotorStatus::CommunicationLost };
     assert_eq!(world.run_to_fault(), fault);
     world.run(500);
-    assert_eq!(world.bus.state(), BusState::Faulted(fault), "nothing brings it back but an arm");
+    assert_eq!(world.bus.state(), BusState::Faulted(fault), "only an arm brings it back");
     world.arm();
     world.run_until(BusState::Holding);
     let cleared = Notice::Cleared { motor: 1, status: MotorStatus::CommunicationLost };
@@ -67,7 +67,7 @@ fn a_silent_motor_disables_all_and_an_arm_fails_until_it_answers() {
     assert_eq!(world.run_to_fault(), Fault::Silent { motor: 1 });
     // It is ordered to turn off all the while: it may receive although its own frames do not arrive.
     world.cycle();
-    assert!(world.sent.contains(&Order::Disable.frame(2)));
+    assert!(world.sent.contains(&StateCommand::Disable.frame(2)));
     world.sims[1].silent = false;
     world.run(5);
     assert!(!world.sims[1].is_on());
@@ -77,7 +77,7 @@ fn a_silent_motor_disables_all_and_an_arm_fails_until_it_answers() {
 }
 
 #[test]
-fn a_few_lost_answers_are_no_silence() {
+fn a_few_lost_answers_do_not_count_as_silence() {
     let mut world = World::armed();
     for _ in 0..15 {
         world.sims[1].silent = true;
@@ -89,7 +89,7 @@ fn a_few_lost_answers_are_no_silence() {
 }
 
 #[test]
-fn a_motor_that_lost_its_power_for_a_moment_is_set_up_again() {
+fn a_motor_is_set_up_again_after_a_power_interruption() {
     let mut world = World::armed();
     world.sims[0].status = MotorStatus::Disabled;
     (world.sims[0].mode, world.sims[0].timeout) = (2, 0);
@@ -163,19 +163,19 @@ fn an_overheating_motor_is_reported_and_then_disables_all() {
 #[test]
 fn a_motor_that_ignores_commands_is_a_fault() {
     let mut world = World::ready();
-    world.sims[1].deaf = Some(Order::Enable);
+    world.sims[1].deaf = Some(StateCommand::Enable);
     world.arm();
     assert_eq!(world.run_to_fault(), Fault::NotEnabled { motor: 1 });
     world.sims[1].deaf = None;
     world.arm();
     world.run_until(BusState::Holding);
-    world.sims[1].deaf = Some(Order::Disable);
+    world.sims[1].deaf = Some(StateCommand::Disable);
     world.disarm();
     assert_eq!(world.run_to_fault(), Fault::NotDisabled { motor: 1 });
     world.arm();
     assert_eq!(world.run_to_fault(), Fault::NotDisabled { motor: 1 });
     world.cycle();
-    assert!(world.sent.contains(&Order::Disable.frame(2)));
+    assert!(world.sent.contains(&StateCommand::Disable.frame(2)));
 }
 
 #[test]
@@ -185,7 +185,7 @@ fn a_joint_waiting_for_the_others_yields_to_external_force() {
     let mut world = World::new(stiff);
     world.run_until(BusState::Disarmed);
     world.sims[0].stuck = true;
-    world.sims[1].deaf = Some(Order::Enable);
+    world.sims[1].deaf = Some(StateCommand::Enable);
     world.arm();
     while world.sims[0].command.is_none() {
         world.cycle();
@@ -221,20 +221,20 @@ fn a_disarm_ends_an_arm_at_any_moment() {
 fn a_motor_counts_as_off_when_it_confirms_after_the_order() {
     let enabling = || {
         let mut world = World::ready();
-        world.sims[0].deaf = Some(Order::Enable);
+        world.sims[0].deaf = Some(StateCommand::Enable);
         world.arm();
-        while !world.sent.contains(&Order::Enable.frame(1)) {
+        while !world.sent.contains(&StateCommand::Enable.frame(1)) {
             world.cycle();
         }
         world
     };
-    // Its report of before is no answer to the order, which is sent all the same.
+    // An earlier report is not an answer to the order, which is still sent.
     let mut world = enabling();
     world.disarm();
     let before = world.sims[0].feedback().unwrap();
     world.bus.feed(&before, world.now);
     world.cycle();
-    assert!(world.sent.contains(&Order::Disable.frame(1)));
+    assert!(world.sent.contains(&StateCommand::Disable.frame(1)));
     // Nor is silence one.
     let mut world = enabling();
     world.cycle();
@@ -262,7 +262,7 @@ fn nothing_is_sent_after_a_stop() {
         let mut world = World::ready();
         world.arm();
         world.run(cycles);
-        assert_eq!(world.stop(), [Order::Disable.frame(1), Order::Disable.frame(2)]);
+        assert_eq!(world.stop(), [StateCommand::Disable.frame(1), StateCommand::Disable.frame(2)]);
         assert_eq!(world.bus.state(), BusState::Stopped);
         world.arm();
         world.target(&[0.0, 0.0]);
@@ -275,7 +275,7 @@ fn nothing_is_sent_after_a_stop() {
 }
 
 #[test]
-fn motors_that_come_late_are_in_samples_after_a_fault_or_a_disarm() {
+fn late_motors_appear_in_samples_after_a_fault_or_a_disarm() {
     let mut sample = [0.0; 12];
     // Armed before the second one had power: the arm fails.
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]));
@@ -290,12 +290,12 @@ fn motors_that_come_late_are_in_samples_after_a_fault_or_a_disarm() {
     world.run(4);
     world.sims[1].silent = true;
     world.run(20);
-    assert!(world.sent.contains(&Order::Disable.frame(2)));
+    assert!(world.sent.contains(&StateCommand::Disable.frame(2)));
     world.sims[1].silent = false;
     world.run(30);
     assert!(world.bus.sample(&mut sample).is_some());
     assert!((sample[0] - 0.25).abs() < 1e-3 && (sample[6] - 0.25).abs() < 1e-3, "{sample:?}");
-    assert_eq!(world.bus.state(), BusState::Faulted(fault), "nothing brings it back but an arm");
+    assert_eq!(world.bus.state(), BusState::Faulted(fault), "only an arm brings it back");
     world.arm();
     world.run_until(BusState::Holding);
 
@@ -313,7 +313,7 @@ fn motors_that_come_late_are_in_samples_after_a_fault_or_a_disarm() {
 }
 
 #[test]
-fn a_motor_whose_parameters_cannot_be_used_is_not_asked_for_ever() {
+fn a_motor_with_unusable_parameters_is_not_queried_forever() {
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT)]));
     (world.sims[0].mode, world.sims[0].stubborn) = (2, true);
     world.run_to_fault();
@@ -322,7 +322,7 @@ fn a_motor_whose_parameters_cannot_be_used_is_not_asked_for_ever() {
 }
 
 #[test]
-fn positions_that_the_motor_cannot_count_to_are_a_fault() {
+fn positions_beyond_the_range_of_the_motor_are_a_fault() {
     for mode in [MIT, MotorMode::PositionVelocity, MotorMode::Velocity] {
         for position in [[13.0, 14.0], [-20.0, -12.6]] {
             let mut spec = spec(vec![motor(1, 0x11, mode)]);
@@ -367,7 +367,7 @@ fn motors_that_may_be_on_are_known_after_a_stop() {
 }
 
 #[test]
-fn every_motor_has_its_turn_to_be_first() {
+fn every_motor_takes_its_turn_to_be_first() {
     let mut world = World::ready();
     let first: Vec<u8> = (0..4)
         .map(|_| {
@@ -409,7 +409,7 @@ fn no_joint_starts_from_a_single_damaged_frame() {
 }
 
 #[test]
-fn an_arm_after_the_program_stood_still_is_as_old_as_that_and_refused() {
+fn an_arm_is_refused_after_the_program_stalled() {
     let mut world = World::ready();
     world.now = world.now.after(Duration::from_mins(1));
     world.arm();
@@ -420,7 +420,7 @@ fn an_arm_after_the_program_stood_still_is_as_old_as_that_and_refused() {
 }
 
 #[test]
-fn a_short_command_of_another_program_is_one_too() {
+fn a_short_command_of_another_program_is_detected_too() {
     let mut world = World::armed();
     let frame = CanFrame { id: 0x201, len: 4, ..CanFrame::default() };
     world.bus.feed(&CanFrame { error: true, ..frame }, world.now);

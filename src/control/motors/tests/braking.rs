@@ -30,7 +30,7 @@ fn armed(stop: Stop) -> World {
 const EMERGENCY: Trip = Trip { stop: 0, is_lost: false };
 
 #[test]
-fn a_brake_is_released_once_its_motor_is_on_and_nothing_is_followed_before() {
+fn a_brake_is_released_once_its_motor_is_on_and_no_action_is_followed_before() {
     let mut world = ready(Stop::Limp);
     assert_eq!(world.bus.releases(), 0);
     world.arm();
@@ -53,7 +53,7 @@ fn a_brake_is_released_once_its_motor_is_on_and_nothing_is_followed_before() {
 }
 
 #[test]
-fn a_joint_that_stops_by_its_brake_holds_until_that_does_and_is_disabled_then() {
+fn a_joint_that_stops_by_its_brake_holds_until_the_brake_does_and_is_then_disabled() {
     for trouble in [
         |world: &mut World| world.sims[0].status = MotorStatus::OverCurrent,
         |world: &mut World| world.sims[1].mos = 99,
@@ -137,7 +137,7 @@ fn a_joint_that_has_sunk_is_not_driven_back_up_by_an_emergency_stop() {
 }
 
 #[test]
-fn what_a_brake_is_counts_from_when_it_is_known() {
+fn the_engaging_time_of_a_brake_counts_from_when_its_state_is_known() {
     let cycles = |limit: Duration| usize::try_from(limit.as_millis() / world::CYCLE.as_millis()).unwrap();
     let engages = cycles(brake().engages_in);
     for trouble in [
@@ -151,7 +151,7 @@ fn what_a_brake_is_counts_from_when_it_is_known() {
         trouble(&mut world.brakes);
         world.emergency(EMERGENCY);
         world.run(engages * 3);
-        assert!(world.sims[1].is_on(), "nothing is known of its brake");
+        assert!(world.sims[1].is_on(), "the state of its brake is unknown");
         world.brakes = Brakes::default();
         world.run(engages - 1);
         assert!(world.sims[1].is_on(), "it takes {:?} to engage", brake().engages_in);
@@ -191,7 +191,7 @@ fn a_brake_that_is_about_to_be_released_is_not_taken_for_engaged() {
 }
 
 #[test]
-fn a_brake_is_engaged_before_the_motor_that_held_its_joint_for_a_time_is_off() {
+fn a_brake_engages_before_the_motor_that_held_its_joint_is_turned_off() {
     let hold_for = Some(Duration::from_millis(400));
     for (stop, hold_for) in [(Stop::Hold, hold_for), (Stop::Hold, Some(Duration::from_millis(10)))] {
         let mut world =
@@ -214,7 +214,7 @@ fn a_brake_is_engaged_before_the_motor_that_held_its_joint_for_a_time_is_off() {
 }
 
 #[test]
-fn a_sound_joint_does_not_fall_because_its_brake_cannot_be_driven() {
+fn a_healthy_joint_does_not_fall_because_its_brake_cannot_be_driven() {
     for (other_fault, is_damped) in [(Stop::Hold, 0), (Stop::Damp, 2)] {
         let stop = StopSpec { own_fault: Stop::Limp, other_fault, emergency: Stop::Limp, hold_for: None };
         let mut world = World::following(braked(stop));
@@ -238,7 +238,7 @@ fn a_brake_that_is_not_released_refuses_the_arm() {
 }
 
 #[test]
-fn at_the_death_of_the_program_brakes_engage_where_nothing_else_keeps_the_joint() {
+fn when_the_program_dies_brakes_engage_where_nothing_else_keeps_the_joint() {
     for (stop, engages) in [(Stop::Limp, 2), (Stop::Brake, 2), (Stop::Hold, 0), (Stop::Damp, 0)] {
         let mut world = armed(stop);
         let first = world.bus.engages_at_death();

@@ -24,7 +24,7 @@ fn an_action_is_reached_when_the_next_is_due() {
 }
 
 #[test]
-fn a_leap_takes_as_long_as_the_slew_limit_wants() {
+fn a_jump_takes_as_long_as_the_slew_limit_requires() {
     let mut world = World::armed();
     let mut cycles = 0;
     while world.sims[0].q < 1.75 - 1e-3 {
@@ -40,7 +40,7 @@ fn a_leap_takes_as_long_as_the_slew_limit_wants() {
 }
 
 #[test]
-fn a_step_that_comes_late_makes_no_leap() {
+fn a_late_step_causes_no_jump() {
     let mut world = World::armed();
     world.target(&[2.0, 0.25]);
     world.cycle();
@@ -66,7 +66,7 @@ fn targets_beyond_the_limits_are_clamped() {
 }
 
 #[test]
-fn limits_beyond_what_the_motor_counts_in_end_there() {
+fn limits_beyond_the_range_of_the_motor_are_cut_to_it() {
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT)]));
     world.sims[0].ranges = [1.5, 30.0, 10.0];
     world.run_until(BusState::Disarmed);
@@ -107,7 +107,7 @@ fn actions_that_cannot_be_followed_move_nothing_and_do_not_feed_the_deadman() {
 }
 
 #[test]
-fn an_action_of_before_the_arm_or_before_another_is_not_followed() {
+fn an_action_older_than_the_arm_or_than_another_action_is_not_followed() {
     let mut world = World::ready();
     world.arm();
     let tick = world.now;
@@ -159,7 +159,7 @@ fn without_actions_motors_hold_and_are_then_disabled() {
 }
 
 #[test]
-fn an_action_that_was_long_on_its_way_is_held_the_sooner() {
+fn the_time_until_a_hold_counts_from_the_tick_of_a_delayed_action() {
     let mut world = World::armed();
     world.run(40);
     let tick = world.now.before(Duration::from_millis(150));
@@ -184,7 +184,7 @@ fn the_rate_of_actions_before_a_disarm_is_forgotten() {
     world.run(150);
     assert!(world.target(&[0.5, 0.5]));
     world.run(39);
-    assert_eq!(world.bus.state(), BusState::Following, "two actions 10 ms apart say nothing of these");
+    assert_eq!(world.bus.state(), BusState::Following, "two actions 10 ms apart do not change the rate of these");
 }
 
 #[test]
@@ -261,7 +261,7 @@ fn the_motors_own_modes_have_their_own_frames() {
 }
 
 #[test]
-fn one_pause_does_not_make_the_deadman_patient() {
+fn one_pause_does_not_extend_the_patience_of_the_deadman() {
     let mut world = World::armed();
     for _ in 0..5 {
         assert!(world.target(&[0.5, 0.5]));
@@ -290,7 +290,7 @@ fn a_slow_publisher_is_detected_by_the_second_action() {
 }
 
 #[test]
-fn two_actions_at_once_do_not_end_the_following() {
+fn two_actions_at_once_do_not_end_following() {
     let mut world = World::armed();
     world.run(20);
     let way = Duration::from_millis(12);
@@ -306,7 +306,7 @@ fn two_actions_at_once_do_not_end_the_following() {
 }
 
 #[test]
-fn a_velocity_comes_to_rest_where_the_motor_counts_no_further() {
+fn a_velocity_comes_to_rest_at_the_end_of_the_range_of_the_motor() {
     let mut world = World::new(spec(vec![motor(1, 0x11, MotorMode::Velocity)]));
     world.sims[0].ranges = [1.0, 30.0, 10.0];
     world.run_until(BusState::Disarmed);
@@ -336,7 +336,7 @@ fn intermittent_conditions_are_reported_once_a_second() {
 }
 
 #[test]
-fn what_begins_within_a_second_of_the_last_report_is_reported_if_it_lasts() {
+fn a_condition_within_a_second_of_the_last_report_is_reported_if_it_lasts() {
     let mut world = World::armed();
     world.target(&[7.0, 0.25]);
     world.run(20);

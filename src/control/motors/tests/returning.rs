@@ -12,7 +12,7 @@ fn outside(mode: MotorMode, at: f64) -> World {
 }
 
 #[test]
-fn a_joint_outside_its_limits_comes_back_slowly_and_follows_nothing_meanwhile() {
+fn a_joint_outside_its_limits_returns_slowly_and_follows_no_action_meanwhile() {
     for (mode, at) in [(MIT, 2.6), (MIT, -2.6), (MotorMode::PositionVelocity, 2.6), (MotorMode::Velocity, -2.6)] {
         let mut world = outside(mode, at);
         world.arm();
@@ -38,7 +38,7 @@ fn a_joint_outside_its_limits_comes_back_slowly_and_follows_nothing_meanwhile() 
 }
 
 #[test]
-fn a_disarm_ends_the_way_back_and_the_next_arm_is_refused_again() {
+fn a_disarm_ends_the_return_and_the_next_arm_is_refused_again() {
     let mut world = outside(MIT, 2.6);
     world.bus.arm_back(world.now);
     world.arm();
@@ -53,7 +53,7 @@ fn a_disarm_ends_the_way_back_and_the_next_arm_is_refused_again() {
 }
 
 #[test]
-fn an_arm_that_drives_back_is_one_like_any_other_within_the_limits() {
+fn an_arm_that_drives_back_is_an_ordinary_arm_within_the_limits() {
     let mut world = outside(MIT, 1.0);
     world.bus.arm_back(world.now);
     world.arm();

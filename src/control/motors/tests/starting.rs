@@ -34,7 +34,7 @@ fn an_arm_is_refused_while_actions_ask_for_a_far_position() {
 }
 
 #[test]
-fn actions_of_long_ago_keep_no_one_from_arming() {
+fn old_actions_do_not_prevent_an_arm() {
     let mut world = ready(5.0);
     world.target(&[2.0]);
     world.run(100);
@@ -61,7 +61,7 @@ fn the_first_action_after_an_arm_is_near_and_the_next_may_be_far() {
 }
 
 #[test]
-fn the_first_motion_is_soft_and_none_is_jerked() {
+fn the_first_motion_is_soft_and_no_motion_jerks() {
     let mut world = ready(2.0);
     world.arm();
     world.run_until(BusState::Holding);
@@ -124,7 +124,7 @@ fn an_unseen_fault_is_reported_before_arming_clears_it() {
 }
 
 #[test]
-fn a_fault_that_comes_to_light_behind_another_is_reported_at_once() {
+fn a_fault_hidden_by_another_is_reported_as_soon_as_it_is_seen() {
     let mut world = World::armed();
     world.sims[1].silent = true;
     let fault = world.run_to_fault();
@@ -138,7 +138,7 @@ fn a_fault_that_comes_to_light_behind_another_is_reported_at_once() {
 }
 
 #[test]
-fn who_leans_on_a_joint_before_the_first_action_takes_none_of_its_soft_start() {
+fn leaning_on_a_joint_before_the_first_action_does_not_shorten_its_soft_start() {
     let fastest_after = |push: f64| {
         let mut world = ready(2.0);
         world.spec.motors[0].torque = 1.0;

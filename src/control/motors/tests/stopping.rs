@@ -45,12 +45,12 @@ fn by_default_a_faulty_joint_is_limp_and_the_others_are_damped() {
         }
         world.disarm();
         world.run(5);
-        assert!(!world.sims[1].is_on() && second(&world).is_none_or(|frame| frame == Order::Disable.frame(2)));
+        assert!(!world.sims[1].is_on() && second(&world).is_none_or(|frame| frame == StateCommand::Disable.frame(2)));
     }
 }
 
 #[test]
-fn a_joint_that_holds_stays_where_it_was_commanded_for_as_long_as_it_is_to() {
+fn a_joint_that_holds_stays_at_its_command_for_the_configured_time() {
     for (hold_for, is_on) in
         [(None, true), (Some(Duration::from_millis(900)), true), (Some(Duration::from_millis(500)), false)]
     {
@@ -84,7 +84,7 @@ fn motors_that_run_their_own_loop_hold_where_others_are_damped() {
 }
 
 #[test]
-fn a_joint_that_is_kept_and_has_a_fault_of_its_own_is_disabled() {
+fn a_kept_joint_with_its_own_fault_is_disabled() {
     for trouble in [
         |sim: &mut Sim| sim.silent = true,
         |sim: &mut Sim| sim.status = MotorStatus::OverCurrent,
@@ -96,13 +96,13 @@ fn a_joint_that_is_kept_and_has_a_fault_of_its_own_is_disabled() {
         world.run(10);
         trouble(&mut world.sims[1]);
         world.run(40);
-        assert!(second(&world).is_none_or(|frame| frame == Order::Disable.frame(2)), "{:x?}", second(&world));
-        assert_eq!(world.bus.state(), BusState::Faulted(first), "what came first is what it is about");
+        assert!(second(&world).is_none_or(|frame| frame == StateCommand::Disable.frame(2)), "{:x?}", second(&world));
+        assert_eq!(world.bus.state(), BusState::Faulted(first), "the first fault is reported");
     }
 }
 
 #[test]
-fn a_joint_that_is_too_hot_stops_as_it_is_to_and_is_reported_once() {
+fn an_overheated_joint_stops_as_configured_and_is_reported_once() {
     for (own_fault, is_on) in [(Stop::Limp, false), (Stop::Damp, true), (Stop::Hold, true)] {
         let mut world = armed(MIT, StopSpec { own_fault, ..others(Stop::Limp) });
         world.sims[1].mos = 99;
@@ -114,7 +114,7 @@ fn a_joint_that_is_too_hot_stops_as_it_is_to_and_is_reported_once() {
 }
 
 #[test]
-fn an_arm_takes_joints_that_are_kept_again() {
+fn an_arm_takes_over_kept_joints() {
     let mut world = armed(MIT, StopSpec::default());
     world.sims[0].status = MotorStatus::OverCurrent;
     world.run_to_fault();
@@ -133,13 +133,13 @@ fn emergency(world: &mut World) {
 }
 
 #[test]
-fn at_an_emergency_stop_each_joint_stops_in_its_way_in_the_next_cycle() {
+fn at_an_emergency_stop_each_joint_stops_as_configured_in_the_next_cycle() {
     for (way, damped, held) in [(Stop::Limp, 0, 0), (Stop::Damp, 2, 0), (Stop::Hold, 0, 2)] {
         let mut world = armed(MIT, StopSpec { emergency: way, ..StopSpec::default() });
         emergency(&mut world);
         world.cycle();
         assert_eq!(world.bus.state(), BusState::Faulted(Fault::EmergencyStop(TRIP)));
-        let disabled = Order::Disable.frame(1);
+        let disabled = StateCommand::Disable.frame(1);
         assert!(world.sent.contains(&disabled), "the first is limp: {:x?}", world.sent);
         assert_eq!(world.notified(Notice::Kept { damped, held, braked: 0 }), usize::from(damped | held != 0));
         // Pressed again, or lost meanwhile: that is the same stop.
@@ -172,7 +172,7 @@ fn an_emergency_stop_is_named() {
 }
 
 #[test]
-fn an_emergency_stop_ends_an_arm_and_what_a_fault_has_left_on() {
+fn an_emergency_stop_ends_an_arm_and_stops_joints_that_a_fault_left_on() {
     let mut world = World::ready();
     // Nothing is on: there is nothing to stop.
     emergency(&mut world);
@@ -200,7 +200,7 @@ fn an_emergency_stop_ends_an_arm_and_what_a_fault_has_left_on() {
 }
 
 #[test]
-fn one_damaged_frame_lets_no_joint_fall_that_is_to_be_kept() {
+fn one_damaged_frame_does_not_drop_a_joint_that_is_to_be_kept() {
     for (own_fault, is_on) in [(Stop::Limp, false), (Stop::Damp, true), (Stop::Hold, true)] {
         let mut world = armed(MIT, StopSpec { own_fault, ..others(Stop::Limp) });
         let damaged = |world: &mut World| {

@@ -19,7 +19,7 @@ fn armed(change: impl Fn(&mut MotorSpec)) -> World {
     world
 }
 
-/// Runs with actions to `target` for so many cycles; the fault, and the cycle in which it came.
+/// Runs this many cycles with actions to `target`; returns the fault and the cycle in which it occurred.
 fn fault_within(world: &mut World, target: f64, cycles: usize) -> Option<(Fault, usize)> {
     for cycle in 1..=cycles {
         if cycle % 20 == 1 {
@@ -81,11 +81,11 @@ fn an_arm_outside_the_limits_is_refused_with_where_the_joint_is() {
     }
 }
 
-/// What befalls a motor, the most cycles until it is a fault, and what that is called.
+/// What happens to a motor, the most cycles until it is a fault, and the name of the fault.
 type Trouble = (&'static str, fn(&mut World), std::ops::RangeInclusive<usize>, &'static str);
 
 #[test]
-fn a_persistent_condition_is_warned_of_and_then_a_named_fault() {
+fn a_persistent_condition_causes_a_warning_and_then_a_named_fault() {
     const TROUBLES: [Trouble; 6] = [
         ("it sinks", |world| (world.sims[0].stuck, world.sims[0].drift) = (true, -0.77), 40..=80, "moves away from"),
         ("it is blocked", |world| world.sims[0].stuck = true, 400..=450, "does not move with 1 Nm"),
@@ -117,7 +117,7 @@ fn a_persistent_condition_is_warned_of_and_then_a_named_fault() {
 }
 
 #[test]
-fn a_blocked_joint_is_a_fault_though_actions_come_in_the_moment_of_a_step() {
+fn a_blocked_joint_is_a_fault_even_if_actions_arrive_during_a_step() {
     let mut world = armed(|_| {});
     world.sims[0].stuck = true;
     let begun = world.now;
@@ -177,7 +177,7 @@ fn a_speed_without_a_movement_is_a_frozen_encoder() {
 }
 
 #[test]
-fn a_gripper_may_hold_something_for_ever() {
+fn a_gripper_may_hold_something_forever() {
     let mut world = armed(|joint| joint.watch.blocked_after = None);
     world.sims[0].stuck = true;
     assert_eq!(fault_within(&mut world, 1.5, 2000), None);
@@ -185,7 +185,7 @@ fn a_gripper_may_hold_something_for_ever() {
 }
 
 #[test]
-fn a_motor_whose_own_loop_does_not_bring_it_there_is_a_fault() {
+fn a_motor_whose_own_loop_misses_its_target_is_a_fault() {
     for (mode, target) in [(MotorMode::PositionVelocity, 1.5), (MotorMode::Velocity, 9.0)] {
         let mut world = armed(|joint| joint.mode = mode);
         world.sims[0].stuck = true;
@@ -195,7 +195,7 @@ fn a_motor_whose_own_loop_does_not_bring_it_there_is_a_fault() {
 }
 
 #[test]
-fn what_another_program_sets_is_noticed_within_a_second() {
+fn a_change_by_another_program_is_noticed_within_a_second() {
     for change in [|sim: &mut Sim| sim.timeout = 0, |sim: &mut Sim| sim.mode = 3] {
         let mut world = armed(|_| {});
         assert_eq!(fault_within(&mut world, 0.25, 400), None);
@@ -211,7 +211,7 @@ fn what_another_program_sets_is_noticed_within_a_second() {
 }
 
 #[test]
-fn another_range_is_noticed_in_the_answer_to_who_sets_it() {
+fn a_changed_range_is_noticed_in_the_reply_to_another_program() {
     for (parameter, value) in [(Parameter::PMax, 25.0), (Parameter::VMax, 10.0), (Parameter::TMax, 28.0)] {
         let mut world = armed(|_| {});
         assert_eq!(fault_within(&mut world, 0.25, 20), None);
@@ -227,20 +227,24 @@ fn another_range_is_noticed_in_the_answer_to_who_sets_it() {
 
 #[test]
 fn another_master_is_named_and_nothing_is_armed_beside_it() {
-    let orders =
-        [Order::Enable.frame(1), Order::Disable.frame(1), Order::SetZero.frame(1), codec::velocity(1, 0.0).unwrap()];
-    for order in orders {
+    let commands = [
+        StateCommand::Enable.frame(1),
+        StateCommand::Disable.frame(1),
+        StateCommand::SetZero.frame(1),
+        codec::velocity(1, 0.0).unwrap(),
+    ];
+    for command in commands {
         let mut world = armed(|_| {});
         assert_eq!(fault_within(&mut world, 0.25, 20), None);
-        world.bus.feed(&order, world.now);
+        world.bus.feed(&command, world.now);
         let (fault, cycle) = fault_within(&mut world, 0.25, 20).expect("a fault");
         assert_eq!((fault, cycle), (Fault::OtherMaster { motor: 0 }, 1));
         // It continues to command: no arm.
         for _ in 0..5 {
-            world.bus.feed(&order, world.now);
+            world.bus.feed(&command, world.now);
             world.arm();
             world.run(20);
-            world.bus.feed(&order, world.now);
+            world.bus.feed(&command, world.now);
             assert_eq!(world.run_to_fault(), Fault::OtherMaster { motor: 0 });
             assert!(!world.sims[0].is_on());
         }

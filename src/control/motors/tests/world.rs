@@ -28,12 +28,12 @@ pub(super) struct Sim {
     pub(super) rotor: u8,
     /// It has no power.
     pub(super) silent: bool,
-    /// It does not move, whatever it is commanded...
+    /// It does not move, whatever the command...
     pub(super) stuck: bool,
     /// ...but is moved so fast, rad/s.
     pub(super) drift: f64,
     /// It takes no orders to turn on, or off.
-    pub(super) deaf: Option<Order>,
+    pub(super) deaf: Option<StateCommand>,
     /// It keeps its control mode, whatever is written.
     pub(super) stubborn: bool,
     /// The last command that it took: its id, and its first number.
@@ -84,17 +84,17 @@ impl Sim {
             return if verb == 0xcc { self.feedback() } else { self.parameter(verb, rid, value) };
         }
         if frame.id == slave && frame.data.starts_with(&[0xff; 7]) {
-            let order = match frame.data[7] {
-                0xfc => Order::Enable,
-                0xfd => Order::Disable,
-                0xfe => Order::SetZero,
-                _ => Order::ClearError,
+            let command = match frame.data[7] {
+                0xfc => StateCommand::Enable,
+                0xfd => StateCommand::Disable,
+                0xfe => StateCommand::SetZero,
+                _ => StateCommand::ClearError,
             };
-            if self.deaf != Some(order) {
-                match order {
-                    Order::Enable if self.status == MotorStatus::Disabled => self.status = MotorStatus::Enabled,
-                    Order::Disable if self.is_on() => self.status = MotorStatus::Disabled,
-                    Order::ClearError if self.status.is_fault() => {
+            if self.deaf != Some(command) {
+                match command {
+                    StateCommand::Enable if self.status == MotorStatus::Disabled => self.status = MotorStatus::Enabled,
+                    StateCommand::Disable if self.is_on() => self.status = MotorStatus::Disabled,
+                    StateCommand::ClearError if self.status.is_fault() => {
                         self.status = self.broken.unwrap_or(MotorStatus::Disabled);
                     }
                     _ => {}

@@ -73,7 +73,7 @@ fn control(name: &str, minimum: i64, maximum: i64) -> ControlInfo {
 }
 
 #[test]
-fn controls_are_found_by_name_however_it_is_written() {
+fn controls_are_found_by_any_spelling_of_their_name() {
     let offered = [control("White Balance, Automatic", 0, 1), control("Exposure Time, Absolute", 3, 2047)];
     for name in ["white_balance_automatic", "White Balance, Automatic", "WHITE BALANCE AUTOMATIC"] {
         assert_eq!(
@@ -88,7 +88,7 @@ fn controls_are_found_by_name_however_it_is_written() {
 }
 
 #[test]
-fn row_padding_is_taken_out() {
+fn row_padding_is_removed() {
     let padded = layout(PixelFormat::Yuyv, 2, 2, 6);
     assert!(padded.is_padded());
     assert_eq!(padded.picture_bytes(), 8);
@@ -121,7 +121,7 @@ fn damaged_pictures_are_flagged() {
 #[test]
 fn gaps_and_empty_pictures_are_lost_pictures() {
     let mut progress = Numbering::default();
-    assert_eq!(progress.take(5), 0, "what came before the first is not known");
+    assert_eq!(progress.take(5), 0, "samples before the first are unknown");
     assert_eq!(progress.take(6), 0);
     assert_eq!(progress.take(9), 2);
     progress.skip(10);
@@ -135,7 +135,7 @@ fn gaps_and_empty_pictures_are_lost_pictures() {
 }
 
 #[test]
-fn the_kernels_time_is_used_where_it_can_be_true() {
+fn the_kernels_time_is_used_where_it_is_plausible() {
     let mut progress = Numbering::default();
     assert_eq!(progress.stamp(&frame(0, Some(100)), Stamp(110)), (Stamp(100), true));
     assert_eq!(progress.stamp(&frame(1, None), Stamp(120)), (Stamp(120), false));
@@ -144,22 +144,22 @@ fn the_kernels_time_is_used_where_it_can_be_true() {
     assert_eq!(progress.stamp(&frame(4, Some(145)), Stamp(150)), (Stamp(145), true));
 }
 
-/// What a kernel reports wrongly about a picture.
+/// An error in a picture's stamp.
 #[derive(Debug, Clone, Copy)]
-enum Wrong {
-    Nothing,
+enum StampError {
+    None,
     Later,
     Earlier,
 }
 
 proptest! {
-    /// Pictures every 33 ms that arrive `delay` after their capture, the stamps of `wrong` among the first being wrong:
-    /// capture times increase, and every stamp of the kernel is used from `delay` after the last wrong one on.
+    /// Pictures every 33 ms that arrive `delay` after their capture, some of the first with wrong stamps: capture times
+    /// increase, and every kernel stamp later than `delay` after the last wrong one is used.
     #[test]
-    fn a_wrong_stamp_costs_no_more_than_its_delay(
+    fn a_wrong_stamp_is_off_by_no_more_than_its_delay(
         delay in 0..200_u64,
         wrong in proptest::collection::vec(
-            prop_oneof![Just(Wrong::Nothing), Just(Wrong::Nothing), Just(Wrong::Later), Just(Wrong::Earlier)], 1..12),
+            prop_oneof![Just(StampError::None), Just(StampError::None), Just(StampError::Later), Just(StampError::Earlier)], 1..12),
     ) {
         const FRAME: u64 = 33;
         const BEGIN: u64 = 10_000;
@@ -170,15 +170,15 @@ proptest! {
             let captured = BEGIN + number * FRAME;
             let arrived = captured + delay;
             let (report, is_wrong) = match wrong.get(usize::try_from(number).unwrap()) {
-                Some(Wrong::Later) => (arrived + 1000, true),
-                Some(Wrong::Earlier) => (captured.saturating_sub(BEGIN / 2), true),
-                Some(Wrong::Nothing) | None => (captured, false),
+                Some(StampError::Later) => (arrived + 1000, true),
+                Some(StampError::Earlier) => (captured.saturating_sub(BEGIN / 2), true),
+                Some(StampError::None) | None => (captured, false),
             };
             let (stamp, is_kernels) = progress.stamp(&frame(0, Some(report)), Stamp(arrived));
             prop_assert!(stamp > last, "{stamp:?} after {last:?}");
             last = stamp;
             if is_wrong {
-                // Moved on by a nanosecond a picture at the most.
+                // Moved by at most a nanosecond per picture.
                 safe_from = arrived + 40;
             } else if captured > safe_from {
                 prop_assert_eq!((stamp, is_kernels), (Stamp(captured), true), "picture {}", number);

@@ -37,7 +37,7 @@ fn hex(text: &str) -> Vec<u8> {
 
 /// As the public host library of the adapter writes them, for a motor with identifier 5.
 #[test]
-fn what_is_sent_is_what_the_host_library_sends() {
+fn sent_bytes_match_the_host_library() {
     let head = "55 aa 1e 03 01 00 00 00 0a 00 00 00 00";
     for (id, id_bytes, data) in [
         (5, "05 00 00 00", "7f ff 7f f0 00 00 07 ff"),
@@ -52,7 +52,7 @@ fn what_is_sent_is_what_the_host_library_sends() {
 }
 
 #[test]
-fn what_comes_is_read_by_its_kind() {
+fn each_kind_of_message_is_decoded() {
     let bytes = hex("aa 11 08 15 00 00 00 15 7f ff 7f f7 ff 1c 1a 55");
     let found = decode(&[&bytes]);
     let data = hex("15 7f ff 7f f7 ff 1c 1a");
@@ -71,7 +71,7 @@ fn what_comes_is_read_by_its_kind() {
 }
 
 #[test]
-fn a_message_that_lost_a_byte_costs_itself_alone() {
+fn a_message_with_a_missing_byte_loses_only_itself() {
     let whole = received(&frame(0x15, &[1, 2, 3, 4, 5, 6, 7, 8]));
     for missing in 0..RECEIVED {
         let mut bytes = whole.clone();
@@ -95,13 +95,13 @@ fn any_frame() -> impl Strategy<Value = CanFrame> {
 
 proptest! {
     #[test]
-    fn a_frame_comes_back(frame in any_frame()) {
+    fn frames_round_trip(frame in any_frame()) {
         let found = decode(&[&received(&frame)]);
         prop_assert_eq!(found, [Message { kind: Kind::Received, frame }]);
     }
 
     #[test]
-    fn any_split_of_any_bytes_says_the_same(
+    fn any_split_of_any_bytes_decodes_equally(
         bytes in prop::collection::vec(
             prop_oneof![Just(HEAD), Just(TAIL), Just(0x11), Just(0), Just(8), any::<u8>()], 0..200),
         cut in 0_usize..200,
@@ -113,7 +113,7 @@ proptest! {
 
     /// Garbage with a head in it may look like the beginning of a message that ends within the next one.
     #[test]
-    fn garbage_without_a_head_costs_nothing(
+    fn garbage_without_a_head_loses_no_message(
         parts in prop::collection::vec(
             (prop::collection::vec(any::<u8>().prop_map(|byte| if byte == HEAD { 0 } else { byte }), 0..40), any_frame()),
             1..8),
@@ -125,7 +125,7 @@ proptest! {
 
     /// Of garbage of any kind, as much is overlapped as a message is long.
     #[test]
-    fn garbage_costs_at_most_what_it_overlaps(
+    fn garbage_loses_at_most_the_messages_it_overlaps(
         garbage in prop::collection::vec(any::<u8>(), 0..60),
         count in 2_usize..6,
     ) {

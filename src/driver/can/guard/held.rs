@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use crate::gpio::Output;
 
-/// A line that cannot be set is tried again so often...
+/// A line that cannot be set is retried this many times...
 const TRIES: usize = 200;
-/// ...and after this.
+/// ...at this interval.
 const AGAIN: Duration = Duration::from_millis(10);
 
-/// See the module's comment. Dropped, it waits until the lines are set that are to be.
+/// See the module's comment. Dropping waits until the requested lines are set.
 #[derive(Debug, Default)]
 pub(super) struct Held {
     lines: Vec<Line>,
@@ -34,8 +34,8 @@ impl Held {
         self.lines.extend(descriptor.map(|descriptor| Line { motors, engaged_high, descriptor, is_engaged: false }));
     }
 
-    /// Engages the brakes of these motors, those that are not engaged yet. A chip that hangs must not keep the motors from
-    /// their frames: each has a thread of its own.
+    /// Engages those brakes of these motors that are not engaged yet. A chip that hangs must not delay the frames of
+    /// motors: each has its own thread.
     pub(super) fn engage(&mut self, motors: u16) {
         for line in &mut self.lines {
             let was_engaged = std::mem::replace(&mut line.is_engaged, line.motors & motors != 0);

@@ -1,4 +1,4 @@
-//! The guard's own process: what it does when, and the loop around that.
+//! The guard's own process: its state machine, and the loop around it.
 
 use std::ffi::OsString;
 use std::io::IoSliceMut;
@@ -14,7 +14,7 @@ use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, RecvMsg,
 use super::held::Held;
 use super::{BRAKE, DISMISSED, FRAME, KEEP_FOR, LONGEST, NAME, ON, decode};
 use crate::control::can::CanFrame;
-use crate::control::damiao::codec::Order;
+use crate::control::damiao::codec::StateCommand;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::{damiao_serial, slcan, socket};
 use crate::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
@@ -23,10 +23,10 @@ use crate::time::Stamp;
 
 /// From one round of frames to the next.
 const ROUND: Duration = Duration::from_millis(5);
-/// For so long motors are disabled: a frame may be lost.
+/// How long the disable frames are repeated: one may be lost.
 const DISABLE_FOR: Duration = Duration::from_millis(100);
 
-/// What the guard was started with.
+/// The arguments of the guard.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Post {
     adapter: CanAdapter,
@@ -43,7 +43,8 @@ impl Post {
         let (_, adapter) = CanAdapter::WORDS.into_iter().find(|(word, _)| *word == adapter)?;
         let stalled_after = Duration::from_millis(args.next()?.parse().ok()?);
         let interface = args.next().filter(|name| name != "-");
-        let off = args.map(|slave| Some(Order::Disable.frame(slave.parse().ok()?))).collect::<Option<Vec<_>>>()?;
+        let off =
+            args.map(|slave| Some(StateCommand::Disable.frame(slave.parse().ok()?))).collect::<Option<Vec<_>>>()?;
         (1..=MAX_MOTORS).contains(&off.len()).then_some(Self { adapter, stalled_after, interface, off })
     }
 }
@@ -53,9 +54,9 @@ impl Post {
 enum State {
     /// No motor is on.
     Idle,
-    /// Motors are on, and a cycle was over at this time.
+    /// Motors are on; the last cycle finished at this time.
     Watching(Stamp),
-    /// It stops the motors since this time.
+    /// It has been stopping the motors since this time.
     Stopping(Stamp),
     /// It stopped them, and the guarded process does not run.
     Stopped,
@@ -63,7 +64,7 @@ enum State {
     Done,
 }
 
-/// What the guard does when, without I/O.
+/// The state machine of the guard, without I/O.
 #[derive(Debug)]
 struct Ward {
     post: Post,
@@ -80,7 +81,7 @@ impl Ward {
         Self { post, state: State::Idle, will: Vec::with_capacity(MAX_MOTORS), engages_first: 0, is_orphan: false }
     }
 
-    /// A message came.
+    /// Takes a message.
     fn receive(&mut self, message: &[u8], now: Stamp) {
         match message {
             [ON, low, high, frames @ ..] => {
@@ -104,12 +105,12 @@ impl Ward {
         };
     }
 
-    /// How long motors are kept on: not at all where each is to be limp.
+    /// How long motors are kept on: not at all if all go limp.
     fn keep_for(&self) -> Duration {
         if self.will.iter().all(|frame| self.post.off.contains(frame)) { Duration::ZERO } else { KEEP_FOR }
     }
 
-    /// The frames of now, if any are to be sent.
+    /// The frames to send now, if any.
     fn due(&mut self, now: Stamp) -> &[CanFrame] {
         if let State::Watching(received) = self.state
             && now.since(received) >= self.post.stalled_after
@@ -124,8 +125,8 @@ impl Ward {
         if passed < keep_for { &self.will } else { &self.post.off }
     }
 
-    /// Bits of the motors whose brakes are to be engaged by now: all of them so long before motors are disabled that the
-    /// slowest holds its joint then.
+    /// Bits of the motors whose brakes are to be engaged by now. All are engaged early enough for the slowest to hold
+    /// its joint when motors are disabled.
     fn engages(&self, now: Stamp) -> u16 {
         match self.state {
             State::Stopping(since) if now.since(since) + BrakeSpec::SLOWEST < self.keep_for() => self.engages_first,
@@ -135,7 +136,7 @@ impl Ward {
         }
     }
 
-    /// When [`Self::due`] is to be asked again, if no message comes; `None` is never.
+    /// When to call [`Self::due`] again without a message; `None` means never.
     fn next(&self, now: Stamp) -> Option<Duration> {
         match self.state {
             State::Watching(received) => Some(received.after(self.post.stalled_after).since(now)),
@@ -146,13 +147,12 @@ impl Ward {
     }
 }
 
-/// Guards what is behind standard output until standard input closes; the arguments are those behind argument 0.
-#[must_use]
+/// Guards the adapter on standard output until standard input closes; `args` are those after argument 0.
 pub fn run(args: impl Iterator<Item = OsString>) -> ExitCode {
     let Some(post) = Post::read(args) else { return ExitCode::from(2) };
-    // The text of /proc/PID/comm, which would be that of the file that was started.
+    // Sets /proc/PID/comm, which is otherwise the name of the executable.
     let _ = std::fs::write("/proc/self/comm", NAME);
-    // Neither is needed on an idle machine, and who may not have them was informed by thread `control`.
+    // Neither is needed on an idle machine; thread `control` has reported missing permissions.
     let _ = use_fifo(CONTROL_PRIORITY);
     let _ = lock_memory();
     let (input, output, error) = (std::io::stdin(), std::io::stdout(), std::io::stderr());
@@ -160,14 +160,14 @@ pub fn run(args: impl Iterator<Item = OsString>) -> ExitCode {
     if !guard(&mut ward, input.as_fd(), output.as_fd()) {
         return ExitCode::SUCCESS;
     }
-    // The motors are off: this may wait for its reader.
+    // The motors are off: logging may block now.
     let kept = if ward.keep_for().is_zero() { "disabled" } else { "stopped as `other_fault` says, then disabled" };
     let text = format!("rapid ended while its motors were on: its guard {kept} them\n");
     let _ = rustix::io::write(error.as_fd(), text.as_bytes());
     ExitCode::SUCCESS
 }
 
-/// Returns when there is nothing left to guard: did it stop the motors of a process that has ended?
+/// Returns when nothing is left to guard: whether it stopped the motors of a process that has ended.
 fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool {
     let mut claim = None;
     let mut has_sent = false;
@@ -179,7 +179,7 @@ fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool
         let frames = ward.due(now);
         if !frames.is_empty() {
             if !std::mem::replace(&mut has_sent, true) && adapter == CanAdapter::Slcan {
-                // Half a line may be what was sent last.
+                // The last write may have sent half a line.
                 let _ = rustix::io::write(output, b"\r");
             }
             for frame in frames {
@@ -189,7 +189,7 @@ fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool
         }
         brakes.engage(ward.engages(now));
         if ward.is_orphan && claim.is_none() {
-            // Until the motors are off no other program is to command them.
+            // Until the motors are off no other program may command them.
             claim = ward.post.interface.as_deref().and_then(|name| Claim::take(name).ok());
         }
         if ward.state == State::Done {
@@ -231,7 +231,7 @@ fn descriptor(control: &mut RecvAncillaryBuffer<'_>) -> Option<OwnedFd> {
     })
 }
 
-/// Waits for a message, or for so long.
+/// Waits for a message, up to this long.
 fn wait(limit: Option<Duration>, input: BorrowedFd<'_>, is_orphan: bool) {
     let limit = limit.map(|limit| Timespec {
         tv_sec: limit.as_secs().try_into().unwrap_or(i64::MAX),
@@ -252,9 +252,9 @@ fn transmit(adapter: CanAdapter, frame: &CanFrame, output: BorrowedFd<'_>) {
     };
 }
 
-/// Takes what the motors answer: an adapter on a serial line that cannot get rid of it may take no more frames.
+/// Discards the answers of motors: an adapter on a serial line that cannot deliver them may accept no more frames.
 fn discard(adapter: CanAdapter, output: BorrowedFd<'_>) {
-    // A socket's queue drops what finds no room.
+    // The queue of a socket drops frames when full.
     let is_line = adapter != CanAdapter::SocketCan;
     let mut bytes = [0; 4096];
     while is_line && rustix::io::read(output, &mut bytes).is_ok_and(|count| count == bytes.len()) {}
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn what_it_is_started_with_is_read_back() {
+    fn its_arguments_are_parsed_back() {
         let post = ward().post;
         assert_eq!((post.adapter, post.stalled_after), (CanAdapter::SocketCan, Duration::from_millis(75)));
         assert_eq!((post.interface.as_deref(), post.off.len()), (Some("can0"), 2));
@@ -295,13 +295,13 @@ mod tests {
     }
 
     #[test]
-    fn frames_survive_the_way_to_it() {
+    fn encoded_frames_round_trip() {
         let frame = damping(0x123);
         assert_eq!(decode(&encode(&frame)), frame);
     }
 
     #[test]
-    fn it_sends_nothing_while_cycles_come_and_nothing_while_no_motor_is_on() {
+    fn nothing_is_sent_while_cycles_arrive_or_no_motor_is_on() {
         let mut ward = ward();
         for ms in 0..200 {
             ward.receive(&will(&[damping(5), damping(6)]), at(ms * 74));
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_death_stops_the_motors_at_once_as_they_are_to_stop_and_later_disables_them() {
+    fn at_the_death_of_the_process_motors_stop_as_configured_and_are_later_disabled() {
         let mut ward = ward();
         let frames = [damping(5), damping(6)];
         ward.receive(&will(&frames), at(0));
@@ -341,7 +341,7 @@ mod tests {
         for (ms, engages) in [(0, 2), (2_999, 2), (3_000, u16::MAX), (5_000, u16::MAX)] {
             assert_eq!(ward.engages(at(ms)), engages, "{ms}");
         }
-        // Where none is kept on there is no time for that.
+        // If no motor is kept on there is no time for brakes.
         let mut ward = ward_of_limp();
         ward.due(at(1));
         assert_eq!(ward.engages(at(1)), u16::MAX);
@@ -365,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_that_stands_still_is_stopped_for_and_watched_again_when_it_runs() {
+    fn motors_of_a_stalled_process_are_stopped_and_it_is_watched_again_once_it_runs() {
         let mut ward = ward();
         let frames = [damping(5), damping(6)];
         ward.receive(&will(&frames), at(0));
@@ -373,7 +373,7 @@ mod tests {
         assert_eq!(ward.due(at(75)), frames);
         ward.receive(&will(&frames), at(300));
         assert_eq!(ward.due(at(301)), &[]);
-        // It stands still permanently.
+        // It stalls permanently.
         assert_eq!(ward.due(at(375)), frames);
         let off = ward.post.off.clone();
         assert_eq!(ward.due(at(5_375)), off);

@@ -85,7 +85,7 @@ fn slcan_carries_frames_both_ways() {
 }
 
 #[test]
-fn an_adapter_that_refuses_or_is_silent() {
+fn a_silent_adapter_is_accepted_and_a_refusal_is_an_error() {
     let (line, path) = terminal();
     let adapter = slcan_adapter(line, b"");
     assert!(Link::open_slcan(&path, 1_000_000).is_ok(), "some never answer");
@@ -131,7 +131,7 @@ fn damiaos_adapter_carries_frames_both_ways() {
 }
 
 #[test]
-fn a_line_is_opened_by_one_alone_and_hangs_up_once() {
+fn a_line_is_opened_exclusively_and_hangs_up_once() {
     let (mut link, adapter) = damiao_link();
     let mut frame = CanFrame::default();
     assert_eq!(link.recv_until(Stamp::default(), &mut frame), Ok(None));
@@ -187,7 +187,7 @@ fn a_full_line_takes_whole_frames_or_none() {
 }
 
 #[tokio::test]
-async fn a_task_gets_all_that_waits_and_the_end_after_it() {
+async fn a_task_gets_all_pending_frames_and_then_the_end() {
     let (link, mut adapter) = damiao_link();
     let mut link = AsyncLink::new(link).unwrap();
     let frame = CanFrame::standard(0x15, [1, 2, 3, 4, 5, 6, 7, 8]);
@@ -235,7 +235,7 @@ async fn a_task_gets_the_frame_that_came_with_the_end() {
 }
 
 #[test]
-fn errors_say_what_to_do_next() {
+fn errors_name_the_next_step() {
     assert!(matches!(LinkError::Gone.into_driver(), DriverError::Gone));
     assert!(matches!(LinkError::BusOff.into_driver(), DriverError::Retry(text) if text.contains("120 ohm")));
     assert!(matches!(LinkError::Full.into_driver(), DriverError::Retry(text) if text.contains("full")));

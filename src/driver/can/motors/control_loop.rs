@@ -1,13 +1,13 @@
-//! Thread `control`: the beat of a bus of motors.
+//! Thread `control`: the cycles of a bus of motors.
 //!
-//! A cycle: take what the bus brings until the cycle's deadline, take what was asked for, let
-//! [`MotorBus`] decide, send. [`Pace`] decides when a cycle begins. The thread waits for the bus, for orders and for the
-//! topic of actions at once: an order that stops the motors begins a cycle at its arrival, a fresh action begins one as
-//! soon as the bus has room for it, as a rule at its arrival too.
+//! A cycle: receive frames until the deadline of the cycle, take orders and the newest action, let [`MotorBus`] decide,
+//! send. [`Pace`] decides when a cycle begins. The thread waits for the bus, for orders and for the topic of actions at
+//! once: an order that stops the motors begins a cycle at its arrival, a fresh action begins one as soon as the bus has
+//! room for it, usually at its arrival too.
 //!
-//! Invariant: between two cycles nothing is allocated, locked or logged, but for two things: text is made of
-//! what happened, and a sample is handed over by tokio's channel, which allocates room for some dozens where
-//! none is free, and whose reader is woken under a lock of the runtime.
+//! Invariant: between two cycles nothing is allocated, locked or logged, with two exceptions: notices are formatted as
+//! text, and a sample goes through tokio's channel, which allocates blocks for some dozens when none is free and wakes
+//! its reader under a lock of the runtime.
 //! Invariant: however the thread ends, a panic included, [`Powered`] orders every motor to turn off. Without a
 //! panic it also waits until each that was on has confirmed that it is off, for a tenth of a second at most. A process
 //! that is killed sends nothing: then its guard does it.
@@ -21,7 +21,7 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 
 use super::powered::Powered;
-use super::tally::{LoopStatistics, Punctuality};
+use super::statistics::{LoopStatistics, Punctuality};
 use crate::action::{ActionSource, ActuatorNotice, Arming, MAX_ACTION, Order, OrderSlot};
 use crate::control::can::CanFrame;
 use crate::control::motors::{BusState, SAMPLE_VALUES};
@@ -36,37 +36,37 @@ use crate::time::Stamp;
 
 /// Frames taken after the deadline of a cycle: a flooded bus must not keep the motors from their commands.
 const LATE_FRAMES: usize = 64;
-/// Trouble with the bus is reported again when there was none for so long.
+/// A problem of the bus is reported again after this long without one.
 const QUIET: Duration = Duration::from_secs(1);
-/// Texts of it that wait to be reported.
+/// Problems that may wait to be reported.
 const TROUBLES: usize = 4;
 
 /// State of all motors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sample {
     pub(super) captured: Stamp,
-    /// The kernel stamped all frames that it is made of.
+    /// The kernel stamped all of its frames.
     pub(super) from_kernel: bool,
     /// Samples before this one for which there was no room.
     pub(super) lost: u64,
     pub(super) values: [f64; MAX_MOTORS * SAMPLE_VALUES],
 }
 
-/// What the thread shares with its owner: what it is to do, and why it ended.
+/// Shared by the thread and its owner: its orders, and why it ended.
 #[derive(Debug, Default)]
 pub(super) struct Shared {
     asked: AtomicBool,
     pub(super) orders: OrderSlot,
-    /// Orders that are taken from where they were given.
+    /// Orders that the thread takes directly from where they were given.
     pub(super) attended: OnceLock<Arc<Attended>>,
-    /// Where the motors are to go.
+    /// The source of actions.
     pub(super) actions: OnceLock<Arc<dyn ActionSource>>,
     reason: OnceLock<LinkError>,
     pub(super) punctuality: OnceLock<Punctuality>,
 }
 
 impl Shared {
-    /// It is to end.
+    /// Asks it to end.
     pub(super) fn ask(&self) {
         self.asked.store(true, Ordering::Release);
         self.orders.bell().ring();
@@ -84,12 +84,12 @@ impl Shared {
     }
 }
 
-/// Something that lasts for a while, and is reported when it begins.
+/// A condition that lasts, and is reported when it begins.
 #[derive(Debug, Default)]
 struct Spell(Option<Stamp>);
 
 impl Spell {
-    /// It happens at `now`. Returns whether that is news.
+    /// The condition holds at `now`. Returns whether it has just begun.
     fn continues(&mut self, now: Stamp) -> bool {
         self.0.replace(now).is_none_or(|last| now.since(last) >= QUIET)
     }
@@ -111,11 +111,11 @@ pub(super) struct ControlLoop {
     full: Spell,
     losing: Spell,
     strange: Spell,
-    /// Trouble with the bus that is not reported yet.
+    /// Problems of the bus that are not reported yet.
     troubles: VecDeque<String>,
-    /// An action that no frame was sent after.
+    /// An action after which no frame was sent yet.
     unsent: Option<Stamp>,
-    tally: LoopStatistics,
+    statistics: LoopStatistics,
 }
 
 impl ControlLoop {
@@ -140,7 +140,7 @@ impl ControlLoop {
             strange: Spell::default(),
             troubles: VecDeque::with_capacity(TROUBLES),
             unsent: None,
-            tally: LoopStatistics::new(),
+            statistics: LoopStatistics::new(),
         }
     }
 
@@ -159,26 +159,26 @@ impl ControlLoop {
                  give the user `memlock unlimited` in /etc/security/limits.conf"
             );
         }
-        let end = self.beat();
+        let end = self.run_cycles();
         if let Err(error) = &end {
             let _ = self.shared.reason.set(error.clone());
         }
-        // What happened in the last cycle.
+        // Notices of the last cycle.
         self.notify();
-        let Self { powered, samples, notices, tally, shared, .. } = self;
+        let Self { powered, samples, notices, statistics, shared, .. } = self;
         let counts = powered.bus.counts();
-        // Before the log, which may block, and before the channels close: who sees that they did may exit.
+        // Before the log, which may block, and before the channels close, after which the process may exit.
         drop(powered);
-        let punctuality = tally.punctuality();
+        let punctuality = statistics.punctuality();
         tracing::info!("{punctuality}");
-        if let Some(mishaps) = tally.mishaps(&counts) {
+        if let Some(mishaps) = statistics.mishaps(&counts) {
             tracing::info!("of thread `control`: {mishaps}");
         }
         let _ = shared.punctuality.set(punctuality);
         drop((samples, notices));
     }
 
-    fn beat(&mut self) -> Result<(), LinkError> {
+    fn run_cycles(&mut self) -> Result<(), LinkError> {
         let mut pace = Pace::new(self.cycle, Stamp::now());
         // There is an action that no cycle has seen.
         let mut is_fresh = false;
@@ -186,6 +186,10 @@ impl ControlLoop {
             fault::point("control");
             let until = if is_fresh { pace.earliest() } else { pace.due() };
             self.listen(until)?;
+            // An order that came with the request to end is for the stream that follows.
+            if self.shared.asked.load(Ordering::Acquire) {
+                break;
+            }
             let now = Stamp::now();
             let is_urgent = self.take_orders(now);
             is_fresh |= self.take_action(now);
@@ -194,9 +198,9 @@ impl ControlLoop {
                 continue;
             }
             if is_early {
-                self.tally.early += 1;
+                self.statistics.early += 1;
             } else {
-                self.tally.late(now.since(pace.due()));
+                self.statistics.late(now.since(pace.due()));
             }
             self.step(now)?;
             self.notify();
@@ -206,7 +210,7 @@ impl ControlLoop {
         Ok(())
     }
 
-    /// Takes what the bus brings until the cycle ends, an order is given or an action published.
+    /// Receives frames until the cycle ends, an order is given or an action published.
     fn listen(&mut self, until: Stamp) -> Result<(), LinkError> {
         let mut frame = CanFrame::default();
         let mut late = 0;
@@ -234,16 +238,16 @@ impl ControlLoop {
             }
         }
         let link = &mut self.powered.link;
-        self.tally.unsent += link.take_refused();
+        self.statistics.unsent += link.take_refused();
         let lost = link.take_lost();
-        self.tally.lost_frames += lost;
+        self.statistics.lost_frames += lost;
         if lost > 0 && self.losing.continues(Stamp::now()) {
             self.complain("frames of the bus are lost before they can be read".to_owned());
         }
         Ok(())
     }
 
-    /// Carries out orders. Returns whether one of them stops the motors, which has no time to lose.
+    /// Carries out orders. Returns whether one of them stops the motors, which is urgent.
     fn take_orders(&mut self, now: Stamp) -> bool {
         let bus = &mut self.powered.bus;
         let before = bus.state();
@@ -258,7 +262,7 @@ impl ControlLoop {
                 Order::Emergency(trip) => bus.emergency(trip, now),
             }
         }
-        // Given again and again, it does nothing more.
+        // Repeating it has no further effect.
         is_stop && bus.state() != before
     }
 
@@ -300,11 +304,11 @@ impl ControlLoop {
         if let Some(brakes) = brakes {
             brakes.release(bus.releases());
         }
-        let trouble = guard.as_mut().and_then(|guard| guard.beat(bus));
+        let trouble = guard.as_mut().and_then(|guard| guard.cycle(bus));
         if sent && let Some(tick) = self.unsent.take() {
-            self.tally.on_the_wire(Stamp::now().0.saturating_sub(tick.0));
+            self.statistics.on_the_wire(Stamp::now().0.saturating_sub(tick.0));
         }
-        self.tally.full += full;
+        self.statistics.full += full;
         if full > 0 && self.full.continues(now) {
             self.complain(LinkError::Full.to_string());
         }
@@ -327,11 +331,11 @@ impl ControlLoop {
             self.lost = 0;
         } else {
             self.lost += 1;
-            self.tally.lost_samples += 1;
+            self.statistics.lost_samples += 1;
         }
     }
 
-    /// The adapter left the bus. One that does not return by itself has to be opened again.
+    /// The adapter left the bus. If it does not return by itself it must be opened again.
     fn bus_off(&mut self) -> Result<(), LinkError> {
         if !std::mem::replace(&mut self.is_bus_off, true) {
             self.complain(LinkError::BusOff.to_string());

@@ -1,4 +1,4 @@
-//! An adapter with motors behind it: however it is dropped, they are ordered to turn off.
+//! An adapter with motors: however it is dropped, the motors are ordered to turn off.
 
 use std::io;
 use std::time::Duration;
@@ -12,14 +12,14 @@ use crate::driver::can::link::{Link, LinkError};
 use crate::registry::DamiaoSpec;
 use crate::time::Stamp;
 
-/// Motors are ordered to turn off so often at least, at [`AGAIN`] from one another: a frame may be lost.
+/// The least number of times that motors are ordered to turn off, [`AGAIN`] apart: a frame may be lost.
 const TURN_OFF: usize = 3;
 /// ...and for this long at most, while one that was on has not confirmed that it is off.
 const OFF_WITHIN: Duration = Duration::from_millis(100);
 /// See [`TURN_OFF`].
 const AGAIN: Duration = Duration::from_millis(5);
 
-/// An adapter with motors behind it that may be powered.
+/// An adapter with motors that may be powered.
 #[derive(Debug)]
 pub(super) struct Powered {
     pub(super) link: Link,
@@ -48,7 +48,7 @@ impl Powered {
 
 impl Drop for Powered {
     fn drop(&mut self) {
-        // After a panic the bus may be half of what it was: it is asked for its frames, and fed no more.
+        // After a panic the bus may be inconsistent: it still gives its last frames and is fed no more.
         let panics = std::thread::panicking();
         let end = Stamp::now().after(OFF_WITHIN);
         let mut frame = CanFrame::default();
@@ -59,10 +59,10 @@ impl Drop for Powered {
         while rounds < TURN_OFF || !(all_off || gone || Stamp::now() >= end) {
             rounds += 1;
             for off in self.bus.stop_frames() {
-                // A bus that is gone has no motors to stop.
+                // Without the bus there are no motors to stop.
                 let _ = self.link.send(&off);
             }
-            // Waiting also lets out what the adapter had no room for.
+            // Waiting also sends frames for which the adapter had no room.
             let until = Stamp::now().after(AGAIN);
             loop {
                 match self.link.recv_until(until, &mut frame) {
@@ -80,7 +80,7 @@ impl Drop for Powered {
             }
             all_off = panics || self.bus.still_on().next().is_none();
         }
-        // The guard holds them as long as they are not engaged.
+        // The guard holds brakes until they are engaged.
         drop(self.brakes.take());
         if let Some(guard) = self.guard.take() {
             guard.dismiss();

@@ -52,23 +52,23 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
     }
 }
 
-/// What befalls the motors.
+/// What the simulated motors are to do.
 #[derive(Debug, Default)]
-struct Fate {
+struct Behaviour {
     /// Orders to turn off that are lost.
-    deaf_to: AtomicU32,
+    ignores: AtomicU32,
     is_on: AtomicBool,
     ends: AtomicBool,
 }
 
 /// One motor that answers at `bus`; gives the bus back when it ends.
-fn motor(bus: UdpSocket) -> (Arc<Fate>, thread::JoinHandle<UdpSocket>) {
-    let fate = Arc::<Fate>::default();
+fn motor(bus: UdpSocket) -> (Arc<Behaviour>, thread::JoinHandle<UdpSocket>) {
+    let behaviour = Arc::<Behaviour>::default();
     bus.set_read_timeout(Some(Duration::from_millis(5))).unwrap();
     let thread = thread::spawn({
-        let fate = Arc::clone(&fate);
+        let behaviour = Arc::clone(&behaviour);
         move || {
-            while !fate.ends.load(Ordering::Acquire) {
+            while !behaviour.ends.load(Ordering::Acquire) {
                 let mut raw = [0; 17];
                 if !matches!(bus.recv(&mut raw), Ok(16)) {
                     continue;
@@ -76,15 +76,15 @@ fn motor(bus: UdpSocket) -> (Arc<Fate>, thread::JoinHandle<UdpSocket>) {
                 let id = u16::from_ne_bytes([raw[0], raw[1]]);
                 let frame = CanFrame::standard(id, raw[8..16].try_into().unwrap());
                 // The thread has ended and receives nothing.
-                let _ = bus.send(&bytes(&answer(&frame, &fate)));
+                let _ = bus.send(&bytes(&answer(&frame, &behaviour)));
             }
             bus
         }
     });
-    (fate, thread)
+    (behaviour, thread)
 }
 
-fn answer(frame: &CanFrame, fate: &Fate) -> CanFrame {
+fn answer(frame: &CanFrame, behaviour: &Behaviour) -> CanFrame {
     const SLAVE: u16 = 1;
     if frame.id == 0x7ff && frame.data[2] != 0xcc {
         let parameter = Parameter::from_rid(frame.data[3]).unwrap();
@@ -97,15 +97,15 @@ fn answer(frame: &CanFrame, fate: &Fate) -> CanFrame {
         };
         return Reply { slave: SLAVE, written: frame.data[2] == 0x55, parameter, value }.encode(0x11);
     }
-    if *frame == codec::Order::Enable.frame(SLAVE) {
-        fate.is_on.store(true, Ordering::Release);
+    if *frame == codec::StateCommand::Enable.frame(SLAVE) {
+        behaviour.is_on.store(true, Ordering::Release);
     }
-    if *frame == codec::Order::Disable.frame(SLAVE)
-        && fate.deaf_to.fetch_update(Ordering::AcqRel, Ordering::Acquire, |left| left.checked_sub(1)).is_err()
+    if *frame == codec::StateCommand::Disable.frame(SLAVE)
+        && behaviour.ignores.fetch_update(Ordering::AcqRel, Ordering::Acquire, |left| left.checked_sub(1)).is_err()
     {
-        fate.is_on.store(false, Ordering::Release);
+        behaviour.is_on.store(false, Ordering::Release);
     }
-    let status = if fate.is_on.load(Ordering::Acquire) { MotorStatus::Enabled } else { MotorStatus::Disabled };
+    let status = if behaviour.is_on.load(Ordering::Acquire) { MotorStatus::Enabled } else { MotorStatus::Disabled };
     let feedback = Feedback { id: 1, status, q: 0.5, dq: 0.0, tau: 0.1, mos: 40, rotor: 41 };
     feedback.encode(0x11, &Ranges::new(12.5, 30.0, 10.0).unwrap()).unwrap()
 }
@@ -123,14 +123,14 @@ async fn reported(motors: &mut Motors, wanted: impl Fn(&ActuatorNotice) -> bool)
             }
             all.push(notice);
         }
-        assert!(begun.elapsed() < PATIENCE, "not told; {all:?}");
+        assert!(begun.elapsed() < PATIENCE, "not reported; {all:?}");
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_emergency_stop_turns_the_motor_off_and_is_named() {
     let (link, bus) = bus();
-    let (fate, thread) = motor(bus);
+    let (behaviour, thread) = motor(bus);
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
     let stops = [("door", StopKind::Emergency), ("pendant", StopKind::Emergency)];
     let permission = Arc::new(Permission::new(false).with_interlocks(Interlocks::new(stops.into_iter())));
@@ -146,17 +146,17 @@ async fn an_emergency_stop_turns_the_motor_off_and_is_named() {
     assert_eq!(notice.text, "emergency stop pendant lost: all motors are stopped");
     assert!(notice.is_problem);
     let begun = Instant::now();
-    while fate.is_on.load(Ordering::Acquire) {
+    while behaviour.is_on.load(Ordering::Acquire) {
         assert!(begun.elapsed() < PATIENCE);
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
     motors.close().await;
-    fate.ends.store(true, Ordering::Release);
+    behaviour.ends.store(true, Ordering::Release);
     thread.join().unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_bus_off_without_a_return_is_told_and_ends_the_driver() {
+async fn a_permanent_bus_off_is_reported_and_ends_the_driver() {
     let (link, bus) = bus();
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
     bus.send(&bytes(&CanFrame { id: 0x40, error: true, len: 8, ..CanFrame::default() })).unwrap();
@@ -164,11 +164,11 @@ async fn a_bus_off_without_a_return_is_told_and_ends_the_driver() {
     assert!(matches!(ended, Err(DriverError::Retry(text)) if text.contains("bus-off")));
     let notice = reported(&mut motors, |notice| notice.text.contains("bus-off")).await;
     assert!(notice.is_problem && notice.arming == Arming::Disarmed, "{notice:?}");
-    assert!(motors.order(Order::Arm).is_err(), "nobody is there to take it");
+    assert!(motors.order(Order::Arm).is_err(), "nothing can take it");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_bus_without_room_is_told() {
+async fn a_full_bus_is_reported() {
     // Nothing reads at the other end.
     let (link, _adapter) = damiao_link();
     let mut motors = Motors::start(link, &spec(10, 1000)).unwrap();
@@ -179,7 +179,7 @@ async fn a_bus_without_room_is_told() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_last_order_counts_and_a_disarm_is_always_carried_out() {
     let (link, bus) = bus();
-    let (fate, thread) = motor(bus);
+    let (behaviour, thread) = motor(bus);
     let mut motors = Motors::start(link, &spec(1, 10)).unwrap();
     reported(&mut motors, |notice| notice.text.contains("all motors have answered")).await;
     motors.order(Order::Arm).unwrap();
@@ -192,9 +192,9 @@ async fn the_last_order_counts_and_a_disarm_is_always_carried_out() {
     motors.order(Order::Arm).unwrap();
     motors.order(Order::Disarm).unwrap();
     reported(&mut motors, |notice| notice.text == "motors are disabled").await;
-    assert!(!fate.is_on.load(Ordering::Acquire));
+    assert!(!behaviour.is_on.load(Ordering::Acquire));
     motors.close().await;
-    fate.ends.store(true, Ordering::Release);
+    behaviour.ends.store(true, Ordering::Release);
     thread.join().unwrap();
 }
 
@@ -210,7 +210,7 @@ async fn notices_wait_for_room() {
         bus.send(&bytes(&feedback.encode(0x11, &Ranges::new(12.5, 30.0, 10.0).unwrap()).unwrap())).unwrap();
         let begun = Instant::now();
         while at == NOTICES && motors.notices.as_ref().is_some_and(|notices| notices.len() < NOTICES / 2) {
-            assert!(begun.elapsed() < PATIENCE, "the first half is not told");
+            assert!(begun.elapsed() < PATIENCE, "the first half is not reported");
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
     }
@@ -220,24 +220,24 @@ async fn notices_wait_for_room() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_motor_that_misses_orders_is_told_to_turn_off_until_it_says_that_it_is() {
+async fn a_motor_that_misses_commands_is_disabled_until_it_confirms() {
     let (link, bus) = bus();
-    let (fate, thread) = motor(bus);
+    let (behaviour, thread) = motor(bus);
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
     motors.order(Order::Arm).unwrap();
     reported(&mut motors, |notice| notice.arming == Arming::Holding).await;
-    assert!(fate.is_on.load(Ordering::Acquire));
-    fate.deaf_to.store(6, Ordering::Release);
+    assert!(behaviour.is_on.load(Ordering::Acquire));
+    behaviour.ignores.store(6, Ordering::Release);
     motors.close().await;
-    assert!(!fate.is_on.load(Ordering::Acquire));
-    fate.ends.store(true, Ordering::Release);
+    assert!(!behaviour.is_on.load(Ordering::Acquire));
+    behaviour.ends.store(true, Ordering::Release);
     thread.join().unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_time_of_a_sample_is_the_kernels_only_where_it_stamped_all_frames() {
+async fn a_sample_has_the_kernels_time_only_if_all_its_frames_have() {
     let (link, bus) = bus();
-    let (fate, thread) = motor(bus);
+    let (behaviour, thread) = motor(bus);
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
     // The kernel begins to stamp a moment after it is asked to.
     let begun = Instant::now();
@@ -245,14 +245,14 @@ async fn the_time_of_a_sample_is_the_kernels_only_where_it_stamped_all_frames() 
         assert!(begun.elapsed() < PATIENCE, "no sample has the kernel's time");
     }
     motors.close().await;
-    fate.ends.store(true, Ordering::Release);
+    behaviour.ends.store(true, Ordering::Release);
     thread.join().unwrap();
 
     let (link, mut adapter) = damiao_link();
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
-    let fate = Arc::<Fate>::default();
+    let behaviour = Arc::<Behaviour>::default();
     let thread = thread::spawn({
-        let fate = Arc::clone(&fate);
+        let behaviour = Arc::clone(&behaviour);
         move || {
             use std::io::{Read as _, Write as _};
             let mut sent = [0; 30];
@@ -260,7 +260,7 @@ async fn the_time_of_a_sample_is_the_kernels_only_where_it_stamped_all_frames() 
             while adapter.read_exact(&mut sent).is_ok() {
                 let frame =
                     CanFrame::standard(u16::from_le_bytes([sent[13], sent[14]]), sent[21..29].try_into().unwrap());
-                let reported = crate::driver::can::link::tests::received(&answer(&frame, &fate));
+                let reported = crate::driver::can::link::tests::received(&answer(&frame, &behaviour));
                 if adapter.write_all(&reported).is_err() {
                     return;
                 }

@@ -16,7 +16,7 @@ async fn read(raw: &mut Raw) -> Result<(Vec<u8>, Stamp, u64), DriverError> {
 }
 
 #[tokio::test]
-async fn a_batch_is_the_frames_that_waited_as_records() {
+async fn a_batch_holds_the_pending_frames_as_records() {
     let (link, mut adapter) = link::tests::damiao_link();
     let mut raw = raw(link);
     let frame = CanFrame { len: 3, ..CanFrame::standard(0x123, [1, 2, 3, 0, 0, 0, 0, 0]) };
@@ -36,7 +36,7 @@ async fn a_batch_is_the_frames_that_waited_as_records() {
 }
 
 #[tokio::test]
-async fn flags_are_those_of_linux_and_no_batch_is_larger_than_permitted() {
+async fn flags_match_linux_and_no_batch_is_larger_than_permitted() {
     let (link, bus) = socket::tests::bus();
     let mut raw = raw(link);
     let frame = CanFrame { id: 0x1abc_def0, extended: true, ..CanFrame::standard(0, [5; 8]) };
@@ -57,7 +57,7 @@ async fn flags_are_those_of_linux_and_no_batch_is_larger_than_permitted() {
 }
 
 #[tokio::test]
-async fn a_bus_that_was_left_for_good_ends_after_telling() {
+async fn a_permanent_bus_off_is_delivered_before_the_end() {
     let (link, bus) = socket::tests::bus();
     let mut raw = raw(link);
     let off = CanFrame { id: 0x40, error: true, ..CanFrame::standard(0, [0; 8]) };
@@ -70,7 +70,7 @@ async fn a_bus_that_was_left_for_good_ends_after_telling() {
 
 /// As many frames as a full bus has in two seconds, a thousand times a second eight at once.
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-async fn a_full_bus_is_received_without_a_loss() {
+async fn a_saturated_bus_is_received_without_loss() {
     const FRAMES: u32 = 16_000;
     let (link, bus) = socket::tests::bus();
     let mut raw = raw(link);

@@ -70,7 +70,7 @@ fn the_kernels_stamp_is_put_on_the_monotonic_clock() {
 }
 
 #[test]
-fn a_stamp_from_before_the_clock_was_set_is_none() {
+fn a_stamp_from_before_the_clock_was_set_is_ignored() {
     let wall = WallClock::now().wall_ns(Stamp::now());
     assert!(arrival(Some(wall)).from_kernel);
     assert!(!arrival(Some(wall - 3_600_000_000_000)).from_kernel);
@@ -79,7 +79,7 @@ fn a_stamp_from_before_the_clock_was_set_is_none() {
 }
 
 #[test]
-fn frames_that_found_the_queue_full_are_counted() {
+fn frames_lost_to_a_full_queue_are_counted() {
     const SENT: u64 = 2_000;
     let (mut link, bus) = bus();
     let Link::Socket(socket) = &link else { panic!("a socket") };

@@ -1,17 +1,17 @@
-//! What a GoPro answers, read; and the request that sets its clock.
+//! Parses a GoPro's answers, and builds the request that sets its clock.
 //!
-//! Invariant: the camera's words become part of a path only if they are plain names.
+//! Invariant: strings from the camera become part of a path only if they are plain names.
 
 use crate::time::Stamp;
 
-/// A clip on the card: plain names.
+/// The name of a clip on the card: plain names.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub(super) struct Name {
     pub(super) folder: String,
     pub(super) file: String,
 }
 
-/// What the camera reports of itself.
+/// The camera's state report.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub(super) struct State {
     pub(super) recording: bool,
@@ -23,13 +23,13 @@ pub(super) struct State {
     pub(super) asked: Stamp,
 }
 
-/// The request that sets the camera's clock, to the second, to the local time.
+/// The request that sets the camera's clock to the local time, to the second.
 pub(super) fn clock() -> String {
-    // SAFETY: all zeroes are a valid time.
+    // SAFETY: all zeroes are a valid value.
     let mut local: libc::tm = unsafe { std::mem::zeroed() };
-    // SAFETY: null asks for the time alone.
+    // SAFETY: a null pointer is allowed.
     let now = unsafe { libc::time(std::ptr::null_mut()) };
-    // SAFETY: both pointers are to locals. Without time zones on the machine it is UTC.
+    // SAFETY: both pointers are to locals. Without time zones on the machine the result is UTC.
     unsafe { libc::localtime_r(&raw const now, &raw mut local) };
     format!(
         "/gopro/camera/set_date_time?date={:04}_{:02}_{:02}&time={:02}_{:02}_{:02}&tzone={}&dst={}",
@@ -39,7 +39,7 @@ pub(super) fn clock() -> String {
         local.tm_hour,
         local.tm_min,
         local.tm_sec,
-        // The zone without daylight saving, which is kept apart.
+        // The zone without daylight saving, which is sent separately.
         local.tm_gmtoff / 60 - if local.tm_isdst > 0 { 60 } else { 0 },
         i32::from(local.tm_isdst > 0),
     )
@@ -48,7 +48,7 @@ pub(super) fn clock() -> String {
 /// The model and firmware, as `/gopro/camera/info` reports them.
 pub(super) fn model(info: &[u8]) -> Option<String> {
     let info: serde_json::Value = serde_json::from_slice(info).ok()?;
-    // Older firmware wraps it.
+    // Older firmware wraps the object.
     let info = info.get("info").unwrap_or(&info);
     let text = |key: &str| Some(info.get(key)?.as_str()?.chars().take(64).collect::<String>());
     let model = text("model_name")?;
@@ -62,7 +62,7 @@ pub(super) fn serial(info: &[u8]) -> Option<String> {
     Some(info.get("serial_number")?.as_str().filter(|serial| is_plain(serial))?.to_owned())
 }
 
-/// The state, whose parts have numbers (Open GoPro, "Camera State", status ids).
+/// The state, whose fields are numbered (Open GoPro, "Camera State", status ids).
 pub(super) fn state(answer: &[u8], asked: Stamp) -> Option<State> {
     const BUSY: &str = "8";
     const ENCODING: &str = "10";
@@ -82,7 +82,7 @@ pub(super) fn state(answer: &[u8], asked: Stamp) -> Option<State> {
     })
 }
 
-/// The newest clip, from the answer to `last_captured`; `None` where there is none on the card.
+/// The newest clip, from the answer to `last_captured`; `None` if the card has none.
 pub(super) fn newest(answer: &[u8]) -> Result<Option<Name>, String> {
     let answer: serde_json::Value = serde_json::from_slice(answer).map_err(|error| error.to_string())?;
     let answer = answer.as_object().ok_or("it is no object")?;
@@ -104,7 +104,7 @@ pub(super) fn size(info: &[u8]) -> Option<u64> {
     size.as_u64().or_else(|| size.as_str()?.parse().ok())
 }
 
-/// May it be a part of a path?
+/// Whether it may be part of a path.
 pub(super) fn is_plain(name: &str) -> bool {
     let legal = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'_' | b'-' | b'.');
     (1..=64).contains(&name.len()) && !name.starts_with('.') && name.bytes().all(legal)

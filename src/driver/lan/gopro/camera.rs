@@ -1,13 +1,13 @@
 //! The task that communicates with a camera: keeps it awake, runs its shutter with the episodes, fetches its clips.
 //!
-//! What is wanted is the episode in progress, what is the case the shutter in the [`Books`]: at every change and at
-//! every beat the one is made to follow the other, so that an answer which did not come, or a lost connection, delays
-//! it and loses nothing.
+//! The wanted state is the episode in progress, the actual state is the shutter in the [`Books`]. At every change and
+//! every keep-alive the actual state is adjusted to the wanted one: a missing answer or a lost connection causes only a
+//! delay.
 //!
-//! Which clip an episode has is known by what was newest on the card before its shutter was started. Where that is not
-//! known, or clips of ours may still come to be listed, no clip is named as the episode's.
+//! An episode's clip is identified by the clip that was newest before its shutter was started. If that is not known, or
+//! clips of ours may not be listed yet, no clip is assigned to the episode.
 //!
-//! Invariant: what goes wrong with a clip is reported, and changes nothing of the episode.
+//! Invariant: a failure with a clip is reported, and changes nothing about the episode.
 
 use std::collections::VecDeque;
 use std::path::PathBuf;
@@ -27,23 +27,23 @@ use super::{Before, Books, Shutter};
 use crate::driver::DriverError;
 use crate::time::Stamp;
 
-/// The episode in progress, if there is one; `None` until it was notified.
-pub(super) type Told = Option<Option<PathBuf>>;
+/// The episode in progress, if there is one; `None` until the camera was notified.
+pub(super) type ReportedEpisode = Option<Option<PathBuf>>;
 
-/// How long things take.
+/// Time limits.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pace {
     /// The camera switches itself off when it receives nothing for longer than this (Open GoPro, "keep alive").
-    pub(super) beat: Duration,
-    /// A clip is in the camera's list a moment after it was stopped, usually within 1.5 s.
+    pub(super) keep_alive: Duration,
+    /// A stopped clip appears in the camera's list after a moment, usually within 1.5 s.
     pub(super) listed_within: Duration,
-    /// After this long it never will be.
+    /// After this long it will never be listed.
     pub(super) listed_at_the_latest: Duration,
 }
 
 impl Pace {
     pub(super) const USUAL: Self = Self {
-        beat: Duration::from_secs(3),
+        keep_alive: Duration::from_secs(3),
         listed_within: Duration::from_secs(4),
         listed_at_the_latest: Duration::from_mins(1),
     };
@@ -60,16 +60,16 @@ pub(super) struct Camera {
     clips: Clips,
     states: mpsc::Sender<Result<State, DriverError>>,
     books: Books,
-    /// The shutter in the books is of an earlier connection: whether it still runs is to be seen.
+    /// An earlier connection put the shutter in the books: whether it still runs must be checked.
     is_inherited: bool,
-    wanted: Told,
-    /// A clip that is not listed yet, and until when it is looked for.
+    wanted: ReportedEpisode,
+    /// A clip that is not listed yet, and until when to look for it.
     unlisted: Option<(Shutter, Instant)>,
-    /// Until then clips may come to be listed whose episodes are not known.
+    /// Until then, clips of unknown episodes may appear in the list.
     unclear_until: Option<Instant>,
-    /// What the camera refused was reported.
+    /// A refusal by the camera was reported.
     is_stated: bool,
-    /// Clips that are still to be fetched; the first is being fetched.
+    /// Clips that must still be fetched; the first is being fetched.
     pending: VecDeque<Clip>,
     fetching: Option<AbortOnDropHandle<Result<(), Failure>>>,
 }
@@ -104,7 +104,7 @@ impl Camera {
         camera
     }
 
-    /// Continues with what an earlier connection, or an earlier run, left to be fetched.
+    /// Continues with the clips that an earlier connection or run left to be fetched.
     async fn inherit(&mut self) {
         for note in self.books.notes().to_vec() {
             let path = note.clone();
@@ -124,9 +124,9 @@ impl Camera {
     }
 
     /// Runs until its owner is dropped, or the camera does not answer.
-    pub(super) async fn run(mut self, mut reported: watch::Receiver<Told>) {
-        let mut beat = interval(self.pace.beat);
-        beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    pub(super) async fn run(mut self, mut reported: watch::Receiver<ReportedEpisode>) {
+        let mut ticks = interval(self.pace.keep_alive);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut is_first = true;
         loop {
             tokio::select! {
@@ -139,7 +139,7 @@ impl Camera {
                     self.is_stated = false;
                     self.settle().await;
                 }
-                _ = beat.tick() => {
+                _ = ticks.tick() => {
                     let state = self.look().await;
                     let is_over = state.is_err();
                     if !self.states.is_closed() && self.states.try_send(state).is_err() {
@@ -148,7 +148,7 @@ impl Camera {
                     if is_over {
                         return;
                     }
-                    // An episode in progress is notified as soon as the camera is open.
+                    // The camera is notified of an episode in progress as soon as it is open.
                     if !std::mem::take(&mut is_first) {
                         self.wanted.get_or_insert(None);
                     }
@@ -192,7 +192,7 @@ impl Camera {
         }
     }
 
-    /// Learns whether the shutter of an earlier connection still runs. Is it known now?
+    /// Checks whether the shutter of an earlier connection still runs. Returns whether this is known.
     async fn has_inherited(&mut self) -> bool {
         let Ok(state) = self.look().await else { return false };
         self.is_inherited = false;
@@ -204,7 +204,7 @@ impl Camera {
     }
 
     async fn start(&mut self, episode: PathBuf) {
-        // The camera reads one card: the clip in progress comes first.
+        // The camera reads one card: the clip being recorded has priority.
         self.fetching = None;
         self.list().await;
         if let Some((shutter, _)) = self.unlisted.take() {
@@ -227,7 +227,7 @@ impl Camera {
             }
             return;
         };
-        // It may record already, by hand.
+        // It may already be recording, started by hand.
         if self.look().await.is_ok_and(|state| state.recording) {
             return;
         }
@@ -237,7 +237,7 @@ impl Camera {
         }
     }
 
-    /// Stops the shutter and notes its clip; `false` if it runs on.
+    /// Stops the shutter and notes its clip; `false` if it keeps running.
     async fn stop(&mut self, shutter: Shutter) -> bool {
         if let Err(error) = ask(&self.server, "/gopro/camera/shutter/stop").await
             && !self.look().await.is_ok_and(|state| !state.recording)
@@ -269,7 +269,7 @@ impl Camera {
         }
     }
 
-    /// Notes the clip that was just made, once the camera lists it.
+    /// Notes the newest clip, once the camera lists it.
     async fn list(&mut self) {
         let Some((shutter, until)) = &self.unlisted else { return };
         match newest(&self.server).await {
@@ -309,7 +309,7 @@ impl Camera {
         }
     }
 
-    /// Reports that an episode is without its clip.
+    /// Reports that an episode has no clip.
     async fn unknown(&self, shutter: &Shutter, reason: &str) {
         let newest = newest(&self.server).await.ok().flatten();
         let newest = newest.map(|Name { folder, file }| format!("; the newest on the card is {folder}/{file}"));
@@ -317,7 +317,7 @@ impl Camera {
         tracing::error!(device = self.name, "which clip belongs to {episode} is not known: {reason}{newest}");
     }
 
-    /// Continues with the clips that are to be fetched.
+    /// Continues fetching clips.
     fn fetch(&mut self) {
         if self.fetching.is_some() || self.wanted != Some(None) || self.books.shutter().is_some() {
             return;
@@ -345,7 +345,7 @@ impl Camera {
 }
 
 impl Drop for Camera {
-    /// Reports what is left undone, however the task ends.
+    /// Reports unfinished work, however the task ends.
     fn drop(&mut self) {
         let then = if self.books.are_kept() { ", and is seen to when the camera is there again" } else { "" };
         for clip in &self.pending {
@@ -369,7 +369,7 @@ async fn fetched(fetching: &mut Option<AbortOnDropHandle<Result<(), Failure>>>) 
     }
 }
 
-/// The newest clip on the card; `None` where there is none.
+/// The newest clip on the card; `None` if there is none.
 async fn newest(server: &Server) -> Result<Option<Name>, String> {
     let mut tries = 1;
     loop {

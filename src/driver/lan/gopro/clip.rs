@@ -1,12 +1,12 @@
 //! A clip that a camera recorded during an episode: noted beside the episode's file, and fetched.
 //!
-//! Beside `NAME.mcap` the note is `NAME.DEVICE.clip.json`, the clip `NAME.DEVICE.FILE`; while it is being
-//! fetched its name ends in `.partial`, and what is there is continued.
+//! Beside `NAME.mcap` the note is `NAME.DEVICE.clip.json` and the clip `NAME.DEVICE.FILE`; while the clip is being
+//! fetched its name ends in `.partial`, and a partial file is continued.
 //!
-//! Invariant: the camera's words become part of a path only if they are plain names.
-//! Invariant: a byte is written where it belongs or not at all, by one fetch at a time, however often fetching is
-//! begun, broken off and begun again.
-//! Invariant: an episode keeps its room on the disk, whatever size the camera reports for the clip.
+//! Invariant: strings from the camera become part of a path only if they are plain names.
+//! Invariant: a byte is written at its proper offset or not at all, by one fetch at a time, however often a fetch is
+//! started, interrupted and restarted.
+//! Invariant: an episode keeps its space on the disk, whatever size the camera reports for the clip.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -28,10 +28,10 @@ use crate::disk::Disk;
 const HEAD_LIMIT: Duration = Duration::from_secs(5);
 /// A camera that sends nothing for this long has stopped.
 const SILENCE_LIMIT: Duration = Duration::from_secs(10);
-/// A clip is asked for again where it broke off, so often without any progress.
+/// A fetch resumes where it stopped; number of attempts without any progress.
 const TRIES: u32 = 3;
 const PAUSE: Duration = Duration::from_secs(1);
-/// Written to the disk at once, bytes.
+/// Bytes written to the disk at once.
 const BLOCK: usize = 1 << 20;
 /// A note has a few hundred bytes.
 const LARGEST_NOTE: u64 = 64 << 10;
@@ -49,9 +49,9 @@ pub(super) struct Clip {
 /// Why a clip was not fetched.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Failure {
-    /// It stays on the camera, and may be fetched another time.
+    /// It stays on the camera and may be fetched later.
     Stays(String),
-    /// The camera does not have it any more.
+    /// The camera no longer has it.
     Lost(String),
 }
 
@@ -60,7 +60,7 @@ impl Clip {
         Self { name, size, episode, device: device.to_owned() }
     }
 
-    /// The clip that a note describes, which is at this path; `None` if it is no note of ours.
+    /// The clip described by the note at this path; `None` if it is not one of our notes.
     pub(super) fn of_note(path: &Path) -> Option<Self> {
         let text = crate::folder::read_text(path, LARGEST_NOTE).ok()?;
         Self::read(path, &text)
@@ -90,12 +90,12 @@ impl Clip {
         self.episode.with_file_name(format!("{stem}.{}.{end}", self.device))
     }
 
-    /// Where the clip goes.
+    /// Path of the clip.
     pub(super) fn target(&self) -> PathBuf {
         self.beside(&self.name.file)
     }
 
-    /// Where the note is.
+    /// Path of the note.
     pub(super) fn note_path(&self) -> PathBuf {
         self.beside("clip.json")
     }
@@ -110,7 +110,7 @@ impl Clip {
     }
 }
 
-/// Fetches the clip, from where an earlier try ended. `reserve` is the registry's `disk_reserve`.
+/// Fetches the clip, continuing an earlier attempt. `reserve` is the registry's `disk_reserve`.
 pub(super) async fn fetch(clip: Clip, server: Server, reserve: Option<u64>) -> Result<(), Failure> {
     let target = clip.target();
     if target.exists() {
@@ -132,7 +132,7 @@ pub(super) async fn fetch(clip: Clip, server: Server, reserve: Option<u64>) -> R
             Err(Broken::Off(reason)) => reason,
         };
         let there = length(&part);
-        // A download that starts over each time makes no progress.
+        // A download that restarts each time makes no progress.
         failed = if there > furthest { 0 } else { failed + 1 };
         furthest = furthest.max(there);
         if failed == TRIES {
@@ -147,7 +147,7 @@ pub(super) async fn fetch(clip: Clip, server: Server, reserve: Option<u64>) -> R
 }
 
 enum Broken {
-    /// Asking again may help.
+    /// Retrying may help.
     Off(String),
     Finally(Failure),
 }
@@ -168,7 +168,7 @@ async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Fe
             part.begin_again()?;
             return Err(off("the camera continued at another byte than requested"));
         }
-        // All of it is there.
+        // It is complete.
         StatusCode::RANGE_NOT_SATISFIABLE if part.there > 0 && clip.size == Some(part.there) => return Ok(()),
         StatusCode::RANGE_NOT_SATISFIABLE if part.there > 0 => {
             part.begin_again()?;
@@ -221,27 +221,27 @@ async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Fe
     }
 }
 
-/// What of a clip is there, held by this fetch alone until it is dropped.
+/// The partial file of a clip, locked by this fetch until it is dropped.
 #[derive(Debug)]
 struct Part {
     file: File,
     path: PathBuf,
-    /// Bytes that are there.
+    /// Bytes fetched so far.
     there: u64,
-    /// What is to stay free on the disk, if the registry asks for it.
+    /// Space that must stay free on the disk, if the registry requires it.
     reserve: Option<u64>,
 }
 
 impl Part {
-    /// `size` is that of the clip, if it is known: what is longer is of another.
+    /// `size` is the size of the clip, if known: a longer file belongs to another clip.
     async fn open(path: &Path, size: Option<u64>, reserve: Option<u64>) -> Result<Self, Broken> {
         let path = path.to_owned();
         let named = path.display().to_string();
         let open = move || {
             let file = OpenOptions::new().create(true).truncate(false).write(true).open(&path)?;
-            // A fetch that was given up may still be writing its last block.
+            // An abandoned fetch may still be writing its last block.
             let locked = rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive);
-            // Not every file system can.
+            // Not every file system supports locks.
             if locked == Err(Errno::WOULDBLOCK) {
                 return Err(Errno::WOULDBLOCK.into());
             }
@@ -268,18 +268,18 @@ impl Part {
         self.truncate().map_err(|error| stays(format_args!("{}: {error}", self.path.display())))
     }
 
-    /// Is there room on the disk for so many bytes more?
+    /// Checks that this many more bytes fit on the disk.
     fn has_room(&self, bytes: u64) -> Result<(), Broken> {
         full(&self.file, bytes, self.reserve).map_or(Ok(()), |full| Err(stays(full)))
     }
 
-    /// Writes what follows; the emptied block comes back.
+    /// Writes the next block and returns it empty.
     async fn write(self, mut block: Vec<u8>, is_last: bool) -> Result<(Self, Vec<u8>), Broken> {
         let named = self.path.display().to_string();
         let write = move || {
             let Self { file, path, there, reserve } = self;
             let bytes = block.len() as u64;
-            // Recordings eat the same disk.
+            // Recordings use the same disk.
             if let Some(full) = full(&file, bytes, reserve) {
                 return Err(io::Error::other(full));
             }
@@ -295,8 +295,8 @@ impl Part {
     }
 }
 
-/// Why so many bytes more do not fit on the disk of `file`; `None` if they do, or the file system does not report it. Episodes keep
-/// their room: twice the registry's `disk_reserve`, as an episode that comes near the reserve is warned of.
+/// Why this many more bytes do not fit on the disk of `file`; `None` if they do, or the file system reports no space.
+/// Episodes keep their space: twice the registry's `disk_reserve`, the level at which an episode is warned.
 fn full(file: &File, bytes: u64, reserve: Option<u64>) -> Option<String> {
     let disk = Disk::of(file).ok().filter(|disk| disk.lacks_room_beside_an_episode(bytes, reserve))?;
     let (wanted, free) = (bytes.div_ceil(1 << 20), disk.free >> 20);
@@ -311,7 +311,7 @@ fn announced(reply: &Reply) -> Option<u64> {
     reply.header(CONTENT_LENGTH)?.parse().ok()
 }
 
-/// Where a part begins: `bytes 10-99/100` (RFC 9110, 14.4).
+/// The start offset of a part: `bytes 10-99/100` (RFC 9110, 14.4).
 fn begins(reply: &Reply) -> Option<u64> {
     reply.header(CONTENT_RANGE)?.trim().strip_prefix("bytes ")?.split_once('-')?.0.trim().parse().ok()
 }
@@ -320,7 +320,7 @@ fn length(path: &Path) -> u64 {
     std::fs::metadata(path).map_or(0, |metadata| metadata.len())
 }
 
-/// Reports every tenth.
+/// Reports progress in steps of a tenth.
 #[derive(Debug)]
 struct FetchProgress {
     device: String,

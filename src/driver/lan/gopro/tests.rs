@@ -10,9 +10,9 @@ use tokio::net::TcpListener;
 use super::answer::Name;
 use super::clip::Failure;
 use super::*;
-use crate::registry::{DeviceNode, LastReceived};
+use crate::device::{DeviceNode, LastReceived};
 
-/// A camera that has a clip, and breaks off in its middle so many times; who is asked how often.
+/// A camera that has a clip and interrupts it this many times; with counts of requests.
 async fn camera(clip: Vec<u8>, breaks: usize) -> (Server, Arc<AtomicUsize>) {
     let listener = TcpListener::bind((Address::LOCALHOST, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
@@ -53,7 +53,7 @@ fn clip_in(folder: &Path) -> Clip {
 }
 
 #[tokio::test]
-async fn a_clip_is_fetched_on_from_where_it_broke_off() {
+async fn an_interrupted_download_of_a_clip_is_resumed() {
     let folder = tempfile::tempdir().expect("a folder");
     let bytes: Vec<u8> = (0..3_u32 << 20).map(|index| index.to_le_bytes()[1]).collect();
     let (server, asked) = camera(bytes.clone(), 2).await;
@@ -64,7 +64,7 @@ async fn a_clip_is_fetched_on_from_where_it_broke_off() {
     let files: Vec<_> =
         std::fs::read_dir(folder.path()).expect("a folder").flatten().map(|file| file.file_name()).collect();
     assert_eq!(files, ["ep_001.gopro.GX010001.MP4"], "nothing is left over");
-    // What is there is not asked for again.
+    // An existing clip is not requested again.
     clip::fetch(clip, server, None).await.expect("there");
     assert_eq!(asked.load(Ordering::Relaxed), 3);
 }
@@ -116,7 +116,7 @@ fn the_state_is_read_by_number() {
 }
 
 #[test]
-fn a_model_is_read_of_either_firmware() {
+fn a_model_is_read_from_either_firmware() {
     let plain = br#"{"model_name":"HERO11 Black","firmware_version":"H22.01.01.20.00"}"#;
     let wrapped = br#"{"info":{"model_name":"HERO9 Black"}}"#;
     assert_eq!(answer::model(plain).as_deref(), Some("HERO11 Black, firmware H22.01.01.20.00"));
@@ -132,7 +132,7 @@ fn the_clock_is_set_to_the_second() {
 }
 
 #[test]
-fn a_clip_is_named_by_plain_words_alone() {
+fn a_clip_is_accepted_only_under_a_plain_name() {
     let newest = |text: &str| answer::newest(text.as_bytes());
     assert_eq!(newest(r#"{"folder":"100GOPRO","file":"GX010001.MP4"}"#), Ok(Some(named(1))));
     for none in ["{}", r#"{"folder":"","file":""}"#] {
@@ -159,7 +159,7 @@ fn a_clip_is_named_by_plain_words_alone() {
 }
 
 #[test]
-fn a_note_is_read_as_it_was_written_and_no_other_file_is_one() {
+fn a_note_is_read_back_and_no_other_file_is_taken_for_one() {
     let folder = tempfile::tempdir().expect("a folder");
     let clip = Clip::new(named(1), Some(7), folder.path().join("ep_001.mcap"), "gopro");
     clip.note("http://172.24.106.51:8080/x").expect("written");
@@ -174,17 +174,17 @@ fn a_note_is_read_as_it_was_written_and_no_other_file_is_one() {
     assert_eq!(read("/a/b.gopro.clip.json", &note.replace("\"gopro\"", "\"../gopro\"")), None);
 }
 
-/// A camera whose clips are listed when the test wants it, and which loses answers if it wants that.
+/// A camera whose clips are listed, and whose answers are lost, as the test chooses.
 #[derive(Default)]
 struct Fake {
     asked: Mutex<Vec<String>>,
     recording: AtomicBool,
-    /// Clips that were made, and those of them that are listed.
+    /// Clips that were made, and how many of them are listed.
     made: AtomicUsize,
     listed: AtomicUsize,
     /// A clip is listed as soon as it is made.
     lists: AtomicBool,
-    /// Requests that hold this word get no answer.
+    /// Requests that contain this word get no answer.
     deaf: Mutex<Option<&'static str>>,
 }
 
@@ -243,7 +243,7 @@ impl Fake {
         Some((200, body))
     }
 
-    /// A clip was made, by whomever.
+    /// A clip was made, by anyone.
     fn made(&self) {
         let made = self.made.fetch_add(1, Ordering::Relaxed) + 1;
         if self.lists.load(Ordering::Relaxed) {
@@ -259,7 +259,7 @@ impl Fake {
         self.recording.load(Ordering::Relaxed)
     }
 
-    fn deafen(&self, word: Option<&'static str>) {
+    fn ignore_requests(&self, word: Option<&'static str>) {
         *self.deaf.lock().expect("no panic") = word;
     }
 
@@ -269,12 +269,12 @@ impl Fake {
 }
 
 const QUICK: Pace = Pace {
-    beat: Duration::from_millis(50),
+    keep_alive: Duration::from_millis(50),
     listed_within: Duration::from_millis(300),
     listed_at_the_latest: Duration::from_secs(30),
 };
 
-/// A driver, whose samples are read.
+/// A driver, with a task that reads its samples.
 struct Bench {
     folder: tempfile::TempDir,
     fake: Arc<Fake>,
@@ -292,7 +292,7 @@ impl Bench {
         bench
     }
 
-    /// Connects, again if it is connected: then the old connection is lost.
+    /// Connects; if already connected, the old connection is lost.
     async fn open(&mut self) {
         self.gopro = None;
         let state = Some(self.folder.path().join("state"));
@@ -337,9 +337,9 @@ impl Bench {
         }
     }
 
-    async fn beats(&mut self, count: usize) {
+    async fn keep_alives(&mut self, count: usize) {
         let looks = self.fake.asked("/state") + count;
-        self.until("beats", |bench| bench.fake.asked("/state") >= looks).await;
+        self.until("keep-alives", |bench| bench.fake.asked("/state") >= looks).await;
     }
 }
 
@@ -361,7 +361,7 @@ async fn each_episode_has_the_clip_that_was_made_for_it_or_none() {
     bench.until("stopped", |bench| !bench.fake.is_recording()).await;
     // Longer than a clip usually takes to be listed.
     bench.until("given up for now", |bench| bench.fake.asked("last_captured") > 6).await;
-    bench.beats(3).await;
+    bench.keep_alives(3).await;
     assert_eq!(bench.clip_of("two"), None, "its clip is not listed");
     bench.fake.list();
     bench.until("a note", |bench| bench.clip_of("two").is_some()).await;
@@ -369,7 +369,7 @@ async fn each_episode_has_the_clip_that_was_made_for_it_or_none() {
 }
 
 #[tokio::test]
-async fn a_clip_that_is_listed_in_the_next_episode_is_not_taken_for_that_ones() {
+async fn a_clip_listed_during_the_next_episode_is_not_assigned_to_it() {
     let mut bench = Bench::new(false).await;
     bench.fake.lists.store(false, Ordering::Relaxed);
     bench.record(Some("one"));
@@ -378,24 +378,24 @@ async fn a_clip_that_is_listed_in_the_next_episode_is_not_taken_for_that_ones() 
     bench.until("stopped", |bench| !bench.fake.is_recording()).await;
     bench.record(Some("two"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
-    // The first one's, in the middle of the second.
+    // The first episode's clip, during the second.
     bench.fake.list();
-    bench.beats(2).await;
+    bench.keep_alives(2).await;
     bench.record(None);
     bench.until("stopped", |bench| !bench.fake.is_recording()).await;
-    bench.beats(2).await;
+    bench.keep_alives(2).await;
     bench.close().await;
     assert_eq!((bench.clip_of("one"), bench.clip_of("two")), (None, None));
 }
 
 #[tokio::test]
-async fn without_an_answer_before_the_shutter_no_clip_is_the_episodes() {
+async fn without_an_answer_before_the_shutter_an_episode_gets_no_clip() {
     let mut bench = Bench::new(false).await;
     bench.fake.made();
-    bench.fake.deafen(Some("last_captured"));
+    bench.fake.ignore_requests(Some("last_captured"));
     bench.record(Some("one"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
-    bench.fake.deafen(None);
+    bench.fake.ignore_requests(None);
     bench.record(None);
     bench.until("stopped", |bench| !bench.fake.is_recording()).await;
     bench.close().await;
@@ -405,15 +405,15 @@ async fn without_an_answer_before_the_shutter_no_clip_is_the_episodes() {
 #[tokio::test]
 async fn a_shutter_that_does_not_answer_is_asked_again() {
     let mut bench = Bench::new(false).await;
-    bench.fake.deafen(Some("shutter"));
+    bench.fake.ignore_requests(Some("shutter"));
     bench.record(Some("one"));
     bench.until("asked twice", |bench| bench.fake.asked("shutter/start") >= 2 * TRIES as usize).await;
-    bench.fake.deafen(None);
+    bench.fake.ignore_requests(None);
     bench.until("recording", |bench| bench.fake.is_recording()).await;
-    bench.fake.deafen(Some("shutter"));
+    bench.fake.ignore_requests(Some("shutter"));
     bench.record(None);
     bench.until("asked twice", |bench| bench.fake.asked("shutter/stop") >= 2 * TRIES as usize).await;
-    bench.fake.deafen(None);
+    bench.fake.ignore_requests(None);
     bench.until("a note", |bench| bench.clip_of("one").is_some()).await;
 }
 
@@ -427,18 +427,18 @@ async fn an_episode_that_ends_while_the_connection_is_lost_ends_the_clip_too() {
     bench.until("a note", |bench| bench.clip_of("one").is_some()).await;
     assert!(!bench.fake.is_recording());
 
-    // An episode that continues is reported, and its shutter stays as it is.
+    // An episode that continues is reported again, and its shutter is left alone.
     bench.record(Some("two"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
     let stops = bench.fake.asked("shutter/stop");
     bench.open().await;
     bench.record(Some("two"));
-    bench.beats(3).await;
+    bench.keep_alives(3).await;
     assert_eq!((bench.fake.asked("shutter/stop"), bench.fake.is_recording()), (stops, true));
     bench.close().await;
     assert_eq!(bench.clip_of("two").as_deref(), Some("GX010002.MP4"));
 
-    // One that was stopped by hand meanwhile may not be the newest any more.
+    // If it was stopped by hand meanwhile, its clip may no longer be the newest.
     bench.open().await;
     bench.record(Some("three"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
@@ -453,7 +453,7 @@ async fn an_episode_that_ends_while_the_connection_is_lost_ends_the_clip_too() {
 #[tokio::test]
 async fn the_next_run_fetches_remaining_clips() {
     let mut bench = Bench::new(true).await;
-    bench.fake.deafen(Some("/videos/"));
+    bench.fake.ignore_requests(Some("/videos/"));
     bench.record(Some("one"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
     bench.close().await;
@@ -461,7 +461,7 @@ async fn the_next_run_fetches_remaining_clips() {
     // A note that was moved away with its episode.
     let books = bench.books().replace("\"notes\": [", "\"notes\": [\"/nowhere/x.gopro.clip.json\",");
     std::fs::write(bench.path("state/gopro/C344.json"), books).expect("written");
-    bench.fake.deafen(None);
+    bench.fake.ignore_requests(None);
     bench.open().await;
     let target = bench.path("one.gopro.GX010001.MP4");
     bench.until("the clip", |_| target.exists()).await;
@@ -469,7 +469,7 @@ async fn the_next_run_fetches_remaining_clips() {
     bench.until("forgotten", |bench| bench.books().is_empty()).await;
 }
 
-/// What a server sends for a clip of which some is there already.
+/// Fetches from a server that answers this, with part of the clip already on the disk.
 async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result<(), Failure>, Vec<u8>) {
     let listener = TcpListener::bind((Address::LOCALHOST, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
@@ -498,7 +498,7 @@ async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result
 async fn a_mismatched_partial_file_is_restarted() {
     let long = [7; 100];
     for (head, size, there) in [
-        // Elsewhere than where it was asked to, or it does not report where.
+        // At another offset than requested, or with no offset given.
         (
             "HTTP/1.1 206 X\r\nContent-Range: bytes 2-14/15\r\nContent-Length: 13\r\n\r\nving pictures",
             None,
@@ -507,7 +507,7 @@ async fn a_mismatched_partial_file_is_restarted() {
         ("HTTP/1.1 206 X\r\nContent-Length: 12\r\n\r\ning pictures", None, &b"mov"[..]),
         ("HTTP/1.1 416 X\r\nContent-Length: 0\r\n\r\n", None, &long[..]),
         ("HTTP/1.1 416 X\r\nContent-Length: 0\r\n\r\n", Some(CLIP.len() as u64), &long[..]),
-        // All of it is there.
+        // It is complete.
         ("HTTP/1.1 416 X\r\nContent-Length: 0\r\n\r\n", Some(CLIP.len() as u64), CLIP),
         ("HTTP/1.1 206 X\r\nContent-Range: bytes 3-14/15\r\nContent-Length: 12\r\n\r\ning pictures", None, &b"mov"[..]),
     ] {
@@ -517,7 +517,7 @@ async fn a_mismatched_partial_file_is_restarted() {
 }
 
 #[tokio::test]
-async fn no_number_of_a_server_breaks_the_fetching() {
+async fn no_number_from_a_server_breaks_the_download() {
     let huge = "HTTP/1.1 206 X\r\nContent-Range: bytes 3-9/*\r\nContent-Length: 18446744073709551614\r\n\r\nx";
     let (outcome, there) = fetched(huge, None, b"mov").await;
     assert!(matches!(outcome, Err(Failure::Stays(_))), "{outcome:?}");
@@ -527,7 +527,7 @@ async fn no_number_of_a_server_breaks_the_fetching() {
 }
 
 #[tokio::test]
-async fn a_clip_is_fetched_by_one_at_a_time() {
+async fn a_clip_is_fetched_by_one_task_at_a_time() {
     let (server, asked) = camera(CLIP.to_vec(), 0).await;
     let folder = tempfile::tempdir().expect("a folder");
     let clip = clip_in(folder.path());
@@ -541,7 +541,7 @@ async fn a_clip_is_fetched_by_one_at_a_time() {
 }
 
 #[tokio::test]
-async fn a_clip_leaves_the_room_free_that_the_registry_reserves() {
+async fn a_clip_leaves_the_reserved_disk_space_free() {
     let (server, _) = camera(CLIP.to_vec(), 0).await;
     let folder = tempfile::tempdir().expect("a folder");
     let clip = clip_in(folder.path());

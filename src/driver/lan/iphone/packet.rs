@@ -1,17 +1,17 @@
-//! What the phone sends, out of the bytes, without I/O.
+//! Parses the phone's messages from the bytes, without I/O.
 //!
-//! The format is that of aod321/iPhoneVIO (`NetworkClient.swift`): messages of 8 bytes of header,
-//! `u32 payload length, u8 type, 3 reserved`, and the payload, little endian. Type 1 is a frame: `u32
-//! JPEG length, 16 f32 camera pose (4 by 4, column by column), f64 time of the device's own clock, f64
-//! wall clock (s since 1970), JPEG`. Type 0 is the session in JSON, once for each connection; 2 and 3
-//! are commands of a teleoperator and reachability, which are let go.
+//! The format is that of aod321/iPhoneVIO (`NetworkClient.swift`): messages with a header of 8 bytes, `u32 payload
+//! length, u8 type, 3 reserved`, and the payload, little endian. Type 1 is a frame: `u32 JPEG length, 16 f32 camera
+//! pose (4 by 4, column by column), f64 time of the device's own clock, f64 wall clock (s since 1970), JPEG`. Type 0 is
+//! the session in JSON, once per connection; 2 and 3 are commands of a teleoperator and reachability, which are
+//! ignored.
 //!
-//! Invariant: memory is bounded by the largest picture permitted, whatever comes.
-//! Invariant: nothing is allocated for a frame once the largest one has been seen.
+//! Invariant: memory is bounded by the largest picture permitted, whatever the input.
+//! Invariant: frames cause no allocation once the largest one has been seen.
 
 /// Header of a message, bytes.
 const HEADER: usize = 8;
-/// Of a frame, what comes before the picture, bytes.
+/// Bytes of a frame before the picture.
 pub(in crate::driver::lan) const FRAME_HEAD: usize = 84;
 /// The session's JSON is some 300 bytes.
 const LARGEST_SESSION: usize = 64 << 10;
@@ -19,7 +19,7 @@ const LARGEST_SESSION: usize = 64 << 10;
 const SESSION: u8 = 0;
 const FRAME: u8 = 1;
 
-/// What came of feeding bytes.
+/// Result of feeding bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::driver::lan) enum Cut {
     /// More bytes are needed.
@@ -28,11 +28,11 @@ pub(in crate::driver::lan) enum Cut {
     Frame(Frame),
     /// The session's JSON is complete: [`Packets::payload`].
     Session,
-    /// A frame that is too large, or describes its picture as it cannot be.
+    /// A frame that is too large, or whose lengths are inconsistent.
     Malformed,
 }
 
-/// What comes with a picture.
+/// Data sent with a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::driver::lan) struct Frame {
     /// Pose of the camera, 4 by 4, column by column.
@@ -49,11 +49,11 @@ pub(in crate::driver::lan) struct Packets {
     header: [u8; HEADER],
     header_filled: usize,
     payload: Vec<u8>,
-    /// Of the payload, what is to come.
+    /// Bytes of the payload still to come.
     missing: usize,
-    /// What comes is let go.
+    /// Incoming bytes are discarded.
     skips: bool,
-    /// The message was handed over, and `payload` begins again.
+    /// The message was handed over; `payload` starts again.
     reported: bool,
     largest_picture: usize,
 }
@@ -71,7 +71,7 @@ impl Packets {
         }
     }
 
-    /// The picture of the frame, or the text of the session, that is complete.
+    /// The picture of the completed frame, or the text of the completed session.
     pub(in crate::driver::lan) fn payload(&self) -> &[u8] {
         let skip = if self.header[4] == FRAME { FRAME_HEAD } else { 0 };
         self.payload.get(skip..).unwrap_or_default()
@@ -120,7 +120,7 @@ impl Packets {
         (taken, Cut::Open)
     }
 
-    /// After a header.
+    /// Starts a message, after its header.
     fn begin(&mut self) -> Cut {
         let [a, b, c, d, kind, ..] = self.header;
         self.missing = u32::from_le_bytes([a, b, c, d]) as usize;
@@ -140,7 +140,7 @@ impl Packets {
         self.reported = true;
         let kind = self.header[4];
         if self.skips {
-            // Reported when it began.
+            // Already reported when it began.
             self.payload.clear();
             self.header_filled = 0;
             self.reported = false;
@@ -161,7 +161,7 @@ impl Packets {
 fn frame(payload: &[u8]) -> Option<Frame> {
     let (head, picture) = payload.split_at_checked(FRAME_HEAD)?;
     let (length, rest) = head.split_first_chunk()?;
-    // What follows the picture, if anything does, is none of it.
+    // Bytes after the picture do not belong to it.
     if u32::from_le_bytes(*length) as usize != picture.len() {
         return None;
     }

@@ -1,7 +1,7 @@
 use super::*;
 
 #[test]
-fn what_the_phone_measured_is_in_the_picture() {
+fn the_phones_measurements_are_in_the_picture() {
     let mut pose = [0.5_f32; 16];
     (pose[0], pose[1], pose[2]) = (f32::NAN, f32::MAX, f32::MIN_POSITIVE);
     let frame = Frame { pose, device_time: f64::MAX, wall_clock: 1_700_000_000.25 };

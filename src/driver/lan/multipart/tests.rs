@@ -2,7 +2,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// What a camera that sends `pieces` one after another is read as.
+/// The parts parsed from a camera that sends `pieces` one after another.
 fn parts(boundary: &str, largest: usize, pieces: &[&[u8]]) -> (Vec<Vec<u8>>, usize) {
     let mut parser = Multipart::new(boundary, largest).expect("a boundary");
     let (mut parts, mut malformed) = (Vec::new(), 0);
@@ -32,35 +32,35 @@ fn check(stream: &[u8], expected: &[&[u8]], malformed: usize) {
 }
 
 #[test]
-fn the_liberties_of_cameras() {
-    // As the book has it.
+fn lenient_variants_of_cameras_are_accepted() {
+    // As in the RFC.
     check(
         b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: 3\r\n\r\nabc\r\n--frame\r\nContent-Length: 2\r\n\r\nde\r\n--frame--\r\n",
         &[b"abc", b"de"],
         0,
     );
-    // A length, but no line end behind the body; newlines alone; odd case; a preamble.
+    // A length, but no line end after the body; newlines alone; odd case; a preamble.
     check(b"hello\n----frame\ncontent-LENGTH:3\n\nabc--frame\nContent-Length: 2\n\nde", &[b"abc", b"de"], 0);
-    // No length: the body may hold line ends, dashes and nearly a boundary.
+    // No length: the body may contain line ends, dashes and almost a boundary.
     check(
         b"--frame\r\n\r\na\r\n--fram\n-b--frame\r\n--frames\r\n\r\n--frame\r\n\r\nc\r\n--frame--\r\n",
         &[b"a\r\n--fram\n-b--frame\r\n--frames\r\n", b"c"],
         0,
     );
-    // Nothing in it.
+    // An empty body.
     check(b"--frame\r\nContent-Length: 0\r\n\r\n\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"", b"a"], 0);
 }
 
 #[test]
 fn a_malformed_part_loses_only_itself() {
-    // Announces more than is permitted.
+    // Announces more than permitted.
     check(b"--frame\r\nContent-Length: 65\r\n\r\nabc\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"a"], 1);
     check(
         b"--frame\r\nContent-Length: 99999999999999999999999\r\n\r\nabc\r\n--frame\r\n\r\na\r\n--frame\r\n",
         &[b"abc", b"a"],
         0,
     );
-    // Sends more than is permitted.
+    // Sends more than permitted.
     let mut stream = b"--frame\r\n\r\n".to_vec();
     stream.extend([b'x'; 300]);
     stream.extend(b"\r\n--frame\r\nContent-Length: 1\r\n\r\na");
@@ -70,7 +70,7 @@ fn a_malformed_part_loses_only_itself() {
     stream.extend(b"X-Header: y\r\n".repeat(LONGEST_HEAD / 10));
     stream.extend(b"\r\n--frame\r\nContent-Length: 1\r\n\r\na");
     check(&stream, &[b"a"], 1);
-    // What makes them too large is the boundary of the next part.
+    // The bytes that make them too large are the next part's boundary.
     for room in 0..40 {
         let mut stream = b"--frame\r\n\r\n".to_vec();
         stream.extend([b'x'; 64 + LONGEST_LINE]);
@@ -81,19 +81,19 @@ fn a_malformed_part_loses_only_itself() {
         stream.extend([b'x'; LONGEST_HEAD]);
         stream.truncate(stream.len() - room);
         stream.extend(b"\n--frame\nContent-Length: 1\r\n\r\na");
-        // With room for it the boundary is a line of the head, and the rest of the head may then be too large or not.
+        // If it fits, the boundary is a line of the head, and the rest of the head may then be too large or not.
         match room {
             0..=8 => check(&stream, &[b"a"], 1),
             9..=29 => check(&stream, &[], 1),
             _ => check(&stream, &[b"a"], 0),
         }
     }
-    // A header line that is too long is not looked at, wherever it is cut.
+    // A header line that is too long is ignored, wherever it is cut.
     let mut stream = b"--frame\r\nContent-Length: 1".to_vec();
     stream.extend([b' '; LONGEST_LINE]);
     stream.extend(b"2\r\n\r\nabc\r\n--frame\r\n");
     check(&stream, &[b"abc"], 0);
-    // A length that is too short: the rest is let go.
+    // A length that is too short: the rest is skipped.
     check(b"--frame\r\nContent-Length: 2\r\n\r\nabc\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"ab", b"a"], 0);
 }
 
@@ -115,7 +115,7 @@ fn a_boundary_is_announced_in_many_ways() {
 
 proptest! {
     #[test]
-    fn pieces_do_not_matter(bodies in prop::collection::vec(prop::collection::vec(0_u8..=255, 0..60), 1..6),
+    fn chunking_does_not_matter(bodies in prop::collection::vec(prop::collection::vec(0_u8..=255, 0..60), 1..6),
                             sized in prop::collection::vec(any::<bool>(), 6), cuts in prop::collection::vec(1_usize..40, 0..30)) {
         let mut stream = Vec::new();
         for (body, sized) in bodies.iter().zip(&sized) {
@@ -141,7 +141,7 @@ proptest! {
     }
 
     #[test]
-    fn no_bytes_break_it(
+    fn any_bytes_are_survived(
         words in prop::collection::vec(
             prop_oneof![
                 any::<u8>().prop_map(|byte| vec![byte]),

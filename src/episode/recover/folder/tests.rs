@@ -6,7 +6,7 @@ use crate::episode::testing::strictly;
 use crate::record::tests::registry;
 
 #[tokio::test]
-async fn in_the_background_a_folder_is_repaired_and_reported() {
+async fn a_folder_is_repaired_and_reported_in_the_background() {
     let (folder, bytes) = recorded().await;
     put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
     put(&folder, "a_002.mcap.partial", b"");
@@ -33,7 +33,7 @@ async fn in_the_background_a_folder_is_repaired_and_reported() {
 }
 
 #[tokio::test]
-async fn a_repair_in_the_background_leaves_the_room_of_an_episode() {
+async fn a_repair_in_the_background_leaves_disk_space_for_an_episode() {
     let (folder, bytes) = recorded().await;
     let partial = put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
     let free = Disk::of(&File::open(folder.path()).unwrap()).unwrap().free;

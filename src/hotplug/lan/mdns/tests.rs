@@ -2,11 +2,11 @@ use tokio::sync::mpsc;
 
 use super::super::super::HotplugEvent;
 use super::*;
-use crate::registry::{DeviceNode, Unit};
+use crate::device::{DeviceNode, Unit};
 
 const LEASE: Duration = Duration::from_secs(3);
 
-/// Entries of a service, and what they report.
+/// The entries of a service, and their reports.
 struct Bench {
     service: Service,
     reported: mpsc::Receiver<HotplugEvent>,
@@ -44,7 +44,7 @@ impl Bench {
         self.reported()
     }
 
-    /// Looks every 100 ms for so long; what is to be queried again, and what is reported.
+    /// Checks every 100 ms for this long; returns the number of queries and the reports.
     async fn pass(&mut self, ms: u64) -> (usize, Vec<String>) {
         let mut questions = 0;
         for _ in 0..ms / 100 {
@@ -76,13 +76,13 @@ impl Bench {
 async fn an_instance_is_reported_once_and_its_goodbye_immediately() {
     let mut bench = Bench::new(&[("phone", None)]);
     assert_eq!(bench.announced("a", &["127.0.0.1:5"]).await, ["+phone a 127.0.0.1:5"]);
-    // More of the same announcement.
+    // More addresses of the same announcement.
     assert!(bench.announced("a", &["127.0.0.2:5", "127.0.0.1:5"]).await.is_empty());
     bench.pass(1000).await;
     assert_eq!(bench.removed("a").await, ["-/lan/phone goodbye"]);
     assert!(bench.removed("a").await.is_empty());
     assert_eq!(bench.announced("a", &["127.0.0.1:5"]).await, ["+phone a 127.0.0.1:5"]);
-    // Its address is another.
+    // Its address has changed.
     assert_eq!(bench.announced("a", &["127.0.0.9:5"]).await, ["+phone a 127.0.0.9:5"]);
 }
 
@@ -92,22 +92,22 @@ async fn announced_instances_are_queried_again_and_silence_ends_the_lease() {
     bench.announced("a", &["127.0.0.1:5"]).await;
     assert_eq!(bench.pass(3000).await, (1, vec![]));
     assert_eq!(bench.pass(9000).await.0, 3, "once a lease and a pause");
-    // 12 s: asked at 0.1, 3.3, 6.5, 9.7; the last is over at 12.7.
+    // 12 s: queried at 0.1, 3.3, 6.5, 9.7; the last lease is over at 12.7.
     bench.pass(700).await;
     assert_eq!(bench.removed("a").await, ["-/lan/phone lease"]);
-    // An instance the library cannot ask for is not.
+    // An instance that the library cannot query is not queried.
     bench.announced("b.c", &["127.0.0.1:5"]).await;
     assert_eq!(bench.pass(9000).await, (0, vec![]));
 }
 
 #[tokio::test]
-async fn what_its_driver_hears_outlasts_a_lost_announcement_and_not_a_goodbye() {
+async fn data_received_by_the_driver_outlasts_a_lost_announcement_and_not_a_goodbye() {
     for goodbye in [false, true] {
         let mut bench = Bench::new(&[("phone", None)]);
         bench.now = Stamp::now().before(Duration::from_secs(10));
         let found = Found { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
         bench.service.announced("a._s._tcp.local.".into(), found, bench.now).await;
-        let Ok(HotplugEvent::Added(attachment)) = bench.reported.try_recv() else { panic!("not told") };
+        let Ok(HotplugEvent::Added(attachment)) = bench.reported.try_recv() else { panic!("not reported") };
         let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
         bench.service.wanted[0].asked = Some(bench.now);
         bench.now = bench.now.after(if goodbye { LEASE / 2 } else { LEASE });
@@ -117,13 +117,13 @@ async fn what_its_driver_hears_outlasts_a_lost_announcement_and_not_a_goodbye() 
             continue;
         }
         assert!(bench.removed("a").await.is_empty());
-        assert_eq!(bench.pass(5000).await, (0, vec![]), "nobody is there to be asked");
+        assert_eq!(bench.pass(5000).await, (0, vec![]), "nothing can be queried");
         assert_eq!(bench.pass(12_000).await.1, ["-/lan/phone lease"]);
     }
 }
 
 #[tokio::test]
-async fn each_instance_is_one_entry_and_a_named_one_the_one_of_its_name() {
+async fn each_instance_takes_one_entry_and_a_named_instance_its_own() {
     let mut bench = Bench::new(&[("left", None), ("named", Some("B")), ("right", None)]);
     assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+named b 127.0.0.1:2"], "not the first free one");
     assert_eq!(bench.announced("a", &["127.0.0.1:1"]).await, ["+left a 127.0.0.1:1"]);
@@ -133,25 +133,25 @@ async fn each_instance_is_one_entry_and_a_named_one_the_one_of_its_name() {
     assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+named b 127.0.0.1:2"]);
     assert_eq!(bench.announced("c", &["127.0.0.1:3"]).await, ["+right c 127.0.0.1:3"]);
     assert!(bench.announced("d", &["127.0.0.1:4"]).await.is_empty());
-    // A waiting one takes the place of one that left.
+    // A waiting instance takes the place of one that left.
     assert_eq!(bench.removed("a").await, ["-/lan/left goodbye", "+left d 127.0.0.1:4"]);
 }
 
 #[tokio::test]
 async fn a_link_that_was_down_for_a_moment_brings_its_device_back() {
     let folder = tempfile::tempdir().expect("a folder");
-    let state = folder.path().join("operstate");
+    let state = folder.path().join("carrier");
     let mut bench = Bench::new(&[("phone", None)]);
     bench.announced("a", &["127.0.0.1:5"]).await;
     bench.pass(200).await;
-    std::fs::write(&state, "down\n").expect("written");
-    bench.service.wanted[0].watch.lead_over(Link::of(folder.path()));
+    std::fs::write(&state, "0\n").expect("written");
+    bench.service.wanted[0].watch.lead_over(Link::of(folder.path().to_str().expect("plain text")));
     assert_eq!(bench.pass(1000).await, (0, vec!["-/lan/phone link".to_owned()]));
-    // Another's announcement is no evidence of it.
+    // Another instance's announcement is no evidence of this one.
     assert_eq!(bench.announced("b", &["127.0.0.1:6"]).await, ["+phone b 127.0.0.1:6"]);
     assert_eq!(bench.removed("b").await, ["-/lan/phone goodbye"]);
-    std::fs::write(&state, "up\n").expect("written");
-    // The library announces nothing: it is as it was. So it is asked.
+    std::fs::write(&state, "1\n").expect("written");
+    // The library reports nothing, because the announcement has not changed. So the device is queried.
     assert_eq!(bench.pass(1000).await, (1, vec!["+phone a 127.0.0.1:5".to_owned()]));
     assert_eq!(bench.removed("a").await, ["-/lan/phone goodbye"]);
 }
@@ -159,21 +159,21 @@ async fn a_link_that_was_down_for_a_moment_brings_its_device_back() {
 #[tokio::test]
 async fn an_announcement_over_another_link_counts_at_once() {
     let folder = tempfile::tempdir().expect("a folder");
-    std::fs::write(folder.path().join("operstate"), "down\n").expect("written");
+    std::fs::write(folder.path().join("carrier"), "0\n").expect("written");
     let mut bench = Bench::new(&[("phone", None)]);
     bench.announced("a", &["127.0.0.1:5"]).await;
-    bench.service.wanted[0].watch.lead_over(Link::of(folder.path()));
+    bench.service.wanted[0].watch.lead_over(Link::of(folder.path().to_str().expect("plain text")));
     assert_eq!(bench.pass(500).await.1, ["-/lan/phone link"]);
     assert_eq!(bench.announced("a", &["127.0.0.2:5"]).await, ["+phone a 127.0.0.2:5"]);
 }
 
 #[tokio::test]
-async fn an_announcement_puts_off_the_question_to_its_own_device_alone() {
+async fn an_announcement_postpones_only_the_query_to_its_own_device() {
     let mut bench = Bench::new(&[("left", None), ("right", None)]);
     bench.announced("a", &["127.0.0.1:1"]).await;
     bench.announced("b", &["127.0.0.1:2"]).await;
     assert_eq!(bench.pass(100).await.0, 2);
-    // Again and again, faster than a lease.
+    // Repeatedly, faster than a lease.
     let mut questions = 0;
     for _ in 0..10 {
         bench.announced("b", &["127.0.0.1:2"]).await;

@@ -5,11 +5,11 @@ use tokio::sync::mpsc;
 
 use super::super::super::HotplugEvent;
 use super::*;
-use crate::registry::DeviceNode;
+use crate::device::DeviceNode;
 
 const LOCAL: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
 
-/// A server that does this with each connection; its address.
+/// A server that handles each connection in this way; returns its address.
 async fn server<F: Future<Output = ()> + Send>(answer: impl Fn(TcpStream) -> F + Send + 'static) -> SocketAddr {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
@@ -60,7 +60,7 @@ async fn a_reply_is_distinguished_from_silence() {
 }
 
 #[tokio::test]
-async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
+async fn packets_of_the_device_are_received_and_the_port_is_released() {
     let port = nobody();
     let sender = UdpSocket::bind((LOCAL, 0)).await.expect("a port");
     let mut received = Box::pin(ask(Probe::Udp, port));
@@ -73,7 +73,7 @@ async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
     assert_eq!(answer, Answer::Here);
     drop(received);
     UdpSocket::bind(port).await.expect("the port is free for the driver");
-    // They are no evidence of another device.
+    // Such packets are no evidence of another device.
     let elsewhere = SocketAddr::from(([127, 0, 0, 9], nobody().port()));
     let mut received = Box::pin(ask(Probe::Udp, elsewhere));
     let answer = loop {
@@ -112,7 +112,7 @@ async fn a_refused_probe_proves_nothing_while_the_driver_holds_the_connection() 
     tokio::spawn(watch(Watch::new("cam", lease, notify), address, address, Probe::Tcp));
     let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
-    // It has a connection, and sends more seldom than it would be asked.
+    // It has a connection, and sends less often than it would be queried.
     drop(listener);
     last_received.now();
     let since = last_received.at();
@@ -130,12 +130,12 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     watch.look(begin.after(EVERY * 2)).await;
     assert!(watch.is_there(), "its driver has not begun");
-    // From the first packet on, the lease is what it is.
+    // From the first packet on, the lease has its normal length.
     last_received.now();
     watch.look(begin).await;
     watch.look(last_received.at().after(EVERY)).await;
     assert!(!watch.is_there());
-    // One that never sent is gone at last.
+    // A device that never sent is gone in the end.
     watch.found(nobody(), None, begin.after(EVERY * 20)).await;
     watch.look(begin.after(EVERY * 23)).await;
     assert!(!watch.is_there());

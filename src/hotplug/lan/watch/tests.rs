@@ -6,18 +6,18 @@ const LENGTH: Duration = Duration::from_nanos(3);
 
 #[derive(Debug, Clone, Copy)]
 enum Step {
-    /// Received from at this moment.
-    Heard(u64),
-    /// Looked at.
+    /// Something was received at this time.
+    Received(u64),
+    /// The lease is checked.
     Look(u64),
     /// Goodbye, or the link is down.
     End(u64),
 }
-use Step::{End, Heard, Look};
+use Step::{End, Look, Received};
 
 fn play(lease: &mut Lease, step: Step) -> Option<Change> {
     match step {
-        Heard(at) => lease.received(Stamp(at)),
+        Received(at) => lease.received(Stamp(at)),
         Look(at) => lease.look(Stamp(at)),
         End(at) => lease.end(Stamp(at)),
     }
@@ -27,17 +27,17 @@ fn play(lease: &mut Lease, step: Step) -> Option<Change> {
 fn a_lease_is_renewed_expires_and_restarts() {
     let table: &[(&str, &[Step], &[&str])] = &[
         ("never there", &[Look(5), End(6), Look(100)], &[]),
-        ("there, once", &[Heard(1), Heard(2), Heard(2)], &["came"]),
-        ("held while it is heard of", &[Heard(1), Look(3), Heard(3), Look(5)], &["came"]),
-        ("over at its end, once", &[Heard(1), Look(4), Look(9)], &["came", "went"]),
-        ("an older answer does not shorten it", &[Heard(5), Heard(2), Look(7)], &["came"]),
-        ("a goodbye ends it at once", &[Heard(1), End(2), Look(9)], &["came", "went"]),
+        ("there, once", &[Received(1), Received(2), Received(2)], &["came"]),
+        ("held while answers arrive", &[Received(1), Look(3), Received(3), Look(5)], &["came"]),
+        ("over at its end, once", &[Received(1), Look(4), Look(9)], &["came", "went"]),
+        ("an older answer does not shorten it", &[Received(5), Received(2), Look(7)], &["came"]),
+        ("a goodbye ends it at once", &[Received(1), End(2), Look(9)], &["came", "went"]),
         (
-            "an answer from before the goodbye says nothing",
-            &[Heard(1), End(4), Heard(3), Heard(5)],
+            "an answer from before the goodbye is ignored",
+            &[Received(1), End(4), Received(3), Received(5)],
             &["came", "went", "came"],
         ),
-        ("and again", &[Heard(1), Look(9), Heard(10), Look(13)], &["came", "went", "came", "went"]),
+        ("and again", &[Received(1), Look(9), Received(10), Look(13)], &["came", "went", "came", "went"]),
     ];
     for (name, steps, expected) in table {
         let mut lease = Lease::new(LENGTH);
@@ -54,7 +54,7 @@ proptest! {
         let (mut now, mut received, mut there) = (1, 0, false);
         for (later, kind) in steps {
             now += later;
-            let change = play(&mut lease, [Heard(now), Look(now), End(now)][usize::from(kind)]);
+            let change = play(&mut lease, [Received(now), Look(now), End(now)][usize::from(kind)]);
             if kind == 0 && (there || change.is_some()) {
                 received = now;
             }

@@ -1,13 +1,13 @@
-//! Storms of hot-plug events, stream reports and time against the core; its invariants are checked after each step.
+//! Random hot-plug events, stream reports and time against the core; its invariants are checked after each step.
 //!
-//! A seed decides all of a storm. A failing seed is printed with the command that plays it again, step by step:
+//! A seed determines a whole run. A failing seed is printed with the command that replays it step by step:
 //! `RAPID_SEED=17 cargo test --workspace --lib rig::core::tests::simulator -- --nocapture`
 
 use std::path::PathBuf;
 
 use super::super::*;
+use crate::device::{DeviceNode, UsbIdentity};
 use crate::random::Random;
-use crate::registry::{DeviceNode, UsbIdentity};
 
 const SEEDS: u64 = 1000;
 const STEPS: u64 = 1000;
@@ -53,28 +53,28 @@ const REGISTRY: &str = r#"
     [device.both_tty.tty]
     channels = 1
 "#;
-/// Where the two interchangeable entries stand.
+/// Indices of the two interchangeable entries.
 const POOL: [usize; 2] = [2, 3];
-/// Models and serial numbers of the units: three for the two interchangeable entries, one that no entry means.
+/// Models and serial numbers of the units: three for the two interchangeable entries, one that no entry matches.
 const UNITS: [(u16, Option<&str>); 7] =
     [(1, Some("A")), (1, None), (2, None), (2, Some("x")), (2, Some("x")), (3, Some("C")), (9, None)];
 /// Hub and port.
 const PORTS: [(&str, &str); 5] = [("1", "1-1"), ("1", "1-2"), ("1", "1-9"), ("2", "2-1"), ("2", "2-2")];
 
-/// What the effects of one modality add up to.
+/// The accumulated effects on one modality.
 #[derive(Debug)]
 struct Model {
     id: ModalityId,
     state: SlotState,
     running: Option<Epoch>,
     newest: Epoch,
-    /// The newest announcement was of an attachment.
+    /// The newest announcement was an attachment.
     is_announced: bool,
     is_plugged: bool,
     absent_since: Option<Stamp>,
 }
 
-/// What the storms reached, so that they cannot pass by doing nothing.
+/// What the runs reached, so that they cannot pass by doing nothing.
 #[derive(Debug, Default)]
 struct Reached {
     starts: u64,
@@ -93,7 +93,7 @@ struct Storm {
     models: Vec<Model>,
     /// Which unit is in each port.
     ports: [Option<usize>; PORTS.len()],
-    /// Events that are on their way.
+    /// Events in transit.
     pending: Vec<HotplugEvent>,
     reached: Reached,
     is_shown: bool,
@@ -157,7 +157,7 @@ impl Storm {
         }
     }
 
-    /// The whole storm, and the calm after it; on failure the step and what is wrong.
+    /// The whole run and the calm phase after it; on failure the step and the violation.
     fn play(&mut self) -> Result<(), (u64, String)> {
         for step in 0..STEPS {
             self.pass_time();
@@ -198,7 +198,7 @@ impl Storm {
         usize::try_from(self.random.below(count as u64)).unwrap_or(0)
     }
 
-    /// Time passes evenly, to a deadline, in a jump, or backwards.
+    /// Time advances evenly, to a deadline, in a jump, or backwards.
     fn pass_time(&mut self) {
         self.now = match self.random.below(100) {
             0..3 => self.now.before(Duration::from_millis(self.random.below(50))),
@@ -224,7 +224,7 @@ impl Storm {
             _ => {}
         }
         if !self.pending.is_empty() && (kind < 26 || self.one_in(4)) {
-            // Mostly in their order.
+            // Mostly in order.
             let index = if self.one_in(4) { self.pick(self.pending.len()) } else { 0 };
             return Input::Hotplug(self.pending.remove(index));
         }
@@ -237,13 +237,13 @@ impl Storm {
 
     fn any_id(&mut self) -> ModalityId {
         let index = self.pick(self.models.len() + 1);
-        // One that no entry has.
+        // A modality that no entry has.
         self.models.get(index).map_or(ModalityId::new(50).expect("below 64"), |model| model.id)
     }
 
     fn plug(&mut self) {
         let (unit, port) = (self.pick(UNITS.len()), self.pick(PORTS.len()));
-        // Whatever was in that port, and the port the unit was in: their removals are missed.
+        // The removals of the unit in that port, and of this unit from its previous port, are missed.
         for (other, plugged) in self.ports.iter_mut().enumerate() {
             *plugged = if other == port { Some(unit) } else { plugged.filter(|plugged| *plugged != unit) };
         }
@@ -261,7 +261,7 @@ impl Storm {
         self.send(removed(&path, source, self.now));
     }
 
-    /// An event may be lost, or come twice.
+    /// An event may be lost or duplicated.
     fn send(&mut self, event: HotplugEvent) {
         match self.random.below(10) {
             0 => {}
@@ -270,7 +270,7 @@ impl Storm {
         }
     }
 
-    /// What the running stream reports, or one that ended long ago.
+    /// A report of the running stream, or of one that ended long ago.
     fn stream(&mut self) -> Input {
         let id = self.any_id();
         let model = self.models.iter().find(|model| model.id == id);
@@ -303,7 +303,7 @@ impl Storm {
         self.check_state(input)
     }
 
-    /// What this input may change at all. The models are still those before the step.
+    /// What this input may change at all. The models still hold the state before the step.
     fn check_input(&self, input: &Input, before: PhysicalMask) -> Result<(), String> {
         let set = self.core.mask().0 & !before.0;
         let mut allowed = 0;
@@ -321,7 +321,7 @@ impl Storm {
         ensure(set & !allowed == 0, || format!("{input:?} sets bits {set:#x}"))
     }
 
-    /// The effects in their order, one after the other.
+    /// Checks the effects in order.
     fn check_effects(&mut self, before: PhysicalMask) -> Result<(), String> {
         let mask = self.core.mask();
         let publishes = matches!(self.effects.first(), Some(Effect::Publish(published)) if *published == mask);
@@ -371,7 +371,7 @@ impl Storm {
             ensure(attached.is_some() || state == SlotState::Absent, || format!("{id} is {state:?}, not attached"))?;
             ensure(attached.is_some() == model.is_plugged, || format!("hooks of {id}: {model:?}"))?;
             ensure(attached.is_some() || !model.is_announced, || format!("{id} was not announced as detached"))?;
-            // Whatever waits is woken.
+            // Every waiting state has a deadline.
             let waits = state == SlotState::Backoff || state == SlotState::Absent && attached.is_some();
             let deadline = lane.slot.deadline();
             ensure(waits == deadline.is_some(), || format!("{id} is {state:?} with deadline {deadline:?}"))?;
@@ -457,7 +457,7 @@ fn removed(path: &str, source: UnplugSource, noticed: Stamp) -> HotplugEvent {
     HotplugEvent::Removed { syspath: PathBuf::from(path), noticed, source }
 }
 
-/// The nodes of a unit in a port: a camera, and of the unit with two nodes a serial line beside it.
+/// The nodes of a unit in a port: a camera, and for the unit with two nodes a serial line as well.
 fn attachments(unit: usize, port: usize) -> Vec<Attachment> {
     let ((model, serial), (hub, port)) = (UNITS[unit], PORTS[port]);
     let usb = UsbIdentity {

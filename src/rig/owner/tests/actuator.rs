@@ -1,4 +1,4 @@
-//! An actuator: simulated motors, which are armed by an order alone.
+//! An actuator: simulated motors, which only an order arms.
 
 use super::*;
 use crate::registry::{
@@ -54,7 +54,7 @@ const UP_DISARMED: [&str; 3] = ["a at 1", "a opening", "a streaming"];
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_arm_at_the_start_is_given_once() {
     let again = ["a at 1", "a backoff", "a opening", "a streaming"];
-    // A disarm, to learn that nothing armed it before.
+    // A disarm order, to show that nothing armed it before.
     let end = [Give(Order::Disarm), Until("a disarmed")];
     let plug = || [Plug("1", NUMBERS), Until("a streaming")];
     let replugged = || [Removed("1", UnplugSource::Kernel), Until("a absent")].into_iter().chain(plug());
@@ -62,7 +62,7 @@ async fn an_arm_at_the_start_is_given_once() {
         ("at the first plug", true, plug().into(), [&UP[..], &["a disarmed"]].concat()),
         ("without it, never", false, plug().into(), [&UP_DISARMED[..], &["a disarmed"]].concat()),
         (
-            "not after a replug, before which it is told to be disarmed",
+            "not after a replug, before which it is reported as disarmed",
             true,
             plug().into_iter().chain(replugged()).collect(),
             [&UP[..], &["a gone kernel", "a disarmed", "a absent"], &again, &["a disarmed"]].concat(),

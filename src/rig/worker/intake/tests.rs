@@ -19,7 +19,7 @@ fn complaint(kind: ModalityKind, shape: &[u32], header: SampleHeader, payload: &
     assert_eq!(intake.judge(&header, payload, NOW), None);
     let complaint = intake.complaint().expect("a complaint");
     assert_eq!(intake.judge(&header, payload, NOW), None);
-    assert_eq!(intake.complaint(), None, "said once");
+    assert_eq!(intake.complaint(), None, "reported once");
     complaint.strip_prefix("samples are refused: ").expect("a refusal").to_owned()
 }
 
@@ -74,7 +74,7 @@ fn samples_that_match_the_entry_are_forwarded() {
 }
 
 #[test]
-fn a_time_that_cannot_be_is_replaced() {
+fn an_impossible_time_is_replaced() {
     let mut intake = intake(ModalityKind::Bytes, &[]);
     let mut captured = |capture_ns, now| {
         let header = SampleHeader { capture_ns, flags: FLAG_DEVICE_TIME, ..header(Encoding::Bytes) };
@@ -85,13 +85,13 @@ fn a_time_that_cannot_be_is_replaced() {
     assert_eq!(captured(0, 100 * s), (100 * s, false, false), "not known");
     assert_eq!(captured(101 * s, 102 * s), (101 * s, true, false));
     assert_eq!(captured(u64::MAX, 103 * s), (103 * s, false, true), "the far future");
-    assert_eq!(captured(104 * s + 1, 104 * s), (104 * s, false, false), "said once");
+    assert_eq!(captured(104 * s + 1, 104 * s), (104 * s, false, false), "reported once");
     assert_eq!(captured(1, 105 * s), (105 * s, false, false), "long ago");
     assert_eq!(captured(104 * s, 106 * s), (105 * s, true, false), "never back");
 }
 
 #[test]
-fn holes_are_counted_and_jumps_are_not() {
+fn gaps_are_counted_and_jumps_are_not() {
     let mut intake = intake(ModalityKind::Bytes, &[]);
     let mut lost = |seq| {
         let header = SampleHeader { seq, ..header(Encoding::Bytes) };
@@ -103,7 +103,7 @@ fn holes_are_counted_and_jumps_are_not() {
 
 proptest! {
     #[test]
-    fn no_header_gets_a_number_through_that_cannot_be(
+    fn no_header_passes_an_impossible_number(
         words: [u64; 4], fields: [u32; 6], valid: bool, bytes in 0..64_usize, kind in 0..3_usize, now: u64,
     ) {
         let kinds = [

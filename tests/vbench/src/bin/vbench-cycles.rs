@@ -1,6 +1,6 @@
-//! `vbench-cycles [N] [--json]`: pulls and replugs a camera N times while `rapid` records, and gives figures: how soon the mask
-//! and the data follow, and how evenly the mask is published. Beside each stands the same of the plainest program there can
-//! be, in the same guest. A benchmark: it asserts nothing about its figures.
+//! `vbench-cycles [N] [--json]`: unplugs and replugs a camera N times while `rapid` records, and measures how soon the
+//! mask and the data follow, and how evenly the mask is published; each figure next to that of the simplest possible
+//! program in the same guest. A benchmark: it asserts nothing about its figures.
 
 use std::process::ExitCode;
 use std::time::Duration;
@@ -38,10 +38,10 @@ format = "MJPG"
 const IDLE_MS: u64 = 10_000;
 /// Recording after the last plug.
 const MARGIN_MS: u64 = 4_000;
-/// Longer than the cooldown, less what the kernel takes to make a node: so that none applies.
+/// Longer than the cooldown minus the time the kernel takes to create a node, so that no cooldown applies.
 const OUT_MS: u64 = 2_200;
 const IN_MS: u64 = 1_800;
-/// The plain program knows no cooldown.
+/// The simple program has no cooldown.
 const PLAIN_OUT_MS: u64 = 600;
 const PLAIN_IN_MS: u64 = 1_800;
 const USAGE: &str = "usage: vbench-cycles [CYCLES] [--json]   (50 cycles by default)";
@@ -136,7 +136,7 @@ exit 0
         Scenario::new("cycles").device(camera).registry(REGISTRY).script(&script).limit(limit)
     }
 
-    /// The emulator's commands: two a cycle, the second `between_ms` after the first, the next cycle `rest_ms` later.
+    /// The emulator's commands: two per cycle, the second `between_ms` after the first, the next cycle `rest_ms` later.
     fn timeline(&self, start_ms: u64, between_ms: u64, rest_ms: u64, [first, second]: [&str; 2]) -> String {
         let cycle = |number: u64| {
             let at = start_ms + number * (between_ms + rest_ms);
@@ -146,11 +146,11 @@ exit 0
     }
 }
 
-/// What all witnesses saw, on CLOCK_MONOTONIC, ns, in order.
+/// The records of all observers, on CLOCK_MONOTONIC, ns, in order.
 struct Seen {
     unplugs: Vec<u64>,
     plugs: Vec<u64>,
-    /// Those of the plain program's part.
+    /// Those of the simple program's part.
     plain_plugs: Vec<u64>,
     bit_cleared: Vec<u64>,
     bit_set: Vec<u64>,
@@ -170,7 +170,7 @@ impl Seen {
         let episode = outcome.episode()?;
         let starts: Vec<Moment> = outcome.origins();
         let [start, plain_start] = starts[..] else { return Err("the timeline has not two starts".into()) };
-        // Both clocks were read at the same moment, and the guest's is never set.
+        // Both clocks were read at the same moment, and the guest's wall clock is never set.
         let shift = start.real_ns - start.mono_ns;
         let within = |time: &u64| (start.mono_ns..plain_start.mono_ns).contains(time);
         let acts =
@@ -342,7 +342,7 @@ impl Seen {
         all
     }
 
-    /// The first of `moments` after each plug and before the next.
+    /// The first of `moments` after each plug and before the next plug.
     fn firsts(&self, moments: &[u64]) -> Vec<u64> {
         let ends = self.plugs.iter().skip(1).copied().chain([u64::MAX]);
         let within = |(plug, end): (&u64, u64)| moments.iter().copied().find(|moment| (*plug..end).contains(moment));
@@ -351,7 +351,7 @@ impl Seen {
 
     fn uevents(&self, by: &str, event: &str, subsystem: &str) -> Vec<u64> {
         let wanted = |line: &&Value| {
-            // udev names which of a camera's nodes captures; it is the first that the kernel makes.
+            // udev identifies which of a camera's nodes captures; it is the first that the kernel creates.
             line["by"] == by
                 && line["event"] == event
                 && line["subsystem"] == subsystem
@@ -361,7 +361,7 @@ impl Seen {
     }
 }
 
-/// When the sampler saw bit 0 take this value.
+/// When the sampler saw bit 0 change to this value.
 fn bit(outcome: &Outcome, set: bool) -> Vec<u64> {
     let is_set = |line: &Value| {
         let mask = line["mask"].as_str().and_then(|mask| u64::from_str_radix(mask.trim_start_matches("0x"), 16).ok());

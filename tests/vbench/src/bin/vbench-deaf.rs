@@ -1,6 +1,6 @@
-//! `vbench-deaf [--json]`: the longest silence of the mask while nothing happens, while a program that ends promptly loses its
-//! device, while a deaf one does, and beside programs that crash and that flood their stderr. A benchmark: it prints figures
-//! and asserts nothing about them.
+//! `vbench-deaf [--json]`: the longest silence of the mask while nothing happens, while a program that ends promptly
+//! loses its device, while one that ignores SIGTERM does, and beside programs that crash and that flood their stderr. A
+//! benchmark: it prints figures and asserts nothing about them.
 
 use std::process::ExitCode;
 

@@ -1,8 +1,8 @@
-//! `vbench-sweep [9|1] [--json]`: the ablation of the paper's table, three fingers times three sets of modalities, or the first
-//! of the nine configurations alone, which shows that it works. First each is put
-//! together by plugging while one `rapid` records, and nothing else is done; then each is recorded as an episode by the command
-//! that `rapid ablation` gives, until it reports that none is missing. Gives the time that the software takes in each. A
-//! benchmark: it asserts nothing about its figures.
+//! `vbench-sweep [9|1] [--json]`: the ablation of the paper's table, three fingers times three sets of modalities, or
+//! only the first of the nine configurations, which shows that the tool works. First each is assembled by plugging
+//! while one `rapid` records; then each is recorded as an episode by the command that `rapid ablation` prints, until it
+//! reports that none is missing. Measures the time that the software takes in each. A benchmark: it asserts nothing
+//! about its figures.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -18,16 +18,16 @@ use vbench::outcome::{Outcome, json_lines};
 use vbench::recording::Recording;
 use vbench::scenario::Scenario;
 
-/// Software time wanted of one reconfiguration, from the plug on.
+/// Target for the software time of one reconfiguration, from the plug on.
 const TARGET_MS: f64 = 1_500.0;
 const PAPER: &str = "the paper's table, hands included: some 72 min without its system, some 45 s with it";
 const CAMERA: &str = "/rapid/camera/wrist";
 const TACTILE: &str = "/rapid/tactile/tip";
 const MOTORS: &str = "/rapid/motors";
 const FINGERS: [&str; 3] = ["rigid", "finray", "silicone"];
-/// By their numbers in the emulator.
+/// Indexed by their numbers in the emulator.
 const ENTRIES: [&str; 3] = ["cam_wrist", "motors", "tactile_tip"];
-/// As `rapid ablation` has them.
+/// As defined in `rapid ablation`.
 const SETS: [Set; 3] = [
     ("vision", &[0], &[CAMERA]),
     ("vision+motors", &[0, 1], &[CAMERA, MOTORS]),
@@ -37,15 +37,15 @@ const BUS: &str = r#"protocol = "damiao"
 silent_after = "400ms"
 timeout = "600ms"
 motors = [{ name = "grip", slave = 0x05, master = 0x15, type = "DM4310", mode = "position", position = [-1.0, 1.0] }]"#;
-/// A configuration is left alone for this long: in this guest looking is what takes time.
+/// A configuration is left alone for this long: in this guest checking takes most of the time.
 const SETTLE_S: u32 = 5;
-/// Between two configurations: longer than the cooldown of an entry, and less than any hand takes.
+/// Pause between two configurations: longer than the cooldown of an entry, and shorter than any manual change.
 const HANDS_S: u32 = 3;
 const USAGE: &str = "usage: vbench-sweep [9|1] [--json]";
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Every finger with every set, in the order of `rapid ablation`: the sets of one finger follow one another.
+/// Every finger with every set, in the order of `rapid ablation`: the sets of one finger are consecutive.
 #[derive(Clone, Copy)]
 struct Plan {
     fingers: &'static [&'static str],
@@ -79,7 +79,7 @@ impl Plan {
         self.sets[place % self.sets.len()]
     }
 
-    /// How often the configurations before this one had the device.
+    /// How many of the configurations before this one had the device.
     fn nth(&self, place: usize, device: usize) -> usize {
         (0..place).filter(|before| self.set(*before).1.contains(&device)).count()
     }
@@ -191,7 +191,7 @@ exit 0
         .limit(Duration::from_secs(600))
 }
 
-/// The part of the script that puts each configuration together once, the fingers outside.
+/// The part of the script that assembles each configuration once; the outer loop is over the fingers.
 fn calls(plan: Plan) -> String {
     let mut script = String::new();
     for place in 0..plan.configurations() {
@@ -253,15 +253,15 @@ fn figures(plan: Plan, outcome: &Outcome) -> Result<Vec<Figure>, Failure> {
     Ok(figures)
 }
 
-/// From the last plug of a configuration, ms.
+/// Times from the last plug of a configuration, ms.
 struct Plugged {
-    /// To the last node that udev has made ready to be opened.
+    /// To the last node that udev has made ready for opening.
     nodes_ms: f64,
     /// To the first sample of the slowest modality.
     all_ms: f64,
 }
 
-/// When udev was done with a camera or a network interface that came, ns of the wall clock.
+/// When udev was done with an added camera or network interface, ns of the wall clock.
 fn nodes(outcome: &Outcome) -> Vec<u64> {
     let is_ready = |line: &serde_json::Value| {
         let is_node = line["subsystem"] == "net" || line["captures"] == true;
@@ -288,7 +288,7 @@ fn plugged(
         let received = episode.topic(topic).map(|message| message.publish_time);
         received.filter(|received| *received >= plug).min()
     };
-    // What came after it was taken apart is not of this one.
+    // Events after it was taken apart do not belong to this configuration.
     let limit = moments("unplug").into_iter().min().ok_or("an unplug is missing")?;
     let last = topics.iter().map(first).max().flatten().filter(|last| *last < limit);
     let all = topics.iter().all(|topic| first(topic).is_some());
@@ -298,7 +298,7 @@ fn plugged(
     Ok(Plugged { nodes_ms: ms(ready, plug), all_ms: ms(last, plug) })
 }
 
-/// From the command of an episode to the first sample of its slowest modality, ms.
+/// Time from the command of an episode to the first sample of its slowest modality, ms.
 fn started(plan: Plan, outcome: &Outcome, place: usize, file: &Path) -> Result<f64, Failure> {
     let word = format!("command-{}", place + 1);
     let line = outcome.emu.iter().find(|line| line["action"] == "say" && line["word"] == word.as_str());

@@ -1,7 +1,7 @@
-//! What happens while a device is plugged: the thread that answers the host, and the thread that keeps the beat.
+//! An attached device: the thread that answers the host, and the thread that sends on the device's clock.
 //!
-//! Invariant: one mutex per device guards function, transfers and socket; it is never held while waiting for the clock or the host.
-//! Invariant: a beat that comes late or finds no reader is skipped, not caught up: a camera does not deliver the past.
+//! Invariant: one mutex per device guards function, transfers and socket; nothing waits for clock or host holding it.
+//! Invariant: a tick that is late or finds no reader is skipped, not caught up: a camera does not deliver the past.
 
 use std::collections::VecDeque;
 use std::io::{Read, Write};
@@ -30,14 +30,14 @@ pub(super) struct Shared {
 pub(super) struct State {
     pub(super) function: Function,
     pub(super) line: Option<UnixStream>,
-    /// Counts attachments: a thread of an older one that wakes late finds another number and ends.
+    /// Counts attachments: a thread of an older one that wakes late sees another number and ends.
     pub(super) epoch: u32,
     /// Transfers to the host that wait for data, by endpoint.
     pub(super) waiting: [VecDeque<Waiting>; 16],
     pub(super) silent: bool,
-    /// When a device that is spoken with is looked after next, ns of CLOCK_MONOTONIC.
+    /// When a device with a protocol is due next, ns of CLOCK_MONOTONIC.
     pub(super) due_ns: u64,
-    /// The emulator has no more use for it.
+    /// The emulator no longer needs it.
     pub(super) ended: bool,
     pub(super) sent: u64,
     skipped: u64,
@@ -71,7 +71,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
     }
 
-    /// Forgets this attachment, unless another has followed it, and lets its threads end.
+    /// Drops this attachment, unless another has followed it, and lets its threads end.
     pub(super) fn hang_up(&self, epoch: u32) {
         let mut state = self.lock();
         if state.epoch != epoch {
@@ -86,7 +86,7 @@ impl Shared {
         self.changed.notify_all();
     }
 
-    /// Answers the host until the line ends.
+    /// Answers the host until the connection ends.
     pub(super) fn serve(&self, mut line: UnixStream, epoch: u32) {
         let mut data = Vec::new();
         let mut header = [0; HEADER_LEN];
@@ -95,7 +95,7 @@ impl Shared {
                 Ok(request) => request,
                 Err(error) => {
                     let fields = json!({"device": self.index, "error": error.to_string()});
-                    self.log.say("protocol_error", Moment::now(), fields);
+                    self.log.write("protocol_error", Moment::now(), fields);
                     break;
                 }
             };
@@ -111,7 +111,7 @@ impl Shared {
         self.hang_up(epoch);
         let state = self.lock();
         let fields = json!({"device": self.index, "sent": state.sent, "skipped": state.skipped});
-        self.log.say("gone", Moment::now(), fields);
+        self.log.write("gone", Moment::now(), fields);
     }
 
     fn answer(&self, request: Request, data: &[u8]) {
@@ -138,7 +138,7 @@ impl Shared {
                 if before != after {
                     let action = if after.is_some() { "stream_on" } else { "stream_off" };
                     let fields = json!({"device": self.index, "sent": state.sent, "skipped": state.skipped});
-                    self.log.say(action, Moment::now(), fields);
+                    self.log.write(action, Moment::now(), fields);
                 }
             }
             Request::Submit(Submit { seq, is_in: true, endpoint, length, .. }) => {
@@ -147,7 +147,7 @@ impl Shared {
             Request::Submit(submit) => {
                 state.write(&wire::submit_reply(submit.seq, Status::Ok, data.len()));
                 if let Some(talker) = state.function.talker() {
-                    talker.hear(data, now.mono_ns);
+                    talker.receive(data, now.mono_ns);
                 }
             }
         }
@@ -158,7 +158,7 @@ impl Shared {
         self.changed.notify_all();
     }
 
-    /// Sends a frame or line at every beat until the line ends.
+    /// Sends a frame or line at every tick until the connection ends.
     pub(super) fn beat(&self, epoch: u32) {
         let mut whole = Vec::new();
         let mut due_ns = 0;
@@ -190,7 +190,7 @@ impl Shared {
         }
     }
 
-    /// Sends `whole` packet by packet as the host asks for them; gives up when the stream or the line ends.
+    /// Sends `whole` packet by packet as the host requests them; gives up when the stream or the connection ends.
     fn send<'a>(
         &'a self,
         mut state: MutexGuard<'a, State>,
@@ -247,7 +247,7 @@ impl State {
         self.write(&[&header[..], data].concat());
     }
 
-    /// A write that fails means that the line has ended, which `serve` sees as well.
+    /// A failed write means that the connection has ended, which `serve` notices as well.
     pub(super) fn write(&mut self, bytes: &[u8]) {
         if let Some(line) = &mut self.line {
             let _ended = line.write_all(bytes);

@@ -1,6 +1,6 @@
-//! USB descriptors and the setup packet: what every kind of device shares.
+//! USB descriptors and the setup packet: the parts that every kind of device shares.
 //!
-//! Invariant: `wTotalLength` and `bNumInterfaces` are counted from the bytes, never written down.
+//! Invariant: `wTotalLength` and `bNumInterfaces` are computed from the bytes, never written by hand.
 
 use super::spec::Identity;
 
@@ -39,12 +39,12 @@ impl Setup {
         Self { kind: bytes[0], request: bytes[1], value: word(2), index: word(4), length: word(6) }
     }
 
-    /// Data flow to the host.
+    /// Whether data flows to the host.
     pub fn is_in(self) -> bool {
         self.kind & 0x80 != 0
     }
 
-    /// One of chapter 9's requests, as opposed to a class's or vendor's.
+    /// Whether it is one of chapter 9's requests, as opposed to a class's or vendor's.
     pub fn is_standard(self) -> bool {
         self.kind & 0x60 == 0
     }
@@ -53,7 +53,7 @@ impl Setup {
 /// A device's answer to a control request.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Answer {
-    /// Data to the host, cut to what it asked for.
+    /// Data to the host, truncated to the requested length.
     Data(Vec<u8>),
     /// Accepted.
     Done,
@@ -112,7 +112,7 @@ pub fn string(identity: &Identity, index: u8) -> Option<Vec<u8>> {
 
 /// A string descriptor.
 pub fn text(text: &str) -> Vec<u8> {
-    // bLength is one byte: 126 UTF-16 units at most.
+    // bLength is one byte: at most 126 UTF-16 units.
     let units: Vec<u8> = text.encode_utf16().take(126).flat_map(u16::to_le_bytes).collect();
     let length = u8::try_from(units.len() + 2).expect("126 units fit a byte");
     [&[length, STRING], &units[..]].concat()
@@ -150,18 +150,18 @@ impl Configuration {
         self.push(&[5, address, 2, low, high, 0])
     }
 
-    /// Appends a descriptor of this configuration built elsewhere, lengths included.
+    /// Appends descriptors of this configuration that were built elsewhere, lengths included.
     pub fn append(&mut self, descriptors: &[u8]) -> &mut Self {
         self.body.extend_from_slice(descriptors);
         self
     }
 
-    /// The descriptors alone, for a part that is appended elsewhere.
+    /// Only the descriptors, for a part that is appended elsewhere.
     pub fn into_body(self) -> Vec<u8> {
         self.body
     }
 
-    /// The whole configuration descriptor.
+    /// The complete configuration descriptor.
     pub fn finish(&self) -> Vec<u8> {
         let interfaces = walk(&self.body).filter(|d| d[1] == INTERFACE && d[3] == 0).count();
         let total = u16::try_from(self.body.len() + 9).expect("configurations stay far below 64 KiB").to_le_bytes();
@@ -171,7 +171,7 @@ impl Configuration {
     }
 }
 
-/// The descriptors in a byte string, one by one; stops at one that does not fit.
+/// Iterates over the descriptors in a byte string; stops at one that does not fit.
 pub fn walk(mut bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
     std::iter::from_fn(move || {
         let length = usize::from(*bytes.first()?);

@@ -1,4 +1,4 @@
-//! A device and its port: plugging and unplugging, as the kernel's `vhci_hcd` is notified of it.
+//! A device and its port: plugging and unplugging, by notifying the kernel's `vhci_hcd`.
 
 use std::fs::OpenOptions;
 use std::io::{self, Write};
@@ -22,7 +22,7 @@ const VHCI: &str = "/sys/devices/platform/vhci_hcd.0";
 /// A port answers EBUSY until the kernel has finished with the device that left it.
 const PORT_FREE_WITHIN: Duration = Duration::from_mins(1);
 const HIGH_SPEED: u32 = 3;
-/// Room for a large frame, so that sending never waits for the kernel to fetch the first half.
+/// Space for a large frame, so that sending never waits for the kernel to fetch the first half.
 const SOCKET_BUFFER: usize = 1 << 20;
 
 /// Why a device could not be plugged or unplugged.
@@ -34,7 +34,7 @@ pub enum PortError {
     /// It is not plugged.
     #[error("not plugged")]
     Unplugged,
-    /// Such a thing cannot happen to it.
+    /// The order does not apply to it.
     #[error("it has no such part")]
     Order,
     /// No socket pair.
@@ -78,18 +78,18 @@ impl Device {
         self.next_port = port;
     }
 
-    /// A silent device stays attached and sends nothing.
+    /// Makes it silent: it stays attached and sends nothing.
     pub fn set_silent(&self, silent: bool) {
         self.shared.lock().silent = silent;
         self.shared.changed.notify_all();
     }
 
-    /// Something happens to it, or to a motor behind it.
-    pub fn befall(&self, motor: Option<u16>, order: Order) -> Result<(), PortError> {
-        if self.shared.befall(motor, order) { Ok(()) } else { Err(PortError::Order) }
+    /// Applies an order to it, or to a motor behind it.
+    pub fn apply(&self, motor: Option<u16>, order: Order) -> Result<(), PortError> {
+        if self.shared.apply(motor, order) { Ok(()) } else { Err(PortError::Order) }
     }
 
-    /// Plugs it in. The moment that is logged is the one right before the kernel was notified.
+    /// Plugs it in. The logged time is the one right before the kernel was notified.
     pub fn plug(&mut self) -> Result<(), PortError> {
         if let Some(port) = self.plugged {
             return Err(PortError::Plugged(port));
@@ -114,7 +114,7 @@ impl Device {
             thread::spawn(move || beating.beat(epoch));
         }
 
-        // devid is bus and device number of the exporting side; nothing reads it here, it must only be unique.
+        // devid is bus and device number of the exporting side; nothing uses it here, but it must be unique.
         let text = format!("{} {} {} {HIGH_SPEED}", self.next_port, kernels.as_raw_fd(), (1 << 16) | (self.index + 2));
         let give_up = Instant::now() + PORT_FREE_WITHIN;
         let mut tries = 0;
@@ -133,22 +133,22 @@ impl Device {
             }
         };
         self.plugged = Some(self.next_port);
-        self.shared.log.say("plug", moment, json!({"device": self.index, "port": self.next_port, "tries": tries}));
+        self.shared.log.write("plug", moment, json!({"device": self.index, "port": self.next_port, "tries": tries}));
         Ok(())
     }
 
-    /// Pulls it out: the kernel learns of it as of a cable that is gone.
+    /// Unplugs it: to the kernel, the cable is gone.
     pub fn unplug(&mut self) -> Result<(), PortError> {
         let port = self.plugged.take().ok_or(PortError::Unplugged)?;
         let moment = Moment::now();
         let reported = tell_vhci("detach", &port.to_string());
-        self.shared.log.say("unplug", moment, json!({"device": self.index, "port": port}));
+        self.shared.log.write("unplug", moment, json!({"device": self.index, "port": port}));
         reported.map_err(|source| PortError::Vhci { file: "detach", text: port.to_string(), source })
     }
 
-    /// Waits until the kernel has let go of the device that was in the port. A hub disables a port that loses its device, so
-    /// that the kernel cannot take the next one for it; `vhci_hcd` leaves the port enabled, and a device that returns before
-    /// the kernel's hub thread has looked is taken for the one that left, with the settings of that one.
+    /// Waits until the kernel has released the device that was in the port. A hub disables a port that loses its
+    /// device, so that the kernel cannot confuse it with the next one; `vhci_hcd` leaves the port enabled, and a device
+    /// that returns before the kernel's hub thread has run is taken for the one that left, with that one's settings.
     fn await_forgotten(&self) {
         let give_up = Instant::now() + PORT_FREE_WITHIN;
         while kernels_device(self.next_port).exists() && Instant::now() < give_up {
@@ -156,7 +156,7 @@ impl Device {
         }
     }
 
-    /// Waits until the threads of the last attachment have let go; cuts the line when the kernel has not.
+    /// Waits until the threads of the last attachment have ended; closes the connection if the kernel has not.
     fn await_free(&self) {
         let free = |state: &mut State| state.line.is_some();
         let (state, timeout) = self
@@ -179,13 +179,13 @@ impl Drop for Device {
     }
 }
 
-/// Pulls everything that is plugged, as fast as the kernel can be notified; which devices these were.
+/// Unplugs everything that is plugged in, as fast as the kernel can be notified; returns which devices these were.
 pub fn unplug_together(devices: &mut [Device]) -> Result<Vec<usize>, PortError> {
     let reported = |text: &str, source| PortError::Vhci { file: "detach", text: text.into(), source };
     let mut detach =
         OpenOptions::new().write(true).open(format!("{VHCI}/detach")).map_err(|error| reported("", error))?;
     let mut pulled = Vec::new();
-    // Nothing is logged before the last one is out.
+    // Nothing is logged before the last one is unplugged.
     for device in devices.iter_mut() {
         let Some(port) = device.plugged.take() else { continue };
         let moment = Moment::now();
@@ -193,12 +193,12 @@ pub fn unplug_together(devices: &mut [Device]) -> Result<Vec<usize>, PortError> 
         pulled.push((device.index, port, moment));
     }
     for (index, port, moment) in &pulled {
-        devices[*index].shared.log.say("unplug", *moment, json!({"device": index, "port": port}));
+        devices[*index].shared.log.write("unplug", *moment, json!({"device": index, "port": port}));
     }
     Ok(pulled.into_iter().map(|(index, ..)| index).collect())
 }
 
-/// What the kernel shows of the device in a port, as long as it knows one there. `vhci_hcd.0` is the machine's only USB 2 bus.
+/// The kernel's sysfs entry for the device in a port, if any. `vhci_hcd.0` is the machine's only USB 2 bus.
 fn kernels_device(port: u8) -> PathBuf {
     PathBuf::from(format!("/sys/bus/usb/devices/1-{}", port + 1))
 }

@@ -1,9 +1,9 @@
-//! What a device sends instead of the bench's own pictures and lines: data that were recorded, one after the other and
-//! again from the first when all were sent.
+//! Data that a device sends instead of the bench's own pictures and lines: recorded data, in order, restarting with the
+//! first record at the end.
 //!
 //! A feed is a file of records, each four bytes of length (little-endian) and that many bytes: a JPEG or a line.
 //!
-//! Invariant: a record is sent as it is, save that a picture is given its identity as every picture of the bench is.
+//! Invariant: a record is sent unchanged, except that a picture gets its identity like every picture of the bench.
 
 use std::path::{Path, PathBuf};
 
@@ -15,7 +15,7 @@ pub type Records = std::sync::Arc<Vec<Vec<u8>>>;
 /// A feed that cannot be sent.
 #[derive(Debug, Error)]
 pub enum FeedError {
-    /// The file is not there or not readable.
+    /// The file is missing or not readable.
     #[error("feed {0}: {1}")]
     Io(PathBuf, #[source] std::io::Error),
     /// It is not a file of records.
@@ -23,7 +23,7 @@ pub enum FeedError {
     Records(PathBuf),
 }
 
-/// The text of a feed with these records.
+/// The contents of a feed with these records.
 pub fn pack<R: AsRef<[u8]>>(records: impl IntoIterator<Item = R>) -> Vec<u8> {
     let mut packed = Vec::new();
     for record in records {
@@ -34,7 +34,7 @@ pub fn pack<R: AsRef<[u8]>>(records: impl IntoIterator<Item = R>) -> Vec<u8> {
     packed
 }
 
-/// Reads a feed, which has one record at least.
+/// Reads a feed, which must have at least one record.
 pub fn load(path: &Path) -> Result<Records, FeedError> {
     let packed = std::fs::read(path).map_err(|error| FeedError::Io(path.into(), error))?;
     unpack(&packed)

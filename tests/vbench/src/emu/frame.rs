@@ -1,4 +1,4 @@
-//! Pictures that prove who they are: each carries its number and its send time, and a reader can get both back.
+//! Pictures with an identity: each contains its number and its send time, which a reader can extract.
 //!
 //! MJPEG: a COM segment right after SOI with the text `rapid-vbench FRAMENO SEND_NS`. YUYV: the same numbers in the first 16 bytes.
 //! Invariant: frames are encoded once; sending one copies bytes and never encodes.
@@ -9,15 +9,15 @@ use jpeg_encoder::{ColorType, Encoder, EncodingError};
 
 const COM_TAG: &str = "rapid-vbench";
 const YUYV_TAG: &[u8; 4] = b"RVBF";
-/// Bytes that its identity adds to a JPEG, at most.
+/// Maximum size of the identity in a JPEG, bytes.
 pub const STAMP: usize = 64;
-/// Different pictures a camera cycles through, so that a frozen picture can be distinguished from a live one.
+/// Number of different pictures that a camera cycles through, so that a frozen picture differs from a live one.
 pub const PICTURES: usize = 6;
 
-/// A folder like one of `/sys/class/leds`: while it is there, cameras that send YUYV look at this light.
+/// A folder like one of `/sys/class/leds`: while it exists, cameras that send YUYV see this light.
 const LIGHT: &str = "/tmp/bench/light";
 
-/// Is the light lit? `None` without one.
+/// Whether the light is on; `None` without a light.
 pub fn light() -> Option<bool> {
     let brightness = std::fs::read(Path::new(LIGHT).join("brightness")).ok()?;
     Some(brightness.first().is_some_and(|first| *first != b'0'))
@@ -26,13 +26,13 @@ pub fn light() -> Option<bool> {
 /// Number and send time (CLOCK_MONOTONIC) of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameId {
-    /// Counts the frames the device has sent, from its own `first_number` on and across replugs.
+    /// Counts the frames the device has sent, starting at its own `first_number`, across replugs.
     pub number: u32,
     /// When the emulator sent it.
     pub sent_ns: u64,
 }
 
-/// Numbers of different devices never meet, so that a frame or line shows which of two equal units sent it.
+/// Number ranges of devices never overlap, so that a frame or line shows which of two equal units sent it.
 pub const NUMBERS_PER_DEVICE: u32 = 1_000_000;
 
 /// The number of the first frame or line of the `index`-th device.
@@ -41,7 +41,7 @@ pub fn first_number(index: usize) -> u32 {
 }
 
 impl FrameId {
-    /// Which of the emulator's devices sent it.
+    /// The device that sent it.
     pub fn device(self) -> usize {
         (self.number / NUMBERS_PER_DEVICE) as usize
     }
@@ -58,7 +58,7 @@ pub fn jpegs(width: u16, height: u16) -> Result<Vec<Vec<u8>>, EncodingError> {
         .collect()
 }
 
-/// `jpeg` with its identity put in, written over `out`.
+/// `jpeg` with its identity inserted, written over `out`.
 pub fn stamp_jpeg(jpeg: &[u8], id: FrameId, out: &mut Vec<u8>) {
     let text = format!("{COM_TAG} {} {}", id.number, id.sent_ns);
     let length = u16::try_from(text.len() + 2).expect("two numbers and a tag").to_be_bytes();
@@ -68,7 +68,7 @@ pub fn stamp_jpeg(jpeg: &[u8], id: FrameId, out: &mut Vec<u8>) {
     out.extend_from_slice(&jpeg[2..]);
 }
 
-/// A YUYV frame of one shade with its identity in front, written over `out`. The shade is that of the light in front
+/// A YUYV frame of one shade that starts with its identity, written over `out`. The shade is that of the light in front
 /// of the camera, if there is one, and otherwise follows from the number.
 pub fn stamp_yuyv(width: u16, height: u16, id: FrameId, light: Option<bool>, out: &mut Vec<u8>) {
     let shade = match light {
@@ -88,7 +88,7 @@ pub fn stamp_yuyv(width: u16, height: u16, id: FrameId, light: Option<bool>, out
     out[8..16].copy_from_slice(&id.sent_ns.to_le_bytes());
 }
 
-/// The identity inside a frame of either format; `None` when it is not one of ours or is damaged.
+/// The identity inside a frame of either format; `None` if there is none or it is damaged.
 pub fn identity(frame: &[u8]) -> Option<FrameId> {
     if let Some(rest) = frame.strip_prefix(YUYV_TAG) {
         let number = u32::from_le_bytes(rest.get(..4)?.try_into().ok()?);
@@ -105,13 +105,13 @@ pub fn identity(frame: &[u8]) -> Option<FrameId> {
     Some(FrameId { number: words.next()?.parse().ok()?, sent_ns: words.next()?.parse().ok()? })
 }
 
-/// A whole JPEG: starts with SOI and ends with EOI (drivers may pad with zeros).
+/// Whether a JPEG is complete: starts with SOI and ends with EOI (drivers may pad with zeros).
 pub fn is_whole_jpeg(frame: &[u8]) -> bool {
     let end = frame.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
     frame.starts_with(&[0xff, 0xd8]) && frame[..end].ends_with(&[0xff, 0xd9])
 }
 
-/// A gradient with grain (so that sizes are like a real camera's) and a bar that moves from picture to picture.
+/// A gradient with grain (so that sizes are realistic) and a bar that moves from picture to picture.
 fn gray(width: u16, height: u16, picture: usize) -> Vec<u8> {
     let (width, height) = (usize::from(width), usize::from(height));
     let bar = width * picture / PICTURES;

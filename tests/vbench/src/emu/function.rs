@@ -1,6 +1,6 @@
-//! What a device is, above its port: a camera, a serial line or one that is spoken with, behind chapter 9's requests.
+//! The function of a device, above its port: a camera, a serial line or a protocol device, behind chapter 9's requests.
 //!
-//! Invariant: no clock, no socket, no thread; requests and times come in, answers and packets go out.
+//! Invariant: no clock, no socket, no thread; requests and times are inputs, answers and packets are outputs.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -47,15 +47,15 @@ pub enum ContentError {
         /// Why.
         source: jpeg_encoder::EncodingError,
     },
-    /// What was given cannot be read.
+    /// The feed cannot be read.
     #[error(transparent)]
     Feed(#[from] FeedError),
-    /// What was given is no picture of the camera's.
+    /// A record of the feed is not a picture for this camera.
     #[error("record {0} of the feed is no whole JPEG that fits {1}x{2}")]
     NotPicture(usize, u16, u16),
 }
 
-/// A device, whichever port it is in.
+/// A device, independent of its port.
 #[derive(Debug)]
 pub struct Function {
     identity: Identity,
@@ -71,8 +71,8 @@ enum Role {
 }
 
 impl Function {
-    /// Makes the device a specification describes; encodes the pictures it needs, or reads what it is to send.
-    /// Its frames or lines are numbered from `first`.
+    /// Creates the device of a specification; encodes the pictures it needs, or reads its feed. Its frames or lines are
+    /// numbered from `first`.
     pub fn new(spec: &DeviceSpec, first: u32, store: &mut PictureStore) -> Result<Self, ContentError> {
         let given = (!spec.feed.is_empty()).then(|| feed::load(Path::new(&spec.feed))).transpose()?;
         let role = match &spec.kind {
@@ -86,7 +86,7 @@ impl Function {
         Ok(Self { identity: spec.identity.clone(), configured: 0, role })
     }
 
-    /// Back to the state of a device that was just plugged in. Numbers continue counting.
+    /// Resets to the state of a device that was just plugged in. Numbers continue.
     pub fn reset(&mut self) {
         self.configured = 0;
         match &mut self.role {
@@ -107,12 +107,12 @@ impl Function {
         }
     }
 
-    /// It is spoken with; otherwise it sends at its own beat.
+    /// Whether it has a protocol; otherwise it sends on its own clock.
     pub fn talks(&self) -> bool {
         matches!(self.role, Role::Talker(_))
     }
 
-    /// The device as one that is spoken with.
+    /// The device as a protocol device.
     pub fn talker(&mut self) -> Option<&mut dyn Talker> {
         match &mut self.role {
             Role::Talker(talker) => Some(talker.as_mut()),
@@ -147,7 +147,7 @@ impl Function {
         }
     }
 
-    /// What `produce` gave has been sent whole.
+    /// The output of `produce` was sent completely.
     pub fn sent(&mut self) {
         match &mut self.role {
             Role::Uvc(camera) => camera.sent(),
@@ -162,7 +162,7 @@ impl Function {
         }
     }
 
-    /// Chapter 9. The address is the host controller's business, and interfaces have one setting.
+    /// Chapter 9. The host controller handles the address, and interfaces have one setting.
     fn standard(&mut self, setup: Setup) -> Answer {
         const GET_STATUS: u8 = 0;
         const CLEAR_FEATURE: u8 = 1;

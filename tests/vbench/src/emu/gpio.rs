@@ -1,7 +1,7 @@
-//! A CP2104: a serial adapter with four GPIO lines, which the kernel's `cp210x` makes a GPIO chip of, without interrupts.
+//! A CP2104: a serial adapter with four GPIO lines, which the kernel's `cp210x` exposes as a chip without interrupts.
 //!
-//! Lines 0 and 1 are outputs (push-pull), 2 and 3 inputs (open drain, pulled up): that is in the chip's memory. Vendor
-//! requests are those of Silicon Labs' AN571, as `drivers/usb/serial/cp210x.c` makes them.
+//! Lines 0 and 1 are outputs (push-pull), 2 and 3 inputs (open drain, pulled up): this is stored in the chip's memory.
+//! Vendor requests are those of Silicon Labs' AN571, as used by `drivers/usb/serial/cp210x.c`.
 
 use serde_json::json;
 
@@ -19,7 +19,7 @@ const GET_PORTCONFIG: u16 = 0x370c;
 const READ_LATCH: u16 = 0x00c2;
 const WRITE_LATCH: u16 = 0x37e1;
 const CP2104: u8 = 0x04;
-/// Lines.
+/// Number of lines.
 const LINES: u8 = 4;
 /// Bits of the lines that are outputs.
 const OUTPUTS: u8 = 0b0011;
@@ -27,9 +27,9 @@ const OUTPUTS: u8 = 0b0011;
 /// The chip.
 #[derive(Debug)]
 pub struct Gpio {
-    /// What the host wrote, a bit for each line.
+    /// The values written by the host, one bit per line.
     latch: u8,
-    /// What pulls each line from outside; high is what nothing pulls.
+    /// The external level of each line; high if nothing pulls it low.
     outside: u8,
     reported: Vec<Reported>,
 }
@@ -41,7 +41,7 @@ impl Default for Gpio {
 }
 
 impl Gpio {
-    /// A line that is driven is what drives it; one that is not is what pulls it.
+    /// A driven line has the level of its driver, any other line its external level.
     fn levels(&self) -> u8 {
         (self.latch & OUTPUTS) | (self.latch & self.outside & !OUTPUTS)
     }
@@ -73,14 +73,14 @@ impl Talker for Gpio {
 
     fn control(&mut self, setup: Setup, _: &[u8], _: u64) -> Answer {
         if setup.request != VENDOR_SPECIFIC {
-            // Of the serial line, which is never opened.
+            // Requests of the serial line, which is never opened.
             return if setup.is_in() { Answer::Data(vec![0; setup.length.into()]) } else { Answer::Done };
         }
         match (setup.value, setup.is_in()) {
             (GET_PARTNUM, true) => Answer::Data(vec![CP2104]),
             (GET_PORTCONFIG, true) => {
                 let mut config = vec![0; setup.length.into()];
-                // gpio_mode and reset_state, a bit a line from bit 8 on: push-pull, and high.
+                // gpio_mode and reset_state, one bit per line from bit 8 on: push-pull, and high.
                 config.iter_mut().zip([0, OUTPUTS, 0, 0, 0, 0x0f]).for_each(|(place, byte)| *place = byte);
                 Answer::Data(config)
             }
@@ -95,7 +95,7 @@ impl Talker for Gpio {
         }
     }
 
-    fn hear(&mut self, _: &[u8], _: u64) {}
+    fn receive(&mut self, _: &[u8], _: u64) {}
 
     fn tend(&mut self, _: u64) -> Option<u64> {
         None
@@ -107,13 +107,13 @@ impl Talker for Gpio {
 
     fn discard(&mut self) {}
 
-    /// A chip without power drives nothing: its lines fall.
+    /// A chip without power drives nothing: its lines go low.
     fn reset(&mut self) {
         self.write(OUTPUTS, 0);
         self.latch = 0x0f & !OUTPUTS;
     }
 
-    fn befall(&mut self, line: Option<u16>, order: Order, _: u64) -> bool {
+    fn apply(&mut self, line: Option<u16>, order: Order, _: u64) -> bool {
         let (Order::Level(is_high), Some(line)) = (order, line.filter(|line| *line < LINES.into())) else {
             return false;
         };
@@ -137,14 +137,14 @@ mod tests {
     }
 
     #[test]
-    fn outputs_are_what_was_written_and_inputs_what_pulls_them() {
+    fn outputs_have_the_written_level_and_inputs_that_of_their_pull() {
         let mut gpio = Gpio::default();
         gpio.reset();
         assert_eq!(latch(&mut gpio), 0b1100);
         let write = Setup { kind: 0x40, request: VENDOR_SPECIFIC, value: WRITE_LATCH, index: 0x0101, length: 0 };
         assert_eq!(gpio.control(write, &[], 0), Answer::Done);
-        assert!(gpio.befall(Some(2), Order::Level(false), 0));
-        assert!(!gpio.befall(Some(4), Order::Level(false), 0) && !gpio.befall(Some(1), Order::Ask, 0));
+        assert!(gpio.apply(Some(2), Order::Level(false), 0));
+        assert!(!gpio.apply(Some(4), Order::Level(false), 0) && !gpio.apply(Some(1), Order::Ask, 0));
         assert_eq!(latch(&mut gpio), 0b1001);
         let mut reported = Vec::new();
         gpio.reported(&mut reported);

@@ -1,6 +1,6 @@
-//! What the emulator did, one JSON object a line on stdout.
+//! The emulator's log, one JSON object per line on stdout.
 //!
-//! Invariant: every line carries both clocks, read when the thing happened and not when it was printed.
+//! Invariant: every line contains both clocks, read at the event and not when it was printed.
 
 use std::io::Write;
 use std::sync::Mutex;
@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 
 use crate::clock;
 
-/// A moment on both clocks.
+/// A time on both clocks.
 #[derive(Clone, Copy, Debug)]
 pub struct Moment {
     /// CLOCK_MONOTONIC, ns.
@@ -25,7 +25,7 @@ impl Moment {
     }
 }
 
-/// Where actions are printed.
+/// The destination of the log.
 pub struct Log {
     out: Mutex<Box<dyn Write + Send>>,
 }
@@ -36,8 +36,8 @@ impl Log {
         Self { out: Mutex::new(out) }
     }
 
-    /// Prints `{"action":..., <fields>, "mono_ns":.., "real_ns":..}`. A reader that has gone is not the emulator's problem.
-    pub fn say(&self, action: &str, moment: Moment, fields: Value) {
+    /// Prints `{"action":..., <fields>, "mono_ns":.., "real_ns":..}`. A closed output is ignored.
+    pub fn write(&self, action: &str, moment: Moment, fields: Value) {
         let mut line = Map::new();
         line.insert("action".into(), json!(action));
         if let Value::Object(fields) = fields {

@@ -1,11 +1,11 @@
 //! The emulator: USB devices in user space, attached to the stock kernel's `vhci_hcd` over a socket pair.
 //!
-//! A `DeviceSpec` becomes a `Function` (what the device is) inside a `Device` (its attachment and beat); the script plugs and
-//! unplugs. The kernel sees ordinary USB devices, so every driver, node and udev rule above is the real one.
+//! A `DeviceSpec` becomes a `Function` (the device's function) inside a `Device` (its attachment and clock); the script
+//! plugs and unplugs. The kernel sees ordinary USB devices, so every driver, node and udev rule above is the real one.
 //!
-//! Invariant: a number (frame or line) is given out only to data that is sent whole, so a hole in what a reader got is the
-//! reader's loss, never the emulator's.
-//! Invariant: nothing a host asks of a device panics; what is unknown is stalled, as hardware does.
+//! Invariant: a number (frame or line) is assigned only to data that is sent completely, so a gap in a reader's data is
+//! the reader's loss, never the emulator's.
+//! Invariant: no request of a host causes a panic; unknown requests are stalled, as by hardware.
 
 mod attachment;
 pub mod can;

@@ -1,4 +1,4 @@
-//! Orders to a device from the emulator's script: what befalls its bus, its motors or its link.
+//! Orders to a device from the emulator's script: events of its bus, its motors or its link.
 //!
 //! ```text
 //! fault N[.ID] CODE   mute N[.ID] 0|1   hot N[.ID] DEGREES   power N[.ID] 0|1   ask N[.ID]
@@ -8,27 +8,27 @@
 //! level N.LINE 0|1
 //! ```
 //!
-//! `N.ID` is one motor (its slave id, hexadecimal) behind device N, `N` alone all of them. The first order of the second group
-//! that concerns a body gives the motor one: from then on it moves by torque and no longer by a fixed lag.
+//! `N.ID` is one motor (its slave id, hexadecimal) behind device N, `N` alone all of them. The first order of the
+//! second group that concerns a body gives the motor one: from then on it moves by torque instead of a fixed lag.
 
 use std::str::SplitWhitespace;
 
-/// Frames a second the generator can be asked for: a classic bus at 1 Mbit/s carries some 8,000 of eight bytes.
+/// Maximum rate of generated frames per second: a classic bus at 1 Mbit/s carries some 8,000 of eight bytes.
 pub const MOST_FRAMES: f64 = 8_000.0;
 
 /// The smallest inertia, kg m²: a lighter joint would move too far in one step of the simulation.
 pub const LEAST_INERTIA: f64 = 0.001;
 
-/// Something that happens to a device.
+/// An event of a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Order {
-    /// A motor latches this fault (8 to 14); 0 takes it away.
+    /// A motor latches this fault (8 to 14); 0 clears it.
     Fault(u8),
-    /// A motor neither receives nor answers, and continues as it is.
+    /// A motor neither receives nor answers, and continues its motion.
     Mute(bool),
     /// A motor has this temperature, degrees Celsius.
     Hot(u8),
-    /// A motor loses or regains its supply: what was not saved is forgotten.
+    /// A motor loses or regains its supply: unsaved settings are lost.
     Power(bool),
     /// A motor writes its state to the log.
     Ask,
@@ -36,41 +36,41 @@ pub enum Order {
     Load {
         /// Nm.
         torque: f64,
-        /// It is a weight on a lever that is level at angle 0: it varies with the cosine.
+        /// It is a weight on a lever that is horizontal at angle 0: it varies with the cosine.
         is_lever: bool,
     },
-    /// The joint has this friction: Nm whatever the speed, and Nm s/rad.
+    /// The joint has this friction: Nm at any speed, and Nm s/rad.
     Friction([f64; 2]),
     /// The joint has this inertia, kg m².
     Inertia(f64),
     /// The joint ends at these angles, rad.
     Ends([f64; 2]),
-    /// The motor counts so much more than before, rad, wherever it is: its zero is another one.
+    /// The motor's reported position shifts by this much, rad: its zero moves.
     Zero(f64),
-    /// The encoder stands still: what is reported stays, and the motor's own loops work with it.
+    /// The encoder is stuck: the reported position stays, and the motor's own loops work with it.
     Freeze(bool),
-    /// The joint does not turn, whatever pushes it.
+    /// The joint does not turn, whatever the torque.
     Block(bool),
-    /// So many frames a second appear on the bus.
+    /// This many frames per second appear on the bus.
     Flood(f64),
     /// The adapter goes bus-off, or recovers.
     BusOff(bool),
-    /// A line of a GPIO chip is pulled low, or is not.
+    /// A line of a GPIO chip is pulled low, or released.
     Level(bool),
-    /// The network cable behind the adapter is in, or out.
+    /// The network cable behind the adapter is plugged in or unplugged.
     Link(bool),
 }
 
-/// Whom an order is for.
+/// The target of an order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Target {
     /// Number of the device.
     pub device: usize,
-    /// Slave id of the motor; all of them without.
+    /// Slave id of the motor; `None` for all of them.
     pub motor: Option<u16>,
 }
 
-/// Reads an order whose first word is `name`; `None` when it is none.
+/// Parses an order whose first word is `name`; `None` if it is not an order.
 pub fn parse(name: &str, words: &mut SplitWhitespace<'_>) -> Option<(Target, Order)> {
     let target = words.next().and_then(target)?;
     if let Some(order) = physical(name, words) {
@@ -95,7 +95,7 @@ pub fn parse(name: &str, words: &mut SplitWhitespace<'_>) -> Option<(Target, Ord
     Some((target, order))
 }
 
-/// Reads an order about what a motor drives.
+/// Parses an order about a motor's load.
 fn physical(name: &str, words: &mut SplitWhitespace<'_>) -> Option<Order> {
     let mut number = |lowest: f64| {
         let number = words.next()?.parse::<f64>().ok()?;

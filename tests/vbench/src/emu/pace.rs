@@ -1,32 +1,32 @@
-//! Something sent so many times a second, with a number each.
+//! Sends numbered items at a fixed rate.
 //!
-//! Invariant: a number is given out only to what is sent; what comes too late is skipped and counted.
+//! Invariant: a number is assigned only to an item that is sent; late ones are skipped and counted.
 
 use serde_json::{Value, json};
 
-/// How late a beat may be; those later are skipped.
+/// Maximum lateness of a tick; later ones are skipped.
 const LATEST_NS: u64 = 50_000_000;
-/// Beats closer than this come several at once.
+/// Ticks closer than this are sent several at a time.
 const SHORTEST_NS: u64 = 1_000_000;
 
-/// A beat and its count.
+/// A clock with a count of its ticks.
 #[derive(Clone, Copy, Debug)]
 pub struct Pace {
     hz: f64,
     begun_ns: u64,
-    /// Beats passed, sent or not.
+    /// Ticks passed, sent or not.
     passed: u64,
     sent: u32,
     skipped: u64,
 }
 
 impl Pace {
-    /// Beats `hz` times a second from now on.
+    /// Starts with `hz` ticks per second.
     pub fn new(hz: f64, now_ns: u64) -> Self {
         Self { hz, begun_ns: now_ns, passed: 0, sent: 0, skipped: 0 }
     }
 
-    /// The number of the beat that is due, if one is: it must be sent.
+    /// The number of the tick that is due, if any: it must be sent.
     pub fn beat(&mut self, now_ns: u64) -> Option<u32> {
         self.skip(now_ns);
         if self.due_ns() > now_ns {
@@ -37,12 +37,12 @@ impl Pace {
         Some(self.sent - 1)
     }
 
-    /// When to look again.
+    /// When to check again.
     pub fn next_ns(&self, now_ns: u64) -> u64 {
         self.due_ns().max(now_ns + SHORTEST_NS)
     }
 
-    /// What came of it.
+    /// The result.
     pub fn summary(&mut self, now_ns: u64) -> Value {
         self.skip(now_ns);
         json!({"sent": self.sent, "skipped": self.skipped})
@@ -67,12 +67,12 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     #[test]
-    fn numbers_have_no_holes() {
+    fn numbers_have_no_gaps() {
         let mut pace = Pace::new(1_000.0, 0);
         let mut beats = |ms: u64| std::iter::from_fn(|| pace.beat(ms * MS)).collect::<Vec<u32>>();
         assert_eq!(beats(0), [0_u32; 0]);
         assert_eq!(beats(3), [0, 1, 2]);
-        // No second was asked for.
+        // No check for a second.
         let late = beats(1_003);
         assert_eq!((late.first(), late.len()), (Some(&3), 50));
         assert_eq!(pace.next_ns(1_003 * MS), 1_004 * MS);

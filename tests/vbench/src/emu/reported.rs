@@ -1,13 +1,13 @@
-//! The events of a device, besides what it sends.
+//! The events of a device, besides its data.
 
 use serde_json::Value;
 
-/// A line for the log, without its times.
+/// A log line without its times.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Reported {
     /// What happened.
     pub action: &'static str,
-    /// More of it: an object.
+    /// Details: an object.
     pub fields: Value,
 }
 

@@ -1,4 +1,4 @@
-//! The emulator's commands, one a line:
+//! The emulator's commands, one per line:
 //!
 //! ```text
 //! plug N..      unplug N..      silent N 0|1      port N P       hub out|in
@@ -7,10 +7,10 @@
 //!
 //! and the orders of `order`.
 //!
-//! `t0` starts the timeline's clock; `at MS` waits until MS after it. `say` logs the word, once everything before it is done.
-//! `hub out` pulls everything that is plugged, in one go, as a hub that loses its own cable does; `hub in` returns what it pulled.
-//! The end of the input means `quit`.
-//! Invariant: a line that makes no sense is reported and skipped; it never ends the emulator.
+//! `t0` starts the timeline's clock; `at MS` waits until MS after it. `say` logs the word once everything before it is
+//! done. `hub out` unplugs all devices at once, like a hub that loses its own cable; `hub in` plugs them in again. The
+//! end of the input means `quit`.
+//! Invariant: an invalid line is reported and skipped; it never ends the emulator.
 
 use std::io::BufRead;
 use std::str::{FromStr, SplitWhitespace};
@@ -27,16 +27,16 @@ use super::order::{self, Order, Target};
 use super::spec::PORTS;
 use crate::clock;
 
-/// One line, understood.
+/// A parsed line.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Command {
     /// Plug these devices, in this order.
     Plug(Vec<usize>),
-    /// Pull these devices, in this order.
+    /// Unplug these devices, in this order.
     Unplug(Vec<usize>),
-    /// Pull everything in one go.
+    /// Unplug everything at once.
     HubOut,
-    /// Plug what the hub took along.
+    /// Plug in the devices that `hub out` unplugged.
     HubIn,
     /// Stop or resume sending.
     Silent(usize, bool),
@@ -46,9 +46,9 @@ pub enum Command {
     Sleep(Duration),
     /// Start of the timeline.
     Origin,
-    /// Wait until this long after the start of the timeline, then do.
+    /// Wait until this long after the start of the timeline, then run the command.
     At(Duration, Option<Box<Command>>),
-    /// Let this happen to a device.
+    /// Apply an order to a device.
     Befall(Target, Order),
     /// Log a word.
     Say(String),
@@ -115,7 +115,7 @@ fn millis(words: &mut SplitWhitespace<'_>) -> Option<Duration> {
     words.next()?.parse().ok().map(Duration::from_millis)
 }
 
-/// Runs commands from `input` until `quit` or its end, then unplugs what is left.
+/// Runs commands from `input` until `quit` or its end, then unplugs all devices.
 pub fn run(input: impl BufRead, devices: &mut [Device], log: &Arc<Log>) {
     let mut player = Player { devices, log, origin_ns: clock::mono_ns(), on_hub: Vec::new() };
     for line in input.lines().map_while(Result::ok).filter(|line| !line.trim().is_empty()) {
@@ -134,7 +134,7 @@ struct Player<'a> {
     devices: &'a mut [Device],
     log: &'a Log,
     origin_ns: u64,
-    /// What the hub took along.
+    /// The devices that `hub out` unplugged.
     on_hub: Vec<usize>,
 }
 
@@ -156,7 +156,7 @@ impl Player<'_> {
                     device.set_silent(silent);
                     Ok(())
                 });
-                self.log.say("silent", moment, json!({"device": index, "silent": silent}));
+                self.log.write("silent", moment, json!({"device": index, "silent": silent}));
             }
             Command::Port(index, port) => self.with(index, |device| {
                 device.set_port(port);
@@ -166,7 +166,7 @@ impl Player<'_> {
             Command::Origin => {
                 let moment = Moment::now();
                 self.origin_ns = moment.mono_ns;
-                self.log.say("t0", moment, json!({}));
+                self.log.write("t0", moment, json!({}));
             }
             Command::At(when, then) => {
                 let due_ns = self.origin_ns + u64::try_from(when.as_nanos()).unwrap_or(u64::MAX);
@@ -177,11 +177,11 @@ impl Player<'_> {
             }
             Command::Befall(target, order) => {
                 let moment = Moment::now();
-                self.with(target.device, |device| device.befall(target.motor, order));
+                self.with(target.device, |device| device.apply(target.motor, order));
                 let fields = json!({"device": target.device, "motor": target.motor, "order": format!("{order:?}")});
-                self.log.say("order", moment, fields);
+                self.log.write("order", moment, fields);
             }
-            Command::Say(word) => self.log.say("say", Moment::now(), json!({"word": word})),
+            Command::Say(word) => self.log.write("say", Moment::now(), json!({"word": word})),
             Command::Quit => {}
         }
     }
@@ -195,7 +195,7 @@ impl Player<'_> {
     }
 
     fn report(&self, error: &dyn std::fmt::Display) {
-        self.log.say("error", Moment::now(), json!({"error": error.to_string()}));
+        self.log.write("error", Moment::now(), json!({"error": error.to_string()}));
     }
 }
 

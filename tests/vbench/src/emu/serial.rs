@@ -1,7 +1,7 @@
 //! Serial devices that send lines of text: CDC-ACM and FTDI.
 //!
-//! A line is `SEQ,MONO_NS,sin,cos\n`: a counter, the send time, and two values that change; or one of those it was given.
-//! What the host sends is ignored.
+//! A line is `SEQ,MONO_NS,sin,cos\n`: a counter, the send time, and two changing values; or a line of its feed. Data
+//! from the host is ignored.
 
 use std::fmt::Write;
 use std::time::Duration;
@@ -36,9 +36,9 @@ pub struct Serial {
 }
 
 impl Serial {
-    /// A device that sends `hz` lines a second, numbered from `first`: those of `feed`, if it is given one.
+    /// A device that sends `hz` lines per second, numbered from `first`: those of `feed`, if given.
     pub fn new(flavour: Flavour, hz: f64, first: u32, feed: Option<Records>) -> Self {
-        // 115200 8N1, what a host reads before it sets its own.
+        // 115200 8N1, the value a host reads before it sets its own.
         let line_coding = [0x00, 0xc2, 0x01, 0x00, 0, 0, 8];
         let first = first.into();
         let period = Duration::from_secs_f64(1.0 / hz);
@@ -71,7 +71,7 @@ impl Serial {
         configuration.bulk(DATA_IN).bulk(DATA_OUT).finish()
     }
 
-    /// Line settings are taken and given back; none of them changes the stream.
+    /// Line settings are stored and returned; none of them changes the stream.
     pub fn control(&mut self, setup: Setup, data: &[u8]) -> Answer {
         match (self.flavour, setup.request, setup.is_in()) {
             (Flavour::Acm, 0x20, false) => {
@@ -91,7 +91,7 @@ impl Serial {
         }
     }
 
-    /// Always sending; whether anybody reads is up to the host.
+    /// Always sending; whether anybody reads depends on the host.
     pub fn live(&self) -> Live {
         Live { stream: 0, period: self.period }
     }
@@ -111,7 +111,7 @@ impl Serial {
         out.extend_from_slice(text.as_bytes());
     }
 
-    /// The line was sent whole: the next one gets the next number.
+    /// The line was sent completely: the next one gets the next number.
     pub fn sent(&mut self) {
         self.next_line += 1;
     }
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn given_lines_go_round() {
+    fn given_lines_repeat() {
         let feed = Records::new(vec![b"1,2\n".to_vec(), b"3,4\n".to_vec()]);
         let mut serial = Serial::new(Flavour::Acm, 10.0, 2_000_001, Some(feed));
         let mut line = Vec::new();

@@ -1,4 +1,4 @@
-//! The words that describe an emulated device: `KIND:key=value,...`.
+//! The text format of an emulated device: `KIND:key=value,...`.
 //!
 //! ```text
 //! uvc:port=0,vid=046d,pid=0825,serial=CAM00A1,product=Wrist,mode=MJPG-640x480@30,mode=YUYV-320x240@30/15
@@ -9,9 +9,9 @@
 //! ecm:serial=C3441325012345,gopro=4,lidar=100                a network adapter, clips of 4 MB, packets a second
 //! ```
 //!
-//! A comma, a per cent sign or a control character in a string is written as in a URL: `%2c`.
+//! A comma, a per cent sign or a control character in a string is percent-encoded as in a URL: `%2c`.
 //!
-//! Invariant: `Display` prints what `FromStr` reads, so the harness and the emulator share one vocabulary.
+//! Invariant: `FromStr` parses what `Display` prints, so the harness and the emulator share one format.
 
 use std::fmt;
 use std::str::FromStr;
@@ -25,19 +25,19 @@ use super::lan::ecm::NetSpec;
 /// Ports `vhci_hcd.0` has for high-speed devices in Debian's kernels.
 pub const PORTS: u8 = 15;
 
-/// Modes of one camera, and rates of one mode: far more than any test wants, far less than a descriptor holds.
+/// Maximum modes of a camera, and rates of a mode: far more than any test needs, far less than a descriptor holds.
 const MODES: usize = 32;
 
 /// A device to emulate.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DeviceSpec {
-    /// What it is.
+    /// Its kind.
     pub kind: Kind,
-    /// Port it is plugged into first; without one, the device's place in the list.
+    /// The port of its first plug; by default, the device's index in the list.
     pub port: Option<u8>,
-    /// How it names itself.
+    /// Its identity.
     pub identity: Identity,
-    /// File of what it sends, see `feed`; empty: the bench's own pictures and lines.
+    /// File of its feed, see `feed`; empty: the bench's own pictures and lines.
     pub feed: String,
 }
 
@@ -63,19 +63,19 @@ pub enum Kind {
     Uvc(Vec<Mode>),
     /// CDC-ACM (`/dev/ttyACM*`) that sends lines at `hz`.
     Acm {
-        /// Lines a second.
+        /// Lines per second.
         hz: f64,
     },
     /// An FTDI adapter (`/dev/ttyUSB*`) that sends lines at `hz`.
     Ftdi {
-        /// Lines a second.
+        /// Lines per second.
         hz: f64,
     },
     /// A CAN adapter.
     Can {
         /// Its protocol with the host.
         protocol: Protocol,
-        /// What is on its bus.
+        /// The motors on its bus.
         motors: Vec<MotorSpec>,
     },
     /// A network adapter (CDC-ECM).
@@ -115,7 +115,7 @@ pub enum SpecError {
     /// A key this kind does not have, or no `=`.
     #[error("unknown key `{key}` for {kind}")]
     Key {
-        /// The kind asked for.
+        /// The requested kind.
         kind: String,
         /// The offending text.
         key: String,
@@ -127,28 +127,28 @@ pub enum SpecError {
         key: String,
         /// What was given.
         value: String,
-        /// What is wanted.
+        /// What is expected.
         expected: &'static str,
     },
 }
 
 impl DeviceSpec {
-    /// A camera; add modes with `mode`. Without any it is `MJPG-640x480@30`.
+    /// A camera; `mode` adds modes. Without any it has `MJPG-640x480@30`.
     pub fn uvc(vid: u16, pid: u16) -> Self {
         Self::new(Kind::Uvc(Vec::new()), vid, pid)
     }
 
-    /// A CDC-ACM device sending `hz` lines a second.
+    /// A CDC-ACM device sending `hz` lines per second.
     pub fn acm(vid: u16, pid: u16, hz: f64) -> Self {
         Self::new(Kind::Acm { hz }, vid, pid)
     }
 
-    /// An FTDI adapter sending `hz` lines a second.
+    /// An FTDI adapter sending `hz` lines per second.
     pub fn ftdi(vid: u16, pid: u16, hz: f64) -> Self {
         Self::new(Kind::Ftdi { hz }, vid, pid)
     }
 
-    /// A CAN adapter on a bus of its own; add motors with `motor`.
+    /// A CAN adapter with its own bus; `motor` adds motors.
     pub fn can(protocol: Protocol) -> Self {
         // candleLight, CANable with its slcan firmware, and the vendor's own.
         let (vid, pid) = match protocol {
@@ -159,7 +159,7 @@ impl DeviceSpec {
         Self::new(Kind::Can { protocol, motors: Vec::new() }, vid, pid)
     }
 
-    /// A network adapter with nothing behind it; add `gopro` and `lidar`.
+    /// A network adapter with nothing behind it; `gopro` and `lidar` add devices.
     pub fn ecm() -> Self {
         Self::new(Kind::Ecm(NetSpec::default()), 0x2672, 0x0059)
     }
@@ -169,7 +169,7 @@ impl DeviceSpec {
         Self::new(Kind::Gpio, 0x10c4, 0xea60)
     }
 
-    /// Adds a Damiao motor to the bus. Other kinds have none and ignore it.
+    /// Adds a Damiao motor to the bus. Ignored by other kinds.
     ///
     /// # Panics
     /// When there is no such type or an id is out of range: the caller is a test.
@@ -182,7 +182,7 @@ impl DeviceSpec {
         self
     }
 
-    /// Puts a GoPro with clips of so many MB behind a network adapter; its address follows from the serial number.
+    /// Puts a GoPro with clips of this many MB behind a network adapter; its address follows from the serial number.
     #[must_use]
     pub fn gopro(mut self, megabytes: u32) -> Self {
         if let Kind::Ecm(net) = &mut self.kind {
@@ -191,7 +191,7 @@ impl DeviceSpec {
         self
     }
 
-    /// Puts a LiDAR that sends `hz` packets a second behind a network adapter.
+    /// Puts a LiDAR that sends `hz` packets per second behind a network adapter.
     #[must_use]
     pub fn lidar(mut self, hz: f64) -> Self {
         if let Kind::Ecm(net) = &mut self.kind {
@@ -207,7 +207,7 @@ impl DeviceSpec {
         self
     }
 
-    /// Gives it these names instead of the bench's own.
+    /// Sets its names in place of the bench's own.
     #[must_use]
     pub fn names(mut self, manufacturer: &str, product: &str) -> Self {
         self.identity.manufacturer = manufacturer.into();
@@ -215,21 +215,21 @@ impl DeviceSpec {
         self
     }
 
-    /// Lets it send the records of this file of the guest: MJPEG pictures of a camera, lines of a serial device.
+    /// Makes it send the records of this file of the guest: MJPEG pictures of a camera, lines of a serial device.
     #[must_use]
     pub fn feed(mut self, path: &str) -> Self {
         self.feed = path.into();
         self
     }
 
-    /// Plugs it into this port first.
+    /// Sets the port of its first plug.
     #[must_use]
     pub fn port(mut self, port: u8) -> Self {
         self.port = Some(port);
         self
     }
 
-    /// Adds a camera mode. Other kinds have none and ignore it.
+    /// Adds a camera mode. Ignored by other kinds.
     #[must_use]
     pub fn mode(mut self, format: Format, width: u16, height: u16, fps: &[u32]) -> Self {
         if let Kind::Uvc(modes) = &mut self.kind {
@@ -246,7 +246,7 @@ impl DeviceSpec {
 }
 
 impl Kind {
-    /// The word that names it.
+    /// The word for the kind.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Uvc(_) => "uvc",

@@ -1,7 +1,7 @@
-//! Devices with a protocol: their output is sent as soon as the host requests it, and what they do of their own
-//! is done in time, plugged or not.
+//! Protocol devices: their output is sent as soon as the host requests it, and their own actions happen on time,
+//! whether they are plugged in or not.
 //!
-//! Invariant: `attend` follows whatever changes such a device, so none of its output or events waits for the next beat.
+//! Invariant: `attend` follows every change of such a device, so its output and events never wait for the next tick.
 
 use std::time::Duration;
 
@@ -11,11 +11,11 @@ use super::order::Order;
 use super::wire::{self, HEADER_LEN, Status};
 use crate::clock;
 
-/// The thread looks at least this often.
+/// The thread checks at least this often.
 const LONGEST: Duration = Duration::from_secs(1);
 
 impl Shared {
-    /// Keeps the device's own time until the emulator has no more use for it.
+    /// Runs the device's own clock until the emulator no longer needs it.
     pub(super) fn talk(&self) {
         let mut state = self.lock();
         while !state.ended {
@@ -25,16 +25,16 @@ impl Shared {
         }
     }
 
-    /// Something happens to the device; false: not to such a one.
-    pub(super) fn befall(&self, motor: Option<u16>, order: Order) -> bool {
+    /// Applies an order to the device; false if it does not support it.
+    pub(super) fn apply(&self, motor: Option<u16>, order: Order) -> bool {
         let now = Moment::now();
         let mut state = self.lock();
-        let done = state.function.talker().is_some_and(|talker| talker.befall(motor, order, now.mono_ns));
+        let done = state.function.talker().is_some_and(|talker| talker.apply(motor, order, now.mono_ns));
         self.attend(&mut state, now);
         done
     }
 
-    /// Lets the device do what is due, sends what the host asks for, logs what it reports.
+    /// Lets the device do what is due, sends what the host has requested, logs its events.
     pub(super) fn attend(&self, state: &mut State, now: Moment) {
         let Some(talker) = state.function.talker() else { return };
         let due_ns = talker.tend(now.mono_ns).unwrap_or(u64::MAX);
@@ -43,7 +43,7 @@ impl Shared {
         for reported in reported {
             let mut fields = reported.fields;
             fields["device"] = self.index.into();
-            self.log.say(reported.action, now, fields);
+            self.log.write(reported.action, now, fields);
         }
         state.deliver(now.mono_ns);
         let sooner = due_ns < state.due_ns;
@@ -55,7 +55,7 @@ impl Shared {
 }
 
 impl State {
-    /// Answers waiting transfers as long as there is something for them, all in one go.
+    /// Completes waiting transfers as long as there is data for them, all at once.
     fn deliver(&mut self, now_ns: u64) {
         let Some(talker) = self.function.talker() else { return };
         if self.silent {

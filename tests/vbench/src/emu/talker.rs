@@ -1,4 +1,4 @@
-//! Devices that are spoken with: they take what the host sends and answer, when asked and of their own.
+//! Protocol devices: they receive data from the host and send, on request and by themselves.
 //!
 //! Invariant: no clock, no socket, no thread; times come in as ns of CLOCK_MONOTONIC.
 
@@ -6,7 +6,7 @@ use super::descriptor::{Answer, DeviceClass, Setup};
 use super::order::Order;
 use super::reported::Reported;
 
-/// A device that is spoken with. It exists whether it is plugged or not; `reset` is the plug's going in or out.
+/// A protocol device. It exists whether it is plugged in or not; `reset` is called at a plug or unplug.
 pub trait Talker: std::fmt::Debug + Send {
     /// Class codes of the device.
     fn class(&self) -> DeviceClass;
@@ -14,29 +14,29 @@ pub trait Talker: std::fmt::Debug + Send {
     /// The configuration descriptor.
     fn configuration(&self) -> Vec<u8>;
 
-    /// The text of a string descriptor of its own, from 4 on.
+    /// The text of its own string descriptor, from index 4 on.
     fn string(&self, index: u8) -> Option<&str>;
 
     /// Answers a class or vendor request; `data` is its data stage towards the device.
     fn control(&mut self, setup: Setup, data: &[u8], now_ns: u64) -> Answer;
 
-    /// Takes a bulk transfer of the host's.
-    fn hear(&mut self, data: &[u8], now_ns: u64);
+    /// Receives a bulk transfer from the host.
+    fn receive(&mut self, data: &[u8], now_ns: u64);
 
-    /// Lets time pass; when it wants to be called again at the latest.
+    /// Advances time; returns when it must be called again at the latest.
     fn tend(&mut self, now_ns: u64) -> Option<u64>;
 
-    /// Appends the next transfer (at most `room` bytes) for an endpoint to `out`; false: there is none.
+    /// Appends the next transfer (at most `room` bytes) for an endpoint to `out`; false if there is none.
     fn take(&mut self, endpoint: u8, room: usize, now_ns: u64, out: &mut Vec<u8>) -> bool;
 
-    /// Throws away what waits to be taken.
+    /// Discards data waiting to be taken.
     fn discard(&mut self);
 
-    /// The cable went in or out: the host's side begins again, what lies behind continues.
+    /// The cable was plugged or unplugged: the host's side restarts, the devices behind it continue.
     fn reset(&mut self);
 
-    /// Something happens to it, or to a motor behind it; false: not to such a device.
-    fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool;
+    /// Applies an order to it, or to a motor behind it; false if it does not support it.
+    fn apply(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool;
 
     /// Appends its events since the last call.
     fn reported(&mut self, reported: &mut Vec<Reported>);

@@ -1,8 +1,8 @@
 //! A USB Video Class 1.0 camera with one bulk endpoint.
 //!
-//! Bulk, because `vhci_hcd` completes bulk transfers as they come, while isochronous ones would need a schedule that a
-//! loaded machine cannot keep; above the endpoint `uvcvideo` treats both alike.
-//! Invariant: a stream lives from COMMIT to CLEAR_FEATURE(HALT), which is how Linux starts and stops a bulk camera.
+//! Bulk, because `vhci_hcd` completes bulk transfers as they arrive, while isochronous ones would need a schedule that
+//! a loaded machine cannot keep; above the endpoint `uvcvideo` treats both alike.
+//! Invariant: a stream lasts from COMMIT to CLEAR_FEATURE(HALT), which is how Linux starts and stops a bulk camera.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use super::frame::{self, FrameId};
 use super::function::{DATA_IN, Live};
 use super::spec::{Format, Mode};
 
-/// A payload fills one of `uvcvideo`'s bulk transfers, which are 32 packets of 512 bytes at most.
+/// A payload fills one of `uvcvideo`'s bulk transfers, which have at most 32 packets of 512 bytes.
 const PAYLOAD: u32 = 16 * 1024;
 const PAYLOAD_HEADER: u8 = 2;
 const PROBE_LEN: usize = 26;
@@ -44,7 +44,7 @@ struct FormatGroup {
     modes: Vec<(Mode, Pictures)>,
 }
 
-/// What probe and commit negotiate; indices count from 1 on the wire and from 0 here.
+/// The result of probe and commit; indices count from 1 on the wire and from 0 here.
 #[derive(Clone, Copy, Debug)]
 struct Selection {
     format: usize,
@@ -53,7 +53,7 @@ struct Selection {
 }
 
 impl Uvc {
-    /// A camera with these modes, grouped by format in order of first appearance, whose first frame is number `first`.
+    /// A camera with these modes, grouped by format in order of first appearance; its first frame has number `first`.
     pub fn new(modes: Vec<(Mode, Pictures)>, first: u32) -> Self {
         let mut formats: Vec<FormatGroup> = Vec::new();
         for (mode, pictures) in modes {
@@ -75,7 +75,7 @@ impl Uvc {
         }
     }
 
-    /// Miscellaneous device with an interface association, as every UVC camera.
+    /// Miscellaneous device with an interface association, like every UVC camera.
     pub fn class(&self) -> DeviceClass {
         DeviceClass { class: [0xef, 2, 1], release: 0x0100 }
     }
@@ -133,7 +133,7 @@ impl Uvc {
         }
     }
 
-    /// The stream is over.
+    /// The stream has ended.
     pub fn stop(&mut self) {
         self.stream = None;
     }
@@ -155,7 +155,7 @@ impl Uvc {
         }
     }
 
-    /// The frame was sent whole: the next one gets the next number.
+    /// The frame was sent completely: the next one gets the next number.
     pub fn sent(&mut self) {
         self.next_frame = self.next_frame.wrapping_add(1);
         self.payload_parity ^= 1;
@@ -177,7 +177,7 @@ impl Uvc {
         &self.formats[selection.format].modes[selection.mode]
     }
 
-    /// The nearest the camera has to what the host proposes.
+    /// The camera's setting nearest to the host's proposal.
     fn negotiate(&self, data: &[u8]) -> Selection {
         let byte = |at: usize| usize::from(data.get(at).copied().unwrap_or(0));
         let format = byte(2).saturating_sub(1).min(self.formats.len() - 1);
@@ -226,7 +226,7 @@ impl FormatGroup {
                 frame.extend(word.to_le_bytes());
             }
             frame.push(u8::try_from(mode.fps.len()).expect("a few rates"));
-            // The class wants them from shortest to longest.
+            // The class requires them from shortest to longest.
             let mut intervals: Vec<u32> = mode.fps.iter().map(|fps| interval(*fps)).collect();
             intervals.sort_unstable();
             frame.extend(intervals.iter().flat_map(|interval| interval.to_le_bytes()));
@@ -240,7 +240,7 @@ fn interval(fps: u32) -> u32 {
     INTERVALS_PER_SECOND / fps
 }
 
-/// Bytes a frame of this mode may have: the host drops a longer one.
+/// Maximum bytes of a frame of this mode: the host drops a longer one.
 pub fn room(mode: &Mode) -> usize {
     frame_bytes(mode) as usize
 }

@@ -1,6 +1,6 @@
 //! USB/IP on the wire: 48-byte headers, big endian, as in the kernel's `Documentation/usb/usbip_protocol.rst`.
 //!
-//! Invariant: pure; bytes in, values out. Isochronous transfers are not spoken.
+//! Invariant: pure; bytes in, values out. Isochronous transfers are not supported.
 
 use thiserror::Error;
 
@@ -23,25 +23,25 @@ pub enum Status {
     Ok = 0,
     /// STALL handshake (-EPIPE).
     Stall = -32,
-    /// Taken back by an unlink (-ECONNRESET).
+    /// Cancelled by an unlink (-ECONNRESET).
     Unlinked = -104,
 }
 
-/// What the host asks for.
+/// A request of the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Request {
     /// A transfer.
     Submit(Submit),
-    /// Take back the transfer with sequence number `victim`.
+    /// Cancel the transfer with sequence number `victim`.
     Unlink {
         /// Sequence number of this request.
         seq: u32,
-        /// Sequence number of the transfer to take back.
+        /// Sequence number of the transfer to cancel.
         victim: u32,
     },
 }
 
-/// One transfer (URB). Data to the device follow the header on the wire.
+/// One transfer (URB). Data to the device follows the header on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Submit {
     /// Sequence number the reply repeats.
@@ -50,13 +50,13 @@ pub struct Submit {
     pub is_in: bool,
     /// Endpoint number without its direction bit.
     pub endpoint: u8,
-    /// Size of the host's buffer, or of the data that follow.
+    /// Size of the host's buffer, or of the data that follows.
     pub length: u32,
     /// Setup packet; meaningful on endpoint 0.
     pub setup: [u8; 8],
 }
 
-/// A header that is not USB/IP as spoken here; the connection cannot continue.
+/// A header that is not supported; the connection cannot continue.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum WireError {
     /// A command other than submit and unlink.
@@ -99,7 +99,7 @@ pub fn decode(header: &[u8; HEADER_LEN]) -> Result<Request, WireError> {
     }
 }
 
-/// The header of a transfer's completion; `actual` bytes were moved. Data to the host follow it.
+/// The header of a transfer's completion; `actual` bytes were transferred. Data to the host follows it.
 pub fn submit_reply(seq: u32, status: Status, actual: usize) -> [u8; HEADER_LEN] {
     let actual = u32::try_from(actual).expect("transfers are bounded by MAX_TRANSFER");
     reply(RET_SUBMIT, seq, status, actual)
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_what_it_does_not_speak() {
+    fn rejects_unsupported_requests() {
         let unknown = header([5, 0, 0, 0, 0, 0, 0, 0, 0, 0], [0; 8]);
         assert_eq!(decode(&unknown), Err(WireError::UnknownCommand(5)));
         let large = header([CMD_SUBMIT, 0, 0, 0, 2, 0, MAX_TRANSFER + 1, 0, 0, 0], [0; 8]);

@@ -1,5 +1,5 @@
-//! The bare beat: a loop that does nothing but sleep to absolute deadlines and note when it woke. What a publisher with the
-//! same period can at best do in this guest.
+//! The bare loop: sleeps to absolute deadlines and records when it woke. The best that a publisher with the same period
+//! can achieve in this guest.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -11,10 +11,10 @@ use rustix::time::{ClockId, Timespec};
 
 use crate::clock;
 
-/// Wakes noted between two writes: about a second's.
+/// Wake-ups recorded between two writes: about a second's.
 const PER_WRITE: usize = 512;
 
-/// Notes CLOCK_MONOTONIC in `path`, u64 little endian each, every `period` until it is killed.
+/// Writes CLOCK_MONOTONIC to `path`, u64 little endian each, every `period` until it is killed.
 pub fn run(period: Duration, path: &Path) -> io::Result<()> {
     let mut out = BufWriter::with_capacity(PER_WRITE * 8, File::create(path)?);
     let period_ns = u64::try_from(period.as_nanos()).unwrap_or(u64::MAX).max(1);
@@ -25,7 +25,7 @@ pub fn run(period: Duration, path: &Path) -> io::Result<()> {
         clock_nanosleep_absolute(ClockId::Monotonic, &due)?;
         let now_ns = clock::mono_ns();
         out.write_all(&now_ns.to_le_bytes())?;
-        // As the mask's publisher does: held up, it continues from here rather than in a burst.
+        // As in the mask's publisher: after a delay it continues from here rather than in a burst.
         if due_ns + period_ns <= now_ns {
             due_ns = now_ns;
         }

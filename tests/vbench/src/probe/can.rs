@@ -21,10 +21,10 @@ use crate::emu::can::bus::FLOOD_ID;
 const CAN_FRAME: usize = 16;
 const ERROR: u32 = 1 << 29;
 const EXTENDED: u32 = 1 << 31;
-/// An answer comes within this, or there is none.
+/// Time limit for an answer.
 const PATIENCE: Duration = Duration::from_secs(6);
 
-/// For seconds of a full bus: a reader that is held up by a busy machine loses none.
+/// Receive buffer for seconds of a full bus, so that a reader delayed by a busy machine loses nothing.
 const ROOM: usize = 16 << 20;
 
 /// A raw socket on one interface.
@@ -71,7 +71,7 @@ impl Bus {
         send(&self.socket, &bytes, SendFlags::empty()).map(drop)
     }
 
-    /// The next frame; none when none came within `limit`.
+    /// The next frame; `None` if none arrived within `limit`.
     pub fn receive(&self, limit: Duration) -> Result<Option<Frame>, Errno> {
         let end = Instant::now() + limit;
         loop {
@@ -93,7 +93,7 @@ impl Bus {
     }
 }
 
-/// Reads `ID#DATA`, as `cansend` does: three digits of an identifier, two of each byte.
+/// Parses `ID#DATA`, as `cansend` does: three digits of the identifier, two per byte.
 pub fn parse(text: &str) -> Option<Frame> {
     let (id, data) = text.split_once('#')?;
     let (pairs, odd) = data.as_bytes().as_chunks::<2>();
@@ -103,14 +103,14 @@ pub fn parse(text: &str) -> Option<Frame> {
     Frame::new(u32::from_str_radix(id, 16).ok()?, id.len() > 3, false, bytes.len(), &bytes)
 }
 
-/// A frame as `parse` reads it.
+/// A frame in the format of `parse`.
 pub fn text(frame: &Frame) -> String {
     let digits = if frame.extended { 8 } else { 3 };
     let data: String = frame.bytes().iter().map(|byte| format!("{byte:02x}")).collect();
     format!("{:0digits$x}#{data}", frame.id)
 }
 
-/// Sends each frame and prints the next one that comes, or `-` when none does.
+/// Sends each frame and prints the next received one, or `-` if there is none.
 pub fn ask(name: &str, frames: &[&str]) -> io::Result<()> {
     let bus = Bus::open(name)?;
     for wanted in frames {
@@ -121,7 +121,7 @@ pub fn ask(name: &str, frames: &[&str]) -> io::Result<()> {
     Ok(())
 }
 
-/// Sends a frame every `period` until the interface is gone; how many, how many came back, and what ended it.
+/// Sends a frame every `period` until the interface is gone; returns frames sent and received, and what ended it.
 pub fn stream(name: &str, frame: &str, period: Duration) -> io::Result<Value> {
     let frame = parse(frame).ok_or_else(|| io::Error::other("no ID#DATA"))?;
     let bus = Bus::open(name)?;
@@ -133,7 +133,7 @@ pub fn stream(name: &str, frame: &str, period: Duration) -> io::Result<Value> {
     };
     loop {
         match bus.send(&frame) {
-            // The queue is full as long as the bus is off.
+            // The queue is full while the bus is off.
             Ok(()) | Err(Errno::NOBUFS) => sent += 1,
             Err(error) => return ended(sent, received, error),
         }
@@ -148,7 +148,7 @@ pub fn stream(name: &str, frame: &str, period: Duration) -> io::Result<Value> {
     }
 }
 
-/// Reads so many generated frames and counts them.
+/// Reads this many generated frames and counts them.
 pub fn count(name: &str, wanted: usize) -> io::Result<Value> {
     let bus = Bus::open(name)?;
     let mut tally = Tally::default();

@@ -1,4 +1,4 @@
-//! A keyboard of the kernel's own making (uinput), and a program that takes another's events away.
+//! A keyboard created through the kernel (uinput), and a program that grabs another's events.
 
 use std::io::BufRead;
 use std::path::Path;
@@ -13,8 +13,8 @@ fn code(word: &str) -> Result<KeyCode, Failure> {
     KeyCode::from_str(word).map_err(|_| format!("there is no key {word}").into())
 }
 
-/// An input device called `name` with these keys, which follows the lines until they end: `press KEY`, `release KEY`.
-/// Prints `ready`, and `done` after each.
+/// An input device called `name` with these keys, which follows the input lines `press KEY` and `release KEY` to their
+/// end. Prints `ready`, and `done` after each.
 pub fn serve(name: &str, keys: &[&str], lines: impl BufRead) -> Result<(), Failure> {
     let mut set = AttributeSet::<KeyCode>::new();
     for word in keys {
@@ -35,7 +35,7 @@ pub fn serve(name: &str, keys: &[&str], lines: impl BufRead) -> Result<(), Failu
     Ok(())
 }
 
-/// Keeps the events of the device at `node` from everybody else, for as long as this program runs.
+/// Grabs the events of the device at `node` for as long as this program runs.
 pub fn grab(node: &Path) -> Result<(), Failure> {
     let mut device = Device::open(node)?;
     device.grab()?;

@@ -10,12 +10,12 @@ use serde_json::Value;
 use super::tally::Tally;
 use crate::emu::lan::lidar;
 
-/// For seconds of packets: a reader that is held up by a busy machine loses none.
+/// Receive buffer for seconds of packets, so that a reader delayed by a busy machine loses nothing.
 const ROOM: usize = 16 << 20;
-/// Packets come more often than this, or there are none.
+/// Time limit for a packet.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Reads so many packets and counts them.
+/// Reads this many packets and counts them.
 pub fn count(port: u16, wanted: usize) -> io::Result<Value> {
     let socket = UdpSocket::bind(("0.0.0.0", port))?;
     socket.set_read_timeout(Some(PATIENCE))?;

@@ -1,8 +1,8 @@
-//! Watches `/dev/shm/rapid_hardware_mask` and prints each change, with the time it was first seen, and how it beats.
+//! Watches `/dev/shm/rapid_hardware_mask` and prints each change, with the time first seen, and publication timing.
 //!
 //! Layout, little endian: bytes "RAPD", u8 version, u8 count, u16 write generation (odd while being written) at 6,
 //! u64 mask at 8, u64 CLOCK_REALTIME ns at 16, u64 sequence at 24.
-//! Invariant: reads only; a record that changed while it was read is read again.
+//! Invariant: reads only; a record that changed while being read is read again.
 
 use std::fs::File;
 use std::os::unix::fs::{FileExt, MetadataExt};
@@ -17,11 +17,11 @@ use crate::emu::log::{Log, Moment};
 /// Where the mask is published.
 pub const MASK_PATH: &str = "/dev/shm/rapid_hardware_mask";
 const RECORD: usize = 32;
-/// Between two looks. The mask is published every 2 ms.
+/// Polling interval. The mask is published every 2 ms.
 const INTERVAL: Duration = Duration::from_micros(500);
-/// A line about the beat covers this much.
+/// Length of the window summarised by a `beat` line.
 const WINDOW_NS: u64 = 100_000_000;
-/// Looks between two checks that the file has not been replaced.
+/// Reads between two checks that the file has not been replaced.
 const LOOKS_PER_CHECK: u32 = 100;
 
 /// One reading.
@@ -41,7 +41,7 @@ pub fn parse(bytes: &[u8; RECORD]) -> Option<Record> {
     (&bytes[..4] == b"RAPD").then_some(Record { mask: word(8)?, published_ns: word(16)?, sequence: word(24)? })
 }
 
-/// Prints `mask` lines (and `mask_gone`, `mask_seen` as the file comes and goes) until `limit` has passed.
+/// Prints `mask` lines (and `mask_gone`, `mask_seen` as the file disappears and appears) until `limit` has passed.
 pub fn watch(path: &Path, limit: Option<Duration>, log: &Log) {
     let started = Instant::now();
     let running = || limit.is_none_or(|limit| started.elapsed() < limit);
@@ -50,9 +50,9 @@ pub fn watch(path: &Path, limit: Option<Duration>, log: &Log) {
             thread::sleep(INTERVAL * 10);
             continue;
         };
-        log.say("mask_seen", Moment::now(), json!({}));
+        log.write("mask_seen", Moment::now(), json!({}));
         follow(&file, running, log);
-        log.say("mask_gone", Moment::now(), json!({}));
+        log.write("mask_gone", Moment::now(), json!({}));
     }
 }
 
@@ -70,7 +70,7 @@ fn follow(file: &File, running: impl Fn() -> bool, log: &Log) {
                     "sequence": record.sequence,
                     "published_ns": record.published_ns,
                 });
-                log.say("mask", Moment::now(), fields);
+                log.write("mask", Moment::now(), fields);
             }
             last = Some(record);
         }
@@ -82,8 +82,8 @@ fn follow(file: &File, running: impl Fn() -> bool, log: &Log) {
     }
 }
 
-/// How the sequence advances, one `beat` line a window: looks and publications in it, the longest silence of the mask that
-/// ended in it, and the longest pause between two looks, which is the sampler's own.
+/// The progress of the sequence, one `beat` line per window: reads and publications in it, the longest silence of the
+/// mask that ended in it, and the longest pause between two reads, which is the sampler's own.
 #[derive(Default)]
 struct Beat {
     begun_ns: u64,
@@ -91,7 +91,7 @@ struct Beat {
     publications: u64,
     longest_ns: u64,
     pause_ns: u64,
-    /// Sequence last seen, and when it was new.
+    /// Last sequence seen, and when it was new.
     last: Option<(u64, u64)>,
     looked_ns: u64,
 }
@@ -124,7 +124,7 @@ impl Beat {
                 "longest_ns": self.longest_ns,
                 "pause_ns": self.pause_ns,
             });
-            log.say("beat", now, fields);
+            log.write("beat", now, fields);
             *self = Self { begun_ns: now_ns, last: self.last, looked_ns: now_ns, ..Self::default() };
         }
     }

@@ -1,7 +1,7 @@
-//! Independent eyes inside the guest: what a camera delivers, what goes over CAN and the network, what the mask is, what kernel
-//! and udev report and how evenly a thread can beat, all without `rapid`.
+//! Independent observers inside the guest, without `rapid`: camera data, CAN and network traffic, the mask, kernel and
+//! udev events, and how evenly a thread can wake.
 //!
-//! Invariant: the only `unsafe` of the bench is here, in the calls of V4L2 and the address of a CAN socket.
+//! Invariant: the only `unsafe` code of the bench is here: V4L2 calls and the address of a CAN socket.
 
 pub mod beat;
 pub mod can;

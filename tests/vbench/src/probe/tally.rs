@@ -1,13 +1,13 @@
-//! Counts of what came with a number each.
+//! Counts received numbers.
 //!
-//! The kernel hands packets of one device to several processors and may give two of them in the other order; what counts is that
-//! none is missing.
+//! The kernel distributes packets of one device over several processors and may deliver two of them in reverse order;
+//! what matters is that none is missing.
 
 use serde_json::{Value, json};
 
 use crate::clock;
 
-/// The numbers that came, in their order.
+/// The numbers received, in order.
 #[derive(Debug, Default)]
 pub struct Tally {
     numbers: Vec<u32>,
@@ -15,7 +15,7 @@ pub struct Tally {
 }
 
 impl Tally {
-    /// This number came.
+    /// A number was received.
     pub fn add(&mut self, number: u32) {
         if self.numbers.is_empty() {
             self.begun_ns = clock::mono_ns();
@@ -23,17 +23,17 @@ impl Tally {
         self.numbers.push(number);
     }
 
-    /// How many came.
+    /// How many were received.
     pub fn len(&self) -> usize {
         self.numbers.len()
     }
 
-    /// None came.
+    /// Whether none was received.
     pub fn is_empty(&self) -> bool {
         self.numbers.is_empty()
     }
 
-    /// How many came, how many between the first and the last did not, how many came after a later one, and the time all took.
+    /// Numbers received, missing between the first and the last, and received after a later one; and the total time.
     pub fn summary(mut self) -> Value {
         let seconds = clock::mono_ns().saturating_sub(self.begun_ns) as f64 / 1e9;
         let came = self.numbers.len();

@@ -1,9 +1,9 @@
 //! The device events of the kernel and udev, as a bare listener receives them.
 //!
-//! Both send on one netlink protocol, in two groups. The kernel's message is `ACTION@PATH` and lines `KEY=VALUE`, each ended
-//! by a zero byte; udev's has a binary head in front of such lines (`struct udev_monitor_netlink_header`, systemd,
+//! Both send on one netlink protocol, in two groups. The kernel's message is `ACTION@PATH` and `KEY=VALUE` lines, each
+//! ended by a zero byte; udev's has a binary header before such lines (`struct udev_monitor_netlink_header`, systemd,
 //! `src/libsystemd/sd-device/device-monitor.c`).
-//! Invariant: a message that is neither is passed over; it never ends the listener.
+//! Invariant: a message that is neither is skipped; it never ends the listener.
 
 use std::os::fd::OwnedFd;
 
@@ -18,7 +18,7 @@ use crate::emu::log::{Log, Moment};
 /// Group 1 is the kernel's, group 2 udev's.
 const GROUPS: u32 = 0b11;
 const UDEV_HEAD: &[u8] = b"libudev\0";
-/// The head is the prefix and eight words of 32 bits; its properties begin at the third of them.
+/// The header is the prefix and eight words of 32 bits; the third is the offset of its properties.
 const PROPERTIES_AT: usize = UDEV_HEAD.len() + 2 * 4;
 /// More than the longest message: the kernel's limit is 2 KiB, udev adds its own properties.
 const ROOM: usize = 16 * 1024;
@@ -27,7 +27,7 @@ const INBOX: usize = 1 << 20;
 /// One message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Uevent {
-    /// Reported by udev, its rules done; otherwise by the kernel.
+    /// Reported by udev after its rules; otherwise by the kernel.
     pub processed: bool,
     properties: Vec<(String, String)>,
 }
@@ -51,12 +51,12 @@ impl Uevent {
         (!event.get("ACTION").is_empty()).then_some(event)
     }
 
-    /// A property; empty when it is not there.
+    /// A property; empty if it is absent.
     pub fn get(&self, key: &str) -> &str {
         self.properties.iter().find(|(found, _)| found == key).map_or("", |(_, value)| value)
     }
 
-    /// The node, with its path, of a camera that has just been made ready to be opened.
+    /// The node, with its path, of a camera that has just become ready for opening.
     pub fn camera_added(&self) -> Option<String> {
         let is_camera = self.get("SUBSYSTEM") == "video4linux" && self.get("ID_V4L_CAPABILITIES").contains(":capture:");
         (self.processed && is_camera && self.get("ACTION") == "add").then(|| self.get("DEVNAME").to_owned())
@@ -82,7 +82,7 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Begins to listen.
+    /// Starts listening.
     pub fn open() -> Result<Self, Errno> {
         let socket = socket(AddressFamily::NETLINK, SocketType::DGRAM, Some(KOBJECT_UEVENT))?;
         set_socket_recv_buffer_size(&socket, INBOX)?;
@@ -90,7 +90,7 @@ impl Listener {
         Ok(Self { socket, room: vec![0; ROOM] })
     }
 
-    /// Waits for the next message, with the moment it came.
+    /// Waits for the next message; returns it with its arrival time.
     pub fn receive(&mut self) -> Result<(Uevent, Moment), Errno> {
         loop {
             let (length, _) = recv(&self.socket, &mut self.room[..], RecvFlags::empty())?;
@@ -102,13 +102,13 @@ impl Listener {
     }
 }
 
-/// Prints `uevent` lines for USB devices, the nodes of cameras and serial lines and network interfaces, without end.
+/// Prints `uevent` lines for USB devices, nodes of cameras and serial lines, and network interfaces, endlessly.
 pub fn watch(log: &Log) -> Result<(), Errno> {
     let mut listener = Listener::open()?;
     loop {
         let (event, moment) = listener.receive()?;
         if matches!(event.get("SUBSYSTEM"), "usb" | "video4linux" | "tty" | "net") {
-            log.say("uevent", moment, event.describe());
+            log.write("uevent", moment, event.describe());
         }
     }
 }

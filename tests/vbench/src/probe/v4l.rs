@@ -1,4 +1,4 @@
-//! Reads a camera through V4L2 and sums up what came: the proof that the emulator works, independent of `rapid`.
+//! Reads a camera through V4L2 and summarises the frames: proof that the emulator works, independent of `rapid`.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -81,7 +81,7 @@ pub enum ReadError {
     Silence(u32),
 }
 
-/// Captures `count` frames in the node's current format and describes them: how many were whole, in order, without a hole.
+/// Captures `count` frames in the node's current format and reports how many were whole, in order, without a gap.
 pub fn read(path: &Path, count: u32) -> Result<Value, ReadError> {
     let mut tally = Tally::default();
     let format = capture(path, |bytes| {
@@ -91,8 +91,8 @@ pub fn read(path: &Path, count: u32) -> Result<Value, ReadError> {
     Ok(tally.describe(&format))
 }
 
-/// Opens each camera as soon as udev has made it ready, takes one frame, closes it and prints how long the steps took, without
-/// end. The plainest program there can be: it keeps the camera's format, and does nothing else meanwhile.
+/// Opens each camera as soon as udev has made it ready, reads one frame, closes it and prints how long the steps took,
+/// endlessly. The simplest possible program: it keeps the camera's format, and does nothing else meanwhile.
 pub fn first_frames(log: &Log) -> Result<(), ReadError> {
     let receive_error = |error| ReadError::Call("recv from udev", error);
     let mut listener = Listener::open().map_err(receive_error)?;
@@ -102,14 +102,14 @@ pub fn first_frames(log: &Log) -> Result<(), ReadError> {
         match first_frame(Path::new(&node)) {
             Ok((streaming, came)) => {
                 let fields = json!({"node": node, "told_ns": reported.mono_ns, "streaming_ns": streaming.mono_ns});
-                log.say("first_frame", came, fields);
+                log.write("first_frame", came, fields);
             }
-            Err(error) => log.say("missed", reported, json!({"node": node, "error": error.to_string()})),
+            Err(error) => log.write("missed", reported, json!({"node": node, "error": error.to_string()})),
         }
     }
 }
 
-/// When the camera streamed and when its first frame had come.
+/// When the camera streamed and when its first frame had arrived.
 fn first_frame(node: &Path) -> Result<(Moment, Moment), ReadError> {
     let mut camera = Camera::open(node)?;
     let streaming = Moment::now();
@@ -121,7 +121,7 @@ fn first_frame(node: &Path) -> Result<(Moment, Moment), ReadError> {
     Ok((streaming, came))
 }
 
-/// Hands each captured frame to `take` until it breaks off, in the node's current format.
+/// Passes each captured frame to `take` until it returns a break, in the node's current format.
 pub fn capture(path: &Path, mut take: impl FnMut(&[u8]) -> ControlFlow<()>) -> Result<Format, ReadError> {
     let mut camera = Camera::open(path)?;
     for so_far in 0.. {
@@ -242,7 +242,7 @@ impl Camera {
         let mut buffer = Buffer { kind: CAPTURE, memory: MMAP, ..Buffer::default() };
         update::<DEQUEUE, _>(&self.node, &mut buffer).map_err(|e| ReadError::Call("VIDIOC_DQBUF", e))?;
         let (place, length) = self.buffers[buffer.index as usize];
-        // SAFETY: the mapping is `length` bytes and lives as long as `self`; the driver does not write a dequeued buffer.
+        // SAFETY: the mapping has `length` bytes and lives as long as `self`; the driver does not write a dequeued one.
         let went = take(unsafe { std::slice::from_raw_parts(place.cast(), length.min(buffer.bytes_used as usize)) });
         update::<QUEUE, _>(&self.node, &mut buffer).map_err(|e| ReadError::Call("VIDIOC_QBUF", e))?;
         Ok(went)
@@ -259,6 +259,6 @@ impl Drop for Camera {
 }
 
 fn update<const OPCODE: Opcode, T>(node: &File, value: &mut T) -> Result<(), Errno> {
-    // SAFETY: every opcode above is made from the `repr(C)` struct it is used with, whose sizes are asserted.
+    // SAFETY: every opcode above is created from the `repr(C)` struct used with it, whose sizes are asserted.
     unsafe { ioctl(node, Updater::<OPCODE, T>::new(value)) }
 }

@@ -1,4 +1,4 @@
-//! What befalls a machine while it records: its clock is set, its disk fills up, its folder is moved or removed.
+//! Accidents while a machine records: its clock is set, its disk fills up, its folder is moved or removed.
 
 use std::path::PathBuf;
 use std::time::Duration;

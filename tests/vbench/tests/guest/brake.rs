@@ -44,7 +44,7 @@ key = { device = "bench pedal", code = "KEY_B" }
 "#;
 
 const SCRIPT: &str = r#"
-modprobe uinput
+modprobe -a uinput evdev
 mkfifo /tmp/keys
 "${usbemu[@]}" --keys 'bench pedal' KEY_B 0<>/tmp/keys >$out/keys 2>&1 &
 exec 8>/tmp/keys
@@ -159,7 +159,7 @@ fn time(lines: &[Value], action: &str, level: Option<u64>) -> Option<u64> {
 }
 
 #[test]
-fn a_brake_is_engaged_before_its_joint_is_let_go_whatever_stops_it() {
+fn a_brake_is_engaged_before_its_joint_is_released_whatever_stops_it() {
     let text = registry(&[can("arm", "/rapid/arm_state", 0, "2e88:4603", "CAN1", BUS)]) + STOPS;
     let scenario = Scenario::new("brake")
         .spare(DeviceSpec::can(Protocol::Damiao).serial("CAN1").motor(0x05, 0x15, "DM4310"))

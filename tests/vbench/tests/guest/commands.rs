@@ -54,6 +54,10 @@ emu plug 0 1 2 3
 wait_for 60 attached 0 1 2 3 || fail 'not attached'
 wait_for 30 test -e /dev/video2 -a -e /dev/ttyUSB0 -a -e /dev/ttyACM0
 udevadm settle
+# A camera that is not on USB.
+modprobe vivid n_devs=1 node_types=0x1 vid_cap_nr=9 || fail 'no vivid'
+wait_for 30 test -e /dev/video9
+udevadm settle
 config='--config /tmp/bench/devices.toml'
 "${rapid[@]}" devices --formats $config >$out/devices.txt || fail 'rapid devices'
 "${rapid[@]}" devices --json $config >$out/devices.jsonl || fail 'rapid devices --json'
@@ -106,6 +110,11 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
     };
     assert_eq!([entry("CAM00A1"), entry("YUV1"), entry("FT1")], ["cam_wide", "cam_raw", "force"]);
     assert_eq!(entry("STRANGER"), serde_json::Value::Null);
+    let onboard: Vec<_> = objects.iter().filter(|object| object["node"] == "/dev/video9").collect();
+    assert_eq!(onboard.len(), 1, "{objects:?}");
+    assert!(onboard[0]["entry"].is_null() && onboard[0]["reasons"][0].as_str().unwrap().contains("not on USB"));
+    let (_, onboard) = listing.split_once("/dev/video9").expect("a camera that is not on USB is listed");
+    assert!(onboard.contains("it is not on USB") && onboard.contains("YUYV"), "{listing}");
 
     // Stable names appear with the rules, and go with the devices.
     println!("{}", outcome.file("links"));

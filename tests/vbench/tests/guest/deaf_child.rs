@@ -5,7 +5,7 @@ use vbench::deaf::{Span, figures, rhythm, scenario};
 use vbench::recording::falls;
 
 #[test]
-fn programs_that_behave_badly_do_not_hold_up_the_mask() {
+fn misbehaving_programs_do_not_delay_the_mask() {
     let outcome = scenario().run().unwrap_or_else(|error| panic!("{error}"));
     ended(&outcome);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());

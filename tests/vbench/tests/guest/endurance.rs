@@ -20,7 +20,7 @@ const SEED: u64 = 0x5eed_2026;
 
 /// 90 cycles over three devices in three stretches after a warm-up; two of the devices end plugged, one unplugged.
 #[test]
-fn ninety_cycles_leave_the_truth_and_nothing_else() {
+fn ninety_cycles_leave_a_correct_mask_and_nothing_else() {
     let mut random = Random(SEED);
     let script = (1..=6).fold(SCRIPT.to_owned(), |script, number| {
         // One device's cycles of each burst begin with a rest longer than the cooldown.

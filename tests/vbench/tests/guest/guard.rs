@@ -65,7 +65,7 @@ fn round<'a>(outcome: &'a Outcome, word: &str) -> &'a [Value] {
 }
 
 #[test]
-fn a_killed_program_leaves_no_motor_to_its_own_limit() {
+fn motors_of_a_killed_program_stop_before_their_own_time_limit() {
     let adapter = |protocol, serial| DeviceSpec::can(protocol).serial(serial).motor(0x05, 0x15, "DM4310");
     let kinds = [("socketcan", "1d50:606f", "CAN1"), ("slcan", "ad50:60c4", "CAN2"), ("damiao", "2e88:4603", "CAN3")];
     let mut scenario = Scenario::new("guard")
@@ -84,7 +84,7 @@ fn a_killed_program_leaves_no_motor_to_its_own_limit() {
         let first = |action: &str| lines.iter().find(|line| line["action"] == action);
         let off = first("motor_disabled").and_then(|line| line["mono_ns"].as_u64());
         let off = off.unwrap_or_else(|| panic!("{round_of}: not disabled: {lines:?}"));
-        assert_eq!(first("motor_timeout"), None, "{round_of}: the motor had to give up by itself");
+        assert_eq!(first("motor_timeout"), None, "{round_of}: the motor timed out by itself");
         assert_eq!(first("motor_enabled"), None, "{round_of}: enabled again");
         let state = first("motor_state").unwrap_or_else(|| panic!("{round_of}: {lines:?}"));
         assert_eq!(state["enabled"], false, "{round_of}: {state}");

@@ -93,7 +93,7 @@ fn camera(outcome: &Outcome) {
     gopro::clip(1, 0, &mut sent);
     let clip = files.lines().find(|name| name.ends_with(".MP4")).unwrap_or_else(|| panic!("{files}"));
     let fetched = std::fs::read(outcome.share.join("out/rec").join(clip)).expect("the clip");
-    assert!(fetched == sent, "{clip}: not what the camera has");
+    assert!(fetched == sent, "{clip}: differs from the clip of the camera");
     assert!(!files.contains(".partial"), "{files}");
 }
 

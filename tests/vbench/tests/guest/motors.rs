@@ -105,7 +105,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
         Scenario::new("motors")
             .device(adapter.motor(0x05, 0x15, "DMH3510").motor(0x06, 0x16, "DM4310"))
             .registry(&registry(&[can("arm", ARM, 0, "1d50:606f", "CAN1", BUS)]))
-            .action_program()
+            .example("publish_action")
             .script(SCRIPT)
             .limit(std::time::Duration::from_secs(180)),
     );
@@ -184,7 +184,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
         };
         let off = reported("motor_disabled").first().and_then(|line| line["mono_ns"].as_u64());
         let off = off.unwrap_or_else(|| panic!("motor {motor} got no command to turn off"));
-        assert!(reported("motor_timeout").is_empty(), "motor {motor} had to give up by itself");
+        assert!(reported("motor_timeout").is_empty(), "motor {motor} timed out by itself");
         let runs = reported("commands_end");
         assert!(!runs.is_empty(), "motor {motor} had commands until the end");
         for run in runs {

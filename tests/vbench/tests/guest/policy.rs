@@ -240,7 +240,7 @@ fn scenario(demonstration: &Recording, feeds: &[(&str, Vec<Vec<u8>>); 2]) -> Sce
         .device(DeviceSpec::acm(0x1209, 0x7a03, 10.0).serial("ARM").feed("/tmp/bench/arm"))
         .device(DeviceSpec::acm(0x1209, 0x7a04, 10.0).serial("MOVER"))
         .registry(&TASK.replace("[device.arm.action]", MOVER.trim()))
-        .node_program()
+        .example("process_node")
         .file("wrist", feed::pack(&feeds[0].1))
         .file("tactile", feed::pack(&feeds[1].1))
         .file("arm", feed::pack(demonstration.rows(ARM).iter().map(line)))

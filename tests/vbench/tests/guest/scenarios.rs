@@ -202,7 +202,7 @@ fn a_quick_replug_is_not_lost() {
 
 /// Two units that differ by their ports alone fill two entries; each keeps its own when the other leaves, and gets it back.
 #[test]
-fn equal_units_keep_their_entries() {
+fn identical_units_keep_their_entries() {
     let registry =
         registry(&[camera("cam_left", WRIST, 0, None, (640, 480)), camera("cam_right", SIDE, 1, None, (640, 480))]);
     let outcome = recorded(

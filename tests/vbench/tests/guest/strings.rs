@@ -72,7 +72,7 @@ fn registry() -> String {
 }
 
 #[test]
-fn names_that_devices_give_themselves_are_names_and_nothing_else() {
+fn names_supplied_by_devices_are_treated_only_as_names() {
     let camera = |pid, serial: &str| {
         DeviceSpec::uvc(0x046d, pid).serial(serial).names(NAMES[0], NAMES[1]).mode(Format::Mjpg, 320, 240, &[15])
     };

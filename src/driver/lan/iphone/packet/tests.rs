@@ -24,40 +24,40 @@ fn picture(bytes: &[u8], time: f64) -> Vec<u8> {
 }
 
 #[derive(Debug, PartialEq)]
-enum Told {
+enum Parsed {
     Picture(Vec<u8>, f64),
     Session(Vec<u8>),
     Malformed,
 }
 
-fn reported(stream: &[u8], size: usize) -> Vec<Told> {
+fn parsed(stream: &[u8], size: usize) -> Vec<Parsed> {
     let mut packets = Packets::new(100);
-    let mut reported = Vec::new();
+    let mut parsed = Vec::new();
     for mut piece in stream.chunks(size.max(1)) {
         while !piece.is_empty() {
             let (taken, cut) = packets.feed(piece);
             piece = &piece[taken..];
             match cut {
                 Cut::Open => assert!(piece.is_empty(), "stopped early"),
-                Cut::Frame(frame) => reported.push(Told::Picture(packets.payload().to_vec(), frame.device_time)),
-                Cut::Session => reported.push(Told::Session(packets.payload().to_vec())),
-                Cut::Malformed => reported.push(Told::Malformed),
+                Cut::Frame(frame) => parsed.push(Parsed::Picture(packets.payload().to_vec(), frame.device_time)),
+                Cut::Session => parsed.push(Parsed::Session(packets.payload().to_vec())),
+                Cut::Malformed => parsed.push(Parsed::Malformed),
             }
         }
     }
     assert!(packets.payload.capacity() <= LARGEST_SESSION.max(4 * (FRAME_HEAD + 100)), "memory is bounded");
-    reported
+    parsed
 }
 
 #[track_caller]
-fn check(stream: &[u8], expected: &[Told]) {
+fn check(stream: &[u8], expected: &[Parsed]) {
     for size in [1, 3, 8, 85, stream.len()] {
-        assert_eq!(reported(stream, size), expected, "pieces of {size}");
+        assert_eq!(parsed(stream, size), expected, "pieces of {size}");
     }
 }
 
 #[test]
-fn a_session_frames_and_what_is_let_go() {
+fn sessions_and_frames_are_parsed_and_other_messages_skipped() {
     let stream = [
         message(0, br#"{"sessionId":"a"}"#),
         picture(b"one", 12.5),
@@ -72,11 +72,11 @@ fn a_session_frames_and_what_is_let_go() {
     check(
         &stream,
         &[
-            Told::Session(br#"{"sessionId":"a"}"#.to_vec()),
-            Told::Picture(b"one".to_vec(), 12.5),
-            Told::Picture(Vec::new(), 12.6),
-            Told::Session(Vec::new()),
-            Told::Picture(vec![9; 100], 12.7),
+            Parsed::Session(br#"{"sessionId":"a"}"#.to_vec()),
+            Parsed::Picture(b"one".to_vec(), 12.5),
+            Parsed::Picture(Vec::new(), 12.6),
+            Parsed::Session(Vec::new()),
+            Parsed::Picture(vec![9; 100], 12.7),
         ],
     );
 }
@@ -93,8 +93,8 @@ fn a_malformed_message_loses_only_itself() {
         picture(b"two", 2.0),
     ]
     .concat();
-    let bad = || Told::Malformed;
-    check(&stream, &[bad(), bad(), bad(), bad(), bad(), Told::Picture(b"two".to_vec(), 2.0)]);
+    let bad = || Parsed::Malformed;
+    check(&stream, &[bad(), bad(), bad(), bad(), bad(), Parsed::Picture(b"two".to_vec(), 2.0)]);
 }
 
 #[test]
@@ -110,7 +110,7 @@ fn a_frame_carries_the_camera_pose() {
 
 proptest! {
     #[test]
-    fn no_bytes_break_it_and_pieces_do_not_matter(
+    fn any_bytes_are_survived_and_chunking_does_not_matter(
         messages in prop::collection::vec((0_u8..5, prop::collection::vec(any::<u8>(), 0..200), any::<bool>()), 0..8),
         tail in prop::collection::vec(any::<u8>(), 0..20), size in 1_usize..50,
     ) {
@@ -120,6 +120,6 @@ proptest! {
         }
         stream.extend(tail);
         // Poses and times of random bytes may be NaN, which equals nothing.
-        prop_assert_eq!(format!("{:?}", reported(&stream, size)), format!("{:?}", reported(&stream, stream.len())));
+        prop_assert_eq!(format!("{:?}", parsed(&stream, size)), format!("{:?}", parsed(&stream, stream.len())));
     }
 }

@@ -1,6 +1,6 @@
 //! A USB adapter for a CAN bus: gs_usb, or a serial line that uses slcan or Damiao's framing.
 //!
-//! Invariant: a frame of the host's reaches the bus only while the adapter is on it, at the bus's own rate, and not bus-off.
+//! Invariant: the host's frames reach the bus only while the adapter is on it, at the bus's own rate, and not bus-off.
 
 use std::collections::VecDeque;
 
@@ -21,7 +21,7 @@ use crate::emu::talker::Talker;
 /// The rate of every simulated bus, bits a second.
 const BUS_RATE: u32 = 1_000_000;
 const DATA_OUT: u8 = 0x02;
-/// What an adapter can hold for a host that does not fetch it; more is lost, and reported.
+/// Output buffer of an adapter for a host that does not fetch; further data is lost, and reported.
 const OUTBOX: usize = 64 * 1024;
 
 /// The adapter's protocol with the host.
@@ -38,13 +38,13 @@ pub enum Protocol {
 /// An adapter with its bus.
 #[derive(Debug)]
 pub struct Adapter {
-    speech: Speech,
+    codec: Codec,
     bus: Bus,
-    /// Bits a second it was set to; `None`: it is not on the bus.
+    /// The bit rate that was set; `None`: it is not on the bus.
     on_bus: Option<u32>,
     rate: u32,
     is_off: bool,
-    /// Frames that wait for the bus to come back, with their echo ids.
+    /// Frames that wait for the bus to recover, with their echo ids.
     held: VecDeque<(u32, Frame)>,
     outbox: VecDeque<u8>,
     lost: u64,
@@ -52,15 +52,15 @@ pub struct Adapter {
 }
 
 #[derive(Debug)]
-enum Speech {
+enum Codec {
     GsUsb,
     Slcan(Serial, Slcan),
     Damiao(Serial, Damiao),
 }
 
-impl Speech {
+impl Codec {
     fn new(protocol: Protocol) -> Self {
-        // Only the line's descriptors and settings are taken of it, none of its own lines.
+        // Only the descriptors and settings of the serial line are used, none of its own text lines.
         let line = || Serial::new(Flavour::Acm, 1.0, 0, None);
         match protocol {
             Protocol::GsUsb => Self::GsUsb,
@@ -82,7 +82,7 @@ impl Adapter {
     /// An adapter on a bus with these motors.
     pub fn new(protocol: Protocol, motors: &[MotorSpec]) -> Self {
         let mut adapter = Self {
-            speech: Speech::new(protocol),
+            codec: Codec::new(protocol),
             bus: Bus::new(motors),
             on_bus: None,
             rate: BUS_RATE,
@@ -102,16 +102,16 @@ impl Adapter {
         }
         self.on_bus = rate;
         match rate {
-            Some(rate) => self.tell("can_up", json!({"bitrate": rate, "fits": rate == BUS_RATE})),
+            Some(rate) => self.report("can_up", json!({"bitrate": rate, "fits": rate == BUS_RATE})),
             None => {
                 let lost = std::mem::take(&mut self.lost);
-                self.tell("can_down", json!({"lost": lost}));
+                self.report("can_down", json!({"lost": lost}));
             }
         }
         self.is_off = false;
         self.held.clear();
-        // A line's answers are on their way already.
-        if matches!(self.speech, Speech::GsUsb) {
+        // Answers on a serial line are already in transit.
+        if matches!(self.codec, Codec::GsUsb) {
             self.outbox.clear();
         }
     }
@@ -120,12 +120,12 @@ impl Adapter {
         self.on_bus == Some(BUS_RATE) && !self.is_off
     }
 
-    /// Byte by byte: what one command leads to comes before the answer to the next.
-    fn hear_text(&mut self, text: &[u8], now_ns: u64) {
+    /// Byte by byte: the effects of one command come before the answer to the next.
+    fn receive_text(&mut self, text: &[u8], now_ns: u64) {
         for byte in text {
-            let Speech::Slcan(_, slcan) = &mut self.speech else { return };
+            let Codec::Slcan(_, slcan) = &mut self.codec else { return };
             let (mut answer, mut what) = (Vec::new(), None);
-            slcan.hear(&[*byte], &mut answer, |received| what = Some(received));
+            slcan.receive(&[*byte], &mut answer, |received| what = Some(received));
             self.outbox.extend(answer);
             match what {
                 Some(Received::Open(rate)) => self.join(rate),
@@ -135,7 +135,7 @@ impl Adapter {
         }
     }
 
-    /// A frame of the host's; a gs_usb host wants it back once it is on the bus.
+    /// A frame from the host; a gs_usb host expects an echo once it is on the bus.
     fn send(&mut self, echo: u32, frame: Frame, now_ns: u64) {
         if !self.is_connected() {
             if self.on_bus == Some(BUS_RATE) {
@@ -143,17 +143,17 @@ impl Adapter {
             }
             return;
         }
-        if matches!(self.speech, Speech::GsUsb) {
+        if matches!(self.codec, Codec::GsUsb) {
             self.outbox.extend(gsusb::encode(&frame, echo));
         }
-        let Self { bus, speech, outbox, lost, .. } = self;
-        bus.send(&frame, now_ns, |answer| put(speech, &answer, outbox, lost));
+        let Self { bus, codec, outbox, lost, .. } = self;
+        bus.send(&frame, now_ns, |answer| put(codec, &answer, outbox, lost));
     }
 
     fn set_off(&mut self, is_off: bool, now_ns: u64) {
         self.is_off = is_off;
-        self.tell("bus_off", json!({"off": is_off}));
-        if matches!(self.speech, Speech::GsUsb) && self.on_bus.is_some() {
+        self.report("bus_off", json!({"off": is_off}));
+        if matches!(self.codec, Codec::GsUsb) && self.on_bus.is_some() {
             self.outbox.extend(gsusb::bus_off(is_off));
         }
         if !is_off {
@@ -163,40 +163,40 @@ impl Adapter {
         }
     }
 
-    fn tell(&mut self, action: &'static str, fields: serde_json::Value) {
+    fn report(&mut self, action: &'static str, fields: serde_json::Value) {
         self.reported.push(Reported::new(action, fields));
     }
 }
 
 /// Writes a frame of the bus for the host.
-fn put(speech: &Speech, frame: &Frame, outbox: &mut VecDeque<u8>, lost: &mut u64) {
+fn put(codec: &Codec, frame: &Frame, outbox: &mut VecDeque<u8>, lost: &mut u64) {
     if outbox.len() > OUTBOX {
         *lost += 1;
         return;
     }
     let mut text = Vec::with_capacity(32);
-    match speech {
-        Speech::GsUsb => text.extend(gsusb::encode(frame, FROM_THE_BUS)),
-        Speech::Slcan(_, slcan) => slcan.tell(frame, &mut text),
-        Speech::Damiao(..) => damiao::tell(frame, &mut text),
+    match codec {
+        Codec::GsUsb => text.extend(gsusb::encode(frame, FROM_THE_BUS)),
+        Codec::Slcan(_, slcan) => slcan.send_to_host(frame, &mut text),
+        Codec::Damiao(..) => damiao::send_to_host(frame, &mut text),
     }
     outbox.extend(text);
 }
 
 impl Talker for Adapter {
     fn class(&self) -> DeviceClass {
-        match &self.speech {
-            Speech::GsUsb => DeviceClass { class: [0, 0, 0], release: 0x0100 },
-            Speech::Slcan(line, _) | Speech::Damiao(line, _) => line.class(),
+        match &self.codec {
+            Codec::GsUsb => DeviceClass { class: [0, 0, 0], release: 0x0100 },
+            Codec::Slcan(line, _) | Codec::Damiao(line, _) => line.class(),
         }
     }
 
     fn configuration(&self) -> Vec<u8> {
-        match &self.speech {
-            Speech::GsUsb => {
+        match &self.codec {
+            Codec::GsUsb => {
                 Configuration::default().interface(0, 2, [255, 255, 255]).bulk(DATA_IN).bulk(DATA_OUT).finish()
             }
-            Speech::Slcan(line, _) | Speech::Damiao(line, _) => line.configuration(),
+            Codec::Slcan(line, _) | Codec::Damiao(line, _) => line.configuration(),
         }
     }
 
@@ -205,8 +205,8 @@ impl Talker for Adapter {
     }
 
     fn control(&mut self, setup: Setup, data: &[u8], _now_ns: u64) -> Answer {
-        match &mut self.speech {
-            Speech::GsUsb => {
+        match &mut self.codec {
+            Codec::GsUsb => {
                 let (answer, request) = gsusb::control(setup, data);
                 match request {
                     Some(Request::Bitrate(rate)) => self.rate = rate,
@@ -215,18 +215,18 @@ impl Talker for Adapter {
                 }
                 answer
             }
-            Speech::Slcan(line, _) | Speech::Damiao(line, _) => line.control(setup, data),
+            Codec::Slcan(line, _) | Codec::Damiao(line, _) => line.control(setup, data),
         }
     }
 
-    fn hear(&mut self, data: &[u8], now_ns: u64) {
+    fn receive(&mut self, data: &[u8], now_ns: u64) {
         let mut frames = Vec::new();
         let mut answers = Vec::new();
-        match &mut self.speech {
-            Speech::GsUsb => frames.extend(gsusb::decode(data)),
-            Speech::Slcan(..) => return self.hear_text(data, now_ns),
-            Speech::Damiao(_, damiao) => {
-                damiao.hear(data, &mut answers, |frame| frames.push((FROM_THE_BUS, frame)));
+        match &mut self.codec {
+            Codec::GsUsb => frames.extend(gsusb::decode(data)),
+            Codec::Slcan(..) => return self.receive_text(data, now_ns),
+            Codec::Damiao(_, damiao) => {
+                damiao.receive(data, &mut answers, |frame| frames.push((FROM_THE_BUS, frame)));
             }
         }
         self.outbox.extend(answers);
@@ -243,14 +243,14 @@ impl Talker for Adapter {
         if endpoint != DATA_IN & 0x0f {
             return false;
         }
-        let most = match self.speech {
-            Speech::GsUsb => HOST_FRAME,
-            Speech::Slcan(..) | Speech::Damiao(..) => room.min(usize::from(BULK_PACKET)),
+        let most = match self.codec {
+            Codec::GsUsb => HOST_FRAME,
+            Codec::Slcan(..) | Codec::Damiao(..) => room.min(usize::from(BULK_PACKET)),
         };
-        // Generated frames are the last to go: they fill what is left of a transfer.
+        // Generated frames come last: they fill the rest of a transfer.
         while self.is_connected() && self.outbox.len() < most {
             let Some(frame) = self.bus.generated(now_ns) else { break };
-            put(&self.speech, &frame, &mut self.outbox, &mut self.lost);
+            put(&self.codec, &frame, &mut self.outbox, &mut self.lost);
         }
         let taken = self.outbox.len().min(most);
         out.extend(self.outbox.drain(..taken));
@@ -264,21 +264,21 @@ impl Talker for Adapter {
     fn reset(&mut self) {
         self.join(None);
         self.outbox.clear();
-        self.speech = Speech::new(self.speech.protocol());
+        self.codec = Codec::new(self.codec.protocol());
         // It has no command to join the bus: it is on it whenever it has power.
-        if self.speech.protocol() == Protocol::Damiao {
+        if self.codec.protocol() == Protocol::Damiao {
             self.on_bus = Some(BUS_RATE);
         }
     }
 
-    fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool {
+    fn apply(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool {
         match order {
             Order::Link(_) | Order::Level(_) => false,
             Order::BusOff(is_off) => {
                 self.set_off(is_off, now_ns);
                 true
             }
-            _ => self.bus.befall(motor, order, now_ns),
+            _ => self.bus.apply(motor, order, now_ns),
         }
     }
 

@@ -44,10 +44,10 @@ fn configurations_add_up() {
 fn a_gs_usb_frame_comes_back_before_its_answer() {
     let mut adapter = adapter(Protocol::GsUsb);
     let frame = Frame::data(5, ZERO_MIT);
-    adapter.hear(&gsusb::encode(&frame, 7), 0);
+    adapter.receive(&gsusb::encode(&frame, 7), 0);
     assert_eq!(taken(&mut adapter, 0), Vec::<Vec<u8>>::new(), "it is not on the bus yet");
     start(&mut adapter, 3);
-    adapter.hear(&gsusb::encode(&frame, 7), 0);
+    adapter.receive(&gsusb::encode(&frame, 7), 0);
     let transfers: Vec<_> = taken(&mut adapter, 0).iter().map(|transfer| gsusb::decode(transfer)).collect();
     assert_eq!(transfers, [Some((7, frame)), Some((FROM_THE_BUS, Frame::data(0x15, RESTING)))]);
     assert_eq!(actions(&mut adapter), ["can_up", "commands_begin"]);
@@ -59,7 +59,7 @@ fn a_gs_usb_frame_comes_back_before_its_answer() {
 fn a_wrong_bit_rate_reaches_no_motor() {
     let mut adapter = adapter(Protocol::GsUsb);
     start(&mut adapter, 6);
-    adapter.hear(&gsusb::encode(&Frame::data(5, ZERO_MIT), 7), 0);
+    adapter.receive(&gsusb::encode(&Frame::data(5, ZERO_MIT), 7), 0);
     assert_eq!(taken(&mut adapter, 0), Vec::<Vec<u8>>::new());
 }
 
@@ -67,17 +67,17 @@ fn a_wrong_bit_rate_reaches_no_motor() {
 fn frames_queued_while_bus_off_are_sent_afterwards() {
     let mut adapter = adapter(Protocol::GsUsb);
     start(&mut adapter, 3);
-    assert!(adapter.befall(None, Order::BusOff(true), 0));
-    adapter.hear(&gsusb::encode(&Frame::data(5, ZERO_MIT), 7), 0);
+    assert!(adapter.apply(None, Order::BusOff(true), 0));
+    adapter.receive(&gsusb::encode(&Frame::data(5, ZERO_MIT), 7), 0);
     assert_eq!(taken(&mut adapter, 0), [gsusb::bus_off(true).to_vec()]);
-    adapter.befall(None, Order::BusOff(false), MS);
+    adapter.apply(None, Order::BusOff(false), MS);
     assert_eq!(taken(&mut adapter, MS).len(), 3, "the adapter is back, the echo, the answer");
 }
 
 #[test]
 fn serial_adapters_reach_the_same_motor() {
     let mut slcan = adapter(Protocol::Slcan);
-    slcan.hear(b"S8\rO\rt00587FFF7FF0000007FF\rC\rt0050\r", 0);
+    slcan.receive(b"S8\rO\rt00587FFF7FF0000007FF\rC\rt0050\r", 0);
     assert_eq!(taken(&mut slcan, 0), [b"\r\rz\rt0158057FFF7FF7FF1E1E\r\r\x07".to_vec()]);
     assert_eq!(actions(&mut slcan), ["can_up", "can_down", "commands_begin"]);
 
@@ -86,8 +86,8 @@ fn serial_adapters_reach_the_same_motor() {
     bytes[..4].copy_from_slice(&[0x55, 0xaa, 0x1e, 0x03]);
     (bytes[13], bytes[18]) = (5, 8);
     bytes[21..29].copy_from_slice(&ZERO_MIT);
-    damiao.hear(&bytes[..10], 0);
-    damiao.hear(&bytes[10..], 0);
+    damiao.receive(&bytes[..10], 0);
+    damiao.receive(&bytes[10..], 0);
     let [transfer] = &taken(&mut damiao, 0)[..] else { panic!("one transfer") };
     assert_eq!((transfer.len(), &transfer[7..15]), (16, &RESTING[..]));
 }
@@ -97,9 +97,9 @@ fn a_motor_keeps_moving_when_the_adapter_is_pulled() {
     let mut adapter = adapter(Protocol::GsUsb);
     start(&mut adapter, 3);
     for bytes in [[0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfc], ZERO_MIT] {
-        adapter.hear(&gsusb::encode(&Frame::data(5, bytes), 7), 0);
+        adapter.receive(&gsusb::encode(&Frame::data(5, bytes), 7), 0);
     }
-    adapter.hear(&gsusb::encode(&Frame::data(0x7ff, [5, 0, 0x55, 9, 0x10, 0x27, 0, 0]), 7), 0);
+    adapter.receive(&gsusb::encode(&Frame::data(0x7ff, [5, 0, 0x55, 9, 0x10, 0x27, 0, 0]), 7), 0);
     adapter.reset();
     assert_eq!(adapter.tend(MS), Some(100 * MS));
     assert_eq!(adapter.tend(100 * MS), Some(500 * MS));
@@ -111,9 +111,9 @@ fn a_motor_keeps_moving_when_the_adapter_is_pulled() {
 #[test]
 fn generated_frames_fill_transfers() {
     let mut adapter = adapter(Protocol::Slcan);
-    adapter.befall(None, Order::Flood(8_000.0), 0);
+    adapter.apply(None, Order::Flood(8_000.0), 0);
     assert_eq!(taken(&mut adapter, 10 * MS).len(), 0, "no host listens");
-    adapter.hear(b"S8\rO\r", 10 * MS);
+    adapter.receive(b"S8\rO\r", 10 * MS);
     let bytes: Vec<u8> = taken(&mut adapter, 20 * MS).concat();
     let lines: Vec<&[u8]> = bytes.split(|byte| *byte == b'\r').filter(|line| line.len() > 5).collect();
     assert_eq!(lines.len(), 160);

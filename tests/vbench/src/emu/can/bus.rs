@@ -1,8 +1,8 @@
-//! What is on the bus besides the adapter: motors, and a generator of frames.
+//! The bus behind the adapter: motors, and a generator of frames.
 //!
 //! A generated frame has `FLOOD_ID`, a counter of 32 bits and the low 32 bits of its send time in us, both little-endian.
 //!
-//! Invariant: a generated frame's number is given out only when the adapter has room for it, so a hole is the reader's loss.
+//! Invariant: a generated frame's number is used only if the adapter has space, so a gap is the reader's loss.
 
 use super::Frame;
 use super::motor::Motor;
@@ -11,15 +11,15 @@ use crate::emu::order::Order;
 use crate::emu::pace::Pace;
 use crate::emu::reported::Reported;
 
-/// Identifier of generated frames: no motor's, and lower in rank than all of them.
+/// Identifier of generated frames: not used by any motor, and of lower priority than all of theirs.
 pub const FLOOD_ID: u16 = 0x7f0;
 
 /// A motor of a specification: `5/15/DMH3510`, slave and master id in hexadecimal and its type.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MotorSpec {
-    /// Identifier it is spoken to by.
+    /// Identifier of commands to it.
     pub slave: u16,
-    /// Identifier of what it answers.
+    /// Identifier of its answers.
     pub master: u16,
     /// Its type.
     pub kind: Type,
@@ -57,14 +57,14 @@ impl Bus {
         Self { motors, flood: None, reported: Vec::new() }
     }
 
-    /// A frame of the adapter's; what is answered is given to `answers`.
+    /// Passes on a frame from the adapter; its answers go to `answers`.
     pub fn send(&mut self, frame: &Frame, now_ns: u64, mut answers: impl FnMut(Frame)) {
         for motor in &mut self.motors {
-            motor.hear(frame, now_ns).into_iter().for_each(&mut answers);
+            motor.receive(frame, now_ns).into_iter().for_each(&mut answers);
         }
     }
 
-    /// Lets time pass; when it wants to be called again at the latest.
+    /// Advances time; returns when it must be called again at the latest.
     pub fn tend(&mut self, now_ns: u64) -> Option<u64> {
         let flood = self.flood.map(|flood| flood.next_ns(now_ns));
         self.motors.iter_mut().filter_map(|motor| motor.tend(now_ns)).chain(flood).min()
@@ -78,8 +78,8 @@ impl Bus {
         Some(Frame::data(FLOOD_ID, [a, b, c, d, e, f, g, h]))
     }
 
-    /// What befalls the bus, or one motor of it; false: there is no such motor.
-    pub fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool {
+    /// Applies an event to the bus or to one of its motors; false if there is no such motor.
+    pub fn apply(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool {
         if let Order::Flood(hz) = order {
             if let Some(mut flood) = self.flood.take() {
                 self.reported.push(Reported::new("flood_end", flood.summary(now_ns)));
@@ -90,13 +90,13 @@ impl Bus {
         let wanted = |slave| motor.is_none_or(|motor| u32::from(motor) == slave);
         let mut found = false;
         for motor in self.motors.iter_mut().filter(|motor| wanted(motor.slave())) {
-            motor.befall(order, now_ns);
+            motor.apply(order, now_ns);
             found = true;
         }
         found
     }
 
-    /// What happened on the bus since the last call.
+    /// The events on the bus since the last call.
     pub fn reported(&mut self) -> impl Iterator<Item = Reported> + '_ {
         self.reported.drain(..).chain(self.motors.iter_mut().flat_map(Motor::reported))
     }
@@ -130,8 +130,8 @@ mod tests {
         let mut answers = Vec::new();
         bus.send(&Frame::data(0x06, [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfc]), 0, |frame| answers.push(frame));
         assert_eq!(answers.iter().map(|frame| (frame.id, frame.padded()[0])).collect::<Vec<_>>(), [(0x16, 0x16)]);
-        assert!(bus.befall(Some(0x05), Order::Mute(true), 0));
-        assert!(!bus.befall(Some(0x07), Order::Mute(true), 0), "no such motor");
+        assert!(bus.apply(Some(0x05), Order::Mute(true), 0));
+        assert!(!bus.apply(Some(0x07), Order::Mute(true), 0), "no such motor");
         answers.clear();
         bus.send(&Frame::data(0x05, [0; 8]), 0, |frame| answers.push(frame));
         assert_eq!(answers, []);
@@ -141,11 +141,11 @@ mod tests {
     #[test]
     fn the_generator_counts_its_output() {
         let mut bus = Bus::new(&[]);
-        bus.befall(None, Order::Flood(1_000.0), 0);
+        bus.apply(None, Order::Flood(1_000.0), 0);
         assert_eq!(counters(&mut bus, 0), [0_u32; 0]);
         assert_eq!(counters(&mut bus, 3 * MS), [0, 1, 2]);
         assert_eq!(bus.tend(3 * MS), Some(4 * MS));
-        bus.befall(None, Order::Flood(0.0), 4 * MS);
+        bus.apply(None, Order::Flood(0.0), 4 * MS);
         assert_eq!(counters(&mut bus, 9 * MS), [0_u32; 0]);
         let reported: Vec<Reported> = bus.reported().collect();
         assert_eq!(reported[0], Reported::new("flood_end", json!({"sent": 3, "skipped": 0})));

@@ -1,7 +1,7 @@
-//! The framing of Damiao's serial CAN adapter, as in the vendor's `DM_CAN.py` and `damiao.h`: 30 bytes a frame from the host,
-//! 16 bytes to it.
+//! The framing of Damiao's serial CAN adapter, as in the vendor's `DM_CAN.py` and `damiao.h`: 30 bytes per frame from
+//! the host, 16 bytes to it.
 //!
-//! Invariant: bytes that begin no frame are passed over one by one, as the vendor's own reader does.
+//! Invariant: bytes that do not start a frame are skipped one by one, as in the vendor's own reader.
 
 use super::Frame;
 
@@ -23,8 +23,8 @@ pub struct Damiao {
 }
 
 impl Damiao {
-    /// Takes what the host sent; acknowledgements go to `out`, frames to `send`.
-    pub fn hear(&mut self, bytes: &[u8], out: &mut Vec<u8>, mut send: impl FnMut(Frame)) {
+    /// Processes data from the host; acknowledgements go to `out`, frames to `send`.
+    pub fn receive(&mut self, bytes: &[u8], out: &mut Vec<u8>, mut send: impl FnMut(Frame)) {
         self.inbox.extend_from_slice(bytes);
         let mut at = 0;
         while let Some(record) = self.inbox[at..].first_chunk::<FROM_HOST>() {
@@ -43,8 +43,8 @@ impl Damiao {
     }
 }
 
-/// Appends a frame of the bus.
-pub fn tell(frame: &Frame, out: &mut Vec<u8>) {
+/// Appends a frame of the bus for the host.
+pub fn send_to_host(frame: &Frame, out: &mut Vec<u8>) {
     encode(frame, RECEIVED, out);
 }
 
@@ -79,7 +79,7 @@ mod tests {
 
     fn decoded(damiao: &mut Damiao, bytes: &[u8]) -> (Vec<u8>, Vec<Frame>) {
         let (mut out, mut frames) = (Vec::new(), Vec::new());
-        damiao.hear(bytes, &mut out, |frame| frames.push(frame));
+        damiao.receive(bytes, &mut out, |frame| frames.push(frame));
         (out, frames)
     }
 
@@ -102,14 +102,14 @@ mod tests {
     #[test]
     fn a_frame_of_the_bus_is_sixteen_bytes() {
         let mut out = Vec::new();
-        tell(&Frame::data(0x15, [0x15, 0x7f, 0xff, 0x7f, 0xf7, 0xff, 30, 31]), &mut out);
+        send_to_host(&Frame::data(0x15, [0x15, 0x7f, 0xff, 0x7f, 0xf7, 0xff, 30, 31]), &mut out);
         let expected = [0xaa, 0x11, 8, 0x15, 0, 0, 0, 0x15, 0x7f, 0xff, 0x7f, 0xf7, 0xff, 30, 31, 0x55];
         assert_eq!(out, expected);
     }
 
     proptest! {
         #[test]
-        fn it_finds_frames_behind_any_noise(
+        fn frames_are_found_after_any_noise(
             noise in proptest::collection::vec(any::<u8>().prop_filter("no head", |byte| *byte != 0x55), 0..60),
             cut in 1_usize..30,
         ) {

@@ -7,7 +7,7 @@ use crate::emu::descriptor::{Answer, Setup};
 
 /// Bytes of a host frame without a time stamp.
 pub const HOST_FRAME: usize = 20;
-/// Echo id of a frame that no host sent.
+/// Echo id of a frame that did not come from the host.
 pub const FROM_THE_BUS: u32 = u32::MAX;
 
 const CLOCK_HZ: u32 = 48_000_000;
@@ -18,7 +18,7 @@ const ERROR: u32 = 1 << 29;
 const CLASS_BUS_OFF: u32 = 0x40;
 const CLASS_RESTARTED: u32 = 0x100;
 
-/// What a control request asks of the adapter.
+/// A control request's effect on the adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Request {
     /// Bits a second on the bus.
@@ -27,7 +27,7 @@ pub enum Request {
     Start(bool),
 }
 
-/// Answers a control request, and what it asks for.
+/// The answer to a control request, and its effect.
 pub fn control(setup: Setup, data: &[u8]) -> (Answer, Option<Request>) {
     const BITTIMING: u8 = 1;
     const MODE: u8 = 2;
@@ -39,7 +39,7 @@ pub fn control(setup: Setup, data: &[u8]) -> (Answer, Option<Request>) {
     };
     let words = |words: &[u32]| Answer::Data(words.iter().flat_map(|word| word.to_le_bytes()).collect());
     match (setup.request, setup.is_in()) {
-        // Three reserved bytes and the number of channels less one; software and hardware version.
+        // Three reserved bytes and the number of channels minus one; software and hardware version.
         (DEVICE_CONFIG, true) => (words(&[0, 2, 1]), None),
         // No features; clock; limits of tseg1, tseg2, sjw and brp.
         (BT_CONST, true) => (words(&[0, CLOCK_HZ, 1, 16, 1, 8, 4, 1, 1024, 1]), None),
@@ -61,7 +61,7 @@ pub fn encode(frame: &Frame, echo: u32) -> [u8; HOST_FRAME] {
     host_frame(echo, frame.id | flags, frame.len(), frame.padded())
 }
 
-/// A frame of the host's and the echo id it wants back.
+/// A frame from the host and its echo id.
 pub fn decode(bytes: &[u8]) -> Option<(u32, Frame)> {
     let bytes: &[u8; HOST_FRAME] = bytes.get(..HOST_FRAME)?.try_into().ok()?;
     let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
@@ -71,7 +71,7 @@ pub fn decode(bytes: &[u8]) -> Option<(u32, Frame)> {
     Some((echo, Frame::new(id & mask, extended, id & REMOTE != 0, len, bytes.get(12..12 + len)?)?))
 }
 
-/// The error frame that reports that the adapter has gone bus-off, or has recovered.
+/// The error frame that reports bus-off, or recovery.
 pub fn bus_off(is_off: bool) -> [u8; HOST_FRAME] {
     host_frame(FROM_THE_BUS, ERROR | if is_off { CLASS_BUS_OFF } else { CLASS_RESTARTED }, 8, [0; 8])
 }
@@ -127,12 +127,12 @@ mod tests {
 
     proptest! {
         #[test]
-        fn frames_come_back(frame in strategies::frame(), echo in any::<u32>()) {
+        fn frames_round_trip(frame in strategies::frame(), echo in any::<u32>()) {
             prop_assert_eq!(decode(&encode(&frame, echo)), Some((echo, frame)));
         }
 
         #[test]
-        fn no_bytes_upset_it(bytes in proptest::collection::vec(any::<u8>(), 0..40), request in 0_u8..20) {
+        fn any_bytes_are_survived(bytes in proptest::collection::vec(any::<u8>(), 0..40), request in 0_u8..20) {
             decode(&bytes);
             control(setup(request, false), &bytes);
         }

@@ -1,9 +1,9 @@
 //! A CAN bus: adapters of three kinds, the motors behind them, and a generator of frames.
 //!
-//! The bus is there whether its adapter is plugged or not: a motor has a power supply of its own, continues when the cable to the
-//! computer is pulled, and ends by its own time-out.
+//! The bus exists whether its adapter is plugged in or not: a motor has its own power supply, continues when the cable
+//! to the computer is unplugged, and stops by its own timeout.
 //!
-//! Invariant: no clock, no socket, no thread below this module; times come in as ns of CLOCK_MONOTONIC.
+//! Invariant: no clock, no socket, no thread below this module; times are passed in as ns of CLOCK_MONOTONIC.
 
 pub mod adapter;
 pub mod bus;
@@ -35,7 +35,7 @@ impl Frame {
         Self { id: u32::from(id & 0x7ff), len: 8, bytes, ..Self::default() }
     }
 
-    /// A frame with these bytes; none with an identifier that is too large or with more than eight bytes.
+    /// A frame with these bytes; `None` if the identifier is too large or there are more than eight bytes.
     pub fn new(id: u32, extended: bool, remote: bool, len: usize, bytes: &[u8]) -> Option<Self> {
         let limit = if extended { 1 << 29 } else { 1 << 11 };
         let len = u8::try_from(len).ok().filter(|len| *len <= 8)?;
@@ -64,7 +64,7 @@ impl Frame {
         self.bytes().is_empty()
     }
 
-    /// All eight bytes, those behind its length zero.
+    /// All eight bytes, those after its length zero.
     pub fn padded(&self) -> [u8; 8] {
         self.bytes
     }

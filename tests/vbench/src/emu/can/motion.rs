@@ -1,4 +1,4 @@
-//! A motor's numbers: values in the bits of its frames, and how it moves.
+//! A motor's numbers: the encoding of values in its frames, and its motion.
 //!
 //! Invariant: pure; positions in rad, velocities in rad/s, torques in Nm, times in s.
 
@@ -6,21 +6,21 @@
 pub const KP_MAX: f64 = 500.0;
 /// Largest damping of an MIT frame.
 pub const KD_MAX: f64 = 5.0;
-/// Lag of a motor's movements.
+/// Time constant of a motor's motion.
 const LAG_S: f64 = 0.03;
 
 /// A command of the MIT mode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mit {
-    /// Wanted position.
+    /// Target position.
     pub position: f64,
-    /// Wanted velocity.
+    /// Target velocity.
     pub velocity: f64,
     /// Stiffness.
     pub kp: f64,
     /// Damping.
     pub kd: f64,
-    /// Torque on top.
+    /// Additional torque.
     pub torque: f64,
 }
 
@@ -39,19 +39,19 @@ impl Mit {
     }
 }
 
-/// A value within ±`limit` as a number of so many bits, truncated as the vendor's code does.
+/// A value within ±`limit` as a number of this many bits, truncated as in the vendor's code.
 pub fn to_unsigned(value: f64, limit: f64, bits: u32) -> u32 {
     let top = f64::from((1_u32 << bits) - 1);
-    // Truncation is the format's; the clamp keeps it within the bits.
+    // The format truncates; the clamp keeps it within the bits.
     ((value + limit) / (2.0 * limit) * top).clamp(0.0, top) as u32
 }
 
-/// The value a number of so many bits stands for.
+/// The value of a number of this many bits.
 pub fn from_unsigned(value: u32, limit: f64, bits: u32) -> f64 {
     f64::from(value) / f64::from((1_u32 << bits) - 1) * 2.0 * limit - limit
 }
 
-/// Position and velocity after `seconds` on the way to `goal`: at full speed as long as the lag allows more, then fading.
+/// Position and velocity after `seconds` of moving to `goal`: at full speed while the lag requires more, then decaying.
 pub fn reach(from: f64, goal: f64, fastest: f64, seconds: f64) -> (f64, f64) {
     let towards = (goal - from).signum();
     let distance = (goal - from).abs();
@@ -64,7 +64,7 @@ pub fn reach(from: f64, goal: f64, fastest: f64, seconds: f64) -> (f64, f64) {
     (goal - towards * left, towards * left / LAG_S)
 }
 
-/// Movement and velocity after `seconds` of turning at what becomes `wanted`.
+/// Movement and velocity after `seconds`, while the velocity approaches `wanted`.
 pub fn turn(velocity: f64, wanted: f64, seconds: f64) -> (f64, f64) {
     let fading = (-seconds / LAG_S).exp();
     let moved = wanted * seconds + (velocity - wanted) * LAG_S * (1.0 - fading);

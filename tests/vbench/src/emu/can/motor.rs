@@ -1,12 +1,12 @@
-//! A simulated Damiao motor: what it is sent over the bus, how it moves, what it answers.
+//! A simulated Damiao motor: its commands on the bus, its motion, its answers.
 //!
-//! Frames as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao`: MIT at its slave id, position with velocity at 0x100 more,
-//! velocity at 0x200 more, parameters at 0x7FF; the answer is one feedback or parameter frame at its master id. It moves towards
-//! its commands with a lag of the first order, never faster than VMAX, and carries no load; once an order gives it a body
-//! (`plant`), it moves as that does under the torque of its loops, TMAX at the most, and without any while it is disabled.
+//! Frames as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao`: MIT at its slave id, position with velocity at
+//! 0x100 more, velocity at 0x200 more, parameters at 0x7FF; the answer is one feedback or parameter frame at its master
+//! id. It follows commands with a first-order lag, never faster than VMAX, without a load; once an order gives it a
+//! body (`plant`), it moves as that does under its loops' torque, at most TMAX and none while disabled.
 //!
-//! Invariant: every frame for a motor that can receive gets one answer, except for a missing register and a save while enabled.
-//! Invariant: it moves by itself only while it is enabled; a fault and the time-out of its own disable it until it is enabled again.
+//! Invariant: every frame that a motor can receive gets one answer, except a missing register and a save while enabled.
+//! Invariant: it moves by itself only while enabled; a fault or its own timeout disables it until it is enabled again.
 
 use serde_json::{Value, json};
 
@@ -18,9 +18,9 @@ use super::run::Run;
 use crate::emu::order::Order;
 use crate::emu::reported::Reported;
 
-/// Identifier that parameters of every motor are spoken to by.
+/// Identifier of parameter frames for all motors.
 const PARAMETERS: u32 = 0x7ff;
-/// From this temperature on it protects itself, degrees Celsius.
+/// From this temperature on it disables itself, degrees Celsius.
 const TOO_HOT: u8 = 120;
 const COIL_TOO_HOT: u8 = 0xc;
 const COMMUNICATION_LOST: u8 = 0xd;
@@ -36,7 +36,7 @@ pub struct Motor {
     fault: u8,
     degrees: u8,
     drive: Drive,
-    /// By its own count.
+    /// By its own encoder.
     movement: Movement,
     body: Option<Body>,
     trouble: Trouble,
@@ -47,7 +47,7 @@ pub struct Motor {
 }
 
 impl Motor {
-    /// A motor as it leaves the factory, cold, disabled and at its zero.
+    /// A motor with factory settings, cold, disabled and at its zero.
     pub fn new(kind: Type, slave: u16, master: u16) -> Self {
         let registers = Registers::new(kind, slave, master);
         Self {
@@ -69,7 +69,7 @@ impl Motor {
         }
     }
 
-    /// Identifier it is spoken to by.
+    /// Identifier of commands to it.
     pub fn slave(&self) -> u32 {
         self.registers.slave
     }
@@ -79,7 +79,7 @@ impl Motor {
         self.movement.position - self.trouble.offset
     }
 
-    /// Is it enabled?
+    /// Whether it is enabled.
     pub fn is_on(&self) -> bool {
         self.enabled && self.powered
     }
@@ -89,8 +89,8 @@ impl Motor {
         self.reported.drain(..)
     }
 
-    /// Receives a frame; its answer, if the frame is for it.
-    pub fn hear(&mut self, frame: &Frame, now_ns: u64) -> Option<Frame> {
+    /// Receives a frame; returns its answer if the frame is for it.
+    pub fn receive(&mut self, frame: &Frame, now_ns: u64) -> Option<Frame> {
         if frame.extended || frame.remote || frame.len() != 8 || self.muted || !self.powered {
             return None;
         }
@@ -117,7 +117,7 @@ impl Motor {
         }
     }
 
-    /// Lets time pass; when it wants to be called again at the latest.
+    /// Advances time; returns when it must be called again at the latest.
     pub fn tend(&mut self, now_ns: u64) -> Option<u64> {
         self.advance(now_ns);
         let silence = self.registers.patience().filter(|_| self.enabled && self.powered);
@@ -126,7 +126,7 @@ impl Motor {
             let patience_ns = u64::try_from(patience.as_nanos()).unwrap_or(u64::MAX);
             let give_up_ns = self.received_ns.saturating_add(patience_ns);
             if now_ns >= give_up_ns {
-                self.tell("motor_timeout", json!({"after_ns": patience_ns, "last_received_ns": self.received_ns}));
+                self.report("motor_timeout", json!({"after_ns": patience_ns, "last_received_ns": self.received_ns}));
                 self.latch(COMMUNICATION_LOST);
             } else {
                 due_ns = Some(give_up_ns);
@@ -136,7 +136,7 @@ impl Motor {
             let ends_ns = run.ends_ns();
             if now_ns >= ends_ns {
                 self.run = None;
-                self.tell("commands_end", run.summary());
+                self.report("commands_end", run.summary());
             } else {
                 due_ns = Some(due_ns.map_or(ends_ns, |due_ns: u64| due_ns.min(ends_ns)));
             }
@@ -144,8 +144,8 @@ impl Motor {
         due_ns
     }
 
-    /// What befalls it.
-    pub fn befall(&mut self, order: Order, now_ns: u64) {
+    /// Applies an event to it.
+    pub fn apply(&mut self, order: Order, now_ns: u64) {
         self.tend(now_ns);
         match order {
             Order::Fault(0) => self.fault = 0,
@@ -186,7 +186,7 @@ impl Motor {
                     "angle": self.angle(),
                     "degrees": self.degrees, "mode": self.registers.mode, "timeout": self.registers.timeout,
                 });
-                self.tell("motor_state", state);
+                self.report("motor_state", state);
             }
             Order::Flood(_) | Order::BusOff(_) | Order::Link(_) | Order::Level(_) => {}
         }
@@ -196,23 +196,23 @@ impl Motor {
         match word {
             0xfb => {
                 self.fault = 0;
-                self.tell("motor_cleared", json!({}));
+                self.report("motor_cleared", json!({}));
             }
-            // A latched fault wants to be cleared first.
-            0xfc if self.fault != 0 => self.tell("motor_enable_refused", json!({"err": self.err()})),
+            // A latched fault must be cleared first.
+            0xfc if self.fault != 0 => self.report("motor_enable_refused", json!({"err": self.err()})),
             0xfc if !self.enabled => {
                 self.enabled = true;
-                self.tell("motor_enabled", json!({}));
+                self.report("motor_enabled", json!({}));
             }
             0xfd => {
                 // Reported each time: a motor may be stopped more than once.
                 self.stop();
-                self.tell("motor_disabled", json!({}));
+                self.report("motor_disabled", json!({}));
             }
             0xfe => {
                 self.shift(-self.movement.position);
                 self.drive = Drive::Off;
-                self.tell("motor_zeroed", json!({}));
+                self.report("motor_zeroed", json!({}));
             }
             _ => {}
         }
@@ -256,7 +256,7 @@ impl Motor {
             run.take(position, enabled, now_ns);
         } else {
             self.run = Some(Run::begin(position, enabled, now_ns));
-            self.tell("commands_begin", json!({"enabled": enabled, "position": position}));
+            self.report("commands_begin", json!({"enabled": enabled, "position": position}));
         }
     }
 
@@ -271,14 +271,14 @@ impl Motor {
             0x33 => answer(word, rid, self.registers.read(rid)?),
             0x55 => {
                 if self.registers.write(rid, value) {
-                    self.tell("motor_written", json!({"rid": rid, "bytes": value}));
+                    self.report("motor_written", json!({"rid": rid, "bytes": value}));
                 }
                 answer(word, rid, self.registers.read(rid)?)
             }
-            // It writes its flash only at rest.
+            // It writes its flash only while disabled.
             0xaa if !self.enabled => {
                 self.saved = self.registers;
-                self.tell("motor_saved", json!({}));
+                self.report("motor_saved", json!({}));
                 answer(word, 1, [0; 4])
             }
             0xcc => Some(self.feedback()),
@@ -286,7 +286,7 @@ impl Motor {
         }
     }
 
-    /// What it reports about itself.
+    /// Its feedback frame.
     fn feedback(&self) -> Frame {
         let [pmax, vmax, tmax] = [self.registers.pmax, self.registers.vmax, self.registers.tmax].map(f64::from);
         let Movement { position, velocity, torque } = self.movement;
@@ -320,7 +320,7 @@ impl Motor {
 
     fn latch(&mut self, code: u8) {
         self.fault = code;
-        self.tell("motor_fault", json!({"err": code, "was_enabled": self.enabled}));
+        self.report("motor_fault", json!({"err": code, "was_enabled": self.enabled}));
         self.stop();
     }
 
@@ -333,7 +333,7 @@ impl Motor {
         }
     }
 
-    /// Counts from another zero.
+    /// Moves its zero.
     fn shift(&mut self, by: f64) {
         self.movement.position += by;
         self.trouble.offset += by;
@@ -343,7 +343,7 @@ impl Motor {
         let passed_ns = now_ns.saturating_sub(self.moved_ns);
         if let Some(body) = self.body {
             let steps = passed_ns / STEP_NS;
-            // What is left of a step is for the next call.
+            // The rest of a step is left for the next call.
             self.moved_ns += steps * STEP_NS;
             let tmax = self.registers.tmax.into();
             body.pass(steps.min(MOST_STEPS), &mut self.movement, self.drive, &self.trouble, tmax);
@@ -359,7 +359,7 @@ impl Motor {
         self.movement = Movement { position, velocity, torque };
     }
 
-    /// Position and velocity of a motor without a body, after a while.
+    /// Position and velocity of a motor without a body, after `seconds`.
     fn glide(&self, [position, velocity]: [f64; 2], seconds: f64) -> (f64, f64) {
         let turned = |wanted| {
             let (moved, reached) = turn(velocity, wanted, seconds);
@@ -374,7 +374,7 @@ impl Motor {
         }
     }
 
-    fn tell(&mut self, action: &'static str, mut fields: Value) {
+    fn report(&mut self, action: &'static str, mut fields: Value) {
         fields["motor"] = json!(self.registers.slave);
         self.reported.push(Reported::new(action, fields));
     }

@@ -17,7 +17,7 @@ fn motor() -> Motor {
 }
 
 fn ask(motor: &mut Motor, id: u16, bytes: [u8; 8], ms: u64) -> [u8; 8] {
-    let answer = motor.hear(&Frame::data(id, bytes), ms * MS).expect("an answer");
+    let answer = motor.receive(&Frame::data(id, bytes), ms * MS).expect("an answer");
     assert_eq!((answer.id, answer.len()), (0x15, 8));
     answer.padded()
 }
@@ -30,7 +30,7 @@ fn actions(motor: &mut Motor) -> Vec<&'static str> {
     motor.reported().map(|reported| reported.action).collect()
 }
 
-/// MIT bytes as a driver would make them.
+/// MIT bytes as a driver would encode them.
 fn mit(position: f64, kp: f64) -> [u8; 8] {
     let [high, low] = (to_unsigned(position, 12.5, 16) as u16).to_be_bytes();
     let [kp_high, kp_low] = ((kp / KP_MAX * 4095.0) as u16).to_be_bytes();
@@ -62,7 +62,7 @@ fn a_resting_motor_answers_zeros() {
 }
 
 #[test]
-fn it_moves_only_when_enabled() {
+fn a_motor_moves_only_when_enabled() {
     let mut motor = motor();
     ask(&mut motor, 0x05, mit(1.0, 10.0), 0);
     assert!(position(ask(&mut motor, 0x05, mit(1.0, 10.0), 50)).abs() < 0.001);
@@ -102,29 +102,29 @@ fn parameters_are_read_written_and_saved() {
     assert_eq!(ask(&mut motor, 0x7ff, [0x05, 0, 0x33, 22, 0, 0, 0, 0], 0)[4..], vmax);
     assert_eq!(ask(&mut motor, 0x7ff, [0x05, 0, 0x55, 9, 0x10, 0x27, 0, 0], 0)[4..], [0x10, 0x27, 0, 0]);
     assert_eq!(motor.registers.patience(), Some(std::time::Duration::from_millis(500)));
-    assert_eq!(motor.hear(&Frame::data(0x7ff, [0x05, 0, 0x33, 200, 0, 0, 0, 0]), 0), None, "no such register");
-    assert_eq!(motor.hear(&Frame::data(0x7ff, [0x06, 0, 0x33, 22, 0, 0, 0, 0]), 0), None, "another motor's");
+    assert_eq!(motor.receive(&Frame::data(0x7ff, [0x05, 0, 0x33, 200, 0, 0, 0, 0]), 0), None, "no such register");
+    assert_eq!(motor.receive(&Frame::data(0x7ff, [0x06, 0, 0x33, 22, 0, 0, 0, 0]), 0), None, "another motor's");
     let pmax = f32::NAN.to_le_bytes();
     let refused = ask(&mut motor, 0x7ff, [0x05, 0, 0x55, 21, pmax[0], pmax[1], pmax[2], pmax[3]], 0);
     assert_eq!(refused[4..], 12.5_f32.to_le_bytes(), "a limit that is no number");
 
-    motor.befall(Order::Power(false), 0);
-    motor.befall(Order::Power(true), 0);
+    motor.apply(Order::Power(false), 0);
+    motor.apply(Order::Power(true), 0);
     assert_eq!(motor.registers.timeout, 0, "not saved, not kept");
     ask(&mut motor, 0x7ff, [0x05, 0, 0x55, 9, 0x10, 0x27, 0, 0], 0);
     ask(&mut motor, 0x05, ENABLE, 0);
     let save = [0x05, 0, 0xaa, 1, 0, 0, 0, 0];
-    assert_eq!(motor.hear(&Frame::data(0x7ff, save), 0), None, "enabled");
+    assert_eq!(motor.receive(&Frame::data(0x7ff, save), 0), None, "enabled");
     ask(&mut motor, 0x05, DISABLE, 0);
     ask(&mut motor, 0x7ff, save, 0);
-    motor.befall(Order::Power(false), 0);
-    assert_eq!(motor.hear(&Frame::data(0x05, ENABLE), 0), None, "no power");
-    motor.befall(Order::Power(true), 0);
+    motor.apply(Order::Power(false), 0);
+    assert_eq!(motor.receive(&Frame::data(0x05, ENABLE), 0), None, "no power");
+    motor.apply(Order::Power(true), 0);
     assert_eq!(motor.registers.timeout, 10_000);
 }
 
 #[test]
-fn it_gives_up_when_nothing_is_sent() {
+fn a_motor_times_out_without_frames() {
     let mut motor = motor();
     ask(&mut motor, 0x7ff, [0x05, 0, 0x55, 9, 0x10, 0x27, 0, 0], 0);
     ask(&mut motor, 0x05, ENABLE, 0);
@@ -142,7 +142,7 @@ fn it_gives_up_when_nothing_is_sent() {
 }
 
 #[test]
-fn a_disabled_motor_waits_for_ever() {
+fn a_disabled_motor_waits_forever() {
     let mut motor = motor();
     ask(&mut motor, 0x7ff, [0x05, 0, 0x55, 9, 0x10, 0x27, 0, 0], 0);
     assert_eq!(motor.tend(3_600_000 * MS), None);
@@ -150,26 +150,26 @@ fn a_disabled_motor_waits_for_ever() {
 }
 
 #[test]
-fn changes_to_it_are_answered() {
+fn changed_states_are_reported_in_feedback() {
     let mut motor = motor();
     ask(&mut motor, 0x05, ENABLE, 0);
-    motor.befall(Order::Hot(95), MS);
+    motor.apply(Order::Hot(95), MS);
     let refresh = [0x05, 0, 0xcc, 0, 0, 0, 0, 0];
     let feedback = ask(&mut motor, 0x7ff, refresh, 2);
     assert_eq!((feedback[0], feedback[6], feedback[7]), (0x15, 95, 95), "hot and going");
-    motor.befall(Order::Hot(TOO_HOT), 3 * MS);
+    motor.apply(Order::Hot(TOO_HOT), 3 * MS);
     assert_eq!(ask(&mut motor, 0x7ff, refresh, 4)[0], 0xc5, "too hot");
-    motor.befall(Order::Fault(0xa), 5 * MS);
+    motor.apply(Order::Fault(0xa), 5 * MS);
     assert_eq!(ask(&mut motor, 0x7ff, refresh, 6)[0], 0xa5);
-    motor.befall(Order::Mute(true), 7 * MS);
-    assert_eq!(motor.hear(&Frame::data(0x7ff, refresh), 8 * MS), None);
-    motor.befall(Order::Mute(false), 9 * MS);
-    motor.befall(Order::Fault(0), 9 * MS);
+    motor.apply(Order::Mute(true), 7 * MS);
+    assert_eq!(motor.receive(&Frame::data(0x7ff, refresh), 8 * MS), None);
+    motor.apply(Order::Mute(false), 9 * MS);
+    motor.apply(Order::Fault(0), 9 * MS);
     assert_eq!(ask(&mut motor, 0x7ff, refresh, 10)[0], 0x05);
 }
 
 #[test]
-fn a_run_of_commands_is_summed_up() {
+fn a_run_of_commands_is_summarized() {
     let mut motor = motor();
     ask(&mut motor, 0x05, ENABLE, 0);
     for (ms, position) in [(10, 0.0), (15, 0.1), (40, 0.4), (45, 0.4)] {
@@ -185,25 +185,25 @@ fn a_run_of_commands_is_summed_up() {
 }
 
 /// Applies a line of the script to it.
-fn befall(motor: &mut Motor, line: &str, ms: u64) {
+fn apply(motor: &mut Motor, line: &str, ms: u64) {
     let mut words = line.split_whitespace();
     let (_, order) = crate::emu::order::parse(words.next().unwrap(), &mut words).expect("an order");
-    motor.befall(order, ms * MS);
+    motor.apply(order, ms * MS);
 }
 
-/// Commands it every 5 ms; the last answer.
+/// Commands it every 5 ms; returns the last answer.
 fn drive(motor: &mut Motor, bytes: [u8; 8], ms: std::ops::Range<u64>) -> [u8; 8] {
     ms.step_by(5).map(|ms| ask(motor, 0x05, bytes, ms)).last().expect("an answer")
 }
 
 #[test]
-fn with_a_load_it_sags_while_on_and_falls_while_off() {
+fn a_loaded_joint_sags_while_on_and_falls_while_off() {
     let mut motor = Motor::new(Type::named("DM4310").unwrap(), 0x05, 0x15);
     for line in ["load 0 1.5", "ends 0 -1 1"] {
-        befall(&mut motor, line, 0);
+        apply(&mut motor, line, 0);
     }
     ask(&mut motor, 0x05, ENABLE, 0);
-    // A stiffness of 20 Nm/rad, and 1 Nm s/rad of damping.
+    // A stiffness of 20 Nm/rad, and damping of 1 Nm s/rad.
     let mut hold = mit(0.0, 20.0);
     hold[5] = 0x33;
     let sagged = position(drive(&mut motor, hold, 0..2_000));
@@ -214,17 +214,17 @@ fn with_a_load_it_sags_while_on_and_falls_while_off() {
 }
 
 #[test]
-fn a_wrong_zero_and_a_frozen_encoder_lie_about_where_it_is() {
+fn a_wrong_zero_and_a_frozen_encoder_falsify_the_position() {
     let mut motor = motor();
-    befall(&mut motor, "inertia 0 0.02", 0);
-    befall(&mut motor, "zero 0 0.25", 0);
+    apply(&mut motor, "inertia 0 0.02", 0);
+    apply(&mut motor, "zero 0 0.25", 0);
     let reported = position(ask(&mut motor, 0x05, [0; 8], 5));
     assert!((reported - 0.25).abs() < 0.001 && motor.angle().abs() < 1e-9, "{reported}");
-    befall(&mut motor, "freeze 0 1", 5);
-    befall(&mut motor, "load 0 0.5", 5);
+    apply(&mut motor, "freeze 0 1", 5);
+    apply(&mut motor, "load 0 0.5", 5);
     let frozen = position(ask(&mut motor, 0x05, [0; 8], 200));
     assert!((frozen - 0.25).abs() < 0.001 && motor.angle() < -0.1, "{frozen} at {}", motor.angle());
-    befall(&mut motor, "freeze 0 0", 200);
+    apply(&mut motor, "freeze 0 0", 200);
     let angle = motor.angle();
     ask(&mut motor, 0x05, SET_ZERO, 200);
     assert!(position(ask(&mut motor, 0x05, [0; 8], 200)).abs() < 0.001);
@@ -232,45 +232,45 @@ fn a_wrong_zero_and_a_frozen_encoder_lie_about_where_it_is() {
 }
 
 #[test]
-fn a_blocked_joint_stays_with_a_body_and_without() {
+fn a_blocked_joint_stays_with_and_without_a_body() {
     for body in [None, Some("load 0 0.1")] {
         let mut motor = motor();
-        body.into_iter().chain(["block 0 1"]).for_each(|line| befall(&mut motor, line, 0));
+        body.into_iter().chain(["block 0 1"]).for_each(|line| apply(&mut motor, line, 0));
         ask(&mut motor, 0x05, ENABLE, 0);
         assert!(position(drive(&mut motor, mit(1.0, 10.0), 0..500)).abs() < 0.001, "{body:?}");
-        befall(&mut motor, "block 0 0", 500);
+        apply(&mut motor, "block 0 0", 500);
         assert!(position(drive(&mut motor, mit(1.0, 10.0), 500..700)) > 0.5, "{body:?}");
     }
 }
 
 proptest! {
     #[test]
-    fn it_never_moves_faster_than_it_can(
+    fn a_motor_never_exceeds_its_maximum_speed(
         from in -12.0..12.0, goal in -12.0..12.0, fastest in 0.0..300.0, seconds in 0.0..2.0,
     ) {
         let (position, velocity) = reach(from, goal, fastest, seconds);
         prop_assert!((position - from).abs() <= fastest * seconds + 1e-9);
         prop_assert!(velocity.abs() <= fastest + 1e-9);
         prop_assert!((goal - position).abs() <= (goal - from).abs() + 1e-9);
-        // Two steps go as far as one.
+        // Two steps move as far as one.
         let (middle, _) = reach(from, goal, fastest, seconds / 3.0);
         let (end, _) = reach(middle, goal, fastest, seconds * 2.0 / 3.0);
         prop_assert!((end - position).abs() < 1e-6, "{end} and {position}");
     }
 
     #[test]
-    fn no_frame_upsets_it(frames in proptest::collection::vec((crate::emu::can::strategies::frame(), 0_u64..50), 0..50)) {
+    fn any_frame_is_survived(frames in proptest::collection::vec((crate::emu::can::strategies::frame(), 0_u64..50), 0..50)) {
         let mut motor = motor();
         let mut now_ns = 0;
         for (frame, ms) in frames {
             now_ns += ms * MS;
-            motor.hear(&frame, now_ns);
+            motor.receive(&frame, now_ns);
             prop_assert!(motor.movement.position.is_finite());
         }
     }
 
     #[test]
-    fn no_bytes_for_it_upset_it(
+    fn any_bytes_for_its_parameters_are_survived(
         frames in proptest::collection::vec((prop_oneof![Just(0x05_u16), Just(0x105), Just(0x205), Just(0x7ff)], any::<[u8; 8]>()), 0..50),
     ) {
         let mut motor = motor();
@@ -279,7 +279,7 @@ proptest! {
             if id == 0x7ff {
                 bytes[..2].copy_from_slice(&[0x05, 0]);
             }
-            motor.hear(&Frame::data(id, bytes), place as u64 * MS);
+            motor.receive(&Frame::data(id, bytes), place as u64 * MS);
             prop_assert!(motor.movement.position.is_finite() && motor.movement.velocity.is_finite());
         }
     }

@@ -1,19 +1,19 @@
-//! What a motor drives: an inertia with friction, a load and end stops, moved by the torque of the motor's own loops.
+//! The load of a motor: an inertia with friction, load torque and end stops, moved by the torque of the motor's loops.
 //!
-//! Invariant: time passes in steps of `STEP_NS`, so a movement does not depend on how often it is looked at.
+//! Invariant: time advances in steps of `STEP_NS`, so the motion does not depend on how often it is queried.
 
 use super::motion::Mit;
 
 /// Length of a step, ns: a fifth of the fastest time constant below.
 pub const STEP_NS: u64 = 100_000;
-/// Steps that are made up for at the most: ten seconds.
+/// Maximum number of steps made up for: ten seconds.
 pub const MOST_STEPS: u64 = 100_000;
 /// Time constant of the motor's own velocity loop, s.
 const VELOCITY_LOOP_S: f64 = 0.001;
 /// Time constant of the motor's own position loop, s.
 const POSITION_LOOP_S: f64 = 0.02;
 
-/// What the motor drives.
+/// The load of the motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Body {
     /// Moment of inertia, kg m².
@@ -24,9 +24,9 @@ pub struct Body {
     pub viscous: f64,
     /// Pulls towards negative angles, Nm.
     pub load: f64,
-    /// The load is that of a weight on a lever, which is level at angle 0: it varies with the cosine.
+    /// The load is a weight on a lever that is horizontal at angle 0: it varies with the cosine.
     pub is_lever: bool,
-    /// Angles that it does not go beyond, rad.
+    /// End stops, rad.
     pub ends: Option<[f64; 2]>,
 }
 
@@ -37,14 +37,14 @@ impl Default for Body {
     }
 }
 
-/// What the motor's loops are commanded.
+/// The command to the motor's loops.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Drive {
     /// No torque.
     Off,
     /// Stiffness, damping and torque.
     Mit(Mit),
-    /// A position, and how fast to go there.
+    /// A position, and the speed limit on the way there.
     Position {
         /// rad.
         position: f64,
@@ -55,25 +55,25 @@ pub enum Drive {
     Velocity(f64),
 }
 
-/// Where the motor is by its own count, and how it moves.
+/// Position by the motor's own encoder, and its motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Movement {
     /// rad.
     pub position: f64,
     /// rad/s.
     pub velocity: f64,
-    /// Of the motor, Nm.
+    /// Torque of the motor, Nm.
     pub torque: f64,
 }
 
-/// What may be wrong with a joint.
+/// Defects of a joint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Trouble {
-    /// The motor's count less the true angle, rad.
+    /// The motor's reported position minus the true angle, rad.
     pub offset: f64,
-    /// The encoder stands at this position and velocity: the motor reports it, and its loops work with it.
+    /// The encoder is stuck at this position and velocity: the motor reports it, and its loops work with it.
     pub frozen: Option<[f64; 2]>,
-    /// It does not turn, whatever pushes it.
+    /// It does not turn, whatever the torque.
     pub is_blocked: bool,
 }
 
@@ -94,7 +94,7 @@ impl Drive {
 }
 
 impl Body {
-    /// Lets so many steps pass.
+    /// Advances this many steps.
     pub fn pass(&self, steps: u64, movement: &mut Movement, drive: Drive, trouble: &Trouble, tmax: f64) {
         for _ in 0..steps.min(MOST_STEPS) {
             let encoder = trouble.frozen.unwrap_or([movement.position, movement.velocity]);
@@ -114,12 +114,12 @@ impl Body {
         let pushed = movement.torque - load;
         let before = movement.velocity;
         movement.velocity = if before == 0.0 {
-            // It sticks until it is pushed harder than friction holds it.
+            // It sticks until the torque exceeds friction.
             pushed.signum() * (pushed.abs() - self.coulomb).max(0.0) / self.inertia * seconds
         } else {
             let friction = self.coulomb * before.signum() + self.viscous * before;
             let after = before + (pushed - friction) / self.inertia * seconds;
-            // Friction ends a movement and begins none.
+            // Friction ends a motion and never starts one.
             if after * before < 0.0 && pushed.abs() <= self.coulomb { 0.0 } else { after }
         };
         movement.position += movement.velocity * seconds;
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn it_falls_as_a_body_does_and_rests_at_its_end() {
+    fn a_joint_falls_as_a_body_does_and_rests_at_its_end() {
         let free = Body { coulomb: 0.0, viscous: 0.0, load: 1.5, ..Body::default() };
         let fallen = after(free, Drive::Off, Trouble::default(), 1_000);
         // Half of 75 rad/s² times the square of 0.1 s.
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn friction_holds_what_pushes_less() {
+    fn friction_resists_smaller_forces() {
         let body = |load| Body { coulomb: 0.3, load, ..Body::default() };
         assert_eq!(after(body(0.29), Drive::Off, Trouble::default(), SECOND), REST);
         assert!(after(body(0.31), Drive::Off, Trouble::default(), SECOND).position < -0.05);
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn two_looks_see_what_one_sees() {
+    fn two_short_steps_equal_one_long_step() {
         let lever = Body { load: 1.0, is_lever: true, ..Body::default() };
         let mut twice = after(lever, spring(0.7), Trouble::default(), 333);
         lever.pass(667, &mut twice, spring(0.7), &Trouble::default(), 10.0);

@@ -1,20 +1,20 @@
 //! The parameters of a Damiao motor: read, written and saved over the bus by register number (RID).
 //!
-//! Numbers, types and the table of limits as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao/tables.py`. The unit of
-//! TIMEOUT, 50 us, is what public drivers take it for; neither of the two states it.
+//! Numbers, types and the table of limits as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao/tables.py`. The
+//! unit of TIMEOUT, 50 us, is the one assumed by public drivers; neither of the two sources states it.
 
 use std::time::Duration;
 
 /// Torque and position loop, `CTRL_MODE` 1.
 pub const MIT: u32 = 1;
-/// Position with a limit of velocity, `CTRL_MODE` 2.
+/// Position with a velocity limit, `CTRL_MODE` 2.
 pub const POS_VEL: u32 = 2;
 /// Velocity, `CTRL_MODE` 3.
 pub const VEL: u32 = 3;
 
 const TIMEOUT_UNIT: Duration = Duration::from_micros(50);
 
-/// What a type of motor has stored when it leaves the factory: name, PMAX (rad), VMAX (rad/s), TMAX (Nm).
+/// Factory settings of each type of motor: name, PMAX (rad), VMAX (rad/s), TMAX (Nm).
 const TYPES: [(&str, f32, f32, f32); 13] = [
     ("DM3507", 12.5, 30.0, 10.0),
     ("DM4310", 12.5, 30.0, 10.0),
@@ -31,7 +31,7 @@ const TYPES: [(&str, f32, f32, f32); 13] = [
     ("DMG6220", 12.5, 45.0, 10.0),
 ];
 
-/// A type of motor, by its place in the table.
+/// A type of motor, by its index in the table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Type(usize);
 
@@ -50,9 +50,9 @@ impl Type {
 /// One motor's registers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Registers {
-    /// 7 MST_ID: identifier of what it answers.
+    /// 7 MST_ID: identifier of its answers.
     pub master: u32,
-    /// 8 ESC_ID: identifier it is spoken to by.
+    /// 8 ESC_ID: identifier of commands to it.
     pub slave: u32,
     /// 9 TIMEOUT, units of 50 us; 0: none.
     pub timeout: u32,
@@ -67,18 +67,18 @@ pub struct Registers {
 }
 
 impl Registers {
-    /// A new motor of this type, in MIT mode and without a time-out.
+    /// A new motor of this type, in MIT mode and without a timeout.
     pub fn new(kind: Type, slave: u16, master: u16) -> Self {
         let (_, pmax, vmax, tmax) = TYPES[kind.0];
         Self { master: master.into(), slave: slave.into(), timeout: 0, mode: MIT, pmax, vmax, tmax }
     }
 
-    /// How long it waits for a frame; `None`: for ever.
+    /// How long it waits for a frame; `None`: without limit.
     pub fn patience(&self) -> Option<Duration> {
         (self.timeout != 0).then(|| TIMEOUT_UNIT * self.timeout)
     }
 
-    /// The four bytes of a register, if there is one with this number.
+    /// The four bytes of a register; `None` if there is no such register.
     pub fn read(&self, rid: u8) -> Option<[u8; 4]> {
         const CAN_RATE_1M: u32 = 4;
         let word = |value: u32| Some(value.to_le_bytes());
@@ -99,7 +99,7 @@ impl Registers {
         }
     }
 
-    /// Writes a register; false: there is none to be written with this number, or not this value.
+    /// Writes a register; false if there is no such writable register, or the value is invalid.
     pub fn write(&mut self, rid: u8, bytes: [u8; 4]) -> bool {
         let word = u32::from_le_bytes(bytes);
         let real = f32::from_le_bytes(bytes);

@@ -1,8 +1,8 @@
-//! Commands to a motor that follow each other without a pause, summed up.
+//! Summary of commands to a motor that follow each other without a pause.
 
 use serde_json::{Value, json};
 
-/// Commands further apart than this are two runs of commands.
+/// A pause longer than this separates two runs of commands.
 const ENDS_NS: u64 = 100_000_000;
 
 /// See the module's comment.
@@ -11,7 +11,7 @@ pub struct Run {
     count: u64,
     last_ns: u64,
     longest_gap_ns: u64,
-    /// Between the positions of two commands, rad.
+    /// Largest step between two consecutive position commands, rad.
     largest_step: f64,
     position: Option<f64>,
     enabled: bool,
@@ -35,7 +35,7 @@ impl Run {
         self.last_ns = now_ns;
     }
 
-    /// When it is over without another command.
+    /// When it ends unless another command comes.
     pub fn ends_ns(&self) -> u64 {
         self.last_ns + ENDS_NS
     }

@@ -1,6 +1,6 @@
-//! slcan, the ASCII protocol of serial CAN adapters (LAWICEL CAN232; what the kernel's `slcan` and `slcand` use).
+//! slcan, the ASCII protocol of serial CAN adapters (LAWICEL CAN232; used by the kernel's `slcan` and by `slcand`).
 //!
-//! Invariant: a command is answered by a carriage return, or by a bell when it is none or comes at the wrong time.
+//! Invariant: a command is answered by a carriage return, or by a bell if it is invalid or comes at the wrong time.
 
 use super::Frame;
 
@@ -19,7 +19,7 @@ pub struct Slcan {
     line: Vec<u8>,
 }
 
-/// What a byte of the host's led to.
+/// The effect of a byte from the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Received {
     /// The channel was opened at this many bits a second, or closed.
@@ -29,15 +29,15 @@ pub enum Received {
 }
 
 impl Slcan {
-    /// Takes what the host sent; answers go to `out`, the rest to `received`.
-    pub fn hear(&mut self, bytes: &[u8], out: &mut Vec<u8>, mut received: impl FnMut(Received)) {
+    /// Processes data from the host; answers go to `out`, effects to `received`.
+    pub fn receive(&mut self, bytes: &[u8], out: &mut Vec<u8>, mut received: impl FnMut(Received)) {
         for byte in bytes {
             match byte {
                 b'\r' => {
                     let line = std::mem::take(&mut self.line);
                     pass_on(self.command(&line, out), &mut received);
                 }
-                // Hosts send line ends of all kinds in front of a command, to end what was there before.
+                // Hosts send line ends of all kinds before a command, to end any previous one.
                 b'\n' if self.line.is_empty() => {}
                 _ if self.line.len() < LONGEST => self.line.push(*byte),
                 _ => {}
@@ -46,7 +46,7 @@ impl Slcan {
     }
 
     /// Writes a frame of the bus to the host.
-    pub fn tell(&self, frame: &Frame, out: &mut Vec<u8>) {
+    pub fn send_to_host(&self, frame: &Frame, out: &mut Vec<u8>) {
         if self.open {
             encode(frame, out);
         }
@@ -77,7 +77,7 @@ impl Slcan {
             (b'V', [], _) => (b"V1013\r", None),
             (b'N', [], _) => (b"NVB01\r", None),
             (b'F', [], true) => (b"F00\r", None),
-            // Time stamps off is what it does anyway.
+            // Time stamps are off anyway.
             (b'Z', [b'0'], false) => (&[OK], None),
             _ => (&[BELL], None),
         };
@@ -106,7 +106,7 @@ pub fn encode(frame: &Frame, out: &mut Vec<u8>) {
     out.push(b'\r');
 }
 
-/// Reads a line without its end.
+/// Parses a line without its end.
 pub fn decode(line: &[u8]) -> Option<Frame> {
     let (word, rest) = line.split_first()?;
     let (extended, remote) = match word {
@@ -141,7 +141,7 @@ mod tests {
 
     fn talk(slcan: &mut Slcan, bytes: &[u8]) -> (Vec<u8>, Vec<Received>) {
         let (mut out, mut received) = (Vec::new(), Vec::new());
-        slcan.hear(bytes, &mut out, |what| received.push(what));
+        slcan.receive(bytes, &mut out, |what| received.push(what));
         (out, received)
     }
 
@@ -150,7 +150,7 @@ mod tests {
         let mut slcan = Slcan::default();
         let frame = Frame::new(5, false, false, 2, &[0xab, 0xcd]).unwrap();
         let mut nothing = Vec::new();
-        slcan.tell(&frame, &mut nothing);
+        slcan.send_to_host(&frame, &mut nothing);
         assert_eq!(nothing, b"", "a closed channel is silent");
         let cases: [(&[u8], &[u8], &[Received]); 12] = [
             (b"\r\r", b"\r\r", &[]),
@@ -182,7 +182,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn frames_come_back(frame in strategies::frame()) {
+        fn frames_round_trip(frame in strategies::frame()) {
             let mut line = Vec::new();
             encode(&frame, &mut line);
             prop_assert!(line.len() <= LONGEST);

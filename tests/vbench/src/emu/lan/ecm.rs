@@ -1,6 +1,6 @@
-//! A CDC-ECM adapter (`cdc_ether` makes it `enx...`): one Ethernet frame is one transfer.
+//! A CDC-ECM adapter (named `enx...` by `cdc_ether`): one Ethernet frame is one transfer.
 //!
-//! The interface gets no address from here: there is no DHCP server behind it, the guest's script gives it one.
+//! The interface gets no address from here: there is no DHCP server behind it; the guest's script sets the address.
 
 use std::net::Ipv4Addr;
 
@@ -16,17 +16,17 @@ use crate::emu::talker::Talker;
 
 const DATA_OUT: u8 = 0x02;
 const NOTIFY_IN: u8 = 0x83;
-/// String descriptor with the address the host is to use.
+/// String descriptor with the host's MAC address.
 const MAC_STRING: u8 = 4;
-/// Where a LiDAR is when there is no camera whose network it shares.
+/// Address of a LiDAR without a camera whose network it shares.
 const LIDAR_ADDRESS: Ipv4Addr = Ipv4Addr::new(192, 168, 1, 201);
 
-/// What is behind the adapter.
+/// The devices behind the adapter.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct NetSpec {
-    /// A GoPro whose clips have so many MB.
+    /// A GoPro with clips of this many MB.
     pub gopro: Option<u32>,
-    /// A LiDAR that sends so many packets a second.
+    /// A LiDAR that sends this many packets per second.
     pub lidar: Option<f64>,
 }
 
@@ -46,16 +46,16 @@ pub struct Ecm {
 #[derive(Debug)]
 struct Lidar {
     hz: f64,
-    /// Begins with the first look at the clock.
+    /// Starts with the first use of the clock.
     pace: Option<Pace>,
 }
 
 impl Ecm {
-    /// An adapter with this behind it; a camera's address follows from its serial number. `first` distinguishes adapters.
+    /// An adapter with these devices; a camera's address follows from its serial. `first` distinguishes adapters.
     pub fn new(net: &NetSpec, serial: &str, first: u32) -> Self {
         let gopro = net.gopro.map(|megabytes| Gopro::new(serial, megabytes));
         let address = gopro.as_ref().map_or(LIDAR_ADDRESS, Gopro::address);
-        // udev names an interface by its address only when that is one from a factory: this range is for documentation.
+        // udev names an interface by its address only if that is a manufacturer's: this range is for documentation.
         let [.., number] = (first / 1_000_000).to_be_bytes();
         Self {
             mac: format!("00005E0053{number:02X}"),
@@ -105,9 +105,9 @@ impl Talker for Ecm {
         if setup.is_in() { Answer::Stall } else { Answer::Done }
     }
 
-    fn hear(&mut self, data: &[u8], _now_ns: u64) {
+    fn receive(&mut self, data: &[u8], _now_ns: u64) {
         if self.linked {
-            self.stack.hear(data);
+            self.stack.receive(data);
         }
     }
 
@@ -151,7 +151,7 @@ impl Talker for Ecm {
         }
     }
 
-    fn befall(&mut self, _motor: Option<u16>, order: Order, _now_ns: u64) -> bool {
+    fn apply(&mut self, _motor: Option<u16>, order: Order, _now_ns: u64) -> bool {
         let Order::Link(linked) = order else { return false };
         self.link(linked);
         self.reported.push(Reported::new("link", serde_json::json!({"linked": linked})));
@@ -201,10 +201,10 @@ mod tests {
         assert_eq!((&frames[0][..6], frames[0].len()), (&[0xff; 6][..], 14 + 20 + 8 + lidar::PACKET));
         let counter = |frame: &[u8]| lidar::number(&frame[42..]);
         assert_eq!(frames.iter().map(|frame| counter(frame)).collect::<Vec<_>>(), [Some(0), Some(1), Some(2), Some(3)]);
-        assert!(ecm.befall(None, Order::Link(false), 40_000_000));
+        assert!(ecm.apply(None, Order::Link(false), 40_000_000));
         assert_eq!(taken(&mut ecm, 1, 60_000_000).len(), 0);
         assert_eq!(taken(&mut ecm, 3, 60_000_000), [[0xa1, 0, 0, 0, 0, 0, 0, 0]]);
-        ecm.befall(None, Order::Link(true), 60_000_000);
+        ecm.apply(None, Order::Link(true), 60_000_000);
         assert_eq!(counter(&taken(&mut ecm, 1, 61_000_000)[0]), Some(4), "no number was spent meanwhile");
     }
 }

@@ -1,7 +1,7 @@
-//! A simulated GoPro as its USB network shows it: the HTTP interface of Open GoPro, as far as recording needs it.
+//! A simulated GoPro as seen on its USB network: the HTTP interface of Open GoPro, as far as recording needs it.
 //!
-//! Its address is 172.2X.1YZ.51 with XYZ the last three digits of its serial number, its port 8080.
-//! A clip that was stopped is there after it was finished, as on a real camera; until then it is busy.
+//! Its address is 172.2X.1YZ.51 with XYZ the last three digits of its serial number, its port 8080. A stopped clip is
+//! available once it is finished, as on a real camera; until then the camera is busy.
 //!
 //! Invariant: every request is logged with its answer's status.
 
@@ -15,9 +15,9 @@ use crate::emu::reported::Reported;
 /// Port of its HTTP server.
 pub const PORT: u16 = 8080;
 const FOLDER: &str = "100GOPRO";
-/// From the stop of the shutter to the clip's being there.
+/// Time from the stop of the shutter until the clip is available.
 const FINISHING_NS: u64 = 700_000_000;
-/// The smallest box by which a file is recognized as MP4.
+/// The smallest box that identifies a file as MP4.
 const HEAD: [u8; 24] = *b"\0\0\0\x18ftypmp41\0\0\0\0mp41isom";
 
 /// The camera.
@@ -26,7 +26,7 @@ pub struct Gopro {
     serial: String,
     clip_bytes: u64,
     encoding: bool,
-    /// Clips that are there or will be: their number is their place plus one, and when they are finished.
+    /// When each clip is finished; a clip's number is its index plus one.
     clips: Vec<u64>,
     reported: Vec<Reported>,
 }
@@ -38,7 +38,7 @@ impl Gopro {
         Self { serial: serial.into(), clip_bytes, encoding: false, clips: Vec::new(), reported: Vec::new() }
     }
 
-    /// Its address; one without three digits at the end of its serial number has zeros for them.
+    /// Its address; without three digits at the end of its serial number, zeros are used.
     pub fn address(&self) -> Ipv4Addr {
         let mut digits = self.serial.bytes().rev().map(|byte| if byte.is_ascii_digit() { byte - b'0' } else { 0 });
         let mut digit = || digits.next().unwrap_or_default();
@@ -128,7 +128,7 @@ impl Gopro {
         })
     }
 
-    /// Status numbers as in Open GoPro: 8 busy, 10 encoding, 35 seconds and 54 KB that are left, 70 battery in per cent.
+    /// Status numbers of Open GoPro: 8 busy, 10 encoding, 35 remaining s, 54 remaining KB, 70 battery in per cent.
     fn state(&self, now_ns: u64) -> Value {
         let busy = self.encoding || self.finished(now_ns).count() != self.clips.len();
         json!({"status": {"8": u8::from(busy), "10": u8::from(self.encoding), "35": 7_200, "54": 62_000_000, "70": 87}, "settings": {}})
@@ -139,11 +139,11 @@ fn file(number: u32) -> String {
     format!("GX01{number:04}.MP4")
 }
 
-/// Writes bytes of clip `number` from `at` on over `out`.
+/// Writes the bytes of clip `number` from `at` on over `out`.
 pub fn clip(number: u32, at: u64, out: &mut [u8]) {
     for (byte, place) in out.iter_mut().zip(at..) {
         let head = usize::try_from(place).ok().and_then(|place| HEAD.get(place));
-        // A pattern that repeats nowhere a reader could have slipped by a power of two.
+        // A pattern that does not repeat at a power of two, so that a reader's slip is noticed.
         *byte = head.copied().unwrap_or((place % 251) as u8 ^ (place / 251 % 253) as u8 ^ number as u8);
     }
 }
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn its_bytes_do_not_depend_on_the_pieces() {
+    fn the_bytes_of_a_clip_do_not_depend_on_the_chunking() {
         let mut whole = [0; 5000];
         clip(3, 0, &mut whole);
         assert_eq!(whole[4..8], *b"ftyp");

@@ -1,10 +1,10 @@
-//! The part of HTTP/1.1 that a camera's server uses: GET, one answer a connection, ranges from a byte on.
+//! The part of HTTP/1.1 that a camera's server uses: GET, one answer per connection, open-ended ranges.
 //!
-//! Invariant: no request panics; one that is not understood is answered 400.
+//! Invariant: no request causes a panic; invalid ones are answered with 400.
 
 use serde_json::Value;
 
-/// No request is longer.
+/// Maximum length of a request.
 const LONGEST: usize = 8 * 1024;
 
 /// A request.
@@ -12,7 +12,7 @@ const LONGEST: usize = 8 * 1024;
 pub struct Request {
     /// Path with its query.
     pub target: String,
-    /// First byte that is asked for.
+    /// First requested byte.
     pub from: u64,
 }
 
@@ -29,18 +29,18 @@ impl Request {
     }
 }
 
-/// What has come in so far.
+/// The data received so far.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Inbox {
-    /// Not the whole request yet.
+    /// An incomplete request.
     Partial,
-    /// No request.
+    /// Not a request.
     Bad,
     /// A request.
     Whole(Request),
 }
 
-/// Reads the bytes of a connection.
+/// Parses the bytes of a connection.
 pub fn read(bytes: &[u8]) -> Inbox {
     let Some(end) = bytes.windows(4).position(|four| four == b"\r\n\r\n") else {
         return if bytes.len() > LONGEST { Inbox::Bad } else { Inbox::Partial };
@@ -63,11 +63,11 @@ pub fn read(bytes: &[u8]) -> Inbox {
 pub struct Reply {
     /// Status code.
     pub status: u16,
-    /// What it carries.
+    /// Its body.
     pub body: Body,
 }
 
-/// What an answer carries.
+/// The body of an answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Body {
     /// JSON text.
@@ -89,7 +89,7 @@ impl Reply {
         Self { status, body: Body::Json(value.to_string()) }
     }
 
-    /// The head that goes before the body.
+    /// The header before the body.
     pub fn head(&self) -> String {
         let reason = match self.status {
             200 => "OK",
@@ -144,7 +144,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_bytes_upset_it(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+        fn any_bytes_are_survived(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
             let _read = read(&[&b"GET "[..], &bytes, b"\r\n\r\n"].concat());
         }
     }

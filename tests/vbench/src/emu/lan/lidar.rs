@@ -1,10 +1,10 @@
-//! Packets of a LiDAR, in the shape of a Velodyne VLP-16's: twelve blocks of 100 bytes, four of time, two of the factory's.
+//! Packets of a LiDAR in the format of a Velodyne VLP-16: twelve blocks of 100 bytes, four of time, two factory bytes.
 //!
-//! The first block's distances hold the packet's number (u32) and its send time (u64, ns of CLOCK_MONOTONIC), little-endian.
+//! The first block's distances are the packet's number (u32) and send time (u64, ns of CLOCK_MONOTONIC), little-endian.
 
 /// Bytes of a packet.
 pub const PACKET: usize = 1206;
-/// Where they are sent to.
+/// Their destination port.
 pub const PORT: u16 = 2368;
 
 const BLOCK: usize = 100;
@@ -18,7 +18,7 @@ const FACTORY: [u8; 2] = [0x37, 0x22];
 pub fn packet(number: u32, sent_ns: u64) -> [u8; PACKET] {
     let mut packet = [0; PACKET];
     for (block, place) in packet.as_chunks_mut::<BLOCK>().0.iter_mut().zip(0_u32..) {
-        // Two blocks a firing, 0.4 degrees apart; azimuth in hundredths of a degree.
+        // Two blocks per firing, 0.4 degrees apart; azimuth in hundredths of a degree.
         let turn = (u64::from(number) * BLOCKS as u64 + u64::from(place)) * 20 % 36_000;
         block[..2].copy_from_slice(&[0xff, 0xee]);
         block[2..4].copy_from_slice(&turn.to_le_bytes()[..2]);
@@ -36,7 +36,7 @@ pub fn packet(number: u32, sent_ns: u64) -> [u8; PACKET] {
     packet
 }
 
-/// The number of a packet; none of bytes that are no whole packet of this LiDAR.
+/// The number of a packet; `None` if the bytes are not a whole packet of this LiDAR.
 pub fn number(packet: &[u8]) -> Option<u32> {
     let whole = packet.len() == PACKET && packet.starts_with(&[0xff, 0xee]) && packet.ends_with(&FACTORY);
     whole.then(|| u32::from_le_bytes([packet[4], packet[5], packet[6], packet[7]]))

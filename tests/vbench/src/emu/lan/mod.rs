@@ -1,6 +1,6 @@
-//! A USB network adapter and what is behind it: a camera that is controlled over HTTP, a LiDAR that sends packets.
+//! A USB network adapter and the devices behind it: a camera controlled over HTTP, a LiDAR that sends packets.
 //!
-//! Invariant: no clock, no socket of the system's, no thread below this module; the TCP/IP is `smoltcp`'s, in memory.
+//! Invariant: no clock, no system socket, no thread below this module; the TCP/IP stack is `smoltcp`, in memory.
 
 pub mod ecm;
 pub mod gopro;

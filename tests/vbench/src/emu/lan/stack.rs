@@ -1,6 +1,6 @@
 //! The TCP/IP behind an adapter: `smoltcp` on two queues of Ethernet frames, an HTTP server, datagrams.
 //!
-//! Invariant: what is sent never grows beyond `QUEUE` frames; TCP waits for room.
+//! Invariant: the output never exceeds `QUEUE` frames; TCP waits for space.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -18,9 +18,9 @@ use super::http::{self, Body, Inbox, Reply};
 
 /// Frames that wait for the host.
 const QUEUE: usize = 64;
-/// Connections at a time.
+/// Maximum simultaneous connections.
 const CONNECTIONS: usize = 6;
-/// The smallest frame cable and drivers know.
+/// Minimum frame size of cables and drivers.
 const SHORTEST_FRAME: usize = 60;
 const LONGEST_FRAME: usize = 1514;
 
@@ -36,12 +36,12 @@ pub struct Stack {
 struct Connection {
     handle: SocketHandle,
     inbox: Vec<u8>,
-    /// The answer, and how much of head and body have been sent.
+    /// The answer, and how much of header and body has been sent.
     reply: Option<(Reply, usize)>,
 }
 
 impl Stack {
-    /// A network of one host with this address, and the computer's.
+    /// A network of one host with this address, and the computer.
     pub fn new(mac: [u8; 6], address: Ipv4Addr) -> Self {
         let mut wire = Wire::default();
         let mut config = Config::new(EthernetAddress(mac).into());
@@ -61,14 +61,14 @@ impl Stack {
         Self { interface, wire, sockets, connections, datagrams }
     }
 
-    /// Takes a frame of the host's.
-    pub fn hear(&mut self, frame: &[u8]) {
+    /// Receives a frame from the host.
+    pub fn receive(&mut self, frame: &[u8]) {
         if self.wire.inbound.len() < QUEUE {
             self.wire.inbound.push_back(frame.to_vec());
         }
     }
 
-    /// Works off what came in; when it wants to be called again at the latest.
+    /// Processes received frames; returns when it must be called again at the latest.
     pub fn poll(&mut self, mut gopro: Option<&mut Gopro>, now_ns: u64) -> Option<u64> {
         let now = instant(now_ns);
         loop {
@@ -85,17 +85,17 @@ impl Stack {
             }
         }
         let due = self.interface.poll_at(now, &self.sockets)?;
-        // A full queue is emptied by the host, not by the clock.
+        // The host empties a full queue, not the clock.
         let is_full = self.wire.outbound.len() >= QUEUE;
         let due_ns = u64::try_from(due.total_micros()).unwrap_or_default() * 1_000;
         (!is_full).then_some(due_ns.max(now_ns + 1_000_000))
     }
 
-    /// Sends a datagram to everybody.
+    /// Broadcasts a datagram.
     pub fn broadcast(&mut self, port: u16, payload: &[u8], now_ns: u64) {
         let socket = self.sockets.get_mut::<udp::Socket<'_>>(self.datagrams);
         if !socket.is_open() {
-            // The port is not 0, which is all there is to fail.
+            // This fails only for port 0.
             let _bound = socket.bind(port);
         }
         if socket.send_slice(payload, (Ipv4Addr::BROADCAST, port)).is_ok() {
@@ -103,7 +103,7 @@ impl Stack {
         }
     }
 
-    /// Nothing waits to be sent.
+    /// Whether no frame waits to be sent.
     pub fn is_quiet(&self) -> bool {
         self.wire.outbound.is_empty()
     }
@@ -113,13 +113,13 @@ impl Stack {
         self.wire.outbound.pop_front()
     }
 
-    /// Throws away what waits.
+    /// Discards waiting frames.
     pub fn discard(&mut self) {
         self.wire.outbound.clear();
         self.wire.inbound.clear();
     }
 
-    /// The cable is gone: connections end without a word.
+    /// The cable is gone: connections end silently.
     pub fn hang_up(&mut self) {
         for connection in &mut self.connections {
             self.sockets.get_mut::<tcp::Socket<'_>>(connection.handle).abort();
@@ -138,7 +138,7 @@ impl fmt::Debug for Stack {
 }
 
 impl Connection {
-    /// Moves on as far as it can; true: something changed.
+    /// Makes as much progress as possible; true if anything changed.
     fn serve(&mut self, socket: &mut tcp::Socket<'_>, gopro: &mut Gopro, now_ns: u64) -> bool {
         if matches!(socket.state(), tcp::State::TimeWait) {
             socket.abort();
@@ -163,7 +163,7 @@ impl Connection {
             .map(|reply| (reply, 0));
         }
         let Some((reply, sent)) = &mut self.reply else {
-            // The host hung up without asking for anything.
+            // The host closed the connection without a request.
             if matches!(socket.state(), tcp::State::CloseWait) {
                 socket.close();
             }
@@ -188,7 +188,7 @@ impl Connection {
 }
 
 impl Reply {
-    /// Writes its bytes from `at` on over `out`, as many as fit; how many, 0 at its end.
+    /// Writes its bytes from `at` on over `out`, as many as fit; returns their number, 0 at the end.
     fn write(&self, at: usize, out: &mut [u8]) -> usize {
         let head = self.head();
         let copy = |from: &[u8], out: &mut [u8]| {

@@ -21,7 +21,7 @@ impl Host {
         Self { interface, wire, sockets: SocketSet::new(Vec::new()) }
     }
 
-    /// One GET to its end; the bytes of the answer, and the milliseconds it took.
+    /// One complete GET; returns the bytes of the answer and the milliseconds it took.
     fn get(&mut self, stack: &mut Stack, gopro: &mut Gopro, target: &str, range: &str, now_ms: &mut u64) -> Vec<u8> {
         let buffer = || tcp::SocketBuffer::new(vec![0; 16 * 1024]);
         let handle = self.sockets.add(tcp::Socket::new(buffer(), buffer()));
@@ -35,7 +35,7 @@ impl Host {
             *now_ms += 1;
             let now_ns = *now_ms * 1_000_000;
             self.interface.poll(instant(now_ns), &mut self.wire, &mut self.sockets);
-            std::mem::take(&mut self.wire.outbound).iter().for_each(|frame| stack.hear(frame));
+            std::mem::take(&mut self.wire.outbound).iter().for_each(|frame| stack.receive(frame));
             stack.poll(Some(gopro), now_ns);
             self.wire.inbound.extend(std::iter::from_fn(|| stack.next_frame()));
             let socket = self.sockets.get_mut::<tcp::Socket<'_>>(handle);

@@ -1,4 +1,4 @@
-//! The tally: the totals of a run, for the summary at its end.
+//! The totals of a run, for the summary at its end.
 //!
 //! Invariant: pure; built from events and snapshots.
 
@@ -15,28 +15,28 @@ use crate::time::Stamp;
 
 /// How long each device was present, and which episodes were closed.
 #[derive(Debug)]
-pub(super) struct Tally {
+pub(super) struct RunTotals {
     began: Stamp,
-    present: [Presence; MAX_MODALITIES],
-    /// Samples that were already counted when the tally began.
+    present: [DevicePresence; MAX_MODALITIES],
+    /// Samples that were already counted when the totals began.
     before: Vec<DeviceStatus>,
     episodes: Vec<Episode>,
-    /// What the policy calls itself, and whether nothing moves.
+    /// The policy's name, and whether it is a dry run.
     policy: Option<(String, bool)>,
     policy_end: Option<PolicyEnd>,
     missed: u64,
 }
 
 #[derive(Debug, Clone, Copy, Default)]
-struct Presence {
+struct DevicePresence {
     since: Option<Stamp>,
     total: Duration,
-    /// The last time it was present, if it is not now.
+    /// The last period in which it was present, if it is not present now.
     last: Option<(Stamp, Stamp)>,
     stalled: bool,
 }
 
-impl Presence {
+impl DevicePresence {
     fn set(&mut self, state: SlotState, at: Stamp) {
         // A stalled device is attached and running: its bit in the mask stays.
         let running = matches!(state, SlotState::Streaming | SlotState::Stalled);
@@ -58,8 +58,8 @@ impl Presence {
         self.total + self.since.map_or(Duration::ZERO, |since| end.since(since))
     }
 
-    /// In which it sent `samples`: without the time that it took to close it, of which the only sign is that the
-    /// newest is older. The silence of a device that has stalled counts.
+    /// The time in which it sent `samples`: without the time it took to close, whose only sign is that the newest
+    /// sample is older. The silence of a stalled device counts.
     fn sending(self, end: Stamp, newest: Option<Stamp>, samples: u64) -> Duration {
         let present = self.until(end);
         let last = self.since.map(|since| (since, end)).or(self.last);
@@ -67,7 +67,7 @@ impl Presence {
         if self.stalled || newest <= since || newest >= until || samples < 2 {
             return present;
         }
-        // The newest sample counts for the time until the next.
+        // The newest sample counts until the next one is due.
         let sent = present.saturating_sub(until.since(newest)).as_secs_f64();
         present.min(Duration::from_secs_f64(sent * samples as f64 / (samples - 1) as f64))
     }
@@ -88,7 +88,7 @@ struct Episode {
     verdict: Verdict,
 }
 
-/// The summary, as JSON one object: `{"event":"summary",...}`.
+/// The summary; as JSON one object: `{"event":"summary",...}`.
 #[derive(Debug, Serialize)]
 #[serde(tag = "event", rename = "summary")]
 pub(super) struct Summary {
@@ -97,7 +97,7 @@ pub(super) struct Summary {
     episodes: Vec<Episode>,
     #[serde(skip_serializing_if = "Option::is_none")]
     policy: Option<PolicyRow>,
-    /// Events this output did not see because it was behind.
+    /// Events that this output missed because it was behind.
     missed_events: u64,
 }
 
@@ -118,28 +118,28 @@ struct Row {
     samples: u64,
     /// Mean rate while present and not being closed.
     hz: f64,
-    /// Part of the run in which the device was present, 0 to 1.
+    /// Share of the run in which the device was present, 0 to 1.
     present: f64,
     gaps: u64,
     bytes: u64,
 }
 
-impl Tally {
+impl RunTotals {
     pub(super) fn new(snapshot: &Snapshot) -> Self {
-        let mut tally = Self {
+        let mut totals = Self {
             began: snapshot.taken,
-            present: [Presence::default(); MAX_MODALITIES],
+            present: [DevicePresence::default(); MAX_MODALITIES],
             before: snapshot.devices.clone(),
             episodes: Vec::new(),
             policy: snapshot.policy.as_ref().map(|policy| (policy.name.clone(), policy.dry_run)),
             policy_end: None,
             missed: 0,
         };
-        tally.agree(snapshot);
-        tally
+        totals.agree(snapshot);
+        totals
     }
 
-    /// Takes over the states as they are, where events may be missing.
+    /// Adopts the states of the snapshot, since events may be missing.
     pub(super) fn agree(&mut self, snapshot: &Snapshot) {
         for device in &snapshot.devices {
             if let Some(presence) = self.present.get_mut(device.id.index()) {
@@ -205,7 +205,7 @@ impl Tally {
     }
 }
 
-/// To three decimals, the precision of a mean over seconds.
+/// Rounds to three decimals, the precision of a mean over seconds.
 fn round(value: f64) -> f64 {
     (value * 1000.0).round() / 1000.0
 }
@@ -246,7 +246,7 @@ impl Summary {
                 text::size(episode.bytes),
                 text::plain(&episode.verdict.sensors())
             ));
-            // Where an error has made a reason, it includes the error.
+            // If an error caused a reason, the reason includes the error.
             let reasons = &episode.verdict.reasons;
             let why = if reasons.is_empty() { episode.error.as_slice() } else { reasons };
             lines.extend(why.iter().map(|reason| format!("         {}", text::plain(reason))));

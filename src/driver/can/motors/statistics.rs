@@ -1,4 +1,4 @@
-//! What thread `control` counts: how well it kept its beat, and what went wrong.
+//! What thread `control` counts: how punctual its cycles were, and what went wrong.
 
 use std::fmt;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use crate::time::nanoseconds;
 /// Longest time the statistics distinguish, ns.
 const LONGEST: u64 = 10_000_000_000;
 
-/// How well the thread kept its beat.
+/// How punctual the thread's cycles were.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Punctuality {
     /// Cycles of the grid: early ones are not counted.
@@ -20,7 +20,7 @@ pub struct Punctuality {
     pub early: u64,
     /// How late the cycles of the grid began, ms: the median, all but one in a thousand, all.
     pub late_ms: [f64; 3],
-    /// Actions that commands followed.
+    /// Actions that were followed by a command.
     pub actions: u64,
     /// From their tick to the first command after it, ms: the median, all but one in a hundred.
     pub wire_ms: [f64; 2],
@@ -60,16 +60,16 @@ pub(super) struct LoopStatistics {
 
 impl LoopStatistics {
     pub(super) fn new() -> Self {
-        let (lateness, latency) = (statistics(), statistics());
+        let (lateness, latency) = (histogram(), histogram());
         Self { lateness, early: 0, latency, lost_frames: 0, full: 0, unsent: 0, lost_samples: 0 }
     }
 
-    /// A cycle of the grid began so late.
+    /// Counts a cycle of the grid that began this late.
     pub(super) fn late(&mut self, late: Duration) {
         self.lateness.saturating_record(nanoseconds(late));
     }
 
-    /// An action was so old when the first command after it was sent.
+    /// Counts an action of this age at the first command after it.
     pub(super) fn on_the_wire(&mut self, ns: u64) {
         self.latency.saturating_record(ns);
     }
@@ -104,7 +104,7 @@ impl LoopStatistics {
     }
 }
 
-fn statistics() -> Histogram<u64> {
+fn histogram() -> Histogram<u64> {
     // Its bounds are in range: the highest is more than twice the lowest, the digits at most 5.
     #[expect(clippy::expect_used, reason = "constants, checked by a test")]
     Histogram::new_with_bounds(1, LONGEST, 2).expect("bounds of a histogram")
@@ -115,18 +115,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_bounds_of_the_statistics_are_ones() {
-        let mut tally = LoopStatistics::new();
-        tally.late(Duration::MAX);
-        assert_eq!(tally.punctuality().cycles, 1);
+    fn the_bounds_of_the_histogram_are_valid() {
+        let mut statistics = LoopStatistics::new();
+        statistics.late(Duration::MAX);
+        assert_eq!(statistics.punctuality().cycles, 1);
     }
 
     #[test]
-    fn what_did_not_happen_is_not_told() {
-        let mut tally = LoopStatistics::new();
-        assert_eq!(tally.mishaps(&Counts::default()), None);
-        tally.full = 3;
+    fn counts_of_zero_are_not_reported() {
+        let mut statistics = LoopStatistics::new();
+        assert_eq!(statistics.mishaps(&Counts::default()), None);
+        statistics.full = 3;
         let bus = Counts { actions: 9, faults: 1, ..Counts::default() };
-        assert_eq!(tally.mishaps(&bus).as_deref(), Some("1 faults, 3 frames without room to the bus"));
+        assert_eq!(statistics.mishaps(&bus).as_deref(), Some("1 faults, 3 frames without room to the bus"));
     }
 }

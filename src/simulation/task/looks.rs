@@ -1,16 +1,16 @@
-//! What the cameras of the task see: pictures of 96 x 96 pixels, 8-bit RGB.
+//! The pictures of the task's cameras: 96 x 96 pixels, 8-bit RGB.
 //!
-//! The wrist camera looks down between the fingers; nothing in its picture depends on the texture. The
-//! tactile camera looks at a gel from behind: plain, until it is pressed on the block.
+//! The wrist camera looks down between the fingers; its picture does not depend on the texture. The tactile camera
+//! looks at a gel from behind, which is plain until it is pressed on the block.
 
 use std::f64::consts::{PI, TAU};
 
 use super::world::{Texture, World, stream};
 use crate::random::Random;
 
-/// Pixels a side.
+/// Pixels per side.
 pub const SIDE_PIXELS: u32 = 96;
-/// The same, to count with.
+/// The same as `usize`.
 pub const SIDE: usize = SIDE_PIXELS as usize;
 const PIXELS: usize = SIDE * SIDE;
 /// Half the block's edge.
@@ -18,14 +18,14 @@ const HALF_EDGE: f64 = 0.12;
 const WRIST_GRAIN: f32 = 0.015;
 const TACTILE_GRAIN: f32 = 0.02;
 
-/// The looks of one trial, drawn from its seed once.
+/// The appearance of one trial, drawn once from its seed.
 #[derive(Debug)]
 pub struct Looks {
     table: [f32; 3],
     block: [f32; 3],
     phases: [f64; 3],
     gain: f32,
-    /// The gel at rest, and what full pressure adds: RGB of each pixel.
+    /// The gel at rest, and the change at full pressure: RGB of each pixel.
     gel: Vec<[f32; 3]>,
     imprint: Vec<[f32; 3]>,
     wrist_grain: Random,
@@ -38,8 +38,7 @@ fn offset(pixel: usize) -> f64 {
 }
 
 impl Looks {
-    /// The looks of trial `seed`, in which the block feels like `texture`.
-    #[must_use]
+    /// The appearance of trial `seed`, in which the block has `texture`.
     pub fn new(seed: u64, texture: Texture) -> Self {
         let mut random = Random::new(seed, stream::LOOKS);
         let mut colour = |low, high| [(); 3].map(|()| narrow(random.uniform(low, high)));
@@ -69,12 +68,12 @@ impl Looks {
         }
     }
 
-    /// Renders what the wrist camera sees into `picture`, 96 x 96 x 3 bytes.
+    /// Renders the wrist camera's picture into `picture`, 96 x 96 x 3 bytes.
     pub fn wrist(&mut self, world: &World, picture: &mut Vec<u8>) {
         let scale = 75.0 / (world.position[2] + 0.45);
         let [p0, p1, p2] = self.phases;
-        // The pattern of the table is a sum of waves along x, along y and along both: each needs its sines
-        // once a column and once a row.
+        // The pattern of the table is a sum of waves along x, along y and along both: each needs its sines once per
+        // column and once per row.
         let column: [[f64; 3]; SIDE] = std::array::from_fn(|pixel| {
             let x = world.position[0] + offset(pixel) / scale;
             [0.05 * (5.0 * x + p0).sin(), (9.0 * x).sin(), (9.0 * x).cos()]
@@ -111,7 +110,7 @@ impl Looks {
         }
     }
 
-    /// Renders what the tactile camera sees into `picture`, 96 x 96 x 3 bytes.
+    /// Renders the tactile camera's picture into `picture`, 96 x 96 x 3 bytes.
     pub fn tactile(&mut self, world: &World, picture: &mut Vec<u8>) {
         let pressure = narrow(world.pressure);
         picture.clear();
@@ -124,13 +123,13 @@ impl Looks {
     }
 }
 
-/// Offsets across and down of every pixel, row by row.
+/// Horizontal and vertical offset of every pixel, row by row.
 fn pixels() -> impl Iterator<Item = (f64, f64)> {
     (0..PIXELS).map(|at| (offset(at % SIDE), offset(at / SIDE)))
 }
 
-/// What the texture adds to the picture of the gel at full pressure, lit by three coloured lights from three
-/// sides: the slope of the surface towards each.
+/// The change of the gel's picture by the texture at full pressure, lit by three coloured lights from three sides: the
+/// slope of the surface towards each.
 fn imprint(texture: Texture, random: &mut Random) -> Vec<[f32; 3]> {
     let (angle, period) = (random.uniform(0.0, PI), random.uniform(15.0, 19.0));
     let shift = [random.uniform(-20.0, 20.0), random.uniform(-20.0, 20.0)];
@@ -147,7 +146,7 @@ fn imprint(texture: Texture, random: &mut Random) -> Vec<[f32; 3]> {
                 (TAU / period * (cos * (u - shift[0]) + sin * (v - shift[1]))).cos()
             });
             let relief = match texture {
-                // Ridges where one of three families of lines runs.
+                // Ridges along three families of lines.
                 Texture::Triangular => (waves.into_iter().fold(f64::MIN, f64::max) - 0.75) / 0.25,
                 // The borders between the points of a triangular lattice are a honeycomb.
                 Texture::Hexagonal => (-waves.iter().sum::<f64>() - 0.35) / 0.65,

@@ -1,8 +1,8 @@
-//! The simulated task: grasp a block, feel what it is, sort it. Its wrist camera, its tactile camera and
-//! its arm are devices like all others; the arm is the actuator.
+//! The simulated task: grasp a block, feel its texture, sort it. Its wrist camera, its tactile camera and its arm are
+//! devices like all others; the arm is the actuator.
 //!
-//! Invariant: what its devices send is a function of the seed, the actions and the number of the step; when
-//! and in which order they are read changes nothing.
+//! Invariant: the samples of its devices are a function of the seed, the actions and the number of the step; the time
+//! and order of reads have no effect.
 
 mod expert;
 mod looks;
@@ -10,22 +10,25 @@ mod world;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+use jpeg_encoder::{ColorType, Encoder, EncodingError, SamplingFactor};
 
 pub use expert::Expert;
 pub use looks::{Looks, SIDE, SIDE_PIXELS};
-pub use world::{AXES, AXIS_COUNT, AXIS_NAMES, MAX_STEPS, Outcome, STEP_HZ, Texture, World};
+pub use world::{AXES, AXIS_COUNT, MAX_STEPS, Outcome, STEP_HZ, Texture, World};
 
-use super::super::DriverError;
-use crate::registry::scenario::{Scene, TaskPart};
+use super::TaskPart;
 use crate::sample::Encoding;
 
-/// Nearly without loss, colours at full resolution: the texture is fine and coloured.
+/// Nearly lossless, colours at full resolution: the texture is fine and coloured.
 const JPEG_QUALITY: u8 = 95;
 const SIDE_U16: u16 = 96;
 
-/// How `part` encodes what it sends, with width and height of the header.
-#[must_use]
+/// A picture of the task cannot be encoded.
+#[derive(Debug, thiserror::Error)]
+#[error("a picture of the simulated task: {0}")]
+pub struct PictureError(#[from] EncodingError);
+
+/// Encoding of the samples of `part`, with width and height of the header.
 pub const fn layout(part: TaskPart) -> (Encoding, u32, u32) {
     match part {
         TaskPart::Arm => (Encoding::F64, AXIS_COUNT, 0),
@@ -33,7 +36,7 @@ pub const fn layout(part: TaskPart) -> (Encoding, u32, u32) {
     }
 }
 
-/// A trial in progress: the world and what it looks like.
+/// A trial in progress: the world and its appearance.
 #[derive(Debug)]
 pub struct Trial {
     /// The world.
@@ -48,7 +51,6 @@ pub struct Trial {
 
 impl Trial {
     /// The beginning of trial `seed`.
-    #[must_use]
     pub fn new(seed: u64) -> Self {
         let world = World::new(seed);
         let looks = Looks::new(seed, world.texture);
@@ -60,25 +62,25 @@ impl Trial {
         self.command = Some(target);
     }
 
-    /// Lets a tenth of a second pass. Without a command the arm stays where it is.
+    /// Advances a tenth of a second. Without a command the arm stays in place.
     pub fn step(&mut self, shake: f64) {
         let target = self.command.unwrap_or_else(|| self.world.state());
         self.before.clone_from(&self.world);
         self.world.step(target, shake);
     }
 
-    /// Lets time pass until `steps` steps are done.
+    /// Advances until `steps` steps are done.
     pub fn advance_to(&mut self, steps: u32) {
         while self.world.steps() < steps {
             self.step(0.0);
         }
     }
 
-    /// Writes what `part` sends now into `payload`: a JPEG picture, or the four numbers of the state.
+    /// Writes the current sample of `part` into `payload`: a JPEG picture, or the four numbers of the state.
     ///
     /// # Errors
     /// When the picture cannot be encoded.
-    pub fn sample(&mut self, part: TaskPart, payload: &mut Vec<u8>) -> Result<(), DriverError> {
+    pub fn sample(&mut self, part: TaskPart, payload: &mut Vec<u8>) -> Result<(), PictureError> {
         self.sample_part_way(part, 1.0, payload)
     }
 
@@ -86,7 +88,7 @@ impl Trial {
     ///
     /// # Errors
     /// When the picture cannot be encoded.
-    pub fn sample_part_way(&mut self, part: TaskPart, share: f64, payload: &mut Vec<u8>) -> Result<(), DriverError> {
+    pub fn sample_part_way(&mut self, part: TaskPart, share: f64, payload: &mut Vec<u8>) -> Result<(), PictureError> {
         payload.clear();
         let between = (share < 1.0).then(|| self.world.part_way_from(&self.before, share));
         let world = between.as_ref().unwrap_or(&self.world);
@@ -100,30 +102,32 @@ impl Trial {
         }
         let mut encoder = Encoder::new(payload, JPEG_QUALITY);
         encoder.set_sampling_factor(SamplingFactor::F_1_1);
-        encoder
-            .encode(&self.picture, SIDE_U16, SIDE_U16, ColorType::Rgb)
-            .map_err(|error| DriverError::Fatal(format!("a picture of the simulated task: {error}")))
+        Ok(encoder.encode(&self.picture, SIDE_U16, SIDE_U16, ColorType::Rgb)?)
     }
 }
 
-/// A trial whose parts are read by streams of their own.
+/// A trial whose parts are read by separate streams.
 #[derive(Debug, Clone)]
-pub struct Shared(Arc<Mutex<Trial>>);
+pub struct SharedTrial {
+    seed: u64,
+    trial: Arc<Mutex<Trial>>,
+}
 
-impl Shared {
-    /// The trial of a scene, begun with the first of its parts that is opened.
-    ///
-    /// # Errors
-    /// When the scene is of another task.
-    pub fn of(scene: &Scene) -> Result<Self, DriverError> {
-        let trial = scene.trial.get_or_init(|| Arc::new(Mutex::new(Trial::new(scene.seed))));
-        let trial = Arc::clone(trial).downcast().map_err(|_| DriverError::Fatal("not a scene of this task".into()))?;
-        Ok(Self(trial))
+impl SharedTrial {
+    /// The beginning of trial `seed`.
+    pub fn new(seed: u64) -> Self {
+        Self { seed, trial: Arc::new(Mutex::new(Trial::new(seed))) }
     }
 
-    /// The trial. A poisoned lock guards numbers that are whole, each of them.
-    pub fn trial(&self) -> MutexGuard<'_, Trial> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Exclusive access to the trial. A poisoned lock guards numbers that are each complete.
+    pub fn lock(&self) -> MutexGuard<'_, Trial> {
+        self.trial.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl PartialEq for SharedTrial {
+    fn eq(&self, other: &Self) -> bool {
+        self.seed == other.seed
     }
 }
 

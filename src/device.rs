@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
 
-use super::scenario::{SimDevice, SimSource};
 use crate::provenance::KernelDriver;
+use crate::simulation::{SimDevice, SimSource};
 use crate::time::Stamp;
 
 /// The identity that a USB device reports, and where it is plugged in.
@@ -37,7 +37,7 @@ pub struct UsbIdentity {
 
 /// A vendor or product id as `devices.toml` and `lsusb` write it: `046d`.
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature serde requires")]
-pub(super) fn usb_id<S: serde::Serializer>(id: &u16, serializer: S) -> Result<S::Ok, S::Error> {
+pub(crate) fn usb_id<S: serde::Serializer>(id: &u16, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{id:04x}"))
 }
 
@@ -66,7 +66,6 @@ pub enum Unit {
 
 impl Unit {
     /// The USB device, if it is one.
-    #[must_use]
     pub const fn usb(&self) -> Option<&UsbIdentity> {
         match self {
             Self::Usb(usb) => Some(usb),
@@ -75,7 +74,6 @@ impl Unit {
     }
 
     /// What distinguishes it from others of its model, if it reports that: a serial number, or the name of its service.
-    #[must_use]
     pub fn serial(&self) -> Option<&str> {
         match self {
             Self::Usb(usb) => usb.serial.as_deref(),
@@ -84,7 +82,6 @@ impl Unit {
     }
 
     /// Where it is: its USB port, or its address.
-    #[must_use]
     pub fn place(&self) -> &str {
         match self {
             Self::Usb(usb) => &usb.port,
@@ -93,14 +90,12 @@ impl Unit {
     }
 
     /// Its location as text for the user.
-    #[must_use]
     pub fn location(&self) -> String {
         let what = if self.usb().is_some() { "port" } else { "address" };
         format!("{what} {}", self.place())
     }
 
     /// Its model, or the word `lan`.
-    #[must_use]
     pub fn model(&self) -> String {
         match self {
             Self::Usb(usb) => format!("{:04x}:{:04x}", usb.vid, usb.pid),
@@ -126,7 +121,6 @@ impl LastReceived {
     }
 
     /// The time of the last data; zero if there was none.
-    #[must_use]
     pub fn at(&self) -> Stamp {
         Stamp(self.0.load(Ordering::Relaxed))
     }
@@ -178,7 +172,6 @@ pub struct Attachment {
 
 impl Attachment {
     /// Whether the removal of `syspath` (a node, its USB device, or a hub above) removes this node.
-    #[must_use]
     pub fn is_under(&self, syspath: &Path) -> bool {
         self.syspath.starts_with(syspath)
     }
@@ -186,13 +179,11 @@ impl Attachment {
 
 impl DeviceNode {
     /// Whether it is a topic of a recorded episode, which needs no program.
-    #[must_use]
     pub fn is_recording(&self) -> bool {
         matches!(self, Self::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
     }
 
     /// The node as shown to the user.
-    #[must_use]
     pub fn label(&self) -> String {
         match self {
             Self::Video(path) | Self::Tty(path) | Self::Usb(path) => path.display().to_string(),

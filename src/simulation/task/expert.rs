@@ -1,9 +1,9 @@
-//! The expert: a script that knows the block's place and texture, and demonstrates the task.
+//! The expert: a script that knows the block's position and texture, and demonstrates the task.
 
 use super::world::{AXES, World, stream};
 use crate::random::Random;
 
-/// Where it is in the demonstration.
+/// Phase of the demonstration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     Approach,
@@ -16,30 +16,29 @@ enum Phase {
     Retract,
 }
 
-/// Height at which it travels, at which it grasps, and how much of the way it counts as there.
+/// Height of travel, height of the grasp, and the tolerance for reaching them.
 const TRAVEL: f64 = 0.6;
 const GRASP: f64 = 0.06;
-/// Steps it holds the block before it lifts it: long enough to feel it.
+/// Steps for which it holds the block before lifting it: long enough to feel it.
 const DWELL: u32 = 3;
 
-/// A demonstrator of the trial of one seed.
+/// A demonstrator for the trial of one seed.
 #[derive(Debug, Clone)]
 pub struct Expert {
     phase: Phase,
-    /// Way a step.
+    /// Distance per step.
     stride: f64,
     dwelt: u32,
 }
 
 impl Expert {
     /// The demonstrator of trial `seed`.
-    #[must_use]
     pub fn new(seed: u64) -> Self {
         let stride = 0.027 * Random::new(seed, stream::EXPERT).uniform(0.9, 1.25);
         Self { phase: Phase::Approach, stride, dwelt: 0 }
     }
 
-    /// What it does next: targets of x, y, z, grip.
+    /// Its next action: targets of x, y, z, grip.
     pub fn act(&mut self, world: &World) -> [f64; AXES] {
         let [x, y, z] = world.position;
         let bin = world.texture.bin();
@@ -66,8 +65,8 @@ impl Expert {
         }
     }
 
-    /// A target at most one step of its speed away, such that the gripper, which goes 0.8 of the way to
-    /// a target, covers that step.
+    /// A target such that the gripper, which covers 0.8 of the distance to a target, moves at most one step of its
+    /// speed.
     fn towards(&self, from: [f64; 3], target: [f64; 3], grip: f64) -> [f64; AXES] {
         let way = [target[0] - from[0], target[1] - from[1], target[2] - from[2]];
         let length = way.iter().map(|part| part * part).sum::<f64>().sqrt();

@@ -1,7 +1,7 @@
 use super::*;
 use TaskPart::{Arm, Tactile, Wrist};
 
-/// A demonstration of `seed`, as it is recorded: 8 steps longer than it takes.
+/// A demonstration of `seed` as it is recorded, with 8 additional steps.
 fn demonstrate(seed: u64, shake: f64) -> Trial {
     let (mut trial, mut expert) = (Trial::new(seed), Expert::new(seed));
     while !trial.world.is_done() {
@@ -61,7 +61,7 @@ fn the_same_seed_gives_the_same_bytes_in_whatever_order_its_parts_are_read() {
     assert_eq!(read([Wrist, Tactile, Arm]), read([Arm, Tactile, Wrist]));
 }
 
-/// The texture is in the tactile picture and only there, and only while the block is held.
+/// Only the tactile picture shows the texture, and only while the block is held.
 #[test]
 fn only_the_tactile_camera_shows_the_texture() {
     let looks = |texture| {

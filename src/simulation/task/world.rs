@@ -1,54 +1,50 @@
-//! The grasp-and-sort task: a block on a table, a gripper, two bins, one step a tenth of a second.
+//! The grasp-and-sort task: a block on a table, a gripper, two bins, one step per tenth of a second.
 //!
-//! The block's texture decides which bin it belongs to: triangular to the left, hexagonal to the front. Only
-//! the gel of the tactile fingertip shows the texture, and only while it is pressed on the block.
+//! The block's texture determines its bin: triangular to the left, hexagonal to the front. Only the gel of the tactile
+//! fingertip shows the texture, and only while it is pressed on the block.
 //!
-//! Lengths are in metres, of a large table with a large block. Everything a world does follows from its
-//! seed and the actions it is given.
+//! Lengths are in metres, for a large table with a large block. A world's behaviour follows entirely from its seed and
+//! its actions.
 //!
-//! Invariant: what is drawn of the looks moves nothing of the dynamics, and the reverse: each has a stream
-//! of its own.
+//! Invariant: random numbers for the appearance do not affect the dynamics, and the reverse: each has its own stream.
 
 use crate::random::Random;
 
-/// Steps a second, which is also the rate of all its devices, Hz.
+/// Steps per second, which is also the rate of all its devices, Hz.
 pub const STEP_HZ: u32 = 10;
-/// Numbers of a state and of an action: x, y, z, grip.
+/// Length of a state and of an action: x, y, z, grip.
 pub const AXIS_COUNT: u32 = 4;
-/// The same, to count with.
+/// The same as `usize`.
 pub const AXES: usize = AXIS_COUNT as usize;
-/// Their names.
-pub const AXIS_NAMES: [&str; AXES] = ["x", "y", "z", "grip"];
 /// A trial that takes longer has failed.
 pub const MAX_STEPS: u32 = 260;
-/// How near the middle of its bin the block must lie.
+/// Maximum distance of the block from the middle of its bin.
 const TOLERANCE: f64 = 0.18;
 /// Opening of the gripper at which it touches the block.
 const BLOCK_WIDTH: f64 = 0.45;
 
 const POSITION_MIN: [f64; 3] = [-1.1, -1.0, 0.03];
 const POSITION_MAX: [f64; 3] = [1.0, 1.0, 0.9];
-/// The furthest the gripper moves in one step, and how much of the way to its target it tries.
+/// Maximum distance of the gripper per step, and the share of the distance to its target that it attempts.
 const STRIDE: f64 = 0.06;
 const GAIN: f64 = 0.8;
-/// The same of its fingers and of the pressure they build up.
+/// The same for its fingers and for the pressure they build up.
 const GRIP_STRIDE: f64 = 0.15;
 const PRESS_STRIDE: f64 = 0.35;
-/// Deviation of a step from where it should end.
+/// Deviation of a step from its intended end.
 const JITTER: f64 = 0.002;
 
-/// What the block feels like.
+/// The texture of the block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Texture {
-    /// Three families of ridges; belongs to the left.
+    /// Three families of ridges; belongs to the left bin.
     Triangular,
-    /// Honeycomb; belongs to the front.
+    /// Honeycomb; belongs to the front bin.
     Hexagonal,
 }
 
 impl Texture {
     /// Middle of the bin it belongs to.
-    #[must_use]
     pub const fn bin(self) -> [f64; 2] {
         match self {
             Self::Triangular => [-0.8, -0.3],
@@ -56,7 +52,7 @@ impl Texture {
         }
     }
 
-    /// The other one.
+    /// The other texture.
     #[must_use]
     pub const fn other(self) -> Self {
         match self {
@@ -70,30 +66,30 @@ impl Texture {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// The block lies in the bin of its texture.
+    /// The block is in the bin of its texture.
     Success,
-    /// It lies in the other one.
+    /// It is in the other bin.
     WrongBin,
-    /// It lies in neither.
+    /// It is in neither.
     Incomplete,
 }
 
 /// The state of the task.
 #[derive(Debug, Clone)]
 pub struct World {
-    /// What the block feels like.
+    /// Texture of the block.
     pub texture: Texture,
-    /// Where the block lies.
+    /// Position of the block.
     pub block: [f64; 2],
-    /// How it is turned, radians.
+    /// Rotation of the block, radians.
     pub yaw: f64,
-    /// Where the gripper is.
+    /// Position of the gripper.
     pub position: [f64; 3],
     /// Opening of the gripper, 0 to 1.
     pub grip: f64,
     /// The block is between the fingers.
     pub held: bool,
-    /// How hard the gel is pressed on it, 0 to 1.
+    /// Pressure of the gel on the block, 0 to 1.
     pub pressure: f64,
     released: bool,
     steps: u32,
@@ -102,8 +98,7 @@ pub struct World {
 }
 
 impl World {
-    /// The beginning of the trial `seed`.
-    #[must_use]
+    /// The beginning of trial `seed`.
     pub fn new(seed: u64) -> Self {
         let mut random = Random::new(seed, stream::LAYOUT);
         let texture = if random.below(2) == 0 { Texture::Triangular } else { Texture::Hexagonal };
@@ -127,21 +122,18 @@ impl World {
     }
 
     /// x, y, z, grip.
-    #[must_use]
     pub const fn state(&self) -> [f64; AXES] {
         let [x, y, z] = self.position;
         [x, y, z, self.grip]
     }
 
     /// Steps done.
-    #[must_use]
     pub const fn steps(&self) -> u32 {
         self.steps
     }
 
-    /// Moves towards the target `action` (x, y, z, grip) for a tenth of a second. `shake` is the deviation
-    /// by which the gripper misses, beside its own: demonstrations are given some, so that there is
-    /// something to correct in them.
+    /// Moves towards the target `action` (x, y, z, grip) for a tenth of a second. `shake` is an additional deviation of
+    /// the gripper: demonstrations have some, so that they contain corrections.
     pub fn step(&mut self, action: [f64; AXES], shake: f64) {
         for (axis, target) in action.into_iter().take(3).enumerate() {
             let way = (GAIN * (target - self.position[axis])).clamp(-STRIDE, STRIDE);
@@ -163,7 +155,7 @@ impl World {
             (self.held, self.released) = (true, false);
             grip = BLOCK_WIDTH;
         }
-        // Drawn at every step, so that what is drawn later does not depend on when the block was held.
+        // Drawn at every step, so that later draws do not depend on when the block was held.
         let flutter = f64::from(self.noise.normal()) * 0.01;
         if self.held {
             let wanted = self.strongest * ((BLOCK_WIDTH - wish) / 0.4).clamp(0.0, 1.0);
@@ -175,8 +167,8 @@ impl World {
         self.steps += 1;
     }
 
-    /// The world on its way here from `before`, one step earlier, after `share` of that step (0 to 1): what moves
-    /// is in between, and what was grasped or let go of was so in the middle of the step.
+    /// The world between `before`, one step earlier, and this one, after `share` of that step (0 to 1): positions are
+    /// interpolated, and a grasp or release happens in the middle of the step.
     #[must_use]
     pub fn part_way_from(&self, before: &Self, share: f64) -> Self {
         let between = |from: f64, to: f64| from + (to - from) * share;
@@ -192,15 +184,13 @@ impl World {
         world
     }
 
-    /// Is the trial over? The block is put down in a bin and the gripper up again, or time is up.
-    #[must_use]
+    /// Whether the trial is over: the block was put down in a bin and the gripper is up again, or time is up.
     pub fn is_done(&self) -> bool {
         let placed = self.is_in(self.texture) || self.is_in(self.texture.other());
         placed && self.position[2] > 0.3 || self.steps >= MAX_STEPS
     }
 
-    /// How the trial ended, if it ended now.
-    #[must_use]
+    /// The outcome if the trial ended now.
     pub fn outcome(&self) -> Outcome {
         if self.is_in(self.texture) {
             Outcome::Success
@@ -217,7 +207,7 @@ impl World {
     }
 }
 
-/// Streams of one seed.
+/// Random streams of one seed.
 pub(super) mod stream {
     pub(in super::super) const LAYOUT: u64 = 0;
     pub(in super::super) const DYNAMICS: u64 = 1;
