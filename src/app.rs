@@ -196,10 +196,12 @@ async fn start(
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
         let (discovery, plugged) = discovery::start(options.devices, &registry)?;
+        // The inputs report their first state at once.
+        let events = board.events();
         // Until the very end: a device that is being closed may still move.
         let watched = Watched::begin(&registry, &permission, &board).map_err(AppError::Interlocks)?;
         let (commands, from_screen) = mpsc::channel(16);
-        let screen = screen::start(kind, &board, commands, &permission, options.duration);
+        let screen = screen::start(kind, &board, events, commands, &permission, options.duration);
         let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
         let inference = options.policy.map(start).transpose()?;
         Ok((discovery, plugged, watched, from_screen, screen, inference))

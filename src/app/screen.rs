@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::mpsc;
+use tokio::sync::{broadcast, mpsc};
 
 use super::stage::Stage;
 use super::{AppError, Screen};
@@ -11,13 +11,14 @@ use crate::fault;
 use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
 use crate::permission::Permission;
-use crate::status::{Board, Command};
+use crate::status::{Board, Command, Event};
 use crate::tui::{self, TuiError};
 
-/// Starts the requested screen.
+/// Starts the requested screen, which shows these events of the board.
 pub(super) fn start(
     screen: Screen,
     board: &Arc<Board>,
+    events: broadcast::Receiver<Event>,
     commands: mpsc::Sender<Command>,
     permission: &Arc<Permission>,
     duration: Option<Duration>,
@@ -45,7 +46,7 @@ pub(super) fn start(
         duration,
     };
     Stage::start("the screen", |stop| {
-        let run = headless::run(board, stop, options, std::io::stdout());
+        let run = headless::run(board, events, stop, options, std::io::stdout());
         async move {
             // Lines of text cannot make requests.
             drop(commands);

@@ -59,7 +59,7 @@ enum Progress {
 /// Prints events to `out`, the process's standard output, until `shutdown`; then the remaining announced events and the
 /// summary.
 ///
-/// Events count from this call, not from the first poll. Cancel `shutdown` when everything else has
+/// `events` are those of the board, from the moment when they were subscribed to. Cancel `shutdown` when everything else has
 /// ended, so that the last episode is in the summary. The future ends early, with `Ok`, when the reader of
 /// the output is gone (a closed pipe or terminal).
 ///
@@ -67,6 +67,7 @@ enum Progress {
 /// When the output cannot be written.
 pub fn run(
     board: Arc<Board>,
+    events: broadcast::Receiver<Event>,
     shutdown: CancellationToken,
     options: HeadlessOptions,
     out: impl Write + Send + 'static,
@@ -79,7 +80,6 @@ pub fn run(
         (true, Terminal::Yes, false) => Progress::InPlace,
         (true, ..) => Progress::Lines,
     };
-    let events = board.events();
     let printer = Printer::new(&board.snapshot(), &options, progress, palette);
     async move {
         let outlet = Outlet::new("output", DEPTH, out)?;

@@ -405,7 +405,7 @@ async fn announcements_before_the_end_are_printed_and_summarized() {
     let shutdown = CancellationToken::new();
     let kept = Kept::default();
     let options = HeadlessOptions { colour: ColourChoice::Never, ..HeadlessOptions::default() };
-    let output = run(Arc::clone(&board), shutdown.clone(), options, kept.clone());
+    let output = run(Arc::clone(&board), board.events(), shutdown.clone(), options, kept.clone());
     // Announced after the call and before the first poll: not lost.
     board.set_slot(id(0), SlotState::Streaming, Epoch(1), "");
     board.announce(state("cam_wrist", 0, SlotState::Streaming, "/dev/video0"));
@@ -428,7 +428,7 @@ async fn every_json_line_is_an_object_and_missed_events_are_reported() {
     let shutdown = CancellationToken::new();
     let kept = Kept::default();
     let options = HeadlessOptions { json: true, progress: true, ..HeadlessOptions::default() };
-    let output = run(Arc::clone(&board), shutdown.clone(), options, kept.clone());
+    let output = run(Arc::clone(&board), board.events(), shutdown.clone(), options, kept.clone());
     // More than the board keeps for a slow reader.
     for _ in 0..5000 {
         board.announce(What::Log { level: Level::Info, text: "x".to_owned() });
@@ -451,7 +451,7 @@ async fn a_closed_pipe_is_a_clean_end_without_a_shutdown() {
     let board = Arc::new(board(&["cam_wrist"]));
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
-    let output = run(Arc::clone(&board), CancellationToken::new(), HeadlessOptions::default(), writer);
+    let output = run(Arc::clone(&board), board.events(), CancellationToken::new(), HeadlessOptions::default(), writer);
     board.announce(What::Log { level: Level::Info, text: "x".to_owned() });
     output.await.unwrap();
 }

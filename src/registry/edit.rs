@@ -163,23 +163,36 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
 }
 
 /// `text` with each table of a serial line that has its old name, `[device.NAME.serial]`, under the present one,
-/// `[device.NAME.tty]`; one that is written as dotted keys stays, and so does a text that is not TOML.
+/// `[device.NAME.tty]`. A text that is not TOML stays.
 pub fn renamed(text: &str) -> String {
     let Ok(document) = Document::parse(text) else { return text.to_owned() };
     let devices = document.as_table().get("device").and_then(Item::as_table_like);
-    let table = |device: &Item| {
-        let device = device.as_table_like()?;
-        let (key, item) = device.get_key_value("serial")?;
-        let is_dotted = item.as_table().is_some_and(Table::is_dotted);
-        if is_dotted || !item.is_table_like() || device.contains_key("tty") { None } else { key.span() }
-    };
-    let mut keys: Vec<_> = devices.into_iter().flat_map(|all| all.iter()).filter_map(|(_, item)| table(item)).collect();
-    keys.sort_by_key(|key| std::cmp::Reverse(key.start));
+    let devices = devices.into_iter().flat_map(|all| all.iter());
+    let mut names: Vec<_> = devices.filter_map(|(_, device)| old_names(text, device)).flatten().collect();
+    names.sort_by_key(|name| std::cmp::Reverse(name.start));
     let mut new = text.to_owned();
-    for key in keys {
-        new.replace_range(key, "tty");
+    for name in names {
+        new.replace_range(name, "tty");
     }
     new
+}
+
+/// Where `text` has the old name of the table of a serial line in this entry; none if it has both.
+fn old_names(text: &str, device: &Item) -> Option<Vec<Range<usize>>> {
+    let device = device.as_table_like().filter(|device| !device.contains_key("tty"))?;
+    let (key, item) = device.get_key_value("serial")?;
+    match item.as_table().filter(|table| table.is_dotted()) {
+        // A name for each key, of which the parser keeps one.
+        Some(table) => table.iter().map(|(key, _)| name_before(text, table.key(key)?.span()?.start)).collect(),
+        None => item.is_table_like().then(|| Some(vec![key.span()?]))?,
+    }
+}
+
+/// Where `serial` is that stands with a dot before the key that starts here.
+fn name_before(text: &str, key: usize) -> Option<Range<usize>> {
+    let before = text.get(..key)?.trim_end().strip_suffix('.')?.trim_end();
+    let name = ["serial", "\"serial\"", "'serial'"].into_iter().find(|name| before.ends_with(name))?;
+    Some(before.len() - name.len()..before.len())
 }
 
 /// Whether `text` contains no device yet. False for a text that is not TOML.

@@ -34,7 +34,7 @@ use rapid::time::Stamp;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use crate::{COUNT, COUNTING, alone};
+use crate::{COUNT, COUNTING, alone, own_allocations};
 
 /// What a device sends has the size the registry lets it have: a picture, and a vector of numbers.
 const REGISTRY: &str = r#"
@@ -101,11 +101,10 @@ fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
     let allocated = runtime.block_on(async {
         let node = DeviceNode::Sim(Arc::new(SimDevice::new(&spec.name, source, Stamp::now())));
         let mut driver = Driver::open(spec, &node).await.unwrap();
-        let mut bytes = 0;
+        let (mut bytes, mut before) = (0, 0);
         for seq in 0..WARM_UP + SAMPLES {
             if seq == WARM_UP {
-                COUNT.store(0, Ordering::Relaxed);
-                COUNTING.store(true, Ordering::Relaxed);
+                before = own_allocations();
             }
             let reading = driver.read().await.unwrap();
             let header = SampleHeader {
@@ -133,9 +132,8 @@ fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
                 .unwrap();
             assert!(taken == 1);
         }
-        COUNTING.store(false, Ordering::Relaxed);
         assert!(bytes > SAMPLES * 8);
-        COUNT.load(Ordering::Relaxed)
+        own_allocations() - before
     });
     assert_eq!(allocated, 0, "{}: allocations for {SAMPLES} samples", spec.name);
     drop((inbox, writer, bus));
@@ -164,10 +162,10 @@ fn a_packet_of_the_network_does_not_allocate() {
                     return 0;
                 }
             };
+            let mut before = 0;
             for number in 0..WARM_UP + SAMPLES {
                 if number == WARM_UP {
-                    COUNT.store(0, Ordering::Relaxed);
-                    COUNTING.store(true, Ordering::Relaxed);
+                    before = own_allocations();
                 }
                 let mut read = pin!(driver.read());
                 // It waits before the packet is there: that is when the link is looked at, too.
@@ -180,8 +178,7 @@ fn a_packet_of_the_network_does_not_allocate() {
                     }
                 }
             }
-            COUNTING.store(false, Ordering::Relaxed);
-            COUNT.load(Ordering::Relaxed)
+            own_allocations() - before
         });
         assert_eq!(allocated, 0, "{}: allocations for {SAMPLES} packets", node.label());
     }

@@ -13,7 +13,7 @@
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -417,15 +417,37 @@ pages_are_run! {
     troubleshooting_runs: "docs/troubleshooting.md",
 }
 
-/// The letters of a picture without its log, whose lines come in any order, and the colours of all of it.
+/// The words and colours of a picture's fixed parts, which no busy machine changes: header, titles, headings and keys; not
+/// the rows of devices and bits, and not the log.
 fn looks(svg: &str) -> (BTreeSet<String>, BTreeSet<String>) {
-    let texts = svg.split("<text ").skip(1).filter_map(|text| text.split_once('>'));
-    let words = texts
-        .filter_map(|(_, text)| text.split("</text>").next())
+    let mut rows: BTreeMap<u32, Vec<&str>> = BTreeMap::new();
+    for text in svg.split("<text ").skip(1) {
+        let row = text.split_once(" y=\"").and_then(|(_, rest)| rest.split('"').next()?.parse().ok());
+        rows.entry(row.expect("its row")).or_default().push(text);
+    }
+    let (last, mut section, mut since) = (rows.len() - 1, "", 0);
+    let mut fixed = Vec::new();
+    for (number, row) in rows.values().enumerate() {
+        let title = ["Mask", "Devices", "Recording", "Log"]
+            .into_iter()
+            .find(|title| row[1..].iter().any(|text| text.contains(&format!(">{title}<"))));
+        (section, since) = title.map_or((section, since + 1), |title| (title, 0));
+        let moves = match section {
+            "Mask" | "Log" => since > 0,
+            "Devices" => since > 1,
+            _ => false,
+        };
+        if !moves || number == last {
+            fixed.extend(row);
+        }
+    }
+    let words = fixed
+        .iter()
+        .filter_map(|text| text.split_once('>')?.1.split("</text>").next())
         .flat_map(|text| text.split(|c: char| !c.is_alphabetic()))
         .filter(|word| word.len() > 2)
         .map(str::to_owned);
-    let colours = svg.split("fill=\"").skip(1).filter_map(|fill| fill.split('"').next()).map(str::to_owned);
+    let colours = fixed.iter().filter_map(|text| text.split_once("fill=\"")?.1.split('"').next()).map(str::to_owned);
     (words.collect(), colours.collect())
 }
 
@@ -442,5 +464,8 @@ fn the_monitor_picture_is_current() {
     assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stderr));
     let read = |path: &Path| std::fs::read_to_string(path).expect("a picture");
     let (now, committed) = (looks(&read(&drawn)), looks(&read(&root().join("docs/monitor.svg"))));
+    for word in ["Mask", "streaming", "published", "Devices", "state", "Recording", "messages", "Log", "quit"] {
+        assert_eq!(committed.0.contains(word), word != "streaming", "{word}: {:?}", committed.0);
+    }
     assert_eq!(now, committed, "the monitor has changed: run `make picture` and look at docs/monitor.svg");
 }

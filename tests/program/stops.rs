@@ -31,7 +31,7 @@ vid = "1209"
 pid = "0001"
 node = "serial"
 bit = 1
-serial = { channels = 2 }
+tty = { channels = 2 }
 [stop.pendant]
 kind = "emergency"
 serial = { path = "PORT", run = "RUN", stop = "STOP", silence = "2s" }
@@ -192,5 +192,57 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
     );
     for word in ["pendant stopped", "pendant runs", "arm armed", "arm faulted", "pendant lost", "buttons lost"] {
         assert!(recorded.iter().any(|is| is == word), "{word} not in {recorded:?}");
+    }
+}
+
+/// An input of each kind that is not there.
+const MISSING: &str = r#"
+[device.arm]
+vid = "2e88"
+pid = "4603"
+node = "can"
+bit = 0
+[device.arm.can]
+protocol = "damiao"
+motors = [{ name = "grip", slave = 5, type = "DMH3510", kp = 0.8, kd = 0.05, position = [-1, 1] }]
+[device.buttons]
+vid = "1209"
+pid = "0001"
+node = "serial"
+bit = 1
+tty = { channels = 2 }
+[stop.field]
+kind = "enabling"
+field = { device = "buttons", index = 0, runs_below = 1.0 }
+[stop.key]
+kind = "enabling"
+key = { device = "no such pedal", code = "KEY_B" }
+[stop.line]
+kind = "emergency"
+gpio = { chip = "/dev/no-such-chip", line = 0, runs_while = "low" }
+[stop.port]
+kind = "emergency"
+serial = { path = "/dev/serial/by-id/none", run = "RUN", stop = "STOP" }
+"#;
+
+#[test]
+fn an_input_that_was_never_found_is_reported_with_its_cause() {
+    let place = Place::new();
+    place.write("devices.toml", MISSING);
+    place.write("sim.toml", "[[device]]\nname = \"arm\"\n");
+    let arguments = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json"];
+    let running = place.start(&arguments, "\"streaming\"");
+    for (name, cause) in [
+        ("field", "enabling switch field lost (no sample of buttons has come)"),
+        ("key", "enabling switch key lost (no input device is called \"no such pedal\" and has KEY_B"),
+        ("line", "emergency stop line lost (/dev/no-such-chip is not plugged in"),
+        ("port", "emergency stop port lost (/dev/serial/by-id/none is not plugged in"),
+    ] {
+        last(&running, name, "lost");
+        let reported = running.reported();
+        let causes: Vec<_> =
+            reported.iter().filter(|event| event["event"] == "stop" && event["stop"] == name).collect();
+        let [only] = causes.as_slice() else { panic!("{name} is reported once: {causes:?}") };
+        assert!(only["text"].as_str().is_some_and(|text| text.starts_with(cause)), "{only}");
     }
 }

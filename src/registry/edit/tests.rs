@@ -33,9 +33,14 @@ fn the_old_name_of_a_serial_line_s_table_is_replaced_and_nothing_else() {
         ("[ device . \"a\" . \"serial\" ]\n[device.b]\n[device.b.serial]\r\n", Some("[ device . \"a\" . tty ]\n")),
         // The serial number, another's table, a name that only contains it, a device of that name.
         ("[device.a]\nserial = \"S\"\n[stop.x.serial]\n[device.serial]\n[device.serial.tty]\n", None),
-        // Dotted keys stay, and are accepted with a warning; both names are an error already.
-        ("[device.a]\nserial.baud = 1\nserial.channels = 2\n", None),
+        ("[device.a]\nserial.baud = 1\nserial . channels = 2\n", Some("tty.baud = 1\ntty . channels = 2\n")),
+        (
+            "device.a.\"serial\".baud = 1\ndevice.a.serial.framing = 'line'\n",
+            Some("a.tty.baud = 1\ndevice.a.tty.framing"),
+        ),
+        // Both names are an error already.
         ("[device.a.tty]\n[device.a.serial]\n", None),
+        ("[device.a]\ntty.baud = 1\nserial.channels = 2\n", None),
         ("[device.a.serial\n", None),
         ("device = 1", None),
     ] {

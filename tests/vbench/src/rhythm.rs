@@ -4,8 +4,10 @@ use serde_json::Value;
 
 use crate::outcome::Outcome;
 
-/// A sampler that read this often in a tenth of a second had the processor, so the publisher could have had it, too.
+/// A sampler that read this often in a tenth of a second had a processor.
 const OFTEN: u64 = 10;
+/// A processor that woke a waiting thread this often in a tenth of a second ran, so the publisher could have run there.
+const WOKEN: u64 = 3;
 
 /// The timing of the mask in a span.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -16,7 +18,7 @@ pub struct Rhythm {
     pub pause_ms: f64,
     /// Publications.
     pub publications: u64,
-    /// Tenths of a second in which the sampler read often and saw no publication.
+    /// Tenths of a second in which the sampler read often and every processor ran, and no publication was seen.
     pub silent_tenths: usize,
 }
 
@@ -29,7 +31,8 @@ impl Rhythm {
         let mut rhythm = None;
         for line in outcome.mask.iter().filter(inside) {
             let Self { longest_ms, pause_ms, publications, silent_tenths } = rhythm.unwrap_or_default();
-            let is_silent = number(line, "looks") >= OFTEN && number(line, "publications") == 0;
+            let is_silent =
+                number(line, "publications") == 0 && number(line, "looks") >= OFTEN && number(line, "woken") >= WOKEN;
             rhythm = Some(Self {
                 longest_ms: longest_ms.max(number(line, "longest_ns") as f64 / 1e6),
                 pause_ms: pause_ms.max(number(line, "pause_ns") as f64 / 1e6),

@@ -7,9 +7,12 @@
 use std::fs::File;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde_json::json;
 
 use crate::emu::log::{Log, Moment};
@@ -19,6 +22,8 @@ pub const MASK_PATH: &str = "/dev/shm/rapid_hardware_mask";
 const RECORD: usize = 32;
 /// Polling interval. The mask is published every 2 ms.
 const INTERVAL: Duration = Duration::from_micros(500);
+/// A thread on each processor wakes this often.
+const WAKES_EVERY: Duration = Duration::from_millis(10);
 /// Length of the window summarised by a `beat` line.
 const WINDOW_NS: u64 = 100_000_000;
 /// Reads between two checks that the file has not been replaced.
@@ -43,6 +48,7 @@ pub fn parse(bytes: &[u8; RECORD]) -> Option<Record> {
 
 /// Prints `mask` lines (and `mask_gone`, `mask_seen` as the file disappears and appears) until `limit` has passed.
 pub fn watch(path: &Path, limit: Option<Duration>, log: &Log) {
+    let processors = Processors::start();
     let started = Instant::now();
     let running = || limit.is_none_or(|limit| started.elapsed() < limit);
     while running() {
@@ -51,18 +57,18 @@ pub fn watch(path: &Path, limit: Option<Duration>, log: &Log) {
             continue;
         };
         log.write("mask_seen", Moment::now(), json!({}));
-        follow(&file, running, log);
+        follow(&file, &processors, running, log);
         log.write("mask_gone", Moment::now(), json!({}));
     }
 }
 
-fn follow(file: &File, running: impl Fn() -> bool, log: &Log) {
+fn follow(file: &File, processors: &Processors, running: impl Fn() -> bool, log: &Log) {
     let mut last: Option<Record> = None;
     let mut looks = 0u32;
-    let mut beat = Beat::default();
+    let mut beat = Beat { woken: processors.woken(), ..Beat::default() };
     while running() {
         if let Some(record) = read(file) {
-            beat.look(record.sequence, Moment::now(), log);
+            beat.look(record.sequence, Moment::now(), processors, log);
             if last.is_none_or(|last| last.mask != record.mask) {
                 let fields = json!({
                     "mask": format!("{:#04x}", record.mask),
@@ -82,8 +88,39 @@ fn follow(file: &File, running: impl Fn() -> bool, log: &Log) {
     }
 }
 
+/// A thread on each processor that only wakes: a processor of an emulated machine can stand still while another runs, and
+/// with it whatever should have run there.
+struct Processors(Vec<Arc<AtomicU64>>);
+
+impl Processors {
+    fn start() -> Self {
+        let own = sched_getaffinity(None).unwrap_or_default();
+        let processors = (0..CpuSet::MAX_CPU).filter(|processor| own.is_set(*processor));
+        let start = |processor| {
+            let woken = Arc::new(AtomicU64::new(0));
+            let of_thread = Arc::clone(&woken);
+            thread::spawn(move || {
+                let mut only = CpuSet::new();
+                only.set(processor);
+                while sched_setaffinity(None, &only).is_ok() {
+                    thread::sleep(WAKES_EVERY);
+                    of_thread.fetch_add(1, Ordering::Relaxed);
+                }
+            });
+            woken
+        };
+        Self(processors.map(start).collect())
+    }
+
+    /// How often each has woken so far.
+    fn woken(&self) -> Vec<u64> {
+        self.0.iter().map(|woken| woken.load(Ordering::Relaxed)).collect()
+    }
+}
+
 /// The progress of the sequence, one `beat` line per window: reads and publications in it, the longest silence of the
-/// mask that ended in it, and the longest pause between two reads, which is the sampler's own.
+/// mask that ended in it, the longest pause between two reads, which is the sampler's own, and how often the processor
+/// that stood still for longest woke.
 #[derive(Default)]
 struct Beat {
     begun_ns: u64,
@@ -94,10 +131,12 @@ struct Beat {
     /// Last sequence seen, and when it was new.
     last: Option<(u64, u64)>,
     looked_ns: u64,
+    /// How often each processor had woken when the window began.
+    woken: Vec<u64>,
 }
 
 impl Beat {
-    fn look(&mut self, sequence: u64, now: Moment, log: &Log) {
+    fn look(&mut self, sequence: u64, now: Moment, processors: &Processors, log: &Log) {
         let now_ns = now.mono_ns;
         match self.last {
             None => {
@@ -117,15 +156,17 @@ impl Beat {
         self.looked_ns = now_ns;
         self.looks += 1;
         if now_ns - self.begun_ns >= WINDOW_NS {
+            let woken = processors.woken();
             let fields = json!({
                 "from_ns": self.begun_ns,
                 "looks": self.looks,
                 "publications": self.publications,
                 "longest_ns": self.longest_ns,
                 "pause_ns": self.pause_ns,
+                "woken": woken.iter().zip(&self.woken).map(|(now, before)| now - before).min(),
             });
             log.write("beat", now, fields);
-            *self = Self { begun_ns: now_ns, last: self.last, looked_ns: now_ns, ..Self::default() };
+            *self = Self { begun_ns: now_ns, last: self.last, looked_ns: now_ns, woken, ..Self::default() };
         }
     }
 }
