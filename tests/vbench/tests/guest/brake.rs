@@ -51,6 +51,8 @@ exec 8>/tmp/keys
 wait_for 30 has_line $out/keys ready || fail "no keys: $(cat $out/keys)"
 key() { echo "$1 KEY_B" >&8; }
 stop_is() { has_line $out/rapid.jsonl '"event":"stop"' "\"stop\":\"$1\"" "\"state\":\"$2\""; }
+# What was last reported of them.
+inputs() { grep -F '"event":"stop"' $out/rapid.jsonl | tail -n 3; }
 # stops N STOP STATE: this state of the stop was reported N times at least.
 stops() { [ "$(grep -F '"event":"stop"' $out/rapid.jsonl | grep -F "\"stop\":\"$2\"" | grep -cF "\"state\":\"$3\"")" -ge "$1" ]; }
 # arm WORD: what follows is of this round.
@@ -71,8 +73,8 @@ emu level 1.2 1
 rapid_start --headless --config /tmp/bench/devices.toml --json
 emu plug 0
 wait_for 60 states 1 arm streaming || fail 'the motor does not stream'
-wait_for 30 stop_is door stopped || fail 'the door is not seen'
-wait_for 30 stop_is pedal stopped || fail 'the pedal is not seen'
+wait_for 30 stop_is door stopped || fail "the door is not seen: $(inputs)"
+wait_for 30 stop_is pedal stopped || fail "the pedal is not seen: $(inputs)"
 "${rapid[@]}" arm >$out/refused 2>&1 && fail 'armed with the door open'
 emu level 1.2 0
 wait_for 30 stops 1 door runs || fail 'the door is not closed'
