@@ -426,7 +426,7 @@ fn looks(svg: &str) -> (BTreeSet<String>, BTreeSet<String>) {
         rows.entry(row.expect("its row")).or_default().push(text);
     }
     let (last, mut section, mut since) = (rows.len() - 1, "", 0);
-    let mut fixed = Vec::new();
+    let mut fixed: Vec<&str> = Vec::new();
     for (number, row) in rows.values().enumerate() {
         let title = ["Mask", "Devices", "Recording", "Log"]
             .into_iter()

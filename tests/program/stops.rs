@@ -233,16 +233,16 @@ fn an_input_that_was_never_found_is_reported_with_its_cause() {
     let arguments = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json"];
     let running = place.start(&arguments, "\"streaming\"");
     for (name, cause) in [
-        ("field", "enabling switch field lost (no sample of buttons has come)"),
-        ("key", "enabling switch key lost (no input device is called \"no such pedal\" and has KEY_B"),
-        ("line", "emergency stop line lost (/dev/no-such-chip is not plugged in"),
-        ("port", "emergency stop port lost (/dev/serial/by-id/none is not plugged in"),
+        ("field", "no sample of buttons has come"),
+        ("key", "no input device is called \"no such pedal\" and has KEY_B"),
+        ("line", "/dev/no-such-chip is not plugged in"),
+        ("port", "/dev/serial/by-id/none is not plugged in"),
     ] {
         last(&running, name, "lost");
         let reported = running.reported();
         let causes: Vec<_> =
             reported.iter().filter(|event| event["event"] == "stop" && event["stop"] == name).collect();
         let [only] = causes.as_slice() else { panic!("{name} is reported once: {causes:?}") };
-        assert!(only["text"].as_str().is_some_and(|text| text.starts_with(cause)), "{only}");
+        assert!(only["detail"].as_str().is_some_and(|detail| detail.starts_with(cause)), "{only}");
     }
 }
