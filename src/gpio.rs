@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use gpiocdev::Request;
 use gpiocdev::line::{Bias, Value};
-use gpiocdev_uapi::v2::{LineValues, set_line_values};
+use gpiocdev_uapi::v2::{LineValues, get_line_values, set_line_values};
 use rustix::io::Errno;
 use rustix::pipe::{PipeFlags, pipe_with};
 
@@ -139,15 +139,27 @@ impl Output {
         self.0.as_fd()
     }
 
-    /// Drives it to a level. Waits for a chip on USB.
+    /// Drives it to a level, and reads it back: before Linux 6.15 a driver cannot report that its chip refused the level
+    /// or is gone (`set` of `struct gpio_chip` returns nothing). Waits for a chip on USB.
     ///
     /// # Errors
-    /// When the kernel cannot.
+    /// When the line cannot be set or read, or has the other level.
     pub fn set(&self, is_high: bool) -> io::Result<()> {
-        set_line_values(&self.0, &LineValues::from_slice(&[is_high])).map_err(|error| match error {
-            gpiocdev_uapi::Error::Os(error) => io::Error::from_raw_os_error(error.0),
-            error @ gpiocdev_uapi::Error::UnderRead(_) => io::Error::other(error),
-        })
+        let mut level = LineValues::from_slice(&[is_high]);
+        set_line_values(&self.0, &level).map_err(os_error)?;
+        get_line_values(&self.0, &mut level).map_err(os_error)?;
+        if level.get(0) == Some(is_high) {
+            return Ok(());
+        }
+        let word = |is_high: bool| if is_high { "high" } else { "low" };
+        Err(io::Error::other(format!("it is {} although it was set to {}", word(!is_high), word(is_high))))
+    }
+}
+
+fn os_error(error: gpiocdev_uapi::Error) -> io::Error {
+    match error {
+        gpiocdev_uapi::Error::Os(error) => io::Error::from_raw_os_error(error.0),
+        error @ gpiocdev_uapi::Error::UnderRead(_) => io::Error::other(error),
     }
 }
 

@@ -4,7 +4,7 @@
 //! may wait for that: each chip has its own thread.
 //!
 //! Invariant: a line is opened engaged, and engaged when the thread ends.
-//! Invariant: a brake is reported engaged or released only if the kernel accepted that state and no other was requested
+//! Invariant: a brake is reported engaged or released only if its line was read back in that state and no other was requested
 //! since. A line that cannot be driven, or is not open yet, is reported broken, and so are all lines of a chip that
 //! hangs.
 //! Invariant: the functions called in a motor cycle neither wait nor allocate.

@@ -31,12 +31,14 @@ pub struct Gpio {
     latch: u8,
     /// The external level of each line; high if nothing pulls it low.
     outside: u8,
+    /// What is written is refused.
+    is_mute: bool,
     reported: Vec<Reported>,
 }
 
 impl Default for Gpio {
     fn default() -> Self {
-        Self { latch: 0x0f, outside: 0x0f, reported: Vec::new() }
+        Self { latch: 0x0f, outside: 0x0f, is_mute: false, reported: Vec::new() }
     }
 }
 
@@ -85,6 +87,7 @@ impl Talker for Gpio {
                 Answer::Data(config)
             }
             (READ_LATCH, true) => Answer::Data(vec![self.levels()]),
+            (WRITE_LATCH, false) if self.is_mute => Answer::Stall,
             (WRITE_LATCH, false) => {
                 let [mask, bits] = setup.index.to_le_bytes();
                 self.write(mask, bits);
@@ -114,10 +117,13 @@ impl Talker for Gpio {
     }
 
     fn apply(&mut self, line: Option<u16>, order: Order, _: u64) -> bool {
-        let (Order::Level(is_high), Some(line)) = (order, line.filter(|line| *line < LINES.into())) else {
-            return false;
-        };
-        self.outside = self.outside & !(1 << line) | u8::from(is_high) << line;
+        match (order, line.filter(|line| *line < LINES.into())) {
+            (Order::Level(is_high), Some(line)) => {
+                self.outside = self.outside & !(1 << line) | u8::from(is_high) << line;
+            }
+            (Order::Mute(is_mute), None) => self.is_mute = is_mute,
+            _ => return false,
+        }
         true
     }
 
@@ -143,7 +149,9 @@ mod tests {
         assert_eq!(latch(&mut gpio), 0b1100);
         let write = Setup { kind: 0x40, request: VENDOR_SPECIFIC, value: WRITE_LATCH, index: 0x0101, length: 0 };
         assert_eq!(gpio.control(write, &[], 0), Answer::Done);
-        assert!(gpio.apply(Some(2), Order::Level(false), 0));
+        assert!(gpio.apply(None, Order::Mute(true), 0));
+        assert_eq!(gpio.control(write, &[], 0), Answer::Stall);
+        assert!(gpio.apply(None, Order::Mute(false), 0) && gpio.apply(Some(2), Order::Level(false), 0));
         assert!(!gpio.apply(Some(4), Order::Level(false), 0) && !gpio.apply(Some(1), Order::Ask, 0));
         assert_eq!(latch(&mut gpio), 0b1001);
         let mut reported = Vec::new();

@@ -24,7 +24,7 @@ pub const LEAST_INERTIA: f64 = 0.001;
 pub enum Order {
     /// A motor latches this fault (8 to 14); 0 clears it.
     Fault(u8),
-    /// A motor neither receives nor answers, and continues its motion.
+    /// A motor neither receives nor answers, and continues its motion; a GPIO chip refuses what is written.
     Mute(bool),
     /// A motor has this temperature, degrees Celsius.
     Hot(u8),

@@ -120,11 +120,23 @@ key press
 wait_for 30 stops 3 pedal runs || fail 'a grabbed pedal is not seen to be pressed'
 kill $grab
 
+# The chip refuses a level, which this kernel does not report to whoever sets it.
+undriven() { has_line $out/rapid.log 'the brake cannot be driven' "$1"; }
+arm refused
+emu mute 1 1
+emu level 1.2 1
+wait_for 30 undriven 'is high although it was set to low' || fail 'a refused level is not noticed'
+sleep 1
+logged motor_disabled && fail 'a joint whose brake is still released was disabled'
+emu mute 1 0
+wait_for 30 logged motor_disabled || fail 'not disabled with the brake engaged'
+emu level 1.2 0
+wait_for 30 stops 3 door runs || fail 'the door is not closed after a refused level'
+
 arm unplugged
 emu unplug 1
 wait_for 30 stops 1 door lost || fail 'the chip is not missed'
-lost() { has_line $out/rapid.log 'the brake cannot be driven'; }
-wait_for 30 lost || fail 'the brake is not missed'
+wait_for 30 undriven 'is not plugged in' || fail 'the brake is not missed'
 sleep 1
 logged motor_disabled && fail 'a joint whose brake is not known to hold was disabled'
 "${rapid[@]}" disarm || fail 'no disarm'
@@ -132,7 +144,7 @@ wait_for 30 logged motor_disabled || fail 'not disarmed'
 "${rapid[@]}" arm >$out/refused.lost 2>&1 && fail 'armed without the door'
 emu plug 1
 emu level 1.2 0
-wait_for 30 stops 3 door runs || fail 'the chip is not found again'
+wait_for 30 stops 4 door runs || fail 'the chip is not found again'
 
 arm killed
 kill -KILL $rapid_pid
@@ -177,7 +189,7 @@ fn a_brake_is_engaged_before_its_joint_is_released_whatever_stops_it() {
     let back = round(&outcome, "back").iter().find(|line| line["action"] == "motor_state");
     let position = back.and_then(|line| line["position"].as_f64()).expect("it was asked");
     assert!((0.9..=1.01).contains(&position), "driven back to {position}, and 1 is its limit");
-    for word in ["door", "pedal", "grabbed", "unplugged", "killed"] {
+    for word in ["door", "pedal", "grabbed", "refused", "unplugged", "killed"] {
         let lines = round(&outcome, word);
         let (on, released) = (time(lines, "motor_enabled", None), time(lines, "gpio", Some(1)));
         assert!(on.is_some() && on < released, "{word}: released before the motor is on: {lines:?}");
@@ -191,6 +203,8 @@ fn a_brake_is_engaged_before_its_joint_is_released_whatever_stops_it() {
         let lines = round(&outcome, &format!("{word}.armed"));
         assert!(time(lines, "gpio", Some(0)).is_some(), "{word}: {lines:?}");
     }
+    let lines = round(&outcome, "refused.armed");
+    assert!(time(lines, "gpio", Some(0)) < time(lines, "motor_disabled", None), "disabled before the brake is engaged");
     // The guard holds the line too.
     let killed = [round(&outcome, "killed.armed"), round(&outcome, "dead")].concat();
     let (engaged, off) = (time(&killed, "gpio", Some(0)).unwrap(), time(&killed, "motor_disabled", None).unwrap());
