@@ -53,8 +53,6 @@ one: ## run one test by its name, with its output: TEST=name (of a test or of a 
 # `cargo test` builds the program as well, into this place: no build of its own goes before it.
 test: setup ## the whole truth: format, lints, all tests with the virtual bench, and a look at what they left behind
 	cargo fmt --all --check
-	$(TESTED) scripts/features.sh ''
-	$(TESTED) $(TESTS) --no-run
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
 features: ## compile the program with no cargo feature, and with each alone

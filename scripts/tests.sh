@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Runs the tests of a built workspace, those of the virtual bench in parallel with the others: both spend much of their
-# time waiting, for an emulated machine and for clocks. The bench's output is printed after that of the others.
+# Builds and runs the tests of the workspace, those of the virtual bench in parallel with everything else: they take the
+# longest and need only the programs, so they begin as soon as these are built. What is built later leaves the processors
+# to the emulated machines. The bench's output is printed after that of the others.
 #
 #     tests.sh cargo test --locked --workspace
 #
@@ -9,19 +10,19 @@ set -euo pipefail
 [[ $# -ge 1 ]] || { echo "usage: tests.sh CARGO TEST..." >&2; exit 2; }
 
 readonly package=tests/vbench
-messages=$("$@" --no-run --message-format=json)
-executables=$(sed -n "s|.*\"manifest_path\":\"[^\"]*/$package/Cargo.toml\".*\"profile\":{[^}]*\"test\":true}.*\"executable\":\"\([^\"]*\)\".*|\1|p" <<<"$messages")
-[[ -n $executables ]] || { echo "tests.sh: no tests in $package" >&2; exit 1; }
+# The test programs of that package, one path per line, of those that are built with these options.
+programs() {
+    "$@" --no-run --message-format=json-render-diagnostics \
+        | sed -n "s|.*\"manifest_path\":\"[^\"]*/$package/Cargo.toml\".*\"profile\":{[^}]*\"test\":true}.*\"executable\":\"\([^\"]*\)\".*|\1|p"
+}
 
-# Each of them needs the machine's two cores, so they run in sequence. While a guest runs, the next one is prepared.
+# With any test of a package its programs are built, too.
+guest=$(programs "$@" --examples --test guest --test layering | grep /guest-) || { echo "tests.sh: no guest in $package" >&2; exit 1; }
+# A guest needs the machine's two cores, so they run in sequence. While one runs, the next is prepared.
 bench() {
+    printf '     Running %s\n' "$guest"
     cd "$package"
-    local code=0
-    while IFS= read -r executable; do
-        printf '     Running %s\n' "$executable"
-        RUST_TEST_THREADS=2 "$executable" </dev/null || { code=1; printf 'error: %s failed\n' "$executable"; }
-    done <<<"$executables"
-    return "$code"
+    RUST_TEST_THREADS=2 "$guest" </dev/null
 }
 
 output=$(mktemp)
@@ -37,7 +38,12 @@ finish() {
 }
 trap finish EXIT
 code=0
+units=$(programs nice -n 19 "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
 "$@" --no-fail-fast --exclude vbench || code=1
+for unit in $units; do
+    (cd "$package" && "$unit") || { code=1; echo "error: $unit failed"; }
+done
+nice -n 19 "${0%/*}/features.sh" '' || code=1
 echo "     Waiting for the virtual bench"
 wait "$job" || code=1
 exit "$code"
