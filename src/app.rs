@@ -34,8 +34,10 @@ use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
+use crate::alignment::Alignment;
 use crate::bus::{self, Bus, TopicId};
 use crate::episode::recover::Repairs;
+use crate::fault;
 use crate::interlock::Interlocks;
 use crate::interlocks::{self, Watched};
 use crate::logging::{self, Stderr};
@@ -204,9 +206,10 @@ async fn start(
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration);
         let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
         let inference = options.policy.map(start).transpose()?;
-        Ok((discovery, plugged, watched, from_screen, screen, inference))
+        let alignment = alignment(&registry, bus)?;
+        Ok((discovery, plugged, watched, from_screen, screen, inference, alignment))
     };
-    let (discovery, plugged, watched, from_screen, screen, inference) = match others() {
+    let (discovery, plugged, watched, from_screen, screen, inference, alignment) = match others() {
         Ok(others) => others,
         Err(error) => {
             // The recorder's thread releases the bus before the bus is dropped: no files of it remain.
@@ -234,6 +237,7 @@ async fn start(
         watched,
         discovery,
         streaming,
+        synchronisation: synchronise(alignment),
         recording,
         inference,
         mask_ended,
@@ -243,6 +247,21 @@ async fn start(
         requests,
     };
     Ok((running, conductor))
+}
+
+fn alignment(registry: &Registry, bus: &Bus) -> Result<Alignment, AppError> {
+    let Some(writer) = bus.writer(TopicId::Observation) else { return Err(AppError::Panicked("the bus")) };
+    Ok(Alignment::new(registry, bus.inbox()?, writer))
+}
+
+/// Starts the stage synchronisation.
+fn synchronise(alignment: Alignment) -> Stage {
+    Stage::start("the synchronisation", |stop| async move {
+        tokio::select! {
+            _ = alignment.run(stop) => Ok(()),
+            never = fault::strike("sync") => never,
+        }
+    })
 }
 
 /// Receives orders of other programs to arm and disarm motors, and disarms them at a signal, regardless of what else
@@ -280,6 +299,7 @@ struct Running {
     watched: Watched,
     discovery: Stage,
     streaming: Streaming,
+    synchronisation: Stage,
     recording: Stage,
     inference: Option<Stage>,
     mask_ended: CancellationToken,
@@ -312,6 +332,7 @@ async fn finish(
     let hurry = running.streaming.hurry.clone();
     let take_down = async {
         running.streaming.close().await;
+        keep_first(&mut outcome, running.synchronisation.end().await);
         let finished = conductor.finish_episode().await;
         keep_first(&mut outcome, running.streaming.end().await);
         keep_first(&mut outcome, finished);

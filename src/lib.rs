@@ -6,6 +6,7 @@
 )]
 
 pub mod action;
+pub mod alignment;
 pub mod app;
 pub mod bell;
 pub mod bus;
@@ -36,6 +37,7 @@ pub mod lockstep;
 pub mod logging;
 pub mod mask;
 pub mod modality;
+pub mod observation;
 pub mod orders;
 pub mod outlet;
 pub mod panics;

@@ -19,6 +19,9 @@ pub const RECORD_LEN: usize = 32;
 const MAGIC: [u8; 4] = *b"RAPD";
 const VERSION: u8 = 1;
 
+/// Size of the payload on the topic in bytes.
+pub const PAYLOAD_LEN: usize = 16;
+
 /// One bit per modality: set exactly while its device is attached and its samples have begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(transparent)]
@@ -27,6 +30,21 @@ pub struct PhysicalMask(pub u64);
 impl PhysicalMask {
     /// No modality present.
     pub const EMPTY: Self = Self(0);
+
+    /// The payload of its topic: mask and number of the publication, little endian.
+    pub fn payload(self, sequence: u64) -> [u8; PAYLOAD_LEN] {
+        let mut payload = [0; PAYLOAD_LEN];
+        payload[..8].copy_from_slice(&self.0.to_le_bytes());
+        payload[8..].copy_from_slice(&sequence.to_le_bytes());
+        payload
+    }
+
+    /// What such a payload holds; `None` if it is too short.
+    pub fn of_payload(payload: &[u8]) -> Option<(Self, u64)> {
+        let (mask, rest) = payload.split_first_chunk()?;
+        let (sequence, _) = rest.split_first_chunk()?;
+        Some((Self(u64::from_le_bytes(*mask)), u64::from_le_bytes(*sequence)))
+    }
 
     /// Whether the modality is present.
     pub const fn contains(self, id: ModalityId) -> bool {

@@ -23,6 +23,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 const LAYERS: &[&[&str]] = &[
     &[
         "modality",
+        "observation",
         "mask",
         "sample",
         "time",
@@ -52,7 +53,7 @@ const LAYERS: &[&[&str]] = &[
         "gpio",
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "interlocks", "sync", "calibration"],
-    &["rig", "record", "policy"],
+    &["rig", "alignment", "record", "policy"],
     &["app", "lockstep", "compare", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];

@@ -73,17 +73,36 @@ class Bus:
 
     def subscriber(self, topic):
         """Yields the header and the payload of every sample of a topic as it arrives; never ends."""
-        port = self._topic(topic).subscriber_builder().create()
+        inbox = self.inbox(topic)
         while True:
-            while (sample := port.receive()) is not None:
-                # Copies: the sample's memory is returned to the publisher when it is dropped.
-                header = SampleHeader.from_buffer_copy(sample.user_header().contents)
-                yield header, bytes(sample.payload().as_memory_view())
-            self._node.wait(iox2.Duration.from_millis(2))
+            yield from inbox.take()
+            self.wait()
+
+    def inbox(self, topic):
+        """The samples of a topic from now on."""
+        return Inbox(self._topic(topic).subscriber_builder().create())
+
+    def wait(self, milliseconds=2):
+        """Sleeps between two looks."""
+        self._node.wait(iox2.Duration.from_millis(milliseconds))
 
     def actions(self):
         """Receives actions."""
         return Actions(self._topic(ACTIONS).subscriber_builder().create())
+
+
+class Inbox:
+    """The samples of one topic."""
+
+    def __init__(self, port):
+        self._port = port
+
+    def take(self):
+        """Yields the header and the payload of every sample that has arrived."""
+        while (sample := self._port.receive()) is not None:
+            # Copies: the sample's memory is returned to the publisher when it is dropped.
+            header = SampleHeader.from_buffer_copy(sample.user_header().contents)
+            yield header, bytes(sample.payload().as_memory_view())
 
 
 class Publisher:

@@ -90,6 +90,9 @@ impl Conductor {
                         carried_out = self.carry_out(request) => if carried_out?.is_break() { return output },
                     }
                 }
+                outcome = running.synchronisation.outcome() => {
+                    return outcome.and(Err(AppError::Panicked("the synchronisation")));
+                }
                 // After the events: the end of its episode explains more.
                 outcome = running.recording.outcome() => return outcome.and(Err(AppError::Panicked("the recorder"))),
                 never = fault::strike("main") => never,

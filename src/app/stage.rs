@@ -1,14 +1,16 @@
 //! A stage of a run: a tokio task that owns the threads that block on its behalf.
 //!
-//! | stage       | its task                                          | what blocks for it                           |
-//! |-------------|---------------------------------------------------|----------------------------------------------|
-//! | discovery   | reads hot-plug events and hands them to streaming  | nothing: netlink and mDNS sockets are polled |
-//! | streaming   | the rig: slots, mask, a task for each device       | thread `mask`, threads of drivers            |
-//! | recording   | waits for its thread and joins it                  | thread `writer`                              |
-//! | inference   | loads the policy, starts it and joins its threads  | threads `control` and `policy`               |
+//! | stage           | its task                                           | what blocks for it                           |
+//! |-----------------|----------------------------------------------------|----------------------------------------------|
+//! | discovery       | reads hot-plug events and hands them to streaming  | nothing: netlink and mDNS sockets are polled |
+//! | streaming       | the rig: slots, mask, a task for each device       | thread `mask`, threads of drivers            |
+//! | synchronisation | publishes the observation of each tick             | nothing: it looks at the bus at each tick    |
+//! | recording       | waits for its thread and joins it                  | thread `writer`                              |
+//! | inference       | loads the policy, starts it and joins its threads  | threads `grid` and `policy`                  |
 //!
-//! Synchronisation is a pure function of samples and ticks ([`crate::sync`]), executed by recording and inference at
-//! their own ticks: a task between would add a hop and could only repeat what both compute from the same samples.
+//! Recording and inference do not wait for the observations of synchronisation: they apply the same rules
+//! ([`crate::sync`]) at their own ticks, the recorder once the samples in transit have arrived, the policy on its own
+//! grid, and neither loses an observation because another task is late.
 //!
 //! Invariant: a stage reports once how it ended, whether it was stopped or not; a panic is an end like any other.
 //! Invariant: no stage blocks a worker of the runtime: threads are joined where blocking is allowed.

@@ -20,7 +20,7 @@ use super::guard::{Guarded, contained};
 use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
 use crate::sample::SampleHeader;
 
-/// A consumer of every topic. Samples wait in shared memory until they are drained.
+/// A consumer of every topic but that of observations, which this process makes for others. Samples wait in shared memory until they are drained.
 pub struct Inbox {
     topics: Vec<Subscription>,
     wake: Guarded<Listener<Service>>,
@@ -99,7 +99,9 @@ impl Inbox {
                 other: Cell::new(None),
             })
         };
-        let topics = topics.iter().zip(writers).map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
+        let is_consumed = |((spec, _), _): &(&(TopicSpec, _), _)| spec.id != TopicId::Observation;
+        let topics =
+            topics.iter().zip(writers).filter(is_consumed).map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
         let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
         Ok(Self { topics, wake: Guarded::new(wake) })
     }

@@ -239,7 +239,8 @@ impl Membership {
 /// The topics of a rig.
 fn specs(registry: &Registry) -> impl Iterator<Item = TopicSpec> {
     let action = registry.actuator().map(|_| TopicSpec::action());
-    registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]).chain(action)
+    let own = [TopicSpec::mask(), TopicSpec::observation(registry.devices.len())];
+    registry.devices.iter().map(TopicSpec::of_device).chain(own).chain(action)
 }
 
 fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Guarded<TopicFactory>), BusError> {

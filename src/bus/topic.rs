@@ -2,17 +2,18 @@
 
 use super::room::BOOKS;
 use crate::action::{ACTION_TOPIC, MAX_ACTION};
-use crate::mask::MASK_TOPIC;
+use crate::mask::{MASK_TOPIC, PAYLOAD_LEN};
 use crate::modality::ModalityId;
+use crate::observation::{HEAD_BYTES, OBSERVATION_TOPIC, SLOT_BYTES};
 use crate::registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
 /// 4 s of mask at 500 Hz: how long a consumer may be held up without losing a sample.
 const MASK_DEPTH: usize = 2048;
-/// u64 mask and u64 sequence.
-const MASK_BYTES: usize = 16;
-
 /// 2 s of actions at 200 Hz, twice the rate of the fastest policy.
 const ACTION_DEPTH: usize = 400;
+
+/// 2 s of observations at 30 Hz.
+const OBSERVATION_DEPTH: usize = 64;
 
 /// Identifies a topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -21,6 +22,8 @@ pub enum TopicId {
     Modality(ModalityId),
     /// The physical mask.
     Mask,
+    /// Observations, for other programs.
+    Observation,
     /// Actions for the actuator; exists only with an actuator in the registry.
     Action,
 }
@@ -49,7 +52,13 @@ impl TopicSpec {
     }
 
     pub(super) fn mask() -> Self {
-        Self { id: TopicId::Mask, name: MASK_TOPIC.to_owned(), depth: MASK_DEPTH, max_bytes: MASK_BYTES }
+        Self { id: TopicId::Mask, name: MASK_TOPIC.to_owned(), depth: MASK_DEPTH, max_bytes: PAYLOAD_LEN }
+    }
+
+    /// Of as many devices.
+    pub(super) fn observation(devices: usize) -> Self {
+        let max_bytes = HEAD_BYTES + devices * SLOT_BYTES;
+        Self { id: TopicId::Observation, name: OBSERVATION_TOPIC.to_owned(), depth: OBSERVATION_DEPTH, max_bytes }
     }
 
     pub(super) fn action() -> Self {

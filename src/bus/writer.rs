@@ -56,8 +56,9 @@ impl Writer {
             .map_err(|error| topic_error(&spec.name, &error))?;
         let event = match spec.id {
             TopicId::Modality(modality) => Some(modality.index()),
-            // Consumers poll the mask; 500 wake-ups a second would be useless to them.
-            TopicId::Mask => None,
+            // Consumers poll the mask; 500 wake-ups a second would be useless to them. Who waits for samples is awake
+            // at their observation.
+            TopicId::Mask | TopicId::Observation => None,
             TopicId::Action => Some(MAX_MODALITIES),
         };
         let notifiers = own.map(|own| (own, 0)).into_iter().chain(event.map(|event| (wake, event)));

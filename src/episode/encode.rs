@@ -9,9 +9,9 @@ use std::ops::Range;
 
 use super::schema::SampleSchema;
 use crate::mask::PhysicalMask;
+use crate::observation::Observation;
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::Level;
-use crate::sync::Observation;
 
 const VARINT: u8 = 0;
 const FIXED64: u8 = 1;

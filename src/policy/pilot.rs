@@ -52,11 +52,11 @@ impl Pilot {
         match topic {
             TopicId::Modality(id) => self.observer.push(id, header, payload),
             TopicId::Mask => {
-                if let Some(mask) = payload.first_chunk() {
-                    self.mask = PhysicalMask(u64::from_le_bytes(*mask));
+                if let Some((mask, _)) = PhysicalMask::of_payload(payload) {
+                    self.mask = mask;
                 }
             }
-            TopicId::Action => {}
+            TopicId::Action | TopicId::Observation => {}
         }
     }
 

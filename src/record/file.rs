@@ -24,10 +24,10 @@ use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::observation::Observation;
 use crate::registry::Registry;
 use crate::sample::SampleHeader;
 use crate::status::Level;
-use crate::sync::Observation;
 use crate::time::{Stamp, WallClock};
 
 /// See the module's comment.

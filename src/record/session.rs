@@ -37,7 +37,7 @@ use crate::episode::chunk_writer::Sink;
 use crate::episode::encode::EventText;
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::Registry;
+use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Event, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
@@ -109,9 +109,11 @@ impl Session {
         }
         // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
+        let kept = |device: &DeviceSpec| device.depth.saturating_add(RING_SLACK);
+        let modalities: Vec<_> = registry.devices.iter().map(|device| SyncModality::of(device, kept(device))).collect();
         let writeback = Writeback::start(Arc::clone(&path.file), &path.folder);
         Ok(Self {
-            sync: Synchronizer::new(&synchronised(&registry), registry.rig.sync_window),
+            sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             grid: Grid::new(begin, registry.rig.observation_hz),
             end: request.duration.map(|duration| begin.after(duration)),
             registry,
@@ -394,16 +396,4 @@ impl Session {
         }
         Ok(())
     }
-}
-
-/// The modalities of a registry, for building frames.
-fn synchronised(registry: &Registry) -> Vec<SyncModality> {
-    let devices = registry.devices.iter();
-    let modality = devices.map(|device| SyncModality {
-        id: device.id,
-        when_stale: device.when_stale,
-        latency: device.latency,
-        capacity: device.depth.saturating_add(RING_SLACK),
-    });
-    modality.collect()
 }

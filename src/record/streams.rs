@@ -40,6 +40,8 @@ impl Streams {
                     session.sample(id, header, payload, hole);
                 }
             }
+            // The frames of an episode are its own: they also know samples that were in transit at a tick.
+            TopicId::Observation => {}
             TopicId::Action => {
                 let now = Last { seq: header.seq, lost: header.lost, captured: Stamp(header.capture_ns) };
                 let hole = self.last_action.replace(now).and_then(|last| last.hole(now));
@@ -48,7 +50,7 @@ impl Streams {
                 }
             }
             TopicId::Mask => {
-                let Some((mask, sequence)) = read_mask(payload) else { return };
+                let Some((mask, sequence)) = PhysicalMask::of_payload(payload) else { return };
                 let now = Last { seq: sequence, lost: 0, captured: Stamp(header.capture_ns) };
                 let hole = self.last_mask.replace(now).and_then(|last| last.hole(now));
                 self.masks.push(header, mask, sequence);
@@ -58,12 +60,6 @@ impl Streams {
             }
         }
     }
-}
-
-fn read_mask(payload: &[u8]) -> Option<(PhysicalMask, u64)> {
-    let (mask, rest) = payload.split_first_chunk()?;
-    let (sequence, _) = rest.split_first_chunk()?;
-    Some((PhysicalMask(u64::from_le_bytes(*mask)), u64::from_le_bytes(*sequence)))
 }
 
 /// Publications of the mask remembered: 16 s at 500 Hz, more than any queue of it holds.

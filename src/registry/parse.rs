@@ -35,7 +35,8 @@ pub use identity::{like_a_name, name_problem};
 pub const BUILTIN: &str = include_str!("../../devices.toml");
 
 /// Topics `rapid` publishes itself.
-const OWN_TOPICS: [&str; 5] = ["/rapid/mask", "/rapid/frame", "/rapid/event", "/rapid/log", "/action"];
+const OWN_TOPICS: [&str; 6] =
+    ["/rapid/mask", "/rapid/frame", "/rapid/observation", "/rapid/event", "/rapid/log", "/action"];
 
 /// A registry, and the warnings about it.
 #[derive(Debug, Clone, PartialEq)]

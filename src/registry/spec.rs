@@ -28,15 +28,15 @@ pub use motors::{
 /// Samples that the pool of a topic holds beyond its depth: those that 8 subscribers hold, 4 each, the
 /// one being written, and one that is about to be replaced. The bus reserves them.
 pub const POOL_SPARE: usize = MAX_SUBSCRIBERS * MAX_BORROWED + 2;
-/// Programs that may subscribe to a topic at once: recorder, policy, and others'.
+/// Programs that may subscribe to a topic at once: recorder, synchronisation, policy, and others'.
 pub const MAX_SUBSCRIBERS: usize = 8;
 /// Samples a subscriber may hold without returning them.
 pub const MAX_BORROWED: usize = 4;
 /// Shared memory in addition to the payload of each sample, bytes: our header, and at most this much for that
 /// of iceoryx2 0.10 and for alignment.
 pub(super) const SAMPLE_OVERHEAD: usize = size_of::<SampleHeader>() + 64;
-/// Shared memory of the mask's topic and of iceoryx2's management data, bytes; part of the budget.
-pub(super) const RESERVED_BYTES: u64 = 512 << 10;
+/// Shared memory of the topics of mask and observations and of iceoryx2's management data, bytes; part of the budget.
+pub(super) const RESERVED_BYTES: u64 = 768 << 10;
 
 /// A checked `devices.toml`.
 #[derive(Debug, Clone, PartialEq)]

@@ -17,7 +17,8 @@ use std::time::Duration;
 
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::WhenStale;
+use crate::observation::{Observation, ObservationSlot};
+use crate::registry::{DeviceSpec, WhenStale};
 use crate::sample::Epoch;
 use crate::time::{Stamp, nanoseconds};
 
@@ -35,6 +36,13 @@ pub struct SyncModality {
     /// Samples kept, at least 1: those of the longest time between a sample's capture and the
     /// evaluation of the last tick that may want it.
     pub capacity: usize,
+}
+
+impl SyncModality {
+    /// The modality of a device, of which `capacity` samples are kept.
+    pub const fn of(device: &DeviceSpec, capacity: usize) -> Self {
+        Self { id: device.id, when_stale: device.when_stale, latency: device.latency, capacity }
+    }
 }
 
 /// See the module's comment.
@@ -161,70 +169,6 @@ impl<T> Lane<T> {
         if let Some((handle, sample)) = newest {
             slot.hold(handle, sample.seq, tick, shown(sample));
         }
-    }
-}
-
-/// One modality of an observation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ObservationSlot {
-    /// The modality.
-    pub id: ModalityId,
-    /// Its bit in the mask at the tick.
-    pub present: bool,
-    /// A sample lies in the window of the tick.
-    pub valid: bool,
-    /// Present, and no sample lies in the window.
-    pub stale: bool,
-    /// The tick minus the moment that the chosen sample stands for (its capture time less the
-    /// latency of the modality), ns; negative for one after the tick; 0 without a sample.
-    pub age_ns: i64,
-    /// Sequence number of the chosen sample; `None`: the modality must be filled with zeros.
-    pub seq: Option<u64>,
-    /// Where the chosen sample lies in its modality's ring; good until the next push.
-    pub handle: Option<usize>,
-}
-
-impl ObservationSlot {
-    fn clear(&mut self, present: bool) {
-        *self = Self { present, ..Self::empty(self.id) };
-    }
-
-    /// Names the sample `seq`, which stands for the moment `shown`.
-    fn hold(&mut self, handle: usize, seq: u64, tick: Stamp, shown: Stamp) {
-        let age = i128::from(tick.0) - i128::from(shown.0);
-        self.age_ns = i64::try_from(age).unwrap_or(if age < 0 { i64::MIN } else { i64::MAX });
-        self.seq = Some(seq);
-        self.handle = Some(handle);
-    }
-
-    fn empty(id: ModalityId) -> Self {
-        Self { id, present: false, valid: false, stale: false, age_ns: 0, seq: None, handle: None }
-    }
-}
-
-/// What one tick of the observation grid saw, in dimensions that do not depend on what is plugged.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Observation {
-    /// The tick.
-    pub tick: Stamp,
-    /// The mask in force at the tick.
-    pub mask: PhysicalMask,
-    /// One a registered modality, in the order of registration.
-    pub slots: Vec<ObservationSlot>,
-}
-
-impl Observation {
-    fn new(ids: &[ModalityId]) -> Self {
-        Self {
-            tick: Stamp::default(),
-            mask: PhysicalMask::EMPTY,
-            slots: ids.iter().map(|id| ObservationSlot::empty(*id)).collect(),
-        }
-    }
-
-    /// The slot of a modality.
-    pub fn slot(&self, id: ModalityId) -> Option<&ObservationSlot> {
-        self.slots.iter().find(|slot| slot.id == id)
     }
 }
 

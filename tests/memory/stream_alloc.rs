@@ -19,10 +19,12 @@ use std::task::Poll;
 use std::time::Duration;
 
 use futures::poll;
+use rapid::alignment::Alignment;
 use rapid::bus::{Bus, Inbox, TopicId};
 use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
+use rapid::mask::PhysicalMask;
 use rapid::registry::Registry;
 use rapid::registry::scenario::Scenario;
 use rapid::rig::Rig;
@@ -184,6 +186,40 @@ fn a_packet_of_the_network_does_not_allocate() {
     }
 }
 
+#[test]
+fn an_observation_does_not_allocate() {
+    let _alone = alone();
+    let text = format!("[rig]\nobservation_hz = 1000\n{REGISTRY}");
+    let registry = Registry::parse(&text, None).unwrap().registry;
+    let instance = format!("alloc-align-{}", std::process::id());
+    let bus = Bus::open(&registry, Some(&instance)).unwrap();
+    let writer = |topic| bus.writer(topic).unwrap();
+    let (state, mask) = (writer(TopicId::Modality(registry.devices[1].id)), writer(TopicId::Mask));
+    let alignment = Alignment::new(&registry, bus.inbox().unwrap(), writer(TopicId::Observation));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let stop = CancellationToken::new();
+    let feed = async {
+        let mut before = 0;
+        for seq in 0..(WARM_UP + SAMPLES) as u64 {
+            if seq == WARM_UP as u64 {
+                before = own_allocations();
+            }
+            let now = Stamp::now().0;
+            let header = SampleHeader { seq, capture_ns: now, recv_ns: now, epoch: 1, ..SampleHeader::default() };
+            state.publish(header, &[1; 64]).unwrap();
+            mask.publish(header, &PhysicalMask(2 + seq % 2).payload(seq)).unwrap();
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        let allocated = own_allocations() - before;
+        stop.cancel();
+        allocated
+    };
+    let (published, allocated) = runtime.block_on(async { tokio::join!(alignment.run(stop.clone()), feed) });
+    assert_eq!(allocated, 0, "allocations for {published} observations");
+    assert!(published > SAMPLES as u64 / 2, "{published} observations in {SAMPLES} ms");
+    drop((state, mask));
+}
+
 fn whole_rig(registry: &Registry, scenario: Scenario) {
     let instance = format!("alloc-rig-{}", std::process::id());
     let folder = tempfile::tempdir().unwrap();
@@ -241,7 +277,7 @@ fn take(inbox: &Inbox, counts: &mut [usize; 3]) {
         .drain(&mut |topic, _, _| match topic {
             TopicId::Modality(id) => counts[id.index()] += 1,
             TopicId::Mask => counts[2] += 1,
-            TopicId::Action => {}
+            TopicId::Action | TopicId::Observation => {}
         })
         .unwrap();
 }

@@ -42,6 +42,7 @@ fn a_panic_anywhere_ends_the_run_with_a_whole_file_and_names_its_place() {
         ("writer", "the writer thread panicked"),
         ("mask", "thread `mask` panicked"),
         ("rig", "the rig panicked"),
+        ("sync", "the synchronisation panicked"),
         ("screen", "the screen panicked"),
         ("main", "the main task panicked"),
     ] {

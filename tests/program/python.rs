@@ -214,3 +214,36 @@ fn the_mask_reader_of_the_examples_reads_again_after_a_torn_read() {
     assert!(ended.status.success(), "{ended:?}");
     assert_eq!(String::from_utf8_lossy(&ended.stdout).trim(), "42 0b101 True False True");
 }
+
+/// Observations of the simulated rig, put together from three topics while its tactile camera is unplugged.
+#[test]
+fn observations_name_samples_that_are_on_their_topics() {
+    let place = Place::new();
+    let scenario = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"motor_state\"\n\
+        [[event]]\nat = \"4s\"\nunplug = \"tactile_tip\"\n";
+    place.write("sim.toml", scenario);
+    let running = place.start(&["--sim", "sim.toml", "--headless", "--json"], "\"mask\":\"0x07\"");
+    let ended = Command::new(python())
+        .arg(example("observe.py"))
+        .args(["240", "/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/motor"])
+        .env("RAPID_INSTANCE", &place.instance)
+        .output()
+        .expect("python");
+    drop(running);
+    assert!(ended.status.success(), "{ended:?}");
+    let text = String::from_utf8_lossy(&ended.stdout);
+    let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split("; ").collect()).collect();
+    assert_eq!(lines.len(), 240, "{text}");
+    // What came before the example subscribed is named and not received.
+    let whole = |line: &&Vec<&str>| line[1..].iter().all(|slot| slot.contains("valid seq") && slot.contains(" bytes"));
+    assert!(lines.iter().filter(whole).count() > 20, "{text}");
+    let unplugged = |line: &&Vec<&str>| {
+        line[0].ends_with("mask 0x05")
+            && line[2] == "1: absent"
+            && line[1].contains("valid")
+            && line[3].contains("bytes")
+    };
+    assert!(lines.iter().filter(unplugged).count() > 20, "{text}");
+    let absent = lines.iter().filter(|line| line[2] == "1: absent");
+    assert!(absent.clone().count() > 20 && absent.clone().all(|line| !line[0].ends_with("0x07")), "{text}");
+}

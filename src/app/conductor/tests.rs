@@ -87,6 +87,7 @@ impl Bench {
             inference: None,
             discovery: idle_stage(),
             recording: idle_stage(),
+            synchronisation: idle_stage(),
             streaming: Streaming {
                 stage: idle_stage(),
                 ending: CancellationToken::new(),

@@ -233,10 +233,7 @@ impl Heartbeat {
             encoding: Encoding::Mask as u32,
             ..SampleHeader::default()
         };
-        let mut payload = [0; 16];
-        payload[..8].copy_from_slice(&mask.0.to_le_bytes());
-        payload[8..].copy_from_slice(&sequence.to_le_bytes());
-        self.writer.publish(header, &payload).map_err(|error| error.to_string())
+        self.writer.publish(header, &mask.payload(sequence)).map_err(|error| error.to_string())
     }
 }
 

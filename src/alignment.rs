@@ -1,0 +1,208 @@
+//! Synchronisation of a running rig: at each tick of the observation grid, which sample of each modality belongs to it.
+//!
+//! It is published on [`OBSERVATION_TOPIC`](crate::observation::OBSERVATION_TOPIC), so that no other program has to align
+//! samples. An observation holds what was known at its tick, as a policy sees it; the frames of an episode are made a
+//! tenth of a second later, and also know samples that were in transit.
+//!
+//! Invariant: nothing here blocks: the samples that wait on the bus are looked at when a tick is due. After the first
+//! ticks nothing allocates.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::sleep;
+use tokio_util::sync::CancellationToken;
+
+use crate::bus::{BusError, Inbox, TopicId, Writer};
+use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
+use crate::observation::{HEAD_BYTES, SLOT_BYTES};
+use crate::registry::Registry;
+use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
+use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
+use crate::time::Stamp;
+
+/// Changes of the mask that are remembered between two ticks.
+const MASKS: usize = 64;
+
+/// See the module's comment.
+#[derive(Debug)]
+pub struct Alignment {
+    aligner: Aligner,
+    hz: f64,
+    inbox: Inbox,
+    writer: Arc<Writer>,
+}
+
+impl Alignment {
+    /// Of the samples that reach `inbox` from now on; `writer` is that of the topic of observations.
+    pub fn new(registry: &Registry, inbox: Inbox, writer: Arc<Writer>) -> Self {
+        Self { aligner: Aligner::new(registry), hz: registry.rig.observation_hz, inbox, writer }
+    }
+
+    /// Publishes an observation at each tick until `stop`. Ticks that pass while the machine is suspended, or too slow
+    /// for their rate, are skipped; the number of a tick is the sequence number of its observation. Returns how many
+    /// were published.
+    pub async fn run(mut self, stop: CancellationToken) -> u64 {
+        let grid = Grid::new(Stamp::now(), self.hz);
+        let (mut next, mut published) = (0, 0);
+        let mut is_reported = false;
+        loop {
+            tokio::select! {
+                biased;
+                () = stop.cancelled() => return published,
+                () = sleep(grid.tick(next).since(Stamp::now())) => {}
+            }
+            let now = Stamp::now();
+            let due = grid.ticks_before(now.after(Duration::from_nanos(1)));
+            let number = next.max(due.saturating_sub(1));
+            match self.publish(number, grid.tick(number), now) {
+                Ok(()) => published += 1,
+                Err(error) if !std::mem::replace(&mut is_reported, true) => {
+                    tracing::warn!(%error, "an observation is not published");
+                }
+                Err(_) => {}
+            }
+            next = number + 1;
+        }
+    }
+
+    fn publish(&mut self, number: u64, tick: Stamp, now: Stamp) -> Result<(), BusError> {
+        let Self { aligner, inbox, writer, .. } = self;
+        inbox.drain(&mut |topic, header, payload| aligner.take(topic, header, payload))?;
+        let payload = aligner.observe(tick);
+        let header = SampleHeader {
+            seq: number,
+            capture_ns: tick.0,
+            recv_ns: now.0,
+            encoding: Encoding::Bytes as u32,
+            ..SampleHeader::default()
+        };
+        writer.publish(header, payload)
+    }
+}
+
+/// The samples and masks so far, and the observation they give.
+#[derive(Debug)]
+struct Aligner {
+    sync: Synchronizer<()>,
+    /// Changes of the mask and when they were published, the oldest first.
+    masks: VecDeque<(Stamp, PhysicalMask)>,
+    payload: Vec<u8>,
+}
+
+impl Aligner {
+    fn new(registry: &Registry) -> Self {
+        let modalities: Vec<_> = registry.devices.iter().map(|device| SyncModality::of(device, device.depth)).collect();
+        Self {
+            sync: Synchronizer::new(&modalities, registry.rig.sync_window),
+            masks: VecDeque::with_capacity(MASKS),
+            payload: Vec::with_capacity(HEAD_BYTES + modalities.len() * SLOT_BYTES),
+        }
+    }
+
+    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        match topic {
+            TopicId::Modality(id) => self.sample(id, header),
+            TopicId::Mask => {
+                if let Some((mask, _)) = PhysicalMask::of_payload(payload) {
+                    self.mask(Stamp(header.capture_ns), mask);
+                }
+            }
+            TopicId::Action | TopicId::Observation => {}
+        }
+    }
+
+    /// A damaged sample belongs to no observation.
+    fn sample(&mut self, id: ModalityId, header: &SampleHeader) {
+        if header.flags & FLAG_ERROR == 0 {
+            let (capture, recv, epoch) = (Stamp(header.capture_ns), Stamp(header.recv_ns), Epoch(header.epoch));
+            self.sync.push(id, SyncSample { capture, recv, seq: header.seq, epoch, keep: () });
+        }
+    }
+
+    fn mask(&mut self, published: Stamp, mask: PhysicalMask) {
+        if self.masks.back().is_some_and(|(_, last)| *last == mask) {
+            return;
+        }
+        if self.masks.len() == MASKS {
+            self.masks.pop_front();
+        }
+        self.masks.push_back((published, mask));
+    }
+
+    /// The observation of this tick, as it is published: from what was received by then, under the mask last published
+    /// by then.
+    fn observe(&mut self, tick: Stamp) -> &[u8] {
+        while self.masks.get(1).is_some_and(|(published, _)| *published <= tick) {
+            self.masks.pop_front();
+        }
+        let in_force = self.masks.front().filter(|(published, _)| *published <= tick);
+        let mask = in_force.map_or(PhysicalMask::EMPTY, |(_, mask)| *mask);
+        self.sync.observe(tick, tick, mask).encode(&mut self.payload);
+        &self.payload
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const REGISTRY: &str = "[device.cam]\nvid = \"1209\"\npid = \"0001\"\nnode = \"camera\"\nbit = 0\n\
+        [device.tof]\nvid = \"1209\"\npid = \"0002\"\nnode = \"serial\"\nbit = 3\ntty = { channels = 1 }\n";
+    const MS: u64 = 1_000_000;
+
+    /// Bit, flags, sequence number and age (ms) of each slot, after the mask.
+    fn read(bytes: &[u8]) -> (u64, Vec<(u32, u32, u64, i64)>) {
+        let (mask, slots) = bytes.split_first_chunk().expect("the mask");
+        let slot = |bytes: &[u8]| {
+            let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("4 bytes"));
+            let long = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("8 bytes"));
+            (word(0), word(4), long(8), long(16).cast_signed() / MS.cast_signed())
+        };
+        (u64::from_le_bytes(*mask), slots.chunks_exact(SLOT_BYTES).map(slot).collect())
+    }
+
+    #[test]
+    fn an_observation_names_what_was_known_at_its_tick() {
+        let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
+        let mut aligner = Aligner::new(&registry);
+        let [cam, tof] = [0, 1].map(|index| registry.devices[index].id);
+        let sample = |seq: u64, captured: u64, received: u64, flags: u32| SampleHeader {
+            seq,
+            capture_ns: captured * MS,
+            recv_ns: received * MS,
+            epoch: 1,
+            flags,
+            ..SampleHeader::default()
+        };
+        let mask = |at: u64| SampleHeader { capture_ns: at * MS, ..SampleHeader::default() };
+        assert_eq!(read(aligner.observe(Stamp(50 * MS))), (0, vec![(0, 0, 0, 0), (3, 0, 0, 0)]), "before any mask");
+
+        aligner.take(TopicId::Mask, &mask(60), &PhysicalMask(0b1001).payload(1));
+        aligner.take(TopicId::Mask, &mask(62), &PhysicalMask(0b1001).payload(2));
+        aligner.take(TopicId::Mask, &mask(110), &PhysicalMask(0b1000).payload(3));
+        aligner.take(TopicId::Mask, &mask(112), b"short");
+        aligner.take(TopicId::Modality(cam), &sample(7, 90, 95, 0), b"");
+        // In transit at the tick; damaged.
+        aligner.take(TopicId::Modality(cam), &sample(8, 99, 101, 0), b"");
+        aligner.take(TopicId::Modality(cam), &sample(9, 100, 100, FLAG_ERROR), b"");
+        aligner.take(TopicId::Modality(tof), &sample(1, 40, 41, 0), b"");
+        let (chosen, stale) = (1 | 2 | 8, 1 | 4 | 8);
+        assert_eq!(read(aligner.observe(Stamp(100 * MS))), (0b1001, vec![(0, chosen, 7, 10), (3, stale, 1, 60)]));
+        // Unplugged: nothing of it, however fresh; the other is known by now.
+        assert_eq!(read(aligner.observe(Stamp(110 * MS))), (0b1000, vec![(0, 0, 0, 0), (3, stale, 1, 70)]));
+    }
+
+    #[test]
+    fn more_changes_of_the_mask_than_are_remembered_leave_the_newest() {
+        let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
+        let mut aligner = Aligner::new(&registry);
+        for at in 0..1000 {
+            aligner.mask(Stamp(at), PhysicalMask(at % 2));
+        }
+        assert_eq!(aligner.masks.capacity(), MASKS);
+        assert_eq!(read(aligner.observe(Stamp(1000))).0, 1);
+    }
+}
