@@ -360,7 +360,7 @@ async fn finish(
     if twice {
         keep_first(&mut outcome, Err(AppError::InterruptedTwice));
     }
-    if let Some((count, file)) = judged.and_then(|board| board.bad_episodes()) {
+    if let Some((count, file)) = judged.and_then(|board| board.episodes().bad()) {
         keep_first(&mut outcome, Err(AppError::Bad { count, file }));
     }
     outcome

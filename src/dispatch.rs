@@ -31,7 +31,7 @@ use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError, inspect};
 use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
-use crate::rig::presence::{PresenceError, json_path, read_mask};
+use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::{outlet, text};
 
 #[cfg(feature = "policy")]
@@ -196,7 +196,7 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let path = mask_path(global.instance.as_deref());
     let json = json_path(&path);
     let names = || commands::mask::layout(&crate::folder::read_text(&json, LARGEST_JSON).ok()?);
-    let read = || read_mask(&path).map_err(|error| error.to_string());
+    let read = || read_mask(&path).map_err(|error| no_mask(&error));
     let options = MaskOptions { watch, json: global.json, palette: palette() };
     let stop = CancellationToken::new();
     block_on(async {
@@ -208,6 +208,20 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
         });
         Ok(commands::mask::run(read, names, crate::time::realtime_ns, options, stop, io::stdout()).await?)
     })?
+}
+
+/// Why there is no mask to read; without one of this name, also which there are.
+fn no_mask(error: &PresenceError) -> String {
+    let others = match error {
+        PresenceError::NotPublished { .. } => presence::instances(&mask_path(None)),
+        _ => Vec::new(),
+    };
+    let command = |name: &String| match name.as_str() {
+        "" => "rapid mask".to_owned(),
+        name => format!("rapid mask --instance {name}"),
+    };
+    let commands: Vec<_> = others.iter().map(command).collect();
+    if commands.is_empty() { error.to_string() } else { format!("{error}; running: {}", commands.join(", ")) }
 }
 
 fn recover(paths: Vec<PathBuf>, format: Format) -> Result<(), Failure> {

@@ -143,7 +143,9 @@ impl Conductor {
         self.begin_episode = false;
         // How an episode ended is announced as an event and shown by the screen.
         let Err(RecordError::Idle) = self.recorder.stop_at(at).await else { return Ok(()) };
-        if let Err(error) = self.recorder.start(self.episode.clone()).await {
+        let started = self.recorder.start(self.episode.clone()).await;
+        self.board.set_not_started(started.as_ref().err().map(ToString::to_string));
+        if let Err(error) = started {
             // In the monitor, a full disk is no reason to exit: it is reported and can be fixed.
             tracing::error!(%error, "the episode was not begun");
         }

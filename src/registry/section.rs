@@ -504,7 +504,12 @@ pub fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErro
     }
     String::from_utf8(bytes).map_err(|error| {
         let line = error.as_bytes().iter().take(error.utf8_error().valid_up_to()).filter(|b| **b == b'\n').count() + 1;
-        problem(format!("it is not UTF-8 text (line {line})"), format!("iconv -f latin1 -t utf-8 {label}"))
+        let bytes = error.as_bytes();
+        // Text of another encoding has no such bytes.
+        let is_text = !bytes.iter().any(|byte| byte.is_ascii_control() && !byte.is_ascii_whitespace());
+        let fix =
+            if is_text { format!("iconv -f latin1 -t utf-8 {label}") } else { "is it the right file?".to_owned() };
+        problem(format!("it is not UTF-8 text (line {line})"), fix)
     })
 }
 

@@ -8,7 +8,7 @@
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -66,6 +66,55 @@ pub struct EpisodeEnd {
     pub error: Option<String>,
 }
 
+/// The episodes of a run, without those dropped.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct EpisodeCounts {
+    /// How many of each grade: good, suspect, bad.
+    counts: [u64; 3],
+    /// The last one.
+    last: Option<(PathBuf, Grade)>,
+    /// The last bad one.
+    last_bad: Option<PathBuf>,
+    /// Where the newest one was written.
+    folder: PathBuf,
+}
+
+impl EpisodeCounts {
+    fn add(&mut self, file: &Path, grade: Grade) {
+        self.counts[grade as usize] += 1;
+        self.last = Some((file.to_owned(), grade));
+        file.parent().unwrap_or(Path::new("")).clone_into(&mut self.folder);
+        if grade == Grade::Bad {
+            self.last_bad = Some(file.to_owned());
+        }
+    }
+
+    /// Only the last one can be dropped.
+    fn drop_last(&mut self) {
+        if let Some((_, grade)) = self.last.take() {
+            self.counts[grade as usize] -= 1;
+        }
+    }
+
+    /// How many BAD ones there are, and the file of the last; `None` if there is none.
+    pub fn bad(&self) -> Option<(u64, PathBuf)> {
+        let count = self.counts[Grade::Bad as usize];
+        self.last_bad.clone().filter(|_| count > 0).map(|file| (count, file))
+    }
+
+    /// For people: how many there are, and how to continue; `None` without any.
+    pub fn summary(&self) -> Option<String> {
+        let [good, suspect, bad] = self.counts;
+        let all = good + suspect + bad;
+        let episodes = if all == 1 { "episode" } else { "episodes" };
+        let folder = text::plain(&self.folder.to_string_lossy()).into_owned();
+        let text = format!(
+            "{all} {episodes} in {folder} ({good} GOOD, {suspect} SUSPECT, {bad} BAD); next: rapid inspect {folder}"
+        );
+        (all > 0).then_some(text)
+    }
+}
+
 #[derive(Debug, Clone, Default)]
 struct SlotStatus {
     state: SlotState,
@@ -85,12 +134,12 @@ pub struct Board {
     mask_sequence: AtomicU64,
     stops: Mutex<Vec<StopStatus>>,
     recording: Mutex<Option<RecordingStatus>>,
+    not_started: Mutex<Option<String>>,
     policy: Mutex<Option<PolicyStatus>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     short_episode: Mutex<Option<ShortEpisode>>,
     last_end: Mutex<Option<EpisodeEnd>>,
-    /// Number of BAD episodes, and the last of them.
-    bad: Mutex<Option<(u64, PathBuf)>>,
+    episodes: Mutex<EpisodeCounts>,
     log: Mutex<VecDeque<LogLine>>,
     events: broadcast::Sender<Event>,
 }
@@ -110,11 +159,12 @@ impl Board {
             mask_sequence: AtomicU64::new(0),
             stops: Mutex::new(registry.stops.iter().map(unreported).collect()),
             recording: Mutex::new(None),
+            not_started: Mutex::new(None),
             policy: Mutex::new(None),
             last_episode: Mutex::new(None),
             short_episode: Mutex::new(None),
             last_end: Mutex::new(None),
-            bad: Mutex::new(None),
+            episodes: Mutex::new(EpisodeCounts::default()),
             log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
             events: broadcast::channel(EVENT_DEPTH).0,
         }
@@ -166,6 +216,11 @@ impl Board {
         *lock(&self.recording) = recording;
     }
 
+    /// Reports why an episode was not begun, or that one has.
+    pub fn set_not_started(&self, why: Option<String>) {
+        *lock(&self.not_started) = why.map(|why| text::plain(&why).into_owned());
+    }
+
     /// Whether an episode is in progress.
     pub fn is_recording(&self) -> bool {
         lock(&self.recording).is_some()
@@ -210,11 +265,10 @@ impl Board {
         }
         if let What::Episode { file, error, verdict, .. } = &what {
             *lock(&self.last_end) = Some(EpisodeEnd { file: file.clone(), error: error.clone() });
-            if verdict.grade == Grade::Bad {
-                let mut bad = lock(&self.bad);
-                let before = bad.as_ref().map_or(0, |(count, _)| *count);
-                *bad = Some((before + 1, file.clone()));
-            }
+            lock(&self.episodes).add(file, verdict.grade);
+        }
+        if let What::Dropped { .. } = &what {
+            lock(&self.episodes).drop_last();
         }
         // An error only means that there is no subscriber.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
@@ -225,9 +279,9 @@ impl Board {
         lock(&self.last_end).clone()
     }
 
-    /// Number of BAD episodes of this run, and the file of the last; `None` if there was none.
-    pub fn bad_episodes(&self) -> Option<(u64, PathBuf)> {
-        lock(&self.bad).clone()
+    /// The episodes of this run.
+    pub fn episodes(&self) -> EpisodeCounts {
+        lock(&self.episodes).clone()
     }
 
     /// All events from now on.
@@ -266,6 +320,7 @@ impl Board {
             devices: devices.collect(),
             stops: self.stops(),
             recording: lock(&self.recording).clone(),
+            not_started: lock(&self.not_started).clone(),
             policy: lock(&self.policy).clone(),
             last_episode,
             last_verdict,

@@ -52,6 +52,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         devices,
         stops: Vec::new(),
         recording: None,
+        not_started: None,
         policy: None,
         last_episode: None,
         last_verdict: None,

@@ -24,7 +24,7 @@ use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
 
-pub use board::{Board, EpisodeEnd};
+pub use board::{Board, EpisodeCounts, EpisodeEnd};
 pub use event::Description;
 pub use event::{Event, Provenance, What};
 
@@ -169,6 +169,8 @@ pub struct Snapshot {
     pub stops: Vec<StopStatus>,
     /// The recording in progress.
     pub recording: Option<RecordingStatus>,
+    /// Why the last request to begin an episode failed, until one begins.
+    pub not_started: Option<String>,
     /// The policy in control, if any.
     pub policy: Option<PolicyStatus>,
     /// The last finished file.

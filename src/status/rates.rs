@@ -140,6 +140,7 @@ mod tests {
                 bytes: 0,
                 newest: (samples > 0).then_some(Stamp(newest_ms * MS)),
             }],
+            not_started: None,
             policy: None,
             recording: recorded.map(|bytes| RecordingStatus {
                 file: "a.mcap".into(),

@@ -7,6 +7,7 @@ use ratatui::style::Stylize;
 use ratatui::text::{Line, Span};
 
 use super::model::Model;
+use super::recording;
 use super::theme::Theme;
 use crate::interlock::{InputState, StopKind};
 use crate::status::StopStatus;
@@ -105,10 +106,8 @@ fn right(model: &Model, theme: Theme) -> Line<'static> {
         spans.push(Span::styled("view paused", theme.warning()));
         spans.push(Span::raw("  "));
     }
-    if model.is_recording() {
-        let elapsed = model.shown().recording.as_ref().map(|recording| format!(" {}", text::clock(recording.elapsed)));
-        let mark = format!("{} REC{}", theme.symbol("●", "*"), elapsed.unwrap_or_default());
-        spans.push(Span::styled(mark, theme.recording()));
+    if let Some(recording) = &model.latest().recording {
+        spans.push(Span::styled(recording::mark(recording, theme), theme.recording()));
         spans.push(Span::raw(" "));
     }
     Line::from(spans)

@@ -22,7 +22,7 @@ mod terminal;
 pub mod theme;
 pub mod view;
 
-use std::io;
+use std::io::{self, Write as _};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -78,6 +78,10 @@ pub async fn run(
     let requests = Requests { commands, permission };
     let outcome = drive(&board, &requests, &shutdown, EventStream::new(), |model| screen.draw(model, theme)).await;
     screen.close().await;
+    // The terminal shows what was there before: without this line nothing of the run is left on it.
+    if let Some(summary) = board.episodes().summary() {
+        let _ = writeln!(io::stdout(), "{summary}");
+    }
     outcome
 }
 

@@ -24,6 +24,9 @@ use crate::time::Stamp;
 const EDGE_SHOWN: Duration = Duration::from_secs(1);
 /// How long the answer to a key stays in the footer.
 const NOTICE_SHOWN: Duration = Duration::from_secs(4);
+/// A press of the space bar so soon after the last one is the repeat of a held key, which few terminals distinguish, or
+/// a hand that trembles.
+const PRESS_AGAIN: Duration = Duration::from_millis(400);
 
 /// Something that happened.
 #[derive(Debug)]
@@ -105,7 +108,26 @@ pub struct Model {
     arming: Option<Stamp>,
     /// The user asked to drop the last episode: the next key confirms or cancels.
     dropping: Option<DropQuestion>,
-    notice: Option<(String, Stamp)>,
+    /// When the space bar was last pressed.
+    pressed: Option<Stamp>,
+    notice: Option<Notice>,
+}
+
+/// The answer to a key.
+#[derive(Debug)]
+struct Notice {
+    text: String,
+    shown: Stamp,
+    /// It announces that a recording begins (`true`) or ends, and is obsolete once that is so.
+    awaits: Option<bool>,
+}
+
+impl Notice {
+    fn is_over(&self, now: &Snapshot) -> bool {
+        let has_failed = self.awaits == Some(true) && now.not_started.is_some();
+        let has_happened = self.awaits.is_some_and(|recording| now.recording.is_some() == recording);
+        has_failed || has_happened || now.taken.since(self.shown) > NOTICE_SHOWN
+    }
 }
 
 impl Model {
@@ -127,6 +149,7 @@ impl Model {
             quit: Quit::No,
             arming: None,
             dropping: None,
+            pressed: None,
             notice: None,
         };
         model.read();
@@ -172,7 +195,7 @@ impl Model {
         if self.quit == Quit::Asked && self.latest.recording.is_none() {
             self.quit = Quit::No;
         }
-        if self.notice.as_ref().is_some_and(|(_, shown)| self.latest.taken.since(*shown) > NOTICE_SHOWN) {
+        if self.notice.as_ref().is_some_and(|notice| notice.is_over(&self.latest)) {
             self.notice = None;
         }
         self.keep_in_bounds();
@@ -246,8 +269,16 @@ impl Model {
     }
 
     fn toggle_recording(&mut self) -> Effect {
-        let text = if self.latest.recording.is_some() { "finishing the episode" } else { "starting an episode" };
-        self.notify(text);
+        let now = self.latest.taken;
+        // Each press counts from itself: while a key is held, nothing happens.
+        if self.pressed.replace(now).is_some_and(|before| now.since(before) < PRESS_AGAIN) {
+            return Effect::None;
+        }
+        let begins = self.latest.recording.is_none();
+        self.notify(if begins { "starting an episode" } else { "finishing the episode" });
+        if let Some(notice) = &mut self.notice {
+            notice.awaits = Some(begins);
+        }
         Effect::Send(Command::ToggleRecording)
     }
 
@@ -275,7 +306,7 @@ impl Model {
     }
 
     fn notify(&mut self, text: &str) {
-        self.notice = Some((text.to_owned(), self.latest.taken));
+        self.notice = Some(Notice { text: text.to_owned(), shown: self.latest.taken, awaits: None });
     }
 
     fn keep_in_bounds(&mut self) {
@@ -287,6 +318,11 @@ impl Model {
     /// The snapshot to show: the newest, or that of the moment the view was paused.
     pub fn shown(&self) -> &Snapshot {
         self.frozen.as_deref().unwrap_or(&self.latest)
+    }
+
+    /// The newest snapshot, paused or not.
+    pub const fn latest(&self) -> &Snapshot {
+        &self.latest
     }
 
     /// Is the view paused?
@@ -329,7 +365,7 @@ impl Model {
 
     /// The answer to the last key, while it is fresh.
     pub fn notice(&self) -> Option<&str> {
-        self.notice.as_ref().map(|(text, _)| text.as_str())
+        self.notice.as_ref().map(|notice| notice.text.as_str())
     }
 }
 

@@ -12,15 +12,24 @@ use super::view;
 use crate::status::{RecordingStatus, Verdict};
 use crate::text;
 
+/// Columns below which the name of a file is left out.
+const FILE_LEAST: usize = 12;
+
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let inner = view::panel(frame, area, "Recording", Line::default(), theme);
-    let lines = match &model.shown().recording {
+    // Also while the view is paused: what is being recorded is not what is being looked at.
+    let lines = match &model.latest().recording {
         Some(recording) => in_progress(recording, inner, model, theme),
         None => idle(inner, model, theme),
     };
     for (line, row) in lines.into_iter().zip(inner.rows()) {
         frame.render_widget(line, row);
     }
+}
+
+/// That an episode is being recorded, and since when: `● REC 00:04`.
+pub(super) fn mark(recording: &RecordingStatus, theme: Theme) -> String {
+    format!("{} REC {}", theme.symbol("●", "*"), text::clock(recording.elapsed))
 }
 
 fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
@@ -33,19 +42,20 @@ fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Th
         let messages = Span::raw(recording.messages.to_string());
         figures.extend([Span::styled("   messages ", theme.faint()), messages]);
     }
-    figures.extend([
-        Span::raw(format!("   {}", text::size(recording.bytes))),
-        Span::raw(format!("   {:.1} MB/s", model.totals.recorded / 1e6)),
-    ]);
+    figures.push(Span::raw(format!("   {}", text::size(recording.bytes))));
+    let rate = Span::raw(format!("   {:.1} MB/s", model.totals.recorded / 1e6));
     let dropped = format!("dropped {}", recording.dropped);
-    figures.push(Span::raw("   "));
-    figures.push(if recording.dropped > 0 {
-        Span::styled(format!("{} {dropped}", theme.symbol("▲", "!")), theme.alarm())
+    let dropped = if recording.dropped > 0 {
+        Span::styled(format!("   {} {dropped}", theme.symbol("▲", "!")), theme.alarm())
     } else {
-        Span::styled(dropped, theme.faint())
-    });
+        Span::styled(format!("   {dropped}"), theme.faint())
+    };
     let mark = Span::styled(format!("{} REC ", theme.symbol("●", "*")), theme.recording());
     let width = usize::from(area.width);
+    // What was lost matters more than the rate, and than a piece of a name.
+    let used: usize = mark.width() + figures.iter().map(Span::width).sum::<usize>() + dropped.width();
+    figures.extend((used + rate.width() <= width).then_some(rate));
+    figures.push(dropped);
     if area.height >= 2 {
         let file = file(&recording.file, width.saturating_sub(mark.width()), theme);
         figures.insert(0, Span::raw(" ".repeat(mark.width())));
@@ -53,15 +63,21 @@ fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Th
     }
     let figures = Line::from(figures);
     let room = width.saturating_sub(mark.width() + figures.width() + 3);
-    let file = file(&recording.file, room, theme);
-    let mut line = Line::from(vec![mark, Span::raw(file), Span::raw("   ")]);
+    let mut line = Line::from(vec![mark]);
+    if room >= FILE_LEAST {
+        line.spans.extend([Span::raw(file(&recording.file, room, theme)), Span::raw("   ")]);
+    }
     line.spans.extend(figures.spans);
     vec![line]
 }
 
 fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let mut first = Line::from(vec![Span::styled("space", theme.title()), Span::raw(" starts an episode")]);
-    let shown = model.shown();
+    let shown = model.latest();
+    if let Some(why) = &shown.not_started {
+        let text = format!("{} not started: {}", theme.symbol("▲", "!"), theme.safe(why));
+        return not_started(first, &text, area, theme);
+    }
     let Some((last, verdict)) = shown.last_episode.as_ref().zip(shown.last_verdict.as_ref()) else {
         return vec![first];
     };
@@ -99,6 +115,13 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
         line.push_span(Span::styled(text::cut(&why, room_why, theme.ellipsis()).into_owned(), theme.grade(*grade)));
     }
     vec![first, line]
+}
+
+/// Why no episode was begun, on as many lines as there are.
+fn not_started(keys: Line<'static>, text: &str, area: Rect, theme: Theme) -> Vec<Line<'static>> {
+    let width = usize::from(area.width);
+    let cut = |text: &str| Line::styled(text::cut(text, width, theme.ellipsis()).into_owned(), theme.alarm());
+    if area.height >= 2 { vec![cut(text), keys] } else { vec![cut(text)] }
 }
 
 /// The path if it fits, otherwise the name of the file.

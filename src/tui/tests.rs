@@ -430,3 +430,38 @@ fn the_header_shows_the_first_stop_that_prevents_motion() {
     // Without a stop nothing is shown.
     assert_eq!(head(&[], THEME).0.matches("stop").count(), 0);
 }
+
+#[test]
+fn a_start_that_failed_is_explained_until_one_succeeds() {
+    let mut end = three_streaming();
+    end.not_started = Some("/proc/nope: cannot be created: No such file or directory".to_owned());
+    assert_snapshot!(draw(&Model::new(end.clone()), (80, 24), THEME));
+    let low = draw(&Model::new(end), (60, 12), ASCII).to_string();
+    assert!(low.contains("! not started: /proc/nope: cannot be created"), "{low}");
+}
+
+#[test]
+fn a_terminal_that_is_too_small_shows_that_it_records() {
+    let mut end = three_streaming();
+    end.recording = Some(recording(0));
+    let size = (view::MINIMUM.0 - 1, view::MINIMUM.1);
+    let shown = draw(&Model::new(end.clone()), size, THEME).to_string();
+    assert!(shown.contains("● REC ") && shown.contains("too small"), "{shown}");
+    // From the minimum on, no figure of the episode is cut.
+    for height in [view::MINIMUM.1, 15, 19] {
+        let shown = draw(&measured(&end), (view::MINIMUM.0, height), THEME).to_string();
+        assert!(shown.contains("dropped 0"), "{height}: {shown}");
+    }
+}
+
+#[test]
+fn what_is_recorded_is_shown_while_the_view_is_paused() {
+    let mut model = Model::new(three_streaming());
+    model.update(press(KeyCode::Char('p')));
+    let mut recorded = three_streaming();
+    recorded.recording = Some(recording(0));
+    model.update(Msg::Snapshot(Box::new(recorded)));
+    let shown = draw(&model, (80, 24), THEME).to_string();
+    assert!(shown.contains("view paused") && shown.contains("messages"), "{shown}");
+    assert!(!shown.contains("starts an episode"), "{shown}");
+}

@@ -27,7 +27,7 @@ const POLICY_LINES: (u16, u16, u16) = (1, 5, 7);
 pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     let area = frame.area();
     if area.width < MINIMUM.0 || area.height < MINIMUM.1 {
-        return draw_too_small(frame, area);
+        return draw_too_small(frame, area, model, theme);
     }
     let gap = u16::from(area.height >= ROOMY);
     let plan = mask::Plan::new(model, area.width, area.height / 4);
@@ -73,12 +73,17 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     }
 }
 
-fn draw_too_small(frame: &mut Frame<'_>, area: Rect) {
-    let lines = vec![
+/// What is being recorded comes first: it continues, and the space bar still ends it.
+fn draw_too_small(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
+    let mut lines = vec![
         Line::from("The terminal is too small.").bold(),
         Line::from(format!("needs {}x{}, has {}x{}", MINIMUM.0, MINIMUM.1, area.width, area.height)),
     ];
-    let [middle] = Layout::vertical([Constraint::Length(2)]).flex(ratatui::layout::Flex::Center).areas(area);
+    if let Some(recording) = &model.latest().recording {
+        lines.insert(0, Line::styled(recording::mark(recording, theme), theme.recording()));
+    }
+    let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).min(area.height);
+    let [middle] = Layout::vertical([Constraint::Length(height)]).flex(ratatui::layout::Flex::Center).areas(area);
     frame.render_widget(Paragraph::new(lines).centered(), middle);
 }
 

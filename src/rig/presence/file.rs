@@ -240,6 +240,24 @@ fn holder(file: &Metadata) -> Option<u32> {
     })
 }
 
+/// The names (`--instance`) under which masks are published beside `path`, which is of the run without a name; that run
+/// itself has the empty name.
+pub fn instances(path: &Path) -> Vec<String> {
+    let stem = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let entries = path.parent().and_then(|folder| std::fs::read_dir(folder).ok());
+    let name = |entry: std::fs::DirEntry| {
+        let file = entry.file_name().into_string().ok()?;
+        let name = file.strip_prefix(&stem)?;
+        let name = if name.is_empty() { name } else { name.strip_prefix('.')? };
+        let is_mask = name != "json" && Path::new(name).extension().is_none_or(|extension| extension != "json");
+        // A file that no process holds was left behind.
+        (is_mask && holder(&entry.metadata().ok()?).is_some()).then(|| name.to_owned())
+    };
+    let mut names: Vec<_> = entries.into_iter().flatten().flatten().filter_map(name).collect();
+    names.sort();
+    names
+}
+
 /// Reads the complete published record.
 ///
 /// # Errors

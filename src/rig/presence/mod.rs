@@ -26,7 +26,7 @@ use crate::sample::{Encoding, SampleHeader};
 use crate::status::Board;
 use crate::time::{Stamp, realtime_ns};
 
-pub use file::{PresenceError, read_mask};
+pub use file::{PresenceError, instances, read_mask};
 pub use json::{JsonDevice, json_path};
 
 use file::MaskFile;

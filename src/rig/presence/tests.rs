@@ -216,3 +216,17 @@ fn an_incomplete_mask_is_named_with_its_cause() {
         );
     }
 }
+
+#[test]
+fn masks_of_other_names_are_found_while_they_are_published() {
+    let unnamed = path();
+    let of = |name: &str| PathBuf::from(format!("{}.{name}", unnamed.display()));
+    assert_eq!(instances(&unnamed), Vec::<String>::new());
+    let files = [of("left"), of("arm.2"), unnamed.clone()].map(|path| MaskFile::create(&path, 1).expect("create"));
+    // Left behind by a killed process.
+    std::fs::write(of("dead"), [0; 32]).expect("written");
+    assert_eq!(instances(&unnamed), ["", "arm.2", "left"]);
+    drop(files);
+    assert_eq!(instances(&unnamed), Vec::<String>::new());
+    std::fs::remove_file(of("dead")).expect("removed");
+}

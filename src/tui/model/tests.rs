@@ -318,3 +318,44 @@ fn the_question_names_the_file_and_fades() {
     model.update(press(KeyCode::Char('x')));
     assert_eq!(model.notice(), Some("nothing to delete: the last episode is not too short"));
 }
+
+#[test]
+fn a_held_space_bar_begins_one_episode_and_a_second_press_ends_it() {
+    let space = || press(KeyCode::Char(' '));
+    let toggled = Effect::Send(Command::ToggleRecording);
+    let mut model = Model::new(three_streaming());
+    let mut presses = |times: &[u64], recording: bool| {
+        let mut snapshot = three_streaming();
+        snapshot.recording = recording.then(|| crate::status::literal::recording(0));
+        let effect = |ms: &u64| {
+            model.update(after(&snapshot, *ms));
+            model.update(space())
+        };
+        times.iter().map(effect).filter(|effect| *effect == toggled).count()
+    };
+    // The repeats of a key that is held for two seconds.
+    let held: Vec<u64> = std::iter::once(0).chain((500..2_500).step_by(33)).collect();
+    assert_eq!(presses(&held[..1], false), 1);
+    assert_eq!(presses(&[300], true), 0, "a second press that is too soon");
+    assert_eq!(presses(&held[1..], true), 0, "after 200 ms, then every 33");
+    assert_eq!(presses(&[2_900], true), 1);
+}
+
+#[test]
+fn an_announcement_ends_with_what_it_announces() {
+    let mut recording = three_streaming();
+    recording.recording = Some(crate::status::literal::recording(0));
+    let mut failed = three_streaming();
+    failed.not_started = Some("the disk is full".to_owned());
+    for (before, then) in
+        [(three_streaming(), recording.clone()), (recording, three_streaming()), (three_streaming(), failed)]
+    {
+        let mut model = Model::new(before.clone());
+        model.update(press(KeyCode::Char(' ')));
+        assert!(model.notice().is_some());
+        model.update(after(&before, 100));
+        assert!(model.notice().is_some());
+        model.update(after(&then, 200));
+        assert_eq!(model.notice(), None);
+    }
+}
