@@ -38,12 +38,12 @@ finish() {
 }
 trap finish EXIT
 code=0
-units=$(programs nice -n 19 "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
+units=$(programs chrt --idle 0 "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
 "$@" --no-fail-fast --exclude vbench || code=1
 for unit in $units; do
     (cd "$package" && "$unit") || { code=1; echo "error: $unit failed"; }
 done
-nice -n 19 "${0%/*}/features.sh" '' || code=1
+chrt --idle 0 "${0%/*}/features.sh" '' || code=1
 echo "     Waiting for the virtual bench"
 wait "$job" || code=1
 exit "$code"

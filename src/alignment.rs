@@ -14,7 +14,7 @@ use std::time::Duration;
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
 
-use crate::bus::{BusError, Inbox, TopicId, Writer};
+use crate::bus::{BusError, Queues, TopicId, Writer};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::observation::{HEAD_BYTES, SLOT_BYTES};
@@ -26,24 +26,28 @@ use crate::time::Stamp;
 /// Changes of the mask that are remembered between two ticks.
 const MASKS: usize = 64;
 
+/// Samples of a modality that may arrive between a tick and the look at the bus, and must not displace an older one that
+/// belongs to it.
+const SLACK: usize = 16;
+
 /// See the module's comment.
 #[derive(Debug)]
 pub struct Alignment {
     aligner: Aligner,
     hz: f64,
-    inbox: Inbox,
+    queues: Queues,
     writer: Arc<Writer>,
 }
 
 impl Alignment {
-    /// Of the samples that reach `inbox` from now on; `writer` is that of the topic of observations.
-    pub fn new(registry: &Registry, inbox: Inbox, writer: Arc<Writer>) -> Self {
-        Self { aligner: Aligner::new(registry), hz: registry.rig.observation_hz, inbox, writer }
+    /// Of the samples that reach `queues` from now on; `writer` is that of the topic of observations.
+    pub fn new(registry: &Registry, queues: Queues, writer: Arc<Writer>) -> Self {
+        Self { aligner: Aligner::new(registry), hz: registry.rig.observation_hz, queues, writer }
     }
 
     /// Publishes an observation at each tick until `stop`. Ticks that pass while the machine is suspended, or too slow
-    /// for their rate, are skipped; the number of a tick is the sequence number of its observation. Returns how many
-    /// were published.
+    /// for their rate, are skipped, and so are some above 200 Hz: the timer has a resolution of 1 ms. The number of a
+    /// tick is the sequence number of its observation. Returns how many were published.
     pub async fn run(mut self, stop: CancellationToken) -> u64 {
         let grid = Grid::new(Stamp::now(), self.hz);
         let (mut next, mut published) = (0, 0);
@@ -69,14 +73,16 @@ impl Alignment {
     }
 
     fn publish(&mut self, number: u64, tick: Stamp, now: Stamp) -> Result<(), BusError> {
-        let Self { aligner, inbox, writer, .. } = self;
-        inbox.drain(&mut |topic, header, payload| aligner.take(topic, header, payload))?;
+        let Self { aligner, queues, writer, .. } = self;
+        queues.drain(&mut |topic, header, payload| aligner.take(topic, header, payload))?;
         let payload = aligner.observe(tick);
         let header = SampleHeader {
             seq: number,
             capture_ns: tick.0,
             recv_ns: now.0,
             encoding: Encoding::Bytes as u32,
+            // Of no modality.
+            id: u32::MAX,
             ..SampleHeader::default()
         };
         writer.publish(header, payload)
@@ -94,7 +100,8 @@ struct Aligner {
 
 impl Aligner {
     fn new(registry: &Registry) -> Self {
-        let modalities: Vec<_> = registry.devices.iter().map(|device| SyncModality::of(device, device.depth)).collect();
+        let modalities: Vec<_> =
+            registry.devices.iter().map(|device| SyncModality::of(device, device.depth + SLACK)).collect();
         Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             masks: VecDeque::with_capacity(MASKS),

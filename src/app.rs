@@ -3,7 +3,7 @@
 //! Each stage is a tokio task that owns the threads that block for it (`stage` has the table).
 //!
 //! Shutdown: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
-//! streams stop, the recorder finishes its file, the programs of devices are waited for, the mask is 0 and its files
+//! streams and observations stop, the recorder finishes its file, the programs of devices are waited for, the mask is 0 and its files
 //! are removed, the screen shows what was recorded and restores the terminal.
 //!
 //! Invariant: only this module sees every stage.
@@ -30,6 +30,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::FutureExt;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
@@ -135,6 +136,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     if options.screen != Screen::Monitor {
         panics::to_log();
     }
+    raise_open_files();
     // Before anything that can fail on a full or damaged machine.
     let (permission, _orders) = receive_orders(options.instance.as_deref(), options.arm, interlocks::of(&registry))?;
     let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
@@ -175,6 +177,13 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     outcome
 }
 
+/// A topic has some twenty open files in this process, and more with each subscriber: 64 devices exceed the limit of 1024
+/// that sessions and units have, and up to the hard limit a process may raise it. At that limit the run is an error.
+fn raise_open_files() {
+    let limit = getrlimit(Resource::Nofile);
+    let _ = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit });
+}
+
 /// What the stages of a run share.
 struct Machine {
     registry: Arc<Registry>,
@@ -197,6 +206,7 @@ async fn start(
     let kind = options.screen;
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
+        let alignment = alignment(&registry, bus)?;
         let (discovery, plugged) = discovery::start(options.devices, &registry)?;
         // The inputs report their first state at once.
         let events = board.events();
@@ -206,7 +216,6 @@ async fn start(
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration);
         let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
         let inference = options.policy.map(start).transpose()?;
-        let alignment = alignment(&registry, bus)?;
         Ok((discovery, plugged, watched, from_screen, screen, inference, alignment))
     };
     let (discovery, plugged, watched, from_screen, screen, inference, alignment) = match others() {
@@ -251,7 +260,7 @@ async fn start(
 
 fn alignment(registry: &Registry, bus: &Bus) -> Result<Alignment, AppError> {
     let Some(writer) = bus.writer(TopicId::Observation) else { return Err(AppError::Panicked("the bus")) };
-    Ok(Alignment::new(registry, bus.inbox()?, writer))
+    Ok(Alignment::new(registry, bus.queues()?, writer))
 }
 
 /// Starts the stage synchronisation.

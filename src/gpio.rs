@@ -17,9 +17,13 @@ use rustix::pipe::{PipeFlags, pipe_with};
 
 use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::text;
+use crate::time::Stamp;
 
 /// A line is read again after this: a chip on USB takes about 1 ms.
 const POLL: Duration = Duration::from_millis(5);
+
+/// How long a line that is set may still have its former level: the edge of a loaded line is slow.
+const EDGE: Duration = Duration::from_millis(5);
 
 /// A line that is read.
 ///
@@ -145,14 +149,23 @@ impl Output {
     /// # Errors
     /// When the line cannot be set or read, or has the other level.
     pub fn set(&self, is_high: bool) -> io::Result<()> {
-        let mut level = LineValues::from_slice(&[is_high]);
-        set_line_values(&self.0, &level).map_err(os_error)?;
-        get_line_values(&self.0, &mut level).map_err(os_error)?;
-        if level.get(0) == Some(is_high) {
-            return Ok(());
+        set_line_values(&self.0, &LineValues::from_slice(&[is_high])).map_err(os_error)?;
+        let set_at = Stamp::now();
+        while self.level()? != Some(is_high) {
+            if Stamp::now().since(set_at) > EDGE {
+                let word = |is_high: bool| if is_high { "high" } else { "low" };
+                let text = format!("it is {} although it was set to {}", word(!is_high), word(is_high));
+                return Err(io::Error::other(text));
+            }
         }
-        let word = |is_high: bool| if is_high { "high" } else { "low" };
-        Err(io::Error::other(format!("it is {} although it was set to {}", word(!is_high), word(is_high))))
+        Ok(())
+    }
+
+    /// The level of the line itself, where its chip can read it.
+    fn level(&self) -> io::Result<Option<bool>> {
+        let mut level = LineValues::from_slice(&[false]);
+        get_line_values(&self.0, &mut level).map_err(os_error)?;
+        Ok(level.get(0))
     }
 }
 

@@ -10,6 +10,7 @@ It ends after COUNT observations. RAPID_INSTANCE is what that `rapid` was given 
 import struct
 import sys
 
+import iceoryx2
 from rapid_node import Bus
 
 MASK = struct.Struct("<Q")
@@ -17,12 +18,19 @@ MASK = struct.Struct("<Q")
 SLOT = struct.Struct("<IIQq")
 VALID, STALE, CHOSEN = 2, 4, 8
 # Samples of a modality that are kept until an observation names one of them.
-KEPT = 512
+KEPT = 64
 
 
 def main(count, topics):
     bus = Bus()
-    observations, inboxes = bus.inbox("/rapid/observation"), [bus.inbox(topic) for topic in topics]
+
+    def inbox(topic):
+        try:
+            return bus.inbox(topic)
+        except iceoryx2.PublishSubscribeOpenError as error:
+            sys.exit(f"{topic}: no such topic: does rapid run, with this device and this RAPID_INSTANCE? ({error})")
+
+    observations, inboxes = inbox("/rapid/observation"), [inbox(topic) for topic in topics]
     samples = {}
     while count > 0:
         bus.wait()
@@ -43,11 +51,12 @@ def main(count, topics):
                 chosen = f" seq {seq} age {age / 1e6:.1f} ms" if flags & CHOSEN else ""
                 held = f", {len(sample)} bytes" if sample is not None else ""
                 line.append(f"{bit}: {state}{chosen}{held}")
+            # Without its bytes: it came before this program subscribed.
             print("; ".join(line), flush=True)
         count -= len(ticks[:count])
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 3:
+    if len(sys.argv) < 3 or not sys.argv[1].isdecimal():
         sys.exit(__doc__)
     main(int(sys.argv[1]), sys.argv[2:])

@@ -19,7 +19,7 @@ MOST_AXES = 64
 
 
 class SampleHeader(ctypes.Structure):
-    """Stands beside every payload."""
+    """The header of every sample."""
 
     _fields_ = [
         ("seq", ctypes.c_uint64),

@@ -90,8 +90,11 @@ impl Conductor {
                         carried_out = self.carry_out(request) => if carried_out?.is_break() { return output },
                     }
                 }
+                // Nothing else depends on it: an episode and a policy continue, and the run ends as one that failed.
                 outcome = running.synchronisation.outcome() => {
-                    return outcome.and(Err(AppError::Panicked("the synchronisation")));
+                    output = outcome.and(Err(AppError::Panicked("the synchronisation")));
+                    let text = "the synchronisation panicked: no more observations are published".to_owned();
+                    self.board.announce(What::Log { level: Level::Error, text });
                 }
                 // After the events: the end of its episode explains more.
                 outcome = running.recording.outcome() => return outcome.and(Err(AppError::Panicked("the recorder"))),

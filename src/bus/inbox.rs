@@ -8,6 +8,7 @@
 //! process, which runs a policy, has published one; the actuator then ignores them ([`super::Actions`]).
 
 use std::cell::Cell;
+use std::ops::Deref;
 use std::time::Duration;
 
 use iceoryx2::identifiers::UniquePublisherId;
@@ -20,9 +21,15 @@ use super::guard::{Guarded, contained};
 use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
 use crate::sample::SampleHeader;
 
-/// A consumer of every topic but that of observations, which this process makes for others. Samples wait in shared memory until they are drained.
-pub struct Inbox {
+/// The samples of every topic but that of observations, which this process makes for others. They wait in shared memory
+/// until they are drained.
+pub struct Queues {
     topics: Vec<Subscription>,
+}
+
+/// A consumer of these samples that can wait for them.
+pub struct Inbox {
+    queues: Queues,
     wake: Guarded<Listener<Service>>,
 }
 
@@ -68,18 +75,51 @@ impl Subscription {
     }
 }
 
-impl std::fmt::Debug for Inbox {
+impl std::fmt::Debug for Queues {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_list().entries(self.topics.iter().map(|topic| &topic.name)).finish()
     }
 }
 
+impl std::fmt::Debug for Inbox {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.queues.fmt(f)
+    }
+}
+
 impl Inbox {
+    pub(super) fn open(queues: Queues, wake: &EventFactory<Service>) -> Result<Self, BusError> {
+        let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
+        Ok(Self { queues, wake: Guarded::new(wake) })
+    }
+
+    /// Blocks until a modality is published, `timeout` passes, or the process is continued after a stop. The mask alone
+    /// wakes no inbox.
+    ///
+    /// # Errors
+    /// When the event service is broken.
+    pub fn wait(&self, timeout: Duration) -> Result<(), BusError> {
+        let waited = contained(|| self.wake.timed_wait(|_| {}, timeout))?;
+        match waited {
+            Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
+            Err(error) => Err(topic_error(super::WAKE_SERVICE, &error)),
+        }
+    }
+}
+
+impl Deref for Inbox {
+    type Target = Queues;
+
+    fn deref(&self) -> &Queues {
+        &self.queues
+    }
+}
+
+impl Queues {
     /// `writers` has the same order as `topics`.
     pub(super) fn open<'a>(
         topics: &[(TopicSpec, Guarded<TopicFactory>)],
         writers: impl Iterator<Item = &'a Writer>,
-        wake: &EventFactory<Service>,
     ) -> Result<Self, BusError> {
         let subscribe = |((spec, factory), writer): (&(TopicSpec, Guarded<TopicFactory>), &Writer)| {
             let subscriber =
@@ -102,21 +142,7 @@ impl Inbox {
         let is_consumed = |((spec, _), _): &(&(TopicSpec, _), _)| spec.id != TopicId::Observation;
         let topics =
             topics.iter().zip(writers).filter(is_consumed).map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
-        let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
-        Ok(Self { topics, wake: Guarded::new(wake) })
-    }
-
-    /// Blocks until a modality is published, `timeout` passes, or the process is continued after a stop. The mask alone
-    /// wakes no inbox.
-    ///
-    /// # Errors
-    /// When the event service is broken.
-    pub fn wait(&self, timeout: Duration) -> Result<(), BusError> {
-        let waited = contained(|| self.wake.timed_wait(|_| {}, timeout))?;
-        match waited {
-            Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
-            Err(error) => Err(topic_error(super::WAKE_SERVICE, &error)),
-        }
+        Ok(Self { topics })
     }
 
     /// An error once memory of the bus has been lost: from then on samples may be mixed or empty.

@@ -48,7 +48,7 @@ use service::Service;
 
 pub use actions::{Actions, watch};
 pub use error::BusError;
-pub use inbox::{Foreign, Inbox};
+pub use inbox::{Foreign, Inbox, Queues};
 pub use ingress::{Arrivals, Given, Ingress};
 pub use place::memory as check_memory;
 pub use sigbus::lost;
@@ -178,7 +178,16 @@ impl Bus {
     /// # Errors
     /// When the topics have no free slot for another subscriber.
     pub fn inbox(&self) -> Result<Inbox, BusError> {
-        contained(|| Inbox::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref()), &self.wake))?
+        let queues = self.queues()?;
+        contained(|| Inbox::open(queues, &self.wake))?
+    }
+
+    /// The same for a consumer that never waits for samples, and that no sample wakes.
+    ///
+    /// # Errors
+    /// As [`Self::inbox`].
+    pub fn queues(&self) -> Result<Queues, BusError> {
+        contained(|| Queues::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref())))?
     }
 
     /// Actions for the actuator; `None` without an actuator in the registry.

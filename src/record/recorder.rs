@@ -31,7 +31,7 @@ use super::session::{Beginning, Session};
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
 use super::verdict::is_short;
-use crate::bus::{Foreign, Inbox, TopicId};
+use crate::bus::{Foreign, Inbox, Queues, TopicId};
 use crate::disk::Disk;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::partial::PARTIAL;
@@ -85,15 +85,15 @@ impl Source for Inbox {
     }
 
     fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String> {
-        Self::drain(self, take).map_err(|error| error.to_string())
+        Queues::drain(self, take).map_err(|error| error.to_string())
     }
 
     fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
-        Self::foreign(self, take);
+        Queues::foreign(self, take);
     }
 
     fn lost(&self) -> Option<String> {
-        Self::lost(self).map(|error| error.to_string())
+        Queues::lost(self).map(|error| error.to_string())
     }
 }
 

@@ -163,29 +163,40 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
 }
 
 /// `text` with each table of a serial line that has its old name, `[device.NAME.serial]`, under the present one,
-/// `[device.NAME.tty]`. A text that is not TOML stays.
+/// `[device.NAME.tty]`. One of which a part cannot be renamed stays, and so does a text that is not TOML.
 pub fn renamed(text: &str) -> String {
-    let Ok(document) = Document::parse(text) else { return text.to_owned() };
-    let devices = document.as_table().get("device").and_then(Item::as_table_like);
-    let devices = devices.into_iter().flat_map(|all| all.iter());
-    let mut names: Vec<_> = devices.filter_map(|(_, device)| old_names(text, device)).flatten().collect();
-    names.sort_by_key(|name| std::cmp::Reverse(name.start));
-    let mut new = text.to_owned();
-    for name in names {
-        new.replace_range(name, "tty");
-    }
-    new
+    let names = |text: &str| -> Option<Vec<String>> {
+        let document = Document::parse(text).ok()?;
+        Some(document.get("device")?.as_table_like()?.iter().map(|(name, _)| name.to_owned()).collect())
+    };
+    names(text).into_iter().flatten().fold(text.to_owned(), |text, name| with_tty(&text, &name).unwrap_or(text))
 }
 
-/// Where `text` has the old name of the table of a serial line in this entry; none if it has both.
-fn old_names(text: &str, device: &Item) -> Option<Vec<Range<usize>>> {
-    let device = device.as_table_like().filter(|device| !device.contains_key("tty"))?;
+/// `text` with that table of this device renamed; `None` if it has none, or has both.
+fn with_tty(text: &str, name: &str) -> Option<String> {
+    let document = Document::parse(text).ok()?;
+    let device = document.get("device")?.get(name)?.as_table_like().filter(|device| !device.contains_key("tty"))?;
     let (key, item) = device.get_key_value("serial")?;
-    match item.as_table().filter(|table| table.is_dotted()) {
+    let is_dotted = item.as_table().is_some_and(Table::is_dotted)
+        || item.as_inline_table().is_some_and(toml_edit::InlineTable::is_dotted);
+    let table = item.as_table_like()?;
+    let mut spans: Vec<_> = if is_dotted {
         // A name for each key, of which the parser keeps one.
-        Some(table) => table.iter().map(|(key, _)| name_before(text, table.key(key)?.span()?.start)).collect(),
-        None => item.is_table_like().then(|| Some(vec![key.span()?]))?,
+        let before = |(key, _)| name_before(text, table.key(key)?.span()?.start);
+        table.iter().map(before).collect::<Option<_>>()?
+    } else {
+        vec![key.span()?]
+    };
+    spans.sort_by_key(|span| std::cmp::Reverse(span.start));
+    let mut new = text.to_owned();
+    for span in spans {
+        new.replace_range(span, "tty");
     }
+    let is_whole = Document::parse(&new).is_ok_and(|new| {
+        let device = new.get("device").and_then(|devices| devices.get(name));
+        device.is_some_and(|device| device.get("serial").is_none() && device.get("tty").is_some())
+    });
+    is_whole.then_some(new)
 }
 
 /// Where `serial` is that stands with a dot before the key that starts here.

@@ -35,7 +35,8 @@ pub const MAX_BORROWED: usize = 4;
 /// Shared memory in addition to the payload of each sample, bytes: our header, and at most this much for that
 /// of iceoryx2 0.10 and for alignment.
 pub(super) const SAMPLE_OVERHEAD: usize = size_of::<SampleHeader>() + 64;
-/// Shared memory of the topics of mask and observations and of iceoryx2's management data, bytes; part of the budget.
+/// Shared memory of the topics of mask and observations and, for some devices, of iceoryx2's management data, bytes;
+/// part of the budget.
 pub(super) const RESERVED_BYTES: u64 = 768 << 10;
 
 /// A checked `devices.toml`.

@@ -42,7 +42,6 @@ fn a_panic_anywhere_ends_the_run_with_a_whole_file_and_names_its_place() {
         ("writer", "the writer thread panicked"),
         ("mask", "thread `mask` panicked"),
         ("rig", "the rig panicked"),
-        ("sync", "the synchronisation panicked"),
         ("screen", "the screen panicked"),
         ("main", "the main task panicked"),
     ] {
@@ -71,6 +70,23 @@ fn a_panic_anywhere_ends_the_run_with_a_whole_file_and_names_its_place() {
         assert!(!place.mask_file().exists(), "{at}");
         assert!(whole_episode(&place, at).topic("/rapid/mask").count() > 0, "{at}");
     }
+}
+
+#[test]
+fn a_panic_of_the_synchronisation_costs_observations_and_no_episode() {
+    let place = Place::new();
+    let order = place.path("now");
+    let mut command = place.command(&RECORD);
+    command.env("RAPID_FAULT", format!("sync:{}", order.display()));
+    let mut running = place.start_as(command, "\"event\":\"recording\"");
+    File::create(order).expect("order");
+    running.wait_for("no more observations are published");
+    until_recorded(&place);
+    running.signal(Signal::INT);
+    let (code, _, stderr) = running.end();
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("the synchronisation panicked"), "{stderr}");
+    assert!(whole_episode(&place, "sync").topic("/rapid/mask").count() > 0);
 }
 
 /// The end to write to of a pipe that has no room left, and the end to read from.

@@ -5,6 +5,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use crate::shared_memory::after;
 use crate::support::{self, Episode, Place, events};
 use rapid::bus::Bus;
 use rapid::driver::sim;
@@ -55,7 +56,8 @@ fn sixty_four_devices_are_recorded_without_a_hole() {
     let duration = format!("{SECONDS}s");
     let mut arguments = vec!["--sim", &played, "--config", &config, "--headless", "--json", "--record"];
     arguments.extend(["--out", "out", "--duration", &duration]);
-    let output = place.run(&arguments);
+    // The limit that a session and a unit have by default.
+    let output = after(&place, "ulimit -Sn 1024", &arguments).output().expect("a shell");
     let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
     assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
     let events = events(&String::from_utf8_lossy(&output.stdout));

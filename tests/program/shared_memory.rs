@@ -22,7 +22,7 @@ const RECORDING: &str = "\"event\":\"recording\"";
 const FOLDER: &str = "/tmp/iceoryx2";
 
 /// `rapid ARGUMENTS` after `first` has been run in the same shell.
-fn after(place: &Place, first: &str, arguments: &[&str]) -> Command {
+pub(crate) fn after(place: &Place, first: &str, arguments: &[&str]) -> Command {
     let plain = place.command(arguments);
     let mut command = Command::new("sh");
     command.args(["-c", &format!("{first}\nexec \"$@\""), "sh"]).arg(plain.get_program()).args(plain.get_args());

@@ -188,7 +188,6 @@ impl Tender {
         let _ = use_fifo(CONTROL_PRIORITY);
         let mut is_first = true;
         loop {
-            self.shared.busy.store(Stamp::now().0.max(1), Ordering::SeqCst);
             let ends = self.shared.ends.load(Ordering::SeqCst);
             self.tend();
             self.shared.busy.store(0, Ordering::SeqCst);
@@ -210,6 +209,8 @@ impl Tender {
         let Self { lines, shared, state, guard, .. } = self;
         lines.sort_by_cached_key(|line| (line.output.is_none(), shared.releases(line.motors)));
         for line in lines {
+            // The limit of a chip that hangs is for one line.
+            shared.busy.store(Stamp::now().0.max(1), Ordering::SeqCst);
             let bits = line.motors;
             if shared.releases(bits) != (state.released & bits == bits) {
                 state.moving |= bits;
@@ -284,7 +285,7 @@ impl Line {
         let tended = match output {
             Some(output) => Ok(output),
             // Both processes have to close a line before it can be opened again.
-            None if guard.is_some() && !*is_handed_over => Err("its guard does not let go of it".to_owned()),
+            None if guard.is_some() && !*is_handed_over => Err("its guard still holds it".to_owned()),
             None => Output::open(&spec.chip, spec.line, engaged_high).map(|opened| {
                 *is_handed_over = false;
                 output.insert(opened)
@@ -294,7 +295,11 @@ impl Line {
             let set = output.set(releases != engaged_high);
             set.map_err(|error| format!("line {} of {}: {error}", spec.line, spec.chip.display()))
         });
-        if tended.is_err() && output.take().is_some() {
+        if tended.is_err()
+            && let Some(output) = output.take()
+        {
+            // A line keeps its level when it is closed: it must not be the one that releases.
+            let _ = output.set(engaged_high);
             *is_handed_over = false;
         }
         if let Some(guard) = guard.filter(|_| !*is_handed_over) {

@@ -38,6 +38,15 @@ fn the_old_name_of_a_serial_line_s_table_is_replaced_and_nothing_else() {
             "device.a.\"serial\".baud = 1\ndevice.a.serial.framing = 'line'\n",
             Some("a.tty.baud = 1\ndevice.a.tty.framing"),
         ),
+        (
+            "[device]\na = { vid = \"1\", serial.baud = 1, serial.channels = 3 }\n",
+            Some("{ vid = \"1\", tty.baud = 1, tty.channels = 3 }"),
+        ),
+        // A part of it would keep the old name.
+        ("[device.a]\nserial.x.b = 1\nserial.x.c = 2\n", None),
+        ("[device.a.serial]\nbaud = 1\n[device.a.serial.sub]\n", None),
+        ("[device.a.serial.p]\n[device.a.serial.q]\n", None),
+        ("[device.a]\n\"\\u0073erial\".baud = 1\nserial.channels = 1\n", None),
         // Both names are an error already.
         ("[device.a.tty]\n[device.a.serial]\n", None),
         ("[device.a]\ntty.baud = 1\nserial.channels = 2\n", None),
