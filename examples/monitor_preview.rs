@@ -15,7 +15,7 @@ use rapid::registry::{
     CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
 };
 use rapid::sample::Epoch;
-use rapid::status::{Board, Command, Level, LogLine, RecordingStatus, SlotState, What};
+use rapid::status::{Board, Command, Level, LogLine, Outlook, RecordingStatus, SlotState, What};
 use rapid::time::{Stamp, realtime_ns};
 use rapid::tui;
 use tokio::sync::mpsc;
@@ -166,6 +166,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
             bytes: messages * 30_000,
             dropped: messages / 2000,
             room: None,
+            outlook: Outlook::default(),
         }));
     }
 }

@@ -49,6 +49,8 @@ const TURN: Duration = Duration::from_millis(20);
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// How often the board is updated.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
+/// Interval at which the episode in progress is judged, for that state.
+const JUDGE_EVERY: Duration = Duration::from_millis(500);
 /// How often the wall clock is checked for a step.
 const CLOCK_EVERY: Duration = Duration::from_millis(100);
 /// Shortest time between two complaints about the bus.
@@ -274,6 +276,8 @@ struct Writer {
     waiting: Vec<Reply<EpisodeReport>>,
     flushed: Stamp,
     reported: Stamp,
+    /// When the episode in progress was last judged.
+    judged: Stamp,
     complained: Option<Stamp>,
 }
 
@@ -302,6 +306,7 @@ impl Writer {
             waiting: Vec::new(),
             flushed: Stamp::default(),
             reported: Stamp::default(),
+            judged: Stamp::default(),
             complained: None,
         }
     }
@@ -468,6 +473,10 @@ impl Writer {
         }
         if now.since(self.reported) >= STATUS_EVERY && !session.is_ending(now) {
             let room = self.space.as_ref().and_then(Space::left);
+            if now.since(self.judged) >= JUDGE_EVERY {
+                session.judge(now, self.publishers.list());
+                self.judged = now;
+            }
             self.config.board.set_recording(Some(RecordingStatus { room, ..session.status(now) }));
             self.reported = now;
         }

@@ -29,9 +29,9 @@ use super::guard::Guard;
 use super::metadata::{self, Configuration, Ending};
 use super::provenance::{Attached, Units};
 use super::publishers::Publisher;
-use super::quality::{Frames, Measured, Measures, SampleFacts};
+use super::quality::{Frames, Measured, Measures, Quality, SampleFacts};
 use super::streams::{Hole, MaskHistory};
-use super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
+use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge};
 use super::writeback::Writeback;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::encode::EventText;
@@ -39,7 +39,7 @@ use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Event, RecordingStatus, What};
+use crate::status::{Board, Event, Outlook, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
 use crate::time::{Stamp, WallClock};
 
@@ -52,6 +52,9 @@ pub(super) const SETTLE: Duration = Duration::from_millis(100);
 /// Received samples may stay on the bus for this long.
 pub(super) const GRACE: Duration = Duration::from_millis(20);
 
+/// An episode is judged from this time on: before, most of its samples are still to come.
+const JUDGED_AFTER: Duration = Duration::from_secs(1);
+
 /// Parameters at the start of a session.
 pub(super) struct Beginning<'a> {
     pub(super) registry: Arc<Registry>,
@@ -62,6 +65,18 @@ pub(super) struct Beginning<'a> {
     pub(super) attached: &'a Attached,
     pub(super) clock: WallClock,
     pub(super) begin: Stamp,
+}
+
+/// The measured quality of each modality in an episode that ends at `end`.
+fn qualities<'a>(registry: &'a Registry, measures: &Measures, end: Stamp) -> Vec<(&'a DeviceSpec, Quality)> {
+    let quality = |device: &'a DeviceSpec| Some((device, measures.quality(device.id, end.0)?));
+    registry.devices.iter().filter_map(quality).collect()
+}
+
+fn judged<'a>(qualities: &'a [(&DeviceSpec, Quality)]) -> Vec<Judged<'a>> {
+    let judged =
+        |(device, quality): &'a (&DeviceSpec, Quality)| Judged { name: &device.name, quality, limits: device.verdict };
+    qualities.iter().map(judged).collect()
 }
 
 /// See the module's comment.
@@ -85,6 +100,8 @@ pub(super) struct Session {
     units: Units,
     /// How long a tick waits for its samples, in addition to the window.
     settle: Duration,
+    /// As last judged.
+    outlook: Outlook,
     /// The first error of the file: nothing is written after it.
     failed: Option<io::Error>,
 }
@@ -130,6 +147,7 @@ impl Session {
             events: 0,
             units,
             settle,
+            outlook: Outlook::default(),
             failed: None,
         })
     }
@@ -287,13 +305,8 @@ impl Session {
         let seconds = end.since(self.begin).as_secs_f64();
         let messages = self.file.messages;
         let dropped = self.measures.dropped();
-        let qualities =
-            self.registry.devices.iter().filter_map(|device| Some((device, self.measures.quality(device.id, end.0)?)));
-        let qualities: Vec<_> = qualities.collect();
-        let judged: Vec<Judged<'_>> = qualities
-            .iter()
-            .map(|(device, quality)| Judged { name: &device.name, quality, limits: device.verdict })
-            .collect();
+        let qualities = qualities(&self.registry, &self.measures, end);
+        let judged = judged(&qualities);
         let facts = Facts {
             modalities: &judged,
             missing: self.missing,
@@ -338,6 +351,25 @@ impl Session {
         EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict }
     }
 
+    /// Judges the episode as if it ended `now`, which is not too early.
+    pub(super) fn judge(&mut self, now: Stamp, publishers: &[Publisher]) {
+        if now.since(self.begin) < JUDGED_AFTER {
+            return;
+        }
+        let qualities = qualities(&self.registry, &self.measures, now);
+        let facts = Facts {
+            modalities: &judged(&qualities),
+            missing: self.missing,
+            expect: &self.registry.rig.expect,
+            publishers,
+            seconds: now.since(self.begin).as_secs_f64(),
+            losses: Losses::Apart,
+            file: FileState::Whole,
+            findings: &[],
+        };
+        self.outlook = Outlook { findings: findings(&facts) };
+    }
+
     /// For the screen.
     pub(super) fn status(&self, now: Stamp) -> RecordingStatus {
         RecordingStatus {
@@ -347,6 +379,7 @@ impl Session {
             bytes: self.file.bytes,
             dropped: self.measures.dropped(),
             room: None,
+            outlook: self.outlook.clone(),
         }
     }
 

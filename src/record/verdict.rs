@@ -23,7 +23,7 @@ use std::time::Duration;
 use super::publishers::Publisher;
 use super::quality::Quality;
 use crate::registry::{Limits, VerdictSpec};
-use crate::status::{Grade, Sensors, Verdict};
+use crate::status::{Finding, Grade, Sensors, Verdict};
 
 /// A modality with its limits.
 #[derive(Debug, Clone)]
@@ -102,42 +102,8 @@ pub(super) fn is_short(seconds: f64) -> bool {
 
 /// The verdict.
 pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
-    let mut found: Vec<(Grade, String)> = Vec::new();
-    match facts.file {
-        FileState::Whole => {}
-        FileState::NotWhole(why) => found.push((Grade::Suspect, format!("the file is not whole: {why}"))),
-        FileState::Failed(why) => found.push((Grade::Bad, format!("the file could not be written: {why}"))),
-    }
-    found.extend(facts.findings.iter().map(|finding| (Grade::Suspect, finding.clone())));
-    if is_short(facts.seconds) {
-        let limit = seconds(SHORTEST.as_secs_f64());
-        found.push((Grade::Bad, format!("too short: {} (limit {limit})", seconds(facts.seconds))));
-    }
-    for judged in facts.modalities {
-        let mut of_it = modality(judged, facts);
-        // The finding is more exact.
-        if of_it.is_empty() && judged.quality.samples == 0 && facts.expect.iter().any(|name| name == judged.name) {
-            of_it.push((Grade::Suspect, "took no part, and is expected (expect under [rig])".to_owned()));
-        }
-        found.extend(of_it.into_iter().map(|(grade, text)| (grade, format!("{}: {text}", judged.name))));
-    }
-    let silent = facts.modalities.iter().all(|judged| judged.quality.samples == 0);
-    if silent && !found.iter().any(|(grade, _)| *grade == Grade::Bad) {
-        found.push((Grade::Bad, "nothing was received from any modality".to_owned()));
-    }
-    let missing = [
-        (facts.missing.actions, "action is", "actions are"),
-        (facts.missing.masks, "publication of the mask is", "publications of the mask are"),
-        (facts.missing.events, "event is", "events are"),
-    ];
-    for (count, is, are) in missing.into_iter().filter(|(count, ..)| *count > 0) {
-        let are = if count == 1 { is } else { are };
-        found.push((Grade::Suspect, format!("{count} {are} not in the file (limit 0)")));
-    }
-    found.extend(facts.publishers.iter().map(|publisher| (Grade::Suspect, publisher.reason())));
-    // Stable: of one grade in the order above.
-    found.sort_by_key(|(grade, _)| std::cmp::Reverse(*grade));
-    let grade = found.first().map_or(Grade::Good, |(grade, _)| *grade);
+    let found = findings(facts);
+    let grade = found.first().map_or(Grade::Good, |finding| finding.grade);
     let without: Vec<String> = facts
         .modalities
         .iter()
@@ -146,7 +112,49 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         .collect();
     let registered = facts.modalities.len();
     let sensors = Sensors { registered, recorded: registered - without.len(), without };
-    Verdict { grade, reasons: found.into_iter().map(|(_, text)| text).collect(), sensors: Some(sensors) }
+    Verdict { grade, reasons: found.iter().map(Finding::sentence).collect(), sensors: Some(sensors) }
+}
+
+/// Every failed check, the most severe first.
+pub(super) fn findings(facts: &Facts<'_>) -> Vec<Finding> {
+    let of_all = |grade: Grade, text: String| Finding { grade, modality: None, text };
+    let mut found: Vec<Finding> = Vec::new();
+    match facts.file {
+        FileState::Whole => {}
+        FileState::NotWhole(why) => found.push(of_all(Grade::Suspect, format!("the file is not whole: {why}"))),
+        FileState::Failed(why) => found.push(of_all(Grade::Bad, format!("the file could not be written: {why}"))),
+    }
+    found.extend(facts.findings.iter().map(|finding| of_all(Grade::Suspect, finding.clone())));
+    if is_short(facts.seconds) {
+        let limit = seconds(SHORTEST.as_secs_f64());
+        found.push(of_all(Grade::Bad, format!("too short: {} (limit {limit})", seconds(facts.seconds))));
+    }
+    for judged in facts.modalities {
+        let mut of_it = modality(judged, facts);
+        // The finding is more exact.
+        if of_it.is_empty() && judged.quality.samples == 0 && facts.expect.iter().any(|name| name == judged.name) {
+            of_it.push((Grade::Suspect, "took no part, and is expected (expect under [rig])".to_owned()));
+        }
+        let modality = || Some(judged.name.to_owned());
+        found.extend(of_it.into_iter().map(|(grade, text)| Finding { grade, modality: modality(), text }));
+    }
+    let silent = facts.modalities.iter().all(|judged| judged.quality.samples == 0);
+    if silent && !found.iter().any(|finding| finding.grade == Grade::Bad) {
+        found.push(of_all(Grade::Bad, "nothing was received from any modality".to_owned()));
+    }
+    let missing = [
+        (facts.missing.actions, "action is", "actions are"),
+        (facts.missing.masks, "publication of the mask is", "publications of the mask are"),
+        (facts.missing.events, "event is", "events are"),
+    ];
+    for (count, is, are) in missing.into_iter().filter(|(count, ..)| *count > 0) {
+        let are = if count == 1 { is } else { are };
+        found.push(of_all(Grade::Suspect, format!("{count} {are} not in the file (limit 0)")));
+    }
+    found.extend(facts.publishers.iter().map(|publisher| of_all(Grade::Suspect, publisher.reason())));
+    // Stable: of one grade in the order above.
+    found.sort_by_key(|finding| std::cmp::Reverse(finding.grade));
+    found
 }
 
 /// The findings against a modality.

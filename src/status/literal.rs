@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::{Board, DeviceStatus, Level, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot};
+use super::{Board, DeviceStatus, Level, LogLine, Outlook, PolicyStatus, RecordingStatus, SlotState, Snapshot};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{
@@ -96,6 +96,7 @@ pub(crate) fn recording(dropped: u64) -> RecordingStatus {
         bytes: 312_400_000,
         dropped,
         room: None,
+        outlook: Outlook::default(),
     }
 }
 

@@ -122,6 +122,48 @@ pub struct RecordingStatus {
     pub dropped: u64,
     /// While the disk is nearly full: time until the episode is closed for lack of disk space.
     pub room: Option<Duration>,
+    /// What it would be judged if it ended now.
+    pub outlook: Outlook,
+}
+
+/// What an episode in progress would be judged if it ended now. Without a finding, as in its first second, it is GOOD.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct Outlook {
+    /// The most severe first.
+    pub findings: Vec<Finding>,
+}
+
+impl Outlook {
+    /// The grade.
+    pub fn grade(&self) -> Grade {
+        self.findings.first().map_or(Grade::Good, |finding| finding.grade)
+    }
+
+    /// The most severe finding against a modality.
+    pub fn of(&self, modality: &str) -> Option<&Finding> {
+        self.findings.iter().find(|finding| finding.modality.as_deref() == Some(modality))
+    }
+}
+
+/// A failed check of an episode.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// How severe it is.
+    pub grade: Grade,
+    /// The modality that it is about, if it is about one.
+    pub modality: Option<String>,
+    /// Figure and limit, for people.
+    pub text: String,
+}
+
+impl Finding {
+    /// As a reason of a [`Verdict`].
+    pub fn sentence(&self) -> String {
+        match &self.modality {
+            Some(modality) => format!("{modality}: {}", self.text),
+            None => self.text.clone(),
+        }
+    }
 }
 
 /// A line of the log.

@@ -149,6 +149,7 @@ mod tests {
                 bytes,
                 dropped: 0,
                 room: None,
+                outlook: crate::status::Outlook::default(),
             }),
             last_episode: None,
             last_verdict: None,

@@ -10,7 +10,7 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::{DeviceStatus, Level, SlotState, Snapshot};
+use crate::status::{DeviceStatus, Finding, Level, SlotState, Snapshot};
 use crate::text;
 
 /// Columns of state, rate, age, gaps and total, each with the space before it.
@@ -106,6 +106,11 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
     let detail = usize::from(width).saturating_sub(used);
     let detail = text::cut(&detail_of(device, model, theme), detail, theme.ellipsis()).into_owned();
     let figures = if running { Style::new() } else { theme.faint() };
+    let style = match finding(device, model) {
+        Some(finding) => theme.grade(finding.grade),
+        None if device.state == SlotState::Failed => theme.alarm(),
+        None => theme.faint(),
+    };
     Line::from(vec![
         Span::styled(if selected { theme.symbol("▸", ">") } else { " " }, theme.title()),
         Span::styled(format!("{:>3} ", device.id.bit()), theme.faint()),
@@ -117,7 +122,7 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
         Span::styled(format!("{:>GAPS$}", compact(device.gaps)), gaps),
         Span::styled(if total > 0 { format!("{:>total$}", compact(device.samples)) } else { String::new() }, figures),
         Span::raw("  "),
-        Span::styled(detail, if device.state == SlotState::Failed { theme.alarm() } else { theme.faint() }),
+        Span::styled(detail, style),
     ])
 }
 
@@ -130,8 +135,16 @@ fn compact(count: u64) -> String {
     }
 }
 
-/// The detail of a device; for an absent one, since when.
+/// What makes the episode in progress worse than GOOD because of this device.
+fn finding<'a>(device: &DeviceStatus, model: &'a Model) -> Option<&'a Finding> {
+    model.latest().recording.as_ref()?.outlook.of(&device.name)
+}
+
+/// The detail of a device, first what is wrong with it; for an absent one, since when.
 fn detail_of(device: &DeviceStatus, model: &Model, theme: Theme) -> String {
+    if let Some(finding) = finding(device, model) {
+        return format!("would be {}: {}", finding.grade.word(), theme.safe(&finding.text));
+    }
     if device.state != SlotState::Absent || !device.detail.is_empty() {
         return theme.safe(&device.detail);
     }

@@ -10,7 +10,7 @@ use super::model::Model;
 use super::recording;
 use super::theme::Theme;
 use crate::interlock::{InputState, StopKind};
-use crate::status::StopStatus;
+use crate::status::{Grade, StopStatus};
 use crate::text;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
@@ -107,6 +107,11 @@ fn right(model: &Model, theme: Theme) -> Line<'static> {
         spans.push(Span::raw("  "));
     }
     if let Some(recording) = &model.latest().recording {
+        let grade = recording.outlook.grade();
+        if grade != Grade::Good {
+            spans.push(Span::styled(format!("would be {}", grade.word()), theme.grade(grade)));
+            spans.push(Span::raw("  "));
+        }
         spans.push(Span::styled(recording::mark(recording, theme), theme.recording()));
         spans.push(Span::raw(" "));
     }

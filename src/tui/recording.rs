@@ -57,9 +57,20 @@ fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Th
     figures.extend((used + rate.width() <= width).then_some(rate));
     figures.push(dropped);
     if area.height >= 2 {
-        let file = file(&recording.file, width.saturating_sub(mark.width()), theme);
         figures.insert(0, Span::raw(" ".repeat(mark.width())));
-        return vec![Line::from(vec![mark, Span::raw(file)]), Line::from(figures)];
+        let mut line = Line::from(vec![mark]);
+        let room = width.saturating_sub(line.width());
+        match recording.outlook.findings.first() {
+            None => line.push_span(Span::raw(file(&recording.file, room, theme))),
+            Some(finding) => {
+                let name = file(&recording.file, room / 2, theme);
+                let room = room.saturating_sub(text::width(&name) + 2);
+                let text = format!("would be {}: {}", finding.grade.word(), theme.safe(&finding.sentence()));
+                let text = text::cut(&text, room, theme.ellipsis()).into_owned();
+                line.spans.extend([Span::raw(name), Span::raw("  "), Span::styled(text, theme.grade(finding.grade))]);
+            }
+        }
+        return vec![line, Line::from(figures)];
     }
     let figures = Line::from(figures);
     let room = width.saturating_sub(mark.width() + figures.width() + 3);

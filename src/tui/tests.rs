@@ -14,7 +14,9 @@ use crate::interlock::{InputState, StopKind};
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
-use crate::status::{Grade, Level, RecordingStatus, Sensors, ShortEpisode, SlotState, Snapshot, StopStatus, Verdict};
+use crate::status::{
+    Finding, Grade, Level, Outlook, RecordingStatus, Sensors, ShortEpisode, SlotState, Snapshot, StopStatus, Verdict,
+};
 use crate::time::Stamp;
 use theme::{Charset, Colours};
 
@@ -464,4 +466,22 @@ fn what_is_recorded_is_shown_while_the_view_is_paused() {
     let shown = draw(&model, (80, 24), THEME).to_string();
     assert!(shown.contains("view paused") && shown.contains("messages"), "{shown}");
     assert!(!shown.contains("starts an episode"), "{shown}");
+}
+
+#[test]
+fn what_spoils_an_episode_is_shown_while_it_can_be_fixed() {
+    let finding = |grade, modality: &str, text: &str| Finding {
+        grade,
+        modality: Some(modality.to_owned()),
+        text: text.to_owned(),
+    };
+    let mut end = three_streaming();
+    let lost = finding(Grade::Bad, "tof", "210 of 2100 samples lost by the device (limit 5 %)");
+    let still =
+        finding(Grade::Suspect, "cam_top", "frozen for 8.0 s: 240 samples byte for byte the same (limit 1.0 s)");
+    end.recording = Some(RecordingStatus { outlook: Outlook { findings: vec![lost, still] }, ..recording(0) });
+    assert_snapshot!(draw(&measured(&end), (120, 40), THEME));
+    let shown = draw(&measured(&end), (80, 24), THEME);
+    assert_eq!(style_of(shown.buffer(), "would be BAD").fg, Some(Color::Red));
+    assert!(draw(&measured(&end), (60, 12), ASCII).to_string().contains("would be BAD  * REC"));
 }

@@ -304,3 +304,29 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
         assert_eq!(of_actions, reasons, "{what}, killed");
     }
 }
+
+#[test]
+fn an_episode_in_progress_is_judged_like_a_finished_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let masks = MaskHistory::new();
+    let mut session = session(folder.path(), &board, &masks);
+    for n in 0..200 {
+        let now = 1000 + n * 10;
+        let hole = Hole { after: Stamp((now - 9) * MS), before: Stamp(now * MS), lost: 1, dropped: 0 };
+        session.sample(id(TOF), &scalars(n, now, now), &[0; 8], Some(hole));
+        session.advance(Stamp(now * MS), &masks);
+        if n == 50 {
+            session.judge(Stamp(now * MS), &[]);
+            assert_eq!(session.status(Stamp(now * MS)).outlook.findings, [], "most of it is still to come");
+        }
+    }
+    let end = Stamp(2990 * MS);
+    session.judge(end, &[]);
+    let outlook = session.status(end).outlook;
+    let report = session.finish(end, &masks, None, &[]);
+    assert_eq!((outlook.grade(), report.verdict.grade), (Grade::Bad, Grade::Bad));
+    let lost = outlook.of("tof").expect("a finding").sentence();
+    assert!(lost.contains("lost by the device"), "{lost}");
+    assert!(report.verdict.reasons.contains(&lost), "{:?}", report.verdict.reasons);
+}
