@@ -52,6 +52,7 @@ pub mod record;
 pub mod registry;
 pub mod rig;
 pub mod sample;
+pub mod session;
 pub mod simulation;
 pub mod status;
 pub mod sync;

@@ -8,6 +8,7 @@
 pub mod board;
 mod event;
 pub mod rates;
+pub mod session;
 
 use std::fmt;
 use std::path::{Path, PathBuf};

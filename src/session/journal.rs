@@ -1,0 +1,353 @@
+//! The session's file: which episodes were recorded, and what people noted about them.
+//!
+//! `session.toml` in the folder of the episodes while the session lasts, `session-BEGUN.toml` afterwards. It is written
+//! at each change, atomically, and waits for the disk: a crash or a power cut loses none of it.
+//!
+//! Invariant: a file that this session did not write is never replaced: it is moved aside, or this session takes another
+//! name.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::trash;
+use crate::folder::{self, Folder, Links, Missing, Sync};
+use crate::status::session::EpisodeEntry;
+use crate::time::{realtime_ns, rfc3339};
+
+/// The name of the file of a session in progress.
+const CURRENT: &str = "session.toml";
+/// A file of a million episodes is smaller; a larger one is not ours.
+const LARGEST: u64 = 1 << 28;
+/// For people who open it.
+const HEAD: &str = "# A session of rapid. Written at each change while it lasts; edit it only when it has ended.\n";
+
+/// What a session is to collect.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Plan {
+    /// The task.
+    pub task: String,
+    /// How many episodes are wanted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub goal: Option<u32>,
+    /// Each episode ends by itself after this time.
+    #[serde(skip_serializing_if = "Option::is_none", with = "span")]
+    pub episode_time: Option<Duration>,
+    /// The next episode begins by itself this long after the end of the last, for which the scene is reset.
+    #[serde(skip_serializing_if = "Option::is_none", with = "span")]
+    pub reset_time: Option<Duration>,
+    /// Time from the request to begin an episode to its beginning.
+    #[serde(skip_serializing_if = "Option::is_none", with = "span")]
+    pub countdown: Option<Duration>,
+    /// Tags of the episodes.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub tags: BTreeMap<String, String>,
+}
+
+/// The contents of the file.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SessionFile {
+    /// When the session began, RFC 3339, UTC.
+    pub begun: String,
+    /// When it ended.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ended: Option<String>,
+    /// What was to be collected.
+    #[serde(default)]
+    pub plan: Plan,
+    /// The episodes, in the order in which they were recorded.
+    #[serde(default, rename = "episode")]
+    pub episodes: Vec<EpisodeEntry>,
+}
+
+/// Why a session cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum JournalError {
+    /// The file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The error of the system.
+        source: io::Error,
+    },
+    /// The file is not a session.
+    #[error("{}: not a session file: {why}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// Where, and what is wrong.
+        why: String,
+    },
+}
+
+/// Every session of the folder `episodes`, oldest first, and what could not be read.
+pub fn sessions(episodes: &Path) -> (Vec<SessionFile>, Vec<JournalError>) {
+    let is_session = |name: &str| {
+        name == CURRENT
+            || (name.starts_with("session-") && Path::new(name).extension().is_some_and(|ending| ending == "toml"))
+    };
+    let (mut files, mut errors) = (Vec::new(), Vec::new());
+    let entries = match std::fs::read_dir(episodes) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return (files, errors),
+        Err(source) => return (files, vec![JournalError::Io { path: episodes.to_owned(), source }]),
+    };
+    for entry in entries.flatten() {
+        if entry.file_name().to_str().is_some_and(is_session) {
+            match read(&entry.path()) {
+                Ok(file) => files.push(file),
+                Err(error) => errors.push(error),
+            }
+        }
+    }
+    files.sort_by(|a, b| a.begun.cmp(&b.begun));
+    (files, errors)
+}
+
+fn read(path: &Path) -> Result<SessionFile, JournalError> {
+    let text = folder::read_text(path, LARGEST).map_err(|source| JournalError::Io { path: path.to_owned(), source })?;
+    let invalid = |why: String| JournalError::Invalid { path: path.to_owned(), why };
+    let file: SessionFile = toml::from_str(&text).map_err(|error| invalid(error.to_string().trim().to_owned()))?;
+    match file.episodes.iter().find(|episode| !trash::is_name(&episode.file)) {
+        Some(episode) => Err(invalid(format!("{:?} is not the name of an episode's file", episode.file))),
+        None => Ok(file),
+    }
+}
+
+/// The file of the session in progress.
+#[derive(Debug)]
+pub struct Journal {
+    folder: PathBuf,
+    name: String,
+    /// Device and inode of the file as written last.
+    written: Option<(u64, u64)>,
+}
+
+impl Journal {
+    /// The session in progress in `folder`, if there is one, continued with what is found of its episodes; and what
+    /// was wrong with its file, which is then moved aside.
+    pub fn open(folder: &Path) -> (Self, Option<SessionFile>, Option<JournalError>) {
+        let mut journal = Self { folder: folder.to_owned(), name: CURRENT.to_owned(), written: None };
+        let path = folder.join(CURRENT);
+        match read(&path) {
+            Ok(mut file) if file.ended.is_none() => {
+                journal.written = identity(&path);
+                for episode in &mut file.episodes {
+                    episode.discarded = trash::holds(folder, &episode.file) && !folder.join(&episode.file).exists();
+                }
+                (journal, Some(file), None)
+            }
+            Ok(file) => {
+                let moved = journal.archive(&file.begun);
+                (journal, None, moved.err())
+            }
+            Err(JournalError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => (journal, None, None),
+            Err(error) => {
+                let moved = journal.archive(&format!("unreadable-{}", rfc3339(realtime_ns())));
+                (journal, None, Some(moved.err().unwrap_or(error)))
+            }
+        }
+    }
+
+    /// Writes the file and waits for the disk.
+    ///
+    /// # Errors
+    /// When the disk does not accept it.
+    pub fn save(&mut self, file: &SessionFile) -> Result<(), JournalError> {
+        let path = self.folder.join(&self.name);
+        if identity(&path) != self.written && path.exists() {
+            // Another run writes it too: both sessions are kept.
+            self.name = format!("session-{}-{}.toml", compact(&file.begun), std::process::id());
+        }
+        let path = self.folder.join(&self.name);
+        let io = |source| JournalError::Io { path: path.clone(), source };
+        let text = toml::to_string(file).map_err(|error| io(io::Error::other(error)))?;
+        let folder = Folder::open(&self.folder, Links::Own, Missing::Last).map_err(|error| io(error.into()))?;
+        folder.replace(&self.name, format!("{HEAD}{text}").as_bytes(), 0o644, Sync::Wait).map_err(io)?;
+        // A file system without this keeps the name at its own pace.
+        let _ = folder.sync();
+        self.written = identity(&path);
+        Ok(())
+    }
+
+    /// Gives the file the name of a session that has ended.
+    ///
+    /// # Errors
+    /// When it cannot be renamed; then it keeps its name.
+    pub fn archive(&mut self, begun: &str) -> Result<(), JournalError> {
+        let from = self.folder.join(&self.name);
+        let io = |source| JournalError::Io { path: from.clone(), source };
+        let folder = Folder::open(&self.folder, Links::Own, Missing::Refused).map_err(|error| io(error.into()))?;
+        let stem = format!("session-{}", compact(begun));
+        let names = std::iter::once(format!("{stem}.toml")).chain((2..100).map(|n| format!("{stem}-{n}.toml")));
+        let mut outcome = Err(io::ErrorKind::AlreadyExists.into());
+        for name in names {
+            outcome = folder.rename_new(self.name.as_ref(), name.as_ref());
+            if !matches!(&outcome, Err(error) if error.kind() == io::ErrorKind::AlreadyExists) {
+                break;
+            }
+        }
+        outcome.map_err(io)?;
+        CURRENT.clone_into(&mut self.name);
+        self.written = None;
+        Ok(())
+    }
+}
+
+/// `2026-11-24T14:03:00.000Z` without what a file's name should not contain.
+fn compact(time: &str) -> String {
+    time.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect()
+}
+
+fn identity(path: &Path) -> Option<(u64, u64)> {
+    std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
+}
+
+/// A time as people write it: `30s`.
+mod span {
+    use std::time::Duration;
+
+    use serde::{Deserialize, Deserializer, Serializer, de};
+
+    #[expect(clippy::ref_option, reason = "serde gives it so")]
+    pub(super) fn serialize<S: Serializer>(span: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
+        match span {
+            Some(span) => serializer.collect_str(&humantime::format_duration(*span)),
+            None => serializer.serialize_none(),
+        }
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Duration>, D::Error> {
+        let text = Option::<String>::deserialize(deserializer)?;
+        text.map(|text| humantime::parse_duration(&text).map_err(de::Error::custom)).transpose()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::session::{Label, Mark};
+    use crate::status::{Grade, Sensors};
+
+    fn entry(file: &str) -> EpisodeEntry {
+        EpisodeEntry {
+            file: file.to_owned(),
+            begun: "2026-11-24T14:03:00.000Z".to_owned(),
+            seconds: Some(29.8),
+            verdict: Some(Grade::Suspect),
+            reasons: vec!["tof: 3 of 213 samples lost".to_owned()],
+            label: Some(Label::Failure),
+            label_reason: "it \"slipped\"\n".to_owned(),
+            note: "# not a comment = 1".to_owned(),
+            discarded: false,
+            marks: vec![Mark { at: 12.5, text: String::new() }, Mark { at: 13.0, text: "grasp".to_owned() }],
+            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] }),
+        }
+    }
+
+    fn session(episodes: Vec<EpisodeEntry>) -> SessionFile {
+        let plan = Plan {
+            task: "place block".to_owned(),
+            goal: Some(50),
+            episode_time: Some(Duration::from_secs(30)),
+            reset_time: None,
+            countdown: Some(Duration::from_millis(2500)),
+            tags: [("finger".to_owned(), "soft".to_owned())].into(),
+        };
+        SessionFile { begun: "2026-11-24T14:02:00.000Z".to_owned(), ended: None, plan, episodes }
+    }
+
+    fn names(folder: &Path) -> Vec<String> {
+        let mut names: Vec<_> =
+            std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn what_is_written_is_read_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut journal, none, error) = Journal::open(folder.path());
+        assert!(none.is_none() && error.is_none());
+        let bare = EpisodeEntry {
+            seconds: None,
+            verdict: None,
+            reasons: Vec::new(),
+            label: None,
+            label_reason: String::new(),
+            note: String::new(),
+            marks: Vec::new(),
+            sensors: None,
+            ..entry("20261124_place-block_002.mcap")
+        };
+        let file = session(vec![entry("20261124_place-block_001.mcap"), bare]);
+        journal.save(&file).unwrap();
+        journal.save(&file).unwrap();
+        assert_eq!(names(folder.path()), ["session.toml"]);
+        let (_, read, error) = Journal::open(folder.path());
+        assert!(error.is_none(), "{error:?}");
+        assert_eq!(read.unwrap(), file);
+        insta::assert_snapshot!(std::fs::read_to_string(folder.path().join("session.toml")).unwrap());
+    }
+
+    #[test]
+    fn an_ended_session_gets_its_own_name_and_all_are_listed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut journal, ..) = Journal::open(folder.path());
+        for _ in 0..3 {
+            let mut file = session(vec![entry("a.mcap")]);
+            file.ended = Some(file.begun.clone());
+            journal.save(&file).unwrap();
+            journal.archive(&file.begun).unwrap();
+        }
+        journal.save(&session(vec![entry("b.mcap")])).unwrap();
+        let stem = "session-2026-11-24T140200000Z";
+        let expected = [format!("{stem}-2.toml"), format!("{stem}-3.toml"), format!("{stem}.toml")];
+        assert_eq!(names(folder.path()), [&expected[..], &["session.toml".to_owned()]].concat());
+        let (all, errors) = sessions(folder.path());
+        assert_eq!((all.len(), errors.len()), (4, 0));
+    }
+
+    #[test]
+    fn a_file_that_is_no_session_is_moved_aside_and_reported() {
+        for text in ["begun = 1", "\u{0}", "[[episode]]\nfile = \"../../etc/passwd\"", "begun=\"\"\nsurprise = 1"] {
+            let folder = tempfile::tempdir().unwrap();
+            std::fs::write(folder.path().join(CURRENT), text).unwrap();
+            let (mut journal, none, error) = Journal::open(folder.path());
+            assert!(none.is_none());
+            assert!(matches!(error, Some(JournalError::Invalid { .. })), "{text:?}: {error:?}");
+            journal.save(&session(Vec::new())).unwrap();
+            let names = names(folder.path());
+            assert_eq!(names.len(), 2, "{names:?}");
+            assert!(names.iter().any(|name| name.starts_with("session-unreadable-")), "{names:?}");
+        }
+        let hostile = "begun = \"x\"\n[[episode]]\nfile = \"../x.mcap\"\nbegun = \"x\"\n";
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(CURRENT), hostile).unwrap();
+        let error = Journal::open(folder.path()).2.unwrap().to_string();
+        assert!(error.contains("\"../x.mcap\" is not the name of an episode's file"), "{error}");
+    }
+
+    #[test]
+    fn two_runs_in_one_folder_keep_a_file_each() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut first, ..) = Journal::open(folder.path());
+        let (mut second, ..) = Journal::open(folder.path());
+        first.save(&session(vec![entry("a.mcap")])).unwrap();
+        second.save(&session(vec![entry("b.mcap")])).unwrap();
+        first.save(&session(vec![entry("a.mcap"), entry("c.mcap")])).unwrap();
+        second.save(&session(vec![entry("b.mcap"), entry("d.mcap")])).unwrap();
+        let (all, errors) = sessions(folder.path());
+        assert!(errors.is_empty());
+        let mut files: Vec<_> = all.iter().flat_map(|session| session.episodes.iter().map(|e| &e.file)).collect();
+        files.sort();
+        assert_eq!(files, ["a.mcap", "b.mcap", "c.mcap", "d.mcap"]);
+    }
+}

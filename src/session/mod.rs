@@ -1,0 +1,522 @@
+//! A session: what is collected, and what happens before, between and after its episodes.
+//!
+//! [`Session`] is a pure core: requests, begins and ends of episodes and the time go in, [`Effect`]s come out. Its owner
+//! carries them out and reports how they ended.
+//!
+//! Invariant: pure: no clock, no file, no recorder. [`journal`] is its file and [`trash`] its folder.
+//! Invariant: an episode is never deleted before the session ends: discarding moves it to the trash.
+//! Invariant: the journal is saved at every change, before anything else happens to the episode.
+
+pub mod journal;
+pub mod trash;
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::status::session::{EpisodeEntry, Label, Mark, Phase, SessionRequest, SessionStatus};
+use crate::status::{Grade, Verdict};
+use crate::time::Stamp;
+use journal::{Plan, SessionFile};
+
+/// Episodes that a screen lists.
+const LISTED: usize = 200;
+/// Longest text of a note, a mark or a reason, in bytes.
+const LONGEST_TEXT: usize = 2000;
+
+/// What the owner of a session is to do, in order.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Effect {
+    /// Save the journal.
+    Save,
+    /// Begin an episode, and report it with [`Session::began`].
+    Begin,
+    /// End the episode in progress at this moment. Its end is reported with [`Session::ended`].
+    End(Stamp),
+    /// Move this episode to the trash; report a failure with [`Session::not_moved`].
+    Discard(String),
+    /// Take this episode back; report a failure with [`Session::not_moved`].
+    Restore(String),
+    /// Record a mark of the episode in progress.
+    Mark(String),
+    /// Delete these from the trash and give the journal its final name.
+    Close(Vec<String>),
+}
+
+/// When a request is answered.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Answer {
+    /// At once, with this text.
+    Now(String),
+    /// When the episode has begun.
+    AtBegin,
+    /// When the episode in progress is closed.
+    AtEnd,
+}
+
+/// Why a request is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// There is an episode in progress.
+    #[error("an episode is being recorded")]
+    Busy,
+    /// There is none.
+    #[error("no episode is being recorded")]
+    Idle,
+    /// The session has no episode to which the request could apply.
+    #[error("this session has no episode")]
+    NoEpisode,
+    /// Nothing was discarded.
+    #[error("nothing was discarded in this session")]
+    NothingDiscarded,
+    /// A text is too long.
+    #[error("the text is longer than {LONGEST_TEXT} bytes")]
+    TooLong,
+}
+
+/// What happens to the episode in progress once it is closed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+struct After {
+    discard: bool,
+    next: Next,
+}
+
+/// What follows the episode in progress.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+enum Next {
+    /// By the plan: a reset and the next episode, or nothing.
+    #[default]
+    Planned,
+    /// Another episode.
+    Begin,
+    /// Nothing.
+    Wait,
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub struct Session {
+    folder: PathBuf,
+    file: SessionFile,
+    phase: Phase,
+    after: After,
+    /// The entry of the episode in progress, and when it began.
+    current: Option<(usize, Stamp)>,
+    /// Entries that were discarded, in that order.
+    discarded: Vec<usize>,
+    free: Option<u64>,
+}
+
+impl Session {
+    /// A session in `folder` by `plan`. It continues `before`, the session in progress there, if that has the same task;
+    /// otherwise the second value is true, and `before` is to be archived.
+    pub fn new(folder: &Path, plan: Plan, before: Option<SessionFile>, begun: String) -> (Self, bool) {
+        let continued = before.filter(|before| before.plan.task == plan.task);
+        let is_new = continued.is_none();
+        let episodes = continued.as_ref().map(|before| before.episodes.clone()).unwrap_or_default();
+        let begun = continued.as_ref().map_or(begun, |before| before.begun.clone());
+        let goal = plan.goal.or_else(|| continued?.plan.goal);
+        let discarded = (0..episodes.len()).filter(|index| episodes.get(*index).is_some_and(|e| e.discarded)).collect();
+        let file = SessionFile { begun, ended: None, plan: Plan { goal, ..plan }, episodes };
+        let session = Self {
+            folder: folder.to_owned(),
+            file,
+            phase: Phase::Idle,
+            after: After::default(),
+            current: None,
+            discarded,
+            free: None,
+        };
+        (session, is_new)
+    }
+
+    /// What is to be saved.
+    pub fn file(&self) -> &SessionFile {
+        &self.file
+    }
+
+    /// What the next episode is of.
+    pub fn plan(&self) -> &Plan {
+        &self.file.plan
+    }
+
+    /// Whether an episode is in progress, or begins at this moment.
+    pub fn phase(&self) -> Phase {
+        self.phase
+    }
+
+    /// How many episodes count for the goal.
+    pub fn counted(&self) -> usize {
+        self.file.episodes.iter().filter(|episode| episode.counts()).count()
+    }
+
+    /// Whether there is a goal and it is reached.
+    pub fn is_complete(&self) -> bool {
+        self.file.plan.goal.is_some_and(|goal| self.counted() >= usize::try_from(goal).unwrap_or(usize::MAX))
+    }
+
+    /// Reports the free space on the disk, bytes.
+    pub fn set_free(&mut self, free: Option<u64>) {
+        self.free = free;
+    }
+
+    /// When [`Self::tick`] is to be called next, if at all.
+    pub fn due(&self) -> Option<Stamp> {
+        match self.phase {
+            Phase::Countdown { until } | Phase::Reset { until } => Some(until),
+            Phase::Idle | Phase::Recording | Phase::Ending => None,
+        }
+    }
+
+    /// Carries out what is due at `now`.
+    pub fn tick(&mut self, now: Stamp) -> Vec<Effect> {
+        match self.phase {
+            Phase::Reset { until } if now >= until => self.approach(now),
+            Phase::Countdown { until } if now >= until => vec![Effect::Begin],
+            _ => Vec::new(),
+        }
+    }
+
+    /// Handles a request made at `now`.
+    ///
+    /// # Errors
+    /// When it does not apply at the moment; nothing has changed then.
+    pub fn request(&mut self, request: &SessionRequest, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        match request {
+            SessionRequest::Toggle if self.phase == Phase::Recording => self.end(After::default(), now),
+            SessionRequest::Toggle | SessionRequest::Start => self.start(now),
+            SessionRequest::Stop => self.stop(now),
+            SessionRequest::Next => self.next(now),
+            SessionRequest::Redo => self.redo(now),
+            SessionRequest::Discard => self.discard(now),
+            SessionRequest::Undo => self.undo(),
+            SessionRequest::Mark { text } => self.mark(text, now),
+            SessionRequest::Label { label, reason } => {
+                let entry = self.about(reason)?;
+                entry.label = Some(*label);
+                entry.label_reason.clone_from(reason);
+                let text = format!("{}: {label}", entry.file);
+                Ok((Answer::Now(text), vec![Effect::Save]))
+            }
+            SessionRequest::Note { text } => {
+                let entry = self.about(text)?;
+                entry.note.clone_from(text);
+                let text = format!("{}: noted", entry.file);
+                Ok((Answer::Now(text), vec![Effect::Save]))
+            }
+            SessionRequest::Plan { task, tags, goal } => Ok(self.change_plan(task.as_deref(), tags, *goal)),
+            SessionRequest::EndSession => self.end_session(),
+        }
+    }
+
+    /// The episode that [`Effect::Begin`] asked for has begun as `file`, or not.
+    pub fn began(&mut self, file: Option<&Path>, begun: String, now: Stamp) -> Vec<Effect> {
+        let Some(file) = file else {
+            // The reason is shown elsewhere; a plan that failed once is not repeated without a request.
+            self.phase = Phase::Idle;
+            return Vec::new();
+        };
+        self.phase = Phase::Recording;
+        self.after = After::default();
+        self.current = Some((self.file.episodes.len(), now));
+        self.file.episodes.push(EpisodeEntry {
+            file: name(file),
+            begun,
+            seconds: None,
+            verdict: None,
+            reasons: Vec::new(),
+            label: None,
+            label_reason: String::new(),
+            note: String::new(),
+            discarded: false,
+            marks: Vec::new(),
+            sensors: None,
+        });
+        vec![Effect::Save]
+    }
+
+    /// The episode in progress was closed as `file`, for whatever reason.
+    pub fn ended(&mut self, file: &Path, seconds: f64, verdict: &Verdict, now: Stamp) -> Vec<Effect> {
+        let Some((index, _)) = self.current.take() else { return Vec::new() };
+        let After { discard, next } = std::mem::take(&mut self.after);
+        if let Some(entry) = self.file.episodes.get_mut(index) {
+            entry.file = name(file);
+            entry.seconds = Some((seconds * 1000.0).round() / 1000.0);
+            entry.verdict = Some(verdict.grade);
+            entry.reasons.clone_from(&verdict.reasons);
+            entry.sensors.clone_from(&verdict.sensors);
+        }
+        let mut effects = vec![Effect::Save];
+        if discard {
+            effects.extend(self.put_away(index));
+        }
+        self.phase = Phase::Idle;
+        effects.extend(match next {
+            Next::Begin => self.approach(now),
+            Next::Wait => Vec::new(),
+            Next::Planned => self.follow_plan(now),
+        });
+        effects
+    }
+
+    /// An episode could not be moved: it is where it was.
+    pub fn not_moved(&mut self, file: &str) -> Vec<Effect> {
+        let Some(index) = self.file.episodes.iter().rposition(|entry| entry.file == file) else { return Vec::new() };
+        let Some(entry) = self.file.episodes.get_mut(index) else { return Vec::new() };
+        entry.discarded = !entry.discarded;
+        self.discarded.retain(|other| *other != index);
+        if entry.discarded {
+            self.discarded.push(index);
+        }
+        vec![Effect::Save]
+    }
+
+    /// For a screen.
+    pub fn status(&self) -> SessionStatus {
+        let episodes = &self.file.episodes;
+        let mut verdicts = [0; 3];
+        for entry in episodes.iter().filter(|entry| !entry.discarded) {
+            if let Some(count) = entry.verdict.and_then(|grade| verdicts.get_mut(grade as usize)) {
+                *count += 1;
+            }
+        }
+        SessionStatus {
+            folder: self.folder.clone(),
+            task: self.file.plan.task.clone(),
+            tags: self.file.plan.tags.iter().map(|(key, value)| (key.clone(), value.clone())).collect(),
+            goal: self.file.plan.goal,
+            phase: self.phase,
+            counted: self.counted(),
+            verdicts,
+            discarded: self.discarded.len(),
+            episodes: episodes.get(episodes.len().saturating_sub(LISTED)..).unwrap_or_default().to_vec(),
+            free: self.free,
+        }
+    }
+
+    fn start(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        match self.phase {
+            Phase::Idle => {
+                let effects = self.approach(now);
+                Ok((Answer::AtBegin, effects))
+            }
+            // Who does not want to wait asks again.
+            Phase::Countdown { .. } | Phase::Reset { .. } => Ok((Answer::AtBegin, vec![Effect::Begin])),
+            Phase::Recording => Err(Refusal::Busy),
+            Phase::Ending => {
+                self.after.next = Next::Begin;
+                Ok((Answer::AtBegin, Vec::new()))
+            }
+        }
+    }
+
+    /// Begins an episode, after the countdown if there is one.
+    fn approach(&mut self, now: Stamp) -> Vec<Effect> {
+        match self.file.plan.countdown.filter(|countdown| !countdown.is_zero()) {
+            Some(countdown) => {
+                self.phase = Phase::Countdown { until: now.after(countdown) };
+                Vec::new()
+            }
+            None => vec![Effect::Begin],
+        }
+    }
+
+    fn follow_plan(&mut self, now: Stamp) -> Vec<Effect> {
+        if let Some(reset) = self.file.plan.reset_time.filter(|_| !self.is_complete()) {
+            self.phase = Phase::Reset { until: now.after(reset) };
+        }
+        Vec::new()
+    }
+
+    fn end(&mut self, after: After, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        self.after = After { discard: self.after.discard || after.discard, next: after.next };
+        match self.phase {
+            Phase::Recording => {
+                self.phase = Phase::Ending;
+                Ok((Answer::AtEnd, vec![Effect::End(now)]))
+            }
+            Phase::Ending => Ok((Answer::AtEnd, Vec::new())),
+            Phase::Idle | Phase::Countdown { .. } | Phase::Reset { .. } => Err(Refusal::Idle),
+        }
+    }
+
+    fn stop(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        match self.phase {
+            Phase::Countdown { .. } | Phase::Reset { .. } => {
+                self.phase = Phase::Idle;
+                Ok((Answer::Now("no further episode begins by itself".to_owned()), Vec::new()))
+            }
+            _ => self.end(After { discard: false, next: Next::Wait }, now),
+        }
+    }
+
+    fn next(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        match self.phase {
+            Phase::Recording | Phase::Ending => self.end(After { discard: false, next: Next::Begin }, now),
+            _ => self.start(now),
+        }
+    }
+
+    fn redo(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        if matches!(self.phase, Phase::Recording | Phase::Ending) {
+            return self.end(After { discard: true, next: Next::Begin }, now);
+        }
+        let last = self.last().ok_or(Refusal::NoEpisode)?;
+        let mut effects = self.put_away(last);
+        let (answer, begin) = self.start(now)?;
+        effects.extend(begin);
+        Ok((answer, effects))
+    }
+
+    fn discard(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        if matches!(self.phase, Phase::Recording | Phase::Ending) {
+            return self.end(After { discard: true, next: Next::Wait }, now);
+        }
+        let last = self.last().ok_or(Refusal::NoEpisode)?;
+        // The scene of a discarded episode is not reset in a hurry.
+        self.phase = Phase::Idle;
+        let effects = self.put_away(last);
+        let file = self.file.episodes.get(last).map(|entry| entry.file.clone()).unwrap_or_default();
+        Ok((Answer::Now(format!("{file} is in the trash")), effects))
+    }
+
+    fn undo(&mut self) -> Result<(Answer, Vec<Effect>), Refusal> {
+        let index = self.discarded.pop().ok_or(Refusal::NothingDiscarded)?;
+        let entry = self.file.episodes.get_mut(index).ok_or(Refusal::NothingDiscarded)?;
+        entry.discarded = false;
+        let file = entry.file.clone();
+        Ok((Answer::Now(format!("{file} is back")), vec![Effect::Restore(file), Effect::Save]))
+    }
+
+    fn mark(&mut self, text: &str, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        let (index, begun) = self.current.filter(|_| self.phase == Phase::Recording).ok_or(Refusal::Idle)?;
+        if text.len() > LONGEST_TEXT {
+            return Err(Refusal::TooLong);
+        }
+        let at = (now.since(begun).as_secs_f64() * 1000.0).round() / 1000.0;
+        if let Some(entry) = self.file.episodes.get_mut(index) {
+            entry.marks.push(Mark { at, text: text.to_owned() });
+        }
+        Ok((Answer::Now(format!("marked at {at:.1} s")), vec![Effect::Mark(text.to_owned()), Effect::Save]))
+    }
+
+    /// The entry that a label or a note is about.
+    fn about(&mut self, text: &str) -> Result<&mut EpisodeEntry, Refusal> {
+        if text.len() > LONGEST_TEXT {
+            return Err(Refusal::TooLong);
+        }
+        let index = self.current.map(|(index, _)| index).or_else(|| self.last()).ok_or(Refusal::NoEpisode)?;
+        self.file.episodes.get_mut(index).ok_or(Refusal::NoEpisode)
+    }
+
+    /// The last episode that is kept.
+    fn last(&self) -> Option<usize> {
+        self.file.episodes.iter().rposition(|entry| !entry.discarded)
+    }
+
+    fn put_away(&mut self, index: usize) -> Vec<Effect> {
+        let Some(entry) = self.file.episodes.get_mut(index) else { return Vec::new() };
+        entry.discarded = true;
+        self.discarded.push(index);
+        vec![Effect::Discard(entry.file.clone()), Effect::Save]
+    }
+
+    fn change_plan(
+        &mut self,
+        task: Option<&str>,
+        tags: &[(String, String)],
+        goal: Option<u32>,
+    ) -> (Answer, Vec<Effect>) {
+        let plan = &mut self.file.plan;
+        if let Some(task) = task {
+            task.clone_into(&mut plan.task);
+        }
+        for (key, value) in tags {
+            if value.is_empty() {
+                plan.tags.remove(key);
+            } else {
+                plan.tags.insert(key.clone(), value.clone());
+            }
+        }
+        if let Some(goal) = goal {
+            plan.goal = (goal > 0).then_some(goal);
+        }
+        let tags: Vec<String> = plan.tags.iter().map(|(key, value)| format!(" {key}={value}")).collect();
+        let goal = plan.goal.map(|goal| format!(", {goal} episodes wanted")).unwrap_or_default();
+        let text = format!("task {:?}{}{goal}", plan.task, tags.concat());
+        // A session without episodes leaves no file.
+        let save = (!self.file.episodes.is_empty()).then_some(Effect::Save);
+        (Answer::Now(text), save.into_iter().collect())
+    }
+
+    fn end_session(&mut self) -> Result<(Answer, Vec<Effect>), Refusal> {
+        if matches!(self.phase, Phase::Recording | Phase::Ending) {
+            return Err(Refusal::Busy);
+        }
+        if self.file.episodes.is_empty() {
+            return Err(Refusal::NoEpisode);
+        }
+        let (is_gone, kept): (Vec<_>, Vec<_>) = self.file.episodes.iter().partition(|entry| entry.discarded);
+        let gone: Vec<String> = is_gone.into_iter().map(|entry| entry.file.clone()).collect();
+        let text = format!("session ended: {} episodes kept, {} deleted", kept.len(), gone.len());
+        self.phase = Phase::Idle;
+        Ok((Answer::Now(text), vec![Effect::Close(gone)]))
+    }
+
+    /// The session that follows one that was closed, by the same plan.
+    pub fn renew(&mut self, begun: String) {
+        self.file = SessionFile { begun, ended: None, plan: self.file.plan.clone(), episodes: Vec::new() };
+        self.discarded.clear();
+    }
+
+    /// What is saved of a session that ends at `ended`: without what is deleted.
+    pub fn closed(&self, ended: String) -> SessionFile {
+        let episodes = self.file.episodes.iter().filter(|entry| !entry.discarded).cloned().collect();
+        SessionFile { ended: Some(ended), episodes, ..self.file.clone() }
+    }
+}
+
+/// The summary of a session, as Markdown.
+pub fn markdown(file: &SessionFile) -> String {
+    use std::fmt::Write as _;
+    let cell = |text: &str| crate::text::plain(text).replace('|', "\\|");
+    let kept: Vec<_> = file.episodes.iter().filter(|entry| !entry.discarded).collect();
+    let of = |grade: Grade| kept.iter().filter(|entry| entry.verdict == Some(grade)).count();
+    let seconds: f64 = kept.iter().filter_map(|entry| entry.seconds).sum();
+    let mut text = format!("# {}\n\n", cell(&file.plan.task));
+    let goal = file.plan.goal.map(|goal| format!(" of {goal} wanted")).unwrap_or_default();
+    // Writing to a string does not fail.
+    let _ = writeln!(
+        text,
+        "{} episodes{goal}, {} in all: {} GOOD, {} SUSPECT, {} BAD. Begun {}.\n",
+        kept.len(),
+        crate::text::about(Duration::from_secs_f64(seconds.max(0.0))),
+        of(Grade::Good),
+        of(Grade::Suspect),
+        of(Grade::Bad),
+        file.begun,
+    );
+    text.push_str("| episode | length | verdict | sensors | label | remarks |\n|---|---|---|---|---|---|\n");
+    for entry in kept {
+        let length = entry.seconds.map(|seconds| format!("{seconds:.1} s")).unwrap_or_default();
+        let verdict = entry.verdict.map_or("not closed", Grade::word);
+        let sensors = entry.sensors.as_ref().map(ToString::to_string).unwrap_or_default();
+        let label = entry.label.map(Label::word).unwrap_or_default();
+        let remarks = [&entry.reasons.join("; "), &entry.label_reason, &entry.note];
+        let remarks: Vec<_> = remarks.into_iter().filter(|text| !text.is_empty()).map(|text| cell(text)).collect();
+        let _ = writeln!(
+            text,
+            "| {} | {length} | {verdict} | {} | {label} | {} |",
+            cell(&entry.file),
+            cell(&sensors),
+            remarks.join("; ")
+        );
+    }
+    text
+}
+
+fn name(file: &Path) -> String {
+    file.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,204 @@
+//! The session as screens and other programs see it, and what they may request of it.
+//!
+//! Invariant: an episode of a session is identified by the name of its file, within the folder of the session.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Grade, Sensors};
+use crate::time::Stamp;
+
+/// What a screen, a pedal or another program may request of the session.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "do", rename_all = "snake_case", deny_unknown_fields)]
+pub enum SessionRequest {
+    /// Begin an episode, or end the one in progress; during a countdown or a reset, begin at once.
+    Toggle,
+    /// Begin an episode; during a countdown or a reset, at once.
+    Start,
+    /// End the episode in progress, and begin no other by itself.
+    Stop,
+    /// End the episode in progress and begin the next.
+    Next,
+    /// Discard the episode in progress, or the last one, and record it again.
+    Redo,
+    /// Move the episode in progress, or the last one, to the trash.
+    Discard,
+    /// Take the episode discarded last back from the trash.
+    Undo,
+    /// Mark this moment of the episode in progress.
+    Mark {
+        /// What the moment is, if anything is to be recorded about it.
+        #[serde(default)]
+        text: String,
+    },
+    /// Label the episode in progress, or the last one.
+    Label {
+        /// The label.
+        label: Label,
+        /// Why.
+        #[serde(default)]
+        reason: String,
+    },
+    /// Attach a note to the episode in progress, or to the last one; an empty one removes it.
+    Note {
+        /// The note.
+        text: String,
+    },
+    /// Change what the next episodes are of. Absent fields stay as they are.
+    Plan {
+        /// The task.
+        #[serde(default)]
+        task: Option<String>,
+        /// Tags to set; one with an empty value is removed.
+        #[serde(default)]
+        tags: Vec<(String, String)>,
+        /// How many episodes are wanted; 0 removes the goal.
+        #[serde(default)]
+        goal: Option<u32>,
+    },
+    /// End the session: its file is closed, and its trash is emptied.
+    EndSession,
+}
+
+/// Whether the demonstration in an episode succeeded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Label {
+    /// It did.
+    Success,
+    /// It did not.
+    Failure,
+}
+
+impl Label {
+    /// The word for it, as in JSON.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Success => "success",
+            Self::Failure => "failure",
+        }
+    }
+}
+
+impl fmt::Display for Label {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.word())
+    }
+}
+
+/// A marked moment of an episode.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Mark {
+    /// Seconds since the beginning of the episode.
+    pub at: f64,
+    /// What it is; empty if nothing was given.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub text: String,
+}
+
+/// One episode of a session.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeEntry {
+    /// Name of its file.
+    pub file: String,
+    /// When it began, RFC 3339, UTC.
+    pub begun: String,
+    /// Its length in seconds; absent while it is recorded, and if `rapid` was killed then.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seconds: Option<f64>,
+    /// Its verdict; absent likewise.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<Grade>,
+    /// Why it is not GOOD.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub reasons: Vec<String>,
+    /// Whether the demonstration succeeded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label: Option<Label>,
+    /// Why it has this label.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub label_reason: String,
+    /// A note.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub note: String,
+    /// It is in the trash.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub discarded: bool,
+    /// Marked moments.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub marks: Vec<Mark>,
+    /// Which sensors took part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sensors: Option<Sensors>,
+}
+
+impl EpisodeEntry {
+    /// Whether it counts for the goal: it is kept, and not known to be BAD.
+    pub fn counts(&self) -> bool {
+        !self.discarded && self.verdict != Some(Grade::Bad)
+    }
+}
+
+/// What the session does at the moment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(tag = "phase", rename_all = "snake_case")]
+pub enum Phase {
+    /// It waits for a request.
+    #[default]
+    Idle,
+    /// An episode begins at `until`.
+    Countdown {
+        /// When.
+        until: Stamp,
+    },
+    /// An episode is being recorded.
+    Recording,
+    /// The last samples of an episode are being written.
+    Ending,
+    /// The scene is being reset; the next episode follows at `until`.
+    Reset {
+        /// When.
+        until: Stamp,
+    },
+}
+
+/// A session, for a screen.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct SessionStatus {
+    /// Where its episodes are written.
+    #[serde(serialize_with = "crate::text::lossy")]
+    pub folder: PathBuf,
+    /// The task of the next episode.
+    pub task: String,
+    /// Its tags.
+    pub tags: Vec<(String, String)>,
+    /// How many episodes are wanted.
+    pub goal: Option<u32>,
+    /// What it does at the moment.
+    pub phase: Phase,
+    /// How many episodes count for the goal.
+    pub counted: usize,
+    /// Episodes that are kept, by verdict: GOOD, SUSPECT, BAD.
+    pub verdicts: [usize; 3],
+    /// Episodes in the trash.
+    pub discarded: usize,
+    /// The newest episodes, oldest first.
+    pub episodes: Vec<EpisodeEntry>,
+    /// Free space on the disk of the folder, bytes.
+    pub free: Option<u64>,
+}
+
+impl SessionStatus {
+    /// `12 of 50`, or `12` without a goal.
+    pub fn progress(&self) -> String {
+        match self.goal {
+            Some(goal) => format!("{} of {goal}", self.counted),
+            None => self.counted.to_string(),
+        }
+    }
+}
