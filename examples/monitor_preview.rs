@@ -15,6 +15,7 @@ use rapid::registry::{
     CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
 };
 use rapid::sample::Epoch;
+use rapid::status::session::SessionRequest;
 use rapid::status::{Board, Command, Level, LogLine, Outlook, RecordingStatus, SlotState, What};
 use rapid::time::{Stamp, realtime_ns};
 use rapid::tui;
@@ -116,15 +117,15 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
             () = shutdown.cancelled() => return,
             Some(command) = commands.recv() => match command {
                 Command::Quit => shutdown.cancel(),
-                Command::ToggleRecording => match episode.take() {
+                Command::Session(SessionRequest::Toggle) => match episode.take() {
                     Some((_, file, _)) => {
                         report(&board, Level::Info, format!("episode {} finished", file.display()));
                         board.set_last_episode(file, pretended());
                     }
                     None => episode = Some((Stamp::now(), "episodes/2026-01-01_place-block_001.mcap".into(), 0)),
                 },
-                // The preview offers none: its episodes have no file.
-                Command::DropEpisode(_) => {}
+                // Its episodes have no file.
+                Command::Session(_) => {}
                 Command::Restart(id) => states[id.index()] = SlotState::Absent,
             },
             _ = beat.tick() => {}

@@ -3,17 +3,19 @@
 //! Each stage is a tokio task that owns the threads that block for it (`stage` has the table).
 //!
 //! Shutdown: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
-//! streams and observations stop, the recorder finishes its file, the programs of devices are waited for, the mask is 0 and its files
-//! are removed, the screen shows what was recorded and restores the terminal.
+//! streams and observations stop, the recorder finishes its file, the session is saved, the programs of devices are
+//! waited for, the mask is 0 and its files are removed, the screen shows what was recorded and restores the terminal.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
 //! Invariant: an episode ends at the moment its end was requested, however slowly something closes after that.
 
 mod bus_files;
+mod collection;
 mod conductor;
 mod discovery;
 mod error;
+mod free_space;
 #[cfg_attr(not(feature = "policy"), path = "app/inference_absent.rs")]
 mod inference;
 mod requests;
@@ -51,8 +53,10 @@ use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
 use crate::rig::Rig;
 use crate::rig::presence::{Claim, Presence};
+use crate::session::journal::Plan;
 use crate::status::Board;
 use crate::time::Stamp;
+use collection::Collection;
 use conductor::Conductor;
 pub use error::AppError;
 pub use inference::PolicyOptions;
@@ -101,8 +105,10 @@ pub struct Options {
     pub devices: Devices,
     /// How the run is shown.
     pub screen: Screen,
-    /// Name and folder of an episode; its duration is that of `duration`.
+    /// Folder, modules and duration of each episode.
     pub episode: EpisodeRequest,
+    /// What the session is to collect.
+    pub plan: Plan,
     /// The policy that moves the actuator, if there is one.
     pub policy: Option<PolicyOptions>,
     /// Begin an episode at the start.
@@ -151,16 +157,16 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let Some(mask_writer) = bus.writer(TopicId::Mask) else { return Err(AppError::Panicked("the bus")) };
     let presence = Presence::start(claim, mask_writer, Arc::clone(&board))?;
 
-    let episode = EpisodeRequest { duration: options.duration, ..options.episode.clone() };
+    let out = options.episode.out.clone();
     let may_record = options.record || options.screen == Screen::Monitor;
     let reserve = registry.rig.disk_reserve;
-    let machine = Machine { registry, board, permission, signals, presence };
+    let machine = Machine { registry, board: Arc::clone(&board), permission, signals, presence };
     let watchman = bus.watchman();
-    let (mut running, mut conductor) = start(machine, &bus, options, episode).await?;
+    let (mut running, mut conductor) = start(machine, &bus, options).await?;
     // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
     // earlier one left unfinished.
     let _repairs = may_record.then(|| {
-        let repairs = Repairs::start(conductor.episode.out.clone(), reserve, Arc::clone(&conductor.board));
+        let repairs = Repairs::start(out.clone(), reserve, Arc::clone(&board));
         repairs.inspect_err(|error| tracing::warn!(%error, "unfinished episodes are not repaired")).ok()
     });
     // A panic here ends the run like any other error: the shutdown is carried out in order.
@@ -168,6 +174,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         tokio::select! {
             outcome = conductor.conduct(&mut running) => outcome,
             never = bus_files::watch(watchman) => never,
+            never = free_space::watch(&out, &board) => never,
         }
     };
     let conducted = AssertUnwindSafe(conducted).catch_unwind().await;
@@ -177,11 +184,16 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     outcome
 }
 
-/// A topic has some twenty open files in this process, and more with each subscriber: 64 devices exceed the limit of 1024
-/// that sessions and units have, and up to the hard limit a process may raise it. At that limit the run is an error.
+/// Open files of the largest rig: a topic has some twenty in this process, and more with each subscriber.
+const OPEN_FILES: u64 = 16_384;
+
+/// 64 devices exceed the limit of 1024 that sessions and units have, and up to the hard limit a process may raise it. No
+/// further than needed: programs of devices inherit the limit, and some close every file up to it.
 fn raise_open_files() {
     let limit = getrlimit(Resource::Nofile);
-    let _ = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit });
+    let wanted = limit.maximum.map_or(OPEN_FILES, |maximum| maximum.min(OPEN_FILES));
+    let current = limit.current.map(|current| current.max(wanted));
+    let _ = setrlimit(Resource::Nofile, Rlimit { current, ..limit });
 }
 
 /// What the stages of a run share.
@@ -194,15 +206,17 @@ struct Machine {
 }
 
 /// Starts the stages and the screen. The bus must outlive them.
-async fn start(
-    machine: Machine,
-    bus: &Bus,
-    options: Options,
-    episode: EpisodeRequest,
-) -> Result<(Running, Conductor), AppError> {
+async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running, Conductor), AppError> {
     let Machine { registry, board, permission, signals, presence } = machine;
     let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
+    let following = recorder.episode();
+    // Ending by itself after some time is the run's, unless it has several episodes.
+    let Plan { goal, episode_time, reset_time, .. } = options.plan;
+    let is_single = goal.is_none() && episode_time.is_none() && reset_time.is_none();
+    let duration = episode_time.or(options.duration.filter(|_| is_single));
+    let episode = EpisodeRequest { duration, ..options.episode };
+    let collection = Collection::new(recorder, episode, options.plan, &board)?;
     let kind = options.screen;
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
@@ -222,7 +236,7 @@ async fn start(
         Ok(others) => others,
         Err(error) => {
             // The recorder's thread releases the bus before the bus is dropped: no files of it remain.
-            drop(recorder);
+            drop(collection);
             let _ = recording.end().await;
             return Err(error);
         }
@@ -230,14 +244,14 @@ async fn start(
     let (to_rig, rig_commands) = mpsc::channel(16);
     let requests = requests::sorted(from_screen, to_rig);
     let mask_ended = presence.ended();
-    let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(recorder.episode());
+    let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
     let streaming = Streaming::start(rig.obeying(&permission).tapped(watched.taps()), plugged, rig_commands);
     let conductor = Conductor {
         events: board.events(),
         board,
-        recorder,
-        episode,
+        collection,
         record: options.record,
+        is_single,
         duration: options.duration,
         begin_episode: options.record,
     };
@@ -336,7 +350,7 @@ async fn finish(
             None => Ok(()),
         }
     };
-    let (ended, ()) = tokio::join!(policy_ended, conductor.end_episode());
+    let (ended, ()) = tokio::join!(policy_ended, conductor.collection.end_episode());
     keep_first(&mut outcome, ended);
     let hurry = running.streaming.hurry.clone();
     let take_down = async {
@@ -345,6 +359,7 @@ async fn finish(
         let finished = conductor.finish_episode().await;
         keep_first(&mut outcome, running.streaming.end().await);
         keep_first(&mut outcome, finished);
+        keep_first(&mut outcome, conductor.collection.close().await);
         // The recorder's thread ends when its handle is dropped: it has nothing left to write.
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);

@@ -141,6 +141,18 @@ pub struct RunArgs {
     /// Module that is mounted and has no sensor of its own; repeatable
     #[arg(long, value_name = "NAME", hide_short_help = true)]
     pub module: Vec<String>,
+    /// Episodes wanted; the session is complete once so many are kept and not BAD
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..), conflicts_with = "duration", hide_short_help = true)]
+    pub goal: Option<u32>,
+    /// End each episode after this time
+    #[arg(long, value_name = "TIME", value_parser = duration, conflicts_with = "duration", hide_short_help = true)]
+    pub episode_time: Option<Duration>,
+    /// Begin the next episode this long after the end of the last, for which the scene is reset
+    #[arg(long, value_name = "TIME", value_parser = duration, conflicts_with = "duration", hide_short_help = true)]
+    pub reset_time: Option<Duration>,
+    /// Count down this long before each episode
+    #[arg(long, value_name = "TIME", value_parser = duration, hide_short_help = true)]
+    pub countdown: Option<Duration>,
     /// Observations per second [default: from the registry]
     #[arg(long, value_name = "HZ", value_parser = rate, hide_short_help = true)]
     pub rate: Option<f64>,

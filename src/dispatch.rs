@@ -32,6 +32,7 @@ use crate::record::{self, EpisodeRequest, RecordError, inspect};
 use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
+use crate::session::journal::Plan;
 use crate::{outlet, text};
 
 #[cfg(feature = "policy")]
@@ -275,6 +276,7 @@ fn run(
         devices,
         screen,
         episode,
+        plan: plan(args),
         record: args.record,
         arm: args.arm,
         duration: args.duration,
@@ -293,6 +295,18 @@ fn request(args: &RunArgs, registry: &Registry) -> Result<EpisodeRequest, Failur
         modules: mounted.into_iter().map(|module| module.name.clone()).collect(),
         duration: args.duration,
     })
+}
+
+/// What the session is to collect.
+fn plan(args: &RunArgs) -> Plan {
+    Plan {
+        task: args.task.clone(),
+        tags: args.tag.iter().cloned().collect(),
+        goal: args.goal,
+        episode_time: args.episode_time,
+        reset_time: args.reset_time,
+        countdown: args.countdown,
+    }
 }
 
 /// Refuses a folder that cannot be written to, before any device is started.

@@ -1,23 +1,24 @@
 //! The conductor: carries out what the user, the command line and the clock request, until one of them ends the run.
 //!
-//! Invariant: the recorder alone knows whether an episode is in progress; the conductor queries it.
+//! Invariant: what concerns episodes is decided by the session ([`Collection`]), and nothing of it here.
 
 use std::ops::ControlFlow;
-use std::path::PathBuf;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
-use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 
+use super::collection::Collection;
 use super::stage::{Stage, join};
 use super::{AppError, Request, Running, Screen};
 use crate::bus;
 use crate::fault;
-use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig, Source};
+use crate::record::{RecordError, Recorder, RecorderConfig, Source};
 use crate::sample::Epoch;
+use crate::status::session::SessionRequest;
 use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 use crate::time::Stamp;
 
@@ -32,15 +33,16 @@ const SETTLE_LOOK: Duration = Duration::from_millis(20);
 /// If no device is plugged in, this is reported after this time.
 const NONE_AFTER: Duration = Duration::from_secs(3);
 /// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
-const LAST_SAMPLES: Duration = Duration::from_secs(2);
+pub(super) const LAST_SAMPLES: Duration = Duration::from_secs(2);
 
 /// Carries out requests, from the first sample to the request to end.
 pub(super) struct Conductor {
     pub(super) board: Arc<Board>,
     pub(super) events: broadcast::Receiver<Event>,
-    pub(super) recorder: Recorder,
-    pub(super) episode: EpisodeRequest,
+    pub(super) collection: Collection,
     pub(super) record: bool,
+    /// The run is for one episode, and not for a session of several.
+    pub(super) is_single: bool,
     pub(super) duration: Option<Duration>,
     /// An episode is still to begin, as soon as every device delivers samples.
     pub(super) begin_episode: bool,
@@ -61,6 +63,7 @@ impl Conductor {
         let mut output = Ok(());
         let mut bus_lost = pin!(bus::lost());
         loop {
+            let due = self.collection.due();
             tokio::select! {
                 biased;
                 () = running.signals.next() => return output,
@@ -79,7 +82,7 @@ impl Conductor {
                 },
                 // Before requests: the end of the last episode is handled before the next one begins.
                 event = self.events.recv() => {
-                    if self.episode_ended(event)? { return output; }
+                    if self.episode_ended(event, running.kind).await? { return output; }
                 }
                 Some(request) = running.requests.recv() => {
                     // A slow disk takes time to close a file: a signal does not wait for it. The recorder still carries
@@ -87,7 +90,7 @@ impl Conductor {
                     tokio::select! {
                         biased;
                         () = running.signals.next() => return output,
-                        carried_out = self.carry_out(request) => if carried_out?.is_break() { return output },
+                        carried_out = self.carry_out(request, running.kind) => if carried_out?.is_break() { return output },
                     }
                 }
                 // Nothing else depends on it: an episode and a policy continue, and the run ends as one that failed.
@@ -102,8 +105,13 @@ impl Conductor {
                 _ = look.tick(), if self.begin_episode => {
                     if self.has_settled(begun) {
                         self.begin_episode = false;
-                        self.recorder.start(self.episode.clone()).await?;
+                        self.collection.request(&SessionRequest::Start, Stamp::now(), None).await?;
                     }
+                }
+                outcome = self.collection.outcome() => self.collection.take(outcome),
+                () = reached(due) => {
+                    let begun = self.collection.tick().await;
+                    self.tolerate(begun, running.kind)?;
                 }
                 () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return output,
                 () = sleep_until(begun + NONE_AFTER), if !has_looked => {
@@ -114,10 +122,14 @@ impl Conductor {
         }
     }
 
-    async fn carry_out(&mut self, request: Request) -> Result<ControlFlow<()>, AppError> {
+    async fn carry_out(&mut self, request: Request, screen: Screen) -> Result<ControlFlow<()>, AppError> {
         match request {
-            Request::ToggleRecording(at) => self.toggle(at).await?,
-            Request::DropEpisode(file) => self.drop_episode(file).await,
+            Request::Session(request, at, reply) => {
+                // Also the one that waits for all devices to deliver is begun, or called off.
+                self.begin_episode &= !request.is_about_recording();
+                let begun = self.collection.request(&request, at, reply).await;
+                self.tolerate(begun, screen)?;
+            }
             Request::Quit => return Ok(ControlFlow::Break(())),
         }
         Ok(ControlFlow::Continue(()))
@@ -140,44 +152,23 @@ impl Conductor {
         waited >= SETTLE_LIMIT || (waited >= SETTLE_LEAST && !opening)
     }
 
-    /// Ends the episode in progress at the moment `at`, or begins one: also the one that waits for all devices to
-    /// deliver.
-    async fn toggle(&mut self, at: Stamp) -> Result<(), AppError> {
-        self.begin_episode = false;
-        // How an episode ended is announced as an event and shown by the screen.
-        let Err(RecordError::Idle) = self.recorder.stop_at(at).await else { return Ok(()) };
-        let started = self.recorder.start(self.episode.clone()).await;
-        self.board.set_not_started(started.as_ref().err().map(ToString::to_string));
-        if let Err(error) = started {
-            // In the monitor, a full disk is no reason to exit: it is reported and can be fixed.
-            tracing::error!(%error, "the episode was not begun");
+    /// In the monitor, a full disk is no reason to exit: it is reported and can be fixed. A run that is to record by
+    /// itself ends.
+    fn tolerate(&self, begun: Result<(), RecordError>, screen: Screen) -> Result<(), AppError> {
+        match begun {
+            Err(error) if self.record && screen != Screen::Monitor => Err(error.into()),
+            Err(error) => {
+                tracing::error!(%error, "the episode was not begun");
+                Ok(())
+            }
+            Ok(()) => Ok(()),
         }
-        Ok(())
-    }
-
-    /// Removes the file of the last episode if the recorder still offers that: not once another has begun.
-    async fn drop_episode(&self, file: PathBuf) {
-        if let Err(error) = self.recorder.drop_short(file).await {
-            tracing::warn!(%error, "the episode was not dropped");
-        }
-    }
-
-    /// Ends the episode in progress at this moment, and waits until its last samples are written: those captured before
-    /// may still be in transit.
-    pub(super) async fn end_episode(&self) {
-        self.recorder.end(Stamp::now());
-        let mut episode = self.recorder.episode();
-        // A stalled disk delays the file, and nothing else.
-        let _ = timeout(LAST_SAMPLES, episode.wait_for(Option::is_none)).await;
     }
 
     /// Ends the episode in progress, if there is one; an error if its file is not whole.
     pub(super) async fn finish_episode(&mut self) -> Result<(), AppError> {
-        if let Ok(report) = self.recorder.stop().await {
-            return match report.error {
-                Some(reason) => Err(AppError::Episode { file: report.file, reason }),
-                None => Ok(()),
-            };
+        if let Some(end) = self.collection.finish_episode().await {
+            return whole(end);
         }
         // It may have ended during the run without a request: the event that reports it may not be read yet.
         loop {
@@ -186,29 +177,53 @@ impl Conductor {
                 Err(TryRecvError::Lagged(count)) => Err(RecvError::Lagged(count)),
                 Err(TryRecvError::Empty | TryRecvError::Closed) => return Ok(()),
             };
-            if let Some(EpisodeEnd { file, error: Some(reason) }) = self.end_in(event) {
-                return Err(AppError::Episode { file, reason });
+            if let Some(end) = self.end_in(event) {
+                self.collection.note_last(&end);
+                whole(end)?;
             }
         }
     }
 
-    /// True when the episode the run was for has ended.
-    fn episode_ended(&mut self, event: Result<Event, RecvError>) -> Result<bool, AppError> {
-        let Some(EpisodeEnd { file, error }) = self.end_in(event).filter(|_| self.record) else { return Ok(false) };
-        match error {
-            Some(reason) => Err(AppError::Episode { file, reason }),
-            // The first episode was requested on the command line; if a duration was given too, it was the whole run.
-            None => Ok(self.duration.is_some()),
+    /// True when what the run was for has been recorded.
+    async fn episode_ended(&mut self, event: Result<Event, RecvError>, screen: Screen) -> Result<bool, AppError> {
+        let Some(end) = self.end_in(event) else { return Ok(false) };
+        let begun = self.collection.ended(&end).await;
+        if !self.record {
+            self.tolerate(begun, screen)?;
+            return Ok(false);
         }
+        whole(end)?;
+        self.tolerate(begun, screen)?;
+        // The first episode was requested on the command line; if a duration was given too, it was the whole run.
+        let is_single = self.is_single && self.duration.is_some();
+        Ok(is_single || (screen != Screen::Monitor && self.collection.is_complete()))
     }
 
     /// The end of an episode in this event, or in events that were missed.
     fn end_in(&self, event: Result<Event, RecvError>) -> Option<EpisodeEnd> {
         match event {
-            Ok(Event { what: What::Episode { file, error, .. }, .. }) => Some(EpisodeEnd { file, error }),
+            Ok(Event { what: What::Episode { file, seconds, error, verdict, .. }, .. }) => {
+                Some(EpisodeEnd { file, seconds, error, verdict })
+            }
             Err(RecvError::Lagged(_)) => self.board.last_end(),
             Ok(_) | Err(RecvError::Closed) => None,
         }
+    }
+}
+
+/// An error if the file of the episode is not whole.
+fn whole(EpisodeEnd { file, error, .. }: EpisodeEnd) -> Result<(), AppError> {
+    match error {
+        Some(reason) => Err(AppError::Episode { file, reason }),
+        None => Ok(()),
+    }
+}
+
+/// Waits until then, if it is a time.
+async fn reached(due: Option<Stamp>) {
+    match due {
+        Some(due) => tokio::time::sleep(due.since(Stamp::now())).await,
+        None => std::future::pending().await,
     }
 }
 

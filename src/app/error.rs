@@ -76,7 +76,7 @@ pub enum AppError {
     #[error("{}", bad(*count, file))]
     Bad {
         /// Episodes that are BAD.
-        count: u64,
+        count: usize,
         /// The last of them.
         file: PathBuf,
     },
@@ -88,7 +88,7 @@ pub enum AppError {
     InterruptedTwice,
 }
 
-fn bad(count: u64, file: &Path) -> String {
+fn bad(count: usize, file: &Path) -> String {
     let file = file.display();
     let many = if count > 1 { format!(", and {} before it", count - 1) } else { String::new() };
     format!("{file} is BAD{many}: its verdict above has the reasons; see `rapid inspect`")

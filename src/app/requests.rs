@@ -3,21 +3,21 @@
 //! Invariant: a request to the rig never waits for a file: it does not pass through the conductor, which waits for
 //! files to be closed. Orders to the actuator take a separate path ([`crate::permission`]).
 
-use std::path::PathBuf;
-
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 
 use crate::rig::RigCommand;
 use crate::status::Command;
+use crate::status::session::SessionRequest;
 use crate::time::Stamp;
 
+/// Receives the answer to a request: what was done, or why it was refused.
+pub(super) type Reply = Option<oneshot::Sender<Result<String, String>>>;
+
 /// A request to the conductor.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug)]
 pub(super) enum Request {
-    /// Begin an episode, or end the one in progress at this moment.
-    ToggleRecording(Stamp),
-    /// Remove this file, the last episode.
-    DropEpisode(PathBuf),
+    /// A request to the session, made at this moment.
+    Session(SessionRequest, Stamp, Reply),
     /// End the run.
     Quit,
 }
@@ -33,8 +33,7 @@ pub(super) fn sorted(
         while let Some(command) = screen.recv().await {
             // A receiver is gone only when the run ends.
             let _ = match command {
-                Command::ToggleRecording => conductor.send(Request::ToggleRecording(Stamp::now())).is_ok(),
-                Command::DropEpisode(file) => conductor.send(Request::DropEpisode(file)).is_ok(),
+                Command::Session(request) => conductor.send(Request::Session(request, Stamp::now(), None)).is_ok(),
                 Command::Quit => conductor.send(Request::Quit).is_ok(),
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
             };
@@ -54,7 +53,7 @@ mod tests {
         let (rig, mut at_rig) = mpsc::channel(1);
         let mut requests = sorted(from_screen, rig);
         for _ in 0..100 {
-            screen.send(Command::ToggleRecording).await.unwrap();
+            screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }
         screen.send(Command::Restart(ModalityId::new(3).unwrap())).await.unwrap();
         assert_eq!(at_rig.recv().await, Some(RigCommand::Restart(ModalityId::new(3).unwrap())));
@@ -64,6 +63,7 @@ mod tests {
         while let Some(one) = requests.recv().await {
             all.push(one);
         }
-        assert_eq!((all.len(), all.last()), (101, Some(&Request::Quit)));
+        assert_eq!(all.len(), 101);
+        assert!(matches!(all.last(), Some(Request::Quit)));
     }
 }

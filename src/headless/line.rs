@@ -83,7 +83,7 @@ impl Columns {
             What::State { state, .. } => palette.state(*state, &word),
             What::Episode { verdict, .. } => palette.grade(verdict.grade, &word),
             What::Recording { .. } | What::Act { .. } | What::Policy { dry_run: false, .. } => palette.good(&word),
-            What::Unregistered { .. } | What::Dropped { .. } | What::Policy { .. } => palette.warn(&word),
+            What::Unregistered { .. } | What::Discarded { .. } | What::Policy { .. } => palette.warn(&word),
             _ => palette.level(described.level, &word),
         };
         let time = palette.faint(&crate::time::time_of_day(wall_ns));

@@ -160,7 +160,10 @@ fn all_events() -> Vec<What> {
         episode(3, None),
         episode(3, Some("disk full")),
         episode(0, Some("disk nearly full")),
-        What::Dropped { file: "out/a.mcap".into(), seconds: 0.2 },
+        What::Discarded { file: "out/a.mcap".into() },
+        What::Restored { file: "out/a.mcap".into() },
+        What::Mark { text: "grasped".to_owned() },
+        What::Mark { text: String::new() },
         What::DiskLow { folder: "out".into(), free: 1_500_000_000, seconds: 252 },
         What::ClockStep { seconds: -3600.0 },
         loaded(false),
@@ -196,7 +199,10 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  episode            SUSPECT       out/a.mcap finished, 30.0 s, 1234 messages, 12.3 MB, 3 dropped, 2 of 3 sensors, without tof: cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
     22:13:20.000Z  episode            BAD           out/a.mcap.partial not whole, 30.0 s, 1234 messages, 12.3 MB, 3 dropped, 2 of 3 sensors, without tof: the file could not be written: disk full
     22:13:20.000Z  episode            BAD           out/a.mcap cut short, 30.0 s, 1234 messages, 12.3 MB, 0 dropped, 2 of 3 sensors, without tof: the file could not be written: disk nearly full
-    22:13:20.000Z  episode            dropped       episode out/a.mcap dropped; it was 0.2 s long
+    22:13:20.000Z  episode            discarded     episode out/a.mcap is in the trash
+    22:13:20.000Z  episode            restored      episode out/a.mcap is back
+    22:13:20.000Z  episode            marked        grasped marked
+    22:13:20.000Z  episode            marked        this moment marked
     22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
     22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
     22:13:20.000Z  policy             loaded        tactile-id loaded: 10 Hz, hash 0123456789ab, onnxruntime 1.22.0

@@ -4,17 +4,18 @@
 
 use std::fs::{self, File};
 use std::io::{self, Seek, SeekFrom, Write};
-use std::os::fd::AsRawFd;
+use std::os::fd::{AsFd, AsRawFd};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use rustix::fs::{Mode, OFlags};
 use serde::Serialize;
 
 use super::RecordError;
 use crate::episode::Failed;
-use crate::episode::partial::{self, Lock, PARTIAL, rename};
+use crate::episode::partial::{self, Lock, PARTIAL, TRASH, rename};
 use crate::folder::{Folder, FolderError, Links, Missing};
 use crate::status::{Board, Level, Verdict, What};
 use crate::{text, time};
@@ -74,26 +75,20 @@ pub(super) struct EpisodePath {
     pub(super) partial: PathBuf,
     /// The open file itself, independent of its names; it holds the lock.
     pub(super) file: Arc<File>,
-    /// Names that other programs know as another episode's.
-    pub(super) dropped: Vec<PathBuf>,
 }
 
 impl EpisodePath {
-    /// Takes the next free number in `out` for `task` on the day of `wall_ns` (UTC) and creates the partial file, under
-    /// none of the names `dropped`: other programs know these as another episode's.
-    pub(super) fn create(out: &Path, task: &str, wall_ns: u64, dropped: &[PathBuf]) -> Result<Self, RecordError> {
+    /// Takes the next free number in `out` for `task` on the day of `wall_ns` (UTC) and creates the partial file.
+    pub(super) fn create(out: &Path, task: &str, wall_ns: u64) -> Result<Self, RecordError> {
         let refused = |source| RecordError::Io { path: out.to_owned(), source };
         let folder = open_folder(out)?;
         let stem = format!("{}_{}_", date(wall_ns), slug(task));
         let first = next_number(&folder, &stem).map_err(refused)?;
         for number in first..first.saturating_add(ATTEMPTS) {
             let name = format!("{stem}{number:03}.mcap");
-            if dropped.contains(&out.join(&name)) {
-                continue;
-            }
             let failed = |source| RecordError::Io { path: out.join(format!("{name}.{PARTIAL}")), source };
             if let Some((file, finished, partial)) = claim(&folder, out, &name).map_err(failed)? {
-                return Ok(Self { folder, finished, partial, file: Arc::new(file), dropped: dropped.to_owned() });
+                return Ok(Self { folder, finished, partial, file: Arc::new(file) });
             }
         }
         Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
@@ -126,7 +121,7 @@ impl EpisodePath {
             let name = format!("{stem}{number:03}.mcap");
             let to = self.finished.with_file_name(&name);
             // Another recorder may be writing the file that is to have this name.
-            if self.dropped.contains(&to) || self.folder.has(format!("{name}.{PARTIAL}")) {
+            if self.folder.has(format!("{name}.{PARTIAL}")) {
                 continue;
             }
             match rename(&self.folder, &self.partial, &to) {
@@ -170,19 +165,28 @@ pub fn open_folder(out: &Path) -> Result<Folder, RecordError> {
     })
 }
 
-/// One more than the highest number of any file, finished, repaired or not, whose name begins with
+/// One more than the highest number of any file, finished, repaired, discarded or not, whose name begins with
 /// `stem`.
 ///
 /// Numbers too high for our count are ignored: another program made that name.
 fn next_number(folder: &Folder, stem: &str) -> io::Result<u32> {
+    let highest = highest_number(folder.descriptor(), stem)?;
+    // Other programs know a discarded episode by its name. A trash that cannot be read has none.
+    let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+    let trash = rustix::fs::openat(folder.descriptor(), TRASH, flags, Mode::empty()).ok();
+    let discarded = trash.and_then(|trash| highest_number(&trash, stem).ok());
+    Ok(highest.max(discarded.unwrap_or(0)) + 1)
+}
+
+fn highest_number(folder: impl AsFd, stem: &str) -> io::Result<u32> {
     let mut highest = 0;
-    for entry in rustix::fs::Dir::read_from(folder.descriptor())? {
+    for entry in rustix::fs::Dir::read_from(folder)? {
         let entry = entry?;
         let name = entry.file_name().to_str().ok().and_then(|name| name.strip_prefix(stem));
         let number = name.and_then(|rest| rest.split_once('.')?.0.parse::<u32>().ok());
         highest = highest.max(number.filter(|number| *number < LARGEST).unwrap_or(0));
     }
-    Ok(highest + 1)
+    Ok(highest)
 }
 
 /// The task as part of a file name: letters and digits of any script in lower case, one hyphen for
@@ -227,7 +231,7 @@ pub(super) fn keep(path: &EpisodePath) -> io::Result<PathBuf> {
             }
             let folder = open(partial.parent().unwrap_or(Path::new("")), Missing::Refused)?;
             let (finished, file) = (partial.with_extension(""), Arc::clone(&path.file));
-            EpisodePath { folder, finished, partial, file, dropped: path.dropped.clone() }.publish()
+            EpisodePath { folder, finished, partial, file }.publish()
         }
         Whereabouts::Removed => {
             let file = write_again(path, Content::Whole)?;
@@ -328,8 +332,7 @@ fn write_into(out: &Path, stem: &str, content: Content, path: &EpisodePath) -> i
         if content == Content::Partial {
             return Ok(partial);
         }
-        let dropped = path.dropped.clone();
-        return EpisodePath { folder, finished, partial, file: Arc::new(copy), dropped }.publish();
+        return EpisodePath { folder, finished, partial, file: Arc::new(copy) }.publish();
     }
     Err(io::Error::new(io::ErrorKind::AlreadyExists, "no free name"))
 }
@@ -384,27 +387,27 @@ mod tests {
     fn numbers_increase_and_no_existing_file_is_touched() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("made");
-        let first = EpisodePath::create(&out, "t", WALL, &[]).unwrap();
+        let first = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(first.finished.file_name().unwrap(), "20231114_t_001.mcap");
-        let second = EpisodePath::create(&out, "t", WALL, &[]).unwrap();
+        let second = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(second.partial.file_name().unwrap(), "20231114_t_002.mcap.partial");
         first.publish().unwrap();
         fs::write(out.join("20231114_t_041.mcap"), "kept").unwrap();
         fs::write(out.join("20231114_t_nonsense.mcap"), "kept").unwrap();
-        let third = EpisodePath::create(&out, "t", WALL, &[]).unwrap();
+        let third = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(third.finished.file_name().unwrap(), "20231114_t_042.mcap");
         for (number, ending) in [(50, "partial"), (60, "recovering"), (70, "damaged"), (80, "empty")] {
             fs::write(out.join(format!("20231114_t_0{number}.mcap.{ending}")), "kept").unwrap();
-            let next = EpisodePath::create(&out, "t", WALL, &[]).unwrap();
+            let next = EpisodePath::create(&out, "t", WALL).unwrap();
             assert_eq!(next.finished.file_name().unwrap(), format!("20231114_t_0{}.mcap", number + 1).as_str());
         }
-        let other = EpisodePath::create(&out, "other", WALL, &[]).unwrap();
+        let other = EpisodePath::create(&out, "other", WALL).unwrap();
         assert_eq!(other.finished.file_name().unwrap(), "20231114_other_001.mcap");
-        // A file that took the name meanwhile stays as it is; what another recorder writes and what was dropped keep
-        // their names too.
+        // A file that took the name meanwhile stays as it is; what another recorder writes and what is in the
+        // trash keep their names too.
         fs::write(&third.finished, "kept").unwrap();
-        let mut third = third;
-        third.dropped = vec![out.join("20231114_t_082.mcap")];
+        fs::create_dir(out.join(TRASH)).unwrap();
+        fs::write(out.join(TRASH).join("20231114_t_082.mcap"), "discarded").unwrap();
         let next = third.publish().unwrap();
         assert_eq!(next.file_name().unwrap(), "20231114_t_083.mcap");
         assert_eq!(fs::read_to_string(&third.finished).unwrap(), "kept");
@@ -426,7 +429,7 @@ mod tests {
         let fifo = rustix::fs::FileType::Fifo;
         rustix::fs::mknodat(rustix::fs::CWD, out.join("20231114_t_004.mcap.partial"), fifo, 0o666.into(), 0).unwrap();
         fs::write(out.join("20231114_t_4294967295.mcap"), "").unwrap();
-        let path = EpisodePath::create(&out, "t", WALL, &[]).unwrap();
+        let path = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(path.finished.file_name().unwrap(), "20231114_t_005.mcap");
         // Planted in the middle of the episode, under the name it was to get.
         symlink(&nowhere, &path.finished).unwrap();
@@ -448,7 +451,7 @@ mod tests {
             println!("NOT CHECKED: only root can give links away");
             return;
         }
-        let error = EpisodePath::create(&out, "t", WALL, &[]).unwrap_err().to_string();
+        let error = EpisodePath::create(&out, "t", WALL).unwrap_err().to_string();
         assert!(error.contains("out: a symbolic link of user 12345, which is not followed here; name"), "{error}");
     }
 
@@ -456,12 +459,12 @@ mod tests {
     fn an_impossible_folder_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let missing = folder.path().join("a/b");
-        let error = EpisodePath::create(&missing, "t", WALL, &[]).unwrap_err();
+        let error = EpisodePath::create(&missing, "t", WALL).unwrap_err();
         assert!(matches!(error, RecordError::NoFolder(_)), "{error}");
         assert!(error.to_string().contains("--out") && error.to_string().contains("a/b"));
         let file = folder.path().join("file");
         fs::write(&file, "").unwrap();
-        let error = EpisodePath::create(&file, "t", WALL, &[]).unwrap_err();
+        let error = EpisodePath::create(&file, "t", WALL).unwrap_err();
         assert!(error.to_string().contains("file: "), "{error}");
     }
 }

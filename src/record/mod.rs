@@ -78,9 +78,6 @@ pub enum RecordError {
     /// There is no episode in progress.
     #[error("not recording")]
     Idle,
-    /// Only the last episode may be dropped, if it is too short to be used and none has begun since.
-    #[error("{}: not dropped; it is not the last episode, or long enough to be used", .0.display())]
-    Kept(PathBuf),
     /// The `writer` thread has ended.
     #[error("the writer thread has ended; the log says why")]
     Ended,

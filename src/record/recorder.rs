@@ -8,10 +8,9 @@
 //! an error of the disk, a panic.
 
 use std::any::Any;
-use std::fs::{File, Metadata};
+use std::fs::File;
 use std::io;
 use std::ops::ControlFlow;
-use std::os::unix::fs::MetadataExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -30,16 +29,14 @@ use super::publishers::Publishers;
 use super::session::{Beginning, Session};
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
-use super::verdict::is_short;
 use crate::bus::{Foreign, Inbox, Queues, TopicId};
 use crate::disk::Disk;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::partial::PARTIAL;
 use crate::fault;
-use crate::folder::{Folder, Links, Missing};
 use crate::registry::Registry;
 use crate::sample::SampleHeader;
-use crate::status::{Board, Episode, EpisodeWatch, Event, Level, RecordingStatus, ShortEpisode, What};
+use crate::status::{Board, Episode, EpisodeWatch, Event, Level, RecordingStatus, What};
 use crate::time::{ClockWatch, Stamp, WallClock};
 
 /// Longest wait for samples, which delays a command, an event or a due frame.
@@ -211,15 +208,6 @@ impl Recorder {
         self.ask(RecorderOrder::Await).await
     }
 
-    /// Drops the last episode, `file`, if it is too short to be used and none has begun since. Another file that has
-    /// its name by now, or a changed one, stays.
-    ///
-    /// # Errors
-    /// When it is another episode, or the file cannot be removed.
-    pub async fn drop_short(&self, file: PathBuf) -> Result<(), RecordError> {
-        self.ask(|reply| RecorderOrder::Drop(file, reply)).await
-    }
-
     async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> RecorderOrder) -> Result<T, RecordError> {
         let (reply, answer) = oneshot::channel();
         let orders = self.orders.as_ref().ok_or(RecordError::Ended)?;
@@ -249,8 +237,6 @@ enum RecorderOrder {
     End(Stamp),
     /// Answer when the file of the episode in progress is closed.
     Await(Reply<EpisodeReport>),
-    /// Drop this file, the last episode, if it is short.
-    Drop(PathBuf, Reply<()>),
 }
 
 /// The thread's own state.
@@ -263,10 +249,6 @@ struct Writer {
     /// Those of the episode in progress, or of the time since the last one began.
     publishers: Publishers,
     session: Option<Session>,
-    /// The last episode, if it is too short to be used, until the next one begins.
-    short: Option<Short>,
-    /// Files that were dropped: their names are not reused.
-    dropped: Vec<PathBuf>,
     /// Receives the reports of the session.
     episode: watch::Sender<Option<Arc<Episode>>>,
     /// Room for the session's file.
@@ -297,8 +279,6 @@ impl Writer {
             attached: Attached::default(),
             publishers: Publishers::default(),
             session: None,
-            short: None,
-            dropped: Vec::new(),
             episode,
             space: None,
             clock,
@@ -401,9 +381,6 @@ impl Writer {
                         let _ = reply.send(Err(RecordError::Idle));
                     }
                 },
-                Ok(RecorderOrder::Drop(file, reply)) => {
-                    let _ = reply.send(self.drop_short(file));
-                }
                 Err(TryRecvError::Empty) => return true,
                 Err(TryRecvError::Disconnected) => {
                     if let Some(session) = &mut self.session {
@@ -421,7 +398,7 @@ impl Writer {
         }
         let clock = (self.config.clock)();
         let begin = (self.config.begin)();
-        let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin), &self.dropped)?;
+        let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
         // Nothing was recorded into it, and it was just created.
         let refuse = |error| {
@@ -448,8 +425,6 @@ impl Writer {
         for stop in self.config.board.stops() {
             session.event(&Event { stamp: begin, what: What::Stop(stop) });
         }
-        // Withdrawn before the next episode is shown.
-        self.set_short(None);
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
         self.session = Some(session);
@@ -524,7 +499,6 @@ impl Writer {
         board.set_recording(None);
         if report.file.extension().is_none_or(|extension| extension != PARTIAL) {
             board.set_last_episode(report.file.clone(), report.verdict.clone());
-            self.set_short(Short::of(&report));
         }
         let board = &self.config.board;
         let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = report.clone();
@@ -532,22 +506,6 @@ impl Writer {
         for reply in self.waiting.drain(..) {
             let _ = reply.send(Ok(report.clone()));
         }
-    }
-
-    fn set_short(&mut self, short: Option<Short>) {
-        self.config.board.set_short_episode(short.as_ref().map(Short::offer));
-        self.short = short;
-    }
-
-    fn drop_short(&mut self, file: PathBuf) -> Result<(), RecordError> {
-        let Some(short) = self.short.take_if(|short| short.is(&file)) else { return Err(RecordError::Kept(file)) };
-        // Tried once: a file that cannot be removed is not offered again.
-        self.set_short(None);
-        let seconds = short.remove().map_err(|source| RecordError::Io { path: file.clone(), source })?;
-        self.config.board.forget_last_episode();
-        self.dropped.push(file.clone());
-        self.config.board.announce(What::Dropped { file, seconds });
-        Ok(())
     }
 
     fn complain_about_bus(&mut self, error: &str) {
@@ -566,63 +524,4 @@ impl Writer {
 fn panic_text(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("no message")
-}
-
-/// The last episode, if it is too short to be used and so may be dropped.
-///
-/// Only the file that existed when the episode ended is ever removed: a changed file, or another of the same name,
-/// stays.
-struct Short {
-    path: PathBuf,
-    seconds: f64,
-    folder: Folder,
-    /// Kept open: no other file gets its inode number.
-    file: File,
-    /// Its metadata as the recorder left it.
-    left: Metadata,
-}
-
-impl Short {
-    /// The episode, if it is finished and short.
-    fn of(report: &EpisodeReport) -> Option<Self> {
-        if !is_short(report.seconds) {
-            return None;
-        }
-        let path = report.file.clone();
-        // A file that cannot be reopened is not offered: only a convenience is lost.
-        let folder = Folder::open(path.parent()?, Links::Own, Missing::Refused).ok()?;
-        let file = folder.open_file(path.file_name()?).ok()?;
-        let left = file.metadata().ok()?;
-        Some(Self { path, seconds: report.seconds, folder, file, left })
-    }
-
-    /// For the screen.
-    fn offer(&self) -> ShortEpisode {
-        ShortEpisode { file: self.path.clone(), length: Duration::from_secs_f64(self.seconds.max(0.0)) }
-    }
-
-    /// Whether this is its file.
-    fn is(&self, file: &Path) -> bool {
-        self.path == file
-    }
-
-    /// Removes the file; returns the length of the episode in seconds.
-    ///
-    /// # Errors
-    /// When the file was changed, replaced or removed since the episode ended, or cannot be removed.
-    fn remove(self) -> io::Result<f64> {
-        let name = self.path.file_name().unwrap_or_default();
-        let now = self.folder.open_file(name)?.metadata()?;
-        if as_written(&now) != as_written(&self.left) {
-            return Err(io::Error::other("changed since the episode ended; remove it by hand"));
-        }
-        self.folder.remove(name)?;
-        drop(self.file);
-        Ok(self.seconds)
-    }
-}
-
-/// The attributes that differ between two files, and between a file before and after a write.
-fn as_written(file: &Metadata) -> (u64, u64, u64, i64, i64) {
-    (file.dev(), file.ino(), file.len(), file.mtime(), file.mtime_nsec())
 }

@@ -4,7 +4,6 @@ mod episode;
 mod faults;
 mod room;
 mod session;
-mod short;
 mod tampering;
 
 use std::collections::{BTreeMap, VecDeque};

@@ -177,6 +177,17 @@ impl Journal {
         Ok(())
     }
 
+    /// Writes the summary of the session beside its file, as Markdown.
+    ///
+    /// # Errors
+    /// When the disk does not accept it.
+    pub fn summarise(&self, file: &SessionFile) -> Result<(), JournalError> {
+        let name = format!("session-{}.md", compact(&file.begun));
+        let io = |source| JournalError::Io { path: self.folder.join(&name), source };
+        let folder = Folder::open(&self.folder, Links::Own, Missing::Refused).map_err(|error| io(error.into()))?;
+        folder.replace(&name, super::markdown(file).as_bytes(), 0o644, Sync::Wait).map_err(io)
+    }
+
     /// Gives the file the name of a session that has ended.
     ///
     /// # Errors

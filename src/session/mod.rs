@@ -3,11 +3,13 @@
 //! [`Session`] is a pure core: requests, begins and ends of episodes and the time go in, [`Effect`]s come out. Its owner
 //! carries them out and reports how they ended.
 //!
-//! Invariant: pure: no clock, no file, no recorder. [`journal`] is its file and [`trash`] its folder.
+//! Invariant: pure: no clock, no file, no recorder. [`journal`] is its file, [`trash`] its folder, and [`keeper`] the
+//! thread that changes both.
 //! Invariant: an episode is never deleted before the session ends: discarding moves it to the trash.
 //! Invariant: the journal is saved at every change, before anything else happens to the episode.
 
 pub mod journal;
+pub mod keeper;
 pub mod trash;
 
 use std::path::{Path, PathBuf};
@@ -103,7 +105,6 @@ pub struct Session {
     current: Option<(usize, Stamp)>,
     /// Entries that were discarded, in that order.
     discarded: Vec<usize>,
-    free: Option<u64>,
 }
 
 impl Session {
@@ -124,7 +125,6 @@ impl Session {
             after: After::default(),
             current: None,
             discarded,
-            free: None,
         };
         (session, is_new)
     }
@@ -152,11 +152,6 @@ impl Session {
     /// Whether there is a goal and it is reached.
     pub fn is_complete(&self) -> bool {
         self.file.plan.goal.is_some_and(|goal| self.counted() >= usize::try_from(goal).unwrap_or(usize::MAX))
-    }
-
-    /// Reports the free space on the disk, bytes.
-    pub fn set_free(&mut self, free: Option<u64>) {
-        self.free = free;
     }
 
     /// When [`Self::tick`] is to be called next, if at all.
@@ -289,7 +284,7 @@ impl Session {
             verdicts,
             discarded: self.discarded.len(),
             episodes: episodes.get(episodes.len().saturating_sub(LISTED)..).unwrap_or_default().to_vec(),
-            free: self.free,
+            answer: None,
         }
     }
 

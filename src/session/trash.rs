@@ -9,10 +9,8 @@ use std::path::Path;
 use rustix::fs::RenameFlags;
 use rustix::io::Errno;
 
+use crate::episode::partial::TRASH;
 use crate::folder::{Folder, Links, Missing};
-
-/// The name of the folder.
-pub const TRASH: &str = ".trash";
 
 /// Whether this is the name of an episode's file, and not a path.
 pub fn is_name(name: &str) -> bool {

@@ -14,9 +14,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
+use super::session::SessionStatus;
 use super::{
-    DeviceStatus, Event, Grade, LogLine, PolicyStatus, RecordingStatus, ShortEpisode, SlotState, Snapshot, StopStatus,
-    Verdict, What,
+    DeviceStatus, Event, Grade, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, StopStatus, Verdict, What,
 };
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
@@ -57,61 +57,66 @@ impl StreamCounters {
     }
 }
 
-/// The end of an episode: its file, and why the file is not whole, if it is not.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// The end of an episode, as in `What::Episode`.
+#[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeEnd {
-    /// As in `What::Episode`.
+    /// Its file.
     pub file: PathBuf,
-    /// As in `What::Episode`.
+    /// Its length.
+    pub seconds: f64,
+    /// Why the file is not whole, if it is not.
     pub error: Option<String>,
+    /// The verdict.
+    pub verdict: Verdict,
 }
 
-/// The episodes of a run, without those dropped.
+/// The episodes of a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct EpisodeCounts {
-    /// How many of each grade: good, suspect, bad.
-    counts: [u64; 3],
-    /// The last one.
-    last: Option<(PathBuf, Grade)>,
-    /// The last bad one.
-    last_bad: Option<PathBuf>,
-    /// Where the newest one was written.
-    folder: PathBuf,
+    /// Files and grades, oldest first.
+    kept: Vec<(PathBuf, Grade)>,
+    /// Those that were discarded, likewise.
+    discarded: Vec<(PathBuf, Grade)>,
 }
 
 impl EpisodeCounts {
-    fn add(&mut self, file: &Path, grade: Grade) {
-        self.counts[grade as usize] += 1;
-        self.last = Some((file.to_owned(), grade));
-        file.parent().unwrap_or(Path::new("")).clone_into(&mut self.folder);
-        if grade == Grade::Bad {
-            self.last_bad = Some(file.to_owned());
-        }
-    }
-
-    /// Only the last one can be dropped.
-    fn drop_last(&mut self) {
-        if let Some((_, grade)) = self.last.take() {
-            self.counts[grade as usize] -= 1;
+    fn note(&mut self, what: &What) {
+        match what {
+            What::Episode { file, verdict, .. } => self.kept.push((file.clone(), verdict.grade)),
+            What::Discarded { file } => shift(&mut self.kept, &mut self.discarded, file),
+            What::Restored { file } => shift(&mut self.discarded, &mut self.kept, file),
+            _ => {}
         }
     }
 
     /// How many BAD ones there are, and the file of the last; `None` if there is none.
-    pub fn bad(&self) -> Option<(u64, PathBuf)> {
-        let count = self.counts[Grade::Bad as usize];
-        self.last_bad.clone().filter(|_| count > 0).map(|file| (count, file))
+    pub fn bad(&self) -> Option<(usize, PathBuf)> {
+        let bad = || self.kept.iter().filter(|(_, grade)| *grade == Grade::Bad);
+        bad().next_back().map(|(file, _)| (bad().count(), file.clone()))
     }
 
     /// For people: how many there are, and how to continue; `None` without any.
     pub fn summary(&self) -> Option<String> {
-        let [good, suspect, bad] = self.counts;
-        let all = good + suspect + bad;
-        let episodes = if all == 1 { "episode" } else { "episodes" };
-        let folder = text::plain(&self.folder.to_string_lossy()).into_owned();
-        let text = format!(
-            "{all} {episodes} in {folder} ({good} GOOD, {suspect} SUSPECT, {bad} BAD); next: rapid inspect {folder}"
-        );
-        (all > 0).then_some(text)
+        let [good, suspect, bad] = [Grade::Good, Grade::Suspect, Grade::Bad]
+            .map(|grade| self.kept.iter().filter(|(_, other)| *other == grade).count());
+        let (last, _) = self.kept.last()?;
+        let episodes = if self.kept.len() == 1 { "episode" } else { "episodes" };
+        let folder = text::plain(&last.parent().unwrap_or(Path::new("")).to_string_lossy()).into_owned();
+        let discarded = match self.discarded.len() {
+            0 => String::new(),
+            count => format!("; {count} in the trash"),
+        };
+        Some(format!(
+            "{} {episodes} in {folder} ({good} GOOD, {suspect} SUSPECT, {bad} BAD{discarded}); next: rapid inspect {folder}",
+            self.kept.len()
+        ))
+    }
+}
+
+/// Moves the episode `file` from one list to another.
+fn shift(from: &mut Vec<(PathBuf, Grade)>, to: &mut Vec<(PathBuf, Grade)>, file: &Path) {
+    if let Some(index) = from.iter().rposition(|(other, _)| other == file) {
+        to.push(from.remove(index));
     }
 }
 
@@ -137,7 +142,8 @@ pub struct Board {
     not_started: Mutex<Option<String>>,
     policy: Mutex<Option<PolicyStatus>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
-    short_episode: Mutex<Option<ShortEpisode>>,
+    session: Mutex<Option<SessionStatus>>,
+    disk_free: Mutex<Option<u64>>,
     last_end: Mutex<Option<EpisodeEnd>>,
     episodes: Mutex<EpisodeCounts>,
     log: Mutex<VecDeque<LogLine>>,
@@ -162,7 +168,8 @@ impl Board {
             not_started: Mutex::new(None),
             policy: Mutex::new(None),
             last_episode: Mutex::new(None),
-            short_episode: Mutex::new(None),
+            session: Mutex::new(None),
+            disk_free: Mutex::new(None),
             last_end: Mutex::new(None),
             episodes: Mutex::new(EpisodeCounts::default()),
             log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
@@ -236,14 +243,14 @@ impl Board {
         *lock(&self.last_episode) = Some((file, verdict));
     }
 
-    /// Reports that the last finished file was removed.
-    pub fn forget_last_episode(&self) {
-        *lock(&self.last_episode) = None;
+    /// Reports the session.
+    pub fn set_session(&self, session: SessionStatus) {
+        *lock(&self.session) = Some(session);
     }
 
-    /// Reports the episode that may be dropped, or that there is none.
-    pub fn set_short_episode(&self, short: Option<ShortEpisode>) {
-        *lock(&self.short_episode) = short;
+    /// Reports the free space on the disk of the episodes, bytes.
+    pub fn set_disk_free(&self, free: Option<u64>) {
+        *lock(&self.disk_free) = free;
     }
 
     /// Adds a line to the log, without characters from a device that could move a terminal's cursor.
@@ -263,13 +270,11 @@ impl Board {
         if let Some((level, text)) = what.log_line() {
             self.log(LogLine { wall_ns: realtime_ns(), level, text });
         }
-        if let What::Episode { file, error, verdict, .. } = &what {
-            *lock(&self.last_end) = Some(EpisodeEnd { file: file.clone(), error: error.clone() });
-            lock(&self.episodes).add(file, verdict.grade);
+        if let What::Episode { file, seconds, error, verdict, .. } = &what {
+            let (file, error, verdict) = (file.clone(), error.clone(), verdict.clone());
+            *lock(&self.last_end) = Some(EpisodeEnd { file, seconds: *seconds, error, verdict });
         }
-        if let What::Dropped { .. } = &what {
-            lock(&self.episodes).drop_last();
-        }
+        lock(&self.episodes).note(&what);
         // An error only means that there is no subscriber.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
     }
@@ -324,7 +329,8 @@ impl Board {
             policy: lock(&self.policy).clone(),
             last_episode,
             last_verdict,
-            short_episode: lock(&self.short_episode).clone(),
+            session: lock(&self.session).clone(),
+            disk_free: *lock(&self.disk_free),
             log: lock(&self.log).iter().cloned().collect(),
         }
     }

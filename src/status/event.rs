@@ -109,13 +109,22 @@ pub enum What {
         #[serde(flatten)]
         verdict: Verdict,
     },
-    /// An episode too short to be used was removed at the user's request.
-    Dropped {
+    /// An episode was moved to the trash.
+    Discarded {
+        /// The file, as it was.
+        #[serde(serialize_with = "text::lossy")]
+        file: PathBuf,
+    },
+    /// An episode was taken back from the trash.
+    Restored {
         /// The file.
         #[serde(serialize_with = "text::lossy")]
         file: PathBuf,
-        /// Length in seconds.
-        seconds: f64,
+    },
+    /// A moment of the episode in progress was marked.
+    Mark {
+        /// What it is; may be empty.
+        text: String,
     },
     /// The disk of the episode in progress is nearly full; reported once per episode.
     DiskLow {
@@ -329,9 +338,15 @@ impl What {
                     .without("recording ")
             }
             Self::Episode { .. } => self.describe_episode(),
-            Self::Dropped { file, seconds } => {
-                let sentence = format!("episode {} dropped; it was {seconds:.1} s long", file.display());
-                D::of(Level::Info, "episode", "dropped", sentence)
+            Self::Discarded { file } => {
+                D::of(Level::Info, "episode", "discarded", format!("episode {} is in the trash", file.display()))
+            }
+            Self::Restored { file } => {
+                D::of(Level::Info, "episode", "restored", format!("episode {} is back", file.display()))
+            }
+            Self::Mark { text } => {
+                let text = if text.is_empty() { "this moment" } else { text };
+                D::of(Level::Info, "episode", "marked", format!("{text} marked"))
             }
             // Data was lost before this run began.
             Self::Recovered { text, .. } => D::of(Level::Warn, "episode", "repaired", text.clone()),

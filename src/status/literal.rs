@@ -56,7 +56,8 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         policy: None,
         last_episode: None,
         last_verdict: None,
-        short_episode: None,
+        session: None,
+        disk_free: None,
         log: Vec::new(),
     }
 }

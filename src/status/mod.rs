@@ -25,6 +25,8 @@ use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
 
+use session::{SessionRequest, SessionStatus};
+
 pub use board::{Board, EpisodeCounts, EpisodeEnd};
 pub use event::Description;
 pub use event::{Event, Provenance, What};
@@ -221,8 +223,10 @@ pub struct Snapshot {
     pub last_episode: Option<PathBuf>,
     /// The verdict on it.
     pub last_verdict: Option<Verdict>,
-    /// The last episode, while it may still be dropped because it is too short to be used.
-    pub short_episode: Option<ShortEpisode>,
+    /// The session, if the run records.
+    pub session: Option<SessionStatus>,
+    /// Free space on the disk of the episodes, bytes.
+    pub disk_free: Option<u64>,
     /// The newest log lines, oldest first.
     pub log: Vec<LogLine>,
 }
@@ -230,10 +234,8 @@ pub struct Snapshot {
 /// A request from a screen.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Command {
-    /// Begin an episode, or end the one in progress.
-    ToggleRecording,
-    /// Remove this file: the last episode, if it is too short to be used and none has begun since.
-    DropEpisode(PathBuf),
+    /// A request to the session.
+    Session(SessionRequest),
     /// Start a failed device again.
     Restart(ModalityId),
     /// End the program.
@@ -349,16 +351,6 @@ pub struct Episode {
     pub file: PathBuf,
     /// The file, once the episode has ended.
     ended: SetOnce<PathBuf>,
-}
-
-/// The last episode, while it may still be dropped because it is too short to be used.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct ShortEpisode {
-    /// Its file.
-    #[serde(serialize_with = "text::lossy")]
-    pub file: PathBuf,
-    /// Its length.
-    pub length: Duration,
 }
 
 /// The episode in progress, if any; notifies of changes.

@@ -24,6 +24,8 @@ pub struct Rates {
 struct Point {
     taken: Stamp,
     publications: u64,
+    /// Payload bytes of all devices.
+    delivered: u64,
     recorded: Option<(std::path::PathBuf, u64)>,
     streams: [Stream; MAX_MODALITIES],
 }
@@ -50,7 +52,13 @@ impl Rates {
             }
         }
         let recorded = snapshot.recording.as_ref().map(|recording| (recording.file.clone(), recording.bytes));
-        self.window.push_back(Point { taken: snapshot.taken, publications: snapshot.mask_sequence, recorded, streams });
+        self.window.push_back(Point {
+            taken: snapshot.taken,
+            publications: snapshot.mask_sequence,
+            delivered: snapshot.devices.iter().fold(0, |sum, device| sum.saturating_add(device.bytes)),
+            recorded,
+            streams,
+        });
         // One measurement at or beyond the window's edge is kept, so that the window is never shorter than full.
         while self.window.get(1).is_some_and(|second| snapshot.taken.since(second.taken) >= WINDOW) {
             self.window.pop_front();
@@ -82,6 +90,12 @@ impl Rates {
     pub fn publications(&self) -> f64 {
         let Some((first, last)) = self.ends() else { return 0.0 };
         per_second(last.publications.saturating_sub(first.publications), last.taken.since(first.taken))
+    }
+
+    /// Payload bytes per second that all devices deliver.
+    pub fn delivered(&self) -> f64 {
+        let Some((first, last)) = self.ends() else { return 0.0 };
+        per_second(last.delivered.saturating_sub(first.delivered), last.taken.since(first.taken))
     }
 
     /// Payload bytes per second written to the episode in progress.
@@ -153,7 +167,8 @@ mod tests {
             }),
             last_episode: None,
             last_verdict: None,
-            short_episode: None,
+            session: None,
+            disk_free: None,
             log: Vec::new(),
         }
     }

@@ -63,6 +63,13 @@ pub enum SessionRequest {
     EndSession,
 }
 
+impl SessionRequest {
+    /// Whether an episode begins or ends by it.
+    pub const fn is_about_recording(&self) -> bool {
+        matches!(self, Self::Toggle | Self::Start | Self::Stop | Self::Next | Self::Redo | Self::Discard)
+    }
+}
+
 /// Whether the demonstration in an episode succeeded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -167,6 +174,17 @@ pub enum Phase {
     },
 }
 
+/// An answer to a request.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Answered {
+    /// When.
+    pub at: Stamp,
+    /// What was done, or why the request was refused.
+    pub text: String,
+    /// It was refused.
+    pub refused: bool,
+}
+
 /// A session, for a screen.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct SessionStatus {
@@ -189,8 +207,8 @@ pub struct SessionStatus {
     pub discarded: usize,
     /// The newest episodes, oldest first.
     pub episodes: Vec<EpisodeEntry>,
-    /// Free space on the disk of the folder, bytes.
-    pub free: Option<u64>,
+    /// The last answer to a request.
+    pub answer: Option<Answered>,
 }
 
 impl SessionStatus {

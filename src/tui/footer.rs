@@ -4,9 +4,9 @@ use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
+use super::keys;
 use super::model::{Model, Quit};
 use super::theme::Theme;
-use crate::status::SlotState;
 use crate::text;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
@@ -16,6 +16,9 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
         Quit::Ending => Some("quitting".to_owned()),
         Quit::No => model.notice().map(|notice| theme.safe(notice)),
     };
+    if let Some((question, text)) = model.prompt().filter(|_| model.quit == Quit::No) {
+        return prompt(frame, area, question, &theme.safe(text), theme);
+    }
     let line = match message {
         Some(message) => {
             let message = text::cut(&message, usize::from(area.width).saturating_sub(2), theme.ellipsis()).into_owned();
@@ -26,16 +29,22 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     frame.render_widget(line, area);
 }
 
+/// The question, and the end of what is typed.
+fn prompt(frame: &mut Frame<'_>, area: Rect, question: &str, text: &str, theme: Theme) {
+    let room = usize::from(area.width).saturating_sub(question.len() + 2);
+    let mut from = 0;
+    while text::width(text.get(from..).unwrap_or_default()) > room {
+        from += text.get(from..).and_then(|rest| rest.chars().next()).map_or(1, char::len_utf8);
+    }
+    let cursor = Span::styled(theme.symbol("█", "_"), theme.warning());
+    let typed = Span::raw(text.get(from..).unwrap_or_default().to_owned());
+    frame.render_widget(Line::from(vec![Span::styled(format!(" {question}"), theme.warning()), typed, cursor]), area);
+}
+
 /// As many keys as fit, the most used first; `?` and `q` always.
 fn keys(width: usize, model: &Model, theme: Theme) -> Line<'static> {
-    let episode = if model.is_recording() { "end episode" } else { "start episode" };
-    let failed = model.selected_device().is_some_and(|device| device.state == SlotState::Failed);
-    let mut keys = vec![("space", episode), (theme.symbol("↑↓", "up/dn"), "select")];
-    if failed {
-        keys.push(("r", "restart"));
-    }
-    keys.extend([("p", if model.is_paused() { "continue" } else { "pause" }), ("pgup/pgdn", "log")]);
-    let last = [("?", "help"), ("q", "quit")];
+    let mut keys = keys::footer(model);
+    let last = keys.split_off(keys.len().saturating_sub(2));
     let columns = |(key, meaning): (&str, &str)| text::width(key) + text::width(meaning) + 4;
     let mut room = width.saturating_sub(last.iter().map(|key| columns(*key)).sum::<usize>() + 1);
     let mut spans = vec![Span::raw(" ")];
@@ -51,6 +60,6 @@ fn keys(width: usize, model: &Model, theme: Theme) -> Line<'static> {
 }
 
 fn push(spans: &mut Vec<Span<'static>>, (key, meaning): (&'static str, &'static str), theme: Theme) {
-    spans.push(Span::styled(key, theme.title()));
+    spans.push(Span::styled(key.replace(", ", "/"), theme.title()));
     spans.push(Span::styled(format!(" {meaning}   "), theme.faint()));
 }

@@ -6,25 +6,12 @@ use ratatui::style::Modifier;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 
+use super::keys;
 use super::theme::Theme;
 use crate::status::SlotState;
 
 /// Width of the box with its border and padding.
 const WIDTH: u16 = 58;
-const KEYS: [(&str, &str); 11] = [
-    ("space", "start an episode, end the one in progress"),
-    ("x, y", "delete the last episode, if it is short"),
-    ("up, down", "select a device"),
-    ("r", "restart the selected device, if it failed"),
-    ("a, ctrl-y", "arm the actuator: motors follow actions"),
-    ("d, esc", "disarm it, in every dialog: motors are off"),
-    ("p", "pause the view; everything else continues"),
-    ("pgup, pgdn", "scroll the log; esc goes to its end"),
-    ("?", "this help"),
-    ("q, ctrl-c", "quit; ctrl-c disarms first"),
-    ("", ""),
-];
-
 const STATES: [(SlotState, &str); 6] = [
     (SlotState::Streaming, "samples arrive; bit set"),
     (SlotState::Stalled, "attached, samples have stopped; bit set"),
@@ -35,18 +22,17 @@ const STATES: [(SlotState, &str); 6] = [
 ];
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
-    let keys = KEYS
-        .iter()
-        .map(|(key, meaning)| Line::from(vec![Span::styled(format!("{key:<12}"), theme.title()), Span::raw(*meaning)]));
+    let keys = keys::help()
+        .map(|(key, meaning)| Line::from(vec![Span::styled(format!("{key:<12}"), theme.title()), Span::raw(meaning)]));
     let states = STATES.iter().map(|(state, meaning)| {
         let word = format!("{} {:<10}", theme.state_symbol(*state), state.word());
         Line::from(vec![Span::styled(word, theme.state(*state)), Span::raw(*meaning)])
     });
-    let mut lines: Vec<_> = keys.chain(states).collect();
+    let mut lines: Vec<_> = keys.chain(std::iter::once(Line::default())).chain(states).collect();
     let room = usize::from(area.height.saturating_sub(2));
     if lines.len() > room {
         // A low screen shows only the keys.
-        lines.truncate(KEYS.len() - 1);
+        lines.truncate(keys::help().count());
     }
     let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).saturating_add(2).min(area.height);
     let [middle] = Layout::vertical([Constraint::Length(height)]).flex(Flex::Center).areas(area);
@@ -67,7 +53,7 @@ mod tests {
     #[test]
     fn no_line_is_cut() {
         let longest =
-            KEYS.iter().map(|(_, meaning)| meaning.len()).chain(STATES.iter().map(|(_, meaning)| meaning.len()));
+            keys::help().map(|(_, meaning)| meaning.len()).chain(STATES.iter().map(|(_, meaning)| meaning.len()));
         assert!(longest.max().expect("lines") + 12 <= usize::from(WIDTH) - 4);
     }
 }

@@ -9,10 +9,12 @@
 //! while it is behind.
 
 mod devices;
+mod episodes;
 pub mod flashlight;
 mod footer;
 mod header;
 mod help;
+mod keys;
 mod log;
 mod mask;
 pub mod model;

@@ -3,20 +3,20 @@
 //! Snapshots and keys come in as [`Msg`], requests to the rest of the program go out as [`Effect`]; the
 //! views only read.
 //!
-//! Invariant: only the file named in the question is deleted, and only while that is still offered. Keys that arrive
-//! immediately, such as text pasted into a terminal that does not mark it, confirm nothing.
+//! Invariant: no key deletes anything: discarding moves to the trash, and the end of a session is confirmed by a word.
 //! Invariant: pure: no clock, no terminal, no channel; time comes from the snapshots.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
+use super::keys::{self, Act};
 use super::theme::Edge;
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::permission::Void;
 use crate::status::rates::Rates;
+use crate::status::session::{Label, SessionRequest};
 use crate::status::{Command, DeviceStatus, SlotState, Snapshot};
 use crate::time::Stamp;
 
@@ -24,8 +24,8 @@ use crate::time::Stamp;
 const EDGE_SHOWN: Duration = Duration::from_secs(1);
 /// How long the answer to a key stays in the footer.
 const NOTICE_SHOWN: Duration = Duration::from_secs(4);
-/// A press of the space bar so soon after the last one is the repeat of a held key, which few terminals distinguish, or
-/// a hand that trembles.
+/// A key that begins or ends an episode, pressed so soon after the last one, is the repeat of a held key, which few
+/// terminals distinguish, or a hand that trembles.
 const PRESS_AGAIN: Duration = Duration::from_millis(400);
 
 /// Something that happened.
@@ -82,6 +82,8 @@ pub struct Totals {
     pub publications: f64,
     /// Bytes per second written to the episode.
     pub recorded: f64,
+    /// Bytes per second that the devices deliver.
+    pub delivered: f64,
 }
 
 /// The state of the screen.
@@ -106,9 +108,9 @@ pub struct Model {
     pub(super) quit: Quit,
     /// When the user asked to arm the actuator: the next key confirms or cancels.
     arming: Option<Stamp>,
-    /// The user asked to drop the last episode: the next key confirms or cancels.
-    dropping: Option<DropQuestion>,
-    /// When the space bar was last pressed.
+    /// The text that is being typed.
+    prompt: Option<Prompt>,
+    /// When a key that begins or ends an episode was last pressed.
     pressed: Option<Stamp>,
     notice: Option<Notice>,
 }
@@ -148,7 +150,7 @@ impl Model {
             help: false,
             quit: Quit::No,
             arming: None,
-            dropping: None,
+            prompt: None,
             pressed: None,
             notice: None,
         };
@@ -188,7 +190,13 @@ impl Model {
             self.scroll += lines_since(&self.latest, &snapshot);
         }
         let refresh = self.rates.update(&snapshot);
+        let answer = snapshot.session.as_ref().and_then(|session| session.answer.clone());
+        let known = self.latest.session.as_ref().and_then(|session| session.answer.as_ref());
+        let news = answer.filter(|answer| known != Some(answer));
         self.latest = snapshot;
+        if let Some(answer) = news {
+            self.notify(&answer.text);
+        }
         if refresh && self.frozen.is_none() {
             self.read();
         }
@@ -202,7 +210,11 @@ impl Model {
     }
 
     fn read(&mut self) {
-        self.totals = Totals { publications: self.rates.publications(), recorded: self.rates.recorded() };
+        self.totals = Totals {
+            publications: self.rates.publications(),
+            recorded: self.rates.recorded(),
+            delivered: self.rates.delivered(),
+        };
         for device in &self.latest.devices {
             if let Some(reading) = self.readings.get_mut(device.id.index()) {
                 let age = device.newest.map(|newest| self.latest.taken.since(newest));
@@ -212,51 +224,85 @@ impl Model {
     }
 
     fn key(&mut self, key: KeyEvent) -> Effect {
-        let control = key.modifiers.contains(KeyModifiers::CONTROL);
+        let act = keys::act(key);
         // Only the next key confirms.
         let arming = self.arming.take();
-        match key.code {
-            KeyCode::Char('c') if control => {
+        // The keys that stop motion work everywhere; letters are text while one is typed.
+        match act {
+            Some(Act::Interrupt) => {
                 // Nothing moves while the user is being asked.
                 let effect = self.ask_to_quit();
                 return if effect == Effect::None { Effect::Order(Order::Disarm) } else { effect };
             }
-            KeyCode::Char('y') if control && key.kind == KeyEventKind::Press => return self.arm(arming),
-            // The keys that stop motion work everywhere, with any modifier.
-            KeyCode::Char('d' | 'D') | KeyCode::Esc => return self.disarm(key.code == KeyCode::Esc),
-            KeyCode::Char(_) if control || key.modifiers.contains(KeyModifiers::ALT) => return Effect::None,
-            KeyCode::Char('q') => return self.ask_to_quit(),
+            Some(Act::Escape) => return self.disarm(true),
+            _ => {}
+        }
+        if let Some(prompt) = self.prompt.take() {
+            return self.type_into(prompt, key);
+        }
+        match act {
+            Some(Act::Disarm) => return self.disarm(false),
+            Some(Act::Arm) => return self.arm(arming),
+            Some(Act::Quit) => return self.ask_to_quit(),
+            None if key.modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) => return Effect::None,
             _ => {}
         }
         // Any other key cancels.
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
-        let dropping = self.dropping.take();
         if self.help {
             // The key that closes the help has no other effect.
             self.help = false;
             return Effect::None;
         }
-        match key.code {
-            // A held key must not start and stop episodes at the keyboard's repeat rate.
-            KeyCode::Char(' ') if key.kind == KeyEventKind::Press => return self.toggle_recording(),
-            KeyCode::Char('r') => return self.restart(),
-            KeyCode::Char('a') if key.kind == KeyEventKind::Press => self.ask_to_arm(),
-            KeyCode::Char('x') if key.kind == KeyEventKind::Press => self.ask_to_drop(),
-            KeyCode::Char('y') if key.kind == KeyEventKind::Press => return self.drop_episode(dropping),
-            KeyCode::Char('p') => self.toggle_pause(),
-            KeyCode::Char('?') | KeyCode::F(1) => self.help = true,
-            KeyCode::Up | KeyCode::Char('k') => self.selected = self.selected.saturating_sub(1),
-            KeyCode::Down | KeyCode::Char('j') => self.selected += 1,
-            KeyCode::Home => self.selected = 0,
-            KeyCode::End => self.selected = usize::MAX,
-            KeyCode::PageUp => self.scroll += SCROLL_STEP,
-            KeyCode::PageDown => self.scroll = self.scroll.saturating_sub(SCROLL_STEP),
-            _ => {}
-        }
+        let effect = act.map_or(Effect::None, |act| self.act(act));
         self.keep_in_bounds();
+        effect
+    }
+
+    fn act(&mut self, act: Act) -> Effect {
+        let session = |request| Effect::Send(Command::Session(request));
+        match act {
+            Act::Toggle => return self.toggle_recording(),
+            Act::Next => return self.once(SessionRequest::Next),
+            Act::Redo => return self.once(SessionRequest::Redo),
+            Act::Discard => return self.once(SessionRequest::Discard),
+            Act::Stop => return session(SessionRequest::Stop),
+            Act::Undo => return session(SessionRequest::Undo),
+            Act::Mark => return session(SessionRequest::Mark { text: String::new() }),
+            Act::Success => {
+                return session(SessionRequest::Label { label: Label::Success, reason: String::new() });
+            }
+            Act::Failure => self.ask(Question::WhyFailed),
+            Act::Note => self.ask(Question::Note),
+            Act::Task => self.ask(Question::Task),
+            Act::EndSession => self.ask(Question::EndSession),
+            Act::Restart => return self.restart(),
+            Act::AskToArm => self.ask_to_arm(),
+            Act::Pause => self.toggle_pause(),
+            Act::Help => self.help = true,
+            Act::Up => self.selected = self.selected.saturating_sub(1),
+            Act::Down => self.selected += 1,
+            Act::First => self.selected = 0,
+            Act::Last => self.selected = usize::MAX,
+            Act::Older => self.scroll += SCROLL_STEP,
+            Act::Newer => self.scroll = self.scroll.saturating_sub(SCROLL_STEP),
+            // Handled before any other key.
+            Act::Arm | Act::Disarm | Act::Escape | Act::Quit | Act::Interrupt => {}
+        }
         Effect::None
+    }
+
+    /// Whether a key that begins or ends an episode counts. Each press counts from itself: while a key is held, nothing
+    /// happens.
+    fn is_new_press(&mut self) -> bool {
+        let now = self.latest.taken;
+        self.pressed.replace(now).is_none_or(|before| now.since(before) >= PRESS_AGAIN)
+    }
+
+    fn once(&mut self, request: SessionRequest) -> Effect {
+        if self.is_new_press() { Effect::Send(Command::Session(request)) } else { Effect::None }
     }
 
     fn ask_to_quit(&mut self) -> Effect {
@@ -269,9 +315,7 @@ impl Model {
     }
 
     fn toggle_recording(&mut self) -> Effect {
-        let now = self.latest.taken;
-        // Each press counts from itself: while a key is held, nothing happens.
-        if self.pressed.replace(now).is_some_and(|before| now.since(before) < PRESS_AGAIN) {
+        if !self.is_new_press() {
             return Effect::None;
         }
         let begins = self.latest.recording.is_none();
@@ -279,7 +323,7 @@ impl Model {
         if let Some(notice) = &mut self.notice {
             notice.awaits = Some(begins);
         }
-        Effect::Send(Command::ToggleRecording)
+        Effect::Send(Command::Session(SessionRequest::Toggle))
     }
 
     fn restart(&mut self) -> Effect {
@@ -340,6 +384,13 @@ impl Model {
         self.readings.get(id.index()).copied().unwrap_or_default()
     }
 
+    /// How long the disk lasts at the rate at which the devices deliver now; `None` if unknown.
+    pub fn disk_left(&self) -> Option<Duration> {
+        let rate = self.totals.delivered.max(self.totals.recorded);
+        let free = self.latest.disk_free.filter(|_| rate >= 1.0)?;
+        Duration::try_from_secs_f64(free as f64 / rate).ok()
+    }
+
     /// Has the bit of `id` just changed?
     pub fn edge(&self, id: ModalityId) -> Edge {
         let changed = self.edges.get(id.index()).copied().flatten();
@@ -398,7 +449,7 @@ impl Model {
 
     /// Disarms, and closes any open dialog, as Esc usually does.
     fn disarm(&mut self, is_escape: bool) -> Effect {
-        (self.help, self.dropping) = (false, None);
+        (self.help, self.prompt) = (false, None);
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
@@ -411,50 +462,83 @@ impl Model {
     }
 }
 
-/// Shortest time between question and confirmation: a person does not read faster, and pasted text arrives immediately.
-const SHORTEST: Duration = Duration::from_millis(150);
+/// Longest text that is typed, in bytes.
+const LONGEST_TEXT: usize = 500;
 
-/// The question shown to the user.
-#[derive(Debug)]
-struct DropQuestion {
-    file: PathBuf,
-    at: Stamp,
+/// What is typed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Question {
+    /// A note on the episode.
+    Note,
+    /// Why the episode is a failure.
+    WhyFailed,
+    /// The task of the next episodes.
+    Task,
+    /// Whether the session is to end.
+    EndSession,
 }
 
-impl DropQuestion {
-    /// Whether a confirmation at `now` answers this question.
-    fn is_answered_at(&self, now: &Snapshot) -> bool {
-        let waited = now.taken.since(self.at);
-        (SHORTEST..=NOTICE_SHOWN).contains(&waited)
-            && now.short_episode.as_ref().is_some_and(|short| short.file == self.file)
+impl Question {
+    const fn text(self) -> &'static str {
+        match self {
+            Self::Note => "note: ",
+            Self::WhyFailed => "why it failed (may be empty): ",
+            Self::Task => "task: ",
+            Self::EndSession => "type end to end the session and delete what was discarded: ",
+        }
     }
+}
+
+/// A question, and the text typed so far.
+#[derive(Debug)]
+struct Prompt {
+    question: Question,
+    text: String,
 }
 
 impl Model {
-    fn ask_to_drop(&mut self) {
-        let Some(short) = &self.latest.short_episode else {
-            return self.notify("nothing to delete: the last episode is not too short");
+    /// The question and the answer typed so far.
+    pub fn prompt(&self) -> Option<(&'static str, &str)> {
+        self.prompt.as_ref().map(|prompt| (prompt.question.text(), prompt.text.as_str()))
+    }
+
+    fn ask(&mut self, question: Question) {
+        let session = self.latest.session.as_ref();
+        let text = match question {
+            Question::Task => session.map(|session| session.task.clone()).unwrap_or_default(),
+            _ => String::new(),
         };
-        let file = short.file.clone();
-        let text = format!("y deletes {}, any other key keeps it", name(&file));
-        self.dropping = Some(DropQuestion { file, at: self.latest.taken });
-        self.notify(&text);
+        self.prompt = Some(Prompt { question, text });
     }
 
-    fn drop_episode(&mut self, asked: Option<DropQuestion>) -> Effect {
-        let Some(asked) = asked else { return Effect::None };
-        if !asked.is_answered_at(&self.latest) {
-            self.notify("nothing deleted");
-            return Effect::None;
+    fn type_into(&mut self, mut prompt: Prompt, key: KeyEvent) -> Effect {
+        let is_text = !key.modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT);
+        match key.code {
+            KeyCode::Enter => return self.answer(prompt),
+            KeyCode::Backspace => {
+                prompt.text.pop();
+            }
+            KeyCode::Char('u') if key.modifiers.contains(KeyModifiers::CONTROL) => prompt.text.clear(),
+            KeyCode::Char(c) if is_text && prompt.text.len() + c.len_utf8() <= LONGEST_TEXT => prompt.text.push(c),
+            _ => {}
         }
-        let text = format!("deleting {}", name(&asked.file));
-        self.notify(&text);
-        Effect::Send(Command::DropEpisode(asked.file))
+        self.prompt = Some(prompt);
+        Effect::None
     }
-}
 
-fn name(file: &std::path::Path) -> String {
-    file.file_name().unwrap_or_default().to_string_lossy().into_owned()
+    fn answer(&mut self, Prompt { question, text }: Prompt) -> Effect {
+        let request = match question {
+            Question::Note => SessionRequest::Note { text },
+            Question::WhyFailed => SessionRequest::Label { label: Label::Failure, reason: text },
+            Question::Task => SessionRequest::Plan { task: Some(text), tags: Vec::new(), goal: None },
+            Question::EndSession if text.trim() == "end" => SessionRequest::EndSession,
+            Question::EndSession => {
+                self.notify("the session continues");
+                return Effect::None;
+            }
+        };
+        Effect::Send(Command::Session(request))
+    }
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! The recording panel: the episode being written, or the last one and its verdict.
 
 use std::path::Path;
+use std::time::Duration;
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -9,14 +10,16 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::{RecordingStatus, Verdict};
+use crate::status::session::Phase;
+use crate::status::{RecordingStatus, Snapshot, Verdict};
 use crate::text;
+use crate::time::Stamp;
 
 /// Columns below which the name of a file is left out.
 const FILE_LEAST: usize = 12;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
-    let inner = view::panel(frame, area, "Recording", Line::default(), theme);
+    let inner = view::panel(frame, area, "Recording", remark(model, theme), theme);
     // Also while the view is paused: what is being recorded is not what is being looked at.
     let lines = match &model.latest().recording {
         Some(recording) => in_progress(recording, inner, model, theme),
@@ -25,6 +28,19 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     for (line, row) in lines.into_iter().zip(inner.rows()) {
         frame.render_widget(line, row);
     }
+}
+
+/// How many episodes there are, and for how long the disk lasts.
+fn remark(model: &Model, theme: Theme) -> Line<'static> {
+    let session = model.latest().session.as_ref();
+    let progress = session.filter(|session| session.goal.is_some() || session.counted > 0);
+    let count = progress.map(|session| match session.goal {
+        Some(_) => format!("{} episodes", session.progress()),
+        None => text::counted(session.counted as u64, "episode"),
+    });
+    let left = model.disk_left().map(|left| format!("disk lasts {}", text::about(left)));
+    let parts: Vec<_> = count.into_iter().chain(left).collect();
+    Line::styled(parts.join(", "), theme.faint())
 }
 
 /// That an episode is being recorded, and since when: `● REC 00:04`.
@@ -83,8 +99,8 @@ fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Th
 }
 
 fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
-    let mut first = Line::from(vec![Span::styled("space", theme.title()), Span::raw(" starts an episode")]);
     let shown = model.latest();
+    let mut first = start(shown, usize::from(area.width), theme);
     if let Some(why) = &shown.not_started {
         let text = format!("{} not started: {}", theme.symbol("▲", "!"), theme.safe(why));
         return not_started(first, &text, area, theme);
@@ -96,13 +112,7 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let word = Span::styled(format!("{} ", grade.word()), theme.grade(*grade));
     let label = Span::styled("last ", theme.faint());
     let width = usize::from(area.width);
-    let offer = shown.short_episode.as_ref().filter(|short| short.file == *last);
-    let offer = offer.map(|short| format!("{:.1} s long: x deletes it", short.length.as_secs_f64()));
     if area.height < 2 {
-        if let Some(offer) = offer {
-            first.spans.extend([Span::raw("   "), label, Span::styled(offer, theme.warning())]);
-            return vec![first];
-        }
         let room = width.saturating_sub(first.width() + 3 + label.width() + word.width());
         first.spans.extend([Span::raw("   "), label, word, Span::raw(file(last, room, theme))]);
         return vec![first];
@@ -116,8 +126,7 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     // As many of the reasons as fit beside the name; the log has all of them.
     let room = width.saturating_sub(label.width() + word.width());
     let name_width = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
-    // The offer replaces the reasons: the first of them is the length.
-    let why = offer.unwrap_or_else(|| theme.safe(&reasons.join("; ")));
+    let why = theme.safe(&reasons.join("; "));
     let room_why = room.saturating_sub(name_width + 2);
     let path = file(last, if why.is_empty() { room } else { name_width.min(room) }, theme);
     let mut line = Line::from(vec![label, word, Span::raw(path)]);
@@ -126,6 +135,32 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
         line.push_span(Span::styled(text::cut(&why, room_why, theme.ellipsis()).into_owned(), theme.grade(*grade)));
     }
     vec![first, line]
+}
+
+/// What begins the next episode, and of what it will be.
+fn start(shown: &Snapshot, width: usize, theme: Theme) -> Line<'static> {
+    let session = shown.session.as_ref();
+    let left = |until: Stamp| text::clock(until.since(shown.taken) + Duration::from_millis(999));
+    let key = Span::styled("space", theme.title());
+    let mut line = match session.map(|session| session.phase).unwrap_or_default() {
+        Phase::Countdown { until } => {
+            let text = format!("an episode begins in {}", left(until));
+            Line::from(vec![Span::styled(text, theme.warning()), Span::raw("; "), key, Span::raw(" begins it now")])
+        }
+        Phase::Reset { until } => {
+            let text = format!("reset the scene: the next episode begins in {}", left(until));
+            Line::from(vec![Span::styled(text, theme.warning()), Span::raw("; "), key, Span::raw(" begins it now")])
+        }
+        Phase::Idle | Phase::Recording | Phase::Ending => Line::from(vec![key, Span::raw(" starts an episode")]),
+    };
+    if let Some(session) = session {
+        let tags: Vec<_> = session.tags.iter().map(|(key, value)| format!("  {key}={value}")).collect();
+        let room = width.saturating_sub(line.width() + 3);
+        let about = theme.safe(&format!("{}{}", session.task, tags.concat()));
+        line.push_span(Span::raw("   "));
+        line.push_span(Span::styled(text::cut(&about, room, theme.ellipsis()).into_owned(), theme.faint()));
+    }
+    line
 }
 
 /// Why no episode was begun, on as many lines as there are.

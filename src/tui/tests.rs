@@ -14,8 +14,9 @@ use crate::interlock::{InputState, StopKind};
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
+use crate::status::session::{EpisodeEntry, Label, Phase, SessionRequest, SessionStatus};
 use crate::status::{
-    Finding, Grade, Level, Outlook, RecordingStatus, Sensors, ShortEpisode, SlotState, Snapshot, StopStatus, Verdict,
+    Finding, Grade, Level, Outlook, RecordingStatus, Sensors, SlotState, Snapshot, StopStatus, Verdict,
 };
 use crate::time::Stamp;
 use theme::{Charset, Colours};
@@ -105,29 +106,71 @@ fn the_last_verdict_is_shown_with_its_file_and_the_reasons_that_fit() {
     assert_snapshot!("verdict_60x12", draw(&measured(&end), (60, 12), THEME));
 }
 
+fn entry(number: usize, verdict: Option<Grade>) -> EpisodeEntry {
+    EpisodeEntry {
+        file: format!("20231114_place-block_{number:03}.mcap"),
+        begun: "2023-11-14T22:13:20.000Z".to_owned(),
+        seconds: verdict.map(|_| 29.8),
+        verdict,
+        reasons: Vec::new(),
+        label: None,
+        label_reason: String::new(),
+        note: String::new(),
+        discarded: false,
+        marks: Vec::new(),
+        sensors: verdict.map(|_| Sensors { registered: 3, recorded: 3, without: Vec::new() }),
+    }
+}
+
+/// Six episodes of twelve wanted, one discarded, one labelled.
+fn session() -> SessionStatus {
+    let mut episodes: Vec<_> = (1..=7).map(|number| entry(number, Some(Grade::Good))).collect();
+    episodes[4].discarded = true;
+    episodes[5].label = Some(Label::Failure);
+    episodes[5].label_reason = "slipped".to_owned();
+    episodes[6].verdict = Some(Grade::Suspect);
+    episodes[6].reasons = vec!["tof: 3 of 213 samples lost by the device (limit 1 %)".to_owned()];
+    SessionStatus {
+        task: "place block".to_owned(),
+        tags: vec![("finger".to_owned(), "soft".to_owned())],
+        goal: Some(12),
+        counted: 6,
+        verdicts: [5, 1, 0],
+        discarded: 1,
+        episodes,
+        ..SessionStatus::default()
+    }
+}
+
 #[test]
-fn a_short_episode_is_offered_to_be_dropped() {
+fn a_session_is_shown_with_its_goal_its_episodes_and_the_time_on_the_disk() {
     let mut end = three_streaming();
-    end.last_episode = Some("episodes/20231114_cube_003.mcap".into());
-    end.last_verdict = Some(Verdict {
-        grade: Grade::Bad,
-        reasons: vec!["too short: 200 ms (limit 500 ms)".to_owned()],
-        sensors: Some(Sensors { registered: 3, recorded: 3, without: Vec::new() }),
-    });
-    end.short_episode =
-        Some(ShortEpisode { file: end.last_episode.clone().unwrap(), length: Duration::from_millis(210) });
-    let mut model = measured(&end);
-    assert_snapshot!("short_80x24", draw(&model, (80, 24), THEME));
-    assert_snapshot!("short_60x12", draw(&model, (60, 12), ASCII));
-    model.update(press(KeyCode::Char('x')));
-    let screen = draw(&model, (80, 24), THEME);
-    assert!(screen.to_string().contains("y deletes 20231114_cube_003.mcap, any other key keeps it"), "{screen}");
-    // The next episode has begun, and ended normally.
-    end.recording = Some(recording(0));
-    end.short_episode = None;
-    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("deletes it"));
-    end.recording = None;
-    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("deletes it"));
+    end.disk_free = Some(500_000_000_000);
+    end.session = Some(session());
+    assert_snapshot!("session_80x24", draw(&measured(&end), (80, 24), THEME));
+    assert_snapshot!("session_120x40", draw(&measured(&end), (120, 40), THEME));
+    let until = end.taken.after(Duration::from_millis(2_100));
+    for (phase, expected) in [
+        (Phase::Countdown { until }, "an episode begins in 00:03; space begins it now"),
+        (Phase::Reset { until }, "reset the scene: the next episode begins in 00:03; space begins it now"),
+    ] {
+        end.session.as_mut().unwrap().phase = phase;
+        for size in [(80, 24), (120, 40)] {
+            let screen = draw(&measured(&end), size, THEME).to_string();
+            assert!(screen.contains(expected) && screen.contains("begin now"), "{screen}");
+        }
+    }
+}
+
+#[test]
+fn a_text_that_is_typed_is_shown_with_its_end() {
+    let mut model = measured(&three_streaming());
+    model.update(press(KeyCode::Char('n')));
+    for c in "a note that is longer than the sixty columns of the line, öä".chars() {
+        model.update(press(KeyCode::Char(c)));
+    }
+    let screen = draw(&model, (60, 12), THEME).to_string();
+    assert!(screen.contains(" note: ") && screen.contains("columns of the line, öä█"), "{screen}");
 }
 
 #[test]
@@ -334,7 +377,7 @@ async fn keys_become_commands_and_shutdown_ends_the_screen() {
     let desk = desk(&sender);
     let screen = drive(&board, &desk, &shutdown, keys, |_| Ok(()));
     let app = async {
-        assert_eq!(commands.recv().await, Some(Command::ToggleRecording));
+        assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Toggle)));
         assert_eq!(commands.recv().await, Some(Command::Quit));
         end.cancel();
     };
@@ -346,7 +389,7 @@ async fn keys_become_commands_and_shutdown_ends_the_screen() {
 async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     let board = board(&["cam"]);
     let (sender, commands) = mpsc::channel(1);
-    sender.try_send(Command::ToggleRecording).unwrap();
+    sender.try_send(Command::Session(SessionRequest::Toggle)).unwrap();
     let shutdown = CancellationToken::new();
     let end = shutdown.clone();
     let mut notice = None;
@@ -375,31 +418,29 @@ async fn a_terminal_that_goes_away_is_an_error() {
 }
 
 #[tokio::test]
-async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
+async fn pasted_text_deletes_nothing_whether_the_terminal_marks_it_or_not() {
     let board = board(&["cam"]);
-    let file = std::path::PathBuf::from("episodes/a_001.mcap");
-    board.set_short_episode(Some(ShortEpisode { file: file.clone(), length: Duration::ZERO }));
     let key = |letter| Ok(Event::Key(KeyEvent::new(KeyCode::Char(letter), KeyModifiers::NONE)));
-    let pasted = vec![Ok(Event::Paste("xyxyaa qq".to_owned())), key('x'), key('y'), key('x'), key('x'), key('y')];
+    let enter = Ok(Event::Key(KeyEvent::new(KeyCode::Enter, KeyModifiers::NONE)));
+    let mut pasted = vec![Ok(Event::Paste("xyxyaa qq".to_owned())), key('x'), key('y'), key('x'), key('x')];
+    pasted.extend("The End".chars().map(key));
+    pasted.push(enter);
     let (sender, mut commands) = mpsc::channel(16);
     let shutdown = CancellationToken::new();
     // All of it arrives at once, before any frame is due.
     let events = futures::stream::iter(pasted).chain(futures::stream::iter([key('q')]));
     let events = events.chain(futures::stream::pending());
-    let mut asked = false;
     let end = shutdown.clone();
     let desk = desk(&sender);
-    let screen = drive(&board, &desk, &shutdown, events, |model| {
-        asked |= model.notice().is_some_and(|report| report.starts_with("y deletes a_001.mcap"));
-        Ok(())
-    });
+    let screen = drive(&board, &desk, &shutdown, events, |_| Ok(()));
     let app = async {
+        // It is in the trash, once, and can be taken back.
+        assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Discard)));
         assert_eq!(commands.recv().await, Some(Command::Quit), "only what was typed last");
         end.cancel();
     };
     let (outcome, ()) = tokio::join!(screen, app);
     outcome.unwrap();
-    assert!(asked);
 }
 
 #[test]

@@ -10,7 +10,7 @@ use ratatui::widgets::Paragraph;
 
 use super::model::Model;
 use super::theme::Theme;
-use super::{devices, footer, header, help, log, mask, policy, recording};
+use super::{devices, episodes, footer, header, help, log, mask, policy, recording};
 
 /// Below this size the screen only shows the size it needs.
 pub const MINIMUM: (u16, u16) = (60, 12);
@@ -20,6 +20,8 @@ const ROOMY: u16 = 32;
 const WITH_SELECTION: u16 = 20;
 /// Least and most lines of log next to a full table.
 const LOG_LINES: (u16, u16) = (1, 5);
+/// Most episodes that are listed on a roomy terminal.
+const EPISODES: u16 = 5;
 /// Most lines of the policy: on a small terminal, otherwise, on a roomy one.
 const POLICY_LINES: (u16, u16, u16) = (1, 5, 7);
 
@@ -39,8 +41,10 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
         policy::rows(policy, area.width, if area.height >= WITH_SELECTION { most } else { small }, theme)
     });
     let policy_rows = if policy_lines > 0 { 1 + policy_lines + gap } else { 0 };
+    let episode_lines = if gap > 0 { episodes::rows(model, EPISODES) } else { 0 };
+    let episode_rows = if episode_lines > 0 { 1 + episode_lines + gap } else { 0 };
     // A rule above each of the four panels, the head of the table, header and footer.
-    let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows;
+    let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows + episode_rows;
     // On the smallest terminals the policy panel replaces the log: it shows the reason of a hold itself.
     let with_log = policy_rows == 0 || area.height >= fixed + 1 + LOG_LINES.0;
     let rest = area.height.saturating_sub(if with_log { fixed } else { fixed - 1 });
@@ -48,13 +52,14 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     let rows =
         u16::try_from(model.shown().devices.len()).unwrap_or(u16::MAX).clamp(1, rest.saturating_sub(log_least).max(1));
 
-    let [header_area, mask_area, devices_area, policy_area, recording_area, log_area, footer_area] =
+    let [header_area, mask_area, devices_area, policy_area, recording_area, episodes_area, log_area, footer_area] =
         Layout::vertical([
             Constraint::Length(1 + gap),
             Constraint::Length(1 + plan.rows() + gap),
             Constraint::Length(2 + rows + selection + gap),
             Constraint::Length(policy_rows),
             Constraint::Length(1 + recording_lines + gap),
+            Constraint::Length(episode_rows),
             Constraint::Fill(1),
             Constraint::Length(1),
         ])
@@ -64,6 +69,9 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     devices::draw(frame, devices_area, (rows, selection), model, theme);
     policy::draw(frame, policy_area, policy_lines, model, theme);
     recording::draw(frame, recording_area, model, theme);
+    if episode_lines > 0 {
+        episodes::draw(frame, episodes_area, episode_lines, model, theme);
+    }
     if with_log {
         log::draw(frame, log_area, model, theme);
     }

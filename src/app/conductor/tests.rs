@@ -1,7 +1,7 @@
 use std::fs::File;
 use std::io;
 
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use super::super::Signals;
@@ -9,9 +9,11 @@ use super::super::streaming::Streaming;
 use super::*;
 use crate::bus::TopicId;
 use crate::interlocks::Watched;
-use crate::record::{RecorderConfig, Sink, Source};
+use crate::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use crate::registry::Registry;
 use crate::sample::{Epoch, SampleHeader};
+use crate::session::journal::Plan;
+use crate::status::session::Label;
 use crate::status::{Grade, Level, Snapshot, Verdict};
 
 /// How long a condition may take to hold.
@@ -61,25 +63,25 @@ struct Bench {
 
 impl Bench {
     fn new(record: bool, duration: Option<Duration>, sink: fn(File) -> Box<dyn Sink>) -> Self {
+        Self::with_plan(record, duration, sink, Plan::default())
+    }
+
+    fn with_plan(record: bool, duration: Option<Duration>, sink: fn(File) -> Box<dyn Sink>, plan: Plan) -> Self {
         let registry = Arc::new(Registry::builtin());
         let board = Arc::new(Board::new(&registry));
         let out = tempfile::tempdir().unwrap();
         let config = RecorderConfig { sink: Box::new(sink), ..RecorderConfig::new(registry, Arc::clone(&board)) };
         let recorder = Recorder::spawn(Quiet, config).unwrap();
         let (keys, requests) = mpsc::unbounded_channel();
-        let episode = EpisodeRequest {
-            out: out.path().to_owned(),
-            task: "test".to_owned(),
-            tags: Vec::new(),
-            modules: Vec::new(),
-            duration: None,
-        };
+        let episode = EpisodeRequest { out: out.path().to_owned(), ..EpisodeRequest::default() };
+        let plan = Plan { task: "test".to_owned(), ..plan };
+        let collection = Collection::new(recorder, episode, plan, &board).unwrap();
         let conductor = Conductor {
             events: board.events(),
             board: Arc::clone(&board),
-            recorder,
-            episode,
+            collection,
             record,
+            is_single: true,
             duration,
             begin_episode: record,
         };
@@ -108,6 +110,12 @@ impl Bench {
 
     /// Files of episodes, finished or not.
     fn files(&self) -> Vec<String> {
+        let mut names = self.names();
+        names.retain(|name| name.contains(".mcap"));
+        names
+    }
+
+    fn names(&self) -> Vec<String> {
         let entries = std::fs::read_dir(self.out.path()).unwrap();
         let mut names: Vec<_> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
         names.sort();
@@ -144,7 +152,7 @@ async fn keys_pressed_while_an_episode_ends_are_handled_in_order() {
     let keys = async {
         let press = async |count: usize| {
             for _ in 0..count {
-                bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
+                bench.keys.send(end()).unwrap();
             }
         };
         press(1).await;
@@ -169,7 +177,7 @@ async fn a_key_pressed_while_devices_settle_begins_exactly_one_episode() {
     let silent = Registry::builtin().devices[0].id;
     bench.board.set_slot(silent, SlotState::Opening, Epoch(1), "");
     let keys = async {
-        bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
+        bench.keys.send(end()).unwrap();
         until(&bench.board, "an episode", |file| file.is_some()).await;
         idle().await;
         bench.keys.send(Request::Quit).unwrap();
@@ -183,9 +191,13 @@ async fn a_key_pressed_while_devices_settle_begins_exactly_one_episode() {
 #[tokio::test]
 async fn the_last_episode_whose_file_fails_is_an_error_of_the_run() {
     let mut bench = Bench::new(false, None, |file| Box::new(Lost(file)));
-    for _ in 0..3 {
-        bench.conductor.toggle(Stamp::now()).await.unwrap();
-    }
+    let collection = &mut bench.conductor.collection;
+    collection.request(&SessionRequest::Start, Stamp::now(), None).await.unwrap();
+    collection.end_episode().await;
+    assert!(collection.recorder.stop().await.is_err());
+    let end = bench.board.last_end().unwrap();
+    bench.conductor.collection.ended(&end).await.unwrap();
+    bench.conductor.collection.request(&SessionRequest::Start, Stamp::now(), None).await.unwrap();
     let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
     assert!(error.contains("_002.mcap.partial") && error.contains("lost"), "{error}");
     assert!(error.contains("`rapid recover ") && error.matches("_002").count() == 2, "{error}");
@@ -239,17 +251,6 @@ async fn an_end_during_shutdown_is_found_before_and_after_missed_events() {
     }
 }
 
-/// Begins an episode and ends it at its first moment; its file.
-async fn moment(board: &Board, keys: &mpsc::UnboundedSender<Request>) -> PathBuf {
-    keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
-    until(board, "an episode", |file| file.is_some()).await;
-    let file = board.snapshot().recording.unwrap().file;
-    keys.send(Request::ToggleRecording(Stamp(0))).unwrap();
-    when(board, "an offer", |snapshot| snapshot.short_episode.is_some()).await;
-    assert_eq!(board.snapshot().short_episode.unwrap().file, file);
-    file
-}
-
 async fn when(board: &Board, what: &str, holds: impl Fn(&Snapshot) -> bool) {
     let begun = std::time::Instant::now();
     while !holds(&board.snapshot()) {
@@ -258,34 +259,81 @@ async fn when(board: &Board, what: &str, holds: impl Fn(&Snapshot) -> bool) {
     }
 }
 
+/// Makes a request; the answer.
+async fn ask(keys: &mpsc::UnboundedSender<Request>, request: SessionRequest) -> Result<String, String> {
+    let (reply, answer) = oneshot::channel();
+    keys.send(Request::Session(request, Stamp::now(), Some(reply))).unwrap();
+    answer.await.expect("an answer")
+}
+
 #[tokio::test]
-async fn only_the_last_episode_is_dropped_on_request() {
+async fn episodes_are_discarded_restored_labelled_and_the_session_ended_by_requests() {
     let mut bench = Bench::new(false, None, |file| Box::new(file));
     let keys = async {
-        let first = moment(&bench.board, &bench.keys).await;
-        let second = moment(&bench.board, &bench.keys).await;
-        // Not the last one; and a file that is not an episode.
-        let foreign = first.with_file_name("notes.mcap");
-        std::fs::write(&foreign, "precious").unwrap();
-        for file in [&first, &foreign] {
-            bench.keys.send(Request::DropEpisode(file.clone())).unwrap();
-        }
-        // Requests are carried out in order: both were refused by the time this one has begun.
-        let third = moment(&bench.board, &bench.keys).await;
-        assert!(first.exists() && foreign.exists() && second.exists());
-        bench.keys.send(Request::DropEpisode(third.clone())).unwrap();
-        when(&bench.board, "its file is gone", |snapshot| snapshot.last_episode.is_none()).await;
-        assert!(!third.exists() && bench.board.snapshot().short_episode.is_none());
-        // A request for one after the next has begun.
-        let fourth = moment(&bench.board, &bench.keys).await;
-        bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
-        bench.keys.send(Request::DropEpisode(fourth.clone())).unwrap();
-        bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
+        let ask = async |request| ask(&bench.keys, request).await;
+        let trash = |name: &str| bench.out.path().join(".trash").join(name).exists();
+        let first = ask(SessionRequest::Start).await.unwrap();
+        assert!(first.ends_with("_001.mcap"), "{first}");
+        assert_eq!(ask(SessionRequest::Start).await.unwrap_err(), "an episode is being recorded");
+        ask(SessionRequest::Mark { text: "grasped".to_owned() }).await.unwrap();
+        // The end of the first is answered when its file is closed, the beginning of the next when it has begun.
+        let ended = ask(SessionRequest::Stop).await.unwrap();
+        assert!(ended.contains("_001.mcap: "), "{ended}");
+        let label = SessionRequest::Label { label: Label::Failure, reason: "dropped".to_owned() };
+        let labelled = ask(label).await.unwrap();
+        assert!(labelled.ends_with("_001.mcap: failure"), "{labelled}");
+        ask(SessionRequest::Start).await.unwrap();
+        let discarded = ask(SessionRequest::Discard).await.unwrap();
+        assert!(discarded.contains("_002.mcap"), "{discarded}");
+        let name = bench.board.last_end().unwrap().file.file_name().unwrap().to_str().unwrap().to_owned();
+        when(&bench.board, "it is in the trash", |_| trash(&name)).await;
+        ask(SessionRequest::Undo).await.unwrap();
+        when(&bench.board, "it is back", |_| !trash(&name)).await;
+        // Recorded again: the discarded one keeps its name, so the next has another.
+        ask(SessionRequest::Redo).await.unwrap();
+        let stopped = ask(SessionRequest::Stop).await.unwrap();
+        assert!(stopped.contains("_003.mcap"), "{stopped}");
+        when(&bench.board, "two are kept", |now| now.session.as_ref().unwrap().verdicts == [0, 0, 2]).await;
+        let ended = ask(SessionRequest::EndSession).await.unwrap();
+        assert_eq!(ended, "session ended: 2 episodes kept, 1 deleted");
         bench.keys.send(Request::Quit).unwrap();
-        fourth
     };
-    let (outcome, fourth) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
+    let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
     outcome.unwrap();
-    assert!(fourth.exists());
-    assert_eq!(bench.files().len(), 5, "{:?}", bench.files());
+    bench.conductor.collection.close().await.unwrap();
+    let names = bench.names();
+    assert_eq!(names.len(), 4, "{names:?}");
+    assert!(names.iter().filter(|name| name.starts_with("session-")).count() == 2, "{names:?}");
+}
+
+#[tokio::test]
+async fn a_run_for_several_episodes_ends_when_they_are_recorded() {
+    let plan = Plan {
+        goal: Some(2),
+        countdown: Some(Duration::from_millis(20)),
+        reset_time: Some(Duration::from_millis(20)),
+        ..Plan::default()
+    };
+    let mut bench = Bench::with_plan(true, None, |file| Box::new(file), plan);
+    bench.conductor.is_single = false;
+    bench.running.kind = Screen::Lines;
+    let keys = async {
+        for number in ["_001", "_002", "_003"] {
+            until(&bench.board, number, |file| file.is_some_and(|file| file.contains(number))).await;
+            let _ = ask(&bench.keys, SessionRequest::Label { label: Label::Success, reason: String::new() }).await;
+            // What has no sample is BAD and does not count: the third is one too many for the goal.
+            let request = if number == "_003" { Request::Quit } else { end() };
+            bench.keys.send(request).unwrap();
+        }
+    };
+    let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
+    outcome.unwrap();
+    bench.conductor.finish_episode().await.unwrap();
+    bench.conductor.collection.close().await.unwrap();
+    assert_eq!(bench.files().len(), 3, "{:?}", bench.files());
+}
+
+/// Ends the episode in progress; the plan decides what follows.
+fn end() -> Request {
+    Request::Session(SessionRequest::Toggle, Stamp::now(), None)
 }

@@ -15,7 +15,7 @@ fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
 
 fn session_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
     let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
-    let path = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0)), &[]).unwrap();
+    let path = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
     let beginning = Beginning {
         registry: Arc::new(registry),
         board: Arc::clone(board),

@@ -1,7 +1,8 @@
 use super::*;
 use crate::mask::PhysicalMask;
+use crate::status::Level;
 use crate::status::literal::{TAKEN, every_state, id, line, recording, three_streaming};
-use crate::status::{Level, ShortEpisode};
+use crate::status::session::{Answered, Label, SessionRequest, SessionStatus};
 
 fn press(code: KeyCode) -> Msg {
     Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))
@@ -28,7 +29,7 @@ fn after(snapshot: &Snapshot, ms: u64) -> Msg {
 #[test]
 fn keys_become_commands() {
     let quit = Effect::Leave;
-    let toggle = Effect::Send(Command::ToggleRecording);
+    let toggle = Effect::Send(Command::Session(SessionRequest::Toggle));
     let restart = Effect::Send(Command::Restart(id(4)));
     let table: Vec<(&str, bool, Vec<Msg>, Effect)> = vec![
         ("space", false, vec![press(KeyCode::Char(' '))], toggle.clone()),
@@ -233,96 +234,10 @@ fn an_answer_fades() {
     assert_eq!(model.notice(), None);
 }
 
-/// A key, its time in ms since the first one, and the snapshot at that time.
-type Timed = (u64, Msg, Snapshot);
-
-/// The state after an episode that was too short.
-fn with_short(file: &str) -> Snapshot {
-    let mut snapshot = three_streaming();
-    snapshot.short_episode = Some(ShortEpisode { file: file.into(), length: Duration::from_millis(200) });
-    snapshot
-}
-
-#[test]
-fn a_short_episode_is_dropped_by_a_key_and_another_soon_after() {
-    let (x, y) = (KeyCode::Char('x'), KeyCode::Char('y'));
-    let dropped = Effect::Send(Command::DropEpisode("a_003.mcap".into()));
-    let short = with_short("a_003.mcap");
-    let table: Vec<(&str, Vec<Timed>, Effect)> = vec![
-        ("x, y", vec![(0, press(x), short.clone()), (400, press(y), short.clone())], dropped.clone()),
-        (
-            "x, any key, x, y",
-            vec![
-                (0, press(x), short.clone()),
-                (400, press(KeyCode::Down), short.clone()),
-                (800, press(x), short.clone()),
-                (1200, press(y), short.clone()),
-            ],
-            dropped,
-        ),
-        ("y alone", vec![(0, press(y), short.clone())], Effect::None),
-        ("x twice", vec![(0, press(x), short.clone()), (400, press(x), short.clone())], Effect::None),
-        ("x held down", vec![(0, press(x), short.clone()), (400, repeated(x), short.clone())], Effect::None),
-        ("y held down", vec![(0, press(x), short.clone()), (400, repeated(y), short.clone())], Effect::None),
-        ("ctrl-y", vec![(0, press(x), short.clone()), (400, control('y'), short.clone())], Effect::None),
-        ("both at once", vec![(0, press(x), short.clone()), (0, press(y), short.clone())], Effect::None),
-        ("too late", vec![(0, press(x), short.clone()), (4_100, press(y), short.clone())], Effect::None),
-        (
-            "another key between them",
-            vec![
-                (0, press(x), short.clone()),
-                (300, press(KeyCode::Up), short.clone()),
-                (600, press(y), short.clone()),
-            ],
-            Effect::None,
-        ),
-        ("the next one began", vec![(0, press(x), short.clone()), (400, press(y), three_streaming())], Effect::None),
-        (
-            "another one ended meanwhile",
-            vec![(0, press(x), short.clone()), (400, press(y), with_short("a_004.mcap"))],
-            Effect::None,
-        ),
-        ("none is short", vec![(0, press(x), three_streaming()), (400, press(y), three_streaming())], Effect::None),
-        (
-            "from the help",
-            vec![
-                (0, press(KeyCode::Char('?')), short.clone()),
-                (300, press(x), short.clone()),
-                (600, press(y), short.clone()),
-            ],
-            Effect::None,
-        ),
-    ];
-    for (what, keys, expected) in table {
-        let mut model = Model::new(short.clone());
-        let mut effects = Vec::new();
-        for (ms, key, snapshot) in keys {
-            model.update(after(&snapshot, ms));
-            effects.push(model.update(key));
-        }
-        assert_eq!(effects.pop(), Some(expected), "{what}");
-        assert!(effects.iter().all(|effect| *effect == Effect::None), "{what}");
-    }
-}
-
-#[test]
-fn the_question_names_the_file_and_fades() {
-    let mut model = Model::new(with_short("out/a_003.mcap"));
-    model.update(press(KeyCode::Char('x')));
-    assert_eq!(model.notice(), Some("y deletes a_003.mcap, any other key keeps it"));
-    model.update(after(&with_short("out/a_003.mcap"), 4_100));
-    assert_eq!(model.notice(), None);
-    model.update(press(KeyCode::Char('y')));
-    assert_eq!(model.notice(), Some("nothing deleted"));
-    let mut model = Model::new(three_streaming());
-    model.update(press(KeyCode::Char('x')));
-    assert_eq!(model.notice(), Some("nothing to delete: the last episode is not too short"));
-}
-
 #[test]
 fn a_held_space_bar_begins_one_episode_and_a_second_press_ends_it() {
     let space = || press(KeyCode::Char(' '));
-    let toggled = Effect::Send(Command::ToggleRecording);
+    let toggled = Effect::Send(Command::Session(SessionRequest::Toggle));
     let mut model = Model::new(three_streaming());
     let mut presses = |times: &[u64], recording: bool| {
         let mut snapshot = three_streaming();
@@ -358,4 +273,55 @@ fn an_announcement_ends_with_what_it_announces() {
         model.update(after(&then, 200));
         assert_eq!(model.notice(), None);
     }
+}
+
+fn typed(model: &mut Model, text: &str) {
+    for c in text.chars() {
+        assert_eq!(model.update(press(KeyCode::Char(c))), Effect::None, "{c}");
+    }
+}
+
+#[test]
+fn a_text_is_typed_and_sent_by_enter_and_escape_disarms_and_closes_it() {
+    let note = |text: &str| Effect::Send(Command::Session(SessionRequest::Note { text: text.to_owned() }));
+    let mut model = Model::new(three_streaming());
+    typed(&mut model, "nquick dxE");
+    assert_eq!(model.prompt(), Some(("note: ", "quick dxE")));
+    model.update(press(KeyCode::Backspace));
+    assert_eq!(model.update(press(KeyCode::Enter)), note("quick dx"));
+    assert_eq!(model.prompt(), None);
+    // It is empty again, and an empty one removes the note.
+    typed(&mut model, "n");
+    assert_eq!(model.update(press(KeyCode::Enter)), note(""));
+    typed(&mut model, "-slipped");
+    let label = SessionRequest::Label { label: Label::Failure, reason: "slipped".to_owned() };
+    assert_eq!(model.update(press(KeyCode::Enter)), Effect::Send(Command::Session(label)));
+    typed(&mut model, "nhalf");
+    assert_eq!(model.update(press(KeyCode::Esc)), Effect::Order(Order::Disarm));
+    assert_eq!(model.prompt(), None);
+    assert_eq!(model.update(press(KeyCode::Enter)), Effect::None);
+}
+
+#[test]
+fn the_end_of_a_session_is_confirmed_by_a_word() {
+    for (word, expected) in [("end", Effect::Send(Command::Session(SessionRequest::EndSession))), ("", Effect::None)] {
+        let mut model = Model::new(three_streaming());
+        typed(&mut model, "E");
+        typed(&mut model, word);
+        assert_eq!(model.update(press(KeyCode::Enter)), expected);
+    }
+}
+
+#[test]
+fn the_answer_to_a_request_is_shown_whoever_made_it() {
+    let mut model = Model::new(three_streaming());
+    let mut answered = three_streaming();
+    let answer = Answered { at: TAKEN, text: "a_003.mcap is back".to_owned(), refused: false };
+    answered.session = Some(SessionStatus { answer: Some(answer), ..SessionStatus::default() });
+    model.update(after(&answered, 100));
+    assert_eq!(model.notice(), Some("a_003.mcap is back"));
+    // Only when it is new.
+    model.update(after(&answered, 4_300));
+    model.update(after(&answered, 4_400));
+    assert_eq!(model.notice(), None);
 }

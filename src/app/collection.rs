@@ -1,0 +1,298 @@
+//! What a run collects: its session, with the recorder and the keeper that carry out what the session decides.
+//!
+//! Invariant: the recorder alone knows whether an episode is in progress; the session follows what it reports.
+//! Invariant: a request is answered once, also when what it waits for does not happen.
+
+use std::sync::Arc;
+
+use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::oneshot;
+use tokio::time::timeout;
+
+use super::AppError;
+use super::conductor::LAST_SAMPLES;
+use super::requests::Reply;
+use super::stage::join;
+use crate::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
+use crate::session::journal::{Journal, Plan};
+use crate::session::keeper::{Keeper, Operation, Outcome};
+use crate::session::{Answer, Effect, Session};
+use crate::status::session::{Answered, Phase, SessionRequest, SessionStatus};
+use crate::status::{Board, EpisodeEnd, Level, What};
+use crate::time::{Stamp, realtime_ns, rfc3339};
+
+/// Answers that wait for an episode to begin, or to end.
+type Waiting = Vec<oneshot::Sender<Result<String, String>>>;
+
+/// See the module's comment.
+pub(super) struct Collection {
+    board: Arc<Board>,
+    pub(super) recorder: Recorder,
+    /// Folder, modules and duration of each episode; task and tags are the session's.
+    episode: EpisodeRequest,
+    session: Session,
+    keeper: Keeper,
+    outcomes: UnboundedReceiver<Outcome>,
+    at_begin: Waiting,
+    at_end: Waiting,
+    answer: Option<Answered>,
+    /// When the session began whose file is there but which is not continued. It is closed when an episode begins: a run
+    /// that records nothing changes nothing.
+    superseded: Option<String>,
+    /// The end that was handled last: a reader that missed events may see it again.
+    handled: Option<EpisodeEnd>,
+}
+
+impl Collection {
+    /// Continues the session of the folder of `episode`, or begins one by `plan`.
+    ///
+    /// # Errors
+    /// When the system provides no thread.
+    pub(super) fn new(
+        recorder: Recorder,
+        episode: EpisodeRequest,
+        plan: Plan,
+        board: &Arc<Board>,
+    ) -> Result<Self, AppError> {
+        let (journal, before, error) = Journal::open(&episode.out);
+        if let Some(error) = error {
+            tracing::warn!(%error, "an earlier session is not continued");
+        }
+        let earlier = before.as_ref().map(|before| before.begun.clone());
+        let (session, is_new) = Session::new(&episode.out, plan, before, rfc3339(realtime_ns()));
+        let (keeper, outcomes) = Keeper::start(&episode.out, journal)?;
+        let collection = Self {
+            board: Arc::clone(board),
+            recorder,
+            episode,
+            session,
+            keeper,
+            outcomes,
+            at_begin: Vec::new(),
+            at_end: Vec::new(),
+            answer: None,
+            superseded: earlier.filter(|_| is_new),
+            handled: None,
+        };
+        collection.show();
+        Ok(collection)
+    }
+
+    /// What is collected is complete.
+    pub(super) fn is_complete(&self) -> bool {
+        self.session.is_complete()
+    }
+
+    /// When [`Self::tick`] is to be called next, if at all.
+    pub(super) fn due(&self) -> Option<Stamp> {
+        self.session.due()
+    }
+
+    /// Carries out what is due.
+    ///
+    /// # Errors
+    /// When an episode could not begin.
+    pub(super) async fn tick(&mut self) -> Result<(), RecordError> {
+        let effects = self.session.tick(Stamp::now());
+        self.carry_out(effects).await
+    }
+
+    /// Carries out a request made at `at`.
+    ///
+    /// # Errors
+    /// When an episode could not begin; the requester has been answered.
+    pub(super) async fn request(
+        &mut self,
+        request: &SessionRequest,
+        at: Stamp,
+        reply: Reply,
+    ) -> Result<(), RecordError> {
+        match self.session.request(request, at) {
+            Ok((answer, effects)) => {
+                match answer {
+                    Answer::Now(text) => self.answer(Ok(text), reply),
+                    Answer::AtBegin => self.at_begin.extend(reply),
+                    Answer::AtEnd => self.at_end.extend(reply),
+                }
+                self.carry_out(effects).await
+            }
+            Err(refusal) => {
+                self.answer(Err(refusal.to_string()), reply);
+                self.show();
+                Ok(())
+            }
+        }
+    }
+
+    /// An episode has ended. One that was handled already is ignored.
+    ///
+    /// # Errors
+    /// When the next one could not begin.
+    pub(super) async fn ended(&mut self, end: &EpisodeEnd) -> Result<(), RecordError> {
+        let effects = self.note_end(end);
+        self.carry_out(effects).await
+    }
+
+    fn note_end(&mut self, end: &EpisodeEnd) -> Vec<Effect> {
+        if self.handled.as_ref() == Some(end) {
+            return Vec::new();
+        }
+        self.handled = Some(end.clone());
+        let text = match &end.error {
+            Some(error) => Err(format!("{}: {error}", end.file.display())),
+            None => Ok(format!("{}: {}, {:.1} s", end.file.display(), end.verdict.grade.word(), end.seconds)),
+        };
+        for reply in self.at_end.drain(..) {
+            // The requester may have ended.
+            let _ = reply.send(text.clone());
+        }
+        self.session.ended(&end.file, end.seconds, &end.verdict, Stamp::now())
+    }
+
+    /// The next outcome of the keeper. Cancel-safe.
+    pub(super) async fn outcome(&mut self) -> Outcome {
+        match self.outcomes.recv().await {
+            Some(outcome) => outcome,
+            // Its thread ends with this.
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Takes an outcome of the keeper.
+    pub(super) fn take(&mut self, outcome: Outcome) {
+        match outcome {
+            Outcome::Discarded(file) => self.board.announce(What::Discarded { file: self.episode.out.join(file) }),
+            Outcome::Restored(file) => self.board.announce(What::Restored { file: self.episode.out.join(file) }),
+            Outcome::NotMoved(file, why) => {
+                self.session.not_moved(&file);
+                self.keeper.request(Operation::Save(self.session.file().clone()));
+                self.fail(format!("{file} was not moved: {why}"));
+            }
+            Outcome::Failed(why) => self.fail(format!("the session is not saved: {why}")),
+        }
+        self.show();
+    }
+
+    fn fail(&mut self, text: String) {
+        self.board.announce(What::Log { level: Level::Error, text: text.clone() });
+        self.answer(Err(text), None);
+    }
+
+    /// Carries out effects in order; an episode that cannot begin ends them.
+    async fn carry_out(&mut self, effects: Vec<Effect>) -> Result<(), RecordError> {
+        let mut outcome = Ok(());
+        for effect in effects {
+            match effect {
+                Effect::Begin => outcome = self.begin().await,
+                effect => self.change(effect),
+            }
+        }
+        if self.session.phase() == Phase::Idle {
+            // Whatever they waited for was called off.
+            for reply in self.at_begin.drain(..) {
+                let _ = reply.send(Err("no episode begins".to_owned()));
+            }
+        }
+        self.show();
+        outcome
+    }
+
+    /// Carries out an effect other than the beginning of an episode.
+    fn change(&mut self, effect: Effect) {
+        match effect {
+            Effect::Begin => {}
+            Effect::Save => self.keeper.request(Operation::Save(self.session.file().clone())),
+            Effect::End(at) => self.recorder.end(at),
+            Effect::Discard(file) => self.keeper.request(Operation::Discard(file)),
+            Effect::Restore(file) => self.keeper.request(Operation::Restore(file)),
+            Effect::Mark(text) => self.board.announce(What::Mark { text }),
+            Effect::Close(gone) => {
+                let now = rfc3339(realtime_ns());
+                self.keeper.request(Operation::Close(self.session.closed(now.clone()), gone));
+                self.session.renew(now);
+            }
+        }
+    }
+
+    async fn begin(&mut self) -> Result<(), RecordError> {
+        let plan = self.session.plan();
+        let request = EpisodeRequest {
+            task: plan.task.clone(),
+            tags: plan.tags.iter().map(|(key, value)| (key.clone(), value.clone())).collect(),
+            ..self.episode.clone()
+        };
+        let started = self.recorder.start(request).await;
+        let why = started.as_ref().err().map(ToString::to_string);
+        self.board.set_not_started(why.clone());
+        let begun = rfc3339(realtime_ns());
+        if let Some(begun) = self.superseded.take_if(|_| started.is_ok()) {
+            self.keeper.request(Operation::Archive(begun));
+        }
+        for effect in self.session.began(started.as_deref().ok(), begun, Stamp::now()) {
+            self.change(effect);
+        }
+        for reply in self.at_begin.drain(..) {
+            let _ = reply.send(match (&started, &why) {
+                (Ok(file), _) => Ok(format!("recording {}", file.display())),
+                (Err(_), why) => Err(why.clone().unwrap_or_default()),
+            });
+        }
+        started.map(|_| ())
+    }
+
+    fn answer(&mut self, text: Result<String, String>, reply: Reply) {
+        let (refused, shown) = match &text {
+            Ok(text) => (false, text.clone()),
+            Err(text) => (true, text.clone()),
+        };
+        self.answer = Some(Answered { at: Stamp::now(), text: shown, refused });
+        // The requester may have ended.
+        let _ = reply.map(|reply| reply.send(text));
+    }
+
+    fn show(&self) {
+        self.board.set_session(SessionStatus { answer: self.answer.clone(), ..self.session.status() });
+    }
+
+    /// Ends the episode in progress at this moment, and waits until its last samples are written: those captured before
+    /// may still be in transit.
+    pub(super) async fn end_episode(&self) {
+        self.recorder.end(Stamp::now());
+        let mut episode = self.recorder.episode();
+        // A stalled disk delays the file, and nothing else.
+        let _ = timeout(LAST_SAMPLES, episode.wait_for(Option::is_none)).await;
+    }
+
+    /// Ends the episode in progress, if there is one, waits until its file is closed, and notes it; no other begins.
+    pub(super) async fn finish_episode(&mut self) -> Option<EpisodeEnd> {
+        let EpisodeReport { file, seconds, error, verdict, .. } = self.recorder.stop().await.ok()?;
+        let end = EpisodeEnd { file, seconds, error, verdict };
+        self.note_last(&end);
+        Some(end)
+    }
+
+    /// An episode has ended, and no other begins.
+    pub(super) fn note_last(&mut self, end: &EpisodeEnd) {
+        for effect in self.note_end(end) {
+            self.change(effect);
+        }
+    }
+
+    /// Writes the summary and waits until everything about the session is on the disk.
+    ///
+    /// # Errors
+    /// When the keeper panicked.
+    pub(super) async fn close(&mut self) -> Result<(), AppError> {
+        if !self.session.file().episodes.is_empty() {
+            self.keeper.request(Operation::Summarise(self.session.file().clone()));
+        }
+        let outcome = match self.keeper.close() {
+            Some(thread) => join(thread, "thread `session`").await,
+            None => Ok(()),
+        };
+        while let Some(outcome) = self.outcomes.recv().await {
+            self.take(outcome);
+        }
+        outcome
+    }
+}

@@ -1,0 +1,69 @@
+//! The episodes panel: those of the session, the newest first.
+
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::text::{Line, Span};
+
+use super::model::Model;
+use super::theme::Theme;
+use super::view;
+use crate::status::session::{EpisodeEntry, Label, SessionStatus};
+use crate::text;
+
+/// Columns of the name of a file.
+const NAME: usize = 34;
+
+/// Episodes to list, of those that have ended.
+fn ended(session: &SessionStatus) -> impl Iterator<Item = &EpisodeEntry> {
+    session.episodes.iter().rev().filter(|entry| entry.verdict.is_some())
+}
+
+/// Rows for the panel without its rule, at most `most`; 0 if there is nothing to list.
+pub(super) fn rows(model: &Model, most: u16) -> u16 {
+    let count = model.latest().session.as_ref().map_or(0, |session| ended(session).count());
+    u16::try_from(count).unwrap_or(most).min(most)
+}
+
+pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, rows: u16, model: &Model, theme: Theme) {
+    let Some(session) = &model.latest().session else { return };
+    let remark = Span::styled(counts(session), theme.faint());
+    let inner = view::panel(frame, area, "Episodes", remark.into(), theme);
+    for (entry, row) in ended(session).zip(inner.rows()).take(usize::from(rows)) {
+        frame.render_widget(line(entry, usize::from(row.width), theme), row);
+    }
+}
+
+/// `12 of 50, 9 GOOD 2 SUSPECT 1 BAD, 1 in the trash`.
+fn counts(session: &SessionStatus) -> String {
+    let [good, suspect, bad] = session.verdicts;
+    let trash = if session.discarded > 0 { format!(", {} in the trash", session.discarded) } else { String::new() };
+    format!("{}, {good} GOOD {suspect} SUSPECT {bad} BAD{trash}", session.progress())
+}
+
+fn line(entry: &EpisodeEntry, width: usize, theme: Theme) -> Line<'static> {
+    let name = text::left(&theme.safe(&entry.file), NAME, theme.ellipsis());
+    let grade = entry.verdict.map_or_else(Span::default, |grade| {
+        Span::styled(format!("  {:7}", grade.word()), if entry.discarded { theme.faint() } else { theme.grade(grade) })
+    });
+    let length = Span::raw(format!("  {:>7.1} s", entry.seconds.unwrap_or_default()));
+    let label = match entry.label {
+        Some(label @ Label::Success) => Span::styled(format!("  {:7}", label.word()), theme.good()),
+        Some(label @ Label::Failure) => Span::styled(format!("  {:7}", label.word()), theme.warning()),
+        None => Span::raw(" ".repeat(9)),
+    };
+    let discarded = if entry.discarded { "discarded".to_owned() } else { String::new() };
+    let marks = match entry.marks.len() {
+        0 => String::new(),
+        count => text::counted(count as u64, "mark"),
+    };
+    let sensors = entry.sensors.as_ref().map(ToString::to_string).unwrap_or_default();
+    let reasons = entry.reasons.join("; ");
+    let remarks = [&discarded, &entry.label_reason, &entry.note, &marks, &reasons, &sensors];
+    let remarks: Vec<_> = remarks.into_iter().filter(|text| !text.is_empty()).map(|text| theme.safe(text)).collect();
+    let style = if entry.discarded { theme.faint() } else { ratatui::style::Style::new() };
+    let mut line = Line::from(vec![Span::styled(name, style), grade, length, label]);
+    let room = width.saturating_sub(line.width() + 2);
+    let remarks = text::cut(&remarks.join("; "), room, theme.ellipsis()).into_owned();
+    line.push_span(Span::styled(format!("  {remarks}"), theme.faint()));
+    line
+}
