@@ -45,7 +45,7 @@ use crate::interlock::Interlocks;
 use crate::interlocks::{self, Watched};
 use crate::logging::{self, Stderr};
 use crate::mask::MASK_PATH;
-use crate::orders::receive::Orders;
+use crate::orders::receive::{Asked, Orders};
 use crate::panics;
 use crate::permission::Permission;
 use crate::record::{EpisodeRequest, RecorderConfig};
@@ -144,7 +144,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     }
     raise_open_files();
     // Before anything that can fail on a full or damaged machine.
-    let (permission, _orders) = receive_orders(options.instance.as_deref(), options.arm, interlocks::of(&registry))?;
+    let (permission, _orders, asked) =
+        receive_orders(options.instance.as_deref(), options.arm, interlocks::of(&registry))?;
     let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
 
     bus::check_memory()?;
@@ -158,9 +159,10 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let presence = Presence::start(claim, mask_writer, Arc::clone(&board))?;
 
     let out = options.episode.out.clone();
-    let may_record = options.record || options.screen == Screen::Monitor;
+    // Without a policy, on order of another program too.
+    let may_record = options.record || options.policy.is_none() || options.screen == Screen::Monitor;
     let reserve = registry.rig.disk_reserve;
-    let machine = Machine { registry, board: Arc::clone(&board), permission, signals, presence };
+    let machine = Machine { registry, board: Arc::clone(&board), permission, signals, presence, asked };
     let watchman = bus.watchman();
     let (mut running, mut conductor) = start(machine, &bus, options).await?;
     // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
@@ -203,11 +205,13 @@ struct Machine {
     permission: Arc<Permission>,
     signals: Signals,
     presence: Presence,
+    /// Requests of other programs.
+    asked: mpsc::Receiver<Asked>,
 }
 
 /// Starts the stages and the screen. The bus must outlive them.
 async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running, Conductor), AppError> {
-    let Machine { registry, board, permission, signals, presence } = machine;
+    let Machine { registry, board, permission, signals, presence, asked } = machine;
     let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let following = recorder.episode();
@@ -242,7 +246,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         }
     };
     let (to_rig, rig_commands) = mpsc::channel(16);
-    let requests = requests::sorted(from_screen, to_rig);
+    let requests = requests::sorted(from_screen, asked, to_rig);
     let mask_ended = presence.ended();
     let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
     let streaming = Streaming::start(rig.obeying(&permission).tapped(watched.taps()), plugged, rig_commands);
@@ -287,15 +291,16 @@ fn synchronise(alignment: Alignment) -> Stage {
     })
 }
 
-/// Receives orders of other programs to arm and disarm motors, and disarms them at a signal, regardless of what else
-/// the run waits for.
+/// Receives orders of other programs to arm and disarm motors, and their requests to the session; and disarms motors at
+/// a signal, regardless of what else the run waits for.
 fn receive_orders(
     instance: Option<&str>,
     arm: bool,
     interlocks: Interlocks,
-) -> Result<(Arc<Permission>, Orders), AppError> {
+) -> Result<(Arc<Permission>, Orders, mpsc::Receiver<Asked>), AppError> {
     let permission = Arc::new(Permission::new(arm).with_interlocks(interlocks));
-    let orders = Orders::receive(instance, Arc::clone(&permission)).map_err(AppError::Orders)?;
+    let (session, asked) = mpsc::channel(16);
+    let orders = Orders::receive(instance, Arc::clone(&permission), session).map_err(AppError::Orders)?;
     tokio::spawn({
         let (mut signals, permission) = (Signals::listen()?, Arc::clone(&permission));
         async move {
@@ -305,7 +310,7 @@ fn receive_orders(
             }
         }
     });
-    Ok((permission, orders))
+    Ok((permission, orders, asked))
 }
 
 /// The screen has limits for a reader that does not read. This one is for a screen that is stuck: crossterm 0.29 reads

@@ -2,6 +2,8 @@
 //!
 //! Invariant: a command shows and accepts only the options that have an effect on it.
 
+mod session;
+
 use std::ffi::OsString;
 use std::ops::RangeBounds;
 use std::path::PathBuf;
@@ -13,6 +15,7 @@ use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, 
 
 #[cfg(feature = "policy")]
 use crate::lockstep::evaluate::Condition;
+pub use session::{EpisodeCommand, SessionCommand};
 
 /// Record robot demonstrations with hot-plugged sensors
 #[derive(Debug, Parser)]
@@ -92,7 +95,7 @@ pub struct Global {
     #[arg(long, short, global = true, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub config: Option<PathBuf>,
     /// Print JSON objects, one per line
-    #[arg(long, global = true)]
+    #[arg(long, global = true, hide_short_help = true)]
     pub json: bool,
     /// Name of this rig, if several run on one machine
     #[arg(long, global = true, value_name = "NAME", value_parser = instance, hide_short_help = true,
@@ -109,7 +112,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "devices" | "register" | "calibrate" => &["sim", "config", "json"],
         "unregister" | "check" | "doctor" | "ablation" => &["config", "json"],
         "artifacts" => &["config"],
-        "mask" | "replay" => &["json", "instance"],
+        "mask" | "replay" | "episode" | "session" => &["json", "instance"],
         "arm" | "disarm" => &["instance"],
         "inspect" | "recover" | "eval" => &["json"],
         _ => &[],
@@ -255,6 +258,20 @@ pub enum Command {
         neither disk nor shared memory.\n\nExamples:\n  rapid disarm\n  rapid disarm --instance left"
     )]
     Disarm,
+    /// Begin, end, discard or label episodes of a running rapid
+    #[command(after_long_help = session::EPISODE)]
+    Episode {
+        /// What to do.
+        #[command(subcommand)]
+        what: EpisodeCommand,
+    },
+    /// Print or change what a running rapid collects
+    #[command(after_long_help = session::SESSION)]
+    Session {
+        /// What to do.
+        #[command(subcommand)]
+        what: Option<SessionCommand>,
+    },
     /// Report on episodes: verdict, rates, gaps, latency, presence
     #[command(after_long_help = "One file gives a report; a folder or several files one line each: GOOD, SUSPECT or \
         BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \

@@ -17,7 +17,9 @@ use tokio_util::sync::CancellationToken;
 
 use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Calibration, Cli, Command, Global, PolicyArgs, RegisterArgs, RunArgs, UnregisterArgs};
+use crate::cli::{
+    Calibration, Cli, Command, Global, PolicyArgs, RegisterArgs, RunArgs, SessionCommand, UnregisterArgs,
+};
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::inspect::InspectFailure;
 use crate::commands::mask::MaskOptions;
@@ -33,6 +35,7 @@ use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::session::journal::Plan;
+use crate::status::session::SessionRequest;
 use crate::{outlet, text};
 
 #[cfg(feature = "policy")]
@@ -102,6 +105,13 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             Ok(commands::arm::order(global.instance.as_deref(), order, out)?)
         }
         Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
+        Command::Episode { what } => {
+            Ok(commands::session::ask(global.instance.as_deref(), &what.into_request(), format, out)?)
+        }
+        Command::Session { what } => {
+            let request = what.map_or(SessionRequest::Show, SessionCommand::into_request);
+            Ok(commands::session::ask(global.instance.as_deref(), &request, format, out)?)
+        }
         Command::Calibrate { what: Calibration::Latency(args) } => {
             let (registry, attached) = connected(global)?;
             Ok(block_on(commands::calibrate::latency(&registry, &attached, &args, format, out))??)
@@ -473,6 +483,7 @@ failures! {
     };
     commands::artifacts::ArtifactsError: |_| 1;
     commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
+    commands::session::RequestError: |_| 1;
     commands::arm::OrderError: |error| match error {
         commands::arm::OrderError::Give(_) => 3,
         commands::arm::OrderError::Output(_) => 1,

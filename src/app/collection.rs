@@ -107,10 +107,14 @@ impl Collection {
         at: Stamp,
         reply: Reply,
     ) -> Result<(), RecordError> {
+        let is_shown = *request != SessionRequest::Show;
         match self.session.request(request, at) {
             Ok((answer, effects)) => {
                 match answer {
-                    Answer::Now(text) => self.answer(Ok(text), reply),
+                    Answer::Now(text) if is_shown => self.answer(Ok(text), reply),
+                    Answer::Now(text) => {
+                        let _ = reply.map(|reply| reply.send(Ok(text)));
+                    }
                     Answer::AtBegin => self.at_begin.extend(reply),
                     Answer::AtEnd => self.at_end.extend(reply),
                 }

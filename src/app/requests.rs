@@ -1,10 +1,12 @@
-//! Requests of the screen, sorted by receiver.
+//! Requests of the screen and of other programs, sorted by receiver.
 //!
 //! Invariant: a request to the rig never waits for a file: it does not pass through the conductor, which waits for
 //! files to be closed. Orders to the actuator take a separate path ([`crate::permission`]).
 
 use tokio::sync::{mpsc, oneshot};
+use tokio::task::spawn_blocking;
 
+use crate::orders::receive::Asked;
 use crate::rig::RigCommand;
 use crate::status::Command;
 use crate::status::session::SessionRequest;
@@ -22,13 +24,27 @@ pub(super) enum Request {
     Quit,
 }
 
-/// Sorts requests of the screen until it has ended. Those to the conductor wait in an unbounded queue: a person types
-/// them.
+/// Sorts requests until the screen, and what receives those of other programs, have ended. Those to the conductor wait in
+/// an unbounded queue: a person types them, and other programs wait for an answer to each.
 pub(super) fn sorted(
     mut screen: mpsc::Receiver<Command>,
+    mut asked: mpsc::Receiver<Asked>,
     rig: mpsc::Sender<RigCommand>,
 ) -> mpsc::UnboundedReceiver<Request> {
     let (conductor, requests) = mpsc::unbounded_channel();
+    let to_conductor = conductor.clone();
+    tokio::spawn(async move {
+        while let Some(asked) = asked.recv().await {
+            let (reply, answer) = oneshot::channel();
+            let request = Request::Session(asked.request.clone(), asked.at, Some(reply));
+            // A receiver is gone only when the run ends; so is then the other end of the answer.
+            let _ = to_conductor.send(request);
+            tokio::spawn(async move {
+                let answer = answer.await.unwrap_or_else(|_| Err("the run is ending".to_owned()));
+                let _ = spawn_blocking(move || asked.answer(answer)).await;
+            });
+        }
+    });
     tokio::spawn(async move {
         while let Some(command) = screen.recv().await {
             // A receiver is gone only when the run ends.
@@ -51,7 +67,7 @@ mod tests {
     async fn the_rig_is_reached_while_the_conductor_is_busy() {
         let (screen, from_screen) = mpsc::channel(1);
         let (rig, mut at_rig) = mpsc::channel(1);
-        let mut requests = sorted(from_screen, rig);
+        let mut requests = sorted(from_screen, mpsc::channel(1).1, rig);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }

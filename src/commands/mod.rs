@@ -19,6 +19,7 @@ pub mod mask;
 pub mod progress;
 pub mod recover;
 pub mod register;
+pub mod session;
 
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -8,9 +8,10 @@ use std::time::Duration;
 
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket_with};
 
-use super::{DONE, LONGEST, instance_part, line, this_user};
+use super::{Answer, DONE, LONGEST, LONGEST_ANSWER, instance_part, line, this_user};
 use crate::action::Order;
 use crate::peer::Peer;
+use crate::status::session::SessionRequest;
 use crate::text::plain;
 use crate::time::Stamp;
 
@@ -37,7 +38,9 @@ pub enum GiveError {
         others: Vec<Other>,
     },
     /// Several runs.
-    #[error("several runs are active (processes {0:?}): arm as the user of one of them, or name it with --instance")]
+    #[error(
+        "several runs are active (processes {0:?}): run this as the user of one of them, or name it with --instance"
+    )]
     Several(Vec<u32>),
     /// The run refused it.
     #[error("process {process}: {why}")]
@@ -53,6 +56,14 @@ pub enum GiveError {
          -9 {process}`, after which its guard stops them"
     )]
     NoAnswer {
+        /// Its process.
+        process: u32,
+        /// Why not.
+        error: io::Error,
+    },
+    /// The run did not answer a request.
+    #[error("process {process} ended or did not answer ({error})")]
+    Unanswered {
         /// Its process.
         process: u32,
         /// Why not.
@@ -128,6 +139,28 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     unreached.map_or(Ok(()), Err)
 }
 
+/// Makes a request to the session of the run of `instance`; the answer, once it is carried out.
+///
+/// # Errors
+/// When no run has carried it out.
+pub fn request(instance: Option<&str>, request: &SessionRequest) -> Result<String, GiveError> {
+    let sockets = String::from_utf8_lossy(&fs::read(SOCKETS)?).into_owned();
+    let (mut runs, _) = runs(&sockets, instance)?;
+    let run = match (runs.pop(), runs.is_empty()) {
+        (Some(run), true) => run,
+        (Some(last), false) => {
+            return Err(GiveError::Several(runs.iter().chain([&last]).map(|run| run.process).collect()));
+        }
+        (None, _) => {
+            let others = sockets.lines().filter_map(|line| other_of(line, instance)).collect();
+            return Err(GiveError::NoRun { instance: instance.map(str::to_owned), others });
+        }
+    };
+    let process = run.process;
+    let answer = run.ask(request).map_err(|error| GiveError::Unanswered { process, error })?;
+    if answer.ok { Ok(answer.text) } else { Err(GiveError::Refused { process, why: answer.text }) }
+}
+
 fn is_of_this_user(process: u32) -> bool {
     fs::metadata(format!("/proc/{process}")).is_ok_and(|about| about.uid() == this_user())
 }
@@ -143,6 +176,19 @@ impl Run {
     fn send(mut self, order: Order, given: Stamp) -> io::Result<UnixStream> {
         self.stream.write_all(line(order, given).as_bytes())?;
         Ok(self.stream)
+    }
+
+    /// Waits without a limit: an episode may take minutes to be closed, or to begin.
+    fn ask(mut self, request: &SessionRequest) -> io::Result<Answer> {
+        self.stream.write_all(format!("{}\n", serde_json::to_string(request)?).as_bytes())?;
+        self.stream.set_read_timeout(None)?;
+        let mut line = String::new();
+        BufReader::new(self.stream.take(LONGEST_ANSWER)).read_line(&mut line)?;
+        if line.is_empty() {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        // An older rapid knows no requests; its answer is its reason.
+        serde_json::from_str(&line).map_err(|_| io::Error::other(line.trim_end().to_owned()))
     }
 }
 

@@ -1,4 +1,5 @@
-//! Orders of other programs to the actuator: `rapid arm` and `rapid disarm`.
+//! Orders of other programs: to the actuator (`rapid arm`, `rapid disarm`), and requests to the session (`rapid episode`,
+//! `rapid session`).
 //!
 //! They come over a socket of the abstract namespace, which needs neither a disk nor shared memory: a run can be
 //! stopped while /dev/shm, /tmp and the disk are full and its bus is damaged. [`receive`] is the run's side, [`give`]
@@ -7,7 +8,9 @@
 //! The name is `rapid/USER/INSTANCE/PROCESS`, numbers except for the instance, which is `-` where there is none
 //! (unix(7)). Any user can create a socket of that name: the peer is identified by the kernel (`SO_PEERCRED`). An order
 //! is one line, `arm NS` or `disarm NS` with the time at which it was given (`CLOCK_MONOTONIC`, ns); the answer is one
-//! line, `done` or the reason of the refusal, and the connection is closed.
+//! line, `done` or the reason of the refusal, and the connection is closed. A request is one line of JSON, a
+//! [`SessionRequest`](crate::status::session::SessionRequest); so is its [`Answer`], which comes when what was requested is done: when the file of an episode is
+//! closed, or when one has begun.
 //!
 //! Invariant: orders of this user and of root are accepted, and of no one else; they are given to a run of this user,
 //! or by root to anyone's.
@@ -21,11 +24,15 @@ use std::io;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::SocketAddr;
 
+use serde::{Deserialize, Serialize};
+
 use crate::action::Order;
 use crate::time::Stamp;
 
-/// Longest line.
-const LONGEST: usize = 256;
+/// Longest line: a text of 2000 bytes, each of them escaped.
+const LONGEST: usize = 16_384;
+/// Longest answer to a request: the episodes of a session with their notes.
+const LONGEST_ANSWER: u64 = 1 << 24;
 /// The answer to an order that was carried out.
 const DONE: &str = "done";
 
@@ -54,6 +61,15 @@ fn line(order: Order, given: Stamp) -> String {
         Order::Disarm | Order::Emergency(_) => "disarm",
     };
     format!("{word} {}\n", given.0)
+}
+
+/// The answer to a request.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Answer {
+    /// Whether it was carried out.
+    pub ok: bool,
+    /// What was done, or why not.
+    pub text: String,
 }
 
 /// The order in a line, without its end.

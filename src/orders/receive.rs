@@ -1,5 +1,7 @@
 //! The run's side: thread `orders`, which receives orders over the socket.
 //!
+//! Requests to the session are handed to the run, which answers them.
+//!
 //! Invariant: it writes to no file and no terminal, and does not wait for a peer: a connection that sends nothing, or
 //! does not read its answer, delays no other.
 
@@ -11,17 +13,43 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
+use tokio::sync::mpsc::Sender;
+use tokio::sync::mpsc::error::TrySendError;
 
-use super::{DONE, LONGEST, address, name, order, this_user};
+use super::{Answer, DONE, LONGEST, address, name, order, this_user};
 use crate::action::Order;
 use crate::peer::Peer;
 use crate::permission::Permission;
+use crate::status::session::SessionRequest;
 use crate::time::Stamp;
 
 /// Connections at a time; beyond that the oldest is closed.
 const CONNECTIONS: usize = 16;
 /// A connection that has sent no order for this long is closed.
 const PATIENCE: Duration = Duration::from_secs(2);
+
+/// A request to the session.
+#[derive(Debug)]
+pub struct Asked {
+    /// What is requested.
+    pub request: SessionRequest,
+    /// When it arrived.
+    pub at: Stamp,
+    stream: UnixStream,
+}
+
+impl Asked {
+    /// Answers; waits a little for a requester that does not read.
+    pub fn answer(mut self, answer: Result<String, String>) {
+        let answer = match answer {
+            Ok(text) => Answer { ok: true, text },
+            Err(text) => Answer { ok: false, text },
+        };
+        // The requester may have ended.
+        let _ = self.stream.set_nonblocking(false).and_then(|()| self.stream.set_write_timeout(Some(PATIENCE)));
+        let _ = serde_json::to_string(&answer).map(|line| self.stream.write_all(format!("{line}\n").as_bytes()));
+    }
+}
 
 /// Takes orders until it is dropped.
 #[derive(Debug)]
@@ -31,15 +59,16 @@ pub struct Orders {
 }
 
 impl Orders {
-    /// Takes orders for the run of `instance` from now on.
+    /// Takes orders for the run of `instance` from now on, and hands over requests to its session.
     ///
     /// # Errors
     /// When the system provides no socket or no thread.
-    pub fn receive(instance: Option<&str>, permission: Arc<Permission>) -> io::Result<Self> {
+    pub fn receive(instance: Option<&str>, permission: Arc<Permission>, session: Sender<Asked>) -> io::Result<Self> {
         let listener = UnixListener::bind_addr(&address(&name(this_user(), instance, std::process::id()))?)?;
         listener.set_nonblocking(true)?;
         let stop = Arc::new(eventfd(0, EventfdFlags::CLOEXEC)?);
-        let desk = Desk { listener, stop: Arc::clone(&stop), waiting: Vec::with_capacity(CONNECTIONS), permission };
+        let desk =
+            Desk { listener, stop: Arc::clone(&stop), waiting: Vec::with_capacity(CONNECTIONS), permission, session };
         let thread = std::thread::Builder::new().name("orders".to_owned()).spawn(move || desk.work())?;
         Ok(Self { stop, thread: Some(thread) })
     }
@@ -67,6 +96,7 @@ struct Desk {
     stop: Arc<OwnedFd>,
     waiting: Vec<Waiting>,
     permission: Arc<Permission>,
+    session: Sender<Asked>,
 }
 
 impl Desk {
@@ -89,11 +119,10 @@ impl Desk {
             }
             let now = Stamp::now();
             let mut ready_of = ready.iter().skip(2).copied();
-            let permission = &self.permission;
-            self.waiting.retain_mut(|one| {
-                let stays = !ready_of.next().unwrap_or(false) || one.take(permission);
-                stays && now.since(one.since) < PATIENCE
-            });
+            for mut one in std::mem::take(&mut self.waiting) {
+                let taken = if ready_of.next().unwrap_or(false) { one.take(&self.permission) } else { Taken::Nothing };
+                self.handle(one, taken, now);
+            }
             if ready.get(1) == Some(&true) {
                 self.accept(now);
             }
@@ -110,32 +139,67 @@ impl Desk {
                 self.waiting.remove(0);
             }
             let mut one = Waiting { stream, since: now, line: Vec::new() };
-            if one.take(&self.permission) {
-                self.waiting.push(one);
+            let taken = one.take(&self.permission);
+            self.handle(one, taken, now);
+        }
+    }
+
+    fn handle(&mut self, one: Waiting, taken: Taken, now: Stamp) {
+        match taken {
+            Taken::Nothing if now.since(one.since) < PATIENCE => self.waiting.push(one),
+            Taken::Nothing | Taken::All => {}
+            Taken::Request(request) => {
+                let asked = Asked { request, at: now, stream: one.stream };
+                if let Err(refused) = self.session.try_send(asked) {
+                    let (TrySendError::Full(asked) | TrySendError::Closed(asked)) = refused;
+                    asked.answer(Err("the run does not take requests at the moment".to_owned()));
+                }
             }
         }
     }
 }
 
+/// What a connection has sent.
+#[derive(Debug, PartialEq, Eq)]
+enum Taken {
+    /// No whole line.
+    Nothing,
+    /// All that it will: it is finished.
+    All,
+    /// This.
+    Request(SessionRequest),
+}
+
 impl Waiting {
-    /// Reads what was sent. False when the connection is finished.
-    fn take(&mut self, permission: &Permission) -> bool {
-        let mut bytes = [0; LONGEST];
+    /// Reads what was sent, and carries out an order.
+    fn take(&mut self, permission: &Permission) -> Taken {
+        let mut bytes = [0; 4096];
         match self.stream.read(&mut bytes) {
-            Ok(0) => return false,
+            Ok(0) => return Taken::All,
             Ok(count) => self.line.extend_from_slice(bytes.get(..count).unwrap_or_default()),
-            Err(error) => return matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted),
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {
+                return Taken::Nothing;
+            }
+            Err(_) => return Taken::All,
         }
-        let Some(end) = self.line.iter().position(|byte| *byte == b'\n') else { return self.line.len() < LONGEST };
+        let Some(end) = self.line.iter().position(|byte| *byte == b'\n') else {
+            return if self.line.len() < LONGEST { Taken::Nothing } else { Taken::All };
+        };
         let line = self.line.get(..end).and_then(|line| str::from_utf8(line).ok());
+        if let Some(json) = line.filter(|line| line.starts_with('{')) {
+            match serde_json::from_str(json) {
+                Ok(request) => return Taken::Request(request),
+                Err(error) => return self.reply(&format!("not a request: {error}")),
+            }
+        }
         let answer = match line.and_then(order) {
-            None => "not an order: write `arm NS` or `disarm NS`".to_owned(),
+            None => "not an order: write `arm NS` or `disarm NS`, or a request as JSON".to_owned(),
             Some((Order::Disarm | Order::Emergency(_), _)) => {
                 permission.disarm(Stamp::now());
                 DONE.to_owned()
             }
             // The sender has ended, or no longer waits.
-            Some((Order::Arm | Order::ArmBack, _)) if self.is_left() => return false,
+            Some((Order::Arm | Order::ArmBack, _)) if self.is_left() => return Taken::All,
             Some((Order::ArmBack, given)) => {
                 permission.arm_back(given, Stamp::now()).map_or_else(|void| void.to_string(), |()| DONE.to_owned())
             }
@@ -143,9 +207,13 @@ impl Waiting {
                 permission.arm(given, Stamp::now()).map_or_else(|void| void.to_string(), |()| DONE.to_owned())
             }
         };
+        self.reply(&answer)
+    }
+
+    fn reply(&mut self, answer: &str) -> Taken {
         // There is room for a line, or there is no reader.
         let _ = self.stream.write_all(format!("{answer}\n").as_bytes());
-        false
+        Taken::All
     }
 
     /// Whether the other end has closed.
@@ -175,7 +243,7 @@ mod tests {
             let mut waiting = Waiting { stream, since: Stamp::now(), line: Vec::new() };
             giver.write_all(line(order, Stamp::now()).as_bytes()).unwrap();
             let giver = (!is_gone).then_some(giver);
-            assert!(!waiting.take(&permission));
+            assert_eq!(waiting.take(&permission), Taken::All);
             assert_eq!(attended.take().collect::<Vec<_>>(), taken, "{order:?}, gone: {is_gone}");
             drop(giver);
         }

@@ -5,25 +5,29 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, listen, socket_with};
+use tokio::sync::mpsc::{Receiver, channel};
 
-use super::give::{GiveError, give};
-use super::receive::Orders;
+use super::give::{GiveError, give, request};
+use super::receive::{Asked, Orders};
 use super::*;
 use crate::permission::{Attended, Permission};
+use crate::status::session::SessionRequest;
 use Order::{Arm, Disarm};
 
 /// A run's side, under a separate instance.
 struct Run {
     instance: String,
     permission: Arc<Permission>,
+    requests: Receiver<Asked>,
     _orders: Orders,
 }
 
 fn run(test: &str) -> Run {
     let instance = format!("orders-{test}-{}", std::process::id());
     let permission = Arc::new(Permission::new(false));
-    let orders = Orders::receive(Some(&instance), Arc::clone(&permission)).unwrap();
-    Run { instance, permission, _orders: orders }
+    let (session, requests) = channel(2);
+    let orders = Orders::receive(Some(&instance), Arc::clone(&permission), session).unwrap();
+    Run { instance, permission, requests, _orders: orders }
 }
 
 impl Run {
@@ -151,7 +155,7 @@ fn an_invalid_order_moves_nothing_and_delays_no_other() {
     }
     // It is closed at once: with unread bytes, which is an error here.
     let mut endless = run.connect();
-    let _ = endless.write_all(&[b'x'; 4 * LONGEST]).and_then(|()| endless.read_to_string(&mut String::new()));
+    let _ = endless.write_all(&vec![b'x'; 4 * LONGEST]).and_then(|()| endless.read_to_string(&mut String::new()));
     assert_eq!(run.give(Disarm), Ok(()));
     assert_eq!(taken(&attended), [Disarm]);
 }
@@ -165,4 +169,62 @@ fn an_unresponsive_socket_is_named_with_its_process() {
     let error = give(Some(&instance), Disarm).unwrap_err();
     assert!(error.to_string().contains(&format!("process {} does not answer", std::process::id())), "{error}");
     closes.join().unwrap();
+}
+
+#[test]
+fn a_request_is_answered_when_the_run_answers_it() {
+    let mut run = run("session");
+    let note = SessionRequest::Note { text: "\"a\nnote\" \u{1b}".repeat(100) };
+    let instance = run.instance.clone();
+    let sent = note.clone();
+    let giver = std::thread::spawn(move || request(Some(&instance), &sent).map_err(|error| error.to_string()));
+    let asked = run.requests.blocking_recv().unwrap();
+    assert_eq!(asked.request, note);
+    asked.answer(Ok("noted\nin two lines".to_owned()));
+    assert_eq!(giver.join().unwrap(), Ok("noted\nin two lines".to_owned()));
+    // An answer longer than a socket holds.
+    let instance = run.instance.clone();
+    let giver = std::thread::spawn(move || request(Some(&instance), &SessionRequest::Stop).unwrap_err().to_string());
+    run.requests.blocking_recv().unwrap().answer(Err("x".repeat(1 << 20)));
+    assert!(giver.join().unwrap().len() > 1 << 20);
+    // The run ends without an answer.
+    let instance = run.instance.clone();
+    let giver = std::thread::spawn(move || request(Some(&instance), &SessionRequest::Stop));
+    drop(run.requests.blocking_recv().unwrap());
+    assert!(matches!(giver.join().unwrap(), Err(GiveError::Unanswered { .. })));
+}
+
+#[test]
+fn what_is_no_request_is_refused_and_disturbs_nothing() {
+    let mut run = run("no-session");
+    for text in ["{\n", "{\"do\":\"fly\"}\n", "{\"do\":\"note\"}\n"] {
+        let answer = answered(&mut run.connect(), text.as_bytes());
+        assert!(answer.starts_with("not a request: "), "{answer}");
+    }
+    let answer = answered(&mut run.connect(), &vec![b'x'; LONGEST]);
+    assert_eq!(answer, "");
+    // A requester that has ended is not answered; the request counts.
+    let mut gone = run.connect();
+    gone.write_all(b"{\"do\":\"stop\"}\n").unwrap();
+    drop(gone);
+    let asked = run.requests.blocking_recv().unwrap();
+    assert_eq!(asked.request, SessionRequest::Stop);
+    asked.answer(Ok(String::new()));
+    // With its queue full, a run still answers.
+    let waiting: Vec<_> = (0..2)
+        .map(|_| {
+            let mut one = run.connect();
+            one.write_all(b"{\"do\":\"stop\"}\n").unwrap();
+            one
+        })
+        .collect();
+    let answer = loop {
+        let answer = answered(&mut run.connect(), b"{\"do\":\"stop\"}\n");
+        if !answer.is_empty() {
+            break answer;
+        }
+    };
+    assert!(answer.contains("does not take requests"), "{answer}");
+    drop(waiting);
+    assert_eq!(run.give(Disarm), Ok(()));
 }

@@ -200,6 +200,9 @@ impl Session {
             }
             SessionRequest::Plan { task, tags, goal } => Ok(self.change_plan(task.as_deref(), tags, *goal)),
             SessionRequest::EndSession => self.end_session(),
+            SessionRequest::Show => {
+                Ok((Answer::Now(crate::text::json(&self.status()).unwrap_or_default()), Vec::new()))
+            }
         }
     }
 

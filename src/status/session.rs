@@ -61,6 +61,8 @@ pub enum SessionRequest {
     },
     /// End the session: its file is closed, and its trash is emptied.
     EndSession,
+    /// Answer with a [`SessionStatus`] as JSON.
+    Show,
 }
 
 impl SessionRequest {
@@ -152,7 +154,7 @@ impl EpisodeEntry {
 }
 
 /// What the session does at the moment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(tag = "phase", rename_all = "snake_case")]
 pub enum Phase {
     /// It waits for a request.
@@ -175,7 +177,7 @@ pub enum Phase {
 }
 
 /// An answer to a request.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Answered {
     /// When.
     pub at: Stamp,
@@ -186,7 +188,7 @@ pub struct Answered {
 }
 
 /// A session, for a screen.
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SessionStatus {
     /// Where its episodes are written.
     #[serde(serialize_with = "crate::text::lossy")]

@@ -149,13 +149,7 @@ pub(super) const TABLE: [Binding; 27] = [
     row(Act::Toggle, &[Char(' ')], Pressed, ("space", "start an episode, end the one in progress"), |m| {
         Some(toggles(m))
     }),
-    row(
-        Act::Disarm,
-        &[Char('d'), Char('D')],
-        Always,
-        ("d, esc", "disarm the actuator, in every dialog: motors off"),
-        never,
-    ),
+    row(Act::Disarm, &[Char('d'), Char('D')], Always, ("d, esc", "disarm the actuator: motors are off"), never),
     row(Act::Escape, &[Esc], Always, ("", ""), never),
     row(Act::Next, &[Right], Pressed, ("right", "end the episode and begin the next"), |m| while_recording(m, "next")),
     row(Act::Redo, &[Left], Pressed, ("left", "discard the episode and record it again"), |m| {
