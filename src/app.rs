@@ -220,7 +220,8 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let is_single = goal.is_none() && episode_time.is_none() && reset_time.is_none();
     let duration = episode_time.or(options.duration.filter(|_| is_single));
     let episode = EpisodeRequest { duration, ..options.episode };
-    let collection = Collection::new(recorder, episode, options.plan, &board)?;
+    let is_kept = !(is_single && options.record && options.screen != Screen::Monitor);
+    let collection = Collection::new(recorder, episode, options.plan, is_kept, &board)?;
     let kind = options.screen;
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.

@@ -36,6 +36,9 @@ pub(super) struct Collection {
     at_begin: Waiting,
     at_end: Waiting,
     answer: Option<Answered>,
+    /// The session has a file. A run that records one episode by itself leaves that episode and nothing beside it, unless
+    /// somebody requests something of it.
+    is_kept: bool,
     /// When the session began whose file is there but which is not continued. It is closed when an episode begins: a run
     /// that records nothing changes nothing.
     superseded: Option<String>,
@@ -52,6 +55,7 @@ impl Collection {
         recorder: Recorder,
         episode: EpisodeRequest,
         plan: Plan,
+        is_kept: bool,
         board: &Arc<Board>,
     ) -> Result<Self, AppError> {
         let (journal, before, error) = Journal::open(&episode.out);
@@ -71,6 +75,7 @@ impl Collection {
             at_begin: Vec::new(),
             at_end: Vec::new(),
             answer: None,
+            is_kept,
             superseded: earlier.filter(|_| is_new),
             handled: None,
         };
@@ -97,6 +102,18 @@ impl Collection {
         self.carry_out(effects).await
     }
 
+    /// Begins an episode, as the command line requested.
+    ///
+    /// # Errors
+    /// When it could not begin.
+    pub(super) async fn start(&mut self) -> Result<(), RecordError> {
+        match self.session.request(&SessionRequest::Start, Stamp::now()) {
+            Ok((_, effects)) => self.carry_out(effects).await,
+            // One is in progress already.
+            Err(_) => Ok(()),
+        }
+    }
+
     /// Carries out a request made at `at`.
     ///
     /// # Errors
@@ -108,6 +125,7 @@ impl Collection {
         reply: Reply,
     ) -> Result<(), RecordError> {
         let is_shown = *request != SessionRequest::Show;
+        self.is_kept |= is_shown;
         match self.session.request(request, at) {
             Ok((answer, effects)) => {
                 match answer {
@@ -169,7 +187,7 @@ impl Collection {
             Outcome::Restored(file) => self.board.announce(What::Restored { file: self.episode.out.join(file) }),
             Outcome::NotMoved(file, why) => {
                 self.session.not_moved(&file);
-                self.keeper.request(Operation::Save(self.session.file().clone()));
+                self.change(Effect::Save);
                 self.fail(format!("{file} was not moved: {why}"));
             }
             Outcome::Failed(why) => self.fail(format!("the session is not saved: {why}")),
@@ -205,6 +223,7 @@ impl Collection {
     fn change(&mut self, effect: Effect) {
         match effect {
             Effect::Begin => {}
+            Effect::Save if !self.is_kept => {}
             Effect::Save => self.keeper.request(Operation::Save(self.session.file().clone())),
             Effect::End(at) => self.recorder.end(at),
             Effect::Discard(file) => self.keeper.request(Operation::Discard(file)),
@@ -229,7 +248,7 @@ impl Collection {
         let why = started.as_ref().err().map(ToString::to_string);
         self.board.set_not_started(why.clone());
         let begun = rfc3339(realtime_ns());
-        if let Some(begun) = self.superseded.take_if(|_| started.is_ok()) {
+        if let Some(begun) = self.superseded.take_if(|_| started.is_ok() && self.is_kept) {
             self.keeper.request(Operation::Archive(begun));
         }
         for effect in self.session.began(started.as_deref().ok(), begun, Stamp::now()) {
@@ -287,7 +306,7 @@ impl Collection {
     /// # Errors
     /// When the keeper panicked.
     pub(super) async fn close(&mut self) -> Result<(), AppError> {
-        if !self.session.file().episodes.is_empty() {
+        if self.is_kept && !self.session.file().episodes.is_empty() {
             self.keeper.request(Operation::Summarise(self.session.file().clone()));
         }
         let outcome = match self.keeper.close() {

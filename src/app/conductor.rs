@@ -18,7 +18,6 @@ use crate::bus;
 use crate::fault;
 use crate::record::{RecordError, Recorder, RecorderConfig, Source};
 use crate::sample::Epoch;
-use crate::status::session::SessionRequest;
 use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 use crate::time::Stamp;
 
@@ -105,7 +104,7 @@ impl Conductor {
                 _ = look.tick(), if self.begin_episode => {
                     if self.has_settled(begun) {
                         self.begin_episode = false;
-                        self.collection.request(&SessionRequest::Start, Stamp::now(), None).await?;
+                        self.collection.start().await?;
                     }
                 }
                 outcome = self.collection.outcome() => self.collection.take(outcome),

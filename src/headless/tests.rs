@@ -201,8 +201,8 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  episode            BAD           out/a.mcap cut short, 30.0 s, 1234 messages, 12.3 MB, 0 dropped, 2 of 3 sensors, without tof: the file could not be written: disk nearly full
     22:13:20.000Z  episode            discarded     episode out/a.mcap is in the trash
     22:13:20.000Z  episode            restored      episode out/a.mcap is back
-    22:13:20.000Z  episode            marked        grasped marked
-    22:13:20.000Z  episode            marked        this moment marked
+    22:13:20.000Z  episode            mark          mark "grasped"
+    22:13:20.000Z  episode            mark          mark
     22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
     22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
     22:13:20.000Z  policy             loaded        tactile-id loaded: 10 Hz, hash 0123456789ab, onnxruntime 1.22.0

@@ -2,7 +2,7 @@
 //!
 //! Invariant: pure; built from events and snapshots.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::Serialize;
@@ -86,6 +86,9 @@ struct Episode {
     error: Option<String>,
     #[serde(flatten)]
     verdict: Verdict,
+    /// It is in the trash.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    discarded: bool,
 }
 
 /// The summary; as JSON one object: `{"event":"summary",...}`.
@@ -167,10 +170,19 @@ impl RunTotals {
                 dropped: *dropped,
                 error: error.clone(),
                 verdict: verdict.clone(),
+                discarded: false,
             }),
+            What::Discarded { file } => self.discard(file, true),
+            What::Restored { file } => self.discard(file, false),
             What::Policy { policy, dry_run, .. } => self.policy = Some((policy.clone(), *dry_run)),
             What::PolicyEnd(end) => self.policy_end = Some(*end),
             _ => {}
+        }
+    }
+
+    fn discard(&mut self, file: &Path, discarded: bool) {
+        if let Some(episode) = self.episodes.iter_mut().rfind(|episode| episode.file == file) {
+            episode.discarded = discarded;
         }
     }
 
@@ -237,8 +249,9 @@ impl Summary {
             let dropped = format!("{} dropped", episode.dropped);
             let dropped = if episode.dropped > 0 { palette.warn(&dropped) } else { dropped };
             let grade = episode.verdict.grade;
+            let trash = if episode.discarded { "  discarded" } else { "" };
             lines.push(format!(
-                "{}  {}  {:.1} s  {} messages  {}  {dropped}  {}",
+                "{}  {}  {:.1} s  {} messages  {}  {dropped}  {}{trash}",
                 palette.grade(grade, &format!("{:7}", grade.word())),
                 palette.bold(&file),
                 episode.seconds,

@@ -136,6 +136,9 @@ impl Journal {
     pub fn open(folder: &Path) -> (Self, Option<SessionFile>, Option<JournalError>) {
         let mut journal = Self { folder: folder.to_owned(), name: CURRENT.to_owned(), written: None };
         let path = folder.join(CURRENT);
+        if matches!(path.symlink_metadata(), Err(error) if error.kind() == io::ErrorKind::NotFound) {
+            return (journal, None, None);
+        }
         match read(&path) {
             Ok(mut file) if file.ended.is_none() => {
                 journal.written = identity(&path);
@@ -148,7 +151,6 @@ impl Journal {
                 let moved = journal.archive(&file.begun);
                 (journal, None, moved.err())
             }
-            Err(JournalError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => (journal, None, None),
             Err(error) => {
                 let moved = journal.archive(&format!("unreadable-{}", rfc3339(realtime_ns())));
                 (journal, None, Some(moved.err().unwrap_or(error)))

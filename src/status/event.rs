@@ -345,8 +345,8 @@ impl What {
                 D::of(Level::Info, "episode", "restored", format!("episode {} is back", file.display()))
             }
             Self::Mark { text } => {
-                let text = if text.is_empty() { "this moment" } else { text };
-                D::of(Level::Info, "episode", "marked", format!("{text} marked"))
+                let text = if text.is_empty() { String::new() } else { format!(" {text:?}") };
+                D::of(Level::Info, "episode", "mark", format!("mark{text}"))
             }
             // Data was lost before this run began.
             Self::Recovered { text, .. } => D::of(Level::Warn, "episode", "repaired", text.clone()),

@@ -13,7 +13,7 @@ use crate::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use crate::registry::Registry;
 use crate::sample::{Epoch, SampleHeader};
 use crate::session::journal::Plan;
-use crate::status::session::Label;
+use crate::status::session::{Label, SessionRequest};
 use crate::status::{Grade, Level, Snapshot, Verdict};
 
 /// How long a condition may take to hold.
@@ -75,7 +75,7 @@ impl Bench {
         let (keys, requests) = mpsc::unbounded_channel();
         let episode = EpisodeRequest { out: out.path().to_owned(), ..EpisodeRequest::default() };
         let plan = Plan { task: "test".to_owned(), ..plan };
-        let collection = Collection::new(recorder, episode, plan, &board).unwrap();
+        let collection = Collection::new(recorder, episode, plan, true, &board).unwrap();
         let conductor = Conductor {
             events: board.events(),
             board: Arc::clone(&board),
