@@ -1,4 +1,4 @@
-//! An inbox: every topic of the rig, for one consumer.
+//! The topics of the rig for one consumer: their queues, and an inbox, which can also wait for samples.
 //!
 //! Any program of the same user may publish on the rig's topics; iceoryx2 names the publisher of every sample.
 //!

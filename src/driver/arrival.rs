@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::time::Stamp;
 
 /// Transfer time of a byte at full speed of USB, 12 Mbit/s (USB 2.0, section 7.1.11). The baud rate of a CDC-ACM device
-/// says nothing about its line.
+/// is not that of any line.
 const BYTE_TIME: Duration = Duration::from_nanos(667);
 
 /// When the message before the last `behind` bytes of a read at `arrived` was complete; later than `last`, the stamp of

@@ -277,9 +277,7 @@ impl Lockstep {
 
     fn publish(&mut self, taker: &mut dyn Taker) {
         self.mask_sequence += 1;
-        let mut payload = [0; 16];
-        payload[..8].copy_from_slice(&self.core.mask().0.to_le_bytes());
-        payload[8..].copy_from_slice(&self.mask_sequence.to_le_bytes());
+        let payload = self.core.mask().payload(self.mask_sequence);
         let header = SampleHeader {
             seq: self.mask_sequence,
             capture_ns: self.now.0,

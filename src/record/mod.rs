@@ -1,7 +1,7 @@
 //! Recording: one episode, one MCAP file, with the mask and the frame index beside every sample.
 //!
 //! `recorder` starts the `writer` thread, which owns the file: it takes what the bus hands over
-//! ([`Source`]), `session` decides what belongs to the episode and which frame it belongs to,
+//! ([`Source`]), `open_episode` decides what belongs to the episode and which frame it belongs to,
 //! `file` writes it. `inspect` reads such a file back.
 //!
 //! Invariant: only the `writer` thread touches the file of an episode in a run, and only the caller that starts or
@@ -15,11 +15,11 @@ mod file;
 mod guard;
 pub mod inspect;
 mod metadata;
+mod open_episode;
 mod provenance;
 mod publishers;
 mod quality;
 mod recorder;
-mod session;
 mod space;
 pub mod stepped;
 mod streams;

@@ -24,9 +24,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::RecordError;
 use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::open_episode::{Beginning, OpenEpisode};
 use super::provenance::Attached;
 use super::publishers::Publishers;
-use super::session::{Beginning, Session};
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
 use crate::bus::{Foreign, Inbox, Queues, TopicId};
@@ -248,10 +248,10 @@ struct Writer {
     attached: Attached,
     /// Those of the episode in progress, or of the time since the last one began.
     publishers: Publishers,
-    session: Option<Session>,
-    /// Receives the reports of the session.
+    open: Option<OpenEpisode>,
+    /// Receives the reports of the episode.
     episode: watch::Sender<Option<Arc<Episode>>>,
-    /// Room for the session's file.
+    /// Room for the episode's file.
     space: Option<Space>,
     clock: ClockWatch,
     clock_looked: Stamp,
@@ -278,7 +278,7 @@ impl Writer {
             streams: Streams::new(),
             attached: Attached::default(),
             publishers: Publishers::default(),
-            session: None,
+            open: None,
             episode,
             space: None,
             clock,
@@ -294,7 +294,7 @@ impl Writer {
     /// Runs until the last handle is dropped and everything is written, or until it panics.
     fn run(mut self, mut source: impl Source) {
         loop {
-            // Unwinding leaves a session complete: it is only replaced or taken as a whole, and its file refuses
+            // Unwinding leaves an open episode complete: it is only replaced or taken as a whole, and its file refuses
             // half-written data.
             match catch_unwind(AssertUnwindSafe(|| self.turn(&mut source))) {
                 Ok(ControlFlow::Continue(())) => {}
@@ -322,9 +322,8 @@ impl Writer {
         }
         // Read before the drain: samples received by then are taken by it.
         let now = Stamp::now();
-        let Self { streams, session, .. } = self;
-        let drained =
-            source.drain(&mut |topic, header, payload| streams.take(session.as_mut(), topic, header, payload));
+        let Self { streams, open, .. } = self;
+        let drained = source.drain(&mut |topic, header, payload| streams.take(open.as_mut(), topic, header, payload));
         if let Some(reason) = source.lost() {
             self.finish(now, Some(reason));
         } else if let Err(error) = drained {
@@ -336,7 +335,7 @@ impl Writer {
         let open = self.take_orders();
         self.watch_clock(now);
         self.advance(now);
-        match (open, &self.session) {
+        match (open, &self.open) {
             (false, None) => ControlFlow::Break(()),
             _ => ControlFlow::Continue(()),
         }
@@ -347,13 +346,13 @@ impl Writer {
             match self.events.try_recv() {
                 Ok(event) => {
                     self.attached.take(&event);
-                    if let Some(session) = &mut self.session {
-                        session.event(&event);
+                    if let Some(open) = &mut self.open {
+                        open.event(&event);
                     }
                 }
                 Err(EventError::Lagged(count)) => {
-                    if let Some(session) = &mut self.session {
-                        session.missed_events(count);
+                    if let Some(open) = &mut self.open {
+                        open.missed_events(count);
                     }
                 }
                 Err(EventError::Empty | EventError::Closed) => return,
@@ -371,11 +370,11 @@ impl Writer {
                     let _ = reply.send(started);
                 }
                 Ok(RecorderOrder::End(at)) => {
-                    if let Some(session) = &mut self.session {
-                        session.end_at(at);
+                    if let Some(open) = &mut self.open {
+                        open.end_at(at);
                     }
                 }
-                Ok(RecorderOrder::Await(reply)) => match &self.session {
+                Ok(RecorderOrder::Await(reply)) => match &self.open {
                     Some(_) => self.waiting.push(reply),
                     None => {
                         let _ = reply.send(Err(RecordError::Idle));
@@ -383,8 +382,8 @@ impl Writer {
                 },
                 Err(TryRecvError::Empty) => return true,
                 Err(TryRecvError::Disconnected) => {
-                    if let Some(session) = &mut self.session {
-                        session.end_at(Stamp::now());
+                    if let Some(open) = &mut self.open {
+                        open.end_at(Stamp::now());
                     }
                     return false;
                 }
@@ -393,8 +392,8 @@ impl Writer {
     }
 
     fn start(&mut self, request: &EpisodeRequest) -> Result<PathBuf, RecordError> {
-        if let Some(session) = &self.session {
-            return Err(RecordError::Busy(session.name().to_owned()));
+        if let Some(open) = &self.open {
+            return Err(RecordError::Busy(open.name().to_owned()));
         }
         let clock = (self.config.clock)();
         let begin = (self.config.begin)();
@@ -420,14 +419,14 @@ impl Writer {
             clock,
             begin,
         };
-        let mut session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
+        let mut open = OpenEpisode::begin(beginning, &self.streams.masks).map_err(failed)?;
         // An episode records their state at its beginning, not only changes.
         for stop in self.config.board.stops() {
-            session.event(&Event { stamp: begin, what: What::Stop(stop) });
+            open.event(&Event { stamp: begin, what: What::Stop(stop) });
         }
-        self.config.board.set_recording(Some(session.status(begin)));
+        self.config.board.set_recording(Some(open.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
-        self.session = Some(session);
+        self.open = Some(open);
         self.publishers = Publishers::default();
         self.episode.send_replace(Some(Arc::new(Episode::new(&finished))));
         self.space = Some(space);
@@ -436,23 +435,23 @@ impl Writer {
     }
 
     fn advance(&mut self, now: Stamp) {
-        let Some(session) = &mut self.session else { return };
-        session.advance(now, &self.streams.masks);
+        let Some(open) = &mut self.open else { return };
+        open.advance(now, &self.streams.masks);
         if now.since(self.flushed) >= FLUSH_EVERY {
-            session.flush();
+            open.flush();
             self.flushed = now;
         }
-        if session.is_over(now) {
+        if open.is_over(now) {
             self.finish(now, None);
             return;
         }
-        if now.since(self.reported) >= STATUS_EVERY && !session.is_ending(now) {
+        if now.since(self.reported) >= STATUS_EVERY && !open.is_ending(now) {
             let room = self.space.as_ref().and_then(Space::left);
             if now.since(self.judged) >= JUDGE_EVERY {
-                session.judge(now, self.publishers.list());
+                open.judge(now, self.publishers.list());
                 self.judged = now;
             }
-            self.config.board.set_recording(Some(RecordingStatus { room, ..session.status(now) }));
+            self.config.board.set_recording(Some(RecordingStatus { room, ..open.status(now) }));
             self.reported = now;
         }
         self.watch_space(now);
@@ -460,14 +459,14 @@ impl Writer {
 
     fn watch_space(&mut self, now: Stamp) {
         let found = self.space.as_mut().and_then(|space| space.look(now, &mut self.config.disk));
-        let Some((found, session)) = found.zip(self.session.as_ref()) else { return };
+        let Some((found, open)) = found.zip(self.open.as_ref()) else { return };
         match found {
             Finding::Low { free, left } => {
-                let folder = session.name().parent().map(Path::to_owned).unwrap_or_default();
+                let folder = open.name().parent().map(Path::to_owned).unwrap_or_default();
                 self.config.board.announce(What::DiskLow { folder, free, seconds: left.as_secs() });
             }
             Finding::Removed => {
-                let file = session.name().display();
+                let file = open.name().display();
                 let text =
                     format!("{file}: removed while it is recorded; it will be written again when the episode ends");
                 self.complain(Level::Error, text);
@@ -488,9 +487,9 @@ impl Writer {
     }
 
     fn finish(&mut self, now: Stamp, reason: Option<String>) {
-        let Some(session) = self.session.take() else { return };
+        let Some(open) = self.open.take() else { return };
         let ended = self.episode.send_replace(None);
-        let report = session.finish(now, &self.streams.masks, reason, self.publishers.list());
+        let report = open.finish(now, &self.streams.masks, reason, self.publishers.list());
         ended.inspect(|ended| ended.end(&report.file));
         if let Some(space) = self.space.take() {
             space.release();

@@ -1,4 +1,4 @@
-//! An episode recorded by the owner of the clock: the same session and the same file as the `writer`
+//! An episode recorded by the owner of the clock: the same code and the same file as the `writer`
 //! thread's, without thread, bus and real time.
 //!
 //! Invariant: the moments handed in never go back.
@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use super::RecordError;
 use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::open_episode::{Beginning, OpenEpisode};
 use super::provenance::Attached;
-use super::session::{Beginning, Session};
 use super::streams::Streams;
 use crate::bus::TopicId;
 use crate::episode::chunk_writer::Sink;
@@ -32,19 +32,19 @@ pub struct Stepped {
     clock: WallClock,
     streams: Streams,
     attached: Attached,
-    session: Option<Session>,
+    open: Option<OpenEpisode>,
 }
 
 impl std::fmt::Debug for Stepped {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Stepped").field("recording", &self.session.is_some()).finish_non_exhaustive()
+        f.debug_struct("Stepped").field("recording", &self.open.is_some()).finish_non_exhaustive()
     }
 }
 
 impl Stepped {
     /// A recorder without an episode. `clock` converts the given moments to the wall clock.
     pub fn new(registry: Arc<Registry>, board: Arc<Board>, clock: WallClock) -> Self {
-        Self { registry, board, clock, streams: Streams::new(), attached: Attached::default(), session: None }
+        Self { registry, board, clock, streams: Streams::new(), attached: Attached::default(), open: None }
     }
 
     /// Begins an episode.
@@ -66,34 +66,34 @@ impl Stepped {
             clock: self.clock,
             begin,
         };
-        self.session = Some(Session::begin(beginning, &self.streams.masks).map_err(failed)?);
+        self.open = Some(OpenEpisode::begin(beginning, &self.streams.masks).map_err(failed)?);
         Ok(())
     }
 
     /// Writes what is due by `now`.
     pub fn advance(&mut self, now: Stamp) {
-        if let Some(session) = &mut self.session {
-            session.advance(now, &self.streams.masks);
+        if let Some(open) = &mut self.open {
+            open.advance(now, &self.streams.masks);
         }
     }
 
     /// Ends the episode with what was captured before `end`; `None` if there is none.
     pub fn finish(&mut self, end: Stamp) -> Option<EpisodeReport> {
-        let mut session = self.session.take()?;
-        session.end_at(end);
-        Some(session.finish(end, &self.streams.masks, None, &[]))
+        let mut open = self.open.take()?;
+        open.end_at(end);
+        Some(open.finish(end, &self.streams.masks, None, &[]))
     }
 }
 
 impl Taker for Stepped {
     fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
-        self.streams.take(self.session.as_mut(), topic, header, payload);
+        self.streams.take(self.open.as_mut(), topic, header, payload);
     }
 
     fn event(&mut self, event: &Event) {
         self.attached.take(event);
-        if let Some(session) = &mut self.session {
-            session.event(event);
+        if let Some(open) = &mut self.open {
+            open.event(event);
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::session::Session;
+use super::open_episode::OpenEpisode;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
 use crate::modality::MAX_MODALITIES;
@@ -24,10 +24,10 @@ impl Streams {
         Self { masks: MaskHistory::new(), last: [None; MAX_MODALITIES], last_mask: None, last_action: None }
     }
 
-    /// Takes a sample, for `session` too if there is one.
+    /// Takes a sample, for `open` too if there is one.
     pub(super) fn take(
         &mut self,
-        session: Option<&mut Session>,
+        open: Option<&mut OpenEpisode>,
         topic: TopicId,
         header: &SampleHeader,
         payload: &[u8],
@@ -36,8 +36,8 @@ impl Streams {
             TopicId::Modality(id) => {
                 let now = Last { seq: header.seq, lost: header.lost, captured: Stamp(header.capture_ns) };
                 let hole = self.last.get_mut(id.index()).and_then(|last| last.replace(now)?.hole(now));
-                if let Some(session) = session {
-                    session.sample(id, header, payload, hole);
+                if let Some(open) = open {
+                    open.sample(id, header, payload, hole);
                 }
             }
             // The frames of an episode are its own: they also know samples that were in transit at a tick.
@@ -45,8 +45,8 @@ impl Streams {
             TopicId::Action => {
                 let now = Last { seq: header.seq, lost: header.lost, captured: Stamp(header.capture_ns) };
                 let hole = self.last_action.replace(now).and_then(|last| last.hole(now));
-                if let Some(session) = session {
-                    session.action(header, payload, hole);
+                if let Some(open) = open {
+                    open.action(header, payload, hole);
                 }
             }
             TopicId::Mask => {
@@ -54,8 +54,8 @@ impl Streams {
                 let now = Last { seq: sequence, lost: 0, captured: Stamp(header.capture_ns) };
                 let hole = self.last_mask.replace(now).and_then(|last| last.hole(now));
                 self.masks.push(header, mask, sequence);
-                if let Some(session) = session {
-                    session.mask(header, mask, sequence, hole);
+                if let Some(open) = open {
+                    open.mask(header, mask, sequence, hole);
                 }
             }
         }

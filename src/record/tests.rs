@@ -2,8 +2,8 @@
 
 mod episode;
 mod faults;
+mod open_episode;
 mod room;
-mod session;
 mod tampering;
 
 use std::collections::{BTreeMap, VecDeque};

@@ -2,7 +2,7 @@
 //!
 //! Owns the rings of recent samples and the rules by which one is chosen; samples go in by
 //! [`Synchronizer::push`] in any order, an [`Observation`] comes out per tick. The recorder's frame
-//! index and a policy use the same code on the same [`Grid`].
+//! index, a policy and the observations on the bus use the same code, each on a [`Grid`] of its own.
 //!
 //! Invariant: pure: no clock, no input or output; the caller passes the time.
 //! Invariant: the result depends on which samples are in the rings, never on the order or the

@@ -211,6 +211,15 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_page_about_the_monitor_lists_exactly_these_keys() {
+        let page = include_str!("../../docs/monitor.md");
+        let rows: Vec<_> = page.lines().filter(|line| line.starts_with("| `")).collect();
+        let expected: Vec<_> =
+            help().map(|(keys, meaning)| format!("| `{}` | {meaning} |", keys.replace(", ", "`, `"))).collect();
+        assert_eq!(rows, expected);
+    }
+
+    #[test]
     fn no_key_has_two_meanings() {
         for modifiers in [KeyModifiers::NONE, KeyModifiers::CONTROL] {
             for code in TABLE.iter().flat_map(|row| row.codes) {

@@ -19,14 +19,14 @@ const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out",
 fn until_recorded(place: &Place) {
     const ENOUGH: u64 = 200_000;
     until("a file with samples", || {
-        let file = place.files("out").pop().and_then(|name| std::fs::metadata(place.path("out").join(name)).ok());
+        let file = place.episodes("out").pop().and_then(|name| std::fs::metadata(place.path("out").join(name)).ok());
         file.is_some_and(|file| file.len() >= ENOUGH)
     });
 }
 
 /// The one episode in `out`, read strictly.
 fn whole_episode(place: &Place, what: &str) -> Episode {
-    let files = place.files("out");
+    let files = place.episodes("out");
     assert!(files.len() == 1 && files[0].ends_with("_001.mcap"), "{what}: {files:?}");
     Episode::read(&place.path("out").join(&files[0]))
 }

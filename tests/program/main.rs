@@ -32,6 +32,7 @@ mod python;
 mod register;
 mod scenarios;
 mod second_run;
+mod session;
 mod shared_memory;
 mod stops;
 mod task;

@@ -15,7 +15,8 @@ use rustix::process::Signal;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
 
-const RIG: &str = r#"
+/// An arm, and a serial line with a switch.
+const DEVICES: &str = r#"
 [rig]
 cooldown = "200ms"
 [device.arm]
@@ -32,6 +33,9 @@ pid = "0001"
 node = "serial"
 bit = 1
 tty = { channels = 2 }
+"#;
+
+const RIG: &str = r#"
 [stop.pendant]
 kind = "emergency"
 serial = { path = "PORT", run = "RUN", stop = "STOP", silence = "2s" }
@@ -124,7 +128,7 @@ fn arm(place: &Place) -> (Option<i32>, String) {
 fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode() {
     let place = Place::new();
     let pendant = Pendant::plug();
-    place.write("devices.toml", &RIG.replace("PORT", &pendant.path));
+    place.write("devices.toml", &(DEVICES.to_owned() + &RIG.replace("PORT", &pendant.path)));
     place.write("sim.toml", PULLED);
     pendant.send(STOP);
     let arguments = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json", "--arm", "--record"];
@@ -197,20 +201,6 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
 
 /// An input of each kind that is not there.
 const MISSING: &str = r#"
-[device.arm]
-vid = "2e88"
-pid = "4603"
-node = "can"
-bit = 0
-[device.arm.can]
-protocol = "damiao"
-motors = [{ name = "grip", slave = 5, type = "DMH3510", kp = 0.8, kd = 0.05, position = [-1, 1] }]
-[device.buttons]
-vid = "1209"
-pid = "0001"
-node = "serial"
-bit = 1
-tty = { channels = 2 }
 [stop.field]
 kind = "enabling"
 field = { device = "buttons", index = 0, runs_below = 1.0 }
@@ -228,7 +218,7 @@ serial = { path = "/dev/serial/by-id/none", run = "RUN", stop = "STOP" }
 #[test]
 fn an_input_that_was_never_found_is_reported_with_its_cause() {
     let place = Place::new();
-    place.write("devices.toml", MISSING);
+    place.write("devices.toml", &(DEVICES.to_owned() + MISSING));
     place.write("sim.toml", "[[device]]\nname = \"arm\"\n");
     let arguments = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json"];
     let running = place.start(&arguments, "\"streaming\"");

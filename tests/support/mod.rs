@@ -160,6 +160,13 @@ impl Place {
         std::fs::read_to_string(folder.join(format!("{device}.log"))).unwrap_or_default()
     }
 
+    /// Files in `folder` of this place but those of a session, by name: the monitor keeps a session.
+    pub(crate) fn episodes(&self, folder: &str) -> Vec<String> {
+        let mut names = self.files(folder);
+        names.retain(|name| !name.starts_with("session"));
+        names
+    }
+
     /// Files in `folder` of this place, by name.
     pub(crate) fn files(&self, folder: &str) -> Vec<String> {
         let mut names: Vec<_> = std::fs::read_dir(self.path(folder))

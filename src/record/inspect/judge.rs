@@ -12,9 +12,9 @@ use std::time::Duration;
 
 use serde_json::{Map, Value};
 
+use super::super::open_episode::SETTLE;
 use super::super::publishers::Publishers;
 use super::super::quality::{Frames, Measured, Measures, Quality, SampleFacts, Spread};
-use super::super::session::SETTLE;
 use super::super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
 use super::ModalityReport;
 use super::state::{self, Counted, file_state};

@@ -1,19 +1,19 @@
-//! A session on a clock of its own: deadlines, losses, edges.
+//! An open episode on a clock of its own: deadlines, losses, edges.
 
 use super::super::episode_path::EpisodePath;
+use super::super::open_episode::{Beginning, OpenEpisode};
 use super::super::provenance::Attached;
-use super::super::session::{Beginning, Session};
 use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
 use crate::provenance::UnplugSource;
 use crate::time::WallClock;
 
-/// A session of its own clock, one second after the monotonic clock's zero.
-fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
-    session_of(registry(), folder, board, masks)
+/// An open episode of its own clock, one second after the monotonic clock's zero.
+fn open(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {
+    open_of(registry(), folder, board, masks)
 }
 
-fn session_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
+fn open_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {
     let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
     let path = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
     let beginning = Beginning {
@@ -26,7 +26,7 @@ fn session_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &Mas
         clock,
         begin: Stamp(1000 * MS),
     };
-    Session::begin(beginning, masks).unwrap()
+    OpenEpisode::begin(beginning, masks).unwrap()
 }
 
 fn scalars(seq: u64, capture_ms: u64, recv_ms: u64) -> SampleHeader {
@@ -46,12 +46,12 @@ fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
     let board = Arc::new(Board::new(&registry()));
     let mut masks = MaskHistory::new();
     masks.push(&scalars(5, 996, 996), PhysicalMask(0b10), 5);
-    let mut session = session(folder.path(), &board, &masks);
+    let mut open = open(folder.path(), &board, &masks);
     for (sequence, capture) in [(6, 998), (7, 1000), (8, 1002)] {
-        session.mask(&scalars(sequence, capture, capture), PhysicalMask(0b10), sequence, None);
+        open.mask(&scalars(sequence, capture, capture), PhysicalMask(0b10), sequence, None);
     }
-    session.end_at(Stamp(1002 * MS));
-    let report = session.finish(Stamp(1200 * MS), &masks, None, &[]);
+    open.end_at(Stamp(1002 * MS));
+    let report = open.finish(Stamp(1200 * MS), &masks, None, &[]);
     assert_eq!(report.error, None);
     let read = read(&report.file);
     assert_eq!(read.on(crate::mask::MASK_TOPIC).map(|message| message.1).collect::<Vec<_>>(), [5, 6, 7, 8]);
@@ -63,24 +63,24 @@ fn late_samples_are_recorded_and_too_late_ones_belong_to_no_frame() {
     let board = Arc::new(Board::new(&registry()));
     let mut masks = MaskHistory::new();
     masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
-    let mut session = session(folder.path(), &board, &masks);
+    let mut open = open(folder.path(), &board, &masks);
     let at = |ms: u64| Stamp(ms * MS);
     // Tick 0 is at 1000 ms; its deadline 25 ms + 100 ms later. One sample comes in time, one does not.
-    session.sample(id(TOF), &scalars(0, 999, 999), &[0; 8], None);
-    session.sample(id(TOF), &scalars(1, 1001, 1126), &[0; 8], None);
-    session.sample(id(TOF), &scalars(2, 1010, 1124), &[0; 8], None);
-    session.advance(at(1144), &masks);
-    assert_eq!(session.status(at(1144)).messages, 3, "two samples and a mask; the frame not before 1145 ms");
-    session.advance(at(1145), &masks);
-    assert_eq!(session.status(at(1145)).messages, 4);
+    open.sample(id(TOF), &scalars(0, 999, 999), &[0; 8], None);
+    open.sample(id(TOF), &scalars(1, 1001, 1126), &[0; 8], None);
+    open.sample(id(TOF), &scalars(2, 1010, 1124), &[0; 8], None);
+    open.advance(at(1144), &masks);
+    assert_eq!(open.status(at(1144)).messages, 3, "two samples and a mask; the frame not before 1145 ms");
+    open.advance(at(1145), &masks);
+    assert_eq!(open.status(at(1145)).messages, 4);
 
-    session.end_at(at(1100));
-    session.end_at(at(1200));
+    open.end_at(at(1100));
+    open.end_at(at(1200));
     // Captured before the end and arriving after it; captured at the end.
-    session.sample(id(TOF), &scalars(3, 1099, 1190), &[0; 8], None);
-    session.sample(id(TOF), &scalars(4, 1100, 1190), &[0; 8], None);
-    assert!(!session.is_over(at(1219)) && session.is_over(at(1220)));
-    let report = session.finish(at(1220), &masks, None, &[]);
+    open.sample(id(TOF), &scalars(3, 1099, 1190), &[0; 8], None);
+    open.sample(id(TOF), &scalars(4, 1100, 1190), &[0; 8], None);
+    assert!(!open.is_over(at(1219)) && open.is_over(at(1220)));
+    let report = open.finish(at(1220), &masks, None, &[]);
     assert_eq!((report.error, report.messages), (None, 7), "one sample and two frames more");
     assert!((report.seconds - 0.1).abs() < 1e-9);
 
@@ -105,18 +105,18 @@ fn losses_are_announced_once_a_second_and_counted_all() {
     let board = Arc::new(Board::new(&registry()));
     let mut events = board.events();
     let masks = MaskHistory::new();
-    let mut session = session(folder.path(), &board, &masks);
+    let mut open = open(folder.path(), &board, &masks);
     for n in 0..200 {
         let now = 1000 + n * 10;
         let hole = Hole { after: Stamp((now - 9) * MS), before: Stamp(now * MS), lost: 1, dropped: 2 };
-        session.sample(id(TOF), &scalars(n, now, now), &[0; 8], Some(hole));
-        session.advance(Stamp(now * MS), &masks);
+        open.sample(id(TOF), &scalars(n, now, now), &[0; 8], Some(hole));
+        open.advance(Stamp(now * MS), &masks);
     }
     // One more, so that a number of hostile size comes to the others.
     let hole = Hole { after: Stamp(1500 * MS), before: Stamp(3000 * MS), lost: 0, dropped: u64::MAX };
-    session.sample(id(CAM), &scalars(1, 3000, 3000), &[0; 8], Some(hole));
-    assert_eq!(session.status(Stamp(0)).dropped, u64::MAX);
-    let report = session.finish(Stamp(3001 * MS), &masks, None, &[]);
+    open.sample(id(CAM), &scalars(1, 3000, 3000), &[0; 8], Some(hole));
+    assert_eq!(open.status(Stamp(0)).dropped, u64::MAX);
+    let report = open.finish(Stamp(3001 * MS), &masks, None, &[]);
     assert_eq!((report.error, report.dropped), (None, u64::MAX));
     let mut answer = Vec::new();
     while let Ok(event) = events.try_recv() {
@@ -139,22 +139,22 @@ fn only_the_part_of_a_gap_within_the_episode_counts() {
     let folder = tempfile::tempdir().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let masks = MaskHistory::new();
-    let mut session = session(folder.path(), &board, &masks);
+    let mut open = open(folder.path(), &board, &masks);
     let hole = |after: u64, before: u64, missing| {
         Some(Hole { after: Stamp(after * MS), before: Stamp(before * MS), lost: 0, dropped: missing })
     };
     // Every 10 ms; the episode begins at 1000 ms: 960 to 990 do not count.
-    session.sample(id(TOF), &scalars(9, 1050, 1050), &[0; 8], hole(950, 1050, 9));
-    assert_eq!(session.status(Stamp(0)).dropped, 5);
+    open.sample(id(TOF), &scalars(9, 1050, 1050), &[0; 8], hole(950, 1050, 9));
+    assert_eq!(open.status(Stamp(0)).dropped, 5);
     // As after a disk that stood still beyond the end: what is left is of later moments, and yet 1060
     // to 1090 ms are lost.
-    session.end_at(Stamp(1100 * MS));
-    session.sample(id(TOF), &scalars(29, 1250, 1250), &[0; 8], hole(1050, 1250, 19));
-    assert_eq!(session.status(Stamp(0)).dropped, 9);
+    open.end_at(Stamp(1100 * MS));
+    open.sample(id(TOF), &scalars(29, 1250, 1250), &[0; 8], hole(1050, 1250, 19));
+    assert_eq!(open.status(Stamp(0)).dropped, 9);
     // Neither a hole in another time nor one of no length.
-    session.sample(id(TOF), &scalars(40, 1300, 1300), &[0; 8], hole(1250, 1300, 10));
-    session.sample(id(TOF), &scalars(50, 1300, 1300), &[0; 8], hole(1300, 1300, 10));
-    let report = session.finish(Stamp(1300 * MS), &masks, None, &[]);
+    open.sample(id(TOF), &scalars(40, 1300, 1300), &[0; 8], hole(1250, 1300, 10));
+    open.sample(id(TOF), &scalars(50, 1300, 1300), &[0; 8], hole(1300, 1300, 10));
+    let report = open.finish(Stamp(1300 * MS), &masks, None, &[]);
     assert_eq!((report.error, report.dropped), (None, 9));
 }
 
@@ -166,17 +166,17 @@ fn every_frame_waits_for_a_slow_sensor() {
     masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
     let mut late = registry();
     late.devices[usize::from(TOF)].latency = Duration::from_millis(300);
-    let mut session = session_of(late, folder.path(), &board, &masks);
+    let mut open = open_of(late, folder.path(), &board, &masks);
     let at = |ms: u64| Stamp(ms * MS);
-    session.end_at(at(1010));
+    open.end_at(at(1010));
     // It stands for tick 0, at 1000 ms; and one, captured as late, for a moment after the end.
-    session.sample(id(TOF), &scalars(0, 1299, 1420), &[0; 8], None);
-    session.sample(id(TOF), &scalars(1, 1310, 1425), &[0; 8], None);
-    session.advance(at(1444), &masks);
-    assert_eq!(session.status(at(1444)).messages, 2, "a sample and a mask; the frame not before 1445 ms");
-    assert!(!session.is_over(at(1429)) && session.is_over(at(1430)));
-    session.advance(at(1445), &masks);
-    let report = session.finish(at(1445), &masks, None, &[]);
+    open.sample(id(TOF), &scalars(0, 1299, 1420), &[0; 8], None);
+    open.sample(id(TOF), &scalars(1, 1310, 1425), &[0; 8], None);
+    open.advance(at(1444), &masks);
+    assert_eq!(open.status(at(1444)).messages, 2, "a sample and a mask; the frame not before 1445 ms");
+    assert!(!open.is_over(at(1429)) && open.is_over(at(1430)));
+    open.advance(at(1445), &masks);
+    let report = open.finish(at(1445), &masks, None, &[]);
     assert_eq!((report.error.as_deref(), report.messages, report.seconds), (None, 3, 0.01));
     let read = read(&report.file);
     let frame = &read.on("/rapid/frame").next().unwrap().4;
@@ -251,19 +251,19 @@ fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
     let board = Arc::new(Board::new(&registry));
     let mut streams = Streams::new();
     streams.masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
-    let mut session = session_of(registry, folder, &board, &streams.masks);
-    session.end_at(Stamp(2000 * MS));
+    let mut open = open_of(registry, folder, &board, &streams.masks);
+    open.end_at(Stamp(2000 * MS));
     for ms in 900..2200 {
         if ms % 10 == 0 {
             let header = scalars(ms / 10, ms, ms);
-            streams.take(Some(&mut session), TopicId::Modality(id(TOF)), &header, &[0; 16]);
+            streams.take(Some(&mut open), TopicId::Modality(id(TOF)), &header, &[0; 16]);
         }
         for (number, _) in actions.iter().filter(|(_, at)| *at == ms) {
-            streams.take(Some(&mut session), TopicId::Action, &scalars(*number, ms, ms), &[0; 8]);
+            streams.take(Some(&mut open), TopicId::Action, &scalars(*number, ms, ms), &[0; 8]);
         }
-        session.advance(Stamp(ms * MS), &streams.masks);
+        open.advance(Stamp(ms * MS), &streams.masks);
     }
-    let report = session.finish(Stamp(2200 * MS), &streams.masks, None, &[]);
+    let report = open.finish(Stamp(2200 * MS), &streams.masks, None, &[]);
     assert_eq!((report.error.as_deref(), report.seconds), (None, 1.0));
     report
 }
@@ -310,21 +310,21 @@ fn an_episode_in_progress_is_judged_like_a_finished_one() {
     let folder = tempfile::tempdir().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let masks = MaskHistory::new();
-    let mut session = session(folder.path(), &board, &masks);
+    let mut open = open(folder.path(), &board, &masks);
     for n in 0..200 {
         let now = 1000 + n * 10;
         let hole = Hole { after: Stamp((now - 9) * MS), before: Stamp(now * MS), lost: 1, dropped: 0 };
-        session.sample(id(TOF), &scalars(n, now, now), &[0; 8], Some(hole));
-        session.advance(Stamp(now * MS), &masks);
+        open.sample(id(TOF), &scalars(n, now, now), &[0; 8], Some(hole));
+        open.advance(Stamp(now * MS), &masks);
         if n == 50 {
-            session.judge(Stamp(now * MS), &[]);
-            assert_eq!(session.status(Stamp(now * MS)).outlook.findings, [], "most of it is still to come");
+            open.judge(Stamp(now * MS), &[]);
+            assert_eq!(open.status(Stamp(now * MS)).outlook.findings, [], "most of it is still to come");
         }
     }
     let end = Stamp(2990 * MS);
-    session.judge(end, &[]);
-    let outlook = session.status(end).outlook;
-    let report = session.finish(end, &masks, None, &[]);
+    open.judge(end, &[]);
+    let outlook = open.status(end).outlook;
+    let report = open.finish(end, &masks, None, &[]);
     assert_eq!((outlook.grade(), report.verdict.grade), (Grade::Bad, Grade::Bad));
     let lost = outlook.of("tof").expect("a finding").sentence();
     assert!(lost.contains("lost by the device"), "{lost}");

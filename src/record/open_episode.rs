@@ -55,7 +55,7 @@ pub(super) const GRACE: Duration = Duration::from_millis(20);
 /// An episode is judged from this time on: before, most of its samples are still to come.
 const JUDGED_AFTER: Duration = Duration::from_secs(1);
 
-/// Parameters at the start of a session.
+/// Parameters at the start of an open episode.
 pub(super) struct Beginning<'a> {
     pub(super) registry: Arc<Registry>,
     pub(super) board: Arc<Board>,
@@ -80,7 +80,7 @@ fn judged<'a>(qualities: &'a [(&DeviceSpec, Quality)]) -> Vec<Judged<'a>> {
 }
 
 /// See the module's comment.
-pub(super) struct Session {
+pub(super) struct OpenEpisode {
     registry: Arc<Registry>,
     board: Arc<Board>,
     path: EpisodePath,
@@ -106,7 +106,7 @@ pub(super) struct Session {
     failed: Option<io::Error>,
 }
 
-impl Session {
+impl OpenEpisode {
     /// Begins an episode and writes the file's initial records.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
         let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;

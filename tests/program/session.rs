@@ -1,0 +1,107 @@
+//! Sessions: episodes begun, ended, discarded and labelled from a shell, by a plan and by keys.
+
+use crate::support::terminal::OnTerminal;
+use crate::support::{Place, until};
+use rustix::process::Signal;
+
+/// Runs `rapid WORDS` in this place; its output, or its error.
+fn ask(place: &Place, words: &[&str]) -> Result<String, String> {
+    let output = place.run(words);
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).trim_end().to_owned();
+    if output.status.success() { Ok(text(&output.stdout)) } else { Err(text(&output.stderr)) }
+}
+
+/// A press within 400 ms of the last one counts as its repeat.
+fn next_press() {
+    std::thread::sleep(std::time::Duration::from_secs(1));
+}
+
+fn session(place: &Place) -> serde_json::Value {
+    serde_json::from_str(&ask(place, &["session", "--json"]).expect("a session")).expect("JSON")
+}
+
+#[test]
+fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
+    let place = Place::new();
+    assert!(ask(&place, &["episode", "start"]).unwrap_err().contains("runs here"));
+    let running = place.start(&["--sim", "--headless", "--out", "out", "--task", "pour"], "motor_state");
+    let started = ask(&place, &["episode", "start"]).expect("it starts");
+    assert!(started.ends_with("_pour_001.mcap"), "{started}");
+    assert!(ask(&place, &["episode", "start"]).unwrap_err().contains("an episode is being recorded"));
+    ask(&place, &["episode", "mark", "grasped"]).expect("a mark");
+    let stopped = ask(&place, &["episode", "stop"]).expect("it stops");
+    // Its file is whole when the answer arrives.
+    assert!(place.path("out").join(started.rsplit('/').next().expect("a name")).exists(), "{stopped}");
+    ask(&place, &["episode", "label", "failure", "spilled"]).expect("a label");
+    ask(&place, &["episode", "start"]).expect("another");
+    ask(&place, &["episode", "discard"]).expect("it is discarded");
+    until("it is in the trash", || place.files("out/.trash").len() == 1);
+    ask(&place, &["episode", "next"]).expect("a third");
+    running.signal(Signal::KILL);
+    drop(running);
+
+    // The next run continues the session, and repairs what was being recorded.
+    let running = place.start(&["--sim", "--headless", "--out", "out", "--task", "pour"], "motor_state");
+    until("the third is repaired", || !place.files("out").iter().any(|name| name.ends_with(".partial")));
+    let status = session(&place);
+    let episodes = status["episodes"].as_array().expect("a list");
+    assert_eq!((episodes.len(), &status["discarded"]), (3, &1.into()), "{status}");
+    assert_eq!((&episodes[0]["label"], &episodes[0]["label_reason"]), (&"failure".into(), &"spilled".into()));
+    assert_eq!(episodes[0]["marks"][0]["text"], "grasped");
+    assert!(place.files("out").contains(&episodes[2]["file"].as_str().expect("a name").to_owned()), "{status}");
+    ask(&place, &["episode", "undo"]).expect("it comes back");
+    until("it is back", || place.files("out/.trash").is_empty());
+    ask(&place, &["session", "plan", "--task", "stack", "--goal", "7", "--tag", "finger=soft"]).expect("a plan");
+    let status = session(&place);
+    assert_eq!((&status["task"], &status["goal"]), (&"stack".into(), &7.into()));
+    let ended = ask(&place, &["session", "end"]).expect("it ends");
+    assert_eq!(ended, "session ended: 3 episodes kept, 0 deleted");
+    assert_eq!(session(&place)["episodes"].as_array().map(Vec::len), Some(0));
+    running.signal(Signal::INT);
+    assert_eq!(running.end().0, Some(0));
+    let names = place.files("out");
+    for ending in [".toml", ".md"] {
+        let of_session = |name: &&String| name.starts_with("session-") && name.ends_with(ending);
+        assert_eq!(names.iter().filter(of_session).count(), 1, "{names:?}");
+    }
+}
+
+#[test]
+fn a_plan_records_its_episodes_and_ends_the_run() {
+    let place = Place::new();
+    let plan = ["--goal", "2", "--episode-time", "700ms", "--reset-time", "100ms", "--countdown", "50ms"];
+    let output = place.run(&[&["--sim", "--headless", "--record", "--out", "out"], &plan[..]].concat());
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), Some(0), "{text}");
+    assert_eq!(place.episodes("out").len(), 2, "{text}");
+    assert_eq!(text.lines().filter(|line| line.starts_with("GOOD ")).count(), 2, "{text}");
+    for words in [&["--goal", "2", "--duration", "3s"][..], &["--goal", "0"], &["--episode-time", "0s"]] {
+        assert_eq!(place.run(words).status.code(), Some(2), "{words:?}");
+    }
+}
+
+#[test]
+fn keys_discard_redo_note_and_end_a_session_in_the_monitor() {
+    let place = Place::new();
+    let mut run = OnTerminal::start(&place, &["--sim", "--record", "--out", "out"], "");
+    run.read_until("REC");
+    let journal = || std::fs::read_to_string(place.path("out/session.toml")).unwrap_or_default();
+    let recorded = |number: &str| journal().contains(number);
+    until("the first is in the journal", || recorded("_001"));
+    run.type_in("\u{1b}[C");
+    until("the second is in the journal", || recorded("_002"));
+    next_press();
+    run.type_in("\u{1b}[D");
+    until("the third is in the journal", || recorded("_003"));
+    until("the second is in the trash", || place.files("out/.trash").iter().any(|name| name.contains("_002")));
+    run.type_in("nnew pads\r");
+    until("the note is in the journal", || journal().contains("note = \"new pads\""));
+    next_press();
+    run.type_in(" ");
+    until("no episode is being recorded", || session(&place)["phase"]["phase"] == "idle");
+    run.type_in("Eend\r");
+    until("the trash is empty", || !place.path("out/.trash").exists());
+    run.type_in("q");
+    until("the end", || run.child.try_wait().expect("wait").is_some());
+    assert_eq!(place.episodes("out").len(), 2, "{:?}", place.files("out"));
+}
