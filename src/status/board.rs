@@ -104,7 +104,7 @@ impl EpisodeCounts {
         let folder = text::plain(&last.parent().unwrap_or(Path::new("")).to_string_lossy()).into_owned();
         let discarded = match self.discarded.len() {
             0 => String::new(),
-            count => format!("; {count} in the trash"),
+            count => format!("; {count} discarded"),
         };
         Some(format!(
             "{} {episodes} in {folder} ({good} GOOD, {suspect} SUSPECT, {bad} BAD{discarded}); next: rapid inspect {folder}",

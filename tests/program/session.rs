@@ -16,6 +16,11 @@ fn next_press() {
     std::thread::sleep(std::time::Duration::from_secs(1));
 }
 
+/// The name of the third episode.
+fn third(place: &Place) -> String {
+    session(place)["episodes"][2]["file"].as_str().expect("a name").to_owned()
+}
+
 fn session(place: &Place) -> serde_json::Value {
     serde_json::from_str(&ask(place, &["session", "--json"]).expect("a session")).expect("JSON")
 }
@@ -37,6 +42,9 @@ fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
     ask(&place, &["episode", "discard"]).expect("it is discarded");
     until("it is in the trash", || place.files("out/.trash").len() == 1);
     ask(&place, &["episode", "next"]).expect("a third");
+    until("there is something in it", || {
+        std::fs::metadata(place.path(&format!("out/{}.partial", third(&place)))).is_ok_and(|file| file.len() > 200_000)
+    });
     running.signal(Signal::KILL);
     drop(running);
 
@@ -48,7 +56,7 @@ fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
     assert_eq!((episodes.len(), &status["discarded"]), (3, &1.into()), "{status}");
     assert_eq!((&episodes[0]["label"], &episodes[0]["label_reason"]), (&"failure".into(), &"spilled".into()));
     assert_eq!(episodes[0]["marks"][0]["text"], "grasped");
-    assert!(place.files("out").contains(&episodes[2]["file"].as_str().expect("a name").to_owned()), "{status}");
+    assert!(place.files("out").contains(&third(&place)), "{status}");
     ask(&place, &["episode", "undo"]).expect("it comes back");
     until("it is back", || place.files("out/.trash").is_empty());
     ask(&place, &["session", "plan", "--task", "stack", "--goal", "7", "--tag", "finger=soft"]).expect("a plan");
@@ -85,6 +93,9 @@ fn keys_discard_redo_note_and_end_a_session_in_the_monitor() {
     let place = Place::new();
     let mut run = OnTerminal::start(&place, &["--sim", "--record", "--out", "out"], "");
     run.read_until("REC");
+    let mut shown = std::fs::File::from(run.master.as_ref().expect("open").try_clone().expect("clone"));
+    // What is not read would stop the screen.
+    std::thread::spawn(move || std::io::copy(&mut shown, &mut std::io::sink()));
     let journal = || std::fs::read_to_string(place.path("out/session.toml")).unwrap_or_default();
     let recorded = |number: &str| journal().contains(number);
     until("the first is in the journal", || recorded("_001"));
@@ -101,6 +112,8 @@ fn keys_discard_redo_note_and_end_a_session_in_the_monitor() {
     until("no episode is being recorded", || session(&place)["phase"]["phase"] == "idle");
     run.type_in("Eend\r");
     until("the trash is empty", || !place.path("out/.trash").exists());
+    // A screen that still shows the recording asks first.
+    next_press();
     run.type_in("q");
     until("the end", || run.child.try_wait().expect("wait").is_some());
     assert_eq!(place.episodes("out").len(), 2, "{:?}", place.files("out"));
