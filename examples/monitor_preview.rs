@@ -36,7 +36,7 @@ async fn main() -> Result<(), tui::TuiError> {
         Some(form) => {
             let duration = Duration::from_secs(40);
             let json = form == "--json";
-            let options = HeadlessOptions { json, progress: true, duration: Some(duration), ..Default::default() };
+            let options = HeadlessOptions { json, duration: Some(duration), ..Default::default() };
             let output =
                 headless::run(Arc::clone(&board), board.events(), shutdown.clone(), options, std::io::stdout());
             // It stands in for the end of the run; when the output ended before, there is nothing to end.

@@ -27,10 +27,10 @@ use crate::commands::register::{self, Dialogue, Target};
 use crate::commands::{self, CommandStatus, Format};
 use crate::device::Attachment;
 use crate::driver::replay;
-use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::{HotplugError, udev};
+use crate::palette::Palette;
 use crate::record::inspect::ReadError;
-use crate::record::{self, EpisodeRequest, RecordError, inspect};
+use crate::record::{self, EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
@@ -59,7 +59,7 @@ pub fn dispatch(cli: Cli) -> ExitCode {
             let message = with_cause(text);
             let lines: Vec<_> = message.lines().map(|line| text::plain(line).into_owned()).collect();
             if !message.is_empty() {
-                let message = format!("{} {}\n", stderr_palette().bad("error:"), lines.join("\n"));
+                let message = format!("{} {}\n", Palette::of(&io::stderr()).bad("error:"), lines.join("\n"));
                 outlet::write_within(io::stderr(), message, STDERR_TIMEOUT);
             }
             ExitCode::from(code)
@@ -118,8 +118,8 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         }
         Command::Inspect { paths } => {
             let columns = crate::tui::columns().unwrap_or(100);
-            let paint = if palette() == Palette::Ansi { inspect::Paint::Ansi } else { inspect::Paint::Plain };
-            reported(commands::inspect::inspect(&paths, format, columns, paint, out)?)
+            let palette = Palette::of(&io::stdout());
+            reported(commands::inspect::inspect(&paths, format, columns, palette, out)?)
         }
         Command::Recover { paths } => recover(paths, format),
         Command::Ablation(args) => {
@@ -208,7 +208,7 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let json = json_path(&path);
     let names = || commands::mask::layout(&crate::folder::read_text(&json, LARGEST_JSON).ok()?);
     let read = || read_mask(&path).map_err(|error| no_mask(&error));
-    let options = MaskOptions { watch, json: global.json, palette: palette() };
+    let options = MaskOptions { watch, json: global.json, palette: Palette::of(&io::stdout()) };
     let stop = CancellationToken::new();
     block_on(async {
         let interrupted = stop.clone();
@@ -336,14 +336,6 @@ fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     done.map_err(|_| Failure::panicked())
 }
 
-fn palette() -> Palette {
-    ColourChoice::Auto.resolve(Terminal::of(&io::stdout()), |name| std::env::var(name).ok())
-}
-
-fn stderr_palette() -> Palette {
-    ColourChoice::Auto.resolve(Terminal::of(&io::stderr()), |name| std::env::var(name).ok())
-}
-
 fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
     find_registry(global).map_or_else(|| Ok(Registry::builtin()), |path| load(&path))
 }
@@ -352,7 +344,7 @@ fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
 fn load(path: &Path) -> Result<Registry, Failure> {
     let loaded = Registry::load(path)?;
     for warning in &loaded.warnings {
-        let _ = writeln!(io::stderr(), "{} {warning}", stderr_palette().warn("warning:"));
+        let _ = writeln!(io::stderr(), "{} {warning}", Palette::of(&io::stderr()).warn("warning:"));
     }
     Ok(loaded.registry)
 }

@@ -40,6 +40,7 @@ pub mod modality;
 pub mod observation;
 pub mod orders;
 pub mod outlet;
+pub mod palette;
 pub mod panics;
 pub mod peer;
 pub mod permission;

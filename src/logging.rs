@@ -28,7 +28,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, Registry};
 
 use crate::headless::ERASE_LINE;
-use crate::headless::style::{ColourChoice, Terminal};
+use crate::palette::Palette;
 use crate::panics;
 use crate::status::{Board, Level, LogLine};
 use crate::text;
@@ -143,7 +143,7 @@ impl Sink for Arc<Board> {
 #[derive(Debug)]
 struct StderrSink {
     form: Stderr,
-    palette: crate::headless::style::Palette,
+    palette: Palette,
     /// Erases a progress line on the same terminal.
     before: &'static str,
     pieces: SyncSender<Piece>,
@@ -153,9 +153,8 @@ struct StderrSink {
 
 impl StderrSink {
     fn new(form: Stderr, pieces: SyncSender<Piece>) -> Self {
-        let terminal = Terminal::of(&io::stderr());
-        let palette = ColourChoice::Auto.resolve(terminal, |name| std::env::var(name).ok());
-        let shared = form == Stderr::Text && terminal == Terminal::Yes && io::stdout().is_terminal();
+        let palette = Palette::of(&io::stderr());
+        let shared = form == Stderr::Text && io::stderr().is_terminal() && io::stdout().is_terminal();
         Self { form, palette, before: if shared { ERASE_LINE } else { "" }, pieces, lost: AtomicU64::new(0) }
     }
 

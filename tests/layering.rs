@@ -41,6 +41,7 @@ const LAYERS: &[&[&str]] = &[
         "link",
         "simulation",
         "status",
+        "palette",
         "text",
         "outlet",
         "folder",
@@ -63,6 +64,7 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
     ("registry", &["folder", "device", "simulation"]),
     ("device", &["simulation"]),
     ("status", &["registry", "device", "text"]),
+    ("palette", &["status"]),
     ("control", &["registry"]),
     ("gpio", &["text", "realtime"]),
     ("episode", &["sync"]),
@@ -78,8 +80,12 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
 /// Modules that see less than their layer would let them: besides layer 0 only these.
 const NARROW: &[(&str, &[&str], &str)] = &[
     ("tui", &["status", "registry", "text", "outlet", "panics"], "a screen knows snapshots and commands, no stage"),
-    ("headless", &["status", "registry", "text", "outlet"], "a screen knows snapshots and commands, no stage"),
-    ("logging", &["status", "text", "outlet", "panics"], "the log goes to the board and knows no stage"),
+    (
+        "headless",
+        &["status", "registry", "palette", "text", "outlet"],
+        "a screen knows snapshots and commands, no stage",
+    ),
+    ("logging", &["status", "palette", "text", "outlet", "panics"], "the log goes to the board and knows no stage"),
 ];
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).

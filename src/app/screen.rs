@@ -1,5 +1,6 @@
 //! The screen of a run: the monitor, or lines on standard output.
 
+use std::io::IsTerminal;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,8 +9,8 @@ use tokio::sync::{broadcast, mpsc};
 use super::stage::Stage;
 use super::{AppError, Screen};
 use crate::fault;
-use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
+use crate::palette::Palette;
 use crate::permission::Permission;
 use crate::status::{Board, Command, Event};
 use crate::tui::{self, TuiError};
@@ -39,14 +40,11 @@ pub(super) fn start(
             }
         });
     }
-    let options = HeadlessOptions {
-        json: screen == Screen::Json,
-        colour: ColourChoice::Auto,
-        progress: screen == Screen::Lines,
-        duration,
-    };
+    let (json, stdout) = (screen == Screen::Json, std::io::stdout());
+    let palette = if json { Palette::Plain } else { Palette::of(&stdout) };
+    let options = HeadlessOptions { json, palette, in_place: !json && stdout.is_terminal(), duration };
     Stage::start("the screen", |stop| {
-        let run = headless::run(board, events, stop, options, std::io::stdout());
+        let run = headless::run(board, events, stop, options, stdout);
         async move {
             // Lines of text cannot make requests.
             drop(commands);

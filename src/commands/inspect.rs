@@ -5,7 +5,8 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use super::{CommandStatus, Format, progress};
-use crate::record::inspect::{self, Judgement, Paint, ReadError};
+use crate::palette::Palette;
+use crate::record::inspect::{self, Judgement, ReadError};
 use crate::text;
 
 /// Why there is no report.
@@ -28,7 +29,7 @@ pub fn inspect(
     paths: &[PathBuf],
     format: Format,
     columns: usize,
-    paint: Paint,
+    palette: Palette,
     out: &mut impl Write,
 ) -> Result<CommandStatus, InspectFailure> {
     if let [path] = paths
@@ -37,7 +38,7 @@ pub fn inspect(
         let inspection = inspect::inspect(path)?;
         match format {
             Format::Json => write_json(out, &inspection)?,
-            Format::Text => out.write_all(inspect::render(&inspection, columns, paint).as_bytes())?,
+            Format::Text => out.write_all(inspect::render(&inspection, columns, palette).as_bytes())?,
         }
         return Ok(CommandStatus::Done);
     }
@@ -60,7 +61,7 @@ pub fn inspect(
         }
         match format {
             Format::Json => write_json(out, &listed),
-            Format::Text => writeln!(out, "{}", inspect::render_list(&listed, &name_of(file), name, paint)),
+            Format::Text => writeln!(out, "{}", inspect::render_list(&listed, &name_of(file), name, palette)),
         }
     })?;
     Ok(outcome)

@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use crate::headless::style::Palette;
 use crate::mask::{MaskRecord, PhysicalMask};
+use crate::palette::Palette;
 use crate::text;
 
 /// A record older than this is stale: a running publisher publishes every 2 ms.

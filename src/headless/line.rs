@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use super::style::Palette;
 use crate::modality::ModalityId;
+use crate::palette::Palette;
 use crate::status::{DeviceStatus, Event, Snapshot, What};
 use crate::text;
 use crate::time::Stamp;

@@ -5,7 +5,6 @@
 
 mod line;
 mod progress;
-pub mod style;
 mod totals;
 
 use std::io::{self, Write};
@@ -18,11 +17,11 @@ use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
 use crate::outlet::Outlet;
+use crate::palette::Palette;
 use crate::status::rates::Rates;
 use crate::status::{Board, Event, Snapshot, What};
 use crate::text;
 use crate::time::{Stamp, WallClock};
-use style::{ColourChoice, Palette, Terminal};
 use totals::RunTotals;
 
 /// Maximum backlog of output; beyond it events wait, and are eventually missed.
@@ -42,18 +41,11 @@ pub struct HeadlessOptions {
     /// One JSON object per line instead of text.
     pub json: bool,
     /// Colours, in text.
-    pub colour: ColourChoice,
-    /// Progress between the events: rewritten in place on a terminal, otherwise every ten seconds.
-    pub progress: bool,
+    pub palette: Palette,
+    /// Text goes to a terminal: progress is rewritten in place, and not a line every ten seconds.
+    pub in_place: bool,
     /// The planned duration of the run; only shown. This module does not end the run.
     pub duration: Option<Duration>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Progress {
-    Off,
-    Lines,
-    InPlace,
 }
 
 /// Prints events to `out`, the process's standard output, until `shutdown`; then the remaining announced events and the
@@ -72,15 +64,7 @@ pub fn run(
     options: HeadlessOptions,
     out: impl Write + Send + 'static,
 ) -> impl Future<Output = io::Result<()>> + Send {
-    let terminal = Terminal::of(&io::stdout());
-    let palette =
-        if options.json { Palette::Plain } else { options.colour.resolve(terminal, |name| std::env::var(name).ok()) };
-    let progress = match (options.progress, terminal, options.json) {
-        (false, ..) => Progress::Off,
-        (true, Terminal::Yes, false) => Progress::InPlace,
-        (true, ..) => Progress::Lines,
-    };
-    let printer = Printer::new(&board.snapshot(), &options, progress, palette);
+    let printer = Printer::new(&board.snapshot(), options);
     async move {
         let outlet = Outlet::new("output", DEPTH, out)?;
         match printer.run(&board, events, &shutdown, outlet).await {
@@ -98,9 +82,7 @@ fn is_gone(error: &io::Error) -> bool {
 
 /// Turns events and snapshots into pieces of output.
 struct Printer {
-    json: bool,
-    progress: Progress,
-    duration: Option<Duration>,
+    options: HeadlessOptions,
     columns: line::Columns,
     wall: WallClock,
     began: Stamp,
@@ -112,13 +94,11 @@ struct Printer {
 }
 
 impl Printer {
-    fn new(snapshot: &Snapshot, options: &HeadlessOptions, progress: Progress, palette: Palette) -> Self {
+    fn new(snapshot: &Snapshot, options: HeadlessOptions) -> Self {
         let name = snapshot.devices.iter().map(|device| text::width(&device.name)).max().unwrap_or(0);
         Self {
-            json: options.json,
-            progress,
-            duration: options.duration,
-            columns: line::Columns { name: name.clamp(8, 28), palette },
+            options,
+            columns: line::Columns { name: name.clamp(8, 28), palette: options.palette },
             wall: WallClock::now(),
             began: snapshot.taken,
             rates: Rates::default(),
@@ -178,7 +158,11 @@ impl Printer {
     /// The start of the output: the rig and its modalities.
     fn opening(&mut self, snapshot: &Snapshot) -> io::Result<String> {
         let wall_ns = self.wall.wall_ns(snapshot.taken);
-        let line = if self.json { line::begin_json(snapshot, wall_ns)? } else { self.columns.begin(snapshot, wall_ns) };
+        let line = if self.options.json {
+            line::begin_json(snapshot, wall_ns)?
+        } else {
+            self.columns.begin(snapshot, wall_ns)
+        };
         Ok(self.whole_line(&line))
     }
 
@@ -186,7 +170,7 @@ impl Printer {
         self.totals.count(event);
         let wall_ns = self.wall.wall_ns(event.stamp);
         let line = match &event.what {
-            _ if self.json => line::json(event, wall_ns)?,
+            _ if self.options.json => line::json(event, wall_ns)?,
             // Chunks arrive continuously; progress shows their rate.
             What::Chunk(chunk) if chunk.skipped == 0 => return Ok(String::new()),
             _ => self.columns.line(event, wall_ns),
@@ -197,7 +181,7 @@ impl Printer {
     fn missed(&mut self, missed: u64, now: &Snapshot) -> String {
         self.totals.miss(missed);
         self.totals.agree(now);
-        let line = if self.json {
+        let line = if self.options.json {
             let time = crate::time::rfc3339(self.wall.wall_ns(now.taken));
             serde_json::json!({ "event": "missed", "count": missed, "time": time }).to_string()
         } else {
@@ -211,19 +195,19 @@ impl Printer {
     fn look(&mut self, snapshot: &Snapshot) -> io::Result<Option<String>> {
         self.rates.update(snapshot);
         let elapsed = snapshot.taken.since(self.began);
-        match self.progress {
-            Progress::Off => return Ok(None),
-            Progress::InPlace => {}
-            Progress::Lines if snapshot.taken.since(self.last_line) < PROGRESS_LINE => return Ok(None),
-            Progress::Lines => self.last_line = snapshot.taken,
+        if !self.options.in_place {
+            if snapshot.taken.since(self.last_line) < PROGRESS_LINE {
+                return Ok(None);
+            }
+            self.last_line = snapshot.taken;
         }
-        if self.json {
+        if self.options.json {
             let wall_ns = self.wall.wall_ns(snapshot.taken);
-            let line = progress::json(snapshot, &self.rates, elapsed, self.duration, wall_ns)?;
+            let line = progress::json(snapshot, &self.rates, elapsed, self.options.duration, wall_ns)?;
             return Ok(Some(self.whole_line(&line)));
         }
-        let line = progress::line(snapshot, &self.rates, elapsed, self.duration);
-        if self.progress == Progress::Lines {
+        let line = progress::line(snapshot, &self.rates, elapsed, self.options.duration);
+        if !self.options.in_place {
             return Ok(Some(self.whole_line(&line)));
         }
         self.pending = true;
@@ -235,8 +219,11 @@ impl Printer {
     fn summary(&mut self, end: &Snapshot) -> io::Result<String> {
         let totals = std::mem::replace(&mut self.totals, RunTotals::new(end));
         let summary = totals.summary(end);
-        let text =
-            if self.json { text::json(&summary)? } else { summary.text(self.columns.name, self.columns.palette) };
+        let text = if self.options.json {
+            text::json(&summary)?
+        } else {
+            summary.text(self.columns.name, self.columns.palette)
+        };
         Ok(self.whole_line(&text))
     }
 

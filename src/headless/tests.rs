@@ -334,7 +334,7 @@ fn timely_chunks_are_printed_only_as_json() {
     let snapshot = three_streaming();
     let print = |json, what: What| {
         let options = HeadlessOptions { json, ..HeadlessOptions::default() };
-        Printer::new(&snapshot, &options, Progress::Off, Palette::Plain).event(&event(what)).unwrap()
+        Printer::new(&snapshot, options).event(&event(what)).unwrap()
     };
     assert_eq!(print(false, chunk(0)), "");
     assert!(print(false, chunk(2)).contains("late chunk    tick 40"));
@@ -410,7 +410,7 @@ async fn announcements_before_the_end_are_printed_and_summarized() {
     let board = Arc::new(board(&["cam_wrist", "tof"]));
     let shutdown = CancellationToken::new();
     let kept = Kept::default();
-    let options = HeadlessOptions { colour: ColourChoice::Never, ..HeadlessOptions::default() };
+    let options = HeadlessOptions::default();
     let output = run(Arc::clone(&board), board.events(), shutdown.clone(), options, kept.clone());
     // Announced after the call and before the first poll: not lost.
     board.set_slot(id(0), SlotState::Streaming, Epoch(1), "");
@@ -433,7 +433,7 @@ async fn every_json_line_is_an_object_and_missed_events_are_reported() {
     let board = Arc::new(board(&["cam_wrist"]));
     let shutdown = CancellationToken::new();
     let kept = Kept::default();
-    let options = HeadlessOptions { json: true, progress: true, ..HeadlessOptions::default() };
+    let options = HeadlessOptions { json: true, ..HeadlessOptions::default() };
     let output = run(Arc::clone(&board), board.events(), shutdown.clone(), options, kept.clone());
     // More than the board keeps for a slow reader.
     for _ in 0..5000 {
@@ -465,8 +465,8 @@ async fn a_closed_pipe_is_a_clean_end_without_a_shutdown() {
 #[test]
 fn progress_in_place_is_erased_before_a_line() {
     let snapshot = three_streaming();
-    let options = HeadlessOptions { progress: true, ..HeadlessOptions::default() };
-    let mut printer = Printer::new(&snapshot, &options, Progress::InPlace, Palette::Plain);
+    let options = HeadlessOptions { in_place: true, ..HeadlessOptions::default() };
+    let mut printer = Printer::new(&snapshot, options);
     let piece = printer.look(&snapshot).unwrap().unwrap();
     assert!(piece.starts_with(ERASE_LINE) && !piece.contains('\n'), "{piece:?}");
     let line = printer.event(&event(episode(0, None))).unwrap();
@@ -474,10 +474,14 @@ fn progress_in_place_is_erased_before_a_line() {
     let line = printer.event(&event(episode(0, None))).unwrap();
     assert!(!line.contains(ERASE_LINE), "{line:?}");
 
-    let mut printer = Printer::new(&snapshot, &options, Progress::Lines, Palette::Plain);
+    let mut printer = Printer::new(&snapshot, HeadlessOptions::default());
     assert_eq!(printer.look(&snapshot).unwrap(), None);
     let mut later = snapshot.clone();
     later.taken = later.taken.after(PROGRESS_LINE);
     let piece = printer.look(&later).unwrap().unwrap();
     assert!(piece.starts_with("00:10  mask 0x07") && piece.ends_with('\n'), "{piece:?}");
+
+    let mut printer = Printer::new(&snapshot, HeadlessOptions { json: true, ..HeadlessOptions::default() });
+    let piece = printer.look(&later).unwrap().unwrap();
+    assert!(piece.contains("\"event\":\"progress\"") && piece.ends_with('\n'), "{piece:?}");
 }

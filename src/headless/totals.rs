@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::style::Palette;
 use crate::modality::MAX_MODALITIES;
+use crate::palette::Palette;
 use crate::status::{DeviceStatus, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
 use crate::text;
 use crate::time::Stamp;

@@ -70,7 +70,7 @@ fn text_lines_replace_a_progress_line_on_the_same_terminal() {
 }
 
 fn sink_to(form: Stderr, before: &'static str, out: impl Write + Send + 'static) -> StderrSink {
-    let palette = crate::headless::style::Palette::Plain;
+    let palette = crate::palette::Palette::Plain;
     StderrSink { form, palette, before, pieces: spawn_writer(out).unwrap(), lost: AtomicU64::new(0) }
 }
 

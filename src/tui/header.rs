@@ -112,7 +112,7 @@ fn right(model: &Model, theme: Theme) -> Line<'static> {
             spans.push(Span::styled(format!("would be {}", grade.word()), theme.grade(grade)));
             spans.push(Span::raw("  "));
         }
-        spans.push(Span::styled(recording::mark(recording, theme), theme.recording()));
+        spans.push(Span::styled(recording::mark(recording, theme), theme.alarm()));
         spans.push(Span::raw(" "));
     }
     Line::from(spans)

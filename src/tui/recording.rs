@@ -66,7 +66,7 @@ fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Th
     } else {
         Span::styled(format!("   {dropped}"), theme.faint())
     };
-    let mark = Span::styled(format!("{} REC ", theme.symbol("●", "*")), theme.recording());
+    let mark = Span::styled(format!("{} REC ", theme.symbol("●", "*")), theme.alarm());
     let width = usize::from(area.width);
     // What was lost matters more than the rate, and than a piece of a name.
     let used: usize = mark.width() + figures.iter().map(Span::width).sum::<usize>() + dropped.width();

@@ -108,11 +108,6 @@ impl Theme {
         self.colour(Color::Green)
     }
 
-    /// An episode is being written.
-    pub fn recording(self) -> Style {
-        self.alarm()
-    }
-
     /// A verdict.
     pub fn grade(self, grade: Grade) -> Style {
         match grade {

@@ -88,7 +88,7 @@ fn draw_too_small(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme
         Line::from(format!("needs {}x{}, has {}x{}", MINIMUM.0, MINIMUM.1, area.width, area.height)),
     ];
     if let Some(recording) = &model.latest().recording {
-        lines.insert(0, Line::styled(recording::mark(recording, theme), theme.recording()));
+        lines.insert(0, Line::styled(recording::mark(recording, theme), theme.alarm()));
     }
     let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).min(area.height);
     let [middle] = Layout::vertical([Constraint::Length(height)]).flex(ratatui::layout::Flex::Center).areas(area);

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::render::{clean, colour, grade_colour, size};
-use super::{FileEnd, Inspection, Judgement, Paint, ReadError, inspect};
+use super::render::clean;
+use super::{FileEnd, Inspection, Judgement, ReadError, inspect};
 use crate::episode::partial::PARTIAL;
+use crate::palette::Palette;
 use crate::status::Grade;
 use crate::text;
 
@@ -94,16 +95,17 @@ pub fn list(file: &Path) -> Listed {
 }
 
 /// The episode, called `name`, in a line without its end; `columns` are those of the longest name.
-pub fn render_list(listed: &Listed, name: &str, columns: usize, paint: Paint) -> String {
+pub fn render_list(listed: &Listed, name: &str, columns: usize, palette: Palette) -> String {
     let name = text::left(&clean(name), columns, "...");
     let (word, shade) = match &listed.verdict {
-        Judgement::Episode(verdict) => (verdict.grade.word(), grade_colour(Some(verdict.grade))),
-        Judgement::NotOurs => ("-", grade_colour(Some(Grade::Suspect))),
-        Judgement::Unreadable(_) => ("?", grade_colour(None)),
+        Judgement::Episode(verdict) => (verdict.grade.word(), verdict.grade),
+        Judgement::NotOurs => ("-", Grade::Suspect),
+        Judgement::Unreadable(_) => ("?", Grade::Bad),
     };
-    let mut line = format!("{}  {name}", colour(paint, shade, &format!("{word:7}")));
+    let mut line = format!("{}  {name}", palette.grade(shade, &format!("{word:7}")));
     if let Judgement::Episode(verdict) = &listed.verdict {
-        let _ = write!(line, "  {:>8.1} s  {:>8}  {}", listed.seconds, size(listed.bytes), clean(&verdict.sensors()));
+        let _ =
+            write!(line, "  {:>8.1} s  {:>8}  {}", listed.seconds, text::size(listed.bytes), clean(&verdict.sensors()));
     }
     let reasons = listed.verdict.reasons();
     if let Some(first) = reasons.first() {

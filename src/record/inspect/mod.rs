@@ -33,7 +33,7 @@ pub use crate::episode::ReadError;
 pub use crate::episode::record_iter::{FileEnd, LeftOut};
 pub use list::{Listed, episodes, list, render_list};
 pub use policy::{HoldReport, PolicyReport};
-pub use render::{Paint, render};
+pub use render::render;
 
 /// Reason of a file that has no verdict.
 const NOT_OURS: &str = "not an episode of rapid";

@@ -5,18 +5,10 @@ use std::fmt::Write;
 
 use super::{FileEnd, Inspection, Judgement, Lateness, ModalityReport, PolicyReport, TopicReport};
 use super::{policy, units};
+use crate::palette::Palette;
 use crate::record::Spread;
 use crate::status::Grade;
 use crate::text;
-
-/// Whether the terminal shows colours.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Paint {
-    /// Text only.
-    Plain,
-    /// ANSI escape sequences.
-    Ansi,
-}
 
 /// Events shown; the JSON form has all of them.
 const EVENTS: usize = 40;
@@ -24,20 +16,20 @@ const EVENTS: usize = 40;
 const TIMELINE: usize = 10;
 
 /// The report in lines of at most `width` characters, as far as names allow.
-pub fn render(inspection: &Inspection, width: usize, paint: Paint) -> String {
+pub fn render(inspection: &Inspection, width: usize, palette: Palette) -> String {
     let mut out = String::new();
     // Writing to a string cannot fail.
-    let _ = write_all(&mut out, inspection, width, paint);
+    let _ = write_all(&mut out, inspection, width, palette);
     out
 }
 
-fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Paint) -> std::fmt::Result {
-    write_head(out, inspection, paint)?;
+fn write_all(out: &mut String, inspection: &Inspection, width: usize, palette: Palette) -> std::fmt::Result {
+    write_head(out, inspection, palette)?;
     let names = inspection.modalities.iter().map(|modality| clean(&modality.name).chars().count());
     let topics = inspection.topics.iter().map(|topic| clean(&topic.topic).chars().count());
     let column = names.chain(topics).max().unwrap_or(0).max(8);
     write_topics(out, inspection, column)?;
-    write_presence(out, inspection, column, width, paint)?;
+    write_presence(out, inspection, column, width, palette)?;
     write_units(out, inspection, column, width)?;
     if let Some(policy) = &inspection.policy {
         write_policy(out, policy, width)?;
@@ -45,20 +37,20 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
     write_events(out, inspection, width)
 }
 
-fn write_head(out: &mut String, inspection: &Inspection, paint: Paint) -> std::fmt::Result {
+fn write_head(out: &mut String, inspection: &Inspection, palette: Palette) -> std::fmt::Result {
     let name = inspection.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    writeln!(out, "{}  {}", clean(&name), ending(inspection, paint))?;
+    writeln!(out, "{}  {}", clean(&name), ending(inspection, palette))?;
     for text in inspection.left_out.sentences(inspection.damaged_chunks) {
-        writeln!(out, "{}", colour(paint, RED, &text))?;
+        writeln!(out, "{}", palette.bad(&text))?;
     }
     if inspection.ordered_messages > 0 {
         let text = super::state::unverified(inspection.ordered_messages);
-        writeln!(out, "{}", colour(paint, YELLOW, &text))?;
+        writeln!(out, "{}", palette.warn(&text))?;
     }
     if let Some(source) = inspection.recovered.get("source") {
-        writeln!(out, "{}", colour(paint, YELLOW, &clean(&repair(source, &inspection.recovered))))?;
+        writeln!(out, "{}", palette.warn(&clean(&repair(source, &inspection.recovered))))?;
     }
-    write_verdict(out, inspection, paint)?;
+    write_verdict(out, inspection, palette)?;
     let mut about = vec![format!("task {}", or_dash(&inspection.task)), format!("rig {}", or_dash(&inspection.rig))];
     about.extend(inspection.tags.iter().map(|(key, value)| format!("{key}={value}")));
     writeln!(out, "{}", clean(&about.join("   ")))?;
@@ -67,7 +59,7 @@ fn write_head(out: &mut String, inspection: &Inspection, paint: Paint) -> std::f
         out,
         "{:.3} s   {}   {} messages   {} frames   {dropped} dropped",
         inspection.seconds,
-        size(inspection.bytes),
+        text::size(inspection.bytes),
         inspection.messages,
         inspection.frames
     )?;
@@ -77,7 +69,7 @@ fn write_head(out: &mut String, inspection: &Inspection, paint: Paint) -> std::f
         .filter_map(|(count, what)| Some(format!("{} {what}", count.filter(|count| *count > 0)?)))
         .collect();
     if !others.is_empty() {
-        writeln!(out, "{}", colour(paint, YELLOW, &others.join(", ")))?;
+        writeln!(out, "{}", palette.warn(&others.join(", ")))?;
     }
     Ok(())
 }
@@ -104,7 +96,7 @@ fn write_presence(
     inspection: &Inspection,
     column: usize,
     width: usize,
-    paint: Paint,
+    palette: Palette,
 ) -> std::fmt::Result {
     if let Some(Spread { p50, p95, max, .. }) = inspection.skew {
         writeln!(out, "\nsamples of a frame lie {p50:.1}/{p95:.1}/{max:.1} ms apart (p50/95/max)")?;
@@ -113,7 +105,7 @@ fn write_presence(
     let cells = width.saturating_sub(column + 8).max(TIMELINE);
     for modality in &inspection.modalities {
         let share = modality.presence.map_or("?".to_owned(), percent);
-        let line = timeline(modality, inspection.seconds, cells, paint);
+        let line = timeline(modality, inspection.seconds, cells, palette);
         writeln!(out, "{:column$} {line} {share:>6}", clean(&modality.name))?;
     }
     Ok(())
@@ -161,16 +153,16 @@ fn write_policy(out: &mut String, policy: &PolicyReport, width: usize) -> std::f
     Ok(())
 }
 
-fn write_verdict(out: &mut String, inspection: &Inspection, paint: Paint) -> std::fmt::Result {
+fn write_verdict(out: &mut String, inspection: &Inspection, palette: Palette) -> std::fmt::Result {
     let Judgement::Episode(verdict) = &inspection.verdict else {
-        return writeln!(out, "{}", colour(paint, YELLOW, &clean(&inspection.verdict.reasons().join("; "))));
+        return writeln!(out, "{}", palette.warn(&clean(&inspection.verdict.reasons().join("; "))));
     };
-    let mut line = colour(paint, grade_colour(Some(verdict.grade)), verdict.grade.word());
+    let mut line = palette.grade(verdict.grade, verdict.grade.word());
     if verdict.sensors.is_some() {
         write!(line, "   {}", clean(&verdict.sensors()))?;
     }
     if let Some(recorded) = inspection.recorded_verdict.as_ref().filter(|recorded| !recorded.agrees_with(verdict)) {
-        let other = colour(paint, grade_colour(Some(recorded.grade)), recorded.grade.word());
+        let other = palette.grade(recorded.grade, recorded.grade.word());
         write!(line, "   when it was recorded: {other} {}", clean(&recorded.why()))?;
     }
     writeln!(out, "{line}")?;
@@ -227,15 +219,13 @@ fn repair(source: &str, recovered: &BTreeMap<String, String>) -> String {
     format!("repaired from {source}: {counts}")
 }
 
-fn ending(inspection: &Inspection, paint: Paint) -> String {
-    let unread = size(inspection.unread_bytes);
+fn ending(inspection: &Inspection, palette: Palette) -> String {
+    let unread = text::size(inspection.unread_bytes);
     match inspection.end {
-        FileEnd::Finished => colour(paint, GREEN, "complete"),
-        FileEnd::Unfinished => colour(paint, YELLOW, "INCOMPLETE: no footer, read to its end"),
-        FileEnd::Torn => {
-            colour(paint, YELLOW, &format!("INCOMPLETE: the last record is cut, {unread} of it not whole"))
-        }
-        FileEnd::Damaged => colour(paint, RED, &format!("DAMAGED: {unread} cannot be read")),
+        FileEnd::Finished => palette.good("complete"),
+        FileEnd::Unfinished => palette.warn("INCOMPLETE: no footer, read to its end"),
+        FileEnd::Torn => palette.warn(&format!("INCOMPLETE: the last record is cut, {unread} of it not whole")),
+        FileEnd::Damaged => palette.bad(&format!("DAMAGED: {unread} cannot be read")),
     }
 }
 
@@ -255,52 +245,32 @@ fn write_topic(out: &mut String, name: &str, topic: &TopicReport, frames: &str, 
 }
 
 /// One character a cell of time: present throughout, absent throughout, or both.
-fn timeline(modality: &ModalityReport, seconds: f64, cells: usize, paint: Paint) -> String {
+fn timeline(modality: &ModalityReport, seconds: f64, cells: usize, palette: Palette) -> String {
     if modality.presence.is_none() {
         return "·".repeat(cells);
     }
     let mut line = String::new();
-    let (mut run, mut run_code) = (String::new(), GREEN);
+    let (mut run, mut run_grade) = (String::new(), Grade::Good);
     for cell in 0..cells {
         let begin = seconds * cell as f64 / cells as f64;
         let end = seconds * (cell + 1) as f64 / cells as f64;
         let together: f64 = modality.present.iter().map(|(from, to)| (to.min(end) - from.max(begin)).max(0.0)).sum();
         let share = if end > begin { together / (end - begin) } else { 0.0 };
         // A rounding error is neither presence nor absence.
-        let (code, glyph) = match share {
-            share if share > 0.999 => (GREEN, '█'),
-            share if share < 0.001 => (RED, '░'),
-            _ => (YELLOW, '▓'),
+        let (grade, glyph) = match share {
+            share if share > 0.999 => (Grade::Good, '█'),
+            share if share < 0.001 => (Grade::Bad, '░'),
+            _ => (Grade::Suspect, '▓'),
         };
-        if code != run_code && !run.is_empty() {
-            line.push_str(&colour(paint, run_code, &run));
+        if grade != run_grade && !run.is_empty() {
+            line.push_str(&palette.grade(run_grade, &run));
             run.clear();
         }
-        run_code = code;
+        run_grade = grade;
         run.push(glyph);
     }
-    line.push_str(&colour(paint, run_code, &run));
+    line.push_str(&palette.grade(run_grade, &run));
     line
-}
-
-/// The colour of a verdict, or of the lack of one.
-pub(super) fn grade_colour(grade: Option<Grade>) -> u8 {
-    match grade {
-        Some(Grade::Good) => GREEN,
-        Some(Grade::Suspect) => YELLOW,
-        Some(Grade::Bad) | None => RED,
-    }
-}
-
-const RED: u8 = 31;
-const GREEN: u8 = 32;
-const YELLOW: u8 = 33;
-
-pub(super) fn colour(paint: Paint, code: u8, text: &str) -> String {
-    match paint {
-        Paint::Plain => text.to_owned(),
-        Paint::Ansi => format!("\x1b[{code}m{text}\x1b[0m"),
-    }
 }
 
 /// Text of a file, without what could move the cursor of a terminal.
@@ -317,13 +287,4 @@ fn percent(share: f64) -> String {
     let percent = if share < 1.0 { (share * 100.0).clamp(0.0, 99.0) } else { 100.0 };
     // An empty sum of floats is minus zero.
     format!("{:.0} %", percent.abs())
-}
-
-pub(super) fn size(bytes: u64) -> String {
-    match bytes {
-        0..10_000 => format!("{bytes} B"),
-        10_000..1_000_000 => format!("{:.1} kB", bytes as f64 / 1e3),
-        1_000_000..1_000_000_000 => format!("{:.1} MB", bytes as f64 / 1e6),
-        _ => format!("{:.1} GB", bytes as f64 / 1e9),
-    }
 }

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::episode::testing;
 use crate::mask::{PhysicalMask, SizedMask};
+use crate::palette::Palette;
 use crate::record::tests::Bench;
 use crate::status::{Chunk, Grade, Hold, Sensors, What};
 
@@ -64,9 +65,9 @@ async fn a_finished_episode_is_reported_as_recorded() {
     let together: u64 =
         report.topics.iter().chain(report.modalities.iter().map(|m| &m.topic)).map(|t| t.messages).sum();
     assert_eq!(together, report.messages);
-    let shown = render(&report, 80, Paint::Ansi);
+    let shown = render(&report, 80, Palette::Ansi);
     assert!(shown.contains("\x1b[32m█") && shown.contains("   0 %") && !shown.contains("-0 %"), "{shown}");
-    assert!(render(&report, 80, Paint::Plain).lines().all(|line| line.chars().count() <= 80));
+    assert!(render(&report, 80, Palette::Plain).lines().all(|line| line.chars().count() <= 80));
     let json = serde_json::to_value(&report).unwrap();
     assert_eq!((&json["end"], &json["modalities"][1]["missing"]), (&"finished".into(), &8.into()));
 }
@@ -86,7 +87,7 @@ async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
         assert_ne!(report.end, FileEnd::Finished, "cut at {cut}");
         assert!((before..=whole.messages).contains(&report.messages), "cut at {cut}");
         before = report.messages;
-        assert!(!render(&report, 80, Paint::Ansi).is_empty());
+        assert!(!render(&report, 80, Palette::Ansi).is_empty());
     }
     assert_eq!(before, whole.messages);
     let mut noticed = 0;
@@ -95,7 +96,7 @@ async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
         flipped[at] ^= 1 << (at % 8);
         if let Some(report) = of(&flipped) {
             noticed += usize::from(report.damaged_chunks > 0 || report.end != FileEnd::Finished);
-            assert!(!render(&report, 80, Paint::Plain).is_empty());
+            assert!(!render(&report, 80, Palette::Plain).is_empty());
         }
     }
     // Whatever lies in a chunk is under its CRC, and chunks are most of the file.
@@ -108,7 +109,7 @@ fn any_damaged_file_has_a_report() {
     for bytes in testing::layouts().map(testing::episode) {
         proptest!(config.clone(), |(mutations in testing::mutations())| {
             if let Some(report) = inspect_bytes(&testing::mutated(&bytes, &mutations)) {
-                prop_assert!(!render(&report, 80, Paint::Plain).is_empty());
+                prop_assert!(!render(&report, 80, Palette::Plain).is_empty());
             }
         });
     }
@@ -158,7 +159,7 @@ async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
     let [hold] = policy.holds.as_slice() else { panic!("{:?}", policy.holds) };
     assert_eq!((hold.reason.as_str(), hold.count), ("missing: arm", 1));
     assert!((0.0..0.5).contains(&hold.seconds), "{}", hold.seconds);
-    let shown = render(&report, 80, Paint::Plain);
+    let shown = render(&report, 80, Palette::Plain);
     assert!(shown.contains("tactile-id  hash 0123456789ab  2 chunks  1 late  latency 30.0/30.0/50.0 ms"), "{shown}");
     assert!(shown.contains("s in 1 hold: missing: arm\n") && !shown.contains("chunk of tick"), "{shown}");
     assert_eq!(serde_json::to_value(&report).unwrap()["policy"]["hash"], "0123456789abcdef");
@@ -323,7 +324,7 @@ fn the_report_on_a_screen() {
             },
         ],
     };
-    insta::assert_snapshot!(render(&report, 60, Paint::Plain));
+    insta::assert_snapshot!(render(&report, 60, Palette::Plain));
 }
 
 #[tokio::test]
@@ -341,7 +342,7 @@ async fn a_folder_is_listed_with_one_line_per_episode() {
 
     let lines: Vec<_> = files
         .iter()
-        .map(|file| render_list(&list(file), &file.file_name().unwrap().to_string_lossy(), 30, Paint::Plain))
+        .map(|file| render_list(&list(file), &file.file_name().unwrap().to_string_lossy(), 30, Palette::Plain))
         .collect();
     assert!(
         lines[0].starts_with("?        20231114_t_001.mcap") && lines[0].ends_with("not an MCAP file"),

@@ -10,8 +10,8 @@ use rapid::commands;
 use rapid::device::{Attachment, DeviceNode, Unit, UsbIdentity};
 use rapid::driver;
 use rapid::episode::recover::recover_bytes;
-use rapid::headless::style::Palette;
 use rapid::mask::{MaskRecord, RECORD_LEN};
+use rapid::palette::Palette;
 use rapid::record::inspect as inspection;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
@@ -113,7 +113,7 @@ pub fn message(bytes: &[u8]) {
 /// A file as `rapid inspect` reads it: whatever it holds, a report that is harmless to a terminal.
 pub fn inspect(bytes: &[u8]) {
     let Some(report) = short(bytes).and_then(inspection::inspect_bytes) else { return };
-    harmless(&inspection::render(&report, 100, inspection::Paint::Plain));
+    harmless(&inspection::render(&report, 100, Palette::Plain));
     harmless(&shown::json(&report).expect("a report has a form in JSON"));
     assert!(report.unread_bytes <= report.bytes);
     assert!(report.seconds.is_finite() && report.seconds >= 0.0, "{} s", report.seconds);
