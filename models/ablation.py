@@ -129,10 +129,10 @@ def judge(configuration: Configuration, args: argparse.Namespace) -> None:
     command += ["--condition", "full", "--seed", str(FIRST_SEED)]
     run_folder.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-    told = f"rapid eval BUNDLE --condition full --trials {args.trials} --seed {FIRST_SEED} --json"
-    lines = [json.loads(line) for line in said.splitlines()]
-    record = {"command": told, "seconds": round(time.monotonic() - started, 1), "said": lines}
+    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    command_line = f"rapid eval BUNDLE --condition full --trials {args.trials} --seed {FIRST_SEED} --json"
+    lines = [json.loads(line) for line in printed.splitlines()]
+    record = {"command": command_line, "seconds": round(time.monotonic() - started, 1), "lines": lines}
     (run_folder / "eval.json").write_text(json.dumps(record, indent=2), encoding="utf-8")
 
 
@@ -141,21 +141,22 @@ def summarize(args: argparse.Namespace) -> None:
     rows = [row for c in CONFIGURATIONS if (row := summary(c, args.runs)) is not None]
     if not rows:
         return
-    told = f"ablation.py EPISODES --rapid RAPID --trials {args.trials} --iterations {args.iterations} --seed {args.seed}"
+    command_line = f"ablation.py EPISODES --rapid RAPID --trials {args.trials} --iterations {args.iterations}"
+    command_line += f" --seed {args.seed}"
     if math.isfinite(args.minutes):
-        told += f" --minutes {args.minutes:g}"
-    report = {"command": told, "trials": rows[0]["trials"], "first_seed": FIRST_SEED, "configurations": rows}
+        command_line += f" --minutes {args.minutes:g}"
+    report = {"command": command_line, "trials": rows[0]["trials"], "first_seed": FIRST_SEED, "configurations": rows}
     results.write(args.out, "ablation", report, markdown(report))
 
 
 def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
     """One row; none if the configuration has not been evaluated yet."""
-    said = runs / configuration.name / "eval.json"
-    if not said.exists():
+    record = runs / configuration.name / "eval.json"
+    if not record.exists():
         return None
-    judged = json.loads(said.read_text(encoding="utf-8"))
+    judged = json.loads(record.read_text(encoding="utf-8"))
     trained = json.loads((configuration.bundle(runs) / "policy.json").read_text(encoding="utf-8"))["training"]
-    trials = [line for line in judged["said"] if line["event"] == "trial"]
+    trials = [line for line in judged["lines"] if line["event"] == "trial"]
     outcomes = Counter("crash" if t["status"] == "crash" else t["outcome"] for t in trials)
     # Left is the bin of a triangular block, and wrong for a hexagonal one.
     left = [t for t in trials if t["outcome"] == ("success" if t["triangular"] else "wrong_bin")]
@@ -223,7 +224,7 @@ def markdown(report: dict[str, Any]) -> str:
         "`tactile-id` is the bundle of the repository. `vision-mask` has one picture to take away, and then only the arm's",
         "state is left. `vision-diff-one` is the paper's row on the data of a single configuration: there the blocks of one",
         "size, here the demonstrations of one texture. Diff: the tactile picture, as difference to the first one. The fewer",
-        "the iterations, the more trials end incomplete, with the block missed or let go on the way.",
+        "the iterations, the more trials end incomplete, with the block missed or dropped on the way.",
         "",
         "Made with `make ablation`, which runs",
         "",

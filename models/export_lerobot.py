@@ -22,7 +22,7 @@ from lerobot_export import config as checkpoint_config
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Returns the exit status: 0, or 1 with one line that says what cannot be exported."""
+    """Returns the exit status: 0, or 1 with one line that names what cannot be exported."""
     options = parser().parse_args(arguments)
     try:
         export(options)
@@ -106,7 +106,7 @@ def export(options: argparse.Namespace) -> None:
     except ModuleNotFoundError as error:
         raise Unsupported(
             f"{sys.executable} has no {error.name}: use a Python environment with what is in "
-            "models/requirements-lerobot.txt (its first lines say how; `make lerobot-test` makes one)"
+            "models/requirements-lerobot.txt (its first lines explain how; `make lerobot-test` makes one)"
         ) from error
 
     settings = bundle.Options(**settings)
@@ -133,7 +133,7 @@ def export(options: argparse.Namespace) -> None:
 
 
 def rig(options: argparse.Namespace, config: checkpoint_config.Config) -> dict:
-    """What the command line and the data say of the rig, checked against the checkpoint."""
+    """What the command line and the data state about the rig, checked against the checkpoint."""
     modalities = {key: key.rsplit(".", 1)[-1] for key in config.keys}
     for key, name in options.modality:
         if key not in modalities:
@@ -151,7 +151,7 @@ def rig(options: argparse.Namespace, config: checkpoint_config.Config) -> dict:
     data = dataset(options.dataset) if options.dataset else {}
     hz = options.hz or data.get("hz")
     if not hz:
-        raise Unsupported("the checkpoint does not say at what rate it acts: give --hz, or its data with --dataset")
+        raise Unsupported("the checkpoint does not state at what rate it acts: give --hz, or its data with --dataset")
     found = {
         "name": options.name or options.out.name,
         "hz": float(hz),

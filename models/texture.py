@@ -117,13 +117,13 @@ def gather(
 def cross_validate(pictures: Pictures, folds: int, iterations: int, seed: int) -> dict[str, Any]:
     """Counts the results of classifiers on pictures of episodes that they were not trained on."""
     random = np.random.default_rng(seed)
-    said = np.full(len(pictures.labels), -1)
+    answers = np.full(len(pictures.labels), -1)
     for fold in deal(pictures, folds, random):
         tested = np.isin(pictures.episodes, fold)
         torch.manual_seed(seed)
         classifier = fit(pictures.pixels[~tested], pictures.labels[~tested], iterations, random)
-        said[tested] = classify(classifier, pictures.pixels[tested])
-    return score(pictures, said)
+        answers[tested] = classify(classifier, pictures.pixels[tested])
+    return score(pictures, answers)
 
 
 def deal(pictures: Pictures, folds: int, random: np.random.Generator) -> list[NDArray[np.int64]]:
@@ -173,19 +173,19 @@ def classify(classifier: Classifier, pixels: NDArray[np.float32]) -> NDArray[np.
     return torch.cat([classifier(part).argmax(1) for part in inner.split(256)]).numpy()
 
 
-def score(pictures: Pictures, said: NDArray[np.int64]) -> dict[str, Any]:
+def score(pictures: Pictures, answers: NDArray[np.int64]) -> dict[str, Any]:
     """Accuracy over pictures and over episodes (by majority of their pictures), precision, recall, counts."""
     labels = pictures.labels
-    confusion = np.array([[np.sum((labels == t) & (said == s)) for s in (0, 1)] for t in (0, 1)])
+    confusion = np.array([[np.sum((labels == t) & (answers == s)) for s in (0, 1)] for t in (0, 1)])
     by_episode = [
-        np.mean(said[pictures.episodes == e] == labels[pictures.episodes == e]) > 0.5
+        np.mean(answers[pictures.episodes == e] == labels[pictures.episodes == e]) > 0.5
         for e in np.unique(pictures.episodes)
     ]
     diagonal = confusion.diagonal()
     return {
         "pictures": int(len(labels)),
         "episodes": len(by_episode),
-        "accuracy": float(np.mean(said == labels)),
+        "accuracy": float(np.mean(answers == labels)),
         "episode_accuracy": float(np.mean(by_episode)),
         "episode_interval": wilson(int(np.sum(by_episode)), len(by_episode)),
         "precision": dict(zip(TEXTURES, (diagonal / np.maximum(confusion.sum(0), 1)).tolist(), strict=True)),
@@ -197,7 +197,7 @@ def score(pictures: Pictures, said: NDArray[np.int64]) -> dict[str, Any]:
 def markdown(report: dict[str, Any]) -> str:
     """The same for people."""
     lines = [
-        "# What a picture says of the texture",
+        "# What a picture shows of the texture",
         "",
         f"A classifier of single pictures, taken while the fingertip is pressed on the block in {report['episodes']}",
         f"simulated episodes ({', '.join(f'{n} {name}' for name, n in report['textures'].items())}). Every episode is",
@@ -218,7 +218,7 @@ def markdown(report: dict[str, Any]) -> str:
         "",
         "Chance is 50 %. The pictures of an episode resemble each other: the interval (Wilson) is of the episodes, each by",
         "the majority of its pictures. The simulated gel shows its lattice without wear, dirt or a second block: these",
-        "figures say that the texture is in the tactile picture and nowhere else, not how hard it is to see on a real one.",
+        "figures show that the texture is in the tactile picture alone, not how hard it is to see on a real one.",
         "",
         "The RAPID paper has 99.73 % for a ResNet-18 on pictures of a real gel (one split of the episodes in 80/10/10,",
         "precision 1.000 / 0.994, recall 0.995 / 1.000).",

@@ -24,9 +24,9 @@ readonly FUZZ_PACKAGES=(g++)
 
 changed=0
 
-say() { printf 'setup: %s\n' "$*"; }
+report() { printf 'setup: %s\n' "$*"; }
 die() { printf 'setup: %s\n' "$*" >&2; exit 1; }
-did() { changed=1; say "$@"; }
+change() { changed=1; report "$@"; }
 
 main() {
     [[ $# -gt 0 ]] || set -- build
@@ -50,7 +50,7 @@ main() {
     packages "${wanted[@]}"
     [[ " $* " != *" build "* ]] || onnxruntime
     [[ " $* " != *" test "* ]] || { lint_tools; python_venv; guest_image; }
-    if [[ $changed = 0 ]]; then say "nothing to do ($*)"; else say "done ($*)"; fi
+    if [[ $changed = 0 ]]; then report "nothing to do ($*)"; else report "done ($*)"; fi
 }
 
 toolchain() {
@@ -60,7 +60,7 @@ toolchain() {
 lint_tools() {
     if cargo fmt --version >/dev/null 2>&1 && cargo clippy --version >/dev/null 2>&1; then return; fi
     command -v rustup >/dev/null || die "no rustfmt or clippy beside cargo, and no rustup to add them"
-    did "adding rustfmt and clippy to the toolchain"
+    change "adding rustfmt and clippy to the toolchain"
     rustup component add rustfmt clippy
 }
 
@@ -74,7 +74,7 @@ test_packages() {
 packages() {
     local missing=() package
     if ! command -v dpkg-query >/dev/null; then
-        say "this is not Debian or Ubuntu: make sure that there is what these packages hold: $*"
+        report "this is not Debian or Ubuntu: make sure that what these packages contain is installed: $*"
         return
     fi
     for package in "$@"; do
@@ -87,7 +87,7 @@ packages() {
         command -v sudo >/dev/null || die "there is no sudo; as root, run: apt-get update && apt-get install ${missing[*]}"
         as_root=(sudo)
     fi
-    did "installing with apt: ${missing[*]}"
+    change "installing with apt: ${missing[*]}"
     "${as_root[@]}" apt-get update -q
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "${missing[@]}"
 }
@@ -102,7 +102,7 @@ python_venv() {
     if [[ $(cat "$VENV/stamp" 2>/dev/null) = "$stamp" ]] && "$VENV/bin/python" -c "$imports" 2>/dev/null; then
         return
     fi
-    did "making the Python environment of the tests: $VENV"
+    change "making the Python environment of the tests: $VENV"
     rm -rf "$VENV"
     python3 -m venv "$VENV"
     "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary=:all: --require-hashes -r "$requirements"
@@ -116,12 +116,12 @@ onnxruntime() {
     library=libonnxruntime.so.$ORT_VERSION
     dir=$CACHE/onnxruntime/$ORT_VERSION-$arch
     if ! grep -q "  $arch/$library\$" scripts/onnxruntime.sha256; then
-        say "no onnxruntime is pinned for $arch: left out"
+        report "no onnxruntime is pinned for $arch: left out"
         return
     fi
     if [[ -f $dir/$library ]] && checked "$dir" "$arch/$library"; then return; fi
 
-    did "fetching onnxruntime $ORT_VERSION for $arch: $dir/$library"
+    change "fetching onnxruntime $ORT_VERSION for $arch: $dir/$library"
     partial=$(mktemp -d "$CACHE/onnxruntime.partial.XXXXXX")
     # shellcheck disable=SC2064  # the folder of now, not of then
     trap "rm -rf '$partial'" EXIT
@@ -158,7 +158,7 @@ guest_image() {
     local build=tests/vbench/image/build.sh
     [[ -x $build ]] || return 0
     "$build" --check >/dev/null 2>&1 && return
-    did "building the guest image of the virtual bench"
+    change "building the guest image of the virtual bench"
     "$build" >/dev/null
 }
 

@@ -28,7 +28,7 @@ readonly SCHEDULE
 # Threads that spin while waiting slow down everything else on the machine.
 export OMP_WAIT_POLICY="${OMP_WAIT_POLICY:-PASSIVE}"
 
-say() { printf 'train: %s\n' "$*"; }
+report() { printf 'train: %s\n' "$*"; }
 die() { printf 'train: %s\n' "$*" >&2; exit 1; }
 
 main() {
@@ -62,7 +62,7 @@ environment() {
         exec 9>&-
         return
     fi
-    say "making the Python environment of the training: $VENV"
+    report "creating the Python environment for training: $VENV"
     rm -rf "$VENV"
     python3 -m venv "$VENV"
     "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary=:all: -r "$requirements"
@@ -74,11 +74,11 @@ environment() {
 demonstrations() {
     local rapid="$1"
     if [[ -d $DEMONSTRATIONS ]]; then
-        say "demonstrations of before: $DEMONSTRATIONS"
+        report "demonstrations of an earlier run: $DEMONSTRATIONS"
         return
     fi
     [[ -x $rapid ]] || die "no program $rapid: build it with cargo build --release"
-    say "recording $EPISODES demonstrations: $DEMONSTRATIONS"
+    report "recording $EPISODES demonstrations: $DEMONSTRATIONS"
     rm -rf "$DEMONSTRATIONS.partial"
     mkdir -p "$DEMONSTRATIONS.partial"
     "$rapid" --sim task --expert --record --episodes "$EPISODES" --out "$DEMONSTRATIONS.partial" --seed "$SEED"

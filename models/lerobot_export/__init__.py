@@ -1,6 +1,6 @@
 """Turns a LeRobot DiffusionPolicy checkpoint into a policy bundle (`models/README.md` has its format).
 
-Folder of a checkpoint -> `config` (what it says of itself, or why it cannot be exported) -> `checkpoint`
+Folder of a checkpoint -> `config` (what it states about itself, or why it cannot be exported) -> `checkpoint`
 (LeRobot's own policy and normalisation) -> `graphs` (two ONNX graphs) and `bundle` (policy.json, README.md)
 -> `verify` (the bundle, run by `runtime` as the program runs it, against LeRobot).
 

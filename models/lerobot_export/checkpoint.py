@@ -192,7 +192,7 @@ def check_steps(file: Path) -> list[str]:
                 f"{file}: steps[{index}].registry_name: {name} is not supported: a bundle has no such step"
             )
     if (needed := STEPS[file.name][-1 if file.name == PRE else 0]) not in names:
-        raise Unsupported(f"{file}: steps: no {needed}, so nothing says how numbers are normalised")
+        raise Unsupported(f"{file}: steps: no {needed}, so nothing states how numbers are normalised")
     return names
 
 

@@ -146,7 +146,7 @@ def main() -> None:
     except OSError as error:
         sys.exit(f"export: {args.checkpoint}: {error}")
     if "final_loss" not in state["provenance"]:
-        sys.exit(f"export: {args.checkpoint} is of a training that has not ended; go on with --resume")
+        sys.exit(f"export: {args.checkpoint} belongs to a training that has not ended; continue it with --resume")
     difference = export(state, args.out)
     size = sum(path.stat().st_size for path in args.out.glob("*.onnx")) / 1e6
     print(f"{args.out}: {size:.1f} MB, largest difference to PyTorch {difference:.2e}")

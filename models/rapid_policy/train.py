@@ -2,7 +2,7 @@
 
     python -m rapid_policy.train EPISODES --out RUN [--resume]
 
-Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` goes on) and RUN/loss.png.
+Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` continues) and RUN/loss.png.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def begin(spec: Spec, schedule: Schedule, dataset: Dataset, provenance: dict[str
 def train(run: Run, dataset: Dataset, out: Path) -> float:
     """Trains to the end of the schedule. Returns the final loss: the mean of the last hundred iterations.
 
-    Whatever ends it before, the checkpoint in `out` is the one to go on from.
+    Whatever ends it before, the checkpoint in `out` is the one to continue from.
     """
     progress = Progress(run.spec.name, run.schedule.iterations, run.iteration)
     try:
@@ -263,7 +263,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=defaults.seed)
     parser.add_argument("--threads", type=int, default=2, help="of the CPU")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
+    parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in --out")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -275,12 +275,12 @@ def main() -> None:
         dataset = Dataset(spec, episodes)
     except (OSError, EpisodeError, ValueError) as error:
         sys.exit(f"train: {error}")
-    told = f"python -m rapid_policy.train EPISODES --out RUN --iterations {args.iterations} --seed {args.seed}"
+    command_line = f"python -m rapid_policy.train EPISODES --out RUN --iterations {args.iterations} --seed {args.seed}"
     schedule = replace(defaults, iterations=args.iterations, minutes=args.minutes, seed=args.seed)
     if state:
         schedule = replace(Schedule(**state["schedule"]), minutes=args.minutes)
     device = pick_device(args.device)
-    facts = provenance(episodes, told)
+    facts = provenance(episodes, command_line)
     facts["hardware"] = hardware(device)
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
         sys.exit(f"train: {checkpoint} was trained on other episodes than those in {args.episodes}")
@@ -294,7 +294,7 @@ def main() -> None:
     except ValueError as error:
         sys.exit(f"train: {error}")
     except KeyboardInterrupt:
-        sys.exit(f"train: stopped after {run.iteration} iterations; --resume goes on from {checkpoint}")
+        sys.exit(f"train: stopped after {run.iteration} iterations; --resume continues from {checkpoint}")
     print(f"final loss {final:.4f} after {run.iteration} iterations, {run.seconds / 60:.1f} min: {checkpoint}")
 
 

@@ -75,7 +75,7 @@ class Recorded(unittest.TestCase):
         self.addCleanup(cut.unlink)
         with self.assertRaisesRegex(EpisodeError, "cut.mcap"):
             read_episodes([cut], self.spec.observations, 4)
-        # Its own record still says GOOD or SUSPECT; what is in it says BAD.
+        # Its own record still states GOOD or SUSPECT; its content is BAD.
         content = bytearray(self.path.read_bytes())
         content[11] ^= 1
         changed = self.folder / "changed.mcap"

@@ -1,4 +1,4 @@
-"""Training: that it learns at all, and that a run which was stopped goes on as if it had not been."""
+"""Training: that it learns at all, and that a run which was stopped continues as if it had not been."""
 
 import sys
 import tempfile

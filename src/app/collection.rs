@@ -37,7 +37,7 @@ pub(super) struct Collection {
     at_end: Waiting,
     answer: Option<Answered>,
     /// The session has a file. A run that records one episode by itself leaves that episode and nothing beside it, unless
-    /// somebody requests something of it.
+    /// something is requested of it.
     is_kept: bool,
     /// When the session began whose file is there but which is not continued. It is closed when an episode begins: a run
     /// that records nothing changes nothing.

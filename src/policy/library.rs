@@ -175,7 +175,7 @@ fn load(origin: &Origin) -> Result<ort::environment::Environment, Cause> {
 }
 
 fn start(path: &Path) -> Result<ort::environment::Environment, Cause> {
-    // Checked here because the error of `ort` does not say what is missing.
+    // Checked here because the error of `ort` does not name what is missing.
     let name = CString::new(path.as_os_str().as_bytes()).map_err(|_| Cause::Missing)?;
     loader::load_onnxruntime(&name)?;
     let builder = ort::init_from(path).map_err(|error| match error {

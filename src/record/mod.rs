@@ -79,6 +79,6 @@ pub enum RecordError {
     #[error("not recording")]
     Idle,
     /// The `writer` thread has ended.
-    #[error("the writer thread has ended; the log says why")]
+    #[error("the writer thread has ended; the log gives the reason")]
     Ended,
 }

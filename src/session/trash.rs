@@ -58,7 +58,7 @@ pub fn empty<'a>(folder: &Path, names: impl Iterator<Item = &'a str>) -> io::Res
             _ => {}
         }
     }
-    // It stays if somebody put something else there.
+    // It stays if another program put something else there.
     let _ = rustix::fs::unlinkat(episodes.descriptor(), TRASH, rustix::fs::AtFlags::REMOVEDIR);
     outcome
 }

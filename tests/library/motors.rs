@@ -130,7 +130,7 @@ async fn without_actions_they_hold_and_are_disabled_until_they_are_armed_again()
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_motor_that_fails_stops_all() {
-    for (fault, mend) in [
+    for (fault, repair) in [
         (Order::Fault(0xd), Order::Fault(0)),
         (Order::Hot(95), Order::Hot(30)),
         (Order::Mute(true), Order::Mute(false)),
@@ -156,7 +156,7 @@ async fn one_motor_that_fails_stops_all() {
         timeout(PATIENCE, faulted).await.unwrap_or_else(|_| panic!("{fault:?} is not noticed"));
         // One that sends nothing receives nothing either.
         adapter.wait_until_off(if fault == Order::Mute(true) { &[1] } else { &[1, 2] });
-        adapter.apply(2, mend);
+        adapter.apply(2, repair);
         let enabled = adapter.count("motor_enabled");
         let begun = Instant::now();
         until(&mut driven, Some([0.1, 0.1]), |_, _| begun.elapsed() > Duration::from_millis(300)).await;

@@ -201,7 +201,7 @@ fn serve(master: OwnedFd, mut codec: Codec, shared: &Mutex<Shared>, pulled: &Ato
                 let count = line.read(&mut piece).unwrap_or(0);
                 codec.receive(&piece[..count], &mut shared.bus, &mut answers);
             } else if ready.contains(PollFlags::HUP) {
-                // Nobody has it open: it may be opened again.
+                // No program has it open: it may be opened again.
                 std::thread::sleep(Duration::from_millis(1));
             }
             shared.bus.tend(Stamp::now().0);

@@ -90,7 +90,7 @@ impl fmt::Display for Words<'_, Fault> {
                 write!(f, "rapid was held up: no motor was commanded for {} ms", after.as_millis())
             }
             Fault::Brake { motor } => {
-                write!(f, "the brake of motor {} cannot be driven: the log says why", self.name(motor))
+                write!(f, "the brake of motor {} cannot be driven: the log gives the reason", self.name(motor))
             }
             Fault::NotReleased { motor } => {
                 write!(f, "the brake of motor {} was not released in time", self.name(motor))

@@ -188,7 +188,7 @@ fn not_set(name: &str, bitrate: u32, state: &Interface, error: &socketcan::Error
         _ if matches!(error, socketcan::Error::Nl(NlError::NoAck)) => LinkError::Retry(format!(
             "{is}, and the kernel refuses to set it up at {bitrate} bit/s: only root may, and not every controller has \
              every bit rate: run `rapid artifacts --install` once, whose udev rule does it at each plug; `{command}` \
-             says what is wrong"
+             prints the reason"
         )),
         _ => LinkError::Retry(format!("{is}, and setting it up failed: {error}")),
     }

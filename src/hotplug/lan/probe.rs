@@ -28,7 +28,7 @@ enum Answer {
     /// The device is present.
     Here,
     /// Its address answers, and the port is closed.
-    Nobody,
+    Refused,
     /// No answer.
     Silence,
 }
@@ -45,8 +45,8 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
                 match answered {
                     Answer::Here => watch.found(server, None, now).await,
                     // A server that accepts one connection refuses the next while the driver holds it.
-                    Answer::Nobody if watch.is_sending(watch.length, now) => {}
-                    Answer::Nobody => watch.gone(UnplugSource::Lease, now).await,
+                    Answer::Refused if watch.is_sending(watch.length, now) => {}
+                    Answer::Refused => watch.gone(UnplugSource::Lease, now).await,
                     Answer::Silence => {}
                 }
                 let driver_has_port = probe == Probe::Udp && watch.is_there();
@@ -74,7 +74,7 @@ async fn ask(probe: Probe, asked: SocketAddr) -> Answer {
     };
     match timeout(EVERY, answer).await {
         Ok(Ok(answer)) => answer,
-        Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => Answer::Nobody,
+        Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => Answer::Refused,
         Ok(Err(error)) => {
             tracing::debug!(%asked, %error, "no answer");
             Answer::Silence

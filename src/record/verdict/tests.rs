@@ -183,8 +183,8 @@ fn a_present_modality_without_samples_is_bad_and_an_absent_one_is_not_missed() {
     assert_eq!(both(&silent(0.3)).grade, Grade::Good);
     assert_eq!(both(&silent(0.0)).grade, Grade::Good);
     // Without any finding.
-    let nobody = verdict_on(&silent(0.0), FileState::Whole);
-    assert_eq!((nobody.grade, nobody.why().as_str()), (Grade::Bad, "nothing was received from any modality"));
+    let empty = verdict_on(&silent(0.0), FileState::Whole);
+    assert_eq!((empty.grade, empty.why().as_str()), (Grade::Bad, "nothing was received from any modality"));
 }
 
 #[test]

@@ -130,7 +130,7 @@ impl Source for Fed {
         }
         if self.left == 0 {
             let taken = Taken { wall_s: begun.elapsed().as_secs_f64(), cpu_s: thread_cpu_s() - cpu };
-            // Nobody receives if the recorder ended early.
+            // There is no receiver if the recorder ended early.
             let _ = self.done.send(taken);
         }
         Ok(())

@@ -26,7 +26,7 @@ pub enum EpisodeError {
 pub struct Stream {
     /// Frames that were sent completely.
     pub sent: u64,
-    /// Ticks without a frame: nobody was reading, or the machine was busy.
+    /// Ticks without a frame: there was no reader, or the machine was busy.
     pub skipped: u64,
 }
 

@@ -107,7 +107,7 @@ fn a_brake_that_cannot_be_driven_refuses_an_arm_and_ends_one() {
     world.run(10);
     assert!(world.sims[1].is_on() && !world.sims[0].is_on(), "each in its way");
     let text = Fault::Brake { motor: 1 }.words(world.bus.names()).to_string();
-    assert_eq!(text, "the brake of motor joint_2 cannot be driven: the log says why");
+    assert_eq!(text, "the brake of motor joint_2 cannot be driven: the log gives the reason");
 }
 
 #[test]

@@ -161,7 +161,7 @@ pub fn run(args: impl Iterator<Item = OsString>) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     // The motors are off: logging may block now.
-    let kept = if ward.keep_for().is_zero() { "disabled" } else { "stopped as `other_fault` says, then disabled" };
+    let kept = if ward.keep_for().is_zero() { "disabled" } else { "stopped as `other_fault` states, then disabled" };
     let text = format!("rapid ended while its motors were on: its guard {kept} them\n");
     let _ = rustix::io::write(error.as_fd(), text.as_bytes());
     ExitCode::SUCCESS

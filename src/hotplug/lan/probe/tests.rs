@@ -22,7 +22,7 @@ async fn server<F: Future<Output = ()> + Send>(answer: impl Fn(TcpStream) -> F +
 }
 
 /// A closed port.
-fn nobody() -> SocketAddr {
+fn closed_port() -> SocketAddr {
     let listener = std::net::TcpListener::bind((LOCAL, 0)).expect("a port");
     listener.local_addr().expect("an address")
 }
@@ -48,12 +48,12 @@ async fn a_reply_is_distinguished_from_silence() {
         (Probe::Tcp, web, Answer::Here),
         (Probe::Tcp, ssh, Answer::Here),
         (Probe::Tcp, silent, Answer::Here),
-        (Probe::Tcp, nobody(), Answer::Nobody),
+        (Probe::Tcp, closed_port(), Answer::Refused),
         (Probe::Http, web, Answer::Here),
         (Probe::Http, ssh, Answer::Silence),
         (Probe::Http, silent, Answer::Silence),
-        (Probe::Http, nobody(), Answer::Nobody),
-        (Probe::Udp, nobody(), Answer::Silence),
+        (Probe::Http, closed_port(), Answer::Refused),
+        (Probe::Udp, closed_port(), Answer::Silence),
     ] {
         assert_eq!(ask(probe, address).await, expected, "{probe:?} {address}");
     }
@@ -61,7 +61,7 @@ async fn a_reply_is_distinguished_from_silence() {
 
 #[tokio::test]
 async fn packets_of_the_device_are_received_and_the_port_is_released() {
-    let port = nobody();
+    let port = closed_port();
     let sender = UdpSocket::bind((LOCAL, 0)).await.expect("a port");
     let mut received = Box::pin(ask(Probe::Udp, port));
     let answer = loop {
@@ -74,7 +74,7 @@ async fn packets_of_the_device_are_received_and_the_port_is_released() {
     drop(received);
     UdpSocket::bind(port).await.expect("the port is free for the driver");
     // Such packets are no evidence of another device.
-    let elsewhere = SocketAddr::from(([127, 0, 0, 9], nobody().port()));
+    let elsewhere = SocketAddr::from(([127, 0, 0, 9], closed_port().port()));
     let mut received = Box::pin(ask(Probe::Udp, elsewhere));
     let answer = loop {
         tokio::select! {
@@ -89,7 +89,7 @@ async fn packets_of_the_device_are_received_and_the_port_is_released() {
 
 #[tokio::test]
 async fn a_device_on_this_machine_is_not_listened_for_on_the_network() {
-    let asked = nobody();
+    let asked = closed_port();
     let mut received = Box::pin(ask(Probe::Udp, asked));
     let is_held = || std::net::UdpSocket::bind(asked).is_err();
     while !is_held() {
@@ -125,7 +125,7 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
     let (notify, mut reported) = mpsc::channel(8);
     let mut watch = Watch::new("lidar", EVERY, notify).waits(EVERY * 2);
     let begin = Stamp::now();
-    watch.found(nobody(), None, begin).await;
+    watch.found(closed_port(), None, begin).await;
     let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     watch.look(begin.after(EVERY * 2)).await;
@@ -136,7 +136,7 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
     watch.look(last_received.at().after(EVERY)).await;
     assert!(!watch.is_there());
     // A device that never sent is gone in the end.
-    watch.found(nobody(), None, begin.after(EVERY * 20)).await;
+    watch.found(closed_port(), None, begin.after(EVERY * 20)).await;
     watch.look(begin.after(EVERY * 23)).await;
     assert!(!watch.is_there());
 }

@@ -90,7 +90,7 @@ async fn an_arm_at_the_start_is_given_once() {
             [&UP_DISARMED[..], &["a disarmed"]].concat(),
         ),
         (
-            "not after an arm of before the plug, which nobody was there to take",
+            "not after an arm of before the plug, for which there was no receiver",
             true,
             [Give(Order::Arm)].into_iter().chain(plug()).collect(),
             [&UP_DISARMED[..], &["a disarmed"]].concat(),

@@ -243,8 +243,8 @@ impl Seen {
         let from_node = Delays::between(&reported, &self.received);
         let from_plug = Delays::between(&self.plugs, &self.received);
         let plain = |key| self.plain.iter().filter_map(|line| line[key].as_u64()).collect::<Vec<_>>();
-        let plain_from_node = Delays::between(&plain("told_ns"), &plain("mono_ns"));
-        let plain_streaming = Delays::between(&plain("told_ns"), &plain("streaming_ns"));
+        let plain_from_node = Delays::between(&plain("reported_ns"), &plain("mono_ns"));
+        let plain_streaming = Delays::between(&plain("reported_ns"), &plain("streaming_ns"));
         let plain_from_plug = Delays::between(&self.plain_plugs, &plain("mono_ns"));
         let cooled = if self.waited == 0 {
             "no cooldown applied".into()

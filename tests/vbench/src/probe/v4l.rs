@@ -101,7 +101,7 @@ pub fn first_frames(log: &Log) -> Result<(), ReadError> {
         let Some(node) = event.camera_added() else { continue };
         match first_frame(Path::new(&node)) {
             Ok((streaming, came)) => {
-                let fields = json!({"node": node, "told_ns": reported.mono_ns, "streaming_ns": streaming.mono_ns});
+                let fields = json!({"node": node, "reported_ns": reported.mono_ns, "streaming_ns": streaming.mono_ns});
                 log.write("first_frame", came, fields);
             }
             Err(error) => log.write("missed", reported, json!({"node": node, "error": error.to_string()})),

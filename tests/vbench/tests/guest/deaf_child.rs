@@ -27,13 +27,13 @@ fn misbehaving_programs_do_not_delay_the_mask() {
         assert!(fallen[0] >= unplugged, "the bit of device {device} fell before it was unplugged");
     }
 
-    let says = |words: &str| {
+    let reports = |words: &str| {
         let printed = |line: &&serde_json::Value| line["text"].as_str().is_some_and(|text| text.contains(words));
         outcome.rapid.iter().filter(printed).count()
     };
-    assert_eq!(says("prompt: reads /dev/ttyACM"), 1, "it is given the serial line");
-    assert_eq!(says("deaf: reads /dev/bus/usb/"), 1, "it is given the USB device");
-    assert_eq!(says("was killed"), 1, "only the deaf one");
+    assert_eq!(reports("prompt: reads /dev/ttyACM"), 1, "it is given the serial line");
+    assert_eq!(reports("deaf: reads /dev/bus/usb/"), 1, "it is given the USB device");
+    assert_eq!(reports("was killed"), 1, "only the deaf one");
     let absent = |line: &&serde_json::Value| line["device"] == "deaf" && line["state"] == "absent";
     let killed = |line: &&serde_json::Value| line["text"].as_str().is_some_and(|text| text.contains("was killed"));
     let stamp = |line: Option<&serde_json::Value>| line.and_then(|line| line["stamp"].as_u64()).expect("a stamp");
@@ -53,7 +53,7 @@ fn misbehaving_programs_do_not_delay_the_mask() {
         "{:?}",
         states("crashing")
     );
-    assert!(says("crashing: Error: \"crashes after 50 samples") >= 5);
+    assert!(reports("crashing: Error: \"crashes after 50 samples") >= 5);
     assert_eq!(states("flooding"), ["opening", "streaming"], "it continues");
-    assert!(says("flooding: prints too much") > 0);
+    assert!(reports("flooding: prints too much") > 0);
 }
