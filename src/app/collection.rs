@@ -39,8 +39,8 @@ pub(super) struct Collection {
     /// The session has a file. A run that records one episode by itself leaves that episode and nothing beside it, unless
     /// something is requested of it.
     is_kept: bool,
-    /// When the session began whose file is there but which is not continued. It is closed when an episode begins: a run
-    /// that records nothing changes nothing.
+    /// When the session began whose file is there but which is not continued. It is archived before this session's is
+    /// written: a run that records nothing changes nothing.
     superseded: Option<String>,
     /// The end that was handled last: a reader that missed events may see it again.
     handled: Option<EpisodeEnd>,
@@ -224,16 +224,27 @@ impl Collection {
         match effect {
             Effect::Begin => {}
             Effect::Save if !self.is_kept => {}
-            Effect::Save => self.keeper.request(Operation::Save(self.session.file().clone())),
+            Effect::Save => {
+                self.archive_superseded();
+                self.keeper.request(Operation::Save(self.session.file().clone()));
+            }
             Effect::End(at) => self.recorder.end(at),
             Effect::Discard(file) => self.keeper.request(Operation::Discard(file)),
             Effect::Restore(file) => self.keeper.request(Operation::Restore(file)),
             Effect::Mark(text) => self.board.announce(What::Mark { text }),
             Effect::Close(gone) => {
                 let now = rfc3339(realtime_ns());
+                self.archive_superseded();
                 self.keeper.request(Operation::Close(self.session.closed(now.clone()), gone));
                 self.session.renew(now);
             }
+        }
+    }
+
+    /// Before this session's file is written for the first time.
+    fn archive_superseded(&mut self) {
+        if let Some(begun) = self.superseded.take() {
+            self.keeper.request(Operation::Archive(begun));
         }
     }
 
@@ -248,9 +259,6 @@ impl Collection {
         let why = started.as_ref().err().map(ToString::to_string);
         self.board.set_not_started(why.clone());
         let begun = rfc3339(realtime_ns());
-        if let Some(begun) = self.superseded.take_if(|_| started.is_ok() && self.is_kept) {
-            self.keeper.request(Operation::Archive(begun));
-        }
         for effect in self.session.began(started.as_deref().ok(), begun, Stamp::now()) {
             self.change(effect);
         }

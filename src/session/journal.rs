@@ -207,9 +207,10 @@ impl Journal {
                 break;
             }
         }
+        // If it keeps its name, the next session takes another.
+        self.written = None;
         outcome.map_err(io)?;
         CURRENT.clone_into(&mut self.name);
-        self.written = None;
         Ok(())
     }
 }

@@ -337,3 +337,27 @@ async fn a_run_for_several_episodes_ends_when_they_are_recorded() {
 fn end() -> Request {
     Request::Session(SessionRequest::Toggle, Stamp::now(), None)
 }
+
+#[tokio::test]
+async fn the_file_of_an_earlier_session_is_kept_whenever_this_one_gets_its_own() {
+    // From the first episode on, or since something was requested of a run that had none.
+    for is_kept in [true, false] {
+        let out = tempfile::tempdir().unwrap();
+        let earlier = "begun = \"2026-01-01T00:00:00.000Z\"\n[plan]\ntask = \"earlier\"\n";
+        std::fs::write(out.path().join("session.toml"), earlier).unwrap();
+        let registry = Arc::new(Registry::builtin());
+        let board = Arc::new(Board::new(&registry));
+        let recorder = Recorder::spawn(Quiet, RecorderConfig::new(registry, Arc::clone(&board))).unwrap();
+        let episode = EpisodeRequest { out: out.path().to_owned(), ..EpisodeRequest::default() };
+        let plan = Plan { task: "now".to_owned(), ..Plan::default() };
+        let mut collection = Collection::new(recorder, episode, plan, is_kept, &board).unwrap();
+        collection.start().await.unwrap();
+        let label = SessionRequest::Label { label: Label::Success, reason: String::new() };
+        collection.request(&label, Stamp::now(), None).await.unwrap();
+        collection.finish_episode().await.unwrap();
+        collection.close().await.unwrap();
+        let read = |name: &str| std::fs::read_to_string(out.path().join(name)).unwrap_or_default();
+        assert_eq!(read("session-2026-01-01T000000000Z.toml"), earlier);
+        assert!(read("session.toml").contains("task = \"now\""), "{is_kept}");
+    }
+}
