@@ -412,16 +412,19 @@ fn frames(run: &Run) {
     }
 }
 
-/// Rule 6.
+/// Rule 6, of which the simulator of the core checks the exact times. Here events are stamped when they are announced,
+/// after the step that decided; what certainly precedes a removal is the last sample before it.
 fn cooldowns(run: &Run) {
     let cooldown = u64::try_from(run.registry.rig.cooldown.as_nanos()).expect("short");
     for device in &run.registry.devices {
         let openings: Vec<u64> =
             run.of(&device.name, "state").filter(|event| event["state"] == "opening").map(stamp).collect();
-        for (_, detached) in run.attachments(&device.name) {
+        for (attached, detached) in run.attachments(&device.name) {
             let Some(detached) = detached else { continue };
             let Some(next) = openings.iter().find(|opening| **opening > detached) else { continue };
-            assert!(next - detached >= cooldown, "{}: opened {} ns after", device.name, next - detached);
+            let samples = run.messages(device).into_iter().map(|message| run.monotonic(message.log_time));
+            let last = samples.filter(|stamp| *stamp <= detached).fold(attached, u64::max);
+            assert!(next - last >= cooldown, "{}: opened {} ns after", device.name, next - last);
         }
     }
 }
