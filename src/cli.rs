@@ -2,6 +2,7 @@
 //!
 //! Invariant: a command shows and accepts only the options that have an effect on it.
 
+mod list;
 mod session;
 
 use std::ffi::OsString;
@@ -15,6 +16,7 @@ use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, 
 
 #[cfg(feature = "policy")]
 use crate::lockstep::evaluate::Condition;
+pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
 pub use session::{EpisodeCommand, SessionCommand};
 
 /// Record robot demonstrations with hot-plugged sensors
@@ -114,7 +116,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "artifacts" => &["config"],
         "mask" | "replay" | "episode" | "session" => &["json", "instance"],
         "arm" | "disarm" => &["instance"],
-        "inspect" | "recover" | "eval" => &["json"],
+        "inspect" | "list" | "recover" | "eval" => &["json"],
         _ => &[],
     }
 }
@@ -130,7 +132,7 @@ pub struct RunArgs {
     #[arg(long)]
     pub record: bool,
     /// End after recording (or running) this long: 30s, 5m
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME", value_parser = duration, hide_short_help = true)]
     pub duration: Option<Duration>,
     /// Folder for episodes
     #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
@@ -281,6 +283,9 @@ pub enum Command {
         #[arg(value_hint = ValueHint::AnyPath, value_name = "FILE|DIR", required = true)]
         paths: Vec<PathBuf>,
     },
+    /// List episodes by verdict, label, task, tag, sensor or date
+    #[command(after_long_help = list::LIST)]
+    List(ListArgs),
     /// Repair unfinished episodes after a kill, power loss or full disk
     #[command(after_long_help = RECOVER)]
     Recover {

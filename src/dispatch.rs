@@ -121,6 +121,10 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             let palette = Palette::of(&io::stdout());
             reported(commands::inspect::inspect(&paths, format, columns, palette, out)?)
         }
+        Command::List(args) => {
+            let palette = Palette::of(&io::stdout());
+            reported(commands::list::list(&args, format, palette, out, &|error| print_warning(&format_args!("labels and notes are missing: {error}")))?)
+        }
         Command::Recover { paths } => recover(paths, format),
         Command::Ablation(args) => {
             let registry = registry_or_builtin(global)?;
@@ -344,9 +348,13 @@ fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
 fn load(path: &Path) -> Result<Registry, Failure> {
     let loaded = Registry::load(path)?;
     for warning in &loaded.warnings {
-        let _ = writeln!(io::stderr(), "{} {warning}", Palette::of(&io::stderr()).warn("warning:"));
+        print_warning(warning);
     }
     Ok(loaded.registry)
+}
+
+fn print_warning(warning: &dyn std::fmt::Display) {
+    let _ = writeln!(io::stderr(), "{} {warning}", Palette::of(&io::stderr()).warn("warning:"));
 }
 
 fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
@@ -455,6 +463,16 @@ const fn argument_code(is_bad_argument: bool) -> u8 {
     if is_bad_argument { 2 } else { 1 }
 }
 
+/// The exit code of a file that cannot be read.
+fn read_code(error: &ReadError) -> u8 {
+    match error {
+        ReadError::NotMcap(_) | ReadError::NotFile(_) => 2,
+        ReadError::Io { source, .. } => {
+            argument_code(matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory))
+        }
+    }
+}
+
 failures! {
     AppError: |error| match error {
         AppError::InterruptedTwice => 130,
@@ -467,12 +485,7 @@ failures! {
     ModuleError: |_| 2;
     PresenceError: |_| 1;
     HotplugError: |_| 1;
-    ReadError: |error| match error {
-        ReadError::NotMcap(_) | ReadError::NotFile(_) => 2,
-        ReadError::Io { source, .. } => {
-            argument_code(matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory))
-        }
-    };
+    ReadError: read_code;
     commands::artifacts::ArtifactsError: |_| 1;
     commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
     commands::session::RequestError: |_| 1;
@@ -481,6 +494,11 @@ failures! {
         commands::arm::OrderError::Output(_) => 1,
     };
     commands::mask::MaskError: |_| 1;
+    commands::list::ListError: |error| match error {
+        commands::list::ListError::Date { .. } => 2,
+        commands::list::ListError::Episode(error) => read_code(error),
+        commands::list::ListError::Output(_) => 1,
+    };
     commands::calibrate::CalibrateError: |error| argument_code(error.is_bad_argument());
     commands::ablation::AblationError: |error| argument_code(error.is_bad_argument());
     #[cfg(feature = "policy")]

@@ -5,6 +5,8 @@
 
 use std::time::Duration;
 
+use jiff::tz::TimeZone;
+use jiff::{Timestamp, ZonedDateTime, civil};
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
@@ -127,38 +129,64 @@ impl ClockWatch {
 
 /// A wall-clock time in UTC, to the millisecond: `2026-02-05T10:30:00.000Z` (RFC 3339).
 pub fn rfc3339(wall_ns: u64) -> String {
-    let (year, month, day) = date(wall_ns);
-    format!("{year:04}-{month:02}-{day:02}T{}", time_of_day(wall_ns))
+    timestamp(wall_ns).strftime("%Y-%m-%dT%H:%M:%S.%3fZ").to_string()
 }
 
 /// The time of day of a wall-clock time in UTC: `22:13:20.123Z`.
 pub fn time_of_day(wall_ns: u64) -> String {
-    let ms = wall_ns % NS_PER_DAY / 1_000_000;
-    format!("{:02}:{:02}:{:02}.{:03}Z", ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60, ms % 1000)
+    timestamp(wall_ns).strftime("%H:%M:%S.%3fZ").to_string()
 }
 
-/// Year, month and day of a wall-clock time in UTC.
-pub const fn date(wall_ns: u64) -> (u64, u64, u64) {
-    civil(wall_ns / NS_PER_DAY)
+/// The day of a wall-clock time in UTC: `20260205`.
+pub fn compact_date(wall_ns: u64) -> String {
+    timestamp(wall_ns).strftime("%Y%m%d").to_string()
 }
 
-const NS_PER_DAY: u64 = 86_400_000_000_000;
+/// Every number is a time: the last of 64 bits is in the year 2554.
+fn timestamp(wall_ns: u64) -> Timestamp {
+    Timestamp::from_nanosecond(i128::from(wall_ns)).unwrap_or(Timestamp::MAX)
+}
 
-/// Year, month and day of a number of days since 1970-01-01, in the Gregorian calendar.
-///
-/// The year is counted from March, so that the leap day is its last: then the months before any
-/// given one have 153 days for every five of them, and a cycle of 400 years has 146,097 days.
-const fn civil(days: u64) -> (u64, u64, u64) {
-    // 0000-03-01 is 719,468 days before 1970-01-01.
-    let shifted = days + 719_468;
-    let (cycle, in_cycle) = (shifted / 146_097, shifted % 146_097);
-    let year_of_cycle = (in_cycle - in_cycle / 1460 + in_cycle / 36_524 - in_cycle / 146_096) / 365;
-    let in_year = in_cycle - (365 * year_of_cycle + year_of_cycle / 4 - year_of_cycle / 100);
-    let from_march = (5 * in_year + 2) / 153;
-    let day = in_year - (153 * from_march + 2) / 5 + 1;
-    let month = if from_march < 10 { from_march + 3 } else { from_march - 9 };
-    let year = cycle * 400 + year_of_cycle;
-    (if month <= 2 { year + 1 } else { year }, month, day)
+/// The zone in which people read times. Files and JSON are always in UTC.
+#[derive(Debug, Clone)]
+pub struct Zone(TimeZone);
+
+impl Zone {
+    /// Universal time.
+    pub const UTC: Self = Self(TimeZone::UTC);
+
+    /// That of this machine (`TZ`, else `/etc/localtime`); UTC where neither is readable.
+    pub fn local() -> Self {
+        Self(TimeZone::try_system().unwrap_or(TimeZone::UTC))
+    }
+
+    /// Day and minute: `2026-02-05 11:30`.
+    pub fn minute(&self, wall_ns: u64) -> String {
+        self.zoned(wall_ns).strftime("%Y-%m-%d %H:%M").to_string()
+    }
+
+    /// The abbreviation in force at that time: `CET`, or `+05`.
+    pub fn name(&self, wall_ns: u64) -> String {
+        self.zoned(wall_ns).strftime("%Z").to_string()
+    }
+
+    /// The wall-clock time, ns, of `2026-02-05` (its first moment) or `2026-02-05T11:30`; seconds may follow, and `Z` or an
+    /// offset for a time of another zone.
+    ///
+    /// # Errors
+    /// When it is none, or before 1970; the text states what was expected.
+    pub fn wall_ns(&self, text: &str) -> Result<u64, String> {
+        let own = || text.parse::<Timestamp>().ok();
+        let here = || {
+            text.parse::<civil::DateTime>().ok()?.to_zoned_datetime(self.0.clone()).ok().map(|zoned| zoned.timestamp())
+        };
+        let moment = own().or_else(here).and_then(|moment| u64::try_from(moment.as_nanosecond()).ok());
+        moment.ok_or_else(|| format!("{text:?} is no date since 1970: write 2026-02-05 or 2026-02-05T11:30"))
+    }
+
+    fn zoned(&self, wall_ns: u64) -> ZonedDateTime {
+        timestamp(wall_ns).to_zoned_datetime(self.0.clone())
+    }
 }
 
 fn read(clock: ClockId) -> u64 {
@@ -217,6 +245,23 @@ mod tests {
         }
         assert_eq!(rfc3339(1_770_287_400_250_000_000), "2026-02-05T10:30:00.250Z");
         assert_eq!(time_of_day(1_700_000_000_123_456_789), "22:13:20.123Z");
+        assert_eq!(compact_date(1_735_689_599_999_999_999), "20241231");
+        assert_eq!(rfc3339(u64::MAX), "2554-07-21T23:34:33.709Z");
+    }
+
+    #[test]
+    fn a_zone_reads_the_times_it_writes() {
+        let berlin = Zone(TimeZone::posix("CET-1CEST,M3.5.0,M10.5.0/3").expect("a zone"));
+        let winter = 1_770_287_400_000_000_000;
+        assert_eq!((berlin.minute(winter), berlin.name(winter)), ("2026-02-05 11:30".to_owned(), "CET".to_owned()));
+        assert_eq!(berlin.name(winter + 150 * 86_400_000_000_000), "CEST");
+        for text in ["2026-02-05T11:30", "2026-02-05 11:30", "2026-02-05T11:30:00", "2026-02-05T10:30Z"] {
+            assert_eq!(berlin.wall_ns(text), Ok(winter), "{text}");
+        }
+        assert_eq!(berlin.wall_ns("2026-02-05"), Ok(winter - 11 * 3_600_000_000_000 - 1_800_000_000_000));
+        for text in ["", "yesterday", "2026-02-30", "1969-12-31", "99999-01-01"] {
+            assert!(berlin.wall_ns(text).is_err_and(|error| error.contains("2026-02-05")), "{text}");
+        }
     }
 
     #[test]

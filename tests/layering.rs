@@ -108,6 +108,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_bb_elementary_traits", &["bus"]),
     ("iceoryx2_cal", &["bus"]),
     ("if_addrs", &["driver/lan"]),
+    ("jiff", &["time"]),
     ("jpeg_encoder", &["driver/sim", "simulation/task"]),
     ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "interlocks"]),
     ("lz4", &["episode"]),

@@ -15,6 +15,7 @@ pub mod doctor;
 #[cfg(feature = "policy")]
 pub mod eval;
 pub mod inspect;
+pub mod list;
 pub mod mask;
 pub mod progress;
 pub mod recover;

@@ -23,6 +23,7 @@ mod lan;
 mod lan_gopro;
 mod lan_hostile;
 mod lan_mdns;
+mod list;
 mod many_devices;
 mod nodes;
 mod process;

@@ -1,5 +1,6 @@
 //! Many episodes at a glance: one line each.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -29,6 +30,13 @@ pub struct Listed {
     pub messages: u64,
     /// The task in the user's words.
     pub task: String,
+    /// Tags of the user.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub tags: BTreeMap<String, String>,
+    /// Beginning, ns since 1970; 0 if unknown.
+    pub begin_ns: u64,
+    /// The modalities with at least one sample.
+    pub recorded: Vec<String>,
     /// How the file ends.
     pub end: Option<FileEnd>,
     /// Why it could not be read.
@@ -73,8 +81,22 @@ fn is_episode(path: &Path) -> bool {
 /// One episode of a list.
 pub fn list(file: &Path) -> Listed {
     match inspect(file) {
-        Ok(Inspection { file, bytes, end, verdict, task, seconds, messages, .. }) => {
-            Listed { file, verdict, seconds, bytes, messages, task, end: Some(end), error: None }
+        Ok(Inspection { file, bytes, end, verdict, task, tags, begin_ns, seconds, messages, modalities, .. }) => {
+            let recorded = modalities.into_iter().filter(|modality| modality.topic.messages > 0);
+            let recorded = recorded.map(|modality| modality.name).collect();
+            Listed {
+                file,
+                verdict,
+                seconds,
+                bytes,
+                messages,
+                task,
+                tags,
+                begin_ns,
+                recorded,
+                end: Some(end),
+                error: None,
+            }
         }
         Err(error) => {
             // The file is named beside it.
@@ -87,6 +109,9 @@ pub fn list(file: &Path) -> Listed {
                 bytes: 0,
                 messages: 0,
                 task: String::new(),
+                tags: BTreeMap::new(),
+                begin_ns: 0,
+                recorded: Vec::new(),
                 end: None,
                 error: Some(text),
             }

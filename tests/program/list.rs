@@ -1,0 +1,76 @@
+//! `rapid list`: recorded episodes, filtered and sorted, with what people noted about them.
+
+use crate::support::Place;
+
+/// The names that `rapid list out WORDS` shows, from its lines and from its JSON.
+fn listed(place: &Place, words: &[&str]) -> Vec<String> {
+    let of = |words: &[&str]| {
+        let output = place.run(words);
+        assert!(output.stderr.is_empty(), "{output:?}");
+        String::from_utf8(output.stdout).expect("text")
+    };
+    let json = of(&[&["list", "out", "--json"], words].concat());
+    let name = |line: &str| {
+        let row: serde_json::Value = serde_json::from_str(line).expect("JSON");
+        row["file"].as_str().expect("a path").strip_prefix("out/").expect("in the folder").to_owned()
+    };
+    let names: Vec<String> = json.lines().map(name).collect();
+    let text = of(&[&["list", "out"], words].concat());
+    let (total, rows) = text.trim_end().rsplit_once('\n').unwrap_or(("", ""));
+    let (rows, total) = if rows.is_empty() { ("", text.as_str()) } else { (total, rows) };
+    assert_eq!(rows.lines().count(), names.len(), "{text}");
+    assert!(rows.lines().zip(&names).all(|(row, name)| row.contains(name.as_str())), "{text}");
+    assert!(total.starts_with(&names.len().to_string()), "{text}");
+    names
+}
+
+#[test]
+fn episodes_are_listed_by_what_is_in_them_and_what_was_noted() {
+    let place = Place::new();
+    let scenario = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"motor_state\"\n";
+    place.write("two.toml", scenario);
+    let record = |words: &[&str]| {
+        let common = ["--headless", "--record", "--out", "out", "--duration"];
+        place.run(&[&common, words].concat());
+    };
+    record(&["500ms", "--sim", "--task", "Place block", "--tag", "finger=soft"]);
+    record(&["500ms", "--sim", "two.toml", "--task", "push"]);
+    // Of several chunks, one of which is to be damaged.
+    record(&["3s", "--sim", "--task", "push"]);
+    let all = listed(&place, &[]);
+    let [block, two, push] = all.as_slice() else { panic!("{all:?}") };
+    let session = format!(
+        "begun = \"2026-11-24T13:00:00.000Z\"\n[[episode]]\nfile = \"{block}\"\nbegun = \"2026-11-24T13:00:00.000Z\"\n\
+         label = \"failure\"\nlabel_reason = \"slipped\"\nnote = \"new pads\"\n"
+    );
+    place.write("out/session.toml", &session);
+    // A byte in the middle of the third is not what was written: it is never listed as GOOD.
+    let path = place.path("out").join(push);
+    let mut bytes = std::fs::read(&path).expect("the episode");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x55;
+    std::fs::write(&path, bytes).expect("the episode");
+
+    let names = |names: &[&String]| names.iter().map(|name| (*name).clone()).collect::<Vec<_>>();
+    assert_eq!(listed(&place, &["--label", "failure"]), names(&[block]));
+    assert_eq!(listed(&place, &["--label", "none", "--task", "PUSH"]), names(&[two, push]));
+    assert_eq!(listed(&place, &["--tag", "finger=soft"]), names(&[block]));
+    assert_eq!(listed(&place, &["--without", "tactile_tip"]), names(&[two]));
+    assert_eq!(listed(&place, &["--sensor", "tactile_tip", "--sensor", "cam_wrist"]), names(&[block, push]));
+    assert!(!listed(&place, &["--verdict", "good"]).contains(push));
+    assert_eq!(listed(&place, &["--sort", "verdict"])[0], *push);
+    assert_eq!(listed(&place, &["--since", "2020-01-01", "--before", "2020-01-02"]), names(&[]));
+    assert_eq!(listed(&place, &["--since", "2020-01-01", "--utc"]), all);
+    let text = String::from_utf8(place.run(&["list", "out"]).stdout).expect("text");
+    assert!(text.contains("failure: slipped; new pads") && text.contains("finger=soft"), "{text}");
+
+    // What cannot be read is never left out, and changes the exit code; a damaged session is reported.
+    place.write("out/broken.mcap", "not an episode");
+    place.write("out/session.toml", "begun = 3");
+    let output = place.run(&["list", "out", "--tag", "finger=hard"]);
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(text.contains("broken.mcap") && text.contains("1 cannot be read"), "{text}");
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("labels and notes are missing: "), "{output:?}");
+    assert_eq!(place.run(&["list", "out", "--since", "yesterday"]).status.code(), Some(2));
+}
