@@ -123,7 +123,9 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         }
         Command::List(args) => {
             let palette = Palette::of(&io::stdout());
-            reported(commands::list::list(&args, format, palette, out, &|error| print_warning(&format_args!("labels and notes are missing: {error}")))?)
+            reported(commands::list::list(&args, format, palette, out, &|error| {
+                print_warning(&format_args!("labels and notes are missing: {error}"));
+            })?)
         }
         Command::Recover { paths } => recover(paths, format),
         Command::Ablation(args) => {

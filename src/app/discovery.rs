@@ -19,12 +19,16 @@ const UDEV: &str = "/run/udev/control";
 /// Events that may wait for the rig, which takes them immediately.
 const DEPTH: usize = 64;
 
-/// Starts to watch; also returns the stream for the rig, which ends when the stage does.
+/// Starts to watch; also returns the stream for the rig, which ends when the stage does. `hands` unplug simulated devices.
 ///
 /// # Errors
 /// When plug events of this machine cannot be received.
-pub(super) fn start(devices: Devices, registry: &Registry) -> Result<(Stage, HotplugStream), AppError> {
-    let mut source = open(devices, registry)?;
+pub(super) fn start(
+    devices: Devices,
+    registry: &Registry,
+    hands: mpsc::UnboundedReceiver<String>,
+) -> Result<(Stage, HotplugStream), AppError> {
+    let mut source = open(devices, registry, hands)?;
     let (events, to_rig) = mpsc::channel(DEPTH);
     let stage = Stage::start("discovery", |stop| async move {
         loop {
@@ -44,9 +48,13 @@ pub(super) fn start(devices: Devices, registry: &Registry) -> Result<(Stage, Hot
     Ok((stage, Box::pin(received)))
 }
 
-fn open(devices: Devices, registry: &Registry) -> Result<HotplugStream, AppError> {
+fn open(
+    devices: Devices,
+    registry: &Registry,
+    hands: mpsc::UnboundedReceiver<String>,
+) -> Result<HotplugStream, AppError> {
     if let Devices::Simulated(scenario) = devices {
-        return Ok(Box::pin(Script::new(scenario)));
+        return Ok(Box::pin(Script::with_hands(scenario, hands)));
     }
     #[cfg(feature = "motors")]
     crate::driver::can::prepare(registry);

@@ -30,6 +30,7 @@ pub(super) fn sorted(
     mut screen: mpsc::Receiver<Command>,
     mut asked: mpsc::Receiver<Asked>,
     rig: mpsc::Sender<RigCommand>,
+    hands: mpsc::UnboundedSender<String>,
 ) -> mpsc::UnboundedReceiver<Request> {
     let (conductor, requests) = mpsc::unbounded_channel();
     let to_conductor = conductor.clone();
@@ -51,6 +52,7 @@ pub(super) fn sorted(
             let _ = match command {
                 Command::Session(request) => conductor.send(Request::Session(request, Stamp::now(), None)).is_ok(),
                 Command::Quit => conductor.send(Request::Quit).is_ok(),
+                Command::Plug(device) => hands.send(device).is_ok(),
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
             };
         }
@@ -67,7 +69,7 @@ mod tests {
     async fn the_rig_is_reached_while_the_conductor_is_busy() {
         let (screen, from_screen) = mpsc::channel(1);
         let (rig, mut at_rig) = mpsc::channel(1);
-        let mut requests = sorted(from_screen, mpsc::channel(1).1, rig);
+        let mut requests = sorted(from_screen, mpsc::channel(1).1, rig, mpsc::unbounded_channel().0);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }

@@ -9,6 +9,7 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use futures::Stream;
+use tokio::sync::mpsc;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::{HotplugError, HotplugEvent, UnplugSource};
@@ -23,13 +24,32 @@ pub struct Script {
     timeline: Timeline,
     begin: Instant,
     timer: Pin<Box<Sleep>>,
+    /// Names of devices that a person plugs in, or unplugs.
+    hands: Option<mpsc::UnboundedReceiver<String>>,
 }
 
 impl Script {
     /// Starts: devices plugged in at the start are reported at once.
     pub fn new(scenario: Scenario) -> Self {
         let begin = Instant::now();
-        Self { timeline: Timeline::new(scenario, Stamp::now()), begin, timer: Box::pin(sleep_until(begin)) }
+        let timer = Box::pin(sleep_until(begin));
+        Self { timeline: Timeline::new(scenario, Stamp::now()), begin, timer, hands: None }
+    }
+
+    /// Likewise; besides, each device named by `hands` is unplugged, or plugged in again, at once.
+    pub fn with_hands(scenario: Scenario, hands: mpsc::UnboundedReceiver<String>) -> Self {
+        Self { hands: Some(hands), ..Self::new(scenario) }
+    }
+
+    /// Carries out what was requested by hand so far.
+    fn move_by_hand(&mut self, context: &mut Context<'_>) {
+        while let Some(hands) = &mut self.hands {
+            match hands.poll_recv(context) {
+                Poll::Ready(Some(name)) => self.timeline.toggle(&name, Stamp::now()),
+                Poll::Ready(None) => self.hands = None,
+                Poll::Pending => return,
+            }
+        }
     }
 }
 
@@ -114,6 +134,17 @@ impl Timeline {
         self.queue.push_back(HotplugEvent::Removed { syspath, noticed: now, source: UnplugSource::Script });
     }
 
+    /// Unplugs a device, or plugs it in where it was last.
+    fn toggle(&mut self, name: &str, now: Stamp) {
+        if self.plugged.contains_key(name) {
+            self.unplug(name, now);
+        } else if self.devices.iter().any(|device| device.name == name) {
+            self.plug(name, None);
+        } else {
+            tracing::warn!(device = name, "the scenario has no device of this name");
+        }
+    }
+
     fn set_silent(&self, name: &str, silent: bool) {
         if let Some((_, sim)) = self.plugged.get(name) {
             sim.set_silent(silent);
@@ -150,6 +181,7 @@ impl Stream for Script {
     type Item = Result<HotplugEvent, HotplugError>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        self.move_by_hand(context);
         loop {
             if let Some(event) = self.timeline.queue.pop_front() {
                 return Poll::Ready(Some(Ok(event)));
@@ -194,6 +226,22 @@ mod tests {
             HotplugEvent::Added(attachment) => format!("+{}", attachment.unit.place()),
             HotplugEvent::Removed { syspath, .. } => format!("-{}", syspath.display()),
         }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn hands_unplug_and_plug_in_between_the_events_of_the_scenario() {
+        let (hands, requested) = mpsc::unbounded_channel();
+        let devices = vec![device("a", "1-1", true), device("b", "1-2", false)];
+        let events = vec![event(100, "a", ScenarioAction::Unplug)];
+        let mut script = Script::with_hands(Scenario { devices, events, repeat: None }, requested);
+        assert_eq!(word(&script.next().await.expect("open").expect("an event")), "+1-1");
+        for (name, expected) in [("b", "+1-2"), ("b", "-/sim/1-2"), ("a", "-/sim/1-1"), ("a", "+1-1")] {
+            hands.send(name.to_owned()).expect("it listens");
+            assert_eq!(word(&script.next().await.expect("open").expect("an event")), expected);
+        }
+        hands.send("nosuch".to_owned()).expect("it listens");
+        drop(hands);
+        assert_eq!(word(&script.next().await.expect("open").expect("an event")), "-/sim/1-1", "the scenario continues");
     }
 
     #[tokio::test(start_paused = true)]

@@ -9,7 +9,7 @@
 use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
@@ -144,6 +144,7 @@ pub struct Board {
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     session: Mutex<Option<SessionStatus>>,
     disk_free: Mutex<Option<u64>>,
+    simulated: AtomicBool,
     last_end: Mutex<Option<EpisodeEnd>>,
     episodes: Mutex<EpisodeCounts>,
     log: Mutex<VecDeque<LogLine>>,
@@ -170,6 +171,7 @@ impl Board {
             last_episode: Mutex::new(None),
             session: Mutex::new(None),
             disk_free: Mutex::new(None),
+            simulated: AtomicBool::new(false),
             last_end: Mutex::new(None),
             episodes: Mutex::new(EpisodeCounts::default()),
             log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
@@ -246,6 +248,11 @@ impl Board {
     /// Reports the session.
     pub fn set_session(&self, session: SessionStatus) {
         *lock(&self.session) = Some(session);
+    }
+
+    /// Reports that the devices are simulated.
+    pub fn set_simulated(&self) {
+        self.simulated.store(true, Ordering::Relaxed);
     }
 
     /// Reports the free space on the disk of the episodes, bytes.
@@ -331,6 +338,7 @@ impl Board {
             last_verdict,
             session: lock(&self.session).clone(),
             disk_free: *lock(&self.disk_free),
+            simulated: self.simulated.load(Ordering::Relaxed),
             log: lock(&self.log).iter().cloned().collect(),
         }
     }

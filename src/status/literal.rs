@@ -58,6 +58,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         last_verdict: None,
         session: None,
         disk_free: None,
+        simulated: false,
         log: Vec::new(),
     }
 }

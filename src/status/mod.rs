@@ -227,6 +227,8 @@ pub struct Snapshot {
     pub session: Option<SessionStatus>,
     /// Free space on the disk of the episodes, bytes.
     pub disk_free: Option<u64>,
+    /// The devices are simulated.
+    pub simulated: bool,
     /// The newest log lines, oldest first.
     pub log: Vec<LogLine>,
 }
@@ -238,6 +240,8 @@ pub enum Command {
     Session(SessionRequest),
     /// Start a failed device again.
     Restart(ModalityId),
+    /// Unplug this simulated device, or plug it in again.
+    Plug(String),
     /// End the program.
     Quit,
 }

@@ -169,6 +169,7 @@ mod tests {
             last_verdict: None,
             session: None,
             disk_free: None,
+            simulated: false,
             log: Vec::new(),
         }
     }

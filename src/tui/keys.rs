@@ -45,6 +45,10 @@ pub(super) enum Act {
     Last,
     /// Restart the selected device.
     Restart,
+    /// Unplug the selected simulated device, or plug it in.
+    Plug,
+    /// Ring the bell of the terminal, or be silent.
+    Bell,
     /// Ask whether to arm the actuator.
     AskToArm,
     /// Arm the actuator, right after the question.
@@ -141,11 +145,16 @@ fn restarts(model: &Model) -> Option<&'static str> {
     model.selected_device().is_some_and(|device| device.state == SlotState::Failed).then_some("restart")
 }
 
+fn plugs(model: &Model) -> Option<&'static str> {
+    let device = model.selected_device().filter(|_| model.latest().simulated)?;
+    Some(if device.state == SlotState::Absent { "plug in" } else { "unplug" })
+}
+
 use KeyCode::{Char, Down, End, Esc, F, Home, Left, PageDown, PageUp, Right, Up};
 use When::{Always, Control, ControlRepeated, Pressed, Repeated};
 
 /// All keys. The footer shows as many as fit, in this order; the help and the last two always.
-pub(super) const TABLE: [Binding; 27] = [
+pub(super) const TABLE: [Binding; 29] = [
     row(Act::Toggle, &[Char(' ')], Pressed, ("space", "start an episode, end the one in progress"), |m| {
         Some(toggles(m))
     }),
@@ -169,11 +178,13 @@ pub(super) const TABLE: [Binding; 27] = [
     row(Act::First, &[Home], Repeated, ("", ""), never),
     row(Act::Last, &[End], Repeated, ("", ""), never),
     row(Act::Restart, &[Char('r')], Repeated, ("r", "restart the selected device, if it failed"), restarts),
+    row(Act::Plug, &[Char('U')], Pressed, ("U", "simulated device: unplug it or plug it in"), plugs),
     row(Act::AskToArm, &[Char('a')], Pressed, ("a, ctrl-y", "arm the actuator: motors follow actions"), never),
     row(Act::Arm, &[Char('y')], Control, ("", ""), never),
     row(Act::Pause, &[Char('p')], Repeated, ("p", "pause the view; everything else continues"), |m| {
         Some(if m.is_paused() { "continue" } else { "pause" })
     }),
+    row(Act::Bell, &[Char('b')], Pressed, ("b", "bell at begin, end and losses: on or off"), never),
     row(Act::Older, &[PageUp], Repeated, ("pgup, pgdn", "scroll the log; esc goes to its end"), |_| Some("log")),
     row(Act::Newer, &[PageDown], Repeated, ("", ""), never),
     row(Act::Help, &[Char('?'), F(1)], Repeated, ("?", "this help"), |_| Some("help")),

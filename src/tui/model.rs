@@ -112,6 +112,10 @@ pub struct Model {
     prompt: Option<Prompt>,
     /// When a key that begins or ends an episode was last pressed.
     pressed: Option<Stamp>,
+    /// No bell is wanted.
+    is_silent: bool,
+    /// How often the bell was to ring.
+    rings: u64,
     notice: Option<Notice>,
 }
 
@@ -152,6 +156,8 @@ impl Model {
             arming: None,
             prompt: None,
             pressed: None,
+            is_silent: false,
+            rings: 0,
             notice: None,
         };
         model.read();
@@ -188,6 +194,9 @@ impl Model {
         }
         if self.scroll > 0 && self.frozen.is_none() {
             self.scroll += lines_since(&self.latest, &snapshot);
+        }
+        if calls_attention(&self.latest, &snapshot) && !self.is_silent {
+            self.rings += 1;
         }
         let refresh = self.rates.update(&snapshot);
         let answer = snapshot.session.as_ref().and_then(|session| session.answer.clone());
@@ -280,6 +289,8 @@ impl Model {
             Act::EndSession => self.ask(Question::EndSession),
             Act::Restart => return self.restart(),
             Act::AskToArm => self.ask_to_arm(),
+            Act::Plug => return self.plug(),
+            Act::Bell => self.toggle_bell(),
             Act::Pause => self.toggle_pause(),
             Act::Help => self.help = true,
             Act::Up => self.selected = self.selected.saturating_sub(1),
@@ -339,6 +350,29 @@ impl Model {
         let text = format!("{} has not failed: nothing to restart", now.name);
         self.notify(&text);
         Effect::None
+    }
+
+    /// Unplugs the selected device, or plugs it in, if it is a simulated one.
+    fn plug(&mut self) -> Effect {
+        let Some(device) = self.shown().devices.get(self.selected) else { return Effect::None };
+        let name = device.name.clone();
+        if !self.latest.simulated {
+            self.notify("U unplugs simulated devices only (rapid --sim)");
+            return Effect::None;
+        }
+        let is_plugged = self.latest.devices.iter().any(|now| now.name == name && now.state != SlotState::Absent);
+        self.notify(&if is_plugged { format!("unplugging {name}") } else { format!("plugging {name} in") });
+        Effect::Send(Command::Plug(name))
+    }
+
+    fn toggle_bell(&mut self) {
+        self.is_silent = !self.is_silent;
+        self.notify(if self.is_silent { "bell off" } else { "bell on" });
+    }
+
+    /// How often the bell was to ring since the screen began.
+    pub fn rings(&self) -> u64 {
+        self.rings
     }
 
     fn toggle_pause(&mut self) {
@@ -422,6 +456,15 @@ impl Model {
 
 /// Lines by which a page key scrolls the log.
 const SCROLL_STEP: usize = 5;
+
+/// Whether an episode began or ended between two snapshots, or a device that sent samples no longer does.
+fn calls_attention(before: &Snapshot, after: &Snapshot) -> bool {
+    let is_lost = |device: &DeviceStatus| {
+        let now = after.devices.iter().find(|now| now.id == device.id);
+        device.state == SlotState::Streaming && now.is_none_or(|now| now.state != SlotState::Streaming)
+    };
+    before.recording.is_some() != after.recording.is_some() || before.devices.iter().any(is_lost)
+}
 
 /// How many lines were added to the log. The oldest are dropped, so the count starts at the last known line;
 /// when that is gone too, all are new.

@@ -35,6 +35,8 @@ pub(super) struct Screen {
     terminal: Terminal<CrosstermBackend<Frame>>,
     frame: Frame,
     outlet: Option<Outlet>,
+    /// How often the bell has rung.
+    rung: u64,
 }
 
 impl Screen {
@@ -48,7 +50,7 @@ impl Screen {
         let frame = Frame::default();
         let outlet = Some(outlet);
         let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
-            Ok(terminal) => Self { terminal, frame, outlet },
+            Ok(terminal) => Self { terminal, frame, outlet, rung: 0 },
             Err(error) => {
                 restore();
                 return Err(error);
@@ -64,6 +66,10 @@ impl Screen {
         let Some(outlet) = &self.outlet else { return Ok(()) };
         if !outlet.is_idle() {
             return Ok(());
+        }
+        // Before the picture, and with it: one that is not drawn because the terminal is blocked rings with the next.
+        if std::mem::replace(&mut self.rung, model.rings()) != model.rings() {
+            self.frame.write_all(b"\x07")?;
         }
         self.terminal.draw(|frame| view::draw(frame, model, theme))?;
         let bytes = self.frame.take();

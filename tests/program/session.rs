@@ -112,6 +112,12 @@ fn keys_discard_redo_note_and_end_a_session_in_the_monitor() {
     until("no episode is being recorded", || session(&place)["phase"]["phase"] == "idle");
     run.type_in("Eend\r");
     until("the trash is empty", || !place.path("out/.trash").exists());
+    // The selected device is unplugged by a key, and plugged in again.
+    let mask = || ask(&place, &["mask", "--json"]).unwrap_or_default();
+    for (key, value) in [("U", "0x06"), ("U", "0x07")] {
+        run.type_in(key);
+        until("the bit changes", || mask().contains(value));
+    }
     // A screen that still shows the recording asks first.
     next_press();
     run.type_in("q");

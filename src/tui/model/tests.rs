@@ -275,6 +275,51 @@ fn an_announcement_ends_with_what_it_announces() {
     }
 }
 
+#[test]
+fn the_bell_rings_at_begin_end_and_each_loss_unless_it_is_off() {
+    let quiet = three_streaming();
+    let mut recording = quiet.clone();
+    recording.recording = Some(crate::status::literal::recording(0));
+    for lost in [SlotState::Absent, SlotState::Stalled, SlotState::Backoff, SlotState::Failed, SlotState::Opening] {
+        let mut without = recording.clone();
+        without.devices[1].state = lost;
+        let mut model = Model::new(quiet.clone());
+        // Still, begins, loses a device, which stays away and returns, and ends.
+        let heard = [&quiet, &recording, &without, &without, &recording, &quiet].map(|snapshot| {
+            model.update(after(snapshot, 100));
+            model.rings()
+        });
+        assert_eq!(heard, [0, 1, 2, 2, 2, 3], "{lost:?}");
+    }
+    let mut model = Model::new(quiet.clone());
+    model.update(press(KeyCode::Char('b')));
+    assert_eq!(model.notice(), Some("bell off"));
+    model.update(after(&recording, 100));
+    assert_eq!(model.rings(), 0);
+    model.update(press(KeyCode::Char('b')));
+    model.update(after(&quiet, 100));
+    assert_eq!(model.rings(), 1);
+}
+
+#[test]
+fn a_key_unplugs_simulated_devices_and_no_others() {
+    let mut model = Model::new(three_streaming());
+    assert_eq!(model.update(press(KeyCode::Char('U'))), Effect::None);
+    assert!(model.notice().is_some_and(|notice| notice.contains("--sim")));
+    let mut simulated = three_streaming();
+    simulated.simulated = true;
+    let mut model = Model::new(simulated.clone());
+    model.update(press(KeyCode::Down));
+    let name = simulated.devices[1].name.clone();
+    assert_eq!(model.update(press(KeyCode::Char('U'))), Effect::Send(Command::Plug(name.clone())));
+    assert_eq!(model.notice(), Some(format!("unplugging {name}").as_str()));
+    assert_eq!(model.update(repeated(KeyCode::Char('U'))), Effect::None);
+    simulated.devices[1].state = SlotState::Absent;
+    model.update(after(&simulated, 100));
+    assert_eq!(model.update(press(KeyCode::Char('U'))), Effect::Send(Command::Plug(name.clone())));
+    assert_eq!(model.notice(), Some(format!("plugging {name} in").as_str()));
+}
+
 fn typed(model: &mut Model, text: &str) {
     for c in text.chars() {
         assert_eq!(model.update(press(KeyCode::Char(c))), Effect::None, "{c}");
