@@ -21,7 +21,7 @@ use super::{
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::{InterlockSpec, Registry};
+use crate::registry::{DeviceSpec, InterlockSpec, Registry};
 use crate::sample::Epoch;
 use crate::text;
 use crate::time::{Stamp, realtime_ns};
@@ -132,7 +132,7 @@ struct SlotStatus {
 pub struct Board {
     rig: String,
     started: Stamp,
-    names: Vec<(ModalityId, String, String)>,
+    entries: Vec<Entry>,
     counters: Vec<StreamCounters>,
     slots: Mutex<Vec<SlotStatus>>,
     mask: AtomicU64,
@@ -151,6 +151,22 @@ pub struct Board {
     events: broadcast::Sender<Event>,
 }
 
+/// What an entry of the registry contributes to each snapshot.
+#[derive(Debug)]
+struct Entry {
+    id: ModalityId,
+    name: String,
+    topic: String,
+    nominal_hz: Option<f64>,
+}
+
+impl Entry {
+    fn of(device: &DeviceSpec) -> Self {
+        let DeviceSpec { id, name, topic, verdict, .. } = device;
+        Self { id: *id, name: name.clone(), topic: topic.clone(), nominal_hz: verdict.hz }
+    }
+}
+
 impl Board {
     /// An empty board for the devices of `registry`.
     pub fn new(registry: &Registry) -> Self {
@@ -159,7 +175,7 @@ impl Board {
         Self {
             rig: registry.rig.name.clone(),
             started: Stamp::now(),
-            names: registry.devices.iter().map(|d| (d.id, d.name.clone(), d.topic.clone())).collect(),
+            entries: registry.devices.iter().map(Entry::of).collect(),
             counters,
             slots: Mutex::new(vec![SlotStatus::default(); MAX_MODALITIES]),
             mask: AtomicU64::new(0),
@@ -305,7 +321,7 @@ impl Board {
     pub fn snapshot(&self) -> Snapshot {
         let taken = Stamp::now();
         let slots = lock(&self.slots).clone();
-        let devices = self.names.iter().map(|(id, name, topic)| {
+        let devices = self.entries.iter().map(|Entry { id, name, topic, nominal_hz }| {
             let counters = &self.counters[id.index()];
             let slot = &slots[id.index()];
             let newest = counters.newest.load(Ordering::Relaxed);
@@ -316,6 +332,7 @@ impl Board {
                 state: slot.state,
                 epoch: slot.epoch,
                 detail: slot.detail.clone(),
+                nominal_hz: *nominal_hz,
                 samples: counters.samples.load(Ordering::Relaxed),
                 gaps: counters.gaps.load(Ordering::Relaxed),
                 bytes: counters.bytes.load(Ordering::Relaxed),

@@ -31,6 +31,7 @@ pub(crate) fn device(bit: u8, name: &str, state: SlotState, detail: &str) -> Dev
         state,
         epoch: Epoch(1),
         detail: detail.to_owned(),
+        nominal_hz: None,
         samples: if running { 18_000 + u64::from(bit) } else { 0 },
         gaps: 0,
         bytes: if running { 540_000_000 } else { 0 },

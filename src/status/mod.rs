@@ -99,6 +99,8 @@ pub struct DeviceStatus {
     pub epoch: Epoch,
     /// Node in use and agreed format, or the reason of the state.
     pub detail: String,
+    /// Samples per second that it should send, if known.
+    pub nominal_hz: Option<f64>,
     /// Samples since the start of the run.
     pub samples: u64,
     /// Samples lost between device and bus, as counted by the device or kernel.

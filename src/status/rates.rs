@@ -149,6 +149,7 @@ mod tests {
                 state: SlotState::Streaming,
                 epoch: Epoch(1),
                 detail: String::new(),
+                nominal_hz: None,
                 samples,
                 gaps: 0,
                 bytes: 0,

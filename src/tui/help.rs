@@ -50,6 +50,12 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
 mod tests {
     use super::*;
 
+    /// On 80x24 every key is in the help.
+    #[test]
+    fn no_key_is_cut() {
+        assert!(keys::help().count() + 2 <= 24);
+    }
+
     #[test]
     fn no_line_is_cut() {
         let longest =

@@ -47,6 +47,8 @@ pub(super) enum Act {
     Restart,
     /// Unplug the selected simulated device, or plug it in.
     Plug,
+    /// List devices in trouble first, or all by their bits.
+    Order,
     /// Ring the bell of the terminal, or be silent.
     Bell,
     /// Ask whether to arm the actuator.
@@ -154,7 +156,7 @@ use KeyCode::{Char, Down, End, Esc, F, Home, Left, PageDown, PageUp, Right, Up};
 use When::{Always, Control, ControlRepeated, Pressed, Repeated};
 
 /// All keys. The footer shows as many as fit, in this order; the help and the last two always.
-pub(super) const TABLE: [Binding; 29] = [
+pub(super) const TABLE: [Binding; 30] = [
     row(Act::Toggle, &[Char(' ')], Pressed, ("space", "start an episode, end the one in progress"), |m| {
         Some(toggles(m))
     }),
@@ -168,8 +170,8 @@ pub(super) const TABLE: [Binding; 29] = [
     row(Act::Undo, &[Char('u')], Pressed, ("u", "take the discarded episode back"), restores),
     row(Act::Stop, &[Char('s')], Pressed, ("s", "end the episode; no other begins by itself"), never),
     row(Act::Mark, &[Char('i')], Pressed, ("i", "mark this moment of the episode"), |m| while_recording(m, "mark")),
-    row(Act::Success, &[Char('+')], Pressed, ("+", "label the episode: success"), never),
-    row(Act::Failure, &[Char('-')], Pressed, ("-", "label the episode: failure, and why"), never),
+    row(Act::Success, &[Char('+')], Pressed, ("+, -", "label it: success, or failure and why"), never),
+    row(Act::Failure, &[Char('-')], Pressed, ("", ""), never),
     row(Act::Note, &[Char('n')], Pressed, ("n", "note on the episode"), never),
     row(Act::Task, &[Char('t')], Pressed, ("t", "task of the next episodes"), never),
     row(Act::EndSession, &[Char('E')], Pressed, ("E", "end the session: its trash is emptied"), never),
@@ -184,6 +186,7 @@ pub(super) const TABLE: [Binding; 29] = [
     row(Act::Pause, &[Char('p')], Repeated, ("p", "pause the view; everything else continues"), |m| {
         Some(if m.is_paused() { "continue" } else { "pause" })
     }),
+    row(Act::Order, &[Char('o')], Pressed, ("o", "order of devices: trouble first, or by bit"), never),
     row(Act::Bell, &[Char('b')], Pressed, ("b", "bell at begin, end and losses: on or off"), never),
     row(Act::Older, &[PageUp], Repeated, ("pgup, pgdn", "scroll the log; esc goes to its end"), |_| Some("log")),
     row(Act::Newer, &[PageDown], Repeated, ("", ""), never),

@@ -14,6 +14,7 @@ pub mod flashlight;
 mod footer;
 mod header;
 mod help;
+mod history;
 mod keys;
 mod log;
 mod mask;

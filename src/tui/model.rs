@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
+use super::history::{Cell, History};
 use super::keys::{self, Act};
 use super::theme::Edge;
 use crate::action::Order;
@@ -17,7 +18,7 @@ use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::permission::Void;
 use crate::status::rates::Rates;
 use crate::status::session::{Label, SessionRequest};
-use crate::status::{Command, DeviceStatus, SlotState, Snapshot};
+use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
 use crate::time::Stamp;
 
 /// How long a changed bit is highlighted.
@@ -92,6 +93,10 @@ pub struct Model {
     latest: Snapshot,
     frozen: Option<Box<Snapshot>>,
     rates: Rates,
+    history: History,
+    frozen_history: Option<History>,
+    /// Devices in trouble come first.
+    by_trouble: bool,
     readings: [Reading; MAX_MODALITIES],
     /// Figures of the whole rig.
     pub(super) totals: Totals,
@@ -145,6 +150,9 @@ impl Model {
             latest: snapshot,
             frozen: None,
             rates,
+            history: History::default(),
+            frozen_history: None,
+            by_trouble: false,
             readings: [Reading::default(); MAX_MODALITIES],
             totals: Totals::default(),
             edges: [None; MAX_MODALITIES],
@@ -199,6 +207,8 @@ impl Model {
             self.rings += 1;
         }
         let refresh = self.rates.update(&snapshot);
+        self.history.update(&snapshot);
+        let selected = self.selected_device().map(|device| device.id);
         let answer = snapshot.session.as_ref().and_then(|session| session.answer.clone());
         let known = self.latest.session.as_ref().and_then(|session| session.answer.as_ref());
         let news = answer.filter(|answer| known != Some(answer));
@@ -215,7 +225,21 @@ impl Model {
         if self.notice.as_ref().is_some_and(|notice| notice.is_over(&self.latest)) {
             self.notice = None;
         }
+        self.select(selected);
         self.keep_in_bounds();
+    }
+
+    /// Selects this device, wherever it is listed now.
+    fn select(&mut self, id: Option<ModalityId>) {
+        let place = self.rows().iter().position(|device| Some(device.id) == id);
+        self.selected = place.unwrap_or(self.selected);
+    }
+
+    fn toggle_order(&mut self) {
+        let selected = self.selected_device().map(|device| device.id);
+        self.by_trouble = !self.by_trouble;
+        self.select(selected);
+        self.notify(if self.by_trouble { "devices in trouble first" } else { "devices by their bits" });
     }
 
     fn read(&mut self) {
@@ -291,6 +315,7 @@ impl Model {
             Act::AskToArm => self.ask_to_arm(),
             Act::Plug => return self.plug(),
             Act::Bell => self.toggle_bell(),
+            Act::Order => self.toggle_order(),
             Act::Pause => self.toggle_pause(),
             Act::Help => self.help = true,
             Act::Up => self.selected = self.selected.saturating_sub(1),
@@ -338,7 +363,7 @@ impl Model {
     }
 
     fn restart(&mut self) -> Effect {
-        let Some(device) = self.shown().devices.get(self.selected) else { return Effect::None };
+        let Some(device) = self.selected_device() else { return Effect::None };
         let id = device.id;
         // The view may be paused: the current state counts.
         let Some(now) = self.latest.devices.iter().find(|device| device.id == id) else { return Effect::None };
@@ -354,7 +379,7 @@ impl Model {
 
     /// Unplugs the selected device, or plugs it in, if it is a simulated one.
     fn plug(&mut self) -> Effect {
-        let Some(device) = self.shown().devices.get(self.selected) else { return Effect::None };
+        let Some(device) = self.selected_device() else { return Effect::None };
         let name = device.name.clone();
         if !self.latest.simulated {
             self.notify("U unplugs simulated devices only (rapid --sim)");
@@ -377,9 +402,11 @@ impl Model {
 
     fn toggle_pause(&mut self) {
         if self.frozen.take().is_some() {
+            self.frozen_history = None;
             self.read();
         } else {
             self.frozen = Some(Box::new(self.latest.clone()));
+            self.frozen_history = Some(self.history.clone());
         }
     }
 
@@ -411,6 +438,35 @@ impl Model {
     /// Is an episode being recorded now, paused or not?
     pub fn is_recording(&self) -> bool {
         self.latest.recording.is_some()
+    }
+
+    /// The devices in the order in which they are listed.
+    pub fn rows(&self) -> Vec<&DeviceStatus> {
+        let mut rows: Vec<&DeviceStatus> = self.shown().devices.iter().collect();
+        if self.by_trouble {
+            rows.sort_by_key(|device| self.trouble(device));
+        }
+        rows
+    }
+
+    /// How urgent a device is, the lowest first.
+    fn trouble(&self, device: &DeviceStatus) -> u8 {
+        let outlook = self.shown().recording.as_ref().and_then(|recording| recording.outlook.of(&device.name));
+        match (outlook.map(|finding| finding.grade), device.state) {
+            (Some(Grade::Bad), _) => 0,
+            (_, SlotState::Failed) => 1,
+            (Some(Grade::Suspect), _) => 2,
+            (_, SlotState::Stalled) => 3,
+            (_, SlotState::Backoff) => 4,
+            (_, SlotState::Absent) => 5,
+            (_, SlotState::Opening) => 6,
+            (_, SlotState::Streaming) => 7,
+        }
+    }
+
+    /// The last minute of a device in so many cells.
+    pub(super) fn strip(&self, id: ModalityId, columns: usize) -> Vec<Cell> {
+        self.frozen_history.as_ref().unwrap_or(&self.history).strip(id, columns)
     }
 
     /// Figures of a device.
@@ -445,7 +501,7 @@ impl Model {
 
     /// The selected device.
     pub fn selected_device(&self) -> Option<&DeviceStatus> {
-        self.shown().devices.get(self.selected)
+        self.rows().get(self.selected).copied()
     }
 
     /// The answer to the last key, while it is fresh.

@@ -370,3 +370,27 @@ fn the_answer_to_a_request_is_shown_whoever_made_it() {
     model.update(after(&answered, 4_400));
     assert_eq!(model.notice(), None);
 }
+
+#[test]
+fn devices_in_trouble_come_first_by_a_key_and_the_selection_stays_on_its_device() {
+    let mut model = Model::new(every_state());
+    let name = |model: &Model| model.selected_device().map(|device| device.name.clone());
+    model.update(press(KeyCode::Down));
+    let selected = name(&model);
+    let by_bit: Vec<_> = model.rows().iter().map(|device| device.id.bit()).collect();
+    assert!(by_bit.is_sorted());
+    model.update(press(KeyCode::Char('o')));
+    let states: Vec<_> = model.rows().iter().map(|device| device.state).collect();
+    assert_eq!(states.first(), Some(&SlotState::Failed), "{states:?}");
+    assert_eq!(states.last(), Some(&SlotState::Streaming), "{states:?}");
+    assert_eq!(name(&model), selected);
+    // The state of another device changes, and with it the order.
+    let mut changed = every_state();
+    let failed = changed.devices.iter_mut().find(|device| device.state == SlotState::Failed).unwrap();
+    failed.state = SlotState::Streaming;
+    model.update(after(&changed, 100));
+    assert_eq!(name(&model), selected);
+    assert_ne!(model.rows()[0].state, SlotState::Failed);
+    model.update(press(KeyCode::Char('o')));
+    assert_eq!(model.rows().iter().map(|device| device.id.bit()).collect::<Vec<_>>(), by_bit);
+}

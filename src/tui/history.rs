@@ -1,0 +1,174 @@
+//! The last minute of each device: per second, whether it was present and at which rate.
+//!
+//! Invariant: pure, and of fixed size: time and counters come from the snapshots alone.
+
+use std::time::Duration;
+
+use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::status::{DeviceStatus, SlotState, Snapshot};
+use crate::time::Stamp;
+
+/// Seconds that are kept.
+pub(super) const SECONDS: usize = 60;
+/// Time in a cell.
+const CELL: Duration = Duration::from_secs(1);
+
+/// A second of a device, or several: the worst of them. In the order of severity.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
+pub(super) enum Cell {
+    /// It was not plugged in, or not yet running, at some moment.
+    Absent,
+    /// It was present; the share of its nominal rate that arrived, 0 to 1.
+    Rate(f32),
+    /// Nothing is known.
+    #[default]
+    Unknown,
+}
+
+/// The last minute of all devices.
+#[derive(Debug, Clone)]
+pub(super) struct History {
+    lanes: Box<[Lane]>,
+    /// When the current second began.
+    begun: Option<Stamp>,
+    /// Whole seconds so far.
+    seconds: usize,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Lane {
+    cells: [Cell; SECONDS],
+    /// Samples when the current second began.
+    samples: u64,
+    /// It was absent at some moment of the current second.
+    was_absent: bool,
+    /// The highest rate so far, for a device without a nominal one.
+    highest: f64,
+}
+
+impl Default for History {
+    fn default() -> Self {
+        let lane = Lane { cells: [Cell::Unknown; SECONDS], samples: 0, was_absent: false, highest: 0.0 };
+        Self { lanes: vec![lane; MAX_MODALITIES].into_boxed_slice(), begun: None, seconds: 0 }
+    }
+}
+
+impl History {
+    /// Takes a snapshot into account.
+    pub(super) fn update(&mut self, snapshot: &Snapshot) {
+        let begun = *self.begun.get_or_insert(snapshot.taken);
+        let elapsed = snapshot.taken.since(begun);
+        let is_over = elapsed >= CELL;
+        for device in &snapshot.devices {
+            if let Some(lane) = self.lanes.get_mut(device.id.index()) {
+                lane.was_absent |= !matches!(device.state, SlotState::Streaming | SlotState::Stalled);
+                if is_over || elapsed.is_zero() {
+                    let cell = lane.end(device, elapsed);
+                    if is_over && let Some(place) = lane.cells.get_mut(self.seconds % SECONDS) {
+                        *place = cell;
+                    }
+                }
+            }
+        }
+        if is_over {
+            self.seconds += 1;
+            self.begun = Some(snapshot.taken);
+        }
+    }
+
+    /// The last minute in so many cells, the oldest first; `columns` divides [`SECONDS`].
+    pub(super) fn strip(&self, id: ModalityId, columns: usize) -> Vec<Cell> {
+        let Some(lane) = self.lanes.get(id.index()) else { return Vec::new() };
+        let each = SECONDS.checked_div(columns).unwrap_or(SECONDS).max(1);
+        // Cells stand for the same seconds until they leave: a strip that is regrouped at each second flickers.
+        let newest = self.seconds.next_multiple_of(each);
+        let oldest = newest.saturating_sub(SECONDS);
+        let cell = |second: usize| {
+            let is_kept = second < self.seconds && second + SECONDS >= self.seconds;
+            lane.cells.get(second % SECONDS).copied().filter(|_| is_kept).unwrap_or_default()
+        };
+        let worst = |first: usize| {
+            let cells = (first..first + each).map(cell);
+            cells.reduce(|a, b| if b < a { b } else { a }).unwrap_or_default()
+        };
+        let missing = columns.saturating_sub((newest - oldest) / each);
+        std::iter::repeat_n(Cell::Unknown, missing).chain((oldest..newest).step_by(each).map(worst)).collect()
+    }
+}
+
+impl Lane {
+    /// The second that ends, of this length; the next one begins.
+    fn end(&mut self, device: &DeviceStatus, length: Duration) -> Cell {
+        let arrived = device.samples.saturating_sub(self.samples);
+        let was_absent = std::mem::replace(&mut self.was_absent, false);
+        self.samples = device.samples;
+        if was_absent || length.is_zero() {
+            return Cell::Absent;
+        }
+        let hz = arrived as f64 / length.as_secs_f64();
+        self.highest = self.highest.max(hz);
+        let expected = device.nominal_hz.unwrap_or(self.highest) * length.as_secs_f64();
+        if device.state == SlotState::Stalled && arrived == 0 {
+            return Cell::Rate(0.0);
+        }
+        // A regular device is one sample short where its phase is unlucky.
+        #[expect(clippy::cast_possible_truncation, reason = "a share, for a picture")]
+        let share = if expected > 0.0 { ((arrived + 1) as f64 / expected).min(1.0) as f32 } else { 1.0 };
+        Cell::Rate(share)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::literal::{device, id, snapshot};
+
+    /// A device of 30 Hz: its state and samples at each tenth of a second.
+    fn played(history: &mut History, tenths: impl Iterator<Item = (SlotState, u64)>) {
+        for (tenth, (state, samples)) in tenths.enumerate() {
+            let mut cam = device(0, "cam", state, "");
+            cam.samples = samples;
+            cam.nominal_hz = Some(30.0);
+            let mut now = snapshot(vec![cam]);
+            now.taken = Stamp(1_000_000_000_000 + tenth as u64 * 100_000_000);
+            history.update(&now);
+        }
+    }
+
+    #[test]
+    fn a_second_shows_the_rate_and_the_slightest_absence() {
+        let mut history = History::default();
+        let tenths = (0..=50).map(|tenth| match tenth {
+            0..=10 => (SlotState::Streaming, tenth * 3),
+            // Half of the rate.
+            11..=20 => (SlotState::Streaming, 30 + (tenth - 10) * 3 / 2),
+            // Away for 100 ms.
+            25 => (SlotState::Absent, 60),
+            21..=30 => (SlotState::Streaming, 45 + (tenth - 20) * 3),
+            // Silent.
+            31..=40 => (SlotState::Stalled, 75),
+            _ => (SlotState::Streaming, 75 + (tenth - 40) * 3),
+        });
+        played(&mut history, tenths);
+        let strip = history.strip(id(0), 60);
+        assert_eq!(strip.len(), 60);
+        assert!(strip[..55].iter().all(|cell| *cell == Cell::Unknown), "{strip:?}");
+        assert_eq!(strip[55], Cell::Rate(1.0));
+        assert!(matches!(strip[56], Cell::Rate(share) if (0.4..0.6).contains(&share)), "{strip:?}");
+        assert_eq!(strip[57..], [Cell::Absent, Cell::Rate(0.0), Cell::Rate(1.0)]);
+        // In fewer cells, the worst of each; the unfinished group counts.
+        assert_eq!(history.strip(id(0), 20)[18..], [Cell::Absent, Cell::Rate(0.0)]);
+    }
+
+    #[test]
+    fn an_old_minute_is_forgotten() {
+        let mut history = History::default();
+        let absent_first = (0..=1300)
+            .map(|tenth| if tenth < 300 { (SlotState::Absent, 0) } else { (SlotState::Streaming, (tenth - 300) * 3) });
+        played(&mut history, absent_first);
+        for columns in [60, 30, 20] {
+            assert!(history.strip(id(0), columns).iter().all(|cell| *cell == Cell::Rate(1.0)), "{columns}");
+        }
+        assert!(history.strip(id(1), 20).iter().all(|cell| *cell == Cell::Unknown));
+    }
+}
