@@ -165,6 +165,11 @@ impl Zone {
         self.zoned(wall_ns).strftime("%Y-%m-%d %H:%M").to_string()
     }
 
+    /// The time of day: `11:30:00.000`.
+    pub fn time_of_day(&self, wall_ns: u64) -> String {
+        self.zoned(wall_ns).strftime("%H:%M:%S.%3f").to_string()
+    }
+
     /// The abbreviation in force at that time: `CET`, or `+05`.
     pub fn name(&self, wall_ns: u64) -> String {
         self.zoned(wall_ns).strftime("%Z").to_string()
@@ -254,6 +259,7 @@ mod tests {
         let berlin = Zone(TimeZone::posix("CET-1CEST,M3.5.0,M10.5.0/3").expect("a zone"));
         let winter = 1_770_287_400_000_000_000;
         assert_eq!((berlin.minute(winter), berlin.name(winter)), ("2026-02-05 11:30".to_owned(), "CET".to_owned()));
+        assert_eq!(berlin.time_of_day(winter + 250_000_000), "11:30:00.250");
         assert_eq!(berlin.name(winter + 150 * 86_400_000_000_000), "CEST");
         for text in ["2026-02-05T11:30", "2026-02-05 11:30", "2026-02-05T11:30:00", "2026-02-05T10:30Z"] {
             assert_eq!(berlin.wall_ns(text), Ok(winter), "{text}");

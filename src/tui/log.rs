@@ -9,6 +9,7 @@ use super::theme::Theme;
 use super::view;
 use crate::status::LogLine;
 use crate::text;
+use crate::time::{Zone, realtime_ns};
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let log = &model.shown().log;
@@ -18,13 +19,14 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     let remark = if scroll > 0 {
         Span::styled(format!("{scroll} newer below"), theme.warning())
     } else {
-        Span::styled("times in UTC", theme.faint())
+        let newest = log.last().map_or_else(realtime_ns, |line| line.wall_ns);
+        Span::styled(format!("times in {}", theme.safe(&model.zone.name(newest))), theme.faint())
     };
     let inner = view::panel(frame, area, "Log", remark.into(), theme);
     let end = log.len().saturating_sub(scroll);
     let shown = log.get(end.saturating_sub(rows)..end).unwrap_or_default();
     for (line, row) in shown.iter().zip(inner.rows()) {
-        frame.render_widget(render(line, row.width, theme), row);
+        frame.render_widget(render(line, row.width, &model.zone, theme), row);
     }
     if log.is_empty()
         && let Some(row) = inner.rows().next()
@@ -33,9 +35,8 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     }
 }
 
-fn render(line: &LogLine, width: u16, theme: Theme) -> Line<'static> {
-    let time = crate::time::time_of_day(line.wall_ns);
-    let time = time.trim_end_matches('Z').to_owned();
+fn render(line: &LogLine, width: u16, zone: &Zone, theme: Theme) -> Line<'static> {
+    let time = zone.time_of_day(line.wall_ns);
     let room = usize::from(width).saturating_sub(time.len() + 8);
     let text = text::cut(&theme.safe(&line.text), room, theme.ellipsis()).into_owned();
     Line::from(vec![

@@ -39,7 +39,7 @@ use tokio_util::sync::CancellationToken;
 use crate::action::Order;
 use crate::permission::Permission;
 use crate::status::{Board, Command};
-use crate::time::Stamp;
+use crate::time::{Stamp, Zone};
 use model::{Effect, Model, Msg};
 use terminal::Screen;
 use theme::Theme;
@@ -138,6 +138,7 @@ async fn drive(
 ) -> Result<(), TuiError> {
     let mut events = std::pin::pin!(events);
     let mut model = Model::new(board.snapshot());
+    model.zone = Zone::local();
     let mut frames = tokio::time::interval(FRAME);
     frames.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {

@@ -19,7 +19,7 @@ use crate::permission::Void;
 use crate::status::rates::Rates;
 use crate::status::session::{Label, SessionRequest};
 use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
-use crate::time::Stamp;
+use crate::time::{Stamp, Zone};
 
 /// How long a changed bit is highlighted.
 const EDGE_SHOWN: Duration = Duration::from_secs(1);
@@ -95,6 +95,8 @@ pub struct Model {
     rates: Rates,
     history: History,
     frozen_history: Option<History>,
+    /// In which the times of the log are shown.
+    pub(super) zone: Zone,
     /// Devices in trouble come first.
     by_trouble: bool,
     readings: [Reading; MAX_MODALITIES],
@@ -152,6 +154,7 @@ impl Model {
             rates,
             history: History::default(),
             frozen_history: None,
+            zone: Zone::UTC,
             by_trouble: false,
             readings: [Reading::default(); MAX_MODALITIES],
             totals: Totals::default(),
