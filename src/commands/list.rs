@@ -141,6 +141,10 @@ pub fn list(
 ) -> Result<CommandStatus, ListError> {
     let zone = args.zone();
     let filter = Filter::new(args, &zone)?;
+    for path in &args.paths {
+        // A name that was mistyped is not an episode that cannot be read.
+        std::fs::metadata(path).map_err(|source| ReadError::Io { path: path.clone(), source })?;
+    }
     let files = inspect::episodes(&args.paths)?;
     let folders: BTreeSet<&Path> = files.iter().filter_map(|file| file.parent()).collect();
     let mut noted = noted(&folders, warn);

@@ -73,4 +73,7 @@ fn episodes_are_listed_by_what_is_in_them_and_what_was_noted() {
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("labels and notes are missing: "), "{output:?}");
     assert_eq!(place.run(&["list", "out", "--since", "yesterday"]).status.code(), Some(2));
+    let mistyped = place.run(&["list", "uot"]);
+    assert_eq!((mistyped.status.code(), mistyped.stdout.len()), (Some(2), 0), "{mistyped:?}");
+    assert!(String::from_utf8_lossy(&mistyped.stderr).contains("uot: "), "{mistyped:?}");
 }
