@@ -173,6 +173,42 @@ fn a_text_that_is_typed_is_shown_with_its_end() {
     assert!(screen.contains(" note: ") && screen.contains("columns of the line, öä█"), "{screen}");
 }
 
+/// A minute in which one camera slows down and recovers, one is unplugged for 8 s, and a device has no nominal rate.
+#[test]
+fn the_last_minute_of_each_device_is_a_strip() {
+    let mut now = three_streaming();
+    let end = now.taken;
+    let mut counts = [0, 0, 0];
+    now.devices[0].nominal_hz = Some(30.0);
+    now.devices[1].nominal_hz = Some(30.0);
+    now.taken = end.before(Duration::from_mins(1));
+    let mut model = Model::new(now.clone());
+    for second in 0..=60 {
+        let is_away = (40..48).contains(&second);
+        let rates = [if second < 20 { 30 } else { (second - 10).min(30) }, if is_away { 0 } else { 30 }, 100];
+        for ((device, count), rate) in now.devices.iter_mut().zip(&mut counts).zip(rates) {
+            *count += rate;
+            device.samples = *count;
+        }
+        now.devices[1].state = if is_away { SlotState::Absent } else { SlotState::Streaming };
+        now.taken = end.before(Duration::from_secs(60 - second));
+        model.update(Msg::Snapshot(Box::new(now.clone())));
+    }
+    assert_snapshot!("history_120x40", draw(&model, (120, 40), THEME));
+    assert_snapshot!("history_200x60", draw(&model, (200, 60), THEME));
+    // A paused view keeps the minute at which it was paused.
+    model.update(Msg::Key(KeyEvent::new(KeyCode::Char('p'), KeyModifiers::NONE)));
+    let strip = |model: &Model| model.strip(now.devices[0].id, 60);
+    let before = strip(&model);
+    for second in 1..5 {
+        now.taken = end.after(Duration::from_secs(second));
+        model.update(Msg::Snapshot(Box::new(now.clone())));
+    }
+    assert_eq!(strip(&model), before);
+    model.update(Msg::Key(KeyEvent::new(KeyCode::Char('p'), KeyModifiers::NONE)));
+    assert_ne!(strip(&model), before);
+}
+
 #[test]
 fn every_state_has_its_word_symbol_and_colour() {
     let model = measured(&every_state());
