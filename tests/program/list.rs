@@ -58,7 +58,14 @@ fn episodes_are_listed_by_what_is_in_them_and_what_was_noted() {
     assert_eq!(listed(&place, &["--without", "tactile_tip"]), names(&[two]));
     assert_eq!(listed(&place, &["--sensor", "tactile_tip", "--sensor", "cam_wrist"]), names(&[block, push]));
     assert!(!listed(&place, &["--verdict", "good"]).contains(push));
-    assert_eq!(listed(&place, &["--sort", "verdict"])[0], *push);
+    // On a busy machine the others need not be GOOD.
+    let sorted = place.run(&["list", "out", "--sort", "verdict", "--json"]).stdout;
+    let severity = |line: &str| {
+        let row: serde_json::Value = serde_json::from_str(line).expect("JSON");
+        ["BAD", "SUSPECT", "GOOD"].iter().position(|word| row["verdict"] == *word).expect("a verdict")
+    };
+    let severities: Vec<usize> = String::from_utf8(sorted).expect("text").lines().map(severity).collect();
+    assert!(severities.len() == 3 && severities.is_sorted() && severities[0] < 2, "{severities:?}");
     assert_eq!(listed(&place, &["--since", "2020-01-01", "--before", "2020-01-02"]), names(&[]));
     assert_eq!(listed(&place, &["--since", "2020-01-01", "--utc"]), all);
     let text = String::from_utf8(place.run(&["list", "out"]).stdout).expect("text");
