@@ -146,12 +146,17 @@ fn enter(running: &Running, place: &Place, program: &Command) -> Output {
 /// A run can be stopped whatever is full, damaged or gone.
 #[test]
 fn an_order_needs_no_memory_no_disk_and_no_bus() {
-    const FULL: &str = "mount -t tmpfs -o size=90m tmpfs /dev/shm && mount -t tmpfs -o size=4m tmpfs /tmp";
     if !may_mount() {
         return;
     }
     let place = Place::new();
-    let running = place.start_as(apart(&place, FULL, &["--sim", "--headless", "--json"]), "\"mask\":\"0x07\"");
+    // The program itself may lie below /tmp: its folder is put back.
+    let folder = Path::new(env!("CARGO_BIN_EXE_rapid")).parent().expect("a folder").display();
+    let full = format!(
+        "exec 3<'{folder}' && mount -t tmpfs -o size=90m tmpfs /dev/shm && mount -t tmpfs -o size=4m tmpfs /tmp && \
+         mkdir -p '{folder}' && mount --bind /proc/self/fd/3 '{folder}'"
+    );
+    let running = place.start_as(apart(&place, &full, &["--sim", "--headless", "--json"]), "\"mask\":\"0x07\"");
     let of = |path: &str| PathBuf::from(format!("/proc/{}/root{path}", running.pid()));
     for folder in ["/dev/shm", "/tmp"] {
         fill_up(&mut File::create(of(folder).join("fill")).expect("the run's memory"));
