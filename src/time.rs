@@ -1,6 +1,6 @@
 //! Time: capture times on the monotonic clock, and their place on the wall clock.
 //!
-//! Owns the only code that reads the system's clocks. A [`Stamp`] orders samples; the wall clock, which
+//! Owns the only code that reads the system's clocks, and the only use of the calendar and of time zones. A [`Stamp`] orders samples; the wall clock, which
 //! may be set at any moment, is always derived from it through a [`WallClock`] fixed at one moment.
 
 use std::time::Duration;
@@ -250,7 +250,17 @@ mod tests {
         }
         assert_eq!(rfc3339(1_770_287_400_250_000_000), "2026-02-05T10:30:00.250Z");
         assert_eq!(time_of_day(1_700_000_000_123_456_789), "22:13:20.123Z");
-        assert_eq!(compact_date(1_735_689_599_999_999_999), "20241231");
+        for (seconds, day) in [
+            (0, "19700101"),
+            (951_782_399, "20000228"),
+            (951_782_400, "20000229"),
+            (951_868_800, "20000301"),
+            (1_700_000_000, "20231114"),
+            (1_735_689_599, "20241231"),
+            (4_107_542_400, "21000301"),
+        ] {
+            assert_eq!(compact_date(seconds * 1_000_000_000), day);
+        }
         assert_eq!(rfc3339(u64::MAX), "2554-07-21T23:34:33.709Z");
     }
 
