@@ -220,11 +220,6 @@ fn write_table(
 
 fn line(row: &Row, name: &str, zone: &Zone, palette: Palette) -> String {
     let Listed { verdict, seconds, bytes, begin_ns, .. } = &row.listed;
-    let (word, shade) = match verdict {
-        Judgement::Episode(verdict) => (verdict.grade.word(), verdict.grade),
-        Judgement::NotOurs => ("-", Grade::Suspect),
-        Judgement::Unreadable(_) => ("?", Grade::Bad),
-    };
     let begun = if *begin_ns > 0 { zone.minute(*begin_ns) } else { String::new() };
     let label = row.label.map_or("", Label::word);
     let sensors = verdict.verdict().and_then(|verdict| verdict.sensors.as_ref());
@@ -233,7 +228,7 @@ fn line(row: &Row, name: &str, zone: &Zone, palette: Palette) -> String {
     let size = if row.listed.error.is_none() { text::size(*bytes) } else { String::new() };
     let line = format!(
         "{begun:16}  {}  {name}  {seconds:>8}  {size:>8}  {sensors:>5}  {label:7}  {}",
-        palette.grade(shade, &format!("{word:7}")),
+        verdict.column(palette),
         row.remarks()
     );
     line.trim_end().to_owned()

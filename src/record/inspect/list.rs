@@ -10,7 +10,6 @@ use super::render::clean;
 use super::{FileEnd, Inspection, Judgement, ReadError, inspect};
 use crate::episode::partial::PARTIAL;
 use crate::palette::Palette;
-use crate::status::Grade;
 use crate::text;
 
 /// An episode of a list. As JSON, one object a line.
@@ -122,12 +121,7 @@ pub fn list(file: &Path) -> Listed {
 /// The episode, called `name`, in a line without its end; `columns` are those of the longest name.
 pub fn render_list(listed: &Listed, name: &str, columns: usize, palette: Palette) -> String {
     let name = text::left(&clean(name), columns, "...");
-    let (word, shade) = match &listed.verdict {
-        Judgement::Episode(verdict) => (verdict.grade.word(), verdict.grade),
-        Judgement::NotOurs => ("-", Grade::Suspect),
-        Judgement::Unreadable(_) => ("?", Grade::Bad),
-    };
-    let mut line = format!("{}  {name}", palette.grade(shade, &format!("{word:7}")));
+    let mut line = format!("{}  {name}", listed.verdict.column(palette));
     if let Judgement::Episode(verdict) = &listed.verdict {
         let _ =
             write!(line, "  {:>8.1} s  {:>8}  {}", listed.seconds, text::size(listed.bytes), clean(&verdict.sensors()));

@@ -25,6 +25,7 @@ use super::quality::{Quality, Spread};
 use crate::episode::reader::Reader;
 use crate::episode::record_iter::Integrity;
 use crate::episode::{self, Failed, ReadAt};
+use crate::palette::Palette;
 use crate::status::{Grade, Sensors, Verdict};
 use crate::text;
 use collect::Collected;
@@ -212,6 +213,16 @@ impl Judgement {
     /// Its word, if there is one.
     pub fn grade(&self) -> Option<Grade> {
         self.verdict().map(|verdict| verdict.grade)
+    }
+
+    /// Its word for a column of a table, `-` for a file of another program, `?` for one that cannot be read.
+    pub fn column(&self, palette: Palette) -> String {
+        let (word, shade) = match self {
+            Self::Episode(verdict) => (verdict.grade.word(), verdict.grade),
+            Self::NotOurs => ("-", Grade::Suspect),
+            Self::Unreadable(_) => ("?", Grade::Bad),
+        };
+        palette.grade(shade, &format!("{word:7}"))
     }
 
     /// Why it is not GOOD, or has no verdict.
