@@ -223,14 +223,14 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let is_kept = !(is_single && options.record && options.screen != Screen::Monitor);
     let collection = Collection::new(recorder, episode, options.plan, is_kept, &board)?;
     let kind = options.screen;
-    let (to_hands, hands) = mpsc::unbounded_channel();
+    let (to_scenario, replugs) = mpsc::unbounded_channel();
     if matches!(options.devices, Devices::Simulated(_)) {
         board.set_simulated();
     }
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
         let alignment = alignment(&registry, bus)?;
-        let (discovery, plugged) = discovery::start(options.devices, &registry, hands)?;
+        let (discovery, plugged) = discovery::start(options.devices, &registry, replugs)?;
         // The inputs report their first state at once.
         let events = board.events();
         // Until the very end: a device that is being closed may still move.
@@ -251,7 +251,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         }
     };
     let (to_rig, rig_commands) = mpsc::channel(16);
-    let requests = requests::sorted(from_screen, asked, to_rig, to_hands);
+    let requests = requests::sorted(from_screen, asked, to_rig, to_scenario);
     let mask_ended = presence.ended();
     let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
     let streaming = Streaming::start(rig.obeying(&permission).tapped(watched.taps()), plugged, rig_commands);

@@ -19,16 +19,17 @@ const UDEV: &str = "/run/udev/control";
 /// Events that may wait for the rig, which takes them immediately.
 const DEPTH: usize = 64;
 
-/// Starts to watch; also returns the stream for the rig, which ends when the stage does. `hands` unplug simulated devices.
+/// Starts to watch; also returns the stream for the rig, which ends when the stage does. `requests` name simulated
+/// devices that are to be unplugged, or plugged in again.
 ///
 /// # Errors
 /// When plug events of this machine cannot be received.
 pub(super) fn start(
     devices: Devices,
     registry: &Registry,
-    hands: mpsc::UnboundedReceiver<String>,
+    requests: mpsc::UnboundedReceiver<String>,
 ) -> Result<(Stage, HotplugStream), AppError> {
-    let mut source = open(devices, registry, hands)?;
+    let mut source = open(devices, registry, requests)?;
     let (events, to_rig) = mpsc::channel(DEPTH);
     let stage = Stage::start("discovery", |stop| async move {
         loop {
@@ -51,10 +52,10 @@ pub(super) fn start(
 fn open(
     devices: Devices,
     registry: &Registry,
-    hands: mpsc::UnboundedReceiver<String>,
+    requests: mpsc::UnboundedReceiver<String>,
 ) -> Result<HotplugStream, AppError> {
     if let Devices::Simulated(scenario) = devices {
-        return Ok(Box::pin(Script::with_hands(scenario, hands)));
+        return Ok(Box::pin(Script::with_requests(scenario, requests)));
     }
     #[cfg(feature = "motors")]
     crate::driver::can::prepare(registry);

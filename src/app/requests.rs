@@ -30,7 +30,7 @@ pub(super) fn sorted(
     mut screen: mpsc::Receiver<Command>,
     mut asked: mpsc::Receiver<Asked>,
     rig: mpsc::Sender<RigCommand>,
-    hands: mpsc::UnboundedSender<String>,
+    scenario: mpsc::UnboundedSender<String>,
 ) -> mpsc::UnboundedReceiver<Request> {
     let (conductor, requests) = mpsc::unbounded_channel();
     let to_conductor = conductor.clone();
@@ -52,7 +52,7 @@ pub(super) fn sorted(
             let _ = match command {
                 Command::Session(request) => conductor.send(Request::Session(request, Stamp::now(), None)).is_ok(),
                 Command::Quit => conductor.send(Request::Quit).is_ok(),
-                Command::Plug(device) => hands.send(device).is_ok(),
+                Command::Plug(device) => scenario.send(device).is_ok(),
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
             };
         }

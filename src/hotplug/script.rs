@@ -25,7 +25,7 @@ pub struct Script {
     begin: Instant,
     timer: Pin<Box<Sleep>>,
     /// Names of devices that a person plugs in, or unplugs.
-    hands: Option<mpsc::UnboundedReceiver<String>>,
+    requests: Option<mpsc::UnboundedReceiver<String>>,
 }
 
 impl Script {
@@ -33,20 +33,20 @@ impl Script {
     pub fn new(scenario: Scenario) -> Self {
         let begin = Instant::now();
         let timer = Box::pin(sleep_until(begin));
-        Self { timeline: Timeline::new(scenario, Stamp::now()), begin, timer, hands: None }
+        Self { timeline: Timeline::new(scenario, Stamp::now()), begin, timer, requests: None }
     }
 
-    /// Likewise; besides, each device named by `hands` is unplugged, or plugged in again, at once.
-    pub fn with_hands(scenario: Scenario, hands: mpsc::UnboundedReceiver<String>) -> Self {
-        Self { hands: Some(hands), ..Self::new(scenario) }
+    /// Likewise; besides, each device named by `requests` is unplugged, or plugged in again, at once.
+    pub fn with_requests(scenario: Scenario, requests: mpsc::UnboundedReceiver<String>) -> Self {
+        Self { requests: Some(requests), ..Self::new(scenario) }
     }
 
-    /// Carries out what was requested by hand so far.
-    fn move_by_hand(&mut self, context: &mut Context<'_>) {
-        while let Some(hands) = &mut self.hands {
-            match hands.poll_recv(context) {
+    /// Carries out what was requested so far.
+    fn toggle_requested(&mut self, context: &mut Context<'_>) {
+        while let Some(requests) = &mut self.requests {
+            match requests.poll_recv(context) {
                 Poll::Ready(Some(name)) => self.timeline.toggle(&name, Stamp::now()),
-                Poll::Ready(None) => self.hands = None,
+                Poll::Ready(None) => self.requests = None,
                 Poll::Pending => return,
             }
         }
@@ -181,7 +181,7 @@ impl Stream for Script {
     type Item = Result<HotplugEvent, HotplugError>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.move_by_hand(context);
+        self.toggle_requested(context);
         loop {
             if let Some(event) = self.timeline.queue.pop_front() {
                 return Poll::Ready(Some(Ok(event)));
@@ -229,18 +229,18 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn hands_unplug_and_plug_in_between_the_events_of_the_scenario() {
-        let (hands, requested) = mpsc::unbounded_channel();
+    async fn requests_unplug_and_plug_in_between_the_events_of_the_scenario() {
+        let (sender, requested) = mpsc::unbounded_channel();
         let devices = vec![device("a", "1-1", true), device("b", "1-2", false)];
         let events = vec![event(100, "a", ScenarioAction::Unplug)];
-        let mut script = Script::with_hands(Scenario { devices, events, repeat: None }, requested);
+        let mut script = Script::with_requests(Scenario { devices, events, repeat: None }, requested);
         assert_eq!(word(&script.next().await.expect("open").expect("an event")), "+1-1");
         for (name, expected) in [("b", "+1-2"), ("b", "-/sim/1-2"), ("a", "-/sim/1-1"), ("a", "+1-1")] {
-            hands.send(name.to_owned()).expect("it listens");
+            sender.send(name.to_owned()).expect("it listens");
             assert_eq!(word(&script.next().await.expect("open").expect("an event")), expected);
         }
-        hands.send("nosuch".to_owned()).expect("it listens");
-        drop(hands);
+        sender.send("nosuch".to_owned()).expect("it listens");
+        drop(sender);
         assert_eq!(word(&script.next().await.expect("open").expect("an event")), "-/sim/1-1", "the scenario continues");
     }
 
