@@ -20,6 +20,7 @@ use crate::modality::ModalityId;
 use crate::observation::{HEAD_BYTES, SLOT_BYTES};
 use crate::registry::Registry;
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
+use crate::status::Board;
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
 use crate::time::Stamp;
 
@@ -37,12 +38,14 @@ pub struct Alignment {
     hz: f64,
     queues: Queues,
     writer: Arc<Writer>,
+    /// Receives the samples that screens look at: no other subscriber is needed for them.
+    board: Arc<Board>,
 }
 
 impl Alignment {
     /// Of the samples that reach `queues` from now on; `writer` is that of the topic of observations.
-    pub fn new(registry: &Registry, queues: Queues, writer: Arc<Writer>) -> Self {
-        Self { aligner: Aligner::new(registry), hz: registry.rig.observation_hz, queues, writer }
+    pub fn new(registry: &Registry, queues: Queues, writer: Arc<Writer>, board: Arc<Board>) -> Self {
+        Self { aligner: Aligner::new(registry), hz: registry.rig.observation_hz, queues, writer, board }
     }
 
     /// Publishes an observation at each tick until `stop`. Ticks that pass while the machine is suspended, or too slow
@@ -73,8 +76,13 @@ impl Alignment {
     }
 
     fn publish(&mut self, number: u64, tick: Stamp, now: Stamp) -> Result<(), BusError> {
-        let Self { aligner, queues, writer, .. } = self;
-        queues.drain(&mut |topic, header, payload| aligner.take(topic, header, payload))?;
+        let Self { aligner, queues, writer, board, .. } = self;
+        queues.drain(&mut |topic, header, payload| {
+            aligner.take(topic, header, payload);
+            if let TopicId::Modality(id) = topic {
+                board.preview(id, header, payload);
+            }
+        })?;
         let payload = aligner.observe(tick);
         let header = SampleHeader {
             seq: number,

@@ -10,6 +10,7 @@
 //! Invariant: whatever ends the run, an episode in progress is finished first.
 //! Invariant: an episode ends at the moment its end was requested, however slowly something closes after that.
 
+mod attached;
 mod bus_files;
 mod collection;
 mod conductor;
@@ -45,7 +46,7 @@ use crate::interlock::Interlocks;
 use crate::interlocks::{self, Watched};
 use crate::logging::{self, Stderr};
 use crate::mask::MASK_PATH;
-use crate::orders::receive::{Asked, Orders};
+use crate::orders::receive::{Arrival, Orders};
 use crate::panics;
 use crate::permission::Permission;
 use crate::record::{EpisodeRequest, RecorderConfig};
@@ -56,6 +57,7 @@ use crate::rig::presence::{Claim, Presence};
 use crate::session::journal::Plan;
 use crate::status::Board;
 use crate::time::Stamp;
+use attached::Attached;
 use collection::Collection;
 use conductor::Conductor;
 pub use error::AppError;
@@ -119,6 +121,8 @@ pub struct Options {
     pub duration: Option<Duration>,
     /// Separates this rig from others on the machine.
     pub instance: Option<String>,
+    /// Members of this process's group may attach screens and make requests, as this user may.
+    pub group_control: bool,
 }
 
 /// Where the mask of an instance is published.
@@ -144,8 +148,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     }
     raise_open_files();
     // Before anything that can fail on a full or damaged machine.
-    let (permission, _orders, asked) =
-        receive_orders(options.instance.as_deref(), options.arm, interlocks::of(&registry))?;
+    let (permission, _orders, arrivals) = receive_orders(&options, interlocks::of(&registry))?;
     let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
 
     bus::check_memory()?;
@@ -162,7 +165,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     // Without a policy, on order of another program too.
     let may_record = options.record || options.policy.is_none() || options.screen == Screen::Monitor;
     let reserve = registry.rig.disk_reserve;
-    let machine = Machine { registry, board: Arc::clone(&board), permission, signals, presence, asked };
+    let machine = Machine { registry, board: Arc::clone(&board), permission, signals, presence, arrivals };
     let watchman = bus.watchman();
     let (mut running, mut conductor) = start(machine, &bus, options).await?;
     // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
@@ -205,13 +208,13 @@ struct Machine {
     permission: Arc<Permission>,
     signals: Signals,
     presence: Presence,
-    /// Requests of other programs.
-    asked: mpsc::Receiver<Asked>,
+    /// Requests of other programs, and their screens.
+    arrivals: mpsc::Receiver<Arrival>,
 }
 
 /// Starts the stages and the screen. The bus must outlive them.
 async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running, Conductor), AppError> {
-    let Machine { registry, board, permission, signals, presence, asked } = machine;
+    let Machine { registry, board, permission, signals, presence, arrivals } = machine;
     let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let following = recorder.episode();
@@ -229,19 +232,20 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     }
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
-        let alignment = alignment(&registry, bus)?;
+        let alignment = alignment(&registry, bus, &board)?;
         let (discovery, plugged) = discovery::start(options.devices, &registry, replugs)?;
         // The inputs report their first state at once.
         let events = board.events();
         // Until the very end: a device that is being closed may still move.
         let watched = Watched::begin(&registry, &permission, &board).map_err(AppError::Interlocks)?;
         let (commands, from_screen) = mpsc::channel(16);
+        let attached = Attached::new(Arc::clone(&board), commands.clone());
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration);
         let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
         let inference = options.policy.map(start).transpose()?;
-        Ok((discovery, plugged, watched, from_screen, screen, inference, alignment))
+        Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment))
     };
-    let (discovery, plugged, watched, from_screen, screen, inference, alignment) = match others() {
+    let (discovery, plugged, watched, (from_screen, attached), screen, inference, alignment) = match others() {
         Ok(others) => others,
         Err(error) => {
             // The recorder's thread releases the bus before the bus is dropped: no files of it remain.
@@ -251,7 +255,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         }
     };
     let (to_rig, rig_commands) = mpsc::channel(16);
-    let requests = requests::sorted(from_screen, asked, to_rig, to_scenario);
+    let requests = requests::sorted(from_screen, (arrivals, attached), to_rig, to_scenario);
     let mask_ended = presence.ended();
     let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
     let streaming = Streaming::start(rig.obeying(&permission).tapped(watched.taps()), plugged, rig_commands);
@@ -281,9 +285,9 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     Ok((running, conductor))
 }
 
-fn alignment(registry: &Registry, bus: &Bus) -> Result<Alignment, AppError> {
+fn alignment(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Result<Alignment, AppError> {
     let Some(writer) = bus.writer(TopicId::Observation) else { return Err(AppError::Panicked("the bus")) };
-    Ok(Alignment::new(registry, bus.queues()?, writer))
+    Ok(Alignment::new(registry, bus.queues()?, writer, Arc::clone(board)))
 }
 
 /// Starts the stage synchronisation.
@@ -299,13 +303,14 @@ fn synchronise(alignment: Alignment) -> Stage {
 /// Receives orders of other programs to arm and disarm motors, and their requests to the session; and disarms motors at
 /// a signal, regardless of what else the run waits for.
 fn receive_orders(
-    instance: Option<&str>,
-    arm: bool,
+    options: &Options,
     interlocks: Interlocks,
-) -> Result<(Arc<Permission>, Orders, mpsc::Receiver<Asked>), AppError> {
-    let permission = Arc::new(Permission::new(arm).with_interlocks(interlocks));
-    let (session, asked) = mpsc::channel(16);
-    let orders = Orders::receive(instance, Arc::clone(&permission), session).map_err(AppError::Orders)?;
+) -> Result<(Arc<Permission>, Orders, mpsc::Receiver<Arrival>), AppError> {
+    let permission = Arc::new(Permission::new(options.arm).with_interlocks(interlocks));
+    let (run, arrivals) = mpsc::channel(16);
+    let group = options.group_control.then(|| rustix::process::getegid().as_raw());
+    let orders = Orders::receive(options.instance.as_deref(), group, Arc::clone(&permission), run);
+    let orders = orders.map_err(AppError::Orders)?;
     tokio::spawn({
         let (mut signals, permission) = (Signals::listen()?, Arc::clone(&permission));
         async move {
@@ -315,7 +320,7 @@ fn receive_orders(
             }
         }
     });
-    Ok((permission, orders, asked))
+    Ok((permission, orders, arrivals))
 }
 
 /// The screen has limits for a reader that does not read. This one is for a screen that is stuck: crossterm 0.29 reads

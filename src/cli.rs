@@ -79,6 +79,19 @@ Examples:
   rapid recover episodes
   rapid recover copied/20260101_place-block_001.mcap";
 
+const MONITOR: &str = "\
+It shows a rapid that runs without a screen, as a service or in another terminal, with the same keys; up to eight \
+may be attached. The run continues when the monitor or its connection ends. When the run ends, the \
+monitor shows its last state and waits for the next.
+
+Allowed are the user of the run, root and, if the run was started with --group-control as the service is, the \
+members of its group.
+
+Examples:
+  rapid monitor
+  rapid monitor --read-only --instance left
+  ssh -t rig rapid monitor                on another machine";
+
 const RUN: &str = "Run options";
 const GENERAL: &str = "General options";
 
@@ -115,7 +128,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "unregister" | "check" | "doctor" | "ablation" => &["config", "json"],
         "artifacts" => &["config"],
         "mask" | "replay" | "episode" | "session" => &["json", "instance"],
-        "arm" | "disarm" => &["instance"],
+        "arm" | "disarm" | "monitor" => &["instance"],
         "inspect" | "list" | "recover" | "eval" => &["json"],
         _ => &[],
     }
@@ -161,6 +174,12 @@ pub struct RunArgs {
     /// Observations per second [default: from the registry]
     #[arg(long, value_name = "HZ", value_parser = rate, hide_short_help = true)]
     pub rate: Option<f64>,
+    /// Let members of this process's group attach and control, as its user may
+    ///
+    /// They may attach monitors, make requests to the session, and arm and disarm. The service that `rapid artifacts`
+    /// writes has it: members of group rapid use it.
+    #[arg(long, hide_short_help = true)]
+    pub group_control: bool,
     /// Enable the actuator as soon as it is connected, instead of by `rapid arm` or the monitor
     #[arg(long, hide_short_help = true)]
     pub arm: bool,
@@ -260,6 +279,13 @@ pub enum Command {
         neither disk nor shared memory.\n\nExamples:\n  rapid disarm\n  rapid disarm --instance left"
     )]
     Disarm,
+    /// Open the monitor of a running rapid, which continues without it
+    #[command(after_long_help = MONITOR)]
+    Monitor {
+        /// Only look: no key changes anything in the run
+        #[arg(long)]
+        read_only: bool,
+    },
     /// Begin, end, discard or label episodes of a running rapid
     #[command(after_long_help = session::EPISODE)]
     Episode {

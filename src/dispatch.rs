@@ -105,6 +105,9 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             Ok(commands::arm::order(global.instance.as_deref(), order, out)?)
         }
         Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
+        Command::Monitor { read_only } => {
+            block_on(commands::monitor::monitor(global.instance.as_deref(), read_only))?.map_err(Failure::from)
+        }
         Command::Episode { what } => {
             Ok(commands::session::ask(global.instance.as_deref(), &what.into_request(), format, out)?)
         }
@@ -297,6 +300,7 @@ fn run(
         arm: args.arm,
         duration: args.duration,
         instance: global.instance.clone(),
+        group_control: args.group_control,
     };
     Ok(block_on(app::run(options))??)
 }
@@ -491,6 +495,10 @@ failures! {
     commands::artifacts::ArtifactsError: |_| 1;
     commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
     commands::session::RequestError: |_| 1;
+    commands::monitor::MonitorError: |error| match error {
+        commands::monitor::MonitorError::Give(_) => 3,
+        commands::monitor::MonitorError::Link { .. } | commands::monitor::MonitorError::Screen(_) => 1,
+    };
     commands::arm::OrderError: |error| match error {
         commands::arm::OrderError::Give(_) => 3,
         commands::arm::OrderError::Output(_) => 1,

@@ -19,7 +19,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::time::Duration;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::action::{Order, Trip};
 use crate::time::Stamp;
@@ -31,7 +31,7 @@ pub const MAX_STOPS: usize = 16;
 pub const SETTLES_IN: Duration = Duration::from_millis(100);
 
 /// What an input stops.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StopKind {
     /// An emergency stop: the joints stop as each is configured, and stay stopped until an arm.
@@ -61,7 +61,7 @@ impl StopKind {
 }
 
 /// The state that an input reports.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum InputState {
     /// The actuator may move.

@@ -30,7 +30,7 @@ use tracing_subscriber::{Layer, Registry};
 use crate::headless::ERASE_LINE;
 use crate::palette::Palette;
 use crate::panics;
-use crate::status::{Board, Level, LogLine};
+use crate::status::{Board, Level};
 use crate::text;
 use crate::time::realtime_ns;
 
@@ -129,6 +129,15 @@ fn filter_of(chosen: &str) -> Result<EnvFilter, ParseError> {
     Ok(EnvFilter::try_new(chosen)?.add_directive(format!("{}=error", panics::TARGET).parse()?))
 }
 
+/// A formatted line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct LogLine {
+    /// Wall time, ns since 1970.
+    wall_ns: u64,
+    level: Level,
+    text: String,
+}
+
 /// Receives formatted lines.
 trait Sink: 'static {
     fn take(&self, line: LogLine);
@@ -136,7 +145,7 @@ trait Sink: 'static {
 
 impl Sink for Arc<Board> {
     fn take(&self, line: LogLine) {
-        self.log(line);
+        self.log(line.level, &line.text);
     }
 }
 

@@ -14,8 +14,27 @@ pub const MAX_MODALITIES: usize = 64;
 
 /// Number of a modality, `0..64`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(transparent)]
+#[serde(try_from = "u8", into = "u8")]
 pub struct ModalityId(u8);
+
+/// A number that is no bit of the mask.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("{0} is no bit of the mask: 0 to 63 are")]
+pub struct NoModality(u8);
+
+impl TryFrom<u8> for ModalityId {
+    type Error = NoModality;
+
+    fn try_from(bit: u8) -> Result<Self, NoModality> {
+        Self::new(bit).ok_or(NoModality(bit))
+    }
+}
+
+impl From<ModalityId> for u8 {
+    fn from(id: ModalityId) -> Self {
+        id.0
+    }
+}
 
 impl ModalityId {
     /// `Some` when `bit` is below [`MAX_MODALITIES`].

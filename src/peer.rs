@@ -5,6 +5,9 @@ use std::mem::size_of;
 use std::os::fd::AsRawFd;
 use std::os::unix::net::UnixStream;
 
+/// Groups of a process, at most (`NGROUPS_MAX`, linux/limits.h).
+const MOST_GROUPS: usize = 65_536;
+
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Peer {
@@ -12,6 +15,8 @@ pub struct Peer {
     pub process: Option<u32>,
     /// Its user.
     pub user: u32,
+    /// Its primary group.
+    pub group: u32,
 }
 
 impl Peer {
@@ -35,7 +40,29 @@ impl Peer {
         if outcome != 0 {
             return Err(io::Error::last_os_error());
         }
-        Ok(Self { process: u32::try_from(found.pid).ok().filter(|pid| *pid != 0), user: found.uid })
+        Ok(Self { process: u32::try_from(found.pid).ok().filter(|pid| *pid != 0), user: found.uid, group: found.gid })
+    }
+
+    /// Whether the process that created the other end of `stream` is a member of `group`, by its primary or another
+    /// group (`SO_PEERGROUPS`, since Linux 4.13). No, where the kernel does not report it.
+    pub fn is_member(stream: &UnixStream, group: u32) -> bool {
+        if Self::of(stream).is_ok_and(|peer| peer.group == group) {
+            return true;
+        }
+        let mut groups = vec![0_u32; MOST_GROUPS];
+        let mut length = libc::socklen_t::try_from(size_of::<u32>() * groups.len()).unwrap_or_default();
+        // SAFETY: both outlive the call, and `length` is the size of `groups`, for which all bytes are valid.
+        let outcome = unsafe {
+            libc::getsockopt(
+                stream.as_raw_fd(),
+                libc::SOL_SOCKET,
+                libc::SO_PEERGROUPS,
+                groups.as_mut_ptr().cast(),
+                &raw mut length,
+            )
+        };
+        let found = usize::try_from(length).unwrap_or_default() / size_of::<u32>();
+        outcome == 0 && groups.iter().take(found).any(|found| *found == group)
     }
 }
 
@@ -46,7 +73,12 @@ mod tests {
     #[test]
     fn the_other_end_of_a_pair_is_this_process() {
         let (one, _other) = UnixStream::pair().unwrap();
-        let user = rustix::process::geteuid().as_raw();
-        assert_eq!(Peer::of(&one).unwrap(), Peer { process: Some(std::process::id()), user });
+        let (user, group) = (rustix::process::geteuid().as_raw(), rustix::process::getegid().as_raw());
+        assert_eq!(Peer::of(&one).unwrap(), Peer { process: Some(std::process::id()), user, group });
+        assert!(Peer::is_member(&one, group));
+        for other in rustix::process::getgroups().unwrap() {
+            assert!(Peer::is_member(&one, other.as_raw()));
+        }
+        assert!(!Peer::is_member(&one, u32::MAX - 1));
     }
 }

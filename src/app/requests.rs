@@ -3,10 +3,13 @@
 //! Invariant: a request to the rig never waits for a file: it does not pass through the conductor, which waits for
 //! files to be closed. Orders to the actuator take a separate path ([`crate::permission`]).
 
+use std::sync::Arc;
+
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::spawn_blocking;
 
-use crate::orders::receive::Asked;
+use super::attached::Attached;
+use crate::orders::receive::Arrival;
 use crate::rig::RigCommand;
 use crate::status::Command;
 use crate::status::session::SessionRequest;
@@ -28,14 +31,21 @@ pub(super) enum Request {
 /// an unbounded queue: a person types them, and other programs wait for an answer to each.
 pub(super) fn sorted(
     mut screen: mpsc::Receiver<Command>,
-    mut asked: mpsc::Receiver<Asked>,
+    (mut arrivals, attached): (mpsc::Receiver<Arrival>, Attached),
     rig: mpsc::Sender<RigCommand>,
     scenario: mpsc::UnboundedSender<String>,
 ) -> mpsc::UnboundedReceiver<Request> {
     let (conductor, requests) = mpsc::unbounded_channel();
-    let to_conductor = conductor.clone();
+    let (to_conductor, board) = (conductor.clone(), Arc::clone(attached.board()));
     tokio::spawn(async move {
-        while let Some(asked) = asked.recv().await {
+        while let Some(arrival) = arrivals.recv().await {
+            let asked = match arrival {
+                Arrival::Asked(asked) => asked,
+                Arrival::Viewer(viewer) => {
+                    attached.attach(viewer);
+                    continue;
+                }
+            };
             let (reply, answer) = oneshot::channel();
             let request = Request::Session(asked.request.clone(), asked.at, Some(reply));
             // A receiver is gone only when the run ends; so is then the other end of the answer.
@@ -53,6 +63,10 @@ pub(super) fn sorted(
                 Command::Session(request) => conductor.send(Request::Session(request, Stamp::now(), None)).is_ok(),
                 Command::Quit => conductor.send(Request::Quit).is_ok(),
                 Command::Plug(device) => scenario.send(device).is_ok(),
+                Command::Look(id) => {
+                    board.look(id, Stamp::now());
+                    true
+                }
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
             };
         }
@@ -64,12 +78,14 @@ pub(super) fn sorted(
 mod tests {
     use super::*;
     use crate::modality::ModalityId;
+    use crate::status::literal::board;
 
     #[tokio::test]
     async fn the_rig_is_reached_while_the_conductor_is_busy() {
         let (screen, from_screen) = mpsc::channel(1);
         let (rig, mut at_rig) = mpsc::channel(1);
-        let mut requests = sorted(from_screen, mpsc::channel(1).1, rig, mpsc::unbounded_channel().0);
+        let attached = Attached::new(Arc::new(board(&["a"])), screen.clone());
+        let mut requests = sorted(from_screen, (mpsc::channel(1).1, attached), rig, mpsc::unbounded_channel().0);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }

@@ -11,6 +11,7 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket
 use super::{Answer, DONE, LONGEST, LONGEST_ANSWER, instance_part, line, this_user};
 use crate::action::Order;
 use crate::peer::Peer;
+use crate::status::attach::ATTACH;
 use crate::status::session::SessionRequest;
 use crate::text::plain;
 use crate::time::Stamp;
@@ -144,21 +145,36 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
 /// # Errors
 /// When no run has carried it out.
 pub fn request(instance: Option<&str>, request: &SessionRequest) -> Result<String, GiveError> {
-    let sockets = String::from_utf8_lossy(&fs::read(SOCKETS)?).into_owned();
-    let (mut runs, _) = runs(&sockets, instance)?;
-    let run = match (runs.pop(), runs.is_empty()) {
-        (Some(run), true) => run,
-        (Some(last), false) => {
-            return Err(GiveError::Several(runs.iter().chain([&last]).map(|run| run.process).collect()));
-        }
-        (None, _) => {
-            let others = sockets.lines().filter_map(|line| other_of(line, instance)).collect();
-            return Err(GiveError::NoRun { instance: instance.map(str::to_owned), others });
-        }
-    };
+    let run = the_run(instance)?;
     let process = run.process;
     let answer = run.ask(request).map_err(|error| GiveError::Unanswered { process, error })?;
     if answer.ok { Ok(answer.text) } else { Err(GiveError::Refused { process, why: answer.text }) }
+}
+
+/// Attaches a screen to the run of `instance`: the link to it and its process.
+///
+/// # Errors
+/// When there is no such run, or several.
+pub fn attach(instance: Option<&str>, read_only: bool) -> Result<(UnixStream, u32), GiveError> {
+    let Run { mut stream, process, .. } = the_run(instance)?;
+    let word = ATTACH[usize::from(read_only)];
+    let asked = stream.write_all(format!("{word}\n").as_bytes());
+    asked.map_err(|error| GiveError::Unanswered { process, error })?;
+    Ok((stream, process))
+}
+
+/// The one run of `instance`.
+fn the_run(instance: Option<&str>) -> Result<Run, GiveError> {
+    let sockets = String::from_utf8_lossy(&fs::read(SOCKETS)?).into_owned();
+    let (mut runs, _) = runs(&sockets, instance)?;
+    match (runs.pop(), runs.is_empty()) {
+        (Some(run), true) => Ok(run),
+        (Some(last), false) => Err(GiveError::Several(runs.iter().chain([&last]).map(|run| run.process).collect())),
+        (None, _) => {
+            let others = sockets.lines().filter_map(|line| other_of(line, instance)).collect();
+            Err(GiveError::NoRun { instance: instance.map(str::to_owned), others })
+        }
+    }
 }
 
 fn is_of_this_user(process: u32) -> bool {
@@ -170,9 +186,17 @@ struct Run {
     stream: UnixStream,
     process: u32,
     user: u32,
+    group: u32,
 }
 
 impl Run {
+    /// Whether a run of another user may accept what this one sends.
+    fn is_permitted(&self) -> bool {
+        let is_member =
+            || rustix::process::getgroups().is_ok_and(|all| all.iter().any(|one| one.as_raw() == self.group));
+        this_user() == 0 || rustix::process::getegid().as_raw() == self.group || is_member()
+    }
+
     fn send(mut self, order: Order, given: Stamp) -> io::Result<UnixStream> {
         self.stream.write_all(line(order, given).as_bytes())?;
         Ok(self.stream)
@@ -192,7 +216,7 @@ impl Run {
     }
 }
 
-/// Those of this user; where root has none, everyone's. And the process numbers, taken from the names of their sockets,
+/// Those of this user; if it has none, those of a group that it is a member of, and for root everyone's. And the process numbers, taken from the names of their sockets,
 /// of those that accepted no connection.
 ///
 /// Any user can create a socket with such a name and accept nothing: none is waited for while another can be reached.
@@ -213,7 +237,11 @@ fn runs(sockets: &str, instance: Option<&str>) -> io::Result<(Vec<Run>, Vec<u32>
         }
         if busy.is_empty() || !ours.is_empty() || Stamp::now() >= end {
             let busy = busy.iter().filter_map(|name| process_of(name)).collect();
-            return Ok((if ours.is_empty() && this_user() == 0 { others } else { ours }, busy));
+            if ours.is_empty() {
+                ours = others;
+                ours.retain(Run::is_permitted);
+            }
+            return Ok((ours, busy));
         }
         names = busy;
         std::thread::sleep(BUSY_AGAIN);
@@ -230,10 +258,10 @@ fn connect(name: &str) -> io::Result<Run> {
     stream.set_nonblocking(false)?;
     stream.set_read_timeout(Some(ANSWER_LIMIT))?;
     stream.set_write_timeout(Some(ANSWER_LIMIT))?;
-    let Peer { process, user } = Peer::of(&stream)?;
+    let Peer { process, user, group } = Peer::of(&stream)?;
     // The number in the socket's name, where its processes are not visible from here.
     let process = process.or_else(|| process_of(name)).unwrap_or_default();
-    Ok(Run { stream, process, user })
+    Ok(Run { stream, process, user, group })
 }
 
 /// The process in the name of a socket.

@@ -10,10 +10,11 @@
 //! is one line, `arm NS` or `disarm NS` with the time at which it was given (`CLOCK_MONOTONIC`, ns); the answer is one
 //! line, `done` or the reason of the refusal, and the connection is closed. A request is one line of JSON, a
 //! [`SessionRequest`](crate::status::session::SessionRequest); so is its [`Answer`], which comes when what was requested is done: when the file of an episode is
-//! closed, or when one has begun.
+//! closed, or when one has begun. A screen sends `attach`, and the connection becomes its link ([`crate::status::attach`]).
 //!
-//! Invariant: orders of this user and of root are accepted, and of no one else; they are given to a run of this user,
-//! or by root to anyone's.
+//! Invariant: orders of this user and of root are accepted, those of members of a group if the run was started so
+//! (`--group-control`), and of no one else. They are given to a run of this user, or else to one whose group the sender
+//! is a member of, or by root to anyone's.
 //! Invariant: an arm counts only while its sender waits for the answer, and within a second: see
 //! [`Permission`](crate::permission::Permission). A disarm counts however late it arrives.
 

@@ -1,6 +1,6 @@
 //! The run's side: thread `orders`, which receives orders over the socket.
 //!
-//! Requests to the session are handed to the run, which answers them.
+//! Requests to the session are handed to the run, which answers them, and so are screens that are to be attached.
 //!
 //! Invariant: it writes to no file and no terminal, and does not wait for a peer: a connection that sends nothing, or
 //! does not read its answer, delays no other.
@@ -20,6 +20,7 @@ use super::{Answer, DONE, LONGEST, address, name, order, this_user};
 use crate::action::Order;
 use crate::peer::Peer;
 use crate::permission::Permission;
+use crate::status::attach::ATTACH;
 use crate::status::session::SessionRequest;
 use crate::time::Stamp;
 
@@ -51,6 +52,34 @@ impl Asked {
     }
 }
 
+/// A screen of another process.
+#[derive(Debug)]
+pub struct Viewer {
+    /// The link to it.
+    pub stream: UnixStream,
+    /// It makes no requests.
+    pub read_only: bool,
+}
+
+/// What the run is to handle.
+#[derive(Debug)]
+pub enum Arrival {
+    /// A request to the session.
+    Asked(Asked),
+    /// A screen is to be attached.
+    Viewer(Viewer),
+}
+
+impl Arrival {
+    fn refuse(self) {
+        let why = "the run does not take requests at the moment";
+        match self {
+            Self::Asked(asked) => asked.answer(Err(why.to_owned())),
+            Self::Viewer(mut viewer) => drop(viewer.stream.write_all(format!("{why}\n").as_bytes())),
+        }
+    }
+}
+
 /// Takes orders until it is dropped.
 #[derive(Debug)]
 pub struct Orders {
@@ -59,16 +88,22 @@ pub struct Orders {
 }
 
 impl Orders {
-    /// Takes orders for the run of `instance` from now on, and hands over requests to its session.
+    /// Takes orders for the run of `instance` from now on, and hands over requests to its session and screens that are to
+    /// be attached. With `group`, members of that group have the same rights as this user.
     ///
     /// # Errors
     /// When the system provides no socket or no thread.
-    pub fn receive(instance: Option<&str>, permission: Arc<Permission>, session: Sender<Asked>) -> io::Result<Self> {
+    pub fn receive(
+        instance: Option<&str>,
+        group: Option<u32>,
+        permission: Arc<Permission>,
+        run: Sender<Arrival>,
+    ) -> io::Result<Self> {
         let listener = UnixListener::bind_addr(&address(&name(this_user(), instance, std::process::id()))?)?;
         listener.set_nonblocking(true)?;
         let stop = Arc::new(eventfd(0, EventfdFlags::CLOEXEC)?);
-        let desk =
-            Desk { listener, stop: Arc::clone(&stop), waiting: Vec::with_capacity(CONNECTIONS), permission, session };
+        let waiting = Vec::with_capacity(CONNECTIONS);
+        let desk = Desk { listener, stop: Arc::clone(&stop), waiting, permission, run, group };
         let thread = std::thread::Builder::new().name("orders".to_owned()).spawn(move || desk.work())?;
         Ok(Self { stop, thread: Some(thread) })
     }
@@ -96,7 +131,8 @@ struct Desk {
     stop: Arc<OwnedFd>,
     waiting: Vec<Waiting>,
     permission: Arc<Permission>,
-    session: Sender<Asked>,
+    run: Sender<Arrival>,
+    group: Option<u32>,
 }
 
 impl Desk {
@@ -131,7 +167,9 @@ impl Desk {
 
     fn accept(&mut self, now: Stamp) {
         while let Ok((stream, _)) = self.listener.accept() {
-            let is_allowed = Peer::of(&stream).is_ok_and(|peer| peer.user == this_user() || peer.user == 0);
+            let is_member = |group| Peer::is_member(&stream, group);
+            let is_allowed = Peer::of(&stream).is_ok_and(|peer| peer.user == this_user() || peer.user == 0)
+                || self.group.is_some_and(is_member);
             if !is_allowed || stream.set_nonblocking(true).is_err() {
                 continue;
             }
@@ -148,13 +186,14 @@ impl Desk {
         match taken {
             Taken::Nothing if now.since(one.since) < PATIENCE => self.waiting.push(one),
             Taken::Nothing | Taken::All => {}
-            Taken::Request(request) => {
-                let asked = Asked { request, at: now, stream: one.stream };
-                if let Err(refused) = self.session.try_send(asked) {
-                    let (TrySendError::Full(asked) | TrySendError::Closed(asked)) = refused;
-                    asked.answer(Err("the run does not take requests at the moment".to_owned()));
-                }
-            }
+            Taken::Request(request) => self.hand_over(Arrival::Asked(Asked { request, at: now, stream: one.stream })),
+            Taken::Attach { read_only } => self.hand_over(Arrival::Viewer(Viewer { stream: one.stream, read_only })),
+        }
+    }
+
+    fn hand_over(&self, arrival: Arrival) {
+        if let Err(TrySendError::Full(arrival) | TrySendError::Closed(arrival)) = self.run.try_send(arrival) {
+            arrival.refuse();
         }
     }
 }
@@ -168,6 +207,8 @@ enum Taken {
     All,
     /// This.
     Request(SessionRequest),
+    /// The wish to be attached as a screen.
+    Attach { read_only: bool },
 }
 
 impl Waiting {
@@ -191,6 +232,9 @@ impl Waiting {
                 Ok(request) => return Taken::Request(request),
                 Err(error) => return self.reply(&format!("not a request: {error}")),
             }
+        }
+        if let Some(place) = line.and_then(|line| ATTACH.iter().position(|word| *word == line)) {
+            return Taken::Attach { read_only: place == 1 };
         }
         let answer = match line.and_then(order) {
             None => "not an order: write `arm NS` or `disarm NS`, or a request as JSON".to_owned(),

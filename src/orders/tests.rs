@@ -7,8 +7,8 @@ use std::sync::Arc;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, listen, socket_with};
 use tokio::sync::mpsc::{Receiver, channel};
 
-use super::give::{GiveError, give, request};
-use super::receive::{Asked, Orders};
+use super::give::{GiveError, attach, give, request};
+use super::receive::{Arrival, Asked, Orders};
 use super::*;
 use crate::permission::{Attended, Permission};
 use crate::status::session::SessionRequest;
@@ -18,15 +18,15 @@ use Order::{Arm, Disarm};
 struct Run {
     instance: String,
     permission: Arc<Permission>,
-    requests: Receiver<Asked>,
+    requests: Receiver<Arrival>,
     _orders: Orders,
 }
 
 fn run(test: &str) -> Run {
     let instance = format!("orders-{test}-{}", std::process::id());
     let permission = Arc::new(Permission::new(false));
-    let (session, requests) = channel(2);
-    let orders = Orders::receive(Some(&instance), Arc::clone(&permission), session).unwrap();
+    let (arrivals, requests) = channel(2);
+    let orders = Orders::receive(Some(&instance), None, Arc::clone(&permission), arrivals).unwrap();
     Run { instance, permission, requests, _orders: orders }
 }
 
@@ -34,6 +34,13 @@ impl Run {
     fn connect(&self) -> UnixStream {
         let name = name(this_user(), Some(&self.instance), std::process::id());
         UnixStream::connect_addr(&address(&name).unwrap()).unwrap()
+    }
+
+    fn asked(&mut self) -> Asked {
+        match self.requests.blocking_recv() {
+            Some(Arrival::Asked(asked)) => asked,
+            other => panic!("{other:?}"),
+        }
     }
 
     fn give(&self, order: Order) -> Result<(), String> {
@@ -178,19 +185,19 @@ fn a_request_is_answered_when_the_run_answers_it() {
     let instance = run.instance.clone();
     let sent = note.clone();
     let giver = std::thread::spawn(move || request(Some(&instance), &sent).map_err(|error| error.to_string()));
-    let asked = run.requests.blocking_recv().unwrap();
+    let asked = run.asked();
     assert_eq!(asked.request, note);
     asked.answer(Ok("noted\nin two lines".to_owned()));
     assert_eq!(giver.join().unwrap(), Ok("noted\nin two lines".to_owned()));
     // An answer longer than a socket holds.
     let instance = run.instance.clone();
     let giver = std::thread::spawn(move || request(Some(&instance), &SessionRequest::Stop).unwrap_err().to_string());
-    run.requests.blocking_recv().unwrap().answer(Err("x".repeat(1 << 20)));
+    run.asked().answer(Err("x".repeat(1 << 20)));
     assert!(giver.join().unwrap().len() > 1 << 20);
     // The run ends without an answer.
     let instance = run.instance.clone();
     let giver = std::thread::spawn(move || request(Some(&instance), &SessionRequest::Stop));
-    drop(run.requests.blocking_recv().unwrap());
+    drop(run.asked());
     assert!(matches!(giver.join().unwrap(), Err(GiveError::Unanswered { .. })));
 }
 
@@ -207,7 +214,7 @@ fn what_is_no_request_is_refused_and_disturbs_nothing() {
     let mut gone = run.connect();
     gone.write_all(b"{\"do\":\"stop\"}\n").unwrap();
     drop(gone);
-    let asked = run.requests.blocking_recv().unwrap();
+    let asked = run.asked();
     assert_eq!(asked.request, SessionRequest::Stop);
     asked.answer(Ok(String::new()));
     // With its queue full, a run still answers.
@@ -227,4 +234,22 @@ fn what_is_no_request_is_refused_and_disturbs_nothing() {
     assert!(answer.contains("does not take requests"), "{answer}");
     drop(waiting);
     assert_eq!(run.give(Disarm), Ok(()));
+}
+
+#[test]
+fn a_screen_is_handed_over_and_does_not_count_as_a_connection() {
+    let mut run = run("screen");
+    for read_only in [false, true] {
+        let (mut link, process) = attach(Some(&run.instance), read_only).unwrap();
+        assert_eq!(process, std::process::id());
+        let Some(Arrival::Viewer(mut viewer)) = run.requests.blocking_recv() else { panic!("no screen") };
+        assert_eq!(viewer.read_only, read_only);
+        viewer.stream.set_nonblocking(false).unwrap();
+        viewer.stream.write_all(b"hello\n").unwrap();
+        drop(viewer);
+        let mut received = String::new();
+        link.read_to_string(&mut received).unwrap();
+        assert_eq!(received, "hello\n");
+    }
+    assert!(matches!(attach(Some("no-such-rig"), false), Err(GiveError::NoRun { .. })));
 }

@@ -423,7 +423,7 @@ impl OpenEpisode {
         let text = event.what.describe().sentence;
         let report = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
         self.file.event(self.events, event.stamp, &report)?;
-        if let What::Log { level, text } = &event.what {
+        if let What::Log { level, text } | What::Printed { level, text, .. } = &event.what {
             self.file.log(self.logs, event.stamp, *level, text)?;
             self.logs += 1;
         }

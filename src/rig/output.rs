@@ -11,7 +11,7 @@ use tokio::time::sleep;
 
 use super::logbook::Logbook;
 use super::programs::Programs;
-use crate::status::{Board, Level, What};
+use crate::status::{Board, Level, PrintedOn, What};
 use crate::text;
 use crate::time::Stamp;
 
@@ -87,7 +87,7 @@ impl Output {
             if let Some(lines) = self.lines.get_mut(index)
                 && let Some(line) = lines.rest()
             {
-                self.print(&line);
+                self.print(index, &line);
             }
         }
         self.notify();
@@ -105,16 +105,18 @@ impl Output {
         lines.closed = read == 0;
         let complete = lines.take(chunk.get(..read).unwrap_or_default());
         for line in complete {
-            self.print(&line);
+            self.print(index, &line);
         }
     }
 
-    fn print(&mut self, line: &str) {
+    fn print(&mut self, index: usize, line: &str) {
         if !self.limit.allows(Stamp::now()) {
             self.left_out += 1;
             return;
         }
-        self.note(Level::Info, line);
+        let text = self.keep(line);
+        let (device, printed) = (self.device.clone(), if index == 0 { PrintedOn::Stdout } else { PrintedOn::Stderr });
+        self.board.announce(What::Printed { level: Level::Info, device, printed, text });
     }
 
     fn notify(&mut self) {
@@ -127,10 +129,15 @@ impl Output {
 
     /// Adds a line to the log and to the device's file.
     pub(super) fn note(&self, level: Level, line: &str) {
+        let text = self.keep(line);
+        self.board.announce(What::Log { level, text });
+    }
+
+    /// Adds a line to the device's file; the line as it is for the log.
+    fn keep(&self, line: &str) -> String {
         let line = format!("{}{line}", self.whose);
         self.logbook.write(&self.device, &line);
-        let text = format!("{}: {line}", self.device);
-        self.board.announce(What::Log { level, text });
+        format!("{}: {line}", self.device)
     }
 }
 

@@ -6,28 +6,29 @@
 //! Invariant: per-sample data are atomics; the locks here guard data that changes at most a few times a second, and are
 //! never held while waiting.
 
-use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
+use super::preview::{LOOKED_AT, Preview};
 use super::session::SessionStatus;
 use super::{
-    DeviceStatus, Event, Grade, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, StopStatus, Verdict, What,
+    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, PrintedOn, RecordingStatus, SlotState, Snapshot,
+    StopStatus, Verdict, What,
 };
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::{DeviceSpec, InterlockSpec, Registry};
-use crate::sample::Epoch;
+use crate::sample::{Epoch, SampleHeader};
 use crate::text;
 use crate::time::{Stamp, realtime_ns};
 
 /// Log lines kept for the screen.
-const LOG_LINES: usize = 500;
+const LOG_LINES: usize = 2000;
 /// Events a slow reader may fall behind before it misses some; it is then notified.
 const EVENT_DEPTH: usize = 4096;
 
@@ -120,6 +121,14 @@ fn shift(from: &mut Vec<(PathBuf, Grade)>, to: &mut Vec<(PathBuf, Grade)>, file:
     }
 }
 
+/// The newest lines of the log.
+#[derive(Debug, Default)]
+struct Log {
+    lines: VecDeque<Arc<LogLine>>,
+    /// All lines so far.
+    added: u64,
+}
+
 #[derive(Debug, Clone, Default)]
 struct SlotStatus {
     state: SlotState,
@@ -147,7 +156,10 @@ pub struct Board {
     simulated: AtomicBool,
     last_end: Mutex<Option<EpisodeEnd>>,
     episodes: Mutex<EpisodeCounts>,
-    log: Mutex<VecDeque<LogLine>>,
+    log: Mutex<Log>,
+    /// Until when a modality is looked at.
+    looks: Vec<AtomicU64>,
+    previews: Mutex<Vec<Arc<Preview>>>,
     events: broadcast::Sender<Event>,
 }
 
@@ -190,7 +202,9 @@ impl Board {
             simulated: AtomicBool::new(false),
             last_end: Mutex::new(None),
             episodes: Mutex::new(EpisodeCounts::default()),
-            log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
+            log: Mutex::new(Log::default()),
+            looks: (0..MAX_MODALITIES).map(|_| AtomicU64::new(0)).collect(),
+            previews: Mutex::new(Vec::new()),
             events: broadcast::channel(EVENT_DEPTH).0,
         }
     }
@@ -276,22 +290,33 @@ impl Board {
         *lock(&self.disk_free) = free;
     }
 
-    /// Adds a line to the log, without characters from a device that could move a terminal's cursor.
-    pub fn log(&self, mut line: LogLine) {
-        if let Cow::Owned(plain) = text::plain(&line.text) {
-            line.text = plain;
-        }
+    /// Adds a line to the log, now. The device that it is about is the one with which it begins.
+    pub fn log(&self, level: Level, text: &str) {
+        self.add(level, text, (self.device_in(text), None));
+    }
+
+    fn device_in(&self, text: &str) -> Option<&str> {
+        let begins = |name: &str| text.strip_prefix(name).is_some_and(|rest| rest.starts_with([':', ' ', ',']));
+        self.entries.iter().map(|entry| entry.name.as_str()).find(|name| begins(name))
+    }
+
+    /// Without characters from a device that could move a terminal's cursor.
+    fn add(&self, level: Level, text: &str, (device, printed): (Option<&str>, Option<PrintedOn>)) {
+        let (text, device) = (text::plain(text).into_owned(), device.map(str::to_owned));
         let mut log = lock(&self.log);
-        if log.len() == LOG_LINES {
-            log.pop_front();
+        let line = LogLine { number: log.added, wall_ns: realtime_ns(), level, device, printed, text };
+        log.added += 1;
+        if log.lines.len() == LOG_LINES {
+            log.lines.pop_front();
         }
-        log.push_back(line);
+        log.lines.push_back(Arc::new(line));
     }
 
     /// Announces an event, now, to all subscribers, and adds it to the log.
     pub fn announce(&self, what: What) {
         if let Some((level, text)) = what.log_line() {
-            self.log(LogLine { wall_ns: realtime_ns(), level, text });
+            let (device, printed) = what.source();
+            self.add(level, &text, (device.or_else(|| self.device_in(&text)), printed));
         }
         if let What::Episode { file, seconds, error, verdict, .. } = &what {
             let (file, error, verdict) = (file.clone(), error.clone(), verdict.clone());
@@ -315,6 +340,43 @@ impl Board {
     /// All events from now on.
     pub fn events(&self) -> broadcast::Receiver<Event> {
         self.events.subscribe()
+    }
+
+    /// A screen looks at a device, from `now` on for [`LOOKED_AT`].
+    pub fn look(&self, id: ModalityId, now: Stamp) {
+        if let Some(until) = self.looks.get(id.index()) {
+            until.store(now.after(LOOKED_AT).0, Ordering::Relaxed);
+        }
+    }
+
+    fn is_looked_at(&self, id: ModalityId, now: Stamp) -> bool {
+        self.looks.get(id.index()).is_some_and(|until| until.load(Ordering::Relaxed) > now.0)
+    }
+
+    /// Keeps a published sample as the preview of its device, if a screen looks at it and the last one is old enough.
+    pub fn preview(&self, id: ModalityId, header: &SampleHeader, payload: &[u8]) {
+        if !self.is_looked_at(id, Stamp(header.recv_ns)) {
+            return;
+        }
+        let mut previews = lock(&self.previews);
+        let last = previews.iter().position(|preview| preview.device == id);
+        if last
+            .and_then(|last| previews.get(last))
+            .is_some_and(|last| !last.is_outdated(Stamp(header.capture_ns), payload.len()))
+        {
+            return;
+        }
+        if let Some(last) = last {
+            previews.remove(last);
+        }
+        previews.extend(Preview::of(id, header, payload).map(Arc::new));
+    }
+
+    /// Those of devices that are looked at; the others are dropped.
+    fn previews(&self, now: Stamp) -> Vec<Arc<Preview>> {
+        let mut previews = lock(&self.previews);
+        previews.retain(|preview| self.is_looked_at(preview.device, now));
+        previews.clone()
     }
 
     /// The current state of everything.
@@ -356,7 +418,8 @@ impl Board {
             session: lock(&self.session).clone(),
             disk_free: *lock(&self.disk_free),
             simulated: self.simulated.load(Ordering::Relaxed),
-            log: lock(&self.log).iter().cloned().collect(),
+            log: lock(&self.log).lines.iter().cloned().collect(),
+            previews: self.previews(taken),
         }
     }
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{Chunk, Grade, Hold, Level, PolicyEnd, SlotState, StopStatus, Verdict};
+use super::{Chunk, Grade, Hold, Level, PolicyEnd, PrintedOn, SlotState, StopStatus, Verdict};
 use crate::action::Arming;
 use crate::device::Unit;
 use crate::mask::SizedMask;
@@ -215,6 +215,18 @@ pub enum What {
         /// Text.
         text: String,
     },
+    /// A line of the log that a program of a device printed.
+    #[serde(rename = "log")]
+    Printed {
+        /// Severity: `info`, since programs print greetings on either output.
+        level: Level,
+        /// Modality.
+        device: String,
+        /// On which output.
+        printed: PrintedOn,
+        /// The modality, the hook if it was one, and what was printed.
+        text: String,
+    },
 }
 
 /// The origin of the samples of one epoch of a modality.
@@ -374,6 +386,14 @@ impl What {
                 D::of(Level::Warn, "bus", "warn", sentence)
             }
             Self::Log { level, text } => D::of(*level, "log", level.word(), text.clone()),
+            Self::Printed { level, device, printed, text } => {
+                let described = D::of(*level, device, printed.word(), text.clone());
+                if text.starts_with(&format!("{device}: ")) {
+                    described.without(&format!("{device}: "))
+                } else {
+                    described
+                }
+            }
         }
     }
 
@@ -388,6 +408,19 @@ impl What {
             _ => false,
         };
         (!is_silent).then_some((described.level, described.sentence))
+    }
+
+    /// The device that the event is about, and on which output a program printed it, if one did.
+    pub(super) fn source(&self) -> (Option<&str>, Option<PrintedOn>) {
+        match self {
+            Self::Attach { device, .. }
+            | Self::Opened { device, .. }
+            | Self::Detach { device, .. }
+            | Self::State { device, .. }
+            | Self::Actuator { device, .. } => (Some(device), None),
+            Self::Printed { device, printed, .. } => (Some(device), Some(*printed)),
+            _ => (None, None),
+        }
     }
 
     fn describe_episode(&self) -> Description {

@@ -1,6 +1,7 @@
 //! Literal snapshots and boards, for tests of screens.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::{Board, DeviceStatus, Level, LogLine, Outlook, PolicyStatus, RecordingStatus, SlotState, Snapshot};
@@ -61,6 +62,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         disk_free: None,
         simulated: false,
         log: Vec::new(),
+        previews: Vec::new(),
     }
 }
 
@@ -130,8 +132,11 @@ pub(crate) fn sixty_four() -> Snapshot {
     snapshot((0..64).map(|bit| device(bit, &format!("sensor_{bit}"), state(bit), "/dev/ttyACM0")).collect())
 }
 
-pub(crate) fn line(second: u64, level: Level, text: &str) -> LogLine {
-    LogLine { wall_ns: WALL_NS + second * 1_000_000_000, level, text: text.to_owned() }
+/// A line of the log whose number is its second, about the device of its first word.
+pub(crate) fn line(second: u64, level: Level, text: &str) -> Arc<LogLine> {
+    let device = text.split([':', ' ']).next().filter(|word| word.starts_with(char::is_alphabetic)).map(str::to_owned);
+    let (wall_ns, text) = (WALL_NS + second * 1_000_000_000, text.to_owned());
+    Arc::new(LogLine { number: second, wall_ns, level, device, printed: None, text })
 }
 
 /// A board for devices of these names, at bits 0, 1, ...

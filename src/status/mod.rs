@@ -5,8 +5,10 @@
 //! Invariant: a screen holds no handle into a stage.
 //! Invariant: there is no verdict by default. GOOD is a result of `record::verdict`.
 
+pub mod attach;
 pub mod board;
 mod event;
+pub mod preview;
 pub mod rates;
 pub mod session;
 
@@ -15,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tokio::sync::{SetOnce, watch};
 
 use crate::interlock::{InputState, StopKind};
@@ -25,6 +27,7 @@ use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
 
+use preview::Preview;
 use session::{SessionRequest, SessionStatus};
 
 pub use board::{Board, EpisodeCounts, EpisodeEnd};
@@ -55,7 +58,7 @@ macro_rules! words {
 
 words! {
     /// What the device of a modality is doing.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
     SlotState {
         /// Not attached.
         #[default]
@@ -85,7 +88,7 @@ impl SlotState {
 }
 
 /// One row of the device table.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DeviceStatus {
     /// Name of the modality.
     pub name: String,
@@ -112,7 +115,7 @@ pub struct DeviceStatus {
 }
 
 /// The recording in progress.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RecordingStatus {
     /// The file being written.
     #[serde(serialize_with = "text::lossy")]
@@ -132,7 +135,7 @@ pub struct RecordingStatus {
 }
 
 /// What an episode in progress would be judged if it ended now. Without a finding, as in its first second, it is GOOD.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Outlook {
     /// The most severe first.
     pub findings: Vec<Finding>,
@@ -151,7 +154,7 @@ impl Outlook {
 }
 
 /// A failed check of an episode.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Finding {
     /// How severe it is.
     pub grade: Grade,
@@ -172,19 +175,36 @@ impl Finding {
 }
 
 /// A line of the log.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LogLine {
+    /// Its place in the log of the run, from 0.
+    pub number: u64,
     /// Wall time, ns since 1970.
     pub wall_ns: u64,
     /// Severity.
     pub level: Level,
+    /// The device that it is about, if it is about one.
+    pub device: Option<String>,
+    /// Which output of a program printed it; `None` if `rapid` wrote it.
+    pub printed: Option<PrintedOn>,
     /// Text, without control characters.
     pub text: String,
 }
 
 words! {
+    /// The two outputs of a program.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    PrintedOn {
+        /// Standard output.
+        Stdout = "stdout",
+        /// Standard error.
+        Stderr = "stderr",
+    }
+}
+
+words! {
     /// Severity of a log line.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
     Level {
         /// Details.
         Debug = "debug",
@@ -198,7 +218,7 @@ words! {
 }
 
 /// Everything a screen may show, copied at one moment.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Snapshot {
     /// Name of the rig.
     pub rig: String,
@@ -232,11 +252,15 @@ pub struct Snapshot {
     /// The devices are simulated.
     pub simulated: bool,
     /// The newest log lines, oldest first.
-    pub log: Vec<LogLine>,
+    pub log: Vec<Arc<LogLine>>,
+    /// The newest samples of the devices that screens look at.
+    #[serde(skip)]
+    pub previews: Vec<Arc<Preview>>,
 }
 
 /// A request from a screen.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "request", content = "of", rename_all = "snake_case")]
 pub enum Command {
     /// A request to the session.
     Session(SessionRequest),
@@ -244,12 +268,14 @@ pub enum Command {
     Restart(ModalityId),
     /// Unplug this simulated device, or plug it in again.
     Plug(String),
+    /// Provide previews of this device for the next seconds ([`preview`]).
+    Look(ModalityId),
     /// End the program.
     Quit,
 }
 
 /// The current state of an emergency stop or an enabling switch.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StopStatus {
     /// Its name.
     pub stop: String,
@@ -302,7 +328,7 @@ words! {
 
 /// The verdict on one episode. As JSON:
 /// `{"verdict":"SUSPECT","reasons":["..."],"sensors":{"registered":3,"recorded":2,"without":["tactile_tip"]}}`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Verdict {
     /// The word.
     #[serde(rename = "verdict")]
@@ -398,7 +424,7 @@ fn absolute(file: &Path) -> PathBuf {
 }
 
 /// The policy in control, for a screen.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PolicyStatus {
     /// Name given in its bundle.
     pub name: String,
@@ -411,6 +437,7 @@ pub struct PolicyStatus {
     /// Ticks since the observation on which the action is based.
     pub chunk_age: Option<u64>,
     /// The newest action: name, value and unit of each axis.
+    #[serde(deserialize_with = "or_nan")]
     pub action: Vec<(String, f64, String)>,
     /// Why the policy holds, if it does.
     pub hold: Option<Hold>,
@@ -425,10 +452,10 @@ pub struct PolicyStatus {
 }
 
 /// Why the policy holds.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Hold {
     /// The modality whose absence is the reason; as JSON `""` if there is none.
-    #[serde(serialize_with = "or_empty")]
+    #[serde(serialize_with = "or_empty", deserialize_with = "unless_empty")]
     pub device: Option<String>,
     /// The reason.
     pub reason: String,
@@ -446,6 +473,16 @@ impl fmt::Display for Hold {
 #[expect(clippy::ref_option, reason = "serde gives it so")]
 fn or_empty<S: Serializer>(device: &Option<String>, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_str(device.as_deref().unwrap_or_default())
+}
+
+/// JSON has no NaN: it is written as null.
+fn or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<(String, f64, String)>, D::Error> {
+    let axes = Vec::<(String, Option<f64>, String)>::deserialize(deserializer)?;
+    Ok(axes.into_iter().map(|(name, value, unit)| (name, value.unwrap_or(f64::NAN), unit)).collect())
+}
+
+fn unless_empty<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
+    Ok(Some(String::deserialize(deserializer)?).filter(|device| !device.is_empty()))
 }
 
 /// What a policy did from its start to its end.

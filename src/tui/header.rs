@@ -6,12 +6,14 @@ use ratatui::layout::Rect;
 use ratatui::style::Stylize;
 use ratatui::text::{Line, Span};
 
+use super::link::LinkState;
 use super::model::Model;
 use super::recording;
 use super::theme::Theme;
 use crate::interlock::{InputState, StopKind};
 use crate::status::{Grade, StopStatus};
 use crate::text;
+use crate::time::Stamp;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let width = usize::from(area.width);
@@ -102,6 +104,19 @@ fn stops(model: &Model, theme: Theme) -> Vec<Span<'static>> {
 
 fn right(model: &Model, theme: Theme) -> Line<'static> {
     let mut spans = stops(model, theme);
+    match model.link {
+        LinkState::Own => {}
+        LinkState::Attached { read_only, .. } => {
+            let word = if read_only { "attached, read-only  " } else { "attached  " };
+            spans.push(Span::styled(word, theme.faint()));
+        }
+        LinkState::Lost { since, .. } => {
+            let ago = text::clock(Stamp::now().since(since));
+            spans.push(Span::styled(format!("RUN ENDED {ago} ago, waiting for the next  "), theme.alarm()));
+            // What it last recorded is not being recorded.
+            return Line::from(spans);
+        }
+    }
     if model.is_paused() {
         spans.push(Span::styled("view paused", theme.warning()));
         spans.push(Span::raw("  "));

@@ -12,10 +12,10 @@ use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
 use super::history::{Cell, History};
 use super::keys::{self, Act};
+use super::link::LinkState;
 use super::theme::Edge;
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::permission::Void;
 use crate::status::rates::Rates;
 use crate::status::session::{Label, SessionRequest};
 use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
@@ -39,7 +39,9 @@ pub enum Msg {
     /// A command could not be sent because the program is busy.
     Refused,
     /// The actuator was not armed, and why.
-    Void(Void),
+    NotArmed(String),
+    /// What was requested was not done, and why.
+    Failed(String),
 }
 
 /// A request of the model to the rest of the program.
@@ -95,6 +97,8 @@ pub struct Model {
     rates: Rates,
     history: History,
     frozen_history: Option<History>,
+    /// What the screen is linked to.
+    pub(super) link: LinkState,
     /// In which the times of the log are shown.
     pub(super) zone: Zone,
     /// Devices in trouble come first.
@@ -154,6 +158,7 @@ impl Model {
             rates,
             history: History::default(),
             frozen_history: None,
+            link: LinkState::Own,
             zone: Zone::UTC,
             by_trouble: false,
             readings: [Reading::default(); MAX_MODALITIES],
@@ -180,9 +185,13 @@ impl Model {
         match msg {
             Msg::Snapshot(snapshot) => self.advance(*snapshot),
             Msg::Key(key) if key.kind == KeyEventKind::Release => {}
-            Msg::Key(key) => return self.key(key),
+            Msg::Key(key) => {
+                let effect = self.key(key);
+                return self.permitted(effect);
+            }
             Msg::Refused => self.notify("busy: request dropped, try again"),
-            Msg::Void(why) => self.notify(&format!("not armed: {why}")),
+            Msg::NotArmed(why) => self.notify(&format!("not armed: {why}")),
+            Msg::Failed(why) => self.notify(&why),
         }
         Effect::None
     }
@@ -265,6 +274,8 @@ impl Model {
         let arming = self.arming.take();
         // The keys that stop motion work everywhere; letters are text while one is typed.
         match act {
+            // The run continues without this screen, and so does what moves.
+            Some(Act::Interrupt) if self.link != LinkState::Own => return self.ask_to_quit(),
             Some(Act::Interrupt) => {
                 // Nothing moves while the user is being asked.
                 let effect = self.ask_to_quit();
@@ -295,6 +306,25 @@ impl Model {
         let effect = act.map_or(Effect::None, |act| self.act(act));
         self.keep_in_bounds();
         effect
+    }
+
+    /// The effect, unless the link does not permit it.
+    fn permitted(&mut self, effect: Effect) -> Effect {
+        let is_request = matches!(effect, Effect::Send(_) | Effect::Order(_));
+        match self.link {
+            LinkState::Attached { read_only: true, .. } if is_request => {
+                // Esc also closes dialogs.
+                if effect != Effect::Order(Order::Disarm) {
+                    self.notify("read-only: `rapid monitor` without --read-only controls the run");
+                }
+                Effect::None
+            }
+            LinkState::Lost { .. } if is_request => {
+                self.notify("the run has ended: nothing receives this");
+                Effect::None
+            }
+            _ => effect,
+        }
     }
 
     fn act(&mut self, act: Act) -> Effect {
@@ -345,7 +375,7 @@ impl Model {
     }
 
     fn ask_to_quit(&mut self) -> Effect {
-        if self.quit == Quit::No && self.latest.recording.is_some() {
+        if self.quit == Quit::No && self.latest.recording.is_some() && self.link == LinkState::Own {
             self.quit = Quit::Asked;
             return Effect::None;
         }

@@ -399,19 +399,19 @@ fn typed(keys: &[KeyCode]) -> impl Stream<Item = io::Result<Event>> + use<> {
     futures::stream::iter(events).chain(futures::stream::pending())
 }
 
-fn desk(commands: &mpsc::Sender<Command>) -> Requests {
-    Requests { commands: commands.clone(), permission: Arc::default() }
+fn desk(board: &Arc<Board>, commands: &mpsc::Sender<Command>) -> Own {
+    Own::new(Arc::clone(board), commands.clone(), Arc::default())
 }
 
 #[tokio::test]
 async fn keys_become_commands_and_shutdown_ends_the_screen() {
-    let board = board(&["cam"]);
+    let board = Arc::new(board(&["cam"]));
     let (sender, mut commands) = mpsc::channel(4);
     let shutdown = CancellationToken::new();
     let end = shutdown.clone();
     let keys = typed(&[KeyCode::Char(' '), KeyCode::Char('q')]);
-    let desk = desk(&sender);
-    let screen = drive(&board, &desk, &shutdown, keys, |_| Ok(()));
+    let mut desk = desk(&board, &sender);
+    let screen = drive(&mut desk, &shutdown, keys, |_| Ok(()));
     let app = async {
         assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Toggle)));
         assert_eq!(commands.recv().await, Some(Command::Quit));
@@ -423,13 +423,13 @@ async fn keys_become_commands_and_shutdown_ends_the_screen() {
 
 #[tokio::test]
 async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
-    let board = board(&["cam"]);
+    let board = Arc::new(board(&["cam"]));
     let (sender, commands) = mpsc::channel(1);
     sender.try_send(Command::Session(SessionRequest::Toggle)).unwrap();
     let shutdown = CancellationToken::new();
     let end = shutdown.clone();
     let mut notice = None;
-    drive(&board, &desk(&sender), &shutdown, typed(&[KeyCode::Char(' ')]), |model| {
+    drive(&mut desk(&board, &sender), &shutdown, typed(&[KeyCode::Char(' ')]), |model| {
         if let Some(report) = model.notice() {
             notice = Some(report.to_owned());
             end.cancel();
@@ -441,21 +441,23 @@ async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     assert_eq!(notice.as_deref(), Some("busy: request dropped, try again"));
 
     drop(commands);
-    drive(&board, &desk(&sender), &CancellationToken::new(), typed(&[KeyCode::Char('q')]), |_| Ok(())).await.unwrap();
+    drive(&mut desk(&board, &sender), &CancellationToken::new(), typed(&[KeyCode::Char('q')]), |_| Ok(()))
+        .await
+        .unwrap();
 }
 
 #[tokio::test]
 async fn a_terminal_that_goes_away_is_an_error() {
-    let board = board(&["cam"]);
+    let board = Arc::new(board(&["cam"]));
     let (sender, _commands) = mpsc::channel(1);
     let hung_up = futures::stream::iter([]);
-    let error = drive(&board, &desk(&sender), &CancellationToken::new(), hung_up, |_| Ok(())).await.unwrap_err();
+    let error = drive(&mut desk(&board, &sender), &CancellationToken::new(), hung_up, |_| Ok(())).await.unwrap_err();
     assert!(matches!(error, TuiError::Gone(_)), "{error}");
 }
 
 #[tokio::test]
 async fn pasted_text_deletes_nothing_whether_the_terminal_marks_it_or_not() {
-    let board = board(&["cam"]);
+    let board = Arc::new(board(&["cam"]));
     let key = |letter| Ok(Event::Key(KeyEvent::new(KeyCode::Char(letter), KeyModifiers::NONE)));
     let enter = Ok(Event::Key(KeyEvent::new(KeyCode::Enter, KeyModifiers::NONE)));
     let mut pasted = vec![Ok(Event::Paste("xyxyaa qq".to_owned())), key('x'), key('y'), key('x'), key('x')];
@@ -467,8 +469,8 @@ async fn pasted_text_deletes_nothing_whether_the_terminal_marks_it_or_not() {
     let events = futures::stream::iter(pasted).chain(futures::stream::iter([key('q')]));
     let events = events.chain(futures::stream::pending());
     let end = shutdown.clone();
-    let desk = desk(&sender);
-    let screen = drive(&board, &desk, &shutdown, events, |_| Ok(()));
+    let mut desk = desk(&board, &sender);
+    let screen = drive(&mut desk, &shutdown, events, |_| Ok(()));
     let app = async {
         // It is in the trash, once, and can be taken back.
         assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Discard)));

@@ -1,0 +1,228 @@
+//! `rapid monitor`: the monitor of a run of another process.
+//!
+//! Invariant: whatever happens here, the run continues; and a run that has ended is waited for, since a service is started
+//! again within seconds.
+
+use std::io::{BufReader, Write as _};
+use std::os::unix::net::UnixStream;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use crate::action::Order;
+use crate::app::signals::Signals;
+use crate::orders::give::{self, GiveError};
+use crate::status::attach::{Decoder, LinkError};
+use crate::status::{Command, Snapshot};
+use crate::time::Stamp;
+use crate::tui::model::{Effect, Msg};
+use crate::tui::{self, Closed, Link, LinkState, TuiError};
+
+/// Time between two attempts to reach the next run.
+const AGAIN: Duration = Duration::from_secs(1);
+/// A run sends ten snapshots a second: one that sends nothing for this long is stopped.
+const SILENT: Duration = Duration::from_secs(3);
+/// A run that takes no request for this long is stopped.
+const WRITE_LIMIT: Duration = Duration::from_secs(2);
+
+/// Why there is no monitor.
+#[derive(Debug, thiserror::Error)]
+pub enum MonitorError {
+    /// No run can be reached.
+    #[error(transparent)]
+    Give(#[from] GiveError),
+    /// The run does not send what it should.
+    #[error("process {process}: {error}")]
+    Link {
+        /// The run.
+        process: u32,
+        /// What is wrong.
+        error: LinkError,
+    },
+    /// No terminal, or it is gone.
+    #[error(transparent)]
+    Screen(#[from] TuiError),
+}
+
+/// Shows the run of `instance` until the user leaves.
+///
+/// # Errors
+/// When there is no such run at the start, or no terminal.
+pub async fn monitor(instance: Option<&str>, read_only: bool) -> Result<(), MonitorError> {
+    let mut signals = Signals::listen().map_err(TuiError::NoTerminal)?;
+    let link = Remote::open(Wanted { instance: instance.map(str::to_owned), read_only })?;
+    let shutdown = CancellationToken::new();
+    let ended = shutdown.clone();
+    tokio::spawn(async move {
+        signals.next().await;
+        ended.cancel();
+    });
+    match tui::show(link, shutdown).await {
+        // The connection of the user has ended, as with SIGHUP.
+        Err(TuiError::Gone(_)) => Ok(()),
+        outcome => Ok(outcome?),
+    }
+}
+
+/// The run to be shown.
+#[derive(Debug, Clone)]
+struct Wanted {
+    instance: Option<String>,
+    read_only: bool,
+}
+
+/// What the reading thread knows.
+#[derive(Debug, Clone)]
+struct View {
+    snapshot: Snapshot,
+    state: LinkState,
+}
+
+/// The link to the run.
+struct Remote {
+    wanted: Wanted,
+    view: watch::Receiver<View>,
+    requests: Sender<Outgoing>,
+    answers: (Sender<Msg>, Receiver<Msg>),
+}
+
+/// For the writing thread.
+enum Outgoing {
+    /// From now on, this is the link.
+    Link(UnixStream),
+    Command(Command),
+}
+
+/// A connection to a run.
+struct Connection {
+    process: u32,
+    stream: UnixStream,
+    decoder: Decoder,
+    reader: BufReader<UnixStream>,
+}
+
+impl Connection {
+    fn open(wanted: &Wanted) -> Result<(Self, Snapshot), MonitorError> {
+        let (stream, process) = give::attach(wanted.instance.as_deref(), wanted.read_only)?;
+        let of = |error: LinkError| MonitorError::Link { process, error };
+        let limits = stream.set_read_timeout(Some(SILENT)).and_then(|()| stream.set_write_timeout(Some(WRITE_LIMIT)));
+        let reader = limits.and_then(|()| stream.try_clone()).map_err(|error| of(error.into()))?;
+        let mut connection = Self { process, stream, decoder: Decoder::default(), reader: BufReader::new(reader) };
+        let first = connection.read().map_err(of)?;
+        Ok((connection, first))
+    }
+
+    fn read(&mut self) -> Result<Snapshot, LinkError> {
+        self.decoder.read(&mut self.reader)
+    }
+}
+
+impl Remote {
+    fn open(wanted: Wanted) -> Result<Self, MonitorError> {
+        let (connection, snapshot) = Connection::open(&wanted)?;
+        let process = connection.process;
+        let state = LinkState::Attached { process, read_only: wanted.read_only };
+        let (shown, view) = watch::channel(View { snapshot, state });
+        let (requests, outgoing) = channel();
+        let answers = channel();
+        let (of, failures) = (wanted.clone(), answers.0.clone());
+        let to_writer = requests.clone();
+        let threads = thread::Builder::new()
+            .name("link".to_owned())
+            .spawn(move || follow(connection, &of, &shown, &to_writer))
+            .and_then(|_| thread::Builder::new().name("requests".to_owned()).spawn(move || send(&outgoing, &failures)));
+        threads.map_err(|error| MonitorError::Link { process, error: error.into() })?;
+        Ok(Self { wanted, view, requests, answers })
+    }
+
+    /// Gives an order beside the link: one that is stuck must not hold up a disarm.
+    fn order(&self, order: Order) {
+        let (instance, answers) = (self.wanted.instance.clone(), self.answers.0.clone());
+        // Without a thread there is no answer, and the log of the run shows no disarm.
+        let _ = thread::Builder::new().name("order".to_owned()).spawn(move || {
+            if let Err(error) = give::give(instance.as_deref(), order) {
+                let is_arm = matches!(order, Order::Arm | Order::ArmBack);
+                let answer = if is_arm { Msg::NotArmed } else { Msg::Failed };
+                let _ = answers.send(answer(error.to_string()));
+            }
+        });
+    }
+}
+
+/// Reads snapshots of the run, and of the next when it has ended. Ends with the screen.
+fn follow(mut connection: Connection, wanted: &Wanted, shown: &watch::Sender<View>, requests: &Sender<Outgoing>) {
+    let read_only = wanted.read_only;
+    loop {
+        if let Ok(stream) = connection.stream.try_clone() {
+            let _ = requests.send(Outgoing::Link(stream));
+        }
+        while let Ok(snapshot) = connection.read() {
+            let state = LinkState::Attached { process: connection.process, read_only };
+            if shown.send(View { snapshot, state }).is_err() {
+                return;
+            }
+        }
+        let since = Stamp::now();
+        shown.send_modify(|view| view.state = LinkState::Lost { since, read_only });
+        let (next, snapshot) = loop {
+            thread::sleep(AGAIN);
+            if shown.is_closed() {
+                return;
+            }
+            if let Ok(next) = Connection::open(wanted) {
+                break next;
+            }
+        };
+        connection = next;
+        let state = LinkState::Attached { process: connection.process, read_only };
+        shown.send_modify(|view| *view = View { snapshot, state });
+    }
+}
+
+/// Writes requests to the link; ends with the screen.
+fn send(outgoing: &Receiver<Outgoing>, failures: &Sender<Msg>) {
+    let mut link: Option<UnixStream> = None;
+    for one in outgoing {
+        let command = match one {
+            Outgoing::Link(stream) => {
+                link = Some(stream);
+                continue;
+            }
+            Outgoing::Command(command) => command,
+        };
+        // Commands have no maps with keys that are not text, the only thing that JSON refuses.
+        let line = serde_json::to_string(&command).unwrap_or_default() + "\n";
+        let sent = link.as_mut().map(|link| link.write_all(line.as_bytes()));
+        if !matches!(sent, Some(Ok(()))) {
+            let _ = failures.send(Msg::Failed("the run does not take this request".to_owned()));
+        }
+    }
+}
+
+impl Link for Remote {
+    fn snapshot(&mut self) -> Snapshot {
+        self.view.borrow().snapshot.clone()
+    }
+
+    fn state(&self) -> LinkState {
+        self.view.borrow().state
+    }
+
+    fn answer(&mut self) -> Option<Msg> {
+        self.answers.1.try_recv().ok()
+    }
+
+    fn carry_out(&mut self, effect: Effect) -> Result<Option<Msg>, Closed> {
+        match effect {
+            Effect::None => {}
+            Effect::Leave => return Err(Closed),
+            Effect::Order(order) => self.order(order),
+            // The writing thread ends only with this.
+            Effect::Send(command) => drop(self.requests.send(Outgoing::Command(command))),
+        }
+        Ok(None)
+    }
+}
