@@ -17,6 +17,7 @@ pub mod eval;
 pub mod inspect;
 pub mod list;
 pub mod mask;
+pub mod plot;
 pub mod progress;
 pub mod recover;
 pub mod register;
