@@ -68,6 +68,18 @@ Exit codes: 0 success, 1 failed while running, 2 invalid configuration or argume
             3 a required device is missing,
             4 without the monitor: an episode is BAD, 130 interrupted twice";
 
+const INSPECT: &str = "\
+One file gives a report; a folder or several files one line each: GOOD, SUSPECT or BAD. With --plot each gives a \
+picture instead, X.svg beside X.mcap: verdict, and the presence, rate, losses and pictures of each sensor over time. \
+A file of that name that is no such picture is not replaced.
+
+Examples:
+  rapid inspect episodes/20260101_place-block_001.mcap
+  rapid inspect episodes/20260101_place-block_001.mcap --plot
+  rapid inspect episodes --plot=pictures/
+  rapid inspect episodes
+  rapid inspect --json episodes | jq -r 'select(.verdict == \"GOOD\") | .file'";
+
 const RECOVER: &str = "\
 A run that may record does this automatically, in the background, for the files in its --out folder.
 
@@ -301,13 +313,14 @@ pub enum Command {
         what: Option<SessionCommand>,
     },
     /// Report on episodes: verdict, rates, gaps, latency, presence
-    #[command(after_long_help = "One file gives a report; a folder or several files one line each: GOOD, SUSPECT or \
-        BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \
-        rapid inspect --json episodes | jq -r 'select(.verdict == \"GOOD\") | .file'")]
+    #[command(after_long_help = INSPECT)]
     Inspect {
         /// Episodes, finished or .partial, or folders of them
         #[arg(value_hint = ValueHint::AnyPath, value_name = "FILE|DIR", required = true)]
         paths: Vec<PathBuf>,
+        /// Draw each episode as an SVG: beside it, in a folder, under a name, or - for standard output
+        #[arg(long, value_name = "SVG|DIR|-", num_args = 0..=1, require_equals = true, value_hint = ValueHint::AnyPath)]
+        plot: Option<Option<PathBuf>>,
     },
     /// List episodes by verdict, label, task, tag, sensor or date
     #[command(after_long_help = list::LIST)]
@@ -388,6 +401,12 @@ impl Cli {
         };
         if let Some(key) = repeated(tags) {
             return Some(format!("--tag {key} is given twice, and an episode has one value per key: leave one out"));
+        }
+        if let Some(Command::Inspect { paths, plot: Some(None) }) = &self.command
+            && let Some(svg) = paths.iter().find(|path| path.extension().is_some_and(|ending| ending == "svg"))
+        {
+            let svg = svg.display();
+            return Some(format!("{svg} is given as an episode; the name of the picture follows a `=`: --plot={svg}"));
         }
         let file = self.global.sim.as_ref()?.as_ref()?.to_str()?;
         let name = command.find_subcommand(file)?.get_name();

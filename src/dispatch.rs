@@ -119,7 +119,10 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             let (registry, attached) = connected(global)?;
             Ok(block_on(commands::calibrate::latency(&registry, &attached, &args, format, out))??)
         }
-        Command::Inspect { paths } => {
+        Command::Inspect { paths, plot: Some(to) } => {
+            reported(commands::plot::plot(&paths, to.as_deref(), format, out, &mut io::stderr())?)
+        }
+        Command::Inspect { paths, plot: None } => {
             let columns = crate::tui::columns().unwrap_or(100);
             let palette = Palette::of(&io::stdout());
             reported(commands::inspect::inspect(&paths, format, columns, palette, out)?)
@@ -504,6 +507,11 @@ failures! {
         commands::arm::OrderError::Output(_) => 1,
     };
     commands::mask::MaskError: |_| 1;
+    commands::plot::PlotError: |error| match error {
+        commands::plot::PlotError::Episode(error) => read_code(error),
+        commands::plot::PlotError::Foreign(_) | commands::plot::PlotError::Several { .. } => 2,
+        _ => 1,
+    };
     commands::list::ListError: |error| match error {
         commands::list::ListError::Date { .. } => 2,
         commands::list::ListError::Episode(error) => read_code(error),

@@ -44,6 +44,8 @@ pub mod palette;
 pub mod panics;
 pub mod peer;
 pub mod permission;
+pub mod pixels;
+pub mod plot;
 #[cfg(feature = "policy")]
 pub mod policy;
 pub mod provenance;

@@ -52,10 +52,11 @@ const LAYERS: &[&[&str]] = &[
         "realtime",
         "control",
         "gpio",
+        "pixels",
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "interlocks", "sync", "calibration"],
     &["rig", "alignment", "record", "session", "policy"],
-    &["app", "lockstep", "compare", "tui", "headless", "logging"],
+    &["app", "lockstep", "compare", "plot", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
@@ -109,7 +110,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_cal", &["bus"]),
     ("if_addrs", &["driver/lan"]),
     ("jiff", &["time"]),
-    ("jpeg_encoder", &["driver/sim", "simulation/task"]),
+    ("jpeg_encoder", &["driver/sim", "simulation/task", "plot"]),
     ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "interlocks"]),
     ("lz4", &["episode"]),
     ("mcap", &["episode", "record/file"]),
@@ -142,7 +143,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
     ("zstd", &["episode", "policy/library"]),
-    ("zune_jpeg", &["calibration/brightness", "policy/picture"]),
+    ("zune_jpeg", &["calibration/brightness", "pixels"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";

@@ -5,6 +5,7 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
+use crate::pixels::with_mark;
 use crate::sample::Encoding;
 
 /// Pixels a picture may have along a side, as in the registry.
@@ -42,17 +43,6 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
             mean(pixels.iter())
         }
         Encoding::Bytes | Encoding::F64 | Encoding::Mask => Err(BrightnessError::NoPicture),
-    }
-}
-
-/// Sets `marked` to the picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the
-/// Huffman tables and imply those of the standard (ITU-T T.81 K.3); with the mark, the decoder uses these in place of
-/// the missing ones.
-pub(crate) fn with_mark(jpeg: &[u8], marked: &mut Vec<u8>) {
-    let (start, rest) = jpeg.split_at(jpeg.len().min(2));
-    marked.clear();
-    for part in [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest] {
-        marked.extend_from_slice(part);
     }
 }
 

@@ -9,6 +9,5 @@
 mod brightness;
 mod latency;
 
-pub(crate) use brightness::with_mark;
 pub use brightness::{BrightnessError, brightness};
 pub use latency::{Estimate, Flip, Refusal, Seen, estimate};

@@ -165,7 +165,7 @@ pub fn list(
 }
 
 /// What was noted about the files of these folders, the latest session last.
-fn noted(folders: &BTreeSet<&Path>, warn: &dyn Fn(&JournalError)) -> BTreeMap<PathBuf, EpisodeEntry> {
+pub(super) fn noted(folders: &BTreeSet<&Path>, warn: &dyn Fn(&JournalError)) -> BTreeMap<PathBuf, EpisodeEntry> {
     let mut noted = BTreeMap::new();
     for folder in folders {
         let here = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };

@@ -18,6 +18,7 @@ pub mod inspect;
 pub mod list;
 pub mod mask;
 pub mod monitor;
+pub mod plot;
 pub mod progress;
 pub mod recover;
 pub mod register;

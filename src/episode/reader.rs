@@ -7,7 +7,6 @@
 //! Invariant: content is read on request, and only once.
 
 use std::collections::BTreeMap;
-#[cfg(feature = "policy")]
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -22,7 +21,6 @@ use super::schema::{PROTOBUF, SampleSchema};
 use super::source::ReadAt;
 use super::wire::Fields;
 use super::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, ReadError, op};
-#[cfg(feature = "policy")]
 use super::{boot_id, open};
 use crate::mask::MASK_TOPIC;
 use crate::modality::ModalityId;
@@ -89,7 +87,6 @@ impl<R> std::fmt::Debug for Reader<R> {
     }
 }
 
-#[cfg(feature = "policy")]
 impl Reader<File> {
     /// Opens an episode, finished or not.
     pub(crate) fn open(path: &Path) -> Result<Self, ReadError> {

@@ -6,41 +6,18 @@
 //!
 //! Invariant: a refused picture changes neither the observation nor the reference.
 
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::zune_core::bytestream::ZCursor;
-use zune_jpeg::zune_core::colorspace::ColorSpace;
-use zune_jpeg::zune_core::options::DecoderOptions;
-
 use super::bundle::{ColorOrder, ImageSpec, Normalization, Operation};
 use super::normalize::Normalizer;
-use crate::calibration::with_mark;
-use crate::sample::Encoding;
+use crate::pixels::{CHANNELS, PixelError, Pixels};
 
-const CHANNELS: usize = 3;
-/// Pixels a picture may have along a side, as in the registry.
-const LARGEST: usize = 8192;
+pub use crate::pixels::Picture;
 
 /// Why a picture cannot be an observation.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PictureError {
-    /// The samples are not pictures.
-    #[error("the samples are no pictures but {0:?}")]
-    NoPicture(Encoding),
-    /// It cannot be decoded.
-    #[error("damaged picture: {0}")]
-    Damaged(String),
-    /// Not as many bytes as pixels of this format have.
-    #[error("{found} bytes, where a picture of {width}x{height} has {expected}")]
-    Length {
-        /// Bytes there are.
-        found: usize,
-        /// Bytes there should be.
-        expected: usize,
-        /// Pixels per row.
-        width: usize,
-        /// Rows.
-        height: usize,
-    },
+    /// The payload has no pixels.
+    #[error(transparent)]
+    Pixels(#[from] PixelError),
     /// The size does not suit the policy.
     #[error(
         "a picture of {width}x{height}, where the policy takes {wanted_width}x{wanted_height}: set the camera to that, \
@@ -58,29 +35,13 @@ pub enum PictureError {
     },
 }
 
-/// A picture as received from the bus.
-#[derive(Debug, Clone, Copy)]
-pub struct Picture<'a> {
-    /// How `bytes` are encoded.
-    pub encoding: Encoding,
-    /// Pixels per row.
-    pub width: u32,
-    /// Rows.
-    pub height: u32,
-    /// The payload.
-    pub bytes: &'a [u8],
-}
-
 /// Converts pictures of one camera to observations.
 #[derive(Debug)]
 pub struct Preprocessor {
     spec: ImageSpec,
     normalizer: Normalizer,
     reference: Option<Reference>,
-    /// The picture with the marker that its decoder requires.
-    jpeg: Vec<u8>,
-    /// Red, green, blue, row by row.
-    pixels: Vec<u8>,
+    pixels: Pixels,
     /// The size that `columns` and `rows` are for.
     size: [usize; 2],
     columns: Vec<Tap>,
@@ -132,8 +93,7 @@ impl Preprocessor {
             spec,
             normalizer: Normalizer::new(normalization, CHANNELS),
             reference: (spec.operation == Some(Operation::DiffToReference)).then(|| Reference::new(len)),
-            jpeg: Vec::new(),
-            pixels: Vec::new(),
+            pixels: Pixels::default(),
             size: [0, 0],
             columns: Vec::with_capacity(spec.width),
             rows: Vec::with_capacity(spec.height),
@@ -160,7 +120,7 @@ impl Preprocessor {
     /// When `out` is not [`Self::output_len`] long.
     pub fn write(&mut self, picture: &Picture<'_>, out: &mut [f32]) -> Result<(), PictureError> {
         assert_eq!(out.len(), self.output_len(), "an observation's place has the length that the bundle gives");
-        let size = self.decode(picture)?;
+        let size = self.pixels.decode(picture)?;
         if self.size != size {
             self.fit(size)?;
         }
@@ -170,57 +130,6 @@ impl Preprocessor {
         }
         self.normalizer.normalize_planes(out);
         Ok(())
-    }
-
-    /// Fills `pixels`; returns height and width.
-    fn decode(&mut self, picture: &Picture<'_>) -> Result<[usize; 2], PictureError> {
-        let side = |side: u32| usize::try_from(side).unwrap_or(usize::MAX);
-        let (width, height) = (side(picture.width), side(picture.height));
-        if !(1..=LARGEST).contains(&width) || !(1..=LARGEST).contains(&height) {
-            return Err(PictureError::Damaged(format!("{width}x{height} pixels")));
-        }
-        let whole = |bytes_per_pixel: usize| {
-            let (found, expected) = (picture.bytes.len(), bytes_per_pixel * width * height);
-            let error = PictureError::Length { found, expected, width, height };
-            if found == expected { Ok(()) } else { Err(error) }
-        };
-        match picture.encoding {
-            Encoding::Grey => {
-                whole(1)?;
-                self.pixels.clear();
-                self.pixels.extend(picture.bytes.iter().flat_map(|grey| [*grey; CHANNELS]));
-            }
-            Encoding::Yuyv => {
-                whole(2)?;
-                self.pixels.clear();
-                self.pixels.extend(picture.bytes.chunks_exact(4).flat_map(colors));
-                if self.pixels.len() != CHANNELS * width * height {
-                    return Err(PictureError::Damaged("an odd number of pixels in YUYV".to_owned()));
-                }
-            }
-            Encoding::Mjpeg => self.decode_jpeg(picture.bytes, width, height)?,
-            other => return Err(PictureError::NoPicture(other)),
-        }
-        Ok([height, width])
-    }
-
-    fn decode_jpeg(&mut self, bytes: &[u8], width: usize, height: usize) -> Result<(), PictureError> {
-        with_mark(bytes, &mut self.jpeg);
-        // Strict: a truncated picture is refused, not padded with grey.
-        let options = DecoderOptions::default()
-            .jpeg_set_out_colorspace(ColorSpace::RGB)
-            .set_max_width(LARGEST)
-            .set_max_height(LARGEST)
-            .set_strict_mode(true);
-        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.jpeg), options);
-        let damaged = |error: zune_jpeg::errors::DecodeErrors| PictureError::Damaged(error.to_string());
-        decoder.decode_headers().map_err(damaged)?;
-        if decoder.dimensions() != Some((width, height)) {
-            let (wide, high) = decoder.dimensions().unwrap_or_default();
-            return Err(PictureError::Damaged(format!("{wide}x{high} pixels in a sample of {width}x{height}")));
-        }
-        self.pixels.resize(CHANNELS * width * height, 0);
-        decoder.decode_into(&mut self.pixels).map_err(damaged)
     }
 
     /// Works out which pixels of a picture of this size each value comes from.
@@ -244,15 +153,15 @@ impl Preprocessor {
     /// Values in 0..1, resized and cropped, channel by channel.
     fn sample(&self, out: &mut [f32]) {
         let (height, width) = (self.spec.height, self.spec.width);
-        let stride = CHANNELS * self.size[1];
+        let (stride, pixels) = (CHANNELS * self.size[1], self.pixels.values());
         for (place, plane) in out.chunks_exact_mut(height * width).enumerate() {
             let channel = match self.spec.color {
                 ColorOrder::Rgb => place,
                 ColorOrder::Bgr => CHANNELS - 1 - place,
             };
             for (values, row) in plane.chunks_exact_mut(width).zip(&self.rows) {
-                let low = &self.pixels[row.low * stride..][..stride];
-                let high = &self.pixels[row.high * stride..][..stride];
+                let low = &pixels[row.low * stride..][..stride];
+                let high = &pixels[row.high * stride..][..stride];
                 for (value, column) in values.iter_mut().zip(&self.columns) {
                     let (left, right) = (CHANNELS * column.low + channel, CHANNELS * column.high + channel);
                     let mix = |line: &[u8]| {
@@ -285,19 +194,6 @@ fn taps(size: usize, resized: usize, wanted: usize, taps: &mut Vec<Tap>) {
 fn crop_start(size: usize, wanted: usize) -> usize {
     let rest = size - wanted;
     rest / 2 + usize::from(rest % 4 == 3)
-}
-
-/// Two pixels of YUYV in red, green and blue: ITU-R BT.601 of limited range, what V4L2 means by YUYV
-/// unless it states otherwise; coefficients in 1/65536.
-fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
-    let at = |index: usize| yuyv.get(index).copied().map_or(0, i32::from);
-    let (u, v) = (at(1) - 128, at(3) - 128);
-    let [first, second] = [at(0), at(2)].map(|y| {
-        let y = 76_309 * (y - 16);
-        [y + 104_597 * v, y - 25_675 * u - 53_279 * v, y + 132_201 * u]
-            .map(|color| u8::try_from(((color + 32_768) >> 16).clamp(0, 255)).unwrap_or(u8::MAX))
-    });
-    [first[0], first[1], first[2], second[0], second[1], second[2]]
 }
 
 #[cfg(test)]

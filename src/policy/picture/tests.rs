@@ -2,6 +2,7 @@ use jpeg_encoder::{ColorType, Encoder};
 use proptest::prelude::*;
 
 use super::*;
+use crate::sample::Encoding;
 
 const PLAIN: ImageSpec =
     ImageSpec { height: 2, width: 2, color: ColorOrder::Rgb, resize: None, crop: None, operation: None };
@@ -217,6 +218,6 @@ fn a_truncated_picture_is_not_padded_with_grey() {
     for share in [2, 3, 5, 8, 12] {
         let cut = &whole[..whole.len() - whole.len() / share];
         let result = preprocessor.write(&picture(Encoding::Mjpeg, [64, 64], cut), &mut [0.0; 12]);
-        assert!(matches!(result, Err(PictureError::Damaged(_))), "without 1/{share}");
+        assert!(matches!(result, Err(PictureError::Pixels(PixelError::Damaged(_)))), "without 1/{share}");
     }
 }

@@ -56,13 +56,13 @@ pub(super) struct Ending<'a> {
 
 /// Numbers of samples as they come, of which a message holds the lower 32 bits, and how many are missing.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Numbers {
+pub(crate) struct Numbers {
     next: Option<u32>,
-    pub(super) missing: u64,
+    pub(crate) missing: u64,
 }
 
 impl Numbers {
-    pub(super) fn take(&mut self, number: u32) {
+    pub(crate) fn take(&mut self, number: u32) {
         // Numbers wrap after 32 bits; a step of more than half of that goes backwards.
         let step = self.next.map_or(0, |next| number.wrapping_sub(next));
         self.missing += u64::from(if step <= u32::MAX / 2 { step } else { 0 });

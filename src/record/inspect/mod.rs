@@ -29,6 +29,7 @@ use crate::palette::Palette;
 use crate::status::{Grade, Sensors, Verdict};
 use crate::text;
 use collect::Collected;
+pub(crate) use judge::Numbers;
 
 pub use crate::episode::ReadError;
 pub use crate::episode::record_iter::{FileEnd, LeftOut};

@@ -1,0 +1,144 @@
+//! Pictures of a camera as pixels: 8-bit red, green, blue, row by row.
+//!
+//! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
+
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+use crate::sample::Encoding;
+
+/// Values of a pixel.
+pub const CHANNELS: usize = 3;
+/// Pixels a picture may have along a side, as in the registry.
+const LARGEST: usize = 8192;
+
+/// Why a payload has no pixels.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PixelError {
+    /// The samples are not pictures.
+    #[error("the samples are no pictures but {0:?}")]
+    NoPicture(Encoding),
+    /// It cannot be decoded.
+    #[error("damaged picture: {0}")]
+    Damaged(String),
+    /// Not as many bytes as pixels of this format have.
+    #[error("{found} bytes, where a picture of {width}x{height} has {expected}")]
+    Length {
+        /// Bytes there are.
+        found: usize,
+        /// Bytes there should be.
+        expected: usize,
+        /// Pixels per row.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+}
+
+/// A picture as received from the bus.
+#[derive(Debug, Clone, Copy)]
+pub struct Picture<'a> {
+    /// How `bytes` are encoded.
+    pub encoding: Encoding,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// The payload.
+    pub bytes: &'a [u8],
+}
+
+/// Memory for the pixels of one picture, reused for the next; only the JPEG decoder allocates for every picture.
+#[derive(Debug, Default)]
+pub struct Pixels {
+    /// The picture with the marker that its decoder requires.
+    jpeg: Vec<u8>,
+    values: Vec<u8>,
+}
+
+impl Pixels {
+    /// Decodes a picture; returns height and width.
+    ///
+    /// # Errors
+    /// When it is damaged, or not a picture. The pixels are then meaningless.
+    pub fn decode(&mut self, picture: &Picture<'_>) -> Result<[usize; 2], PixelError> {
+        let side = |side: u32| usize::try_from(side).unwrap_or(usize::MAX);
+        let (width, height) = (side(picture.width), side(picture.height));
+        if !(1..=LARGEST).contains(&width) || !(1..=LARGEST).contains(&height) {
+            return Err(PixelError::Damaged(format!("{width}x{height} pixels")));
+        }
+        let whole = |bytes_per_pixel: usize| {
+            let (found, expected) = (picture.bytes.len(), bytes_per_pixel * width * height);
+            let error = PixelError::Length { found, expected, width, height };
+            if found == expected { Ok(()) } else { Err(error) }
+        };
+        match picture.encoding {
+            Encoding::Grey => {
+                whole(1)?;
+                self.values.clear();
+                self.values.extend(picture.bytes.iter().flat_map(|grey| [*grey; CHANNELS]));
+            }
+            Encoding::Yuyv => {
+                whole(2)?;
+                self.values.clear();
+                self.values.extend(picture.bytes.chunks_exact(4).flat_map(colors));
+                if self.values.len() != CHANNELS * width * height {
+                    return Err(PixelError::Damaged("an odd number of pixels in YUYV".to_owned()));
+                }
+            }
+            Encoding::Mjpeg => self.decode_jpeg(picture.bytes, width, height)?,
+            other => return Err(PixelError::NoPicture(other)),
+        }
+        Ok([height, width])
+    }
+
+    /// The pixels of the picture decoded last: red, green, blue, row by row.
+    pub fn values(&self) -> &[u8] {
+        &self.values
+    }
+
+    fn decode_jpeg(&mut self, bytes: &[u8], width: usize, height: usize) -> Result<(), PixelError> {
+        with_mark(bytes, &mut self.jpeg);
+        // Strict: a truncated picture is refused, not padded with grey.
+        let options = DecoderOptions::default()
+            .jpeg_set_out_colorspace(ColorSpace::RGB)
+            .set_max_width(LARGEST)
+            .set_max_height(LARGEST)
+            .set_strict_mode(true);
+        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.jpeg), options);
+        let damaged = |error: zune_jpeg::errors::DecodeErrors| PixelError::Damaged(error.to_string());
+        decoder.decode_headers().map_err(damaged)?;
+        if decoder.dimensions() != Some((width, height)) {
+            let (wide, high) = decoder.dimensions().unwrap_or_default();
+            return Err(PixelError::Damaged(format!("{wide}x{high} pixels in a sample of {width}x{height}")));
+        }
+        self.values.resize(CHANNELS * width * height, 0);
+        decoder.decode_into(&mut self.values).map_err(damaged)
+    }
+}
+
+/// Sets `marked` to the picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the
+/// Huffman tables and imply those of the standard (ITU-T T.81 K.3); with the mark, the decoder uses these in place of
+/// the missing ones.
+pub(crate) fn with_mark(jpeg: &[u8], marked: &mut Vec<u8>) {
+    let (start, rest) = jpeg.split_at(jpeg.len().min(2));
+    marked.clear();
+    for part in [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest] {
+        marked.extend_from_slice(part);
+    }
+}
+
+/// Two pixels of YUYV in red, green and blue: ITU-R BT.601 of limited range, what V4L2 means by YUYV
+/// unless it states otherwise; coefficients in 1/65536.
+fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
+    let at = |index: usize| yuyv.get(index).copied().map_or(0, i32::from);
+    let (u, v) = (at(1) - 128, at(3) - 128);
+    let [first, second] = [at(0), at(2)].map(|y| {
+        let y = 76_309 * (y - 16);
+        [y + 104_597 * v, y - 25_675 * u - 53_279 * v, y + 132_201 * u]
+            .map(|color| u8::try_from(((color + 32_768) >> 16).clamp(0, 255)).unwrap_or(u8::MAX))
+    });
+    [first[0], first[1], first[2], second[0], second[1], second[2]]
+}
