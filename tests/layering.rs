@@ -80,7 +80,11 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
 
 /// Modules that see less than their layer would let them: besides layer 0 only these.
 const NARROW: &[(&str, &[&str], &str)] = &[
-    ("tui", &["status", "registry", "text", "outlet", "panics"], "a screen knows snapshots and commands, no stage"),
+    (
+        "tui",
+        &["status", "registry", "text", "outlet", "panics", "pixels"],
+        "a screen knows snapshots and commands, no stage",
+    ),
     (
         "headless",
         &["status", "registry", "palette", "text", "outlet"],
@@ -109,6 +113,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_bb_elementary_traits", &["bus"]),
     ("iceoryx2_cal", &["bus"]),
     ("if_addrs", &["driver/lan"]),
+    ("image", &["tui/picture"]),
     ("jiff", &["time"]),
     ("jpeg_encoder", &["driver/sim", "simulation/task", "plot"]),
     ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "interlocks"]),
@@ -121,6 +126,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rand_distr", &["random"]),
     ("rand_pcg", &["random"]),
     ("ratatui", &["tui"]),
+    ("ratatui_image", &["tui/picture"]),
     ("rustix", &["time", "bell", ABOVE_NOUNS]),
     ("sd_notify", &["app/watchdog"]),
     ("serde", &[ANYWHERE]),

@@ -13,11 +13,12 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
+use super::detail::{DeviceDetail, Intervals, StaticDetail};
 use super::preview::{LOOKED_AT, Preview};
 use super::session::SessionStatus;
 use super::{
-    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, PrintedOn, RecordingStatus, SlotState, Snapshot,
-    StopStatus, Verdict, What,
+    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance, RecordingStatus, SlotState,
+    Snapshot, StopStatus, Verdict, What,
 };
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
@@ -39,6 +40,7 @@ pub struct StreamCounters {
     gaps: AtomicU64,
     bytes: AtomicU64,
     newest: AtomicU64,
+    intervals: Intervals,
 }
 
 impl StreamCounters {
@@ -46,7 +48,11 @@ impl StreamCounters {
     pub fn count(&self, bytes: usize, captured: Stamp, lost: u64) {
         self.samples.fetch_add(1, Ordering::Relaxed);
         self.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
-        self.newest.store(captured.0, Ordering::Relaxed);
+        let before = self.newest.swap(captured.0, Ordering::Relaxed);
+        // None before the first sample.
+        if before > 0 {
+            self.intervals.count(captured.since(Stamp(before)));
+        }
         self.lose(lost);
     }
 
@@ -159,6 +165,8 @@ pub struct Board {
     log: Mutex<Log>,
     /// Until when a modality is looked at.
     looks: Vec<AtomicU64>,
+    /// The newest incarnation of each modality.
+    opened: Mutex<Vec<Option<Provenance>>>,
     previews: Mutex<Vec<Arc<Preview>>>,
     events: broadcast::Sender<Event>,
 }
@@ -170,12 +178,19 @@ struct Entry {
     name: String,
     topic: String,
     nominal_hz: Option<f64>,
+    detail: StaticDetail,
 }
 
 impl Entry {
     fn of(device: &DeviceSpec) -> Self {
         let DeviceSpec { id, name, topic, verdict, .. } = device;
-        Self { id: *id, name: name.clone(), topic: topic.clone(), nominal_hz: verdict.hz }
+        Self {
+            id: *id,
+            name: name.clone(),
+            topic: topic.clone(),
+            nominal_hz: verdict.hz,
+            detail: StaticDetail::of(device),
+        }
     }
 }
 
@@ -204,6 +219,7 @@ impl Board {
             episodes: Mutex::new(EpisodeCounts::default()),
             log: Mutex::new(Log::default()),
             looks: (0..MAX_MODALITIES).map(|_| AtomicU64::new(0)).collect(),
+            opened: Mutex::new(vec![None; MAX_MODALITIES]),
             previews: Mutex::new(Vec::new()),
             events: broadcast::channel(EVENT_DEPTH).0,
         }
@@ -322,6 +338,11 @@ impl Board {
             let (file, error, verdict) = (file.clone(), error.clone(), verdict.clone());
             *lock(&self.last_end) = Some(EpisodeEnd { file, seconds: *seconds, error, verdict });
         }
+        if let What::Opened { bit, provenance, .. } = &what
+            && let Some(opened) = lock(&self.opened).get_mut(bit.index())
+        {
+            *opened = Some(Provenance::clone(provenance));
+        }
         lock(&self.episodes).note(&what);
         // An error only means that there is no subscriber.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
@@ -372,6 +393,17 @@ impl Board {
         previews.extend(Preview::of(id, header, payload).map(Arc::new));
     }
 
+    /// Of the devices that are looked at.
+    fn details(&self, now: Stamp) -> Vec<DeviceDetail> {
+        let looked_at = self.entries.iter().filter(|entry| self.is_looked_at(entry.id, now));
+        let detail = |entry: &Entry| {
+            let opened = lock(&self.opened);
+            let opened = opened.get(entry.id.index()).and_then(Option::as_ref);
+            DeviceDetail::of(&entry.detail, opened, self.counters(entry.id).intervals.counts())
+        };
+        looked_at.map(detail).collect()
+    }
+
     /// Those of devices that are looked at; the others are dropped.
     fn previews(&self, now: Stamp) -> Vec<Arc<Preview>> {
         let mut previews = lock(&self.previews);
@@ -383,7 +415,7 @@ impl Board {
     pub fn snapshot(&self) -> Snapshot {
         let taken = Stamp::now();
         let slots = lock(&self.slots).clone();
-        let devices = self.entries.iter().map(|Entry { id, name, topic, nominal_hz }| {
+        let devices = self.entries.iter().map(|Entry { id, name, topic, nominal_hz, .. }| {
             let counters = &self.counters[id.index()];
             let slot = &slots[id.index()];
             let newest = counters.newest.load(Ordering::Relaxed);
@@ -419,6 +451,7 @@ impl Board {
             disk_free: *lock(&self.disk_free),
             simulated: self.simulated.load(Ordering::Relaxed),
             log: lock(&self.log).lines.iter().cloned().collect(),
+            details: self.details(taken),
             previews: self.previews(taken),
         }
     }

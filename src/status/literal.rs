@@ -62,6 +62,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         disk_free: None,
         simulated: false,
         log: Vec::new(),
+        details: Vec::new(),
         previews: Vec::new(),
     }
 }

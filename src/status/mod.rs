@@ -7,6 +7,7 @@
 
 pub mod attach;
 pub mod board;
+pub mod detail;
 mod event;
 pub mod preview;
 pub mod rates;
@@ -27,6 +28,7 @@ use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
 
+use detail::DeviceDetail;
 use preview::Preview;
 use session::{SessionRequest, SessionStatus};
 
@@ -253,6 +255,8 @@ pub struct Snapshot {
     pub simulated: bool,
     /// The newest log lines, oldest first.
     pub log: Vec<Arc<LogLine>>,
+    /// More about the devices that screens look at.
+    pub details: Vec<DeviceDetail>,
     /// The newest samples of the devices that screens look at.
     #[serde(skip)]
     pub previews: Vec<Arc<Preview>>,

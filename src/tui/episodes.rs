@@ -1,7 +1,7 @@
 //! The episodes panel: those of the session, the newest first.
 
 use ratatui::Frame;
-use ratatui::layout::Rect;
+use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::text::{Line, Span};
 
 use super::model::Model;
@@ -31,6 +31,67 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, rows: u16, model: &Model, 
     for (entry, row) in ended(session).zip(inner.rows()).take(usize::from(rows)) {
         frame.render_widget(line(entry, usize::from(row.width), theme), row);
     }
+}
+
+/// The page: every episode of the session that is known here, and the selected one in full.
+pub(super) fn draw_page(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
+    let Some(session) = &model.latest().session else {
+        let inner = view::panel(frame, area, "Episodes", Line::default(), theme);
+        return frame.render_widget(Line::styled("this run records no session", theme.faint()), inner);
+    };
+    let entries: Vec<&EpisodeEntry> = session.episodes.iter().rev().collect();
+    let about = entries.get(model.episode).map_or_else(Vec::new, |entry| in_full(entry, session, area.width, theme));
+    let lines = u16::try_from(about.len()).unwrap_or(u16::MAX).min(area.height / 2) + 1;
+    let [list, below] = Layout::vertical([Constraint::Fill(1), Constraint::Length(lines)]).areas(area);
+    let remark = Span::styled(counts(session), theme.faint());
+    let inner = view::panel(frame, list, "Episodes", remark.into(), theme);
+    let first = model.episode.saturating_sub(usize::from(inner.height / 2));
+    for (place, (entry, row)) in
+        entries.iter().enumerate().skip(first).zip(inner.rows()).map(|((place, entry), row)| (place, (entry, row)))
+    {
+        let [mark, rest] = Layout::horizontal([Constraint::Length(2), Constraint::Fill(1)]).areas(row);
+        if place == model.episode {
+            frame.render_widget(Span::styled(theme.symbol("▸", ">"), theme.title()), mark);
+        }
+        frame.render_widget(line(entry, usize::from(rest.width), theme), rest);
+    }
+    if entries.is_empty() {
+        frame.render_widget(Line::styled("none yet: space begins one", theme.faint()), inner);
+    }
+    let name = entries.get(model.episode).map_or_else(String::new, |entry| theme.safe(&entry.file));
+    let inner = view::panel(frame, below, &text::cut(&name, 60, theme.ellipsis()), Line::default(), theme);
+    for (line, row) in about.into_iter().zip(inner.rows()) {
+        frame.render_widget(line, row);
+    }
+}
+
+/// Everything that is known of an episode.
+fn in_full(entry: &EpisodeEntry, session: &SessionStatus, width: u16, theme: Theme) -> Vec<Line<'static>> {
+    let fact = |name: &str, value: &str| {
+        let room = usize::from(width).saturating_sub(14);
+        let value = text::cut(&theme.safe(value), room, theme.ellipsis()).into_owned();
+        Line::from(vec![Span::styled(format!("{name:<10}"), theme.faint()), Span::raw(value)])
+    };
+    let verdict = match entry.verdict {
+        Some(grade) => Line::from(vec![
+            Span::styled(format!("{:<10}", "verdict"), theme.faint()),
+            Span::styled(grade.word(), theme.grade(grade)),
+            Span::raw(format!(", {:.1} s", entry.seconds.unwrap_or_default())),
+        ]),
+        None => fact("verdict", "none yet"),
+    };
+    let mut lines = vec![fact("begun", &entry.begun), verdict];
+    lines.extend(entry.reasons.iter().map(|reason| fact("reason", reason)));
+    lines.extend(entry.sensors.as_ref().map(|sensors| fact("sensors", &sensors.to_string())));
+    lines.extend(entry.label.map(|label| match entry.label_reason.as_str() {
+        "" => fact("label", label.word()),
+        why => fact("label", &format!("{}: {why}", label.word())),
+    }));
+    lines.extend((!entry.note.is_empty()).then(|| fact("note", &entry.note)));
+    lines.extend(entry.marks.iter().map(|mark| fact("mark", &format!("{:.1} s {}", mark.at, mark.text))));
+    lines.extend(entry.discarded.then(|| fact("trash", "discarded; u takes the last one back")));
+    lines.push(fact("folder", &session.folder.to_string_lossy()));
+    lines
 }
 
 /// `12 of 50, 9 GOOD 2 SUSPECT 1 BAD, 1 in the trash`.

@@ -1,4 +1,4 @@
-//! The help: all keys, and the meaning of the states.
+//! The help: all keys on two pages, and the meaning of the states.
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
@@ -10,6 +10,8 @@ use super::keys;
 use super::theme::Theme;
 use crate::status::SlotState;
 
+/// Pages of the help.
+pub(super) const PAGES: usize = 2;
 /// Width of the box with its border and padding.
 const WIDTH: u16 = 58;
 const STATES: [(SlotState, &str); 6] = [
@@ -21,26 +23,35 @@ const STATES: [(SlotState, &str); 6] = [
     (SlotState::Absent, "not attached"),
 ];
 
-pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
-    let keys = keys::help()
-        .map(|(key, meaning)| Line::from(vec![Span::styled(format!("{key:<12}"), theme.title()), Span::raw(meaning)]));
+/// The lines of a page, from 1: keys about episodes and motion, then keys about the screen, and the states.
+fn lines(page: usize, theme: Theme) -> Vec<Line<'static>> {
+    let row = |(key, meaning): (&'static str, &'static str)| {
+        Line::from(vec![Span::styled(format!("{key:<12}"), theme.title()), Span::raw(meaning)])
+    };
+    let keys = keys::help(page == 1).map(row);
+    if page == 1 {
+        return keys.collect();
+    }
     let states = STATES.iter().map(|(state, meaning)| {
         let word = format!("{} {:<10}", theme.state_symbol(*state), state.word());
         Line::from(vec![Span::styled(word, theme.state(*state)), Span::raw(*meaning)])
     });
-    let mut lines: Vec<_> = keys.chain(std::iter::once(Line::default())).chain(states).collect();
-    let room = usize::from(area.height.saturating_sub(2));
-    if lines.len() > room {
-        // A low screen shows only the keys.
-        lines.truncate(keys::help().count());
-    }
+    keys.chain(states).collect()
+}
+
+pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, page: usize, theme: Theme) {
+    let lines = lines(page, theme);
     let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).saturating_add(2).min(area.height);
     let [middle] = Layout::vertical([Constraint::Length(height)]).flex(Flex::Center).areas(area);
     let [middle] = Layout::horizontal([Constraint::Length(WIDTH)]).flex(Flex::Center).areas(middle);
+    let title = match page {
+        1 => " Keys: episodes and motion (? for the screen's) ",
+        _ => " Keys: the screen; states ",
+    };
     let block = Block::bordered()
         .border_set(theme.border())
         .border_style(theme.faint())
-        .title(Span::styled(" Keys and states ", theme.title().remove_modifier(Modifier::DIM)))
+        .title(Span::styled(title, theme.title().remove_modifier(Modifier::DIM)))
         .padding(Padding::horizontal(1));
     frame.render_widget(Clear, middle);
     frame.render_widget(Paragraph::new(lines).block(block), middle);
@@ -49,17 +60,21 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tui::theme::{Charset, Colours};
+
+    const THEME: Theme = Theme { colours: Colours::None, charset: Charset::Unicode };
 
     /// On 80x24 every key is in the help.
     #[test]
     fn no_key_is_cut() {
-        assert!(keys::help().count() + 2 <= 24);
+        let shown: usize = (1..=PAGES).map(|page| lines(page, THEME).len()).sum();
+        assert!((1..=PAGES).all(|page| lines(page, THEME).len() + 2 <= 24));
+        assert_eq!(shown, keys::help(true).count() + keys::help(false).count() + STATES.len());
     }
 
     #[test]
     fn no_line_is_cut() {
-        let longest =
-            keys::help().map(|(_, meaning)| meaning.len()).chain(STATES.iter().map(|(_, meaning)| meaning.len()));
-        assert!(longest.max().expect("lines") + 12 <= usize::from(WIDTH) - 4);
+        let longest = (1..=PAGES).flat_map(|page| lines(page, THEME)).map(|line| line.width()).max();
+        assert!(longest.expect("lines") <= usize::from(WIDTH) - 4);
     }
 }

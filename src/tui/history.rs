@@ -25,10 +25,36 @@ pub(super) enum Cell {
     Unknown,
 }
 
-/// The last minute of all devices.
+/// Seconds of the mask that are kept.
+pub(super) const MASK_SECONDS: usize = 300;
+
+/// A bit of the mask during some seconds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Bit {
+    /// Nothing is known.
+    Unknown,
+    /// It was set.
+    Set,
+    /// It was clear.
+    Clear,
+    /// It changed.
+    Edge,
+}
+
+/// A second of the mask: the bits that were set all the time, and those that were at some moment.
+#[derive(Debug, Clone, Copy, Default)]
+struct Second {
+    always: u64,
+    ever: u64,
+}
+
+/// The last minute of all devices, and the last five of the mask.
 #[derive(Debug, Clone)]
 pub(super) struct History {
     lanes: Box<[Lane]>,
+    mask: Box<[Second]>,
+    /// The current second of the mask.
+    current: Option<Second>,
     /// When the current second began.
     begun: Option<Stamp>,
     /// Whole seconds so far.
@@ -49,7 +75,8 @@ struct Lane {
 impl Default for History {
     fn default() -> Self {
         let lane = Lane { cells: [Cell::Unknown; SECONDS], samples: 0, was_absent: false, highest: 0.0 };
-        Self { lanes: vec![lane; MAX_MODALITIES].into_boxed_slice(), begun: None, seconds: 0 }
+        let mask = vec![Second::default(); MASK_SECONDS].into_boxed_slice();
+        Self { lanes: vec![lane; MAX_MODALITIES].into_boxed_slice(), mask, current: None, begun: None, seconds: 0 }
     }
 }
 
@@ -59,6 +86,15 @@ impl History {
         let begun = *self.begun.get_or_insert(snapshot.taken);
         let elapsed = snapshot.taken.since(begun);
         let is_over = elapsed >= CELL;
+        let mask = snapshot.mask.0;
+        let current = self.current.get_or_insert(Second { always: mask, ever: mask });
+        current.always &= mask;
+        current.ever |= mask;
+        if is_over && let Some(place) = self.mask.get_mut(self.seconds % MASK_SECONDS) {
+            *place = *current;
+            // A change between two seconds is one in the next.
+            self.current = Some(Second { always: mask, ever: mask });
+        }
         for device in &snapshot.devices {
             if let Some(lane) = self.lanes.get_mut(device.id.index()) {
                 lane.was_absent |= !matches!(device.state, SlotState::Streaming | SlotState::Stalled);
@@ -74,6 +110,28 @@ impl History {
             self.seconds += 1;
             self.begun = Some(snapshot.taken);
         }
+    }
+
+    /// The last five minutes of a bit in so many cells, the oldest first.
+    pub(super) fn bits(&self, id: ModalityId, columns: usize) -> Vec<Bit> {
+        let each = MASK_SECONDS.div_ceil(columns.max(1)).max(1);
+        let newest = self.seconds.next_multiple_of(each);
+        let bit = 1_u64 << id.bit();
+        let of = |second: usize| {
+            let is_kept = second < self.seconds && second + MASK_SECONDS >= self.seconds;
+            self.mask.get(second % MASK_SECONDS).filter(|_| is_kept).map(|second| match second {
+                Second { always, .. } if always & bit != 0 => Bit::Set,
+                Second { ever, .. } if ever & bit == 0 => Bit::Clear,
+                _ => Bit::Edge,
+            })
+        };
+        let cell = |first: usize| {
+            let known = (first..first + each).filter_map(of);
+            known.reduce(|a, b| if a == b { a } else { Bit::Edge }).unwrap_or(Bit::Unknown)
+        };
+        let oldest = newest.saturating_sub(each * columns);
+        let missing = columns.saturating_sub((newest - oldest) / each);
+        std::iter::repeat_n(Bit::Unknown, missing).chain((oldest..newest).step_by(each).map(cell)).collect()
     }
 
     /// The last minute in so many cells, the oldest first; `columns` divides [`SECONDS`].
@@ -158,6 +216,28 @@ mod tests {
         assert_eq!(strip[57..], [Cell::Absent, Cell::Rate(0.0), Cell::Rate(1.0)]);
         // In fewer cells, the worst of each; the unfinished group counts.
         assert_eq!(history.strip(id(0), 20)[18..], [Cell::Absent, Cell::Rate(0.0)]);
+    }
+
+    #[test]
+    fn a_bit_has_its_edges_for_five_minutes() {
+        let mut history = History::default();
+        // Away from second 20 to 30, and for an instant in second 40.
+        let tenths = (0..=1000).map(|tenth| match tenth {
+            200..=300 | 405 => (SlotState::Absent, 0),
+            _ => (SlotState::Streaming, tenth * 3),
+        });
+        played(&mut history, tenths);
+        let bits = history.bits(id(0), MASK_SECONDS);
+        assert_eq!(bits.len(), MASK_SECONDS);
+        let known = &bits[200..];
+        assert!(bits[..200].iter().all(|bit| *bit == Bit::Unknown));
+        let edges: Vec<_> = (0..100).filter(|second| known[*second] == Bit::Edge).collect();
+        assert_eq!(edges, [19, 30, 40]);
+        assert!(known[20..30].iter().all(|bit| *bit == Bit::Clear), "{known:?}");
+        assert!(known[..19].iter().chain(&known[41..]).all(|bit| *bit == Bit::Set), "{known:?}");
+        let coarse = history.bits(id(0), 60);
+        assert_eq!((coarse.len(), coarse[40..].iter().filter(|bit| **bit == Bit::Edge).count()), (60, 3));
+        assert!(history.bits(id(1), 60)[40..].iter().all(|bit| *bit == Bit::Clear));
     }
 
     #[test]

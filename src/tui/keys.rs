@@ -4,7 +4,7 @@
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-use super::model::Model;
+use super::model::{Model, Page};
 use crate::status::SlotState;
 use crate::status::session::Phase;
 
@@ -61,6 +61,24 @@ pub(super) enum Act {
     Escape,
     /// Pause the view.
     Pause,
+    /// Show the selected device, or return from it.
+    Detail,
+    /// Show the log, or return from it.
+    Log,
+    /// Show the episodes, or return from them.
+    Episodes,
+    /// Ask what lines of the log are to contain.
+    Search,
+    /// Show more severe lines only.
+    Level,
+    /// Show only lines about the selected device, or all.
+    OneDevice,
+    /// Continue long lines of the log on the next row, or cut them.
+    Wrap,
+    /// Group repeated lines of the log, or list each.
+    Group,
+    /// Show pictures, or not.
+    Pictures,
     /// Scroll to older lines of the log.
     Older,
     /// Scroll to newer lines of the log.
@@ -71,6 +89,34 @@ pub(super) enum Act {
     Quit,
     /// Disarm the actuator, then end the program.
     Interrupt,
+}
+
+impl Act {
+    /// Whether it does something about episodes, devices or motion, and not only about the screen.
+    const fn is_about_the_rig(self) -> bool {
+        matches!(
+            self,
+            Self::Toggle
+                | Self::Next
+                | Self::Redo
+                | Self::Discard
+                | Self::Undo
+                | Self::Stop
+                | Self::Mark
+                | Self::Success
+                | Self::Failure
+                | Self::Note
+                | Self::Task
+                | Self::EndSession
+                | Self::Restart
+                | Self::Plug
+                | Self::AskToArm
+                | Self::Arm
+                | Self::Disarm
+                | Self::Quit
+                | Self::Interrupt
+        )
+    }
 }
 
 /// When a key counts.
@@ -156,7 +202,7 @@ use KeyCode::{Char, Down, End, Esc, F, Home, Left, PageDown, PageUp, Right, Up};
 use When::{Always, Control, ControlRepeated, Pressed, Repeated};
 
 /// All keys. The footer shows as many as fit, in this order; the help and the last two always.
-pub(super) const TABLE: [Binding; 30] = [
+pub(super) const TABLE: [Binding; 39] = [
     row(Act::Toggle, &[Char(' ')], Pressed, ("space", "start an episode, end the one in progress"), |m| {
         Some(toggles(m))
     }),
@@ -188,7 +234,26 @@ pub(super) const TABLE: [Binding; 30] = [
     }),
     row(Act::Order, &[Char('o')], Pressed, ("o", "order of devices: trouble first, or by bit"), never),
     row(Act::Bell, &[Char('b')], Pressed, ("b", "bell at begin, end and losses: on or off"), never),
-    row(Act::Older, &[PageUp], Repeated, ("pgup, pgdn", "scroll the log; esc goes to its end"), |_| Some("log")),
+    row(Act::Detail, &[KeyCode::Enter], Pressed, ("enter", "the selected device: picture, plots, facts"), |m| {
+        Some(if m.page == Page::Device { "back" } else { "device" })
+    }),
+    row(Act::Log, &[Char('l')], Pressed, ("l", "the log on the whole screen"), |m| {
+        Some(if m.page == Page::Log { "back" } else { "log" })
+    }),
+    row(Act::Episodes, &[Char('e')], Pressed, ("e", "the episodes of the session, with reasons"), never),
+    row(Act::Search, &[Char('/')], Pressed, ("/", "only lines of the log that contain a text"), |m| {
+        (m.page == Page::Log).then_some("search")
+    }),
+    row(Act::Level, &[Char('v')], Pressed, ("v", "log: warnings, errors, everything"), |m| {
+        (m.page == Page::Log).then_some("level")
+    }),
+    row(Act::OneDevice, &[Char('f')], Pressed, ("f", "log: of the selected device only"), |m| {
+        (m.page == Page::Log).then_some("device only")
+    }),
+    row(Act::Wrap, &[Char('w')], Pressed, ("w, g", "log: wrap long lines; group repeats"), never),
+    row(Act::Group, &[Char('g')], Pressed, ("", ""), never),
+    row(Act::Pictures, &[Char('c')], Pressed, ("c", "pictures of cameras: on or off"), never),
+    row(Act::Older, &[PageUp], Repeated, ("pgup, pgdn", "scroll the log; esc goes to its end"), never),
     row(Act::Newer, &[PageDown], Repeated, ("", ""), never),
     row(Act::Help, &[Char('?'), F(1)], Repeated, ("?", "this help"), |_| Some("help")),
     row(Act::Quit, &[Char('q')], Repeated, ("q, ctrl-c", "quit; ctrl-c disarms first"), |_| Some("quit")),
@@ -215,9 +280,10 @@ pub(super) fn footer(model: &Model) -> Vec<(&'static str, &'static str)> {
     TABLE.iter().filter_map(|row| Some((row.shown.split(", ctrl").next()?, (row.footer)(model)?))).collect()
 }
 
-/// The rows of the help.
-pub(super) fn help() -> impl Iterator<Item = (&'static str, &'static str)> {
-    TABLE.iter().filter(|row| !row.shown.is_empty()).map(|row| (row.shown, row.help))
+/// The rows of the help: those about episodes and motion, or those about the screen.
+pub(super) fn help(is_about_the_rig: bool) -> impl Iterator<Item = (&'static str, &'static str)> {
+    let rows = TABLE.iter().filter(move |row| !row.shown.is_empty() && row.act.is_about_the_rig() == is_about_the_rig);
+    rows.map(|row| (row.shown, row.help))
 }
 
 #[cfg(test)]
@@ -228,8 +294,10 @@ mod tests {
     fn the_page_about_the_monitor_lists_exactly_these_keys() {
         let page = include_str!("../../docs/monitor.md");
         let rows: Vec<_> = page.lines().filter(|line| line.starts_with("| `")).collect();
-        let expected: Vec<_> =
-            help().map(|(keys, meaning)| format!("| `{}` | {meaning} |", keys.replace(", ", "`, `"))).collect();
+        let expected: Vec<_> = help(true)
+            .chain(help(false))
+            .map(|(keys, meaning)| format!("| `{}` | {meaning} |", keys.replace(", ", "`, `")))
+            .collect();
         assert_eq!(rows, expected);
     }
 

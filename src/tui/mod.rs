@@ -7,6 +7,7 @@
 //! Invariant: a blocked terminal delays nothing: a separate thread writes the frames, and frames are dropped
 //! while it is behind.
 
+mod detail;
 mod devices;
 mod episodes;
 pub mod flashlight;
@@ -15,14 +16,18 @@ mod header;
 mod help;
 mod history;
 mod keys;
+mod lidar;
 mod link;
 mod log;
+mod log_view;
 mod mask;
 pub mod model;
+pub mod picture;
 mod policy;
 mod recording;
 mod terminal;
 pub mod theme;
+mod timeline;
 pub mod view;
 
 use std::io::{self, Write as _};
@@ -90,7 +95,11 @@ pub async fn run(
 pub async fn show(mut link: impl Link, shutdown: CancellationToken) -> Result<(), TuiError> {
     let theme = Theme::detect(|name| std::env::var(name).ok());
     let mut screen = Screen::open().map_err(TuiError::NoTerminal)?;
-    let outcome = drive(&mut link, &shutdown, EventStream::new(), |model| screen.draw(model, theme)).await;
+    let size = crossterm::terminal::size().ok();
+    // The size comes with later changes of it.
+    let size = futures::stream::iter(size.map(|(columns, rows)| Ok(Event::Resize(columns, rows))));
+    let events = size.chain(EventStream::new());
+    let outcome = drive(&mut link, &shutdown, events, |model| screen.draw(model, theme)).await;
     screen.close().await;
     outcome
 }
@@ -117,7 +126,8 @@ async fn drive(
             () = shutdown.cancelled() => return Ok(()),
             event = events.next() => match event {
                 Some(Ok(Event::Key(key))) => model.update(Msg::Key(key)),
-                // A resize, which the next frame detects by itself, and pasted text, which is no request.
+                Some(Ok(Event::Resize(columns, rows))) => model.update(Msg::Size(columns, rows)),
+                // Pasted text is no request.
                 Some(Ok(_)) => model::Effect::None,
                 Some(Err(error)) => return Err(TuiError::Gone(error)),
                 None => return Err(TuiError::Gone(io::ErrorKind::UnexpectedEof.into())),

@@ -6,16 +6,23 @@
 //! Invariant: no key deletes anything: discarding moves to the trash, and the end of a session is confirmed by a word.
 //! Invariant: pure: no clock, no terminal, no channel; time comes from the snapshots.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-use super::history::{Cell, History};
+use super::history::{Bit, Cell, History};
 use super::keys::{self, Act};
+use super::lidar::Sweep;
 use super::link::LinkState;
+use super::log_view::LogView;
+use super::picture::Picture;
 use super::theme::Edge;
+use super::{help, view};
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::sample::Encoding;
+use crate::status::preview::Preview;
 use crate::status::rates::Rates;
 use crate::status::session::{Label, SessionRequest};
 use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
@@ -36,6 +43,8 @@ pub enum Msg {
     Snapshot(Box<Snapshot>),
     /// A key.
     Key(KeyEvent),
+    /// The size of the terminal, columns and rows.
+    Size(u16, u16),
     /// A command could not be sent because the program is busy.
     Refused,
     /// The actuator was not armed, and why.
@@ -55,6 +64,20 @@ pub enum Effect {
     Order(Order),
     /// Disarm the actuator, then end the program.
     Leave,
+}
+
+/// What fills the screen between header and footer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Page {
+    /// The rig: mask, devices, recording, log.
+    #[default]
+    Rig,
+    /// The selected device.
+    Device,
+    /// The log.
+    Log,
+    /// The episodes of the session.
+    Episodes,
 }
 
 /// Whether the user asked to quit.
@@ -111,10 +134,22 @@ pub struct Model {
     unplugged: [Option<Stamp>; MAX_MODALITIES],
     /// Row of the selected device.
     pub(super) selected: usize,
-    /// Lines of the log below what is shown.
-    pub(super) scroll: usize,
-    /// The help is open.
-    pub(super) help: bool,
+    /// What fills the screen.
+    pub(super) page: Page,
+    /// Row of the selected episode, the newest first.
+    pub(super) episode: usize,
+    /// Which lines of the log are shown.
+    pub(super) log: LogView,
+    /// Columns and rows of the terminal.
+    size: (u16, u16),
+    /// Pictures are shown.
+    pub(super) pictures: bool,
+    /// When previews of the selected device were last requested.
+    looked: Option<Stamp>,
+    /// What the previews showed so far.
+    seen: Seen,
+    /// The open page of the help, from 1.
+    pub(super) help: Option<usize>,
     /// Whether the user has asked to quit.
     pub(super) quit: Quit,
     /// When the user asked to arm the actuator: the next key confirms or cancels.
@@ -166,8 +201,14 @@ impl Model {
             edges: [None; MAX_MODALITIES],
             unplugged: [None; MAX_MODALITIES],
             selected: 0,
-            scroll: 0,
-            help: false,
+            page: Page::default(),
+            episode: 0,
+            log: LogView::default(),
+            size: (80, 24),
+            pictures: true,
+            looked: None,
+            seen: Seen::default(),
+            help: None,
             quit: Quit::No,
             arming: None,
             prompt: None,
@@ -183,7 +224,11 @@ impl Model {
     /// Applies a message.
     pub fn update(&mut self, msg: Msg) -> Effect {
         match msg {
-            Msg::Snapshot(snapshot) => self.advance(*snapshot),
+            Msg::Snapshot(snapshot) => {
+                self.advance(*snapshot);
+                return self.look();
+            }
+            Msg::Size(columns, rows) => self.size = (columns, rows),
             Msg::Key(key) if key.kind == KeyEventKind::Release => {}
             Msg::Key(key) => {
                 let effect = self.key(key);
@@ -212,14 +257,14 @@ impl Model {
                 *unplugged = Some(snapshot.taken);
             }
         }
-        if self.scroll > 0 && self.frozen.is_none() {
-            self.scroll += lines_since(&self.latest, &snapshot);
-        }
         if calls_attention(&self.latest, &snapshot) && !self.is_silent {
             self.rings += 1;
         }
         let refresh = self.rates.update(&snapshot);
         self.history.update(&snapshot);
+        if self.frozen.is_none() {
+            snapshot.previews.iter().for_each(|preview| self.seen.take(preview));
+        }
         let selected = self.selected_device().map(|device| device.id);
         let answer = snapshot.session.as_ref().and_then(|session| session.answer.clone());
         let known = self.latest.session.as_ref().and_then(|session| session.answer.as_ref());
@@ -298,9 +343,9 @@ impl Model {
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
-        if self.help {
+        if let Some(page) = self.help {
             // The key that closes the help has no other effect.
-            self.help = false;
+            self.help = (act == Some(Act::Help) && page < help::PAGES).then_some(page + 1);
             return Effect::None;
         }
         let effect = act.map_or(Effect::None, |act| self.act(act));
@@ -350,17 +395,100 @@ impl Model {
             Act::Bell => self.toggle_bell(),
             Act::Order => self.toggle_order(),
             Act::Pause => self.toggle_pause(),
-            Act::Help => self.help = true,
-            Act::Up => self.selected = self.selected.saturating_sub(1),
-            Act::Down => self.selected += 1,
-            Act::First => self.selected = 0,
-            Act::Last => self.selected = usize::MAX,
-            Act::Older => self.scroll += SCROLL_STEP,
-            Act::Newer => self.scroll = self.scroll.saturating_sub(SCROLL_STEP),
+            Act::Help => self.help = Some(1),
+            Act::Up | Act::Down | Act::First | Act::Last => self.step(act),
+            Act::Older => self.scroll(act, SCROLL_STEP),
+            Act::Newer => self.scroll(act, SCROLL_STEP),
+            Act::Detail => self.turn_to(Page::Device),
+            Act::Log => self.turn_to(Page::Log),
+            Act::Episodes => self.turn_to(Page::Episodes),
+            Act::Search => self.ask(Question::Search),
+            Act::Level => self.log.raise(),
+            Act::OneDevice => self.filter_by_device(),
+            Act::Wrap => self.log.wraps = !self.log.wraps,
+            Act::Group => self.log.groups = !self.log.groups,
+            Act::Pictures => self.pictures = !self.pictures,
             // Handled before any other key.
             Act::Arm | Act::Disarm | Act::Escape | Act::Quit | Act::Interrupt => {}
         }
         Effect::None
+    }
+
+    /// Opens a page, or returns from it to the rig.
+    fn turn_to(&mut self, page: Page) {
+        self.page = if self.page == page { Page::Rig } else { page };
+        self.looked = None;
+    }
+
+    /// Moves the selection of the page, or its text.
+    fn step(&mut self, act: Act) {
+        let selected = match self.page {
+            Page::Rig | Page::Device => &mut self.selected,
+            Page::Episodes => &mut self.episode,
+            Page::Log => return self.scroll(act, 1),
+        };
+        *selected = match act {
+            Act::Up => selected.saturating_sub(1),
+            Act::Down => selected.saturating_add(1),
+            Act::First => 0,
+            _ => usize::MAX,
+        };
+        self.looked = None;
+    }
+
+    fn scroll(&mut self, act: Act, by: usize) {
+        let log = self.frozen.as_deref().unwrap_or(&self.latest).log.as_slice();
+        match act {
+            Act::Up | Act::Older => self.log.older(log, by),
+            Act::First => self.log.older(log, usize::MAX - 1),
+            Act::Down | Act::Newer => self.log.newer(log, by),
+            _ => self.log.follow(),
+        }
+    }
+
+    /// Shows only the lines about the selected device, or all.
+    fn filter_by_device(&mut self) {
+        let name = self.selected_device().map(|device| device.name.clone());
+        self.log.device = if self.log.device.is_some() { None } else { name };
+    }
+
+    /// Requests previews of the selected device while they are shown.
+    fn look(&mut self) -> Effect {
+        let is_shown = self.page == Page::Device || (self.page == Page::Rig && self.has_column());
+        let is_due = self.looked.is_none_or(|looked| self.latest.taken.since(looked) >= LOOK_AGAIN);
+        let Some(device) = self.selected_device().filter(|_| is_shown && is_due && self.frozen.is_none()) else {
+            return Effect::None;
+        };
+        let id = device.id;
+        self.looked = Some(self.latest.taken);
+        let is_linked = matches!(self.link, LinkState::Own | LinkState::Attached { .. });
+        if is_linked { Effect::Send(Command::Look(id)) } else { Effect::None }
+    }
+
+    /// Whether the selected device is shown beside the rig.
+    pub(super) fn has_column(&self) -> bool {
+        let (columns, rows) = self.size;
+        columns >= view::WITH_COLUMN.0 && rows >= view::WITH_COLUMN.1
+    }
+
+    /// The newest sample of a device that is looked at.
+    pub(super) fn preview(&self, id: ModalityId) -> Option<&Preview> {
+        self.shown().previews.iter().find(|preview| preview.device == id).map(|preview| &**preview)
+    }
+
+    /// It as a picture, or why it is none that can be shown; `None` if it is something else.
+    pub(super) fn picture(&self, id: ModalityId) -> Option<&Result<Picture, String>> {
+        self.seen.picture.as_ref().filter(|_| self.seen.device == Some(id))
+    }
+
+    /// Its scan, if it is a LiDAR's.
+    pub(super) fn sweep(&self, id: ModalityId) -> Option<&Sweep> {
+        self.seen.sweep.as_ref().filter(|_| self.seen.device == Some(id))
+    }
+
+    /// The numbers of the last samples that were looked at, with their capture times.
+    pub(super) fn numbers(&self, id: ModalityId) -> impl Iterator<Item = &(Stamp, Vec<f64>)> {
+        self.seen.numbers.iter().filter(move |_| self.seen.device == Some(id))
     }
 
     /// Whether a key that begins or ends an episode counts. Each press counts from itself: while a key is held, nothing
@@ -448,9 +576,9 @@ impl Model {
     }
 
     fn keep_in_bounds(&mut self) {
-        let (devices, lines) = (self.shown().devices.len(), self.shown().log.len());
-        self.selected = self.selected.min(devices.saturating_sub(1));
-        self.scroll = self.scroll.min(lines.saturating_sub(1));
+        self.selected = self.selected.min(self.shown().devices.len().saturating_sub(1));
+        let episodes = self.latest.session.as_ref().map_or(0, |session| session.episodes.len());
+        self.episode = self.episode.min(episodes.saturating_sub(1));
     }
 
     /// The snapshot to show: the newest, or that of the moment the view was paused.
@@ -502,6 +630,11 @@ impl Model {
         self.frozen_history.as_ref().unwrap_or(&self.history).strip(id, columns)
     }
 
+    /// The last five minutes of a bit in so many cells.
+    pub(super) fn bits(&self, id: ModalityId, columns: usize) -> Vec<Bit> {
+        self.frozen_history.as_ref().unwrap_or(&self.history).bits(id, columns)
+    }
+
     /// Figures of a device.
     pub fn reading(&self, id: ModalityId) -> Reading {
         self.readings.get(id.index()).copied().unwrap_or_default()
@@ -543,6 +676,10 @@ impl Model {
     }
 }
 
+/// Previews are requested anew after this time, well before the run stops them.
+const LOOK_AGAIN: Duration = Duration::from_millis(500);
+/// Samples of numbers that are kept for a plot: some 15 s.
+const SAMPLES: usize = 300;
 /// Lines by which a page key scrolls the log.
 const SCROLL_STEP: usize = 5;
 
@@ -555,11 +692,35 @@ fn calls_attention(before: &Snapshot, after: &Snapshot) -> bool {
     before.recording.is_some() != after.recording.is_some() || before.devices.iter().any(is_lost)
 }
 
-/// How many lines were added to the log. The oldest are dropped, so the count starts at the last known line;
-/// when that is gone too, all are new.
-fn lines_since(before: &Snapshot, after: &Snapshot) -> usize {
-    let Some(known) = before.log.last() else { return after.log.len() };
-    after.log.iter().rev().take_while(|line| *line != known).count()
+/// What the previews of one device showed: of fixed size.
+#[derive(Debug, Default)]
+struct Seen {
+    device: Option<ModalityId>,
+    seq: Option<u64>,
+    picture: Option<Result<Picture, String>>,
+    sweep: Option<Sweep>,
+    numbers: VecDeque<(Stamp, Vec<f64>)>,
+}
+
+impl Seen {
+    fn take(&mut self, preview: &Preview) {
+        if self.device != Some(preview.device) {
+            *self = Self { device: Some(preview.device), ..Self::default() };
+        }
+        if self.seq.replace(preview.seq) == Some(preview.seq) {
+            return;
+        }
+        self.picture = Picture::decode(preview);
+        let numbers = preview.numbers();
+        if !numbers.is_empty() {
+            self.numbers.push_back((preview.captured, numbers));
+            self.numbers.drain(..self.numbers.len().saturating_sub(SAMPLES));
+        }
+        if preview.encoding == Encoding::Bytes {
+            let mut sweep = self.sweep.take().unwrap_or_default();
+            self.sweep = sweep.take(&preview.payload).then_some(sweep);
+        }
+    }
 }
 
 /// How long after the question an arm may be confirmed.
@@ -581,12 +742,14 @@ impl Model {
 
     /// Disarms, and closes any open dialog, as Esc usually does.
     fn disarm(&mut self, is_escape: bool) -> Effect {
-        (self.help, self.prompt) = (false, None);
+        (self.help, self.prompt) = (None, None);
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
         if is_escape {
-            self.scroll = 0;
+            self.log.follow();
+            self.log.search.clear();
+            self.page = Page::Rig;
         } else {
             self.notify("disarming the actuator");
         }
@@ -608,6 +771,8 @@ enum Question {
     Task,
     /// Whether the session is to end.
     EndSession,
+    /// What lines of the log contain.
+    Search,
 }
 
 impl Question {
@@ -616,6 +781,7 @@ impl Question {
             Self::Note => "note: ",
             Self::WhyFailed => "why it failed (may be empty): ",
             Self::Task => "task: ",
+            Self::Search => "lines of the log with: ",
             Self::EndSession => "type end to end the session and delete what was discarded: ",
         }
     }
@@ -638,6 +804,7 @@ impl Model {
         let session = self.latest.session.as_ref();
         let text = match question {
             Question::Task => session.map(|session| session.task.clone()).unwrap_or_default(),
+            Question::Search => self.log.search.clone(),
             _ => String::new(),
         };
         self.prompt = Some(Prompt { question, text });
@@ -654,6 +821,10 @@ impl Model {
             KeyCode::Char(c) if is_text && prompt.text.len() + c.len_utf8() <= LONGEST_TEXT => prompt.text.push(c),
             _ => {}
         }
+        if prompt.question == Question::Search {
+            // What matches is seen while it is typed.
+            self.log.search.clone_from(&prompt.text);
+        }
         self.prompt = Some(prompt);
         Effect::None
     }
@@ -663,6 +834,10 @@ impl Model {
             Question::Note => SessionRequest::Note { text },
             Question::WhyFailed => SessionRequest::Label { label: Label::Failure, reason: text },
             Question::Task => SessionRequest::Plan { task: Some(text), tags: Vec::new(), goal: None },
+            Question::Search => {
+                self.log.search = text;
+                return Effect::None;
+            }
             Question::EndSession if text.trim() == "end" => SessionRequest::EndSession,
             Question::EndSession => {
                 self.notify("the session continues");

@@ -19,6 +19,7 @@ use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
 
 use super::model::Model;
+use super::picture::Canvas;
 use super::theme::Theme;
 use super::view;
 use crate::outlet::Outlet;
@@ -37,6 +38,7 @@ pub(super) struct Screen {
     outlet: Option<Outlet>,
     /// How often the bell has rung.
     rung: u64,
+    canvas: Canvas,
 }
 
 impl Screen {
@@ -49,8 +51,9 @@ impl Screen {
         enter_raw_mode()?;
         let frame = Frame::default();
         let outlet = Some(outlet);
+        let canvas = Canvas::detect(|name| std::env::var(name).ok(), cell());
         let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
-            Ok(terminal) => Self { terminal, frame, outlet, rung: 0 },
+            Ok(terminal) => Self { terminal, frame, outlet, rung: 0, canvas },
             Err(error) => {
                 restore();
                 return Err(error);
@@ -71,7 +74,7 @@ impl Screen {
         if std::mem::replace(&mut self.rung, model.rings()) != model.rings() {
             self.frame.write_all(b"\x07")?;
         }
-        self.terminal.draw(|frame| view::draw(frame, model, theme))?;
+        self.terminal.draw(|frame| view::draw(frame, model, theme, &mut self.canvas))?;
         let bytes = self.frame.take();
         if outlet.is_closed() {
             return Err(io::ErrorKind::BrokenPipe.into());
@@ -97,6 +100,13 @@ impl Drop for Screen {
         }
         restore();
     }
+}
+
+/// Pixels of a cell, if the terminal reports them.
+fn cell() -> Option<(u16, u16)> {
+    let size = crossterm::terminal::window_size().ok()?;
+    let side = |pixels: u16, cells: u16| pixels.checked_div(cells).filter(|pixels| *pixels > 0);
+    Some((side(size.width, size.columns)?, side(size.height, size.rows)?))
 }
 
 /// A writer to the terminal: standard output or, if that is redirected, the controlling terminal.

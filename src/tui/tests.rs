@@ -19,6 +19,7 @@ use crate::status::{
     Finding, Grade, Level, Outlook, RecordingStatus, Sensors, SlotState, Snapshot, StopStatus, Verdict,
 };
 use crate::time::Stamp;
+use picture::Canvas;
 use theme::{Charset, Colours};
 
 const THEME: Theme = Theme { colours: Colours::Sixteen, charset: Charset::Unicode };
@@ -53,7 +54,7 @@ fn measured(end: &Snapshot) -> Model {
 
 fn draw(model: &Model, (width, height): (u16, u16), theme: Theme) -> TestBackend {
     let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
-    terminal.draw(|frame| view::draw(frame, model, theme)).unwrap();
+    terminal.draw(|frame| view::draw(frame, model, theme, &mut Canvas::default())).unwrap();
     terminal.backend().clone()
 }
 

@@ -8,9 +8,10 @@ use ratatui::style::Stylize;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 
-use super::model::Model;
+use super::model::{Model, Page};
+use super::picture::Canvas;
 use super::theme::Theme;
-use super::{devices, episodes, footer, header, help, log, mask, policy, recording};
+use super::{detail, devices, episodes, footer, header, help, log, mask, policy, recording, timeline};
 
 /// Below this size the screen only shows the size it needs.
 pub const MINIMUM: (u16, u16) = (60, 12);
@@ -25,12 +26,53 @@ const EPISODES: u16 = 5;
 /// Most lines of the policy: on a small terminal, otherwise, on a roomy one.
 const POLICY_LINES: (u16, u16, u16) = (1, 5, 7);
 
+/// From this width and height on, the selected device is shown beside the rig.
+pub(super) const WITH_COLUMN: (u16, u16) = (160, 40);
+/// Columns of it.
+const COLUMN: u16 = 62;
+/// From this height on, the bits of the mask have a row each for their last minutes.
+const WITH_TIMELINE: u16 = 44;
+
 /// Draws everything.
-pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
+pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme, canvas: &mut Canvas) {
     let area = frame.area();
     if area.width < MINIMUM.0 || area.height < MINIMUM.1 {
         return draw_too_small(frame, area, model, theme);
     }
+    let [header_area, middle, footer_area] =
+        Layout::vertical([Constraint::Length(1), Constraint::Fill(1), Constraint::Length(1)]).areas(area);
+    header::draw(frame, header_area, model, theme);
+    match model.page {
+        Page::Rig if model.has_column() => {
+            let [left, _, right] = Layout::horizontal([
+                Constraint::Fill(1),
+                Constraint::Length(1),
+                Constraint::Length(COLUMN.min(area.width / 2)),
+            ])
+            .areas(middle);
+            draw_rig(frame, left, model, theme);
+            detail::draw_column(
+                frame,
+                Rect { y: right.y + 1, height: right.height - 1, ..right },
+                model,
+                (theme, canvas),
+            );
+        }
+        Page::Rig => draw_rig(frame, middle, model, theme),
+        Page::Device => detail::draw(frame, middle, model, (theme, canvas)),
+        Page::Log => log::draw(frame, middle, model, theme),
+        Page::Episodes => episodes::draw_page(frame, middle, model, theme),
+    }
+    footer::draw(frame, footer_area, model, theme);
+    if let Some(page) = model.help {
+        help::draw(frame, area, page, theme);
+    }
+}
+
+/// The panels of the rig, between header and footer.
+fn draw_rig(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
+    // Thresholds are heights of the whole screen.
+    let area = Rect { y: area.y - 1, height: area.height + 2, ..area };
     let gap = u16::from(area.height >= ROOMY);
     let plan = mask::Plan::new(model, area.width, area.height / 4);
     let selection = u16::from(area.height >= WITH_SELECTION);
@@ -43,8 +85,11 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     let policy_rows = if policy_lines > 0 { 1 + policy_lines + gap } else { 0 };
     let episode_lines = if gap > 0 { episodes::rows(model, EPISODES) } else { 0 };
     let episode_rows = if episode_lines > 0 { 1 + episode_lines + gap } else { 0 };
+    let timeline_lines = if area.height >= WITH_TIMELINE { timeline::rows(model, area.height / 4) } else { 0 };
+    let timeline_rows = if timeline_lines > 0 { 1 + timeline_lines + gap } else { 0 };
     // A rule above each of the four panels, the head of the table, header and footer.
-    let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows + episode_rows;
+    let fixed =
+        4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows + episode_rows + timeline_rows;
     // On the smallest terminals the policy panel replaces the log: it shows the reason of a hold itself.
     let with_log = policy_rows == 0 || area.height >= fixed + 1 + LOG_LINES.0;
     let rest = area.height.saturating_sub(if with_log { fixed } else { fixed - 1 });
@@ -52,11 +97,12 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     let rows =
         u16::try_from(model.shown().devices.len()).unwrap_or(u16::MAX).clamp(1, rest.saturating_sub(log_least).max(1));
 
-    let [header_area, mask_area, devices_area, policy_area, recording_area, episodes_area, log_area, footer_area] =
+    let [_, mask_area, devices_area, timeline_area, policy_area, recording_area, episodes_area, log_area, _] =
         Layout::vertical([
             Constraint::Length(1 + gap),
             Constraint::Length(1 + plan.rows() + gap),
             Constraint::Length(2 + rows + selection + gap),
+            Constraint::Length(timeline_rows),
             Constraint::Length(policy_rows),
             Constraint::Length(1 + recording_lines + gap),
             Constraint::Length(episode_rows),
@@ -64,9 +110,11 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
             Constraint::Length(1),
         ])
         .areas(area);
-    header::draw(frame, header_area, model, theme);
     mask::draw(frame, mask_area, &plan, model, theme);
     devices::draw(frame, devices_area, (rows, selection), model, theme);
+    if timeline_lines > 0 {
+        timeline::draw(frame, timeline_area, model, theme);
+    }
     policy::draw(frame, policy_area, policy_lines, model, theme);
     recording::draw(frame, recording_area, model, theme);
     if episode_lines > 0 {
@@ -74,10 +122,6 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     }
     if with_log {
         log::draw(frame, log_area, model, theme);
-    }
-    footer::draw(frame, footer_area, model, theme);
-    if model.help {
-        help::draw(frame, area, theme);
     }
 }
 
