@@ -57,6 +57,7 @@ use crate::rig::presence::{Claim, Presence};
 use crate::session::journal::Plan;
 use crate::status::Board;
 use crate::time::Stamp;
+use crate::tui::ScreenOptions;
 use attached::Attached;
 use collection::Collection;
 use conductor::Conductor;
@@ -107,6 +108,8 @@ pub struct Options {
     pub devices: Devices,
     /// How the run is shown.
     pub screen: Screen,
+    /// Options of the monitor.
+    pub shown: ScreenOptions,
     /// Folder, modules and duration of each episode.
     pub episode: EpisodeRequest,
     /// What the session is to collect.
@@ -240,7 +243,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         let watched = Watched::begin(&registry, &permission, &board).map_err(AppError::Interlocks)?;
         let (commands, from_screen) = mpsc::channel(16);
         let attached = Attached::new(Arc::clone(&board), commands.clone());
-        let screen = screen::start(kind, &board, events, commands, &permission, options.duration);
+        let screen = screen::start(kind, &board, events, commands, &permission, options.duration, options.shown);
         let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
         let inference = options.policy.map(start).transpose()?;
         Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment))

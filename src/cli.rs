@@ -139,7 +139,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "devices" | "register" | "calibrate" => &["sim", "config", "json"],
         "unregister" | "check" | "doctor" | "ablation" => &["config", "json"],
         "artifacts" => &["config"],
-        "mask" | "replay" | "episode" | "session" => &["json", "instance"],
+        "mask" | "replay" | "episode" | "session" | "logs" => &["json", "instance"],
         "arm" | "disarm" | "monitor" => &["instance"],
         "inspect" | "list" | "recover" | "eval" => &["json"],
         _ => &[],
@@ -198,6 +198,20 @@ pub struct RunArgs {
     /// Half width of the synchronisation window of an observation [default: from the registry]
     #[arg(long, value_name = "TIME", value_parser = window, hide_short_help = true)]
     pub window: Option<Duration>,
+    /// How the monitor is shown.
+    #[command(flatten)]
+    pub shown: ShownArgs,
+}
+
+/// How the monitor is shown.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct ShownArgs {
+    /// Show times in UTC in the monitor, not in the zone of this machine
+    #[arg(long, hide_short_help = true)]
+    pub utc: bool,
+    /// Select and scroll with the mouse in the monitor (text is then selected with shift)
+    #[arg(long, hide_short_help = true)]
+    pub mouse: bool,
 }
 
 /// Options of the simulated task.
@@ -297,6 +311,27 @@ pub enum Command {
         /// Only look: no key changes anything in the run
         #[arg(long)]
         read_only: bool,
+        /// How it is shown.
+        #[command(flatten)]
+        shown: ShownArgs,
+    },
+    /// Print the log of a running rapid, and what its programs print
+    #[command(after_long_help = "It has the last 2000 lines; the files below ~/.local/state/rapid keep what programs printed \
+        before.\n\nExamples:\n  rapid logs\n  rapid logs tactile_tip -f          one device and its programs, until the run ends\n  \
+        rapid logs --level warn --utc")]
+    Logs {
+        /// Only lines about this entry of the registry
+        #[arg(value_name = "NAME")]
+        device: Option<String>,
+        /// Continue with new lines until the run ends
+        #[arg(long, short)]
+        follow: bool,
+        /// Least severity: debug, info, warn or error
+        #[arg(long, value_name = "LEVEL", default_value = "info", hide_possible_values = true)]
+        level: LevelArg,
+        /// Times in UTC instead of the zone of this machine
+        #[arg(long)]
+        utc: bool,
     },
     /// Begin, end, discard or label episodes of a running rapid
     #[command(after_long_help = session::EPISODE)]
@@ -357,6 +392,19 @@ pub enum Command {
         #[arg(value_name = "DIR", default_value = "man", value_hint = ValueHint::DirPath)]
         to: PathBuf,
     },
+}
+
+/// A severity on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LevelArg {
+    /// Everything.
+    Debug,
+    /// State changes, and what is more severe.
+    Info,
+    /// Warnings and errors.
+    Warn,
+    /// Errors.
+    Error,
 }
 
 impl Cli {

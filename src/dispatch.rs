@@ -18,10 +18,11 @@ use tokio_util::sync::CancellationToken;
 use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{
-    Calibration, Cli, Command, Global, PolicyArgs, RegisterArgs, RunArgs, SessionCommand, UnregisterArgs,
+    Calibration, Cli, Command, Global, LevelArg, PolicyArgs, RegisterArgs, RunArgs, SessionCommand, UnregisterArgs,
 };
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::inspect::InspectFailure;
+use crate::commands::logs::LogsOptions;
 use crate::commands::mask::MaskOptions;
 use crate::commands::register::{self, Dialogue, Target};
 use crate::commands::{self, CommandStatus, Format};
@@ -35,7 +36,10 @@ use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::session::journal::Plan;
+use crate::status::Level;
 use crate::status::session::SessionRequest;
+use crate::time::Zone;
+use crate::tui::ScreenOptions;
 use crate::{outlet, text};
 
 #[cfg(feature = "policy")]
@@ -105,8 +109,21 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             Ok(commands::arm::order(global.instance.as_deref(), order, out)?)
         }
         Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
-        Command::Monitor { read_only } => {
-            block_on(commands::monitor::monitor(global.instance.as_deref(), read_only))?.map_err(Failure::from)
+        Command::Monitor { read_only, shown } => {
+            let shown = ScreenOptions { utc: shown.utc, mouse: shown.mouse };
+            Ok(block_on(commands::monitor::monitor(global.instance.as_deref(), read_only, shown))??)
+        }
+        Command::Logs { device, follow, level, utc } => {
+            let least = match level {
+                LevelArg::Debug => Level::Debug,
+                LevelArg::Info => Level::Info,
+                LevelArg::Warn => Level::Warn,
+                LevelArg::Error => Level::Error,
+            };
+            let zone = if utc { Zone::UTC } else { Zone::local() };
+            let palette = Palette::of(&io::stdout());
+            let options = LogsOptions { device, least, follow, zone, format, palette };
+            Ok(commands::logs::logs(global.instance.as_deref(), &options, out)?)
         }
         Command::Episode { what } => {
             Ok(commands::session::ask(global.instance.as_deref(), &what.into_request(), format, out)?)
@@ -297,6 +314,7 @@ fn run(
         registry,
         devices,
         screen,
+        shown: ScreenOptions { utc: args.shown.utc, mouse: args.shown.mouse },
         episode,
         plan: plan(args),
         record: args.record,
@@ -498,6 +516,11 @@ failures! {
     commands::artifacts::ArtifactsError: |_| 1;
     commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
     commands::session::RequestError: |_| 1;
+    commands::logs::LogsError: |error| match error {
+        commands::logs::LogsError::Monitor(commands::monitor::MonitorError::Give(_)) => 3,
+        commands::logs::LogsError::NoDevice { .. } => 2,
+        commands::logs::LogsError::Monitor(_) | commands::logs::LogsError::Output(_) => 1,
+    };
     commands::monitor::MonitorError: |error| match error {
         commands::monitor::MonitorError::Give(_) => 3,
         commands::monitor::MonitorError::Link { .. } | commands::monitor::MonitorError::Screen(_) => 1,

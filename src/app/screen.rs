@@ -13,7 +13,7 @@ use crate::headless::{self, HeadlessOptions};
 use crate::palette::Palette;
 use crate::permission::Permission;
 use crate::status::{Board, Command, Event};
-use crate::tui::{self, TuiError};
+use crate::tui::{self, ScreenOptions, TuiError};
 
 /// Starts the requested screen, which shows these events of the board.
 pub(super) fn start(
@@ -23,12 +23,13 @@ pub(super) fn start(
     commands: mpsc::Sender<Command>,
     permission: &Arc<Permission>,
     duration: Option<Duration>,
+    shown: ScreenOptions,
 ) -> Stage {
     let (board, permission) = (Arc::clone(board), Arc::clone(permission));
     if screen == Screen::Monitor {
         return Stage::start("the screen", |stop| async move {
             tokio::select! {
-                outcome = tui::run(board, commands, permission, stop) => match outcome {
+                outcome = tui::run(board, commands, permission, shown, stop) => match outcome {
                     // Equivalent to SIGHUP, which arrives with it or a little later.
                     Err(error @ TuiError::Gone(_)) => {
                         tracing::warn!(%error, "the run ends");

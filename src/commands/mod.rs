@@ -16,6 +16,7 @@ pub mod doctor;
 pub mod eval;
 pub mod inspect;
 pub mod list;
+pub mod logs;
 pub mod mask;
 pub mod monitor;
 pub mod plot;

@@ -19,7 +19,7 @@ use crate::status::attach::{Decoder, LinkError};
 use crate::status::{Command, Snapshot};
 use crate::time::Stamp;
 use crate::tui::model::{Effect, Msg};
-use crate::tui::{self, Closed, Link, LinkState, TuiError};
+use crate::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
 
 /// Time between two attempts to reach the next run.
 const AGAIN: Duration = Duration::from_secs(1);
@@ -51,7 +51,11 @@ pub enum MonitorError {
 ///
 /// # Errors
 /// When there is no such run at the start, or no terminal.
-pub async fn monitor(instance: Option<&str>, read_only: bool) -> Result<(), MonitorError> {
+pub async fn monitor(
+    instance: Option<&str>,
+    read_only: bool,
+    shown: ScreenOptions,
+) -> Result<(), MonitorError> {
     let mut signals = Signals::listen().map_err(TuiError::NoTerminal)?;
     let link = Remote::open(Wanted { instance: instance.map(str::to_owned), read_only })?;
     let shutdown = CancellationToken::new();
@@ -60,7 +64,7 @@ pub async fn monitor(instance: Option<&str>, read_only: bool) -> Result<(), Moni
         signals.next().await;
         ended.cancel();
     });
-    match tui::show(link, shutdown).await {
+    match tui::show(link, shown, shutdown).await {
         // The connection of the user has ended, as with SIGHUP.
         Err(TuiError::Gone(_)) => Ok(()),
         outcome => Ok(outcome?),
@@ -69,9 +73,9 @@ pub async fn monitor(instance: Option<&str>, read_only: bool) -> Result<(), Moni
 
 /// The run to be shown.
 #[derive(Debug, Clone)]
-struct Wanted {
-    instance: Option<String>,
-    read_only: bool,
+pub(super) struct Wanted {
+    pub(super) instance: Option<String>,
+    pub(super) read_only: bool,
 }
 
 /// What the reading thread knows.
@@ -97,7 +101,7 @@ enum Outgoing {
 }
 
 /// A connection to a run.
-struct Connection {
+pub(super) struct Connection {
     process: u32,
     stream: UnixStream,
     decoder: Decoder,
@@ -105,7 +109,8 @@ struct Connection {
 }
 
 impl Connection {
-    fn open(wanted: &Wanted) -> Result<(Self, Snapshot), MonitorError> {
+    /// Connects; returns the first snapshot too.
+    pub(super) fn open(wanted: &Wanted) -> Result<(Self, Snapshot), MonitorError> {
         let (stream, process) = give::attach(wanted.instance.as_deref(), wanted.read_only)?;
         let of = |error: LinkError| MonitorError::Link { process, error };
         let limits = stream.set_read_timeout(Some(SILENT)).and_then(|()| stream.set_write_timeout(Some(WRITE_LIMIT)));
@@ -115,7 +120,8 @@ impl Connection {
         Ok((connection, first))
     }
 
-    fn read(&mut self) -> Result<Snapshot, LinkError> {
+    /// The next snapshot.
+    pub(super) fn read(&mut self) -> Result<Snapshot, LinkError> {
         self.decoder.read(&mut self.reader)
     }
 }

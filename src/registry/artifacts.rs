@@ -268,7 +268,7 @@ const PROGRAMS: &str = "\
 #   IPAddressAllow=any
 ";
 
-/// `rapid.service`: records without a screen from boot to shutdown.
+/// `rapid.service`: runs without a screen from boot to shutdown, and records when a member of its group requests it.
 ///
 /// Invariant: the service may do what the entries of its registry need, and no more: kinds of sockets, device nodes
 /// and groups follow from them. `systemd-analyze security` gives every unit 2.0 or better (a test, on every kind of
@@ -301,7 +301,8 @@ fn unit(registry: &Registry) -> String {
 # Before the first start:
 {make_group}#   useradd --system --user-group --no-create-home --groups {listed} rapid
 #   install -D -m 644 devices.toml {SYSTEM_REGISTRY}
-# The recordings, in /var/lib/rapid, are readable for the group of that user. To be in it from the next login on:
+# Members of the group of that user read the recordings, in /var/lib/rapid, and control the service (`rapid monitor`,
+# `rapid episode start`). To be in it from the next login on:
 #   usermod --append --groups rapid YOUR_NAME
 [Unit]
 Description=rapid: sensors and recording of rig {rig}
@@ -311,7 +312,7 @@ ConditionPathExists={SYSTEM_REGISTRY}
 
 [Service]
 Type=exec
-ExecStart=/usr/local/bin/rapid --headless --record --config {SYSTEM_REGISTRY} --out /var/lib/rapid
+ExecStart=/usr/local/bin/rapid --headless --group-control --config {SYSTEM_REGISTRY} --out /var/lib/rapid
 User=rapid
 SupplementaryGroups={groups}
 StateDirectory=rapid

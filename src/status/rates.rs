@@ -142,6 +142,8 @@ mod tests {
             mask: PhysicalMask(1),
             mask_sequence: ms / 2,
             stops: Vec::new(),
+            details: Vec::new(),
+            previews: Vec::new(),
             devices: vec![DeviceStatus {
                 name: "cam".to_owned(),
                 id: id(),

@@ -65,6 +65,14 @@ fn first_row(selected: usize, rows: usize, devices: usize) -> usize {
     selected.saturating_sub(rows / 2).min(devices.saturating_sub(rows))
 }
 
+/// The device at this line of the panel, whose table has so many rows.
+pub(super) fn row_at(line: usize, rows: usize, model: &Model) -> Option<usize> {
+    let devices = model.rows().len();
+    // The rule and the head of the table come first.
+    let row = line.checked_sub(2).filter(|row| *row < rows)? + first_row(model.selected, rows, devices);
+    (row < devices).then_some(row)
+}
+
 fn remark(first: usize, rows: usize, devices: usize, theme: Theme) -> Line<'static> {
     if devices <= rows {
         return Line::default();

@@ -3,7 +3,7 @@
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
-use ratatui::style::Stylize;
+use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
 
 use super::link::LinkState;
@@ -11,7 +11,7 @@ use super::model::Model;
 use super::recording;
 use super::theme::Theme;
 use crate::interlock::{InputState, StopKind};
-use crate::status::{Grade, StopStatus};
+use crate::status::{Grade, SlotState, StopStatus};
 use crate::text;
 use crate::time::Stamp;
 
@@ -100,6 +100,33 @@ fn stops(model: &Model, theme: Theme) -> Vec<Span<'static>> {
         Some(_) => theme.warning(),
     };
     vec![Span::styled(word + &more, style), Span::raw("  ")]
+}
+
+/// What is wrong, the worst first: what the episode would be judged for, devices that were unplugged, and those in trouble.
+pub(super) fn draw_banner(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
+    let snapshot = model.latest();
+    let finding = snapshot.recording.as_ref().and_then(|recording| recording.outlook.findings.first());
+    let mut parts: Vec<(String, Style)> = Vec::new();
+    if let Some(finding) = finding {
+        let text = format!("{}: the episode would be {}", finding.sentence(), finding.grade.word());
+        parts.push((text, theme.grade(finding.grade)));
+    }
+    for device in &snapshot.devices {
+        let ago = model.unplugged_for(device).map(|ago| format!("{} unplugged {} ago", device.name, text::clock(ago)));
+        let trouble = match device.state {
+            SlotState::Failed | SlotState::Stalled => Some(format!("{} {}", device.name, device.state.word())),
+            _ => None,
+        };
+        parts.extend(ago.or(trouble).map(|text| (text, theme.state(device.state))));
+    }
+    let mut line = Line::default();
+    for (place, (text, style)) in parts.into_iter().enumerate() {
+        let joint = if place == 0 { theme.symbol(" ▲ ", " ! ") } else { theme.symbol(" · ", " | ") };
+        let room = usize::from(area.width).saturating_sub(line.width() + 3);
+        line.push_span(Span::styled(joint, style));
+        line.push_span(Span::styled(text::cut(&theme.safe(&text), room, theme.ellipsis()).into_owned(), style));
+    }
+    frame.render_widget(line, area);
 }
 
 fn right(model: &Model, theme: Theme) -> Line<'static> {

@@ -34,8 +34,9 @@ use std::io::{self, Write as _};
 use std::sync::Arc;
 use std::time::Duration;
 
-use crossterm::event::{Event, EventStream};
+use crossterm::event::{Event, EventStream, MouseButton, MouseEvent, MouseEventKind};
 use futures::{Stream, StreamExt};
+use ratatui::layout::Position;
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
@@ -67,6 +68,26 @@ pub fn columns() -> Option<usize> {
     crossterm::terminal::size().ok().map(|(columns, _)| usize::from(columns))
 }
 
+/// How a screen is shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ScreenOptions {
+    /// Times are UTC, and not those of the machine's zone.
+    pub utc: bool,
+    /// The mouse selects and scrolls; the terminal's own selection of text then needs shift.
+    pub mouse: bool,
+}
+
+/// What a click or the wheel means.
+fn pointed(mouse: MouseEvent, model: &Model, theme: Theme) -> Option<Msg> {
+    let target = view::target(model, model.size, theme, Position::new(mouse.column, mouse.row));
+    match mouse.kind {
+        MouseEventKind::Down(MouseButton::Left) => target.map(Msg::Click),
+        MouseEventKind::ScrollUp => Some(Msg::Wheel(target, true)),
+        MouseEventKind::ScrollDown => Some(Msg::Wheel(target, false)),
+        _ => None,
+    }
+}
+
 /// Shows the monitor of a run of this process until `shutdown`.
 ///
 /// A request to quit only sends [`Command::Quit`]; the screen stays until the receiver of the commands
@@ -78,9 +99,10 @@ pub async fn run(
     board: Arc<Board>,
     commands: mpsc::Sender<Command>,
     permission: Arc<Permission>,
+    options: ScreenOptions,
     shutdown: CancellationToken,
 ) -> Result<(), TuiError> {
-    let outcome = show(Own::new(Arc::clone(&board), commands, permission), shutdown).await;
+    let outcome = show(Own::new(Arc::clone(&board), commands, permission), options, shutdown).await;
     // The terminal shows what was there before: without this line nothing of the run is left on it.
     if let Some(summary) = board.episodes().summary() {
         let _ = writeln!(io::stdout(), "{summary}");
@@ -92,14 +114,18 @@ pub async fn run(
 ///
 /// # Errors
 /// When there is no terminal, or it goes away.
-pub async fn show(mut link: impl Link, shutdown: CancellationToken) -> Result<(), TuiError> {
+pub async fn show(
+    mut link: impl Link,
+    options: ScreenOptions,
+    shutdown: CancellationToken,
+) -> Result<(), TuiError> {
     let theme = Theme::detect(|name| std::env::var(name).ok());
-    let mut screen = Screen::open().map_err(TuiError::NoTerminal)?;
+    let mut screen = Screen::open(options.mouse).map_err(TuiError::NoTerminal)?;
     let size = crossterm::terminal::size().ok();
     // The size comes with later changes of it.
     let size = futures::stream::iter(size.map(|(columns, rows)| Ok(Event::Resize(columns, rows))));
     let events = size.chain(EventStream::new());
-    let outcome = drive(&mut link, &shutdown, events, |model| screen.draw(model, theme)).await;
+    let outcome = drive(&mut link, &shutdown, events, options, |model| screen.draw(model, theme)).await;
     screen.close().await;
     outcome
 }
@@ -109,11 +135,13 @@ async fn drive(
     link: &mut impl Link,
     shutdown: &CancellationToken,
     events: impl Stream<Item = io::Result<Event>>,
+    options: ScreenOptions,
     mut draw: impl FnMut(&Model) -> io::Result<()>,
 ) -> Result<(), TuiError> {
     let mut events = std::pin::pin!(events);
     let mut model = Model::new(link.snapshot());
-    model.zone = Zone::local();
+    model.zone = if options.utc { Zone::UTC } else { Zone::local() };
+    let theme = Theme::detect(|name| std::env::var(name).ok());
     let mut frames = tokio::time::interval(FRAME);
     frames.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
@@ -126,6 +154,7 @@ async fn drive(
             () = shutdown.cancelled() => return Ok(()),
             event = events.next() => match event {
                 Some(Ok(Event::Key(key))) => model.update(Msg::Key(key)),
+                Some(Ok(Event::Mouse(mouse))) => pointed(mouse, &model, theme).map_or(model::Effect::None, |msg| model.update(msg)),
                 Some(Ok(Event::Resize(columns, rows))) => model.update(Msg::Size(columns, rows)),
                 // Pasted text is no request.
                 Some(Ok(_)) => model::Effect::None,

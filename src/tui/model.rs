@@ -18,6 +18,7 @@ use super::link::LinkState;
 use super::log_view::LogView;
 use super::picture::Picture;
 use super::theme::Edge;
+use super::view::Target;
 use super::{help, view};
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -45,6 +46,10 @@ pub enum Msg {
     Key(KeyEvent),
     /// The size of the terminal, columns and rows.
     Size(u16, u16),
+    /// A click.
+    Click(Target),
+    /// The wheel over a part of the screen, upwards or down.
+    Wheel(Option<Target>, bool),
     /// A command could not be sent because the program is busy.
     Refused,
     /// The actuator was not armed, and why.
@@ -141,7 +146,7 @@ pub struct Model {
     /// Which lines of the log are shown.
     pub(super) log: LogView,
     /// Columns and rows of the terminal.
-    size: (u16, u16),
+    pub(super) size: (u16, u16),
     /// Pictures are shown.
     pub(super) pictures: bool,
     /// When previews of the selected device were last requested.
@@ -229,6 +234,8 @@ impl Model {
                 return self.look();
             }
             Msg::Size(columns, rows) => self.size = (columns, rows),
+            Msg::Click(target) => self.click(target),
+            Msg::Wheel(target, is_up) => self.wheel(target, is_up),
             Msg::Key(key) if key.kind == KeyEventKind::Release => {}
             Msg::Key(key) => {
                 let effect = self.key(key);
@@ -434,6 +441,30 @@ impl Model {
             _ => usize::MAX,
         };
         self.looked = None;
+    }
+
+    /// Selects a device, or opens the page of what was clicked. It neither begins nor ends anything.
+    fn click(&mut self, target: Target) {
+        match target {
+            Target::Device(row) if row == self.selected => self.turn_to(Page::Device),
+            Target::Device(row) => (self.selected, self.looked) = (row, None),
+            Target::Detail => self.turn_to(Page::Device),
+            Target::Log => self.turn_to(Page::Log),
+            Target::Episodes => self.turn_to(Page::Episodes),
+            Target::Devices => {}
+        }
+    }
+
+    fn wheel(&mut self, target: Option<Target>, is_up: bool) {
+        match target {
+            Some(Target::Log) => self.scroll(if is_up { Act::Older } else { Act::Newer }, WHEEL),
+            Some(Target::Device(_) | Target::Devices | Target::Detail) | None => {
+                self.step(if is_up { Act::Up } else { Act::Down });
+            }
+            Some(Target::Episodes) if self.page == Page::Episodes => self.step(if is_up { Act::Up } else { Act::Down }),
+            Some(Target::Episodes) => {}
+        }
+        self.keep_in_bounds();
     }
 
     fn scroll(&mut self, act: Act, by: usize) {
@@ -680,6 +711,8 @@ impl Model {
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
 /// Samples of numbers that are kept for a plot: some 15 s.
 const SAMPLES: usize = 300;
+/// Lines by which the wheel scrolls the log.
+const WHEEL: usize = 3;
 /// Lines by which a page key scrolls the log.
 const SCROLL_STEP: usize = 5;
 

@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
 use crossterm::cursor::{Hide, Show};
-use crossterm::event::{DisableBracketedPaste, EnableBracketedPaste};
+use crossterm::event::{DisableBracketedPaste, DisableMouseCapture, EnableBracketedPaste, EnableMouseCapture};
 use crossterm::terminal::{
     DisableLineWrap, EnableLineWrap, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
@@ -43,7 +43,7 @@ pub(super) struct Screen {
 
 impl Screen {
     /// Switches the terminal to the screen.
-    pub(super) fn open() -> io::Result<Self> {
+    pub(super) fn open(mouse: bool) -> io::Result<Self> {
         if !io::stdout().is_terminal() {
             return Err(io::Error::other("standard output is not a terminal"));
         }
@@ -59,6 +59,9 @@ impl Screen {
                 return Err(error);
             }
         };
+        if mouse {
+            crossterm::queue!(screen.frame, EnableMouseCapture)?;
+        }
         // Pasted text is marked, so it is not read as keys.
         crossterm::queue!(screen.frame, EnterAlternateScreen, DisableLineWrap, Hide, EnableBracketedPaste)?;
         Ok(screen)
@@ -134,7 +137,7 @@ pub(super) fn restore() {
     let (done, is_done) = mpsc::channel();
     let leave = move || {
         if let Ok(mut terminal) = writer() {
-            let _ = crossterm::execute!(terminal, DisableBracketedPaste, EnableLineWrap, LeaveAlternateScreen, Show);
+            let _ = crossterm::execute!(terminal, DisableMouseCapture, DisableBracketedPaste, EnableLineWrap, LeaveAlternateScreen, Show);
         }
         let _ = done.send(());
     };

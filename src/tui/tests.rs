@@ -324,6 +324,8 @@ fn the_help_lists_every_key() {
     model.update(press(KeyCode::Char('?')));
     assert_snapshot!("help_80x24", draw(&model, (80, 24), THEME));
     assert_snapshot!("help_60x12", draw(&model, (60, 12), THEME));
+    model.update(press(KeyCode::Char('?')));
+    assert_snapshot!("help_screen_80x24", draw(&model, (80, 24), THEME));
 }
 
 #[test]
@@ -412,7 +414,7 @@ async fn keys_become_commands_and_shutdown_ends_the_screen() {
     let end = shutdown.clone();
     let keys = typed(&[KeyCode::Char(' '), KeyCode::Char('q')]);
     let mut desk = desk(&board, &sender);
-    let screen = drive(&mut desk, &shutdown, keys, |_| Ok(()));
+    let screen = drive(&mut desk, &shutdown, keys, ScreenOptions::default(), |_| Ok(()));
     let app = async {
         assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Toggle)));
         assert_eq!(commands.recv().await, Some(Command::Quit));
@@ -430,7 +432,7 @@ async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     let shutdown = CancellationToken::new();
     let end = shutdown.clone();
     let mut notice = None;
-    drive(&mut desk(&board, &sender), &shutdown, typed(&[KeyCode::Char(' ')]), |model| {
+    drive(&mut desk(&board, &sender), &shutdown, typed(&[KeyCode::Char(' ')]), ScreenOptions::default(), |model| {
         if let Some(report) = model.notice() {
             notice = Some(report.to_owned());
             end.cancel();
@@ -442,7 +444,7 @@ async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     assert_eq!(notice.as_deref(), Some("busy: request dropped, try again"));
 
     drop(commands);
-    drive(&mut desk(&board, &sender), &CancellationToken::new(), typed(&[KeyCode::Char('q')]), |_| Ok(()))
+    drive(&mut desk(&board, &sender), &CancellationToken::new(), typed(&[KeyCode::Char('q')]), ScreenOptions::default(), |_| Ok(()))
         .await
         .unwrap();
 }
@@ -452,7 +454,7 @@ async fn a_terminal_that_goes_away_is_an_error() {
     let board = Arc::new(board(&["cam"]));
     let (sender, _commands) = mpsc::channel(1);
     let hung_up = futures::stream::iter([]);
-    let error = drive(&mut desk(&board, &sender), &CancellationToken::new(), hung_up, |_| Ok(())).await.unwrap_err();
+    let error = drive(&mut desk(&board, &sender), &CancellationToken::new(), hung_up, ScreenOptions::default(), |_| Ok(())).await.unwrap_err();
     assert!(matches!(error, TuiError::Gone(_)), "{error}");
 }
 
@@ -471,7 +473,7 @@ async fn pasted_text_deletes_nothing_whether_the_terminal_marks_it_or_not() {
     let events = events.chain(futures::stream::pending());
     let end = shutdown.clone();
     let mut desk = desk(&board, &sender);
-    let screen = drive(&mut desk, &shutdown, events, |_| Ok(()));
+    let screen = drive(&mut desk, &shutdown, events, ScreenOptions::default(), |_| Ok(()));
     let app = async {
         // It is in the trash, once, and can be taken back.
         assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Discard)));

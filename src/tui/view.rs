@@ -3,7 +3,7 @@
 //! Invariant: drawing changes nothing but the frame.
 
 use ratatui::Frame;
-use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::layout::{Constraint, Layout, Position, Rect};
 use ratatui::style::Stylize;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
@@ -43,22 +43,13 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme, canvas: &mut Can
         Layout::vertical([Constraint::Length(1), Constraint::Fill(1), Constraint::Length(1)]).areas(area);
     header::draw(frame, header_area, model, theme);
     match model.page {
-        Page::Rig if model.has_column() => {
-            let [left, _, right] = Layout::horizontal([
-                Constraint::Fill(1),
-                Constraint::Length(1),
-                Constraint::Length(COLUMN.min(area.width / 2)),
-            ])
-            .areas(middle);
+        Page::Rig => {
+            let (left, column) = columns(middle, model);
             draw_rig(frame, left, model, theme);
-            detail::draw_column(
-                frame,
-                Rect { y: right.y + 1, height: right.height - 1, ..right },
-                model,
-                (theme, canvas),
-            );
+            if let Some(column) = column {
+                detail::draw_column(frame, column, model, (theme, canvas));
+            }
         }
-        Page::Rig => draw_rig(frame, middle, model, theme),
         Page::Device => detail::draw(frame, middle, model, (theme, canvas)),
         Page::Log => log::draw(frame, middle, model, theme),
         Page::Episodes => episodes::draw_page(frame, middle, model, theme),
@@ -69,37 +60,53 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme, canvas: &mut Can
     }
 }
 
-/// The panels of the rig, between header and footer.
-fn draw_rig(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
-    // Thresholds are heights of the whole screen.
-    let area = Rect { y: area.y - 1, height: area.height + 2, ..area };
-    let gap = u16::from(area.height >= ROOMY);
-    let plan = mask::Plan::new(model, area.width, area.height / 4);
-    let selection = u16::from(area.height >= WITH_SELECTION);
-    let recording_lines = if area.height >= WITH_SELECTION { 2 } else { 1 };
-    let policy_lines = model.shown().policy.as_ref().map_or(0, |policy| {
-        let (small, usual, roomy) = POLICY_LINES;
-        let most = if gap > 0 { roomy } else { usual };
-        policy::rows(policy, area.width, if area.height >= WITH_SELECTION { most } else { small }, theme)
-    });
-    let policy_rows = if policy_lines > 0 { 1 + policy_lines + gap } else { 0 };
-    let episode_lines = if gap > 0 { episodes::rows(model, EPISODES) } else { 0 };
-    let episode_rows = if episode_lines > 0 { 1 + episode_lines + gap } else { 0 };
-    let timeline_lines = if area.height >= WITH_TIMELINE { timeline::rows(model, area.height / 4) } else { 0 };
-    let timeline_rows = if timeline_lines > 0 { 1 + timeline_lines + gap } else { 0 };
-    // A rule above each of the four panels, the head of the table, header and footer.
-    let fixed =
-        4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows + episode_rows + timeline_rows;
-    // On the smallest terminals the policy panel replaces the log: it shows the reason of a hold itself.
-    let with_log = policy_rows == 0 || area.height >= fixed + 1 + LOG_LINES.0;
-    let rest = area.height.saturating_sub(if with_log { fixed } else { fixed - 1 });
-    let log_least = if with_log { (rest / 3).clamp(LOG_LINES.0, LOG_LINES.1) } else { 0 };
-    let rows =
-        u16::try_from(model.shown().devices.len()).unwrap_or(u16::MAX).clamp(1, rest.saturating_sub(log_least).max(1));
+/// Where the panels of the rig are, and how many lines they have.
+struct RigLayout {
+    banner: Rect,
+    plan: mask::Plan,
+    mask: Rect,
+    devices: Rect,
+    /// Rows of the table, and 1 if there is a line about the selected device.
+    rows: u16,
+    selection: u16,
+    timeline: Option<Rect>,
+    policy: Rect,
+    policy_lines: u16,
+    recording: Rect,
+    episodes: Rect,
+    episode_lines: u16,
+    log: Option<Rect>,
+}
 
-    let [_, mask_area, devices_area, timeline_area, policy_area, recording_area, episodes_area, log_area, _] =
-        Layout::vertical([
-            Constraint::Length(1 + gap),
+impl RigLayout {
+    /// In the area between header and footer.
+    fn new(area: Rect, model: &Model, theme: Theme) -> Self {
+        // Thresholds are heights of the whole screen.
+        let area = Rect { y: area.y - 1, height: area.height + 2, ..area };
+        let gap = u16::from(area.height >= ROOMY);
+        let plan = mask::Plan::new(model, area.width, area.height / 4);
+        let selection = u16::from(area.height >= WITH_SELECTION);
+        let recording_lines = if area.height >= WITH_SELECTION { 2 } else { 1 };
+        let policy_lines = policy_lines(area, model, theme);
+        // A rule above and, on a roomy terminal, an empty line below.
+        let with_rule = |lines: u16| if lines > 0 { 1 + lines + gap } else { 0 };
+        let policy_rows = with_rule(policy_lines);
+        let episode_lines = if gap > 0 { episodes::rows(model, EPISODES) } else { 0 };
+        let episode_rows = with_rule(episode_lines);
+        let timeline_lines = if area.height >= WITH_TIMELINE { timeline::rows(model, area.height / 4) } else { 0 };
+        let timeline_rows = with_rule(timeline_lines);
+        // A rule above each of the four panels, the head of the table, header and footer.
+        let fixed =
+            4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows + episode_rows + timeline_rows;
+        // On the smallest terminals the policy panel replaces the log: it shows the reason of a hold itself.
+        let with_log = policy_rows == 0 || area.height >= fixed + 1 + LOG_LINES.0;
+        let rest = area.height.saturating_sub(if with_log { fixed } else { fixed - 1 });
+        let log_least = if with_log { (rest / 3).clamp(LOG_LINES.0, LOG_LINES.1) } else { 0 };
+        let devices = u16::try_from(model.shown().devices.len()).unwrap_or(u16::MAX);
+        let rows = devices.clamp(1, rest.saturating_sub(log_least).max(1));
+        let [_, banner, mask, devices, timeline, policy, recording, episodes, log, _] = Layout::vertical([
+            Constraint::Length(1),
+            Constraint::Length(gap),
             Constraint::Length(1 + plan.rows() + gap),
             Constraint::Length(2 + rows + selection + gap),
             Constraint::Length(timeline_rows),
@@ -110,19 +117,88 @@ fn draw_rig(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
             Constraint::Length(1),
         ])
         .areas(area);
-    mask::draw(frame, mask_area, &plan, model, theme);
-    devices::draw(frame, devices_area, (rows, selection), model, theme);
-    if timeline_lines > 0 {
-        timeline::draw(frame, timeline_area, model, theme);
+        let (timeline, log) = ((timeline_rows > 0).then_some(timeline), with_log.then_some(log));
+        let (policy_lines, episode_lines) = (policy_lines, episode_lines);
+        Self { banner, plan, mask, devices, rows, selection, timeline, policy, policy_lines, recording, episodes, episode_lines, log }
     }
-    policy::draw(frame, policy_area, policy_lines, model, theme);
-    recording::draw(frame, recording_area, model, theme);
-    if episode_lines > 0 {
-        episodes::draw(frame, episodes_area, episode_lines, model, theme);
+}
+
+fn policy_lines(area: Rect, model: &Model, theme: Theme) -> u16 {
+    let (small, usual, roomy) = POLICY_LINES;
+    let most = match area.height {
+        ROOMY.. => roomy,
+        WITH_SELECTION.. => usual,
+        _ => small,
+    };
+    model.shown().policy.as_ref().map_or(0, |policy| policy::rows(policy, area.width, most, theme))
+}
+
+/// The panels of the rig, between header and footer.
+fn draw_rig(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
+    let layout = RigLayout::new(area, model, theme);
+    header::draw_banner(frame, layout.banner, model, theme);
+    mask::draw(frame, layout.mask, &layout.plan, model, theme);
+    devices::draw(frame, layout.devices, (layout.rows, layout.selection), model, theme);
+    if let Some(area) = layout.timeline {
+        timeline::draw(frame, area, model, theme);
     }
-    if with_log {
-        log::draw(frame, log_area, model, theme);
+    policy::draw(frame, layout.policy, layout.policy_lines, model, theme);
+    recording::draw(frame, layout.recording, model, theme);
+    if layout.episode_lines > 0 {
+        episodes::draw(frame, layout.episodes, layout.episode_lines, model, theme);
     }
+    if let Some(area) = layout.log {
+        log::draw(frame, area, model, theme);
+    }
+}
+
+/// What is at a place of the screen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Target {
+    /// The row of this device in the table, from 0.
+    Device(usize),
+    /// The list of devices, beside its rows.
+    Devices,
+    /// The log.
+    Log,
+    /// The episodes.
+    Episodes,
+    /// The selected device.
+    Detail,
+}
+
+/// What is at this place of a screen of this size.
+pub(super) fn target(model: &Model, (width, height): (u16, u16), theme: Theme, place: Position) -> Option<Target> {
+    let (left, column) = match model.page {
+        Page::Rig if width < MINIMUM.0 || height < MINIMUM.1 => return None,
+        Page::Rig => columns(Rect { x: 0, y: 1, width, height: height - 2 }, model),
+        Page::Device => return Some(Target::Detail),
+        Page::Log => return Some(Target::Log),
+        Page::Episodes => return Some(Target::Episodes),
+    };
+    let layout = RigLayout::new(left, model, theme);
+    let is_in = |area: Rect| area.contains(place);
+    if is_in(layout.devices) {
+        let row = devices::row_at(usize::from(place.y - layout.devices.y), usize::from(layout.rows), model);
+        return Some(row.map_or(Target::Devices, Target::Device));
+    }
+    match () {
+        () if column.is_some_and(is_in) => Some(Target::Detail),
+        () if layout.log.is_some_and(is_in) => Some(Target::Log),
+        () if layout.episode_lines > 0 && is_in(layout.episodes) => Some(Target::Episodes),
+        () => None,
+    }
+}
+
+/// The part of the rig, and that of the selected device where there is room for it.
+fn columns(area: Rect, model: &Model) -> (Rect, Option<Rect>) {
+    if !model.has_column() {
+        return (area, None);
+    }
+    let column = Constraint::Length(COLUMN.min(area.width / 2));
+    let [left, _, right] =
+        Layout::horizontal([Constraint::Fill(1), Constraint::Length(1), column]).areas(area);
+    (left, Some(Rect { y: right.y + 1, height: right.height - 1, ..right }))
 }
 
 /// What is being recorded comes first: it continues, and the space bar still ends it.

@@ -112,7 +112,7 @@ fn keys_that_stop_motion_work_at_any_moment() {
             // Ctrl-C confirms the question whether to leave.
             let leaves = question == "leaving" && what.contains("'c'");
             assert_eq!(effect, if leaves { Effect::Leave } else { Effect::Order(Order::Disarm) }, "{what}");
-            assert!(!model.help || what.contains("'c'"), "{what}");
+            assert!(model.help.is_none() || what.contains("'c'"), "{what}");
             // The next key does not answer the question.
             assert_eq!(model.update(control('y')), Effect::None, "{what}");
         }
@@ -204,23 +204,26 @@ fn a_paused_view_is_frozen_but_commands_use_current_state() {
 #[test]
 fn a_log_scrolled_back_stays_where_it_is_when_lines_come() {
     let mut snapshot = three_streaming();
-    snapshot.log = (0..50).map(|second| line(second, Level::Info, "tick")).collect();
+    let tick = |second| line(second, Level::Info, if second % 2 == 0 { "tick" } else { "tock" });
+    snapshot.log = (0..50).map(tick).collect();
     let mut model = Model::new(snapshot.clone());
+    model.update(press(KeyCode::Char('g')));
+    let below = |model: &Model| model.log.below(&model.shown().log);
     model.update(press(KeyCode::PageUp));
-    assert_eq!(model.scroll, SCROLL_STEP);
+    assert_eq!(below(&model), SCROLL_STEP);
     // Two lines are added, the two oldest are removed.
     snapshot.log.drain(..2);
-    snapshot.log.extend((50..52).map(|second| line(second, Level::Info, "tick")));
+    snapshot.log.extend((50..52).map(tick));
     model.update(after(&snapshot, 100));
-    assert_eq!(model.scroll, SCROLL_STEP + 2);
+    assert_eq!(below(&model), SCROLL_STEP + 2);
     model.update(press(KeyCode::Esc));
-    assert_eq!(model.scroll, 0);
+    assert_eq!(below(&model), 0);
     model.update(after(&snapshot, 200));
-    assert_eq!(model.scroll, 0);
+    assert_eq!(below(&model), 0);
     for _ in 0..30 {
         model.update(press(KeyCode::PageUp));
     }
-    assert_eq!(model.scroll, 49);
+    assert_eq!(below(&model), 49);
 }
 
 #[test]
@@ -393,4 +396,101 @@ fn devices_in_trouble_come_first_by_a_key_and_the_selection_stays_on_its_device(
     assert_ne!(model.rows()[0].state, SlotState::Failed);
     model.update(press(KeyCode::Char('o')));
     assert_eq!(model.rows().iter().map(|device| device.id.bit()).collect::<Vec<_>>(), by_bit);
+}
+
+#[test]
+fn previews_are_requested_while_they_are_shown_and_never_else() {
+    let cam = three_streaming();
+    let look = Effect::Send(Command::Look(id(0)));
+    let mut model = Model::new(cam.clone());
+    assert_eq!(model.update(after(&cam, 100)), Effect::None);
+    model.update(press(KeyCode::Enter));
+    assert_eq!(model.update(after(&cam, 200)), look);
+    assert_eq!(model.update(after(&cam, 300)), Effect::None, "not at every frame");
+    assert_eq!(model.update(after(&cam, 800)), look);
+    model.update(press(KeyCode::Down));
+    assert_eq!(model.update(after(&cam, 900)), Effect::Send(Command::Look(id(1))), "the other device at once");
+    model.link = LinkState::Lost { since: TAKEN, read_only: false };
+    assert_eq!(model.update(after(&cam, 2_000)), Effect::None);
+    model.link = LinkState::Attached { process: 1, read_only: true };
+    assert_eq!(model.update(after(&cam, 2_100)), Effect::Send(Command::Look(id(1))), "looking changes nothing");
+    model.update(press(KeyCode::Enter));
+    assert_eq!(model.update(after(&cam, 4_000)), Effect::None);
+    // Beside the rig, where there is room.
+    model.update(Msg::Size(200, 60));
+    assert_eq!(model.update(after(&cam, 5_000)), Effect::Send(Command::Look(id(1))));
+}
+
+#[test]
+fn what_is_attached_ends_nothing_and_read_only_changes_nothing() {
+    let mut recording_now = three_streaming();
+    recording_now.recording = Some(recording(0));
+    recording_now.simulated = true;
+    let keys = || {
+        let letters = "xuis+rUdD".chars().map(KeyCode::Char);
+        letters.chain([KeyCode::Left, KeyCode::Right, KeyCode::Esc, KeyCode::Char(' ')])
+    };
+    for read_only in [false, true] {
+        let mut model = Model::new(recording_now.clone());
+        model.link = LinkState::Attached { process: 1, read_only };
+        let effects: Vec<_> = keys().map(|code| model.update(press(code))).filter(|effect| *effect != Effect::None).collect();
+        assert_eq!(effects.is_empty(), read_only, "{effects:?}");
+        assert!(model.notice().is_some());
+        // Without a question although an episode is recorded, and without a disarm.
+        assert_eq!(model.update(control('c')), Effect::Leave);
+        let mut model = Model::new(recording_now.clone());
+        model.link = LinkState::Attached { process: 1, read_only };
+        assert_eq!(model.update(press(KeyCode::Char('q'))), Effect::Leave);
+    }
+    let mut model = Model::new(recording_now.clone());
+    model.link = LinkState::Lost { since: TAKEN, read_only: false };
+    for code in keys() {
+        assert_eq!(model.update(press(code)), Effect::None, "{code:?}");
+    }
+    assert_eq!(model.notice(), Some("the run has ended: nothing receives this"));
+}
+
+#[test]
+fn pages_open_and_close_by_the_same_key_and_esc_returns() {
+    let mut model = Model::new(three_streaming());
+    for (code, page) in [(KeyCode::Enter, Page::Device), (KeyCode::Char('l'), Page::Log), (KeyCode::Char('e'), Page::Episodes)] {
+        model.update(press(code));
+        assert_eq!(model.page, page);
+        model.update(press(code));
+        assert_eq!(model.page, Page::Rig);
+        model.update(press(code));
+        assert_eq!(model.update(press(KeyCode::Esc)), Effect::Order(Order::Disarm));
+        assert_eq!(model.page, Page::Rig);
+    }
+}
+
+#[test]
+fn a_search_narrows_the_log_while_it_is_typed() {
+    let mut snapshot = three_streaming();
+    snapshot.log = vec![line(0, Level::Info, "cam one"), line(1, Level::Info, "tof two")];
+    let mut model = Model::new(snapshot);
+    model.update(press(KeyCode::Char('/')));
+    for (letter, shown) in [('t', 1), ('x', 0)] {
+        // `x` is text here and discards nothing.
+        assert_eq!(model.update(press(KeyCode::Char(letter))), Effect::None);
+        assert_eq!(model.log.entries(&model.shown().log).len(), shown, "{letter}");
+    }
+    model.update(press(KeyCode::Backspace));
+    model.update(press(KeyCode::Enter));
+    assert_eq!((model.prompt(), model.log.search.as_str()), (None, "t"));
+    model.update(press(KeyCode::Esc));
+    assert_eq!(model.log.search, "");
+}
+
+#[test]
+fn the_mouse_selects_and_opens_and_begins_nothing() {
+    let mut model = Model::new(three_streaming());
+    assert_eq!(model.update(Msg::Click(Target::Device(2))), Effect::None);
+    assert_eq!((model.selected, model.page), (2, Page::Rig));
+    model.update(Msg::Click(Target::Device(2)));
+    assert_eq!(model.page, Page::Device);
+    model.update(Msg::Wheel(Some(Target::Detail), true));
+    assert_eq!(model.selected, 1);
+    model.update(Msg::Click(Target::Log));
+    assert_eq!(model.page, Page::Log);
 }

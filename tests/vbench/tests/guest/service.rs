@@ -1,5 +1,5 @@
-//! The unit that `rapid artifacts --install` writes, under a real systemd: installed as a user would, it records a camera, a
-//! CAN bus and a device on the network, over a restart, an unplug, a kill and a hang.
+//! The unit that `rapid artifacts --install` writes, under a real systemd: installed as a user would, a user of its group
+//! lets it record a camera, a CAN bus and a device on the network, over a restart, an unplug, a kill and a hang.
 
 use vbench::check::{assert_whole, play};
 use vbench::emu::can::adapter::Protocol;
@@ -65,11 +65,18 @@ awk '/^(Uid|CapEff|NoNewPrivs|Seccomp:)/' /proc/$main/status >$out/status
 for task in /proc/$main/task/*; do [ "$(cat $task/comm)" = mask ] && chrt -p ${task##*/}; done >$out/sched
 stat -c '%n %U:%G %a' /dev/shm/rapid_hardware_mask /dev/shm/rapid_hardware_mask.json >$out/published
 as stranger rapid mask --json >$out/mask.json 2>&1 || give_up "rapid mask as another user: $(cat $out/mask.json)"
+# Nothing is recorded before someone of the group requests it, and no one else may.
+is 0 count || give_up 'it records by itself'
+as stranger rapid episode start >$out/refused.txt 2>&1 && fail 'everybody can begin an episode'
+as stranger rapid monitor </dev/null >>$out/refused.txt 2>&1 && fail 'everybody can attach a monitor'
+record() { as keeper rapid episode start >>$out/keeper.txt 2>&1 || give_up "a user of the group: $(cat $out/keeper.txt)"; }
+record
 grown
 
 systemctl restart rapid || give_up 'systemctl restart rapid'
-wait_for 60 is 2 count || give_up 'no second episode'
 wait_for 60 streams || give_up 'not everything streams after the restart'
+record
+wait_for 60 is 2 count || give_up 'no second episode'
 grown
 emu unplug 0
 wait_for 60 is absent published wrist || give_up 'the camera is still there'
@@ -82,8 +89,9 @@ grown
 systemctl kill --signal=KILL rapid || give_up 'systemctl kill'
 rm -f /dev/shm/rapid_hardware_mask.json
 wait_for 60 is 1 restarts || give_up 'systemd does not start it again'
-wait_for 60 is 3 count || give_up 'no third episode'
 wait_for 60 streams || give_up 'not everything streams after the kill'
+record
+wait_for 60 is 3 count || give_up 'no third episode'
 grown
 wait_for 180 repaired || give_up 'the killed episode is not repaired'
 systemctl stop rapid || give_up 'systemctl stop rapid'
@@ -196,6 +204,8 @@ fn rights(outcome: &Outcome) {
     }
     assert!(files >= 3, "{modes}");
     assert!(outcome.file("stranger").contains("Permission denied"), "{}", outcome.file("stranger"));
+    assert!(outcome.file("refused.txt").contains("no rapid runs here for this user"), "{}", outcome.file("refused.txt"));
+    assert_eq!(outcome.file("keeper.txt").matches("recording /var/lib/rapid/").count(), 3, "{}", outcome.file("keeper.txt"));
 }
 
 /// What an emulated processor that has others beside it is to blame for; no limit turns these off.
