@@ -26,6 +26,7 @@ mod lan_mdns;
 mod list;
 mod many_devices;
 mod nodes;
+mod plot;
 mod process;
 mod provenance;
 mod publishers;
