@@ -18,6 +18,7 @@ mod ends;
 mod hooks;
 mod hostile;
 mod infer;
+mod json;
 mod kill;
 mod lan;
 mod lan_gopro;
