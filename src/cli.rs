@@ -42,6 +42,9 @@ pub struct Cli {
     /// General options, of the commands in `general_options`.
     #[command(flatten)]
     pub global: Global,
+    /// Name of the command, `run` without one.
+    #[arg(skip)]
+    pub name: String,
     /// Print version
     #[arg(long, short = 'V', action = ArgAction::Version, help_heading = GENERAL)]
     version: Option<bool>,
@@ -104,6 +107,8 @@ Examples:
   rapid monitor --read-only --instance left
   ssh -t rig rapid monitor                on another machine";
 
+/// What a run without a command is called in JSON.
+const RUN_NAME: &str = "run";
 const RUN: &str = "Run options";
 const GENERAL: &str = "General options";
 
@@ -415,11 +420,19 @@ impl Cli {
     pub fn read(typed: impl IntoIterator<Item = OsString>) -> Result<Self, clap::Error> {
         let mut command = Self::grammar();
         let matches = command.try_get_matches_from_mut(typed).map_err(|error| explained(error, &mut command))?;
-        let cli = Self::from_arg_matches(&matches)?;
+        let mut cli = Self::from_arg_matches(&matches)?;
+        matches.subcommand_name().unwrap_or(RUN_NAME).clone_into(&mut cli.name);
         match misplaced(&matches, &command).or_else(|| cli.contradiction(&command)) {
             Some(text) => Err(command.error(ErrorKind::ArgumentConflict, text)),
             None => Ok(cli),
         }
+    }
+
+    /// The name of the command in words that may not be a command line, `run` without one.
+    pub fn name_in(typed: impl IntoIterator<Item = OsString>) -> String {
+        let grammar = Self::command();
+        let named = |word: OsString| Some(grammar.find_subcommand(word)?.get_name().to_owned());
+        typed.into_iter().skip(1).find_map(named).unwrap_or_else(|| RUN_NAME.to_owned())
     }
 
     /// The grammar for parsing, help, completions and manual pages: without the general options that have no effect on

@@ -49,13 +49,44 @@ use crate::compare::CompareError;
 
 /// Tasks that are still running at the end must finish within this time.
 const TASKS_TIMEOUT: Duration = Duration::from_millis(500);
-/// The reader of standard error must accept an error message within this time: it may never read.
+/// The reader of an output must accept an error message within this time: it may never read.
 const STDERR_TIMEOUT: Duration = Duration::from_secs(2);
 /// The mask's JSON file lists 64 devices at most; a larger file is not one.
 const LARGEST_JSON: u64 = 1 << 20;
 
+/// Why a program ended: with `--json` the last line of standard output.
+#[derive(serde::Serialize)]
+struct Ended<'a> {
+    event: &'static str,
+    command: &'a str,
+    message: &'a str,
+    exit_code: u8,
+}
+
+/// Prints why the command named `command` ended, as JSON.
+fn print_ended(command: &str, message: &str, exit_code: u8) {
+    let ended = Ended { event: "error", command, message, exit_code };
+    let line = text::json(&ended).unwrap_or_default() + "\n";
+    outlet::write_within(io::stdout(), line, STDERR_TIMEOUT);
+}
+
+/// Prints a command line's error, or its help or version, and returns the exit code.
+pub fn refuse(error: &clap::Error) -> ExitCode {
+    // Help and version go to standard output and are not errors.
+    let code = if error.use_stderr() { 2 } else { 0 };
+    // If even this cannot be written, no error can be shown.
+    let _ = error.print();
+    if code != 0 && std::env::args_os().any(|word| word == "--json") {
+        let message = error.to_string();
+        let message = message.split("\n\nUsage:").next().unwrap_or_default();
+        print_ended(&Cli::name_in(std::env::args_os()), message.trim_start_matches("error: ").trim_end(), code);
+    }
+    ExitCode::from(code)
+}
+
 /// Runs a command line.
 pub fn dispatch(cli: Cli) -> ExitCode {
+    let (json, command) = (cli.global.json, cli.name.clone());
     match execute(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure { text, code }) => {
@@ -65,6 +96,9 @@ pub fn dispatch(cli: Cli) -> ExitCode {
             if !message.is_empty() {
                 let message = format!("{} {}\n", Palette::of(&io::stderr()).bad("error:"), lines.join("\n"));
                 outlet::write_within(io::stderr(), message, STDERR_TIMEOUT);
+                if json {
+                    print_ended(&command, &lines.join("\n"), code);
+                }
             }
             ExitCode::from(code)
         }

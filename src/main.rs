@@ -1,5 +1,5 @@
 //! Entry point: the guard of a bus of motors if it was started as one; otherwise parses the command line, runs the
-//! command, prints an error and sets the exit code.
+//! command and sets the exit code.
 
 use std::process::ExitCode;
 
@@ -15,12 +15,6 @@ fn main() -> ExitCode {
     }
     match rapid::cli::Cli::read(std::env::args_os()) {
         Ok(cli) => rapid::dispatch::dispatch(cli),
-        Err(error) => {
-            // Help and version go to standard output and are not errors.
-            let code = if error.use_stderr() { 2 } else { 0 };
-            // If even this cannot be written, no error can be shown.
-            let _ = error.print();
-            ExitCode::from(code)
-        }
+        Err(error) => rapid::dispatch::refuse(&error),
     }
 }

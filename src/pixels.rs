@@ -142,3 +142,21 @@ fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
     });
     [first[0], first[1], first[2], second[0], second[1], second[2]]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn yuyv_is_bt_601_of_limited_range() {
+        for value in 0..=255_u8 {
+            let [y, u, v] = [f64::from(value) - 16.0, f64::from(255 - value) - 128.0, f64::from(value / 2) - 128.0];
+            let y = y * 255.0 / 219.0;
+            let expected = [y + 1.596_027 * v, y - 0.391_762 * u - 0.812_968 * v, y + 2.017_232 * u];
+            let found = colors(&[value, 255 - value, value, value / 2]);
+            for (found, expected) in found.iter().zip(expected) {
+                assert!((f64::from(*found) - expected.clamp(0.0, 255.0)).abs() <= 0.51, "{value}: {found} {expected}");
+            }
+        }
+    }
+}

@@ -16,7 +16,7 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout, timeout_at};
 use tokio_util::sync::CancellationToken;
 
-use super::Format;
+use super::{Format, json_line};
 use crate::app::signals::Signals;
 use crate::calibration::{self, Estimate, Flip, Seen, brightness};
 use crate::cli::LatencyArgs;
@@ -126,7 +126,7 @@ pub async fn latency(
     let estimate = calibration::estimate(&flips, &seen).map_err(in_camera(&spec.name))?;
     let result = Measured::new(spec, &light, args.light_delay, estimate);
     match format {
-        Format::Json => writeln!(out, "{}", text::json(&result).map_err(io::Error::other)?)?,
+        Format::Json => writeln!(out, "{}", json_line("calibrated", &result)?)?,
         Format::Text => result.print(registry, spec, out)?,
     }
     Ok(())

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{CommandStatus, Format};
+use super::{CommandStatus, Format, json_line};
 use crate::interlock::StopKind;
 use crate::registry::{
     CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InterlockInput, InterlockSpec, Loaded, ModuleSpec,
@@ -24,7 +24,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Com
         Err(errors) => (errors.diagnostics.iter().map(Line::Error).collect(), CommandStatus::BadConfiguration),
     };
     if format == Format::Json {
-        lines.iter().try_for_each(|line| writeln!(out, "{}", text::json(line)?))?;
+        lines.iter().try_for_each(|line| writeln!(out, "{}", json_line(line.event(), line)?))?;
         return Ok(outcome);
     }
     let summary = match &loaded {
@@ -68,6 +68,20 @@ enum Line<'a> {
     Stop(StopRow<'a>),
     Warning(&'a Diagnostic),
     Error(&'a Diagnostic),
+}
+
+impl Line<'_> {
+    /// Its kind among all objects that are printed: `kind` is that among those of this command.
+    const fn event(&self) -> &'static str {
+        match self {
+            Self::Device(_) => "entry",
+            Self::Module(_) => "module",
+            Self::Motor(_) => "motor",
+            Self::Stop(_) => "interlock",
+            Self::Warning(_) => "warning",
+            Self::Error(_) => "mistake",
+        }
+    }
 }
 
 /// The stop behaviour of a joint.
@@ -269,9 +283,9 @@ mod tests {
             assert!(text.contains(line), "{text}");
         }
         let (_, json) = checked(motors, Format::Json);
-        assert!(
-            json.contains(r#"{"kind":"motor","name":"lift","device":"arm","own_fault":"limp","other_fault":"brake""#)
-        );
+        assert!(json.contains(
+            r#"{"event":"motor","kind":"motor","name":"lift","device":"arm","own_fault":"limp","other_fault":"brake""#
+        ));
     }
 
     #[test]
@@ -303,7 +317,7 @@ mod tests {
         let (_, text) = checked(crate::registry::BUILTIN, Format::Json);
         let rows: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         assert_eq!(rows.len(), 3);
-        assert_eq!(rows[0]["kind"], "device");
+        assert_eq!((&rows[0]["event"], &rows[0]["kind"]), (&"entry".into(), &"device".into()));
         assert_eq!(rows[0]["serial"], "CAM00A1");
         assert_eq!(rows[2]["format"], "115200 baud line csv x3");
         let (outcome, text) = checked("[device.a]\n", Format::Json);

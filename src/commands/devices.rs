@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::Format;
+use super::{Format, json_line};
 use crate::device::{Attachment, DeviceNode, Unit};
 use crate::driver::camera::{CameraInfo, cameras, is_on_usb, name, query};
 use crate::registry::{Assigner, Assignment, DeviceSpec, IdentitySpec, Registry, UsbSpec};
@@ -148,11 +148,11 @@ struct Missing<'a> {
 
 fn print_json(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write) -> io::Result<()> {
     for what in plugged {
-        writeln!(out, "{}", text::json(&Line { plugged: true, what })?)?;
+        writeln!(out, "{}", json_line("plugged", &Line { plugged: true, what })?)?;
     }
     for entry in missing {
         let what = Missing { entry: &entry.name, identity: &entry.identity };
-        writeln!(out, "{}", text::json(&Line { plugged: false, what })?)?;
+        writeln!(out, "{}", json_line("missing", &Line { plugged: false, what })?)?;
     }
     Ok(())
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use super::{CommandStatus, Format, progress};
+use super::{CommandStatus, Format, json_line, progress};
 use crate::palette::Palette;
 use crate::record::inspect::{self, Judgement, ReadError};
 use crate::text;
@@ -37,7 +37,7 @@ pub fn inspect(
     {
         let inspection = inspect::inspect(path)?;
         match format {
-            Format::Json => write_json(out, &inspection)?,
+            Format::Json => writeln!(out, "{}", json_line("inspection", &inspection)?)?,
             Format::Text => out.write_all(inspect::render(&inspection, columns, palette).as_bytes())?,
         }
         return Ok(CommandStatus::Done);
@@ -60,13 +60,9 @@ pub fn inspect(
             outcome = CommandStatus::BadConfiguration;
         }
         match format {
-            Format::Json => write_json(out, &listed),
+            Format::Json => json_line("listed", &listed).and_then(|line| writeln!(out, "{line}")),
             Format::Text => writeln!(out, "{}", inspect::render_list(&listed, &name_of(file), name, palette)),
         }
     })?;
     Ok(outcome)
-}
-
-fn write_json(out: &mut impl Write, value: &impl serde::Serialize) -> io::Result<()> {
-    writeln!(out, "{}", crate::text::json(value)?)
 }

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{CommandStatus, Format, progress};
+use super::{CommandStatus, Format, json_line, progress};
 use crate::cli::{LabelFilter, ListArgs, SortArg};
 use crate::palette::Palette;
 use crate::record::inspect::{self, Judgement, Listed, ReadError};
@@ -157,7 +157,7 @@ pub fn list(
     rows.retain(|row| filter.wants(row));
     sort(&mut rows, args.sort);
     match format {
-        Format::Json => rows.iter().try_for_each(|row| writeln!(out, "{}", text::json(row)?))?,
+        Format::Json => rows.iter().try_for_each(|row| writeln!(out, "{}", json_line("listed", row)?))?,
         Format::Text => write_table(&rows, all, folders.len() > 1, &zone, palette, out)?,
     }
     let unreadable = rows.iter().any(|row| matches!(row.listed.verdict, Judgement::Unreadable(_)));

@@ -111,6 +111,7 @@ fn age(record: &MaskRecord, now_ns: u64) -> Duration {
 /// The record as JSON.
 #[derive(Debug, Serialize)]
 struct Object<'a> {
+    event: &'static str,
     mask: String,
     mask_binary: String,
     device_count: u8,
@@ -139,6 +140,7 @@ pub fn render_json(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64) ->
     let count = usize::from(record.device_count);
     let online = |bit: u8| bit < 64 && record.mask.0 >> bit & 1 == 1;
     text::json(&Object {
+        event: "mask",
         mask: record.mask.hex(count),
         mask_binary: record.mask.binary(count),
         device_count: record.device_count,
@@ -255,7 +257,7 @@ impl Change {
                 Ok(render_json(record, names().as_deref(), now_ns)? + "\n")
             }
             Self::Gone(reason) if options.json => {
-                let gone = serde_json::json!({ "gone": reason, "time": crate::time::rfc3339(now_ns) });
+                let gone = serde_json::json!({ "event": "gone", "gone": reason, "time": crate::time::rfc3339(now_ns) });
                 Ok(text::json(&gone)? + "\n")
             }
             Self::Mask { record, before } => {

@@ -25,6 +25,20 @@ pub mod recover;
 pub mod register;
 pub mod session;
 
+/// An object of the output with what it is about as its key `event`.
+#[derive(serde::Serialize)]
+struct Tagged<'a, T> {
+    event: &'static str,
+    #[serde(flatten)]
+    value: &'a T,
+}
+
+/// `value`, an object, as one line of JSON with the key `event`: the kind of an object, by which docs/schema.json
+/// distinguishes all that are printed. Without a line end.
+fn json_line(event: &'static str, value: &impl serde::Serialize) -> std::io::Result<String> {
+    Ok(crate::text::json(&Tagged { event, value })?)
+}
+
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Format {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::{CommandStatus, Format, list};
+use super::{CommandStatus, Format, json_line, list};
 use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::plot::{self, Plot};
 use crate::record::inspect::{self, Judgement, ReadError};
@@ -124,7 +124,7 @@ pub fn plot(
         write(&name, &svg)?;
         let written = Written { file, verdict: &report.verdict, svg: &name, bytes: svg.len() };
         match format {
-            Format::Json => writeln!(out, "{}", text::json(&written).map_err(io::Error::from)?)?,
+            Format::Json => writeln!(out, "{}", json_line("plotted", &written)?)?,
             Format::Text => writeln!(out, "{}", text::plain(&name.display().to_string()))?,
         }
     }

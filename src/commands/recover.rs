@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use serde::Serialize;
 use serde_json::json;
 
-use super::Format;
+use super::{Format, json_line};
 use crate::episode::recover::{ProgressFn, RecoverError, Recovered, finished, is_damaged, left_behind, recover};
 use crate::text;
 
@@ -69,8 +69,8 @@ pub fn run(
                 Err(error) => report.failed(&file, &error),
             }
         }
-        if is_idle && is_sound && format == Format::Text {
-            report.line(&format!("{}: nothing to repair", path.display()));
+        if is_idle && is_sound {
+            report.nothing(path);
         }
     }
     report.end()
@@ -116,6 +116,14 @@ impl<O: Write, E: Write> Report<'_, O, E> {
         done
     }
 
+    /// Reports that nothing of this path needs a repair.
+    fn nothing(&mut self, path: &Path) {
+        match self.format {
+            Format::Json => self.json(&json!({"file": path.to_string_lossy(), "outcome": "nothing"})),
+            Format::Text => self.line(&text::plain(&format!("{}: nothing to repair", path.display()))),
+        }
+    }
+
     /// Reports a damaged finished file: it is not changed unless it is named explicitly.
     fn damaged(&mut self, file: &Path) {
         let name = file.display();
@@ -147,9 +155,9 @@ impl<O: Write, E: Write> Report<'_, O, E> {
     }
 
     fn json(&mut self, value: &impl Serialize) {
-        match text::json(value) {
+        match json_line("repair", value) {
             Ok(line) => self.line(&line),
-            Err(error) => self.written = Err(error.into()),
+            Err(error) => self.written = Err(error),
         }
     }
 

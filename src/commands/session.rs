@@ -35,7 +35,7 @@ pub fn ask(
     match (wanted, format) {
         (SessionRequest::Show, Format::Json) => writeln!(out, "{answer}")?,
         (SessionRequest::Show, Format::Text) => show(&serde_json::from_str(&answer)?, out)?,
-        (_, Format::Json) => writeln!(out, "{}", text::json(&serde_json::json!({ "done": answer }))?)?,
+        (_, Format::Json) => writeln!(out, "{}", super::json_line("answer", &serde_json::json!({ "done": answer }))?)?,
         (_, Format::Text) => writeln!(out, "{}", text::plain(&answer))?,
     }
     Ok(())

@@ -57,6 +57,8 @@ struct DeviceProgress<'a> {
     samples: u64,
     gaps: u64,
     hz: f64,
+    /// Since the newest sample was captured; null before the first.
+    age_ms: Option<f64>,
 }
 
 #[derive(Debug, Serialize)]
@@ -92,7 +94,8 @@ pub(super) fn json(
                 state: device.state,
                 samples: device.samples,
                 gaps: device.gaps,
-                hz: (rates.samples(device.id) * 1000.0).round() / 1000.0,
+                hz: thousandths(rates.samples(device.id)),
+                age_ms: device.newest.map(|newest| thousandths(snapshot.taken.since(newest).as_secs_f64() * 1e3)),
             })
             .collect(),
         recording: snapshot.recording.as_ref().map(|recording| RecordingProgress {
@@ -104,6 +107,10 @@ pub(super) fn json(
         }),
         policy: snapshot.policy.as_ref().map(|policy| PolicyProgress::of(policy, snapshot.devices.len())),
     })
+}
+
+fn thousandths(value: f64) -> f64 {
+    (value * 1000.0).round() / 1000.0
 }
 
 /// What the policy is doing, in a few words for the progress line.

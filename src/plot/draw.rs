@@ -31,8 +31,8 @@ text{font-family:system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-se
 .code{font-family:ui-monospace,'DejaVu Sans Mono',monospace;font-size:11px;fill:#59636e}
 .word{font-size:13px;font-weight:700;fill:#fff}
 .GOOD{fill:#1a7f37}.SUSPECT{fill:#9a6700}.BAD,.loss{fill:#cf222e}.none{fill:#59636e}
-.track{fill:#eef1f4}.on{fill:#d3f0db}.rate{fill:#43a564}.action{fill:#5b8def}
-.nominal{stroke:#1a7f37;stroke-dasharray:2 3;fill:none}.lost{fill:#cf222e}.stale{fill:#e0a100}
+.track{fill:#eef1f4}.on{fill:#e2f4e7}.rate{fill:#71c28a}.action{fill:#8fb1ee}
+.nominal{stroke:#116329;stroke-dasharray:2 3;fill:none}.lost{fill:#cf222e}.stale{fill:#e0a100}
 .edge{stroke:#1f2328;stroke-width:1.4;fill:none}.grid{stroke:#d8dee4;fill:none}
 .mark{stroke:#8250df;stroke-width:1.4;stroke-dasharray:5 3;fill:none}.said{fill:#8250df;font-size:11.5px;font-weight:600}
 .void{fill:url(#void)}.frame{fill:none;stroke:#d0d7de}

@@ -83,7 +83,7 @@ pub(super) struct Row {
 }
 
 impl Row {
-    fn new(topic: String) -> Self {
+    pub(super) fn new(topic: String) -> Self {
         let bins = || vec![0; BINS];
         Self {
             topic,

@@ -21,8 +21,7 @@ use crate::status::session::EpisodeEntry;
 use gather::{Span, Timeline};
 
 /// How every picture begins, by which it is recognised as made here.
-pub const BEGINNING: &str =
-    "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<!-- An episode, by `rapid inspect --plot`. -->\n";
+pub const BEGINNING: &str = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<!-- An episode, drawn by rapid. -->\n";
 
 /// A picture, and the report it is made of.
 #[derive(Debug)]

@@ -94,6 +94,14 @@ enum Next {
     Wait,
 }
 
+/// A session as it is shown to other programs, with the kind of the object (docs/schema.json).
+#[derive(serde::Serialize)]
+struct Shown<'a> {
+    event: &'static str,
+    #[serde(flatten)]
+    session: &'a SessionStatus,
+}
+
 /// See the module's comment.
 #[derive(Debug)]
 pub struct Session {
@@ -201,7 +209,8 @@ impl Session {
             SessionRequest::Plan { task, tags, goal } => Ok(self.change_plan(task.as_deref(), tags, *goal)),
             SessionRequest::EndSession => self.end_session(),
             SessionRequest::Show => {
-                Ok((Answer::Now(crate::text::json(&self.status()).unwrap_or_default()), Vec::new()))
+                let shown = Shown { event: "session", session: &self.status() };
+                Ok((Answer::Now(crate::text::json(&shown).unwrap_or_default()), Vec::new()))
             }
         }
     }

@@ -77,7 +77,7 @@ fn packets_become_samples_unchanged() {
     sender.join().expect("no panic");
     wait_for(&running, "lidar", "by lease", 1);
     let reported = stop(running);
-    let lost = reported.last().expect("a summary")["devices"][0].clone();
+    let lost = reported.iter().rfind(|event| event["event"] == "summary").expect("a summary")["devices"][0].clone();
     let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
     let samples: Vec<Vec<u8>> = episode.topic("/rapid/lan/lidar").map(support::Message::payload).collect();
     assert!(samples.len() > 20, "{}", samples.len());

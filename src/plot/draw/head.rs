@@ -1,7 +1,7 @@
 //! The head: file, verdict and reasons, and what is known about the episode.
 
 use super::{MARGIN, WIDTH};
-use crate::plot::svg::{Anchor, Svg};
+use crate::plot::svg::{Anchor, Px, Svg};
 use crate::record::inspect::{FileEnd, Inspection};
 use crate::status::session::{EpisodeEntry, Label};
 use crate::text;
@@ -22,7 +22,11 @@ pub(super) fn draw(page: &mut Svg, report: &Inspection, noted: Option<&EpisodeEn
     let word = report.verdict.grade().map_or("no verdict", crate::status::Grade::word);
     let class = report.verdict.grade().map_or("none", crate::status::Grade::word);
     let width = 24.0 + 9.6 * text::width(word) as f64;
-    page.rect(class, [WIDTH - MARGIN - width, 25.0, width, 26.0], "");
+    let left = Px(WIDTH - MARGIN - width);
+    page.raw(format_args!(
+        "<rect class=\"{class}\" x=\"{left}\" y=\"25\" width=\"{}\" height=\"26\" rx=\"13\"/>\n",
+        Px(width)
+    ));
     page.text("word", WIDTH - MARGIN - width / 2.0, 42.5, Anchor::Middle, word);
     let mut y = 46.0;
     let mut line = |class: &str, words: &str| {

@@ -212,35 +212,44 @@ fn curve(page: &mut Svg, band: &Band, row: &Row, timeline: &Timeline, y: f64) {
     let wide = (SAMPLES / (band.hz * bin)).ceil().clamp(1.0, (BINS / STEPS) as f64) as usize;
     let base = y + BAND;
     let mut path = String::new();
-    let mut is_open = false;
+    // Where the figure that is being drawn has come to.
+    let mut open: Option<f64> = None;
     for (step, bins) in row.samples.chunks(wide).enumerate() {
         let samples: u64 = bins.iter().copied().map(u64::from).sum();
         let (from, to) = ((step * wide) as f64 / BINS as f64, (step * wide + bins.len()) as f64 / BINS as f64);
         let whole = (to - from) * timeline.span.seconds;
-        // In a step that it was absent for a part of, its rate is that of the rest.
-        let present: f64 = band
-            .present
-            .as_ref()
-            .map_or(to - from, |spans| spans.iter().map(|(begin, end)| (end.min(to) - begin.max(from)).max(0.0)).sum());
+        let (present, from, to) = overlap(band.present.as_deref(), from, to);
+        // A few samples beside a presence are no high rate.
         let time = (present * timeline.span.seconds).max(whole / 4.0);
         let share = samples as f64 / (band.hz * time);
         let height = (share * NOMINAL).clamp(0.0, 1.0) * BAND;
-        if samples == 0 || !height.is_finite() {
-            if std::mem::take(&mut is_open) {
-                let _ = write!(path, "V{}z", Px(base));
+        let is_drawn = samples > 0 && height.is_finite();
+        if open.is_some_and(|end| !is_drawn || x(from) - end > 0.5) {
+            open = None;
+            let _ = write!(path, "V{}z", Px(base));
+        }
+        if is_drawn {
+            if open.is_none() {
+                let _ = write!(path, "M{} {}", Px(x(from)), Px(base));
             }
-            continue;
+            let _ = write!(path, "V{}H{}", Px(base - height), Px(x(to)));
+            open = Some(x(to));
         }
-        if !is_open {
-            let _ = write!(path, "M{} {}", Px(x(from)), Px(base));
-        }
-        let _ = write!(path, "V{}H{}", Px(base - height), Px(x(to)));
-        is_open = true;
     }
-    if is_open {
+    if open.is_some() {
         let _ = write!(path, "V{}z", Px(base));
     }
     page.path(band.class, &path, &band.title);
+}
+
+/// How much of a step something was present, and where that begins and ends: in a step with an unplug, the rate is that
+/// of the rest. A step without any presence counts as a whole.
+fn overlap(present: Option<&[(f64, f64)]>, from: f64, to: f64) -> (f64, f64, f64) {
+    let spans = present.unwrap_or_default().iter().map(|(begin, end)| (begin.max(from), end.min(to)));
+    let (sum, begin, end) = spans
+        .filter(|(begin, end)| begin < end)
+        .fold((0.0, to, from), |(sum, first, last), (begin, end)| (sum + end - begin, first.min(begin), last.max(end)));
+    if sum > 0.0 { (sum, begin, end) } else { (to - from, from, to) }
 }
 
 /// Where samples are lost, hanging from above, as high as their share; and frames without one, along the lower edge.
