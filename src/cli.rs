@@ -321,9 +321,11 @@ pub enum Command {
         shown: ShownArgs,
     },
     /// Print the log of a running rapid, and what its programs print
-    #[command(after_long_help = "It has the last 2000 lines; the files below ~/.local/state/rapid keep what programs printed \
+    #[command(
+        after_long_help = "It has the last 2000 lines; the files below ~/.local/state/rapid keep what programs printed \
         before.\n\nExamples:\n  rapid logs\n  rapid logs tactile_tip -f          one device and its programs, until the run ends\n  \
-        rapid logs --level warn --utc")]
+        rapid logs --level warn --utc"
+    )]
     Logs {
         /// Only lines about this entry of the registry
         #[arg(value_name = "NAME")]

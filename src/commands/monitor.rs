@@ -51,11 +51,7 @@ pub enum MonitorError {
 ///
 /// # Errors
 /// When there is no such run at the start, or no terminal.
-pub async fn monitor(
-    instance: Option<&str>,
-    read_only: bool,
-    shown: ScreenOptions,
-) -> Result<(), MonitorError> {
+pub async fn monitor(instance: Option<&str>, read_only: bool, shown: ScreenOptions) -> Result<(), MonitorError> {
     let mut signals = Signals::listen().map_err(TuiError::NoTerminal)?;
     let link = Remote::open(Wanted { instance: instance.map(str::to_owned), read_only })?;
     let shutdown = CancellationToken::new();

@@ -80,7 +80,7 @@ fn facts(device: &DeviceStatus, model: &Model, theme: Theme) -> Vec<(String, Str
         fact("state", format!("{}{state}", device.state.word())),
         fact("rate", format!("{} Hz{wanted}", text::hertz(reading.hz))),
         fact("run", format!("{} samples, {}, {} lost", device.samples, text::size(device.bytes), device.gaps)),
-        fact("starts", format!("{} (epoch {})", device.epoch.0, device.epoch.0)),
+        fact("starts", device.epoch.0.to_string()),
     ];
     if let Some(finding) = model.latest().recording.as_ref().and_then(|recording| recording.outlook.of(&device.name)) {
         facts.push(fact("episode", format!("would be {}: {}", finding.grade.word(), finding.text)));

@@ -114,11 +114,7 @@ pub async fn run(
 ///
 /// # Errors
 /// When there is no terminal, or it goes away.
-pub async fn show(
-    mut link: impl Link,
-    options: ScreenOptions,
-    shutdown: CancellationToken,
-) -> Result<(), TuiError> {
+pub async fn show(mut link: impl Link, options: ScreenOptions, shutdown: CancellationToken) -> Result<(), TuiError> {
     let theme = Theme::detect(|name| std::env::var(name).ok());
     let mut screen = Screen::open(options.mouse).map_err(TuiError::NoTerminal)?;
     let size = crossterm::terminal::size().ok();

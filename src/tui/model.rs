@@ -487,13 +487,11 @@ impl Model {
     fn look(&mut self) -> Effect {
         let is_shown = self.page == Page::Device || (self.page == Page::Rig && self.has_column());
         let is_due = self.looked.is_none_or(|looked| self.latest.taken.since(looked) >= LOOK_AGAIN);
-        let Some(device) = self.selected_device().filter(|_| is_shown && is_due && self.frozen.is_none()) else {
-            return Effect::None;
-        };
-        let id = device.id;
+        let is_linked = !matches!(self.link, LinkState::Lost { .. });
+        let wanted = self.selected_device().filter(|_| is_shown && is_due && is_linked && self.frozen.is_none());
+        let Some(id) = wanted.map(|device| device.id) else { return Effect::None };
         self.looked = Some(self.latest.taken);
-        let is_linked = matches!(self.link, LinkState::Own | LinkState::Attached { .. });
-        if is_linked { Effect::Send(Command::Look(id)) } else { Effect::None }
+        Effect::Send(Command::Look(id))
     }
 
     /// Whether the selected device is shown beside the rig.

@@ -137,7 +137,14 @@ pub(super) fn restore() {
     let (done, is_done) = mpsc::channel();
     let leave = move || {
         if let Ok(mut terminal) = writer() {
-            let _ = crossterm::execute!(terminal, DisableMouseCapture, DisableBracketedPaste, EnableLineWrap, LeaveAlternateScreen, Show);
+            let _ = crossterm::execute!(
+                terminal,
+                DisableMouseCapture,
+                DisableBracketedPaste,
+                EnableLineWrap,
+                LeaveAlternateScreen,
+                Show
+            );
         }
         let _ = done.send(());
     };

@@ -1,3 +1,4 @@
+mod pages;
 mod policy;
 
 use std::time::Duration;
@@ -444,9 +445,15 @@ async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     assert_eq!(notice.as_deref(), Some("busy: request dropped, try again"));
 
     drop(commands);
-    drive(&mut desk(&board, &sender), &CancellationToken::new(), typed(&[KeyCode::Char('q')]), ScreenOptions::default(), |_| Ok(()))
-        .await
-        .unwrap();
+    drive(
+        &mut desk(&board, &sender),
+        &CancellationToken::new(),
+        typed(&[KeyCode::Char('q')]),
+        ScreenOptions::default(),
+        |_| Ok(()),
+    )
+    .await
+    .unwrap();
 }
 
 #[tokio::test]
@@ -454,7 +461,10 @@ async fn a_terminal_that_goes_away_is_an_error() {
     let board = Arc::new(board(&["cam"]));
     let (sender, _commands) = mpsc::channel(1);
     let hung_up = futures::stream::iter([]);
-    let error = drive(&mut desk(&board, &sender), &CancellationToken::new(), hung_up, ScreenOptions::default(), |_| Ok(())).await.unwrap_err();
+    let error =
+        drive(&mut desk(&board, &sender), &CancellationToken::new(), hung_up, ScreenOptions::default(), |_| Ok(()))
+            .await
+            .unwrap_err();
     assert!(matches!(error, TuiError::Gone(_)), "{error}");
 }
 

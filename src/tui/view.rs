@@ -96,8 +96,16 @@ impl RigLayout {
         let timeline_lines = if area.height >= WITH_TIMELINE { timeline::rows(model, area.height / 4) } else { 0 };
         let timeline_rows = with_rule(timeline_lines);
         // A rule above each of the four panels, the head of the table, header and footer.
-        let fixed =
-            4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows + episode_rows + timeline_rows;
+        let fixed = 4
+            + 1
+            + 2
+            + 4 * gap
+            + plan.rows()
+            + selection
+            + recording_lines
+            + policy_rows
+            + episode_rows
+            + timeline_rows;
         // On the smallest terminals the policy panel replaces the log: it shows the reason of a hold itself.
         let with_log = policy_rows == 0 || area.height >= fixed + 1 + LOG_LINES.0;
         let rest = area.height.saturating_sub(if with_log { fixed } else { fixed - 1 });
@@ -119,7 +127,21 @@ impl RigLayout {
         .areas(area);
         let (timeline, log) = ((timeline_rows > 0).then_some(timeline), with_log.then_some(log));
         let (policy_lines, episode_lines) = (policy_lines, episode_lines);
-        Self { banner, plan, mask, devices, rows, selection, timeline, policy, policy_lines, recording, episodes, episode_lines, log }
+        Self {
+            banner,
+            plan,
+            mask,
+            devices,
+            rows,
+            selection,
+            timeline,
+            policy,
+            policy_lines,
+            recording,
+            episodes,
+            episode_lines,
+            log,
+        }
     }
 }
 
@@ -196,8 +218,7 @@ fn columns(area: Rect, model: &Model) -> (Rect, Option<Rect>) {
         return (area, None);
     }
     let column = Constraint::Length(COLUMN.min(area.width / 2));
-    let [left, _, right] =
-        Layout::horizontal([Constraint::Fill(1), Constraint::Length(1), column]).areas(area);
+    let [left, _, right] = Layout::horizontal([Constraint::Fill(1), Constraint::Length(1), column]).areas(area);
     (left, Some(Rect { y: right.y + 1, height: right.height - 1, ..right }))
 }
 

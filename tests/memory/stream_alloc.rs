@@ -195,7 +195,8 @@ fn an_observation_does_not_allocate() {
     let bus = Bus::open(&registry, Some(&instance)).unwrap();
     let writer = |topic| bus.writer(topic).unwrap();
     let (state, mask) = (writer(TopicId::Modality(registry.devices[1].id)), writer(TopicId::Mask));
-    let alignment = Alignment::new(&registry, bus.queues().unwrap(), writer(TopicId::Observation));
+    let board = Arc::new(Board::new(&registry));
+    let alignment = Alignment::new(&registry, bus.queues().unwrap(), writer(TopicId::Observation), board);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let stop = CancellationToken::new();
     let feed = async {

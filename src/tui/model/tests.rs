@@ -64,7 +64,12 @@ fn keys_become_commands() {
         (
             "space after the help",
             false,
-            vec![press(KeyCode::Char('?')), press(KeyCode::Char('?')), press(KeyCode::Char(' '))],
+            vec![
+                press(KeyCode::Char('?')),
+                press(KeyCode::Char('?')),
+                press(KeyCode::Char('?')),
+                press(KeyCode::Char(' ')),
+            ],
             toggle,
         ),
     ];
@@ -433,7 +438,8 @@ fn what_is_attached_ends_nothing_and_read_only_changes_nothing() {
     for read_only in [false, true] {
         let mut model = Model::new(recording_now.clone());
         model.link = LinkState::Attached { process: 1, read_only };
-        let effects: Vec<_> = keys().map(|code| model.update(press(code))).filter(|effect| *effect != Effect::None).collect();
+        let effects: Vec<_> =
+            keys().map(|code| model.update(press(code))).filter(|effect| *effect != Effect::None).collect();
         assert_eq!(effects.is_empty(), read_only, "{effects:?}");
         assert!(model.notice().is_some());
         // Without a question although an episode is recorded, and without a disarm.
@@ -453,7 +459,9 @@ fn what_is_attached_ends_nothing_and_read_only_changes_nothing() {
 #[test]
 fn pages_open_and_close_by_the_same_key_and_esc_returns() {
     let mut model = Model::new(three_streaming());
-    for (code, page) in [(KeyCode::Enter, Page::Device), (KeyCode::Char('l'), Page::Log), (KeyCode::Char('e'), Page::Episodes)] {
+    for (code, page) in
+        [(KeyCode::Enter, Page::Device), (KeyCode::Char('l'), Page::Log), (KeyCode::Char('e'), Page::Episodes)]
+    {
         model.update(press(code));
         assert_eq!(model.page, page);
         model.update(press(code));

@@ -204,8 +204,17 @@ fn rights(outcome: &Outcome) {
     }
     assert!(files >= 3, "{modes}");
     assert!(outcome.file("stranger").contains("Permission denied"), "{}", outcome.file("stranger"));
-    assert!(outcome.file("refused.txt").contains("no rapid runs here for this user"), "{}", outcome.file("refused.txt"));
-    assert_eq!(outcome.file("keeper.txt").matches("recording /var/lib/rapid/").count(), 3, "{}", outcome.file("keeper.txt"));
+    assert!(
+        outcome.file("refused.txt").contains("no rapid runs here for this user"),
+        "{}",
+        outcome.file("refused.txt")
+    );
+    assert_eq!(
+        outcome.file("keeper.txt").matches("recording /var/lib/rapid/").count(),
+        3,
+        "{}",
+        outcome.file("keeper.txt")
+    );
 }
 
 /// What an emulated processor that has others beside it is to blame for; no limit turns these off.
