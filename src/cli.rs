@@ -471,6 +471,14 @@ impl Cli {
             let svg = svg.display();
             return Some(format!("{svg} is given as an episode; the name of the picture follows a `=`: --plot={svg}"));
         }
+        if let Some(Command::Inspect { plot: Some(Some(to)), .. }) = &self.command
+            && to.as_os_str() == "-"
+            && self.global.json
+        {
+            return Some(
+                "--plot=- writes a picture to standard output, and --json objects: leave one of them out".to_owned(),
+            );
+        }
         let file = self.global.sim.as_ref()?.as_ref()?.to_str()?;
         let name = command.find_subcommand(file)?.get_name();
         let fix = match name {

@@ -34,7 +34,7 @@ text{font-family:system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-se
 .track{fill:#eef1f4}.on{fill:#e2f4e7}.rate{fill:#71c28a}.action{fill:#8fb1ee}
 .nominal{stroke:#116329;stroke-dasharray:2 3;fill:none}.lost{fill:#cf222e}.stale{fill:#e0a100}
 .edge{stroke:#1f2328;stroke-width:1.4;fill:none}.grid{stroke:#d8dee4;fill:none}
-.mark{stroke:#8250df;stroke-width:1.4;stroke-dasharray:5 3;fill:none}.said{fill:#8250df;font-size:11.5px;font-weight:600}
+.mark{stroke:#8250df;stroke-width:1.4;stroke-dasharray:5 3;fill:none}.caption{fill:#8250df;font-size:11.5px;font-weight:600}
 .void{fill:url(#void)}.frame{fill:none;stroke:#d0d7de}
 ";
 
@@ -161,7 +161,7 @@ fn draw_marks(page: &mut Svg, timeline: &Timeline, top: f64, bottom: f64) {
             let text = text::cut(text, MARK, "…");
             let (place, anchor) =
                 if at + MARK_WIDTH > WIDTH { (at - 4.0, Anchor::End) } else { (at + 4.0, Anchor::Start) };
-            page.text("said", place, top - height + 9.0, anchor, &text);
+            page.text("caption", place, top - height + 9.0, anchor, &text);
         }
     }
 }

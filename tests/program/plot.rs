@@ -55,7 +55,7 @@ fn an_episode_is_drawn_with_presence_pictures_marks_and_notes() {
     assert_eq!(texts(&document, "name"), ["mask", "cam_wrist", "tactile_tip", "motor_state"]);
     // The demonstration unplugs the tactile camera after 4 s and plugs it in again.
     assert_eq!(texts(&document, "code")[..2], ["0x07", "0x05"]);
-    assert_eq!(texts(&document, "said"), ["a <b> & c"]);
+    assert_eq!(texts(&document, "caption"), ["a <b> & c"]);
     let about = texts(&document, "");
     assert!(about.iter().any(|text| text.contains("put </title> & \"x\"")), "{about:?}");
     assert!(about.iter().any(|text| text.contains("label failure: it <slipped>")), "{about:?}");
@@ -120,5 +120,6 @@ fn a_name_for_several_pictures_and_a_name_without_its_sign_are_refused_with_the_
     refused(&["inspect", "a.mcap", "b.mcap", "--plot=-"], "2 episodes");
     refused(&["inspect", "a.mcap", "--plot", "c.svg"], "--plot=c.svg");
     refused(&["inspect", "none.mcap", "--plot"], "none.mcap: ");
+    refused(&["inspect", "none.mcap", "--plot=-", "--json"], "leave one of them out");
     assert!(files(&place, ".", ".svg").is_empty());
 }
