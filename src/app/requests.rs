@@ -27,12 +27,12 @@ pub(super) enum Request {
 /// Sorts requests until the screen, and what receives those of other programs, have ended. Those to the conductor wait in
 /// an unbounded queue: a person types them, and other programs wait for an answer to each.
 pub(super) fn sorted(
+    conductor: mpsc::UnboundedSender<Request>,
     mut screen: mpsc::Receiver<Command>,
     mut asked: mpsc::Receiver<Asked>,
     rig: mpsc::Sender<RigCommand>,
     scenario: mpsc::UnboundedSender<String>,
-) -> mpsc::UnboundedReceiver<Request> {
-    let (conductor, requests) = mpsc::unbounded_channel();
+) {
     let to_conductor = conductor.clone();
     tokio::spawn(async move {
         while let Some(asked) = asked.recv().await {
@@ -57,7 +57,6 @@ pub(super) fn sorted(
             };
         }
     });
-    requests
 }
 
 #[cfg(test)]
@@ -69,7 +68,8 @@ mod tests {
     async fn the_rig_is_reached_while_the_conductor_is_busy() {
         let (screen, from_screen) = mpsc::channel(1);
         let (rig, mut at_rig) = mpsc::channel(1);
-        let mut requests = sorted(from_screen, mpsc::channel(1).1, rig, mpsc::unbounded_channel().0);
+        let (conductor, mut requests) = mpsc::unbounded_channel();
+        sorted(conductor, from_screen, mpsc::channel(1).1, rig, mpsc::unbounded_channel().0);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }

@@ -8,8 +8,8 @@ use serde::Serialize;
 use super::{CommandStatus, Format};
 use crate::interlock::StopKind;
 use crate::registry::{
-    CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InterlockInput, InterlockSpec, Loaded, ModuleSpec,
-    MotorSpec, Mount, NodeSpec, Registry, StopSpec, UsbSpec,
+    ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
+    ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, StopSpec, UsbSpec,
 };
 use crate::text;
 
@@ -41,6 +41,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Com
             Line::Module(module) => writeln!(out, "{}", module_line(module))?,
             Line::Motor(motor) => writeln!(out, "{}", text::plain(&motor.to_string()))?,
             Line::Stop(stop) => writeln!(out, "{}", stop_line(&stop))?,
+            Line::Button(button) => writeln!(out, "{}", button_line(button))?,
             Line::Error(error) => writeln!(out, "{error}")?,
         }
     }
@@ -54,6 +55,7 @@ fn lines(loaded: &Loaded) -> Vec<Line<'_>> {
     lines.extend(registry.modules.iter().map(Line::Module));
     lines.extend(motors(registry).map(Line::Motor));
     lines.extend(registry.stops.iter().map(|stop| Line::Stop(StopRow::of(stop))));
+    lines.extend(registry.buttons.iter().map(Line::Button));
     lines.extend(warnings.iter().map(Line::Warning));
     lines
 }
@@ -66,6 +68,7 @@ enum Line<'a> {
     Module(&'a ModuleSpec),
     Motor(MotorRow<'a>),
     Stop(StopRow<'a>),
+    Button(&'a ButtonSpec),
     Warning(&'a Diagnostic),
     Error(&'a Diagnostic),
 }
@@ -122,7 +125,7 @@ struct StopRow<'a> {
     name: &'a str,
     stops_as: StopKind,
     actuators: &'a [String],
-    input: &'a InterlockInput,
+    input: &'a InputSpec,
 }
 
 impl<'a> StopRow<'a> {
@@ -181,8 +184,16 @@ fn module_line(module: &ModuleSpec) -> String {
 
 fn stop_line(stop: &StopRow<'_>) -> String {
     let what = if stop.actuators.is_empty() { "nothing".to_owned() } else { stop.actuators.join(" ") };
-    let line = format!("{} {}: {}; stops {what}", stop.stops_as.label(), stop.name, stop.input);
+    let line = format!("{} {}: {}; stops {what}", stop.stops_as.label(), stop.name, stop.input.text("runs", "stops"));
     text::plain(&line).into_owned()
+}
+
+fn button_line(button: &ButtonSpec) -> String {
+    let hold = format!("held for {:?}", button.hold_after);
+    let gestures = [("press", button.press), (hold.as_str(), button.hold), ("two presses", button.double)];
+    let actions = gestures.into_iter().filter_map(|(gesture, action)| Some(format!("; {gesture}: {}", action?)));
+    let input = button.input.text("pressed", "released");
+    text::plain(&format!("button {}: {input}{}", button.name, actions.collect::<String>())).into_owned()
 }
 
 fn table(loaded: &Loaded, out: &mut dyn Write) -> io::Result<()> {
@@ -295,7 +306,7 @@ mod tests {
         let rows: Vec<serde_json::Value> = json.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         let pedal = rows.iter().find(|row| row["name"] == "pedal").unwrap();
         assert_eq!((&pedal["kind"], &pedal["stops_as"]), (&"stop".into(), &"enabling".into()));
-        assert_eq!(pedal["input"]["field"]["runs"]["above"], 0.5);
+        assert_eq!(pedal["input"]["field"]["on"]["above"], 0.5);
     }
 
     #[test]

@@ -12,9 +12,9 @@ use rapid::interlock::StopKind;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InterlockInput, LanFind, LanPicture,
-    LanProtocol, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe,
-    Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
+    BUILTIN, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InputSpec, LanFind, LanPicture,
+    LanProtocol, LineOff, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
+    Probe, Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -257,20 +257,20 @@ fn emergency_stops_and_enabling_switches_are_parsed() {
     let [pendant, pedal, panel, door, wrist] = registry.stops.as_slice() else { panic!("five stops") };
     assert_eq!((pendant.name.as_str(), pendant.kind, pedal.kind), ("pendant", StopKind::Emergency, StopKind::Enabling));
     assert!(registry.stops.iter().all(|stop| stop.actuators == ["arm"]), "the default is all");
-    let InterlockInput::Serial(line) = &pendant.input else { panic!("a serial port") };
-    assert_eq!((line.baud, line.run.as_str(), line.stop.as_deref()), (9600, "RUN", Some("STOP")));
-    assert_eq!((line.path.to_str(), line.silence.as_millis()), (Some("/dev/serial/by-id/usb-pendant"), 150));
+    let InputSpec::Serial(line) = &pendant.input else { panic!("a serial port") };
+    assert_eq!((line.baud, line.on.as_str(), &line.off), (9600, "RUN", &LineOff::Line("STOP".into())));
+    assert_eq!((line.path.to_str(), line.silence.unwrap().as_millis()), (Some("/dev/serial/by-id/usb-pendant"), 150));
     // A switch is held, an emergency stop is not pressed, unless configured otherwise.
     let keys = [pedal, panel].map(|stop| {
-        let InterlockInput::Key(key) = &stop.input else { panic!("a key") };
-        (key.device.as_str(), key.number, key.runs_while_pressed)
+        let InputSpec::Key(key) = &stop.input else { panic!("a key") };
+        (key.device.as_str(), key.number, key.on_while_pressed)
     });
     assert_eq!(keys, [("PCsensor FootSwitch Keyboard", 48, true), ("/dev/input/by-id/panel", 0x120, true)]);
-    let InterlockInput::Gpio(gpio) = &door.input else { panic!("a line of a chip") };
-    assert_eq!((gpio.chip.to_str(), gpio.line, gpio.runs_while_high), (Some("/dev/gpiochip0"), 17, false));
-    let InterlockInput::Field(field) = &wrist.input else { panic!("a number") };
+    let InputSpec::Gpio(gpio) = &door.input else { panic!("a line of a chip") };
+    assert_eq!((gpio.chip.to_str(), gpio.line, gpio.on_while_high), (Some("/dev/gpiochip0"), 17, false));
+    let InputSpec::Field(field) = &wrist.input else { panic!("a number") };
     assert_eq!((field.device.as_str(), field.index, field.silence.as_millis()), ("buttons", 1, 200));
-    assert!(field.runs.holds(-0.6) && !field.runs.holds(-0.5) && !field.runs.holds(f64::NAN));
+    assert!(field.on.holds(-0.6) && !field.on.holds(-0.5) && !field.on.holds(f64::NAN));
     let NodeSpec::Can(can) = &registry.named("arm").unwrap().node else { panic!("a CAN adapter") };
     let CanProtocol::Damiao(damiao) = &can.protocol else { panic!("motors") };
     assert_eq!(damiao.motors[0].stop, StopSpec { emergency: Stop::Hold, ..StopSpec::default() });
