@@ -310,6 +310,34 @@ mod tests {
     }
 
     #[test]
+    fn buttons_are_listed() {
+        let buttons = "[button.pedal]\nkey = { device = \"a pad\", code = \"KEY_B\", grab = true }\n\
+                       press = \"toggle\"\nhold = \"discard\"\ndouble = \"redo\"\n[button.go]\n\
+                       serial = { path = \"/dev/ttyUSB7\", line = \"go\" }\npress = \"start\"\n[button.lever]\n\
+                       serial = { path = \"/dev/ttyUSB7\", pressed = \"down\", released = \"up\" }\n\
+                       press = \"stop\"\n[button.panel]\n\
+                       gpio = { chip = \"/dev/gpiochip0\", line = 17, pressed_while = \"low\" }\n\
+                       press = \"disarm\"\n[button.grip]\nfield = { device = \"motor_state\", index = 2, \
+                       pressed_above = 0.5, released_below = 0.25 }\npress = \"mark\"\n";
+        let text = format!("{}{buttons}", crate::registry::BUILTIN);
+        let (_, text_out) = checked(&text, Format::Text);
+        for line in [
+            "button pedal: KEY_B of a pad, which no other program gets; press: toggle; held for 1s: discard; two presses: redo",
+            "button go: /dev/ttyUSB7 at 115200 baud, pressed with \"go\"; press: start",
+            "button lever: /dev/ttyUSB7 at 115200 baud, pressed with \"down\", released with \"up\"; press: stop",
+            "button panel: line 17 of /dev/gpiochip0, pressed while low; press: disarm",
+            "button grip: number 2 of motor_state, pressed above 0.5, released below 0.25, lost after 500ms without it; press: mark",
+        ] {
+            assert!(text_out.lines().any(|is| is == line), "{line} not in {text_out}");
+        }
+        let (_, json) = checked(&text, Format::Json);
+        let rows: Vec<serde_json::Value> = json.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let pedal = rows.iter().find(|row| row["name"] == "pedal").unwrap();
+        assert_eq!((&pedal["kind"], &pedal["hold"]), (&"button".into(), &"discard".into()));
+        assert_eq!(pedal["input"]["key"]["grab"], true);
+    }
+
+    #[test]
     fn json_is_one_object_per_line() {
         let (_, text) = checked(crate::registry::BUILTIN, Format::Json);
         let rows: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();

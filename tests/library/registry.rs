@@ -12,7 +12,7 @@ use rapid::interlock::StopKind;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InputSpec, LanFind, LanPicture,
+    BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InputSpec, LanFind, LanPicture,
     LanProtocol, LineOff, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
     Probe, Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
 };
@@ -274,6 +274,38 @@ fn emergency_stops_and_enabling_switches_are_parsed() {
     let NodeSpec::Can(can) = &registry.named("arm").unwrap().node else { panic!("a CAN adapter") };
     let CanProtocol::Damiao(damiao) = &can.protocol else { panic!("motors") };
     assert_eq!(damiao.motors[0].stop, StopSpec { emergency: Stop::Hold, ..StopSpec::default() });
+}
+
+#[test]
+fn buttons_are_parsed() {
+    let Loaded { registry, warnings } = valid("buttons");
+    assert_eq!(warnings, []);
+    let [left, right, go, lever, remote, panel, thumb, index] = registry.buttons.as_slice() else { panic!("eight") };
+    assert_eq!(
+        [left.press, left.hold, left.double].map(Option::unwrap).map(|action| action.to_string()),
+        ["toggle", "discard", "redo"]
+    );
+    assert_eq!((left.hold_after.as_millis(), lever.hold_after.as_millis(), lever.press), (1000, 500, None));
+    let keys = [left, right].map(|button| {
+        let InputSpec::Key(key) = &button.input else { panic!("a key") };
+        (key.number, key.on_while_pressed, key.grab)
+    });
+    assert_eq!(keys, [(183, true, true), (184, true, false)]);
+    let lines = [go, lever, remote].map(|button| {
+        let InputSpec::Serial(line) = &button.input else { panic!("a serial port") };
+        (line.baud, line.on.as_str(), line.off.clone(), line.silence.map(|silence| silence.as_millis()))
+    });
+    assert_eq!(lines[0], (9600, "go", LineOff::AtOnce, None));
+    assert_eq!(lines[1], (9600, "down", LineOff::Line("up".into()), None));
+    assert_eq!(lines[2], (115_200, "1", LineOff::Line("0".into()), Some(1000)));
+    let InputSpec::Gpio(gpio) = &panel.input else { panic!("a line of a chip") };
+    assert_eq!((gpio.line, gpio.on_while_high), (17, false));
+    let fields = [thumb, index].map(|button| {
+        let InputSpec::Field(field) = &button.input else { panic!("a number") };
+        (field.index, field.on, field.off, field.silence.as_millis())
+    });
+    assert_eq!(fields[0], (1, Bound::Above(0.8), Some(Bound::Below(0.6)), 2000));
+    assert_eq!(fields[1], (0, Bound::Below(0.0), None, 500));
 }
 
 #[test]
