@@ -190,6 +190,7 @@ fn a_button_works_in_the_monitor() {
     place.write("devices.toml", &(DEVICES.to_owned() + GRIP));
     place.write("sim.toml", SIM);
     let mut run = OnTerminal::start(&place, &["--sim", "sim.toml", "--config", "devices.toml", "--out", "out"], "");
-    run.read_until("grip: begin episode");
     run.read_until("REC");
+    let journal = || std::fs::read_to_string(place.path("out/session.toml")).unwrap_or_default();
+    until("it is in the journal", || journal().contains("_001"));
 }
