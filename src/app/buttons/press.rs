@@ -176,7 +176,7 @@ mod tests {
     /// with the time of the press and of the decision: `press 100@130`.
     fn play(rules: Rules, script: &str) -> String {
         let mut presses = Presses::new(rules);
-        let mut did = Vec::new();
+        let (mut did, mut last) = (Vec::new(), at(0));
         let mut note = |done: Vec<(Gesture, Stamp)>, now: Stamp| {
             for (gesture, since) in done {
                 let word = match gesture {
@@ -192,7 +192,7 @@ mod tests {
         for (what, now) in steps.chain([("end", at(100_000))]) {
             // As the owner does: at each moment that is due.
             while let Some(due) = presses.due().filter(|due| *due <= now) {
-                let before = (presses.state, presses.released);
+                let (before, due) = ((presses.state, presses.released), due.max(last));
                 note(presses.advance(due), due);
                 assert_ne!((presses.state, presses.released), before, "{script}: nothing was due at {due:?}");
             }
@@ -202,6 +202,7 @@ mod tests {
                 "?" => note(presses.lose(now), now),
                 _ => {}
             }
+            last = now;
         }
         did.join(", ")
     }
