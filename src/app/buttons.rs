@@ -44,7 +44,7 @@ impl Buttons {
         if registry.buttons.is_empty() {
             return buttons;
         }
-        let (changes, changed) = mpsc::unbounded_channel();
+        let (changes, reported) = mpsc::unbounded_channel();
         let read = Readers::new(false).and_then(|mut readers| {
             for (place, own) in Place::of_all(registry.buttons.iter().map(|button| &button.input)) {
                 let names: Vec<&str> =
@@ -71,7 +71,7 @@ impl Buttons {
             board: Arc::clone(board),
             conductor: conductor.clone(),
         };
-        tokio::spawn(desk.work(changed));
+        tokio::spawn(desk.work(reported));
         buttons
     }
 

@@ -17,15 +17,15 @@ pub(super) const LOOK: Duration = Duration::from_millis(50);
 pub(super) struct Keys {
     device: Device,
     shown: String,
-    /// Each with the level at which it is on.
-    keys: Vec<(KeyCode, bool)>,
+    /// Keys, each with the level at which it is on.
+    wanted: Vec<(KeyCode, bool)>,
 }
 
 impl Keys {
     /// Opens the device at its path, or the first with its name and all of these keys, which are of one device.
     pub(super) fn open(specs: &[KeyInput]) -> Result<Self, String> {
         let Some(shown) = specs.first().map(|spec| spec.device.clone()) else { return Err("no key".to_owned()) };
-        let keys: Vec<_> = specs.iter().map(|spec| (KeyCode(spec.number), spec.on_while_pressed)).collect();
+        let wanted = specs.iter().map(|spec| (KeyCode(spec.number), spec.on_while_pressed)).collect();
         let missing = |device: &Device| {
             let has = |spec: &&KeyInput| device.supported_keys().is_some_and(|all| all.contains(KeyCode(spec.number)));
             specs.iter().find(|spec| !has(spec))
@@ -55,7 +55,7 @@ impl Keys {
                 _ => fail(error),
             })?;
         }
-        Ok(Self { device, shown, keys })
+        Ok(Self { device, shown, wanted })
     }
 
     pub(super) fn fd(&self) -> BorrowedFd<'_> {
@@ -63,17 +63,17 @@ impl Keys {
     }
 
     pub(super) fn take(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
-        let Self { device, shown, keys } = self;
+        let Self { device, shown, wanted } = self;
         let fail = |error: std::io::Error| not_opened(shown, "input", &error);
         match device.fetch_events() {
             // After an overflow of the kernel's queue, the crate synthesizes the changes.
-            Ok(events) => events.for_each(|event| judge(event, keys, report)),
+            Ok(events) => events.for_each(|event| judge(event, wanted, report)),
             Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
             Err(error) => return Err(fail(error)),
         }
         // A device that another program has grabbed delivers no events.
         let pressed = device.get_key_state().map_err(fail)?;
-        for (which, (code, on_while_pressed)) in keys.iter().enumerate() {
+        for (which, (code, on_while_pressed)) in wanted.iter().enumerate() {
             report(which, pressed.contains(*code) == *on_while_pressed);
         }
         Ok(())
