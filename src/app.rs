@@ -12,6 +12,7 @@
 
 mod attached;
 mod bus_files;
+mod buttons;
 mod collection;
 mod conductor;
 mod discovery;
@@ -59,6 +60,7 @@ use crate::status::Board;
 use crate::time::Stamp;
 use crate::tui::ScreenOptions;
 use attached::Attached;
+use buttons::Buttons;
 use collection::Collection;
 use conductor::Conductor;
 pub use error::AppError;
@@ -258,10 +260,16 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         }
     };
     let (to_rig, rig_commands) = mpsc::channel(16);
-    let requests = requests::sorted(from_screen, (arrivals, attached), to_rig, to_scenario);
+    let (to_conductor, requests) = mpsc::unbounded_channel();
+    let buttons = Buttons::begin(&registry, &permission, &board, &to_conductor);
+    requests::sorted(to_conductor, from_screen, (arrivals, attached), to_rig, to_scenario);
     let mask_ended = presence.ended();
     let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
-    let streaming = Streaming::start(rig.obeying(&permission).tapped(watched.taps()), plugged, rig_commands);
+    let streaming = Streaming::start(
+        rig.obeying(&permission).tapped(&[watched.taps(), buttons.taps()].concat()),
+        plugged,
+        rig_commands,
+    );
     let conductor = Conductor {
         events: board.events(),
         board,
@@ -274,6 +282,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let running = Running {
         permission,
         watched,
+        buttons,
         discovery,
         streaming,
         synchronisation: synchronise(alignment),
@@ -338,6 +347,7 @@ const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 struct Running {
     permission: Arc<Permission>,
     watched: Watched,
+    buttons: Buttons,
     discovery: Stage,
     streaming: Streaming,
     synchronisation: Stage,
@@ -362,6 +372,7 @@ async fn finish(
     // the rest.
     running.permission.disarm(Stamp::now());
     running.watched.end();
+    running.buttons.end();
     let policy_ended = async {
         match &mut running.inference {
             Some(inference) => timeout(LAST_CHUNK, inference.end()).await.unwrap_or(Err(AppError::Stuck)),

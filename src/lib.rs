@@ -28,6 +28,7 @@ pub mod folder;
 pub mod gpio;
 pub mod headless;
 pub mod hotplug;
+pub mod inputs;
 pub mod interlock;
 pub mod interlocks;
 #[cfg(feature = "lan")]

@@ -219,7 +219,7 @@ fn whole(EpisodeEnd { file, error, .. }: EpisodeEnd) -> Result<(), AppError> {
 }
 
 /// Waits until then, if it is a time.
-async fn reached(due: Option<Stamp>) {
+pub(super) async fn reached(due: Option<Stamp>) {
     match due {
         Some(due) => tokio::time::sleep(due.since(Stamp::now())).await,
         None => std::future::pending().await,

@@ -30,12 +30,12 @@ pub(super) enum Request {
 /// Sorts requests until the screen, and what receives those of other programs, have ended. Those to the conductor wait in
 /// an unbounded queue: a person types them, and other programs wait for an answer to each.
 pub(super) fn sorted(
+    conductor: mpsc::UnboundedSender<Request>,
     mut screen: mpsc::Receiver<Command>,
     (mut arrivals, attached): (mpsc::Receiver<Arrival>, Attached),
     rig: mpsc::Sender<RigCommand>,
     scenario: mpsc::UnboundedSender<String>,
-) -> mpsc::UnboundedReceiver<Request> {
-    let (conductor, requests) = mpsc::unbounded_channel();
+) {
     let (to_conductor, board) = (conductor.clone(), Arc::clone(attached.board()));
     tokio::spawn(async move {
         while let Some(arrival) = arrivals.recv().await {
@@ -71,7 +71,6 @@ pub(super) fn sorted(
             };
         }
     });
-    requests
 }
 
 #[cfg(test)]
@@ -84,8 +83,9 @@ mod tests {
     async fn the_rig_is_reached_while_the_conductor_is_busy() {
         let (screen, from_screen) = mpsc::channel(1);
         let (rig, mut at_rig) = mpsc::channel(1);
-        let attached = Attached::new(Arc::new(board(&["a"])), screen.clone());
-        let mut requests = sorted(from_screen, (mpsc::channel(1).1, attached), rig, mpsc::unbounded_channel().0);
+        let attached = Attached::new(Arc::new(board(&["a"])), mpsc::channel(1).0);
+        let (conductor, mut requests) = mpsc::unbounded_channel();
+        sorted(conductor, from_screen, (mpsc::channel(1).1, attached), rig, mpsc::unbounded_channel().0);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }

@@ -44,6 +44,7 @@ pub(super) fn registry(depth: usize) -> Registry {
         }],
         modules: Vec::new(),
         stops: Vec::new(),
+        buttons: Vec::new(),
         path: None,
         text: String::new(),
     }

@@ -8,8 +8,8 @@ use serde::Serialize;
 use super::{CommandStatus, Format, json_line};
 use crate::interlock::StopKind;
 use crate::registry::{
-    CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InterlockInput, InterlockSpec, Loaded, ModuleSpec,
-    MotorSpec, Mount, NodeSpec, Registry, StopSpec, UsbSpec,
+    ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
+    ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, StopSpec, UsbSpec,
 };
 use crate::text;
 
@@ -41,6 +41,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Com
             Line::Module(module) => writeln!(out, "{}", module_line(module))?,
             Line::Motor(motor) => writeln!(out, "{}", text::plain(&motor.to_string()))?,
             Line::Stop(stop) => writeln!(out, "{}", stop_line(&stop))?,
+            Line::Button(button) => writeln!(out, "{}", button_line(button))?,
             Line::Error(error) => writeln!(out, "{error}")?,
         }
     }
@@ -54,6 +55,7 @@ fn lines(loaded: &Loaded) -> Vec<Line<'_>> {
     lines.extend(registry.modules.iter().map(Line::Module));
     lines.extend(motors(registry).map(Line::Motor));
     lines.extend(registry.stops.iter().map(|stop| Line::Stop(StopRow::of(stop))));
+    lines.extend(registry.buttons.iter().map(Line::Button));
     lines.extend(warnings.iter().map(Line::Warning));
     lines
 }
@@ -66,6 +68,7 @@ enum Line<'a> {
     Module(&'a ModuleSpec),
     Motor(MotorRow<'a>),
     Stop(StopRow<'a>),
+    Button(&'a ButtonSpec),
     Warning(&'a Diagnostic),
     Error(&'a Diagnostic),
 }
@@ -78,6 +81,7 @@ impl Line<'_> {
             Self::Module(_) => "module",
             Self::Motor(_) => "motor",
             Self::Stop(_) => "interlock",
+            Self::Button(_) => "button",
             Self::Warning(_) => "warning",
             Self::Error(_) => "mistake",
         }
@@ -136,7 +140,7 @@ struct StopRow<'a> {
     name: &'a str,
     stops_as: StopKind,
     actuators: &'a [String],
-    input: &'a InterlockInput,
+    input: &'a InputSpec,
 }
 
 impl<'a> StopRow<'a> {
@@ -195,8 +199,16 @@ fn module_line(module: &ModuleSpec) -> String {
 
 fn stop_line(stop: &StopRow<'_>) -> String {
     let what = if stop.actuators.is_empty() { "nothing".to_owned() } else { stop.actuators.join(" ") };
-    let line = format!("{} {}: {}; stops {what}", stop.stops_as.label(), stop.name, stop.input);
+    let line = format!("{} {}: {}; stops {what}", stop.stops_as.label(), stop.name, stop.input.text("runs", "stops"));
     text::plain(&line).into_owned()
+}
+
+fn button_line(button: &ButtonSpec) -> String {
+    let hold = format!("held for {:?}", button.hold_after);
+    let gestures = [("press", button.press), (hold.as_str(), button.hold), ("two presses", button.double)];
+    let actions = gestures.into_iter().filter_map(|(gesture, action)| Some(format!("; {gesture}: {}", action?)));
+    let input = button.input.text("pressed", "released");
+    text::plain(&format!("button {}: {input}{}", button.name, actions.collect::<String>())).into_owned()
 }
 
 fn table(loaded: &Loaded, out: &mut dyn Write) -> io::Result<()> {
@@ -309,7 +321,35 @@ mod tests {
         let rows: Vec<serde_json::Value> = json.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         let pedal = rows.iter().find(|row| row["name"] == "pedal").unwrap();
         assert_eq!((&pedal["kind"], &pedal["stops_as"]), (&"stop".into(), &"enabling".into()));
-        assert_eq!(pedal["input"]["field"]["runs"]["above"], 0.5);
+        assert_eq!(pedal["input"]["field"]["on"]["above"], 0.5);
+    }
+
+    #[test]
+    fn buttons_are_listed() {
+        let buttons = "[button.pedal]\nkey = { device = \"a pad\", code = \"KEY_B\", grab = true }\n\
+                       press = \"toggle\"\nhold = \"discard\"\ndouble = \"redo\"\n[button.go]\n\
+                       serial = { path = \"/dev/ttyUSB7\", line = \"go\" }\npress = \"start\"\n[button.lever]\n\
+                       serial = { path = \"/dev/ttyUSB7\", pressed = \"down\", released = \"up\" }\n\
+                       press = \"stop\"\n[button.panel]\n\
+                       gpio = { chip = \"/dev/gpiochip0\", line = 17, pressed_while = \"low\" }\n\
+                       press = \"disarm\"\n[button.grip]\nfield = { device = \"motor_state\", index = 2, \
+                       pressed_above = 0.5, released_below = 0.25 }\npress = \"mark\"\n";
+        let text = format!("{}{buttons}", crate::registry::BUILTIN);
+        let (_, text_out) = checked(&text, Format::Text);
+        for line in [
+            "button pedal: KEY_B of a pad, which no other program gets; press: toggle; held for 1s: discard; two presses: redo",
+            "button go: /dev/ttyUSB7 at 115200 baud, pressed with \"go\"; press: start",
+            "button lever: /dev/ttyUSB7 at 115200 baud, pressed with \"down\", released with \"up\"; press: stop",
+            "button panel: line 17 of /dev/gpiochip0, pressed while low; press: disarm",
+            "button grip: number 2 of motor_state, pressed above 0.5, released below 0.25, lost after 500ms without it; press: mark",
+        ] {
+            assert!(text_out.lines().any(|is| is == line), "{line} not in {text_out}");
+        }
+        let (_, json) = checked(&text, Format::Json);
+        let rows: Vec<serde_json::Value> = json.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let pedal = rows.iter().find(|row| row["name"] == "pedal").unwrap();
+        assert_eq!((&pedal["kind"], &pedal["hold"]), (&"button".into(), &"discard".into()));
+        assert_eq!(pedal["input"]["key"]["grab"], true);
     }
 
     #[test]

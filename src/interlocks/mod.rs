@@ -1,36 +1,22 @@
-//! Emergency stops and enabling switches: where their inputs are read.
+//! Emergency stops and enabling switches: what follows from their inputs.
 //!
-//! Each has a thread, which sleeps until the kernel has something to read or the input has been silent for too long;
-//! for a number in the samples of a device the thread of [`tap`] only waits for silence, and the device's stream
-//! evaluates the number. The state of an input goes to the run's [`Permission`], which gives the orders, and then to
-//! the board.
+//! The inputs are read by the threads of [`crate::inputs`]. The state of an input goes to the run's [`Permission`], which
+//! gives the orders, and then to the board.
 //!
 //! Invariant: the order is given before anything is shown or logged.
-//! Invariant: an input is lost from the moment when it cannot be read until it reports that it runs: unplugged, silent,
-//! held by another program, or read by a thread that panicked.
-
-mod gpio;
-mod key;
-mod line;
-mod source;
-pub mod tap;
-mod watch;
+//! Invariant: an input that is lost does not run.
 
 use std::io;
-use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 
-use rustix::event::{EventfdFlags, eventfd};
-
+use crate::inputs::tap::Tap;
+use crate::inputs::{Place, Readers, Report};
 use crate::interlock::{InputState, Interlocks};
 use crate::permission::Permission;
-use crate::realtime::{CONTROL_PRIORITY, use_fifo};
-use crate::registry::{InterlockInput, Registry};
+use crate::registry::Registry;
 use crate::status::Board;
 use crate::time::Stamp;
-use tap::Tap;
 
 /// The stops of a registry, none of which runs.
 pub fn of(registry: &Registry) -> Interlocks {
@@ -40,9 +26,7 @@ pub fn of(registry: &Registry) -> Interlocks {
 /// Reads the inputs until it is dropped.
 #[derive(Debug)]
 pub struct Watched {
-    stop: Arc<OwnedFd>,
-    threads: Vec<JoinHandle<()>>,
-    taps: Vec<Tap>,
+    readers: Readers,
     is_ending: Arc<AtomicBool>,
 }
 
@@ -52,8 +36,7 @@ impl Watched {
     /// # Errors
     /// When the system provides no thread.
     pub fn begin(registry: &Registry, permission: &Arc<Permission>, board: &Arc<Board>) -> io::Result<Self> {
-        let stop = Arc::new(eventfd(0, EventfdFlags::CLOEXEC)?);
-        let mut watched = Self { stop, threads: Vec::new(), taps: Vec::new(), is_ending: Arc::default() };
+        let mut watched = Self { readers: Readers::new(true)?, is_ending: Arc::default() };
         for (index, spec) in registry.stops.iter().enumerate() {
             let reporter = Reporter {
                 index,
@@ -61,27 +44,12 @@ impl Watched {
                 board: Arc::clone(board),
                 is_ending: Arc::clone(&watched.is_ending),
             };
-            let stop = Arc::clone(&watched.stop);
-            let begin = |work: Box<dyn FnOnce() + Send>| {
-                // As much of the name as the kernel keeps.
-                let name = format!("stop-{}", spec.name).chars().take(15).collect();
-                std::thread::Builder::new().name(name).spawn(move || {
-                    // Without the privilege for it, the motors' thread warns.
-                    let _ = use_fifo(CONTROL_PRIORITY);
-                    work();
-                })
-            };
-            let thread = match spec.input.clone() {
-                InterlockInput::Field(field) => {
-                    let tap = Tap::new(&field, reporter)?;
-                    // Before any sample can come.
-                    tap.lose(&format!("no sample of {} has come", field.device));
-                    watched.taps.push(tap.clone());
-                    begin(Box::new(move || tap.watch(&stop)))?
-                }
-                input => begin(Box::new(move || watch::watch(&input, &reporter, &stop)))?,
-            };
-            watched.threads.push(thread);
+            let place = Place::of(&spec.input);
+            if let Place::Field(field) = &place {
+                // Before any sample can come.
+                reporter.lost(&format!("no sample of {} has come", field.device));
+            }
+            watched.readers.read(&format!("stop-{}", spec.name), place, Arc::new(reporter))?;
         }
         Ok(watched)
     }
@@ -94,18 +62,7 @@ impl Watched {
 
     /// The inputs that are numbers in the samples of a device.
     pub fn taps(&self) -> &[Tap] {
-        &self.taps
-    }
-}
-
-impl Drop for Watched {
-    fn drop(&mut self) {
-        // An eventfd always has room for a number.
-        let _ = rustix::io::write(&self.stop, &1_u64.to_ne_bytes());
-        for thread in self.threads.drain(..) {
-            // Its panic has been reported.
-            let _ = thread.join();
-        }
+        self.readers.taps()
     }
 }
 
@@ -127,20 +84,15 @@ impl Reporter {
             self.board.set_stop(self.index, state, why);
         }
     }
-
-    /// Held by a thread or task: if it panics, the input is lost.
-    fn lost_at_a_panic(&self) -> LostAtPanic<'_> {
-        LostAtPanic(self)
-    }
 }
 
-struct LostAtPanic<'a>(&'a Reporter);
+impl Report for Reporter {
+    fn level(&self, _: usize, is_on: bool) {
+        self.report(if is_on { InputState::Runs } else { InputState::Stopped }, "");
+    }
 
-impl Drop for LostAtPanic<'_> {
-    fn drop(&mut self) {
-        if std::thread::panicking() {
-            self.0.report(InputState::Lost, "its thread panicked; please report this");
-        }
+    fn lost(&self, why: &str) {
+        self.report(InputState::Lost, why);
     }
 }
 

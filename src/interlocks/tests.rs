@@ -8,6 +8,7 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
 use super::*;
 use crate::action::{Order, Trip};
+use crate::inputs::{lost_at_a_panic, tap};
 use crate::permission::Attended;
 use crate::sample::Encoding;
 use crate::status::{Event, StopStatus, What};
@@ -252,7 +253,7 @@ fn an_input_whose_thread_panics_is_lost() {
     let panicked = std::thread::spawn({
         let reporter = reporter.clone();
         move || {
-            let _lost = reporter.lost_at_a_panic();
+            let _lost = lost_at_a_panic(&reporter);
             panic!("on purpose");
         }
     });

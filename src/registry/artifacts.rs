@@ -11,9 +11,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use super::spec::{
-    CanAdapter, CanProtocol, CanSpec, DeviceSpec, IdentitySpec, InterlockInput, NodeSpec, Opens, Registry,
-};
+use super::spec::{CanAdapter, CanProtocol, CanSpec, DeviceSpec, IdentitySpec, InputSpec, NodeSpec, Opens, Registry};
 use crate::modality::ModalityKind;
 
 /// First line of every generated file: a file that begins otherwise must not be removed.
@@ -158,9 +156,9 @@ struct Nodes {
 
 /// A program opens the USB device itself.
 const USB: Nodes = Nodes { group: "plugdev", kind: "char-usb_device" };
-/// A stop is a key.
+/// A stop or a button is a key.
 const KEYS: Nodes = Nodes { group: "input", kind: "char-input" };
-/// A stop, or the brake of a joint, is a line of a GPIO chip.
+/// A stop, a button, or the brake of a joint, is a line of a GPIO chip.
 const GPIO: Nodes = Nodes { group: "gpio", kind: "char-gpiochip" };
 
 /// What the entries of a registry require of the system.
@@ -174,7 +172,7 @@ struct Needs {
     programs: bool,
     /// Motors have a guard, which outlives the program.
     guard: bool,
-    /// A stop is on a serial port of the board.
+    /// A stop or a button is on a serial port of the board.
     uarts: bool,
 }
 
@@ -206,13 +204,13 @@ impl Needs {
             }
             needs.programs |= !device.hooks.is_empty();
         }
-        for stop in &registry.stops {
-            match &stop.input {
-                InterlockInput::Key(_) => _ = needs.nodes.insert(KEYS),
-                InterlockInput::Gpio(_) => _ = needs.nodes.insert(GPIO),
+        for (_, input) in registry.inputs() {
+            match input {
+                InputSpec::Key(_) => _ = needs.nodes.insert(KEYS),
+                InputSpec::Gpio(_) => _ = needs.nodes.insert(GPIO),
                 // Those on USB are allowed to every unit.
-                InterlockInput::Serial(line) => needs.uarts |= !line.path.starts_with("/dev/serial"),
-                InterlockInput::Field(_) => {}
+                InputSpec::Serial(line) => needs.uarts |= !line.path.starts_with("/dev/serial"),
+                InputSpec::Field(_) => {}
             }
         }
         needs
@@ -246,7 +244,7 @@ impl Needs {
     }
 }
 
-/// For a unit with a stop on a serial port of the board.
+/// For a unit with a stop or a button on a serial port of the board.
 const UARTS: &str = "DeviceAllow=char-ttyS rw\nDeviceAllow=char-ttyAMA rw\n";
 
 /// For a unit without sockets for the network.

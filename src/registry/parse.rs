@@ -6,8 +6,10 @@
 //! Invariant: no text causes a panic.
 //! Invariant: all problems of a file are reported at once, each with its place and a fix.
 
+mod button;
 mod device;
 mod identity;
+mod input;
 mod interlock;
 mod lan;
 mod motors;
@@ -95,7 +97,7 @@ impl Registry {
 
 /// The content of the tables of the text.
 fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Registry, RegistryErrors> {
-    root.allow(&["rig", "verdict", "device", "module", "stop"]);
+    root.allow(&["rig", "verdict", "device", "module", "stop", "button"]);
     let section = root.table("rig");
     let mut rig = rig(section.as_ref());
     let verdict = verdict::read(root, Whose::Rig);
@@ -116,6 +118,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     fit(&mut drafts, rig.memory_budget, root);
     let modules = interlock::modules(root, &drafts);
     let stops = interlock::interlocks(root, &drafts);
+    let buttons = button::buttons(root, &drafts, &stops);
     root.check()?;
 
     let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
@@ -128,7 +131,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
             lan.keep_free(rig.disk_reserve);
         }
     }
-    Ok(Registry { rig, devices, modules, stops, path: None, text: String::new() })
+    Ok(Registry { rig, devices, modules, stops, buttons, path: None, text: String::new() })
 }
 
 fn rig(section: Option<&Section<'_>>) -> RigSpec {

@@ -7,6 +7,7 @@
 //! The reason for every default limit of the verdict is given here; `[verdict]` changes it for all devices,
 //! `[device.NAME.verdict]` for one.
 
+mod input;
 mod lan;
 mod motors;
 
@@ -16,10 +17,13 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use crate::interlock::StopKind;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
+pub use input::{
+    Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
+    MAX_BUTTONS,
+};
 pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, own_side};
 pub use motors::{
     BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
@@ -50,6 +54,8 @@ pub struct Registry {
     pub modules: Vec<ModuleSpec>,
     /// Emergency stops and enabling switches, in the order of the file, at most 16.
     pub stops: Vec<InterlockSpec>,
+    /// Buttons, in the order of the file, at most [`MAX_BUTTONS`].
+    pub buttons: Vec<ButtonSpec>,
     /// Where the text came from, for messages. `None` for the built-in registry.
     pub path: Option<PathBuf>,
     /// The text itself, recorded with every episode.
@@ -622,134 +628,6 @@ impl NodeSpec {
                         format!("{name} {word}")
                     }
                 }
-            }
-        }
-    }
-}
-
-/// One `[stop.NAME]` table.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct InterlockSpec {
-    /// Its name: `[a-z][a-z0-9_]*`, at most 64 bytes.
-    pub name: String,
-    /// What it stops.
-    pub kind: StopKind,
-    /// Names of the entries that it stops, each an actuator; empty if the rig has none.
-    pub actuators: Vec<String>,
-    /// What it is read from.
-    pub input: InterlockInput,
-}
-
-/// What a stop is read from.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum InterlockInput {
-    /// A key of an input device of the kernel (evdev).
-    Key(KeyInput),
-    /// A line of a GPIO chip.
-    Gpio(GpioInput),
-    /// Lines of text on a serial port.
-    Serial(LineInput),
-    /// A number in the samples of an entry.
-    Field(FieldInput),
-}
-
-/// `key = { ... }`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct KeyInput {
-    /// The device: an absolute path, or the name that it reports.
-    pub device: String,
-    /// The key's name in `linux/input-event-codes.h`.
-    pub code: String,
-    /// The key's number there.
-    pub number: u16,
-    /// The actuator may move while the key is pressed; otherwise while it is not.
-    pub runs_while_pressed: bool,
-}
-
-/// `gpio = { ... }`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct GpioInput {
-    /// The chip, for example `/dev/gpiochip0`.
-    pub chip: PathBuf,
-    /// Its line.
-    pub line: u32,
-    /// The actuator may move while the line is high; otherwise while it is low. The line is biased to the other level,
-    /// so that a broken wire stops.
-    pub runs_while_high: bool,
-}
-
-/// `serial = { ... }`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct LineInput {
-    /// The port, absolute.
-    pub path: PathBuf,
-    /// Bits a second, default 115200.
-    pub baud: u32,
-    /// The line that means that the actuator may move.
-    pub run: String,
-    /// The line that means that it may not; then lines other than the two are ignored. Without it every other line
-    /// means that it may not.
-    pub stop: Option<String>,
-    /// Without one of the two for this long the input is lost.
-    pub silence: Duration,
-}
-
-/// `field = { ... }`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct FieldInput {
-    /// The entry, whose samples are numbers.
-    pub device: String,
-    /// Which number of a sample, from 0.
-    pub index: usize,
-    /// The numbers at which the actuator may move.
-    pub runs: Bound,
-    /// Without a sample for this long the input is lost.
-    pub silence: Duration,
-}
-
-/// One side of a number.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Bound {
-    /// Above this.
-    Above(f64),
-    /// Below this.
-    Below(f64),
-}
-
-impl Bound {
-    /// Whether `value` is on this side. NaN is not.
-    pub fn holds(self, value: f64) -> bool {
-        match self {
-            Self::Above(bound) => value > bound,
-            Self::Below(bound) => value < bound,
-        }
-    }
-}
-
-impl fmt::Display for InterlockInput {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Key(key) => {
-                let state = if key.runs_while_pressed { "pressed" } else { "not pressed" };
-                write!(f, "{} of {}, runs while {state}", key.code, key.device)
-            }
-            Self::Gpio(gpio) => {
-                let level = if gpio.runs_while_high { "high" } else { "low" };
-                write!(f, "line {} of {}, runs while {level}", gpio.line, gpio.chip.display())
-            }
-            Self::Serial(line) => {
-                let (path, run) = (line.path.display(), &line.run);
-                write!(f, "{path} at {} baud, runs with {run:?}, lost after {:?} without it", line.baud, line.silence)
-            }
-            Self::Field(field) => {
-                let (device, index) = (&field.device, field.index);
-                let (side, bound) = match field.runs {
-                    Bound::Above(bound) => ("above", bound),
-                    Bound::Below(bound) => ("below", bound),
-                };
-                write!(f, "number {index} of {device}, runs {side} {bound}, lost after {:?} without it", field.silence)
             }
         }
     }

@@ -26,7 +26,7 @@ use crate::bus::{Bus, TopicId, Writer};
 use crate::device::Attachment;
 use crate::driver::DriverError;
 use crate::hotplug::HotplugStream;
-use crate::interlocks::tap::Tap;
+use crate::inputs::tap::Tap;
 use crate::mask::SizedMask;
 use crate::modality::ModalityId;
 use crate::permission::Permission;
@@ -152,7 +152,7 @@ impl Rig {
         self
     }
 
-    /// Makes the samples of its devices be checked for these emergency stops and enabling switches.
+    /// Makes the samples of its devices be checked for these emergency stops, enabling switches and buttons.
     #[must_use]
     pub fn tapped(mut self, taps: &[Tap]) -> Self {
         for modality in &mut self.modalities {

@@ -23,7 +23,7 @@ use crate::bus::Writer;
 use crate::device::Attachment;
 use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
-use crate::interlocks::tap::{Tap, lost_at_the_end};
+use crate::inputs::tap::{Tap, lost_at_the_end};
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};

@@ -181,6 +181,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         devices: names.iter().enumerate().map(device).collect(),
         modules: Vec::new(),
         stops: Vec::new(),
+        buttons: Vec::new(),
         path: None,
         text: String::new(),
     })

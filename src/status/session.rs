@@ -4,6 +4,7 @@
 
 use std::fmt;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -65,7 +66,16 @@ pub enum SessionRequest {
     Show,
 }
 
+/// A press that asks for one of the requests that [count once](SessionRequest::counts_once), so soon after the last one,
+/// is the repeat of a held key, which few terminals distinguish, or a hand that trembles.
+pub const PRESS_AGAIN: Duration = Duration::from_millis(400);
+
 impl SessionRequest {
+    /// Whether made twice it does something else than made once: of presses within [`PRESS_AGAIN`] only the first counts.
+    pub const fn counts_once(&self) -> bool {
+        matches!(self, Self::Toggle | Self::Next | Self::Redo | Self::Discard)
+    }
+
     /// Whether an episode begins or ends by it.
     pub const fn is_about_recording(&self) -> bool {
         matches!(self, Self::Toggle | Self::Start | Self::Stop | Self::Next | Self::Redo | Self::Discard)

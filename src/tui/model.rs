@@ -25,7 +25,7 @@ use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::sample::Encoding;
 use crate::status::preview::Preview;
 use crate::status::rates::Rates;
-use crate::status::session::{Label, SessionRequest};
+use crate::status::session::{Label, PRESS_AGAIN, SessionRequest};
 use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
 use crate::time::{Stamp, Zone};
 
@@ -33,9 +33,6 @@ use crate::time::{Stamp, Zone};
 const EDGE_SHOWN: Duration = Duration::from_secs(1);
 /// How long the answer to a key stays in the footer.
 const NOTICE_SHOWN: Duration = Duration::from_secs(4);
-/// A key that begins or ends an episode, pressed so soon after the last one, is the repeat of a held key, which few
-/// terminals distinguish, or a hand that trembles.
-const PRESS_AGAIN: Duration = Duration::from_millis(400);
 
 /// Something that happened.
 #[derive(Debug)]

@@ -136,6 +136,7 @@ async fn only_chunks_allocate() {
         devices: vec![device],
         modules: Vec::new(),
         stops: Vec::new(),
+        buttons: Vec::new(),
         path: None,
         text: String::new(),
     });

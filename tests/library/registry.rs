@@ -12,9 +12,9 @@ use rapid::interlock::StopKind;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InterlockInput, LanFind, LanPicture,
-    LanProtocol, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe,
-    Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
+    BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InputSpec, LanFind, LanPicture,
+    LanProtocol, LineOff, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
+    Probe, Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -257,23 +257,55 @@ fn emergency_stops_and_enabling_switches_are_parsed() {
     let [pendant, pedal, panel, door, wrist] = registry.stops.as_slice() else { panic!("five stops") };
     assert_eq!((pendant.name.as_str(), pendant.kind, pedal.kind), ("pendant", StopKind::Emergency, StopKind::Enabling));
     assert!(registry.stops.iter().all(|stop| stop.actuators == ["arm"]), "the default is all");
-    let InterlockInput::Serial(line) = &pendant.input else { panic!("a serial port") };
-    assert_eq!((line.baud, line.run.as_str(), line.stop.as_deref()), (9600, "RUN", Some("STOP")));
-    assert_eq!((line.path.to_str(), line.silence.as_millis()), (Some("/dev/serial/by-id/usb-pendant"), 150));
+    let InputSpec::Serial(line) = &pendant.input else { panic!("a serial port") };
+    assert_eq!((line.baud, line.on.as_str(), &line.off), (9600, "RUN", &LineOff::Line("STOP".into())));
+    assert_eq!((line.path.to_str(), line.silence.unwrap().as_millis()), (Some("/dev/serial/by-id/usb-pendant"), 150));
     // A switch is held, an emergency stop is not pressed, unless configured otherwise.
     let keys = [pedal, panel].map(|stop| {
-        let InterlockInput::Key(key) = &stop.input else { panic!("a key") };
-        (key.device.as_str(), key.number, key.runs_while_pressed)
+        let InputSpec::Key(key) = &stop.input else { panic!("a key") };
+        (key.device.as_str(), key.number, key.on_while_pressed)
     });
     assert_eq!(keys, [("PCsensor FootSwitch Keyboard", 48, true), ("/dev/input/by-id/panel", 0x120, true)]);
-    let InterlockInput::Gpio(gpio) = &door.input else { panic!("a line of a chip") };
-    assert_eq!((gpio.chip.to_str(), gpio.line, gpio.runs_while_high), (Some("/dev/gpiochip0"), 17, false));
-    let InterlockInput::Field(field) = &wrist.input else { panic!("a number") };
+    let InputSpec::Gpio(gpio) = &door.input else { panic!("a line of a chip") };
+    assert_eq!((gpio.chip.to_str(), gpio.line, gpio.on_while_high), (Some("/dev/gpiochip0"), 17, false));
+    let InputSpec::Field(field) = &wrist.input else { panic!("a number") };
     assert_eq!((field.device.as_str(), field.index, field.silence.as_millis()), ("buttons", 1, 200));
-    assert!(field.runs.holds(-0.6) && !field.runs.holds(-0.5) && !field.runs.holds(f64::NAN));
+    assert!(field.on.holds(-0.6) && !field.on.holds(-0.5) && !field.on.holds(f64::NAN));
     let NodeSpec::Can(can) = &registry.named("arm").unwrap().node else { panic!("a CAN adapter") };
     let CanProtocol::Damiao(damiao) = &can.protocol else { panic!("motors") };
     assert_eq!(damiao.motors[0].stop, StopSpec { emergency: Stop::Hold, ..StopSpec::default() });
+}
+
+#[test]
+fn buttons_are_parsed() {
+    let Loaded { registry, warnings } = valid("buttons");
+    assert_eq!(warnings, []);
+    let [left, right, go, lever, remote, panel, thumb, index] = registry.buttons.as_slice() else { panic!("eight") };
+    assert_eq!(
+        [left.press, left.hold, left.double].map(Option::unwrap).map(|action| action.to_string()),
+        ["toggle", "discard", "redo"]
+    );
+    assert_eq!((left.hold_after.as_millis(), lever.hold_after.as_millis(), lever.press), (1000, 500, None));
+    let keys = [left, right].map(|button| {
+        let InputSpec::Key(key) = &button.input else { panic!("a key") };
+        (key.number, key.on_while_pressed, key.grab)
+    });
+    assert_eq!(keys, [(183, true, true), (184, true, false)]);
+    let lines = [go, lever, remote].map(|button| {
+        let InputSpec::Serial(line) = &button.input else { panic!("a serial port") };
+        (line.baud, line.on.as_str(), line.off.clone(), line.silence.map(|silence| silence.as_millis()))
+    });
+    assert_eq!(lines[0], (9600, "go", LineOff::AtOnce, None));
+    assert_eq!(lines[1], (9600, "down", LineOff::Line("up".into()), None));
+    assert_eq!(lines[2], (115_200, "1", LineOff::Line("0".into()), Some(1000)));
+    let InputSpec::Gpio(gpio) = &panel.input else { panic!("a line of a chip") };
+    assert_eq!((gpio.line, gpio.on_while_high), (17, false));
+    let fields = [thumb, index].map(|button| {
+        let InputSpec::Field(field) = &button.input else { panic!("a number") };
+        (field.index, field.on, field.off, field.silence.as_millis())
+    });
+    assert_eq!(fields[0], (1, Bound::Above(0.8), Some(Bound::Below(0.6)), 2000));
+    assert_eq!(fields[1], (0, Bound::Below(0.0), None, 500));
 }
 
 #[test]

@@ -33,15 +33,26 @@ fn variants(source: &str) -> Vec<String> {
     let is_word = |token: &TokenTree, word: &str| matches!(token, TokenTree::Ident(ident) if ident == word);
     let at = tokens.windows(2).position(|pair| is_word(&pair[0], "enum") && is_word(&pair[1], "What")).expect("What");
     let TokenTree::Group(body) = &tokens[at + 2] else { panic!("its variants follow its name") };
-    let is_variant = |token: TokenTree| match token {
-        TokenTree::Ident(name) => Some(name.to_string()),
-        _ => None,
-    };
     let snake = |name: String| {
         let word = |c: char| if c.is_uppercase() { format!("_{}", c.to_lowercase()) } else { c.to_string() };
         name.chars().map(word).collect::<String>().trim_start_matches('_').to_owned()
     };
-    body.stream().into_iter().filter_map(is_variant).map(snake).collect()
+    // `#[serde(rename = "x")]` before a variant is its name.
+    let mut renamed = None;
+    let mut names = Vec::new();
+    for token in body.stream() {
+        match token {
+            TokenTree::Group(attribute) => {
+                let text = attribute.to_string();
+                let rename =
+                    text.strip_prefix("[serde (rename = \"").or_else(|| text.strip_prefix("[serde(rename = \""));
+                renamed = rename.and_then(|rest| rest.split('"').next()).map(str::to_owned);
+            }
+            TokenTree::Ident(name) => names.push(renamed.take().unwrap_or_else(|| snake(name.to_string()))),
+            _ => {}
+        }
+    }
+    names
 }
 
 #[test]

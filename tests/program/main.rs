@@ -12,6 +12,7 @@ mod support;
 mod ablation;
 mod alone;
 mod binary;
+mod buttons;
 mod calibrate;
 mod docs;
 mod ends;

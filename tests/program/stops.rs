@@ -52,6 +52,16 @@ const SILENT: u8 = 0;
 const RUN: u8 = 1;
 const STOP: u8 = 2;
 
+/// The other end of a serial port, and the path of the port.
+pub(crate) fn serial_port() -> (OwnedFd, String) {
+    let port: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
+    grantpt(&port).expect("a terminal");
+    unlockpt(&port).expect("a terminal");
+    let path = ptsname(&port, Vec::new()).expect("its name").into_string().expect("UTF-8");
+    rustix::fs::fcntl_setfl(&port, OFlags::RDWR | OFlags::NONBLOCK).expect("a flag");
+    (port, path)
+}
+
 /// A pendant that sends its line 50 times a second.
 struct Pendant {
     sends: Arc<AtomicU8>,
@@ -63,11 +73,7 @@ const END: u8 = 3;
 
 impl Pendant {
     fn plug() -> Self {
-        let port: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
-        grantpt(&port).expect("a terminal");
-        unlockpt(&port).expect("a terminal");
-        let path = ptsname(&port, Vec::new()).expect("its name").into_string().expect("UTF-8");
-        rustix::fs::fcntl_setfl(&port, OFlags::RDWR | OFlags::NONBLOCK).expect("a flag");
+        let (port, path) = serial_port();
         let sends = Arc::new(AtomicU8::new(RUN));
         let thread = std::thread::spawn({
             let sends = Arc::clone(&sends);

@@ -5,6 +5,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use super::super::Signals;
+use super::super::buttons::Buttons;
 use super::super::streaming::Streaming;
 use super::*;
 use crate::bus::TopicId;
@@ -99,6 +100,7 @@ impl Bench {
             },
             permission: Arc::default(),
             watched: Watched::begin(&Registry::builtin(), &Arc::default(), &board).unwrap(),
+            buttons: Buttons::default(),
             mask_ended: CancellationToken::new(),
             kind: Screen::Monitor,
             screen: idle_stage(),

@@ -6,6 +6,7 @@
 //!
 //! Pure: facts and registry in, findings out.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
@@ -13,7 +14,7 @@ use serde::Serialize;
 
 use super::facts::{Facts, Node, UsbDevice};
 use crate::device::{Attachment, DeviceNode, UsbIdentity};
-use crate::registry::{Assigner, CameraSpec, DeviceSpec, NodeSpec, Opens, PixelFormat, Registry};
+use crate::registry::{Assigner, CameraSpec, DeviceSpec, InputSpec, NodeSpec, Opens, PixelFormat, Registry};
 use crate::text;
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
@@ -68,6 +69,7 @@ pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&s
     found.extend(speeds(&plugged));
     found.extend(serials(&facts.usb, entries));
     found.extend(nodes(facts, entries, &plugged));
+    found.extend(inputs(facts, registry));
     found.extend(udev(facts, rules));
     found.extend(suspending(&plugged));
     found.extend(can(facts, entries, &plugged));
@@ -285,6 +287,27 @@ fn nodes(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDev
         ));
     }
     found
+}
+
+/// Whether this user may read what stops and buttons are read from.
+fn inputs(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
+    let mut lacking: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    for (user, input) in registry.filter(|_| !facts.user.is_root).into_iter().flat_map(Registry::inputs) {
+        let group = match input {
+            InputSpec::Key(_) => "input",
+            InputSpec::Gpio(_) => "gpio",
+            InputSpec::Serial(_) => "dialout",
+            InputSpec::Field(_) => continue,
+        };
+        if !facts.user.groups.iter().any(|own| own == group) {
+            lacking.entry(group).or_default().push(user);
+        }
+    }
+    let finding = |(group, users): (&str, Vec<String>)| {
+        let what = format!("this user is not in the group {group}, which reads {}", users.join(", "));
+        Finding::warn("groups", what, format!("sudo usermod -aG {group} $USER, and log in again"))
+    };
+    lacking.into_iter().map(finding).collect()
 }
 
 fn suspending(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {

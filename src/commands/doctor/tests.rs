@@ -293,6 +293,15 @@ fn one_problem_is_one_finding() {
         assert_eq!(found.len(), 1, "{expected}: {found:?}");
         assert!(found[0].starts_with(expected), "{found:?} for {expected:?}");
     }
+    let buttons = "[stop.pedal]\nkind = \"enabling\"\nkey = { device = \"a pedal\", code = \"KEY_B\" }\n\
+                   [button.pedal]\nkey = { device = \"a pedal\", code = \"KEY_A\" }\npress = \"toggle\"\n\
+                   [button.go]\nserial = { path = \"/dev/ttyUSB7\", line = \"go\" }\npress = \"start\"\n";
+    let buttons = Registry::parse(&format!("{}{buttons}", registry.text), None).unwrap().registry;
+    let rules = artifacts(&buttons).swap_remove(0).contents;
+    let found = wrong(&Facts { rules: Some(rules), ..facts.clone() }, &buttons);
+    let expected = "Warn groups: this user is not in the group input, which reads stop pedal, button pedal";
+    assert!(found.iter().any(|found| found == expected), "{found:?}");
+    assert!(!found.iter().any(|found| found.contains("button go")), "{found:?}");
     let root = User { is_root: true, groups: Vec::new() };
     assert_eq!(wrong(&Facts { user: root, realtime: Some(0), ..facts }, &registry), Vec::<String>::new());
 }

@@ -16,7 +16,7 @@ use std::path::Path;
 
 use super::HEADER;
 use crate::registry::spec::{
-    CAN_RESTART_MS, CanProtocol, CanSpec, DeviceSpec, GpioInput, InterlockInput, NodeSpec, Opens, Registry, UsbSpec,
+    CAN_RESTART_MS, CanProtocol, CanSpec, DeviceSpec, GpioInput, InputSpec, NodeSpec, Opens, Registry, UsbSpec,
 };
 
 /// The number of a CAN interface in `linux/if_arp.h` (`ARPHRD_CAN`).
@@ -61,8 +61,8 @@ pub(super) fn rules(registry: &Registry) -> String {
 
 /// GPIO chips with their users: several lines of one may be in use.
 fn chips(registry: &Registry) -> BTreeMap<&Path, Vec<String>> {
-    let stops = registry.stops.iter().filter_map(|stop| match &stop.input {
-        InterlockInput::Gpio(GpioInput { chip, .. }) => Some((format!("stop {}", stop.name), chip.as_path())),
+    let inputs = registry.inputs().filter_map(|(user, input)| match input {
+        InputSpec::Gpio(GpioInput { chip, .. }) => Some((user, chip.as_path())),
         _ => None,
     });
     let buses = registry.devices.iter().filter_map(|device| match &device.node {
@@ -72,7 +72,7 @@ fn chips(registry: &Registry) -> BTreeMap<&Path, Vec<String>> {
     let brakes = buses.flatten().filter_map(|motor| Some((motor, motor.brake.as_ref()?)));
     let mut chips = BTreeMap::<_, Vec<_>>::new();
     for (user, chip) in
-        stops.chain(brakes.map(|(motor, brake)| (format!("brake of {}", motor.name), brake.chip.as_path())))
+        inputs.chain(brakes.map(|(motor, brake)| (format!("brake of {}", motor.name), brake.chip.as_path())))
     {
         chips.entry(chip).or_default().push(user);
     }

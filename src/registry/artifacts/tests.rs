@@ -119,13 +119,21 @@ fn the_service_may_open_usb_devices_only_where_a_program_does() {
 }
 
 #[test]
-fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_needs_them() {
+fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_or_button_needs_them() {
     let key = "[stop.pedal]\nkind = \"enabling\"\nkey = { device = \"a pedal\", code = \"KEY_B\" }\n";
     let gpio = "[stop.door]\nkind = \"emergency\"\n\
                 gpio = { chip = \"/dev/gpiochip3\", line = 1, runs_while = \"low\" }\n";
-    for (stops, keys, chips) in
-        [("", false, false), (key, true, false), (gpio, false, true), (&[key, gpio].concat(), true, true)]
-    {
+    let pedal = "[button.pedal]\nkey = { device = \"a pedal\", code = \"KEY_A\" }\npress = \"toggle\"\n";
+    let panel = "[button.panel]\ngpio = { chip = \"/dev/gpiochip3\", line = 2, pressed_while = \"low\" }\n\
+                 press = \"toggle\"\n";
+    for (stops, keys, chips) in [
+        ("", false, false),
+        (key, true, false),
+        (gpio, false, true),
+        (&[key, gpio].concat(), true, true),
+        (pedal, true, false),
+        (panel, false, true),
+    ] {
         let text = format!("{}{stops}", crate::registry::BUILTIN);
         let all = artifacts(&Registry::parse(&text, None).unwrap().registry);
         let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
@@ -182,6 +190,7 @@ fn the_service_may_open_the_chips_of_brakes_and_the_serial_ports_of_the_board_wh
         (arm(brake), true, false),
         (arm("") + &stop("/dev/serial/by-id/usb-pendant"), false, false),
         (arm("") + &stop("/dev/ttyAMA0"), false, true),
+        (arm("") + "[button.a]\nserial = { path = \"/dev/ttyS0\", line = \"a\" }\npress = \"mark\"\n", false, true),
     ] {
         let all = artifacts(&Registry::parse(&text, None).unwrap().registry);
         let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));

@@ -1,26 +1,19 @@
 //! `[stop.NAME]` and `[module.NAME]`.
 
-use std::path::PathBuf;
-use std::str::FromStr as _;
 use std::time::Duration;
 
 use super::device::{Draft, Kind};
 use super::identity::name_problem;
+use super::input::{self, INPUTS, LEVELS, are_one};
 use super::names;
 use crate::interlock::{MAX_STOPS, StopKind};
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::Section;
 use crate::registry::spec::{
-    Bound, FieldInput, GpioInput, InterlockInput, InterlockSpec, KeyInput, LineInput, ModuleSpec, Mount,
+    FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff, ModuleSpec, Mount,
 };
 
-const KEYS: [&str; 6] = ["kind", "actuators", "key", "gpio", "serial", "field"];
-const INPUTS: [&str; 4] = ["key", "gpio", "serial", "field"];
 const KINDS: [(&str, StopKind); 2] = [("emergency", StopKind::Emergency), ("enabling", StopKind::Enabling)];
-/// Levels of a line of a GPIO chip.
-pub(super) const LEVELS: [(&str, bool); 2] = [("high", true), ("low", false)];
-/// Longest line that is searched for on a serial port, bytes.
-const LONGEST_LINE: usize = 64;
 /// A stop that is silent for this long is lost, unless its entry states otherwise.
 const SILENCE: Duration = Duration::from_millis(200);
 
@@ -38,7 +31,7 @@ pub(super) fn interlocks(root: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<Interl
             let fix = fix.replace("[device.", "[stop.");
             section.report_at(section.at, format!("{name:?} cannot be a stop's name"), fix);
         }
-        section.allow(&KEYS);
+        section.allow(&[&["kind", "actuators"][..], &INPUTS].concat());
         section.need("kind", "write kind = \"emergency\", or \"enabling\" for a switch that is held");
         let kind = section.choice("kind", &KINDS);
         let actuators = actuators(&section, drafts);
@@ -53,19 +46,6 @@ pub(super) fn interlocks(root: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<Interl
         }
     }
     stops
-}
-
-/// Whether they are the same input, which only one can read.
-fn are_one(one: &InterlockInput, other: &InterlockInput) -> bool {
-    match (one, other) {
-        (InterlockInput::Key(one), InterlockInput::Key(other)) => {
-            (&one.device, one.number) == (&other.device, other.number)
-        }
-        (InterlockInput::Gpio(one), InterlockInput::Gpio(other)) => (&one.chip, one.line) == (&other.chip, other.line),
-        (InterlockInput::Serial(one), InterlockInput::Serial(other)) => one.path == other.path,
-        // Several numbers of a device may stop, and one number within a range.
-        _ => false,
-    }
 }
 
 /// The actuators that it stops: all by default.
@@ -109,146 +89,62 @@ fn actuators(section: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<String> {
     names
 }
 
-fn input(section: &Section<'_>, kind: StopKind, drafts: &[Draft<'_>]) -> Option<InterlockInput> {
-    let written: Vec<&str> = INPUTS.into_iter().filter(|input| section.has(input)).collect();
-    let [input] = written.as_slice() else {
-        if let [_, second, ..] = written.as_slice() {
-            let message = format!("{} and {second}: a stop has one input", written.first().unwrap_or(&""));
-            section.report(second, message, "write a separate table for each input: each of them stops");
-        } else {
-            let fix = "write key = { ... }, gpio = { ... }, serial = { ... } or field = { ... }";
-            section.report_at(section.at, "it has no input", fix);
-        }
-        return None;
-    };
-    let table = section.table(input)?;
-    match *input {
-        "key" => key(&table, kind).map(InterlockInput::Key),
-        "gpio" => gpio(&table).map(InterlockInput::Gpio),
-        "serial" => line(&table).map(InterlockInput::Serial),
-        _ => field(&table, drafts).map(InterlockInput::Field),
+fn input(section: &Section<'_>, kind: StopKind, drafts: &[Draft<'_>]) -> Option<InputSpec> {
+    let (input, table) = input::only(section, "a stop", "each of them stops")?;
+    match input {
+        "key" => key(&table, kind).map(InputSpec::Key),
+        "gpio" => gpio(&table).map(InputSpec::Gpio),
+        "serial" => line(&table).map(InputSpec::Serial),
+        _ => field(&table, drafts).map(InputSpec::Field),
     }
 }
 
 fn key(table: &Section<'_>, kind: StopKind) -> Option<KeyInput> {
     table.allow(&["device", "code", "runs_while"]);
-    let device = "write device = \"/dev/input/by-id/...\", or the name that `evtest` shows";
-    table.need("device", device);
-    table.need("code", "write code = \"KEY_...\" or \"BTN_...\", as `evtest` shows it");
-    let device = match table.text("device") {
-        Some(text) if text.trim().is_empty() => table.refuse("device", "device is empty", device),
-        text => text,
-    };
-    let code = table.text("code");
-    let number = code.and_then(|code| {
-        let fix = "write a name of linux/input-event-codes.h, as `evtest` shows it, for example \"KEY_B\"";
-        let number = evdev::KeyCode::from_str(code).ok().map(evdev::KeyCode::code);
-        number.or_else(|| table.refuse("code", format!("there is no key {code:?}"), fix))
-    });
-    let runs = if table.has("runs_while") {
+    let (device, code) = input::key(table);
+    let on_while_pressed = if table.has("runs_while") {
         table.choice("runs_while", &[("pressed", true), ("released", false)])
     } else {
         Some(kind == StopKind::Enabling)
     };
-    Some(KeyInput { device: device?.to_owned(), code: code?.to_owned(), number: number?, runs_while_pressed: runs? })
+    let (code, number) = code?;
+    Some(KeyInput { device: device?, code, number, on_while_pressed: on_while_pressed?, grab: false })
 }
 
 fn gpio(table: &Section<'_>) -> Option<GpioInput> {
     table.allow(&["chip", "line", "runs_while"]);
     let runs = "write runs_while = \"high\" or \"low\": the level of a closed contact, so that a broken wire stops";
-    let (chip, line) = gpio_line(table);
+    let (chip, line) = input::gpio_line(table);
     table.need("runs_while", runs);
     let runs = table.choice("runs_while", &LEVELS);
-    Some(GpioInput { chip: chip?, line: line?, runs_while_high: runs? })
-}
-
-/// Reads `chip` and `line`; the level is a third key.
-pub(super) fn gpio_line(table: &Section<'_>) -> (Option<PathBuf>, Option<u32>) {
-    table.need("chip", "write chip = \"/dev/gpiochip0\"; `gpiodetect` lists them");
-    table.need("line", "write line = its number on the chip; `gpioinfo` lists them");
-    let chip = absolute(table, "chip");
-    (chip, table.integer("line", 0..=65_535))
+    Some(GpioInput { chip: chip?, line: line?, on_while_high: runs? })
 }
 
 fn line(table: &Section<'_>) -> Option<LineInput> {
     table.allow(&["path", "baud", "run", "stop", "silence"]);
-    table.need("path", "write path = \"/dev/serial/by-id/...\"");
+    let (path, baud) = input::port(table);
     table.need("run", "write run = the line that is sent, again and again, while the actuator may move");
-    let path = absolute(table, "path");
-    let baud = if table.has("baud") { table.integer("baud", 300..=4_000_000) } else { Some(115_200) };
-    let mut words = ["run", "stop"].map(|key| {
-        let text = table.text(key)?;
-        let is_line = (1..=LONGEST_LINE).contains(&text.len()) && !text.chars().any(char::is_control);
-        if !is_line || text.trim() != text {
-            let fix = format!("write 1 to {LONGEST_LINE} characters without a line end, and no space around them");
-            return table.refuse(key, format!("{key} = {text:?} is not a line"), fix);
-        }
-        Some(text.to_owned())
-    });
-    if words[0].is_some() && words[0] == words[1] {
+    let [run, stop] = ["run", "stop"].map(|key| input::line(table, key));
+    if run.is_some() && run == stop {
         table.report("stop", "stop is the same line as run".to_owned(), "write another, or remove it");
     }
     let silence = silence(table);
-    let (run, stop) = (words[0].take(), words[1].take());
-    if stop.is_none() && table.has("stop") {
-        return None;
-    }
-    Some(LineInput { path: path?, baud: baud?, run: run?, stop, silence })
+    let off = if table.has("stop") { LineOff::Line(stop?) } else { LineOff::Others };
+    Some(LineInput { path: path?, baud: baud?, on: run?, off, silence: Some(silence) })
 }
 
 fn field(table: &Section<'_>, drafts: &[Draft<'_>]) -> Option<FieldInput> {
     table.allow(&["device", "index", "runs_above", "runs_below", "silence"]);
-    table.need("device", "write device = the entry whose samples hold the number");
-    table.need("index", "write index = which number of a sample, from 0");
-    let index = table.integer("index", 0..=1023);
-    let device = table.text("device");
-    if let Some(name) = device {
-        match drafts.iter().find(|draft| draft.name == name) {
-            None => {
-                let fix = did_you_mean(name, names(drafts), "entries are");
-                table.report("device", format!("there is no [device.{name}]"), fix);
-            }
-            Some(draft) => match (draft.numbers(), index) {
-                (Some(0), _) => {
-                    let message = format!("samples of [device.{name}] are not numbers");
-                    table.report("device", message, "name an entry whose samples are: serial, motors, a program");
-                }
-                (Some(count), Some(index)) if index >= count => {
-                    let message = format!("index = {index}, and a sample of [device.{name}] has {count} numbers");
-                    table.report("index", message, format!("write index = 0 to {}", count - 1));
-                }
-                // The content of its samples is unknown, which has been reported.
-                _ => {}
-            },
-        }
-    }
-    let range = || f64::MIN..=f64::MAX;
-    let runs = match (table.has("runs_above"), table.has("runs_below")) {
-        (true, false) => table.number("runs_above", range()).map(Bound::Above),
-        (false, true) => table.number("runs_below", range()).map(Bound::Below),
-        (true, true) => {
-            let fix = "remove one; for a range write two stops";
-            table.refuse("runs_below", "runs_above and runs_below".to_owned(), fix)
-        }
-        (false, false) => {
-            table.missing("runs_above", "write runs_above = 0.5, or runs_below, for what lets the actuator move");
-            None
-        }
-    };
+    let (device, index) = input::number(table, drafts);
+    let both = "remove one; for a range write two stops";
+    let none = "write runs_above = 0.5, or runs_below, for what lets the actuator move";
+    let on = input::bound(table, "runs_above", "runs_below", both, none);
     let silence = silence(table);
-    Some(FieldInput { device: device?.to_owned(), index: index?, runs: runs?, silence })
+    Some(FieldInput { device: device?, index: index?, on: on?, off: None, silence })
 }
 
 fn silence(table: &Section<'_>) -> Duration {
     table.duration("silence", Duration::from_millis(10)..=Duration::from_secs(5)).unwrap_or(SILENCE)
-}
-
-fn absolute(table: &Section<'_>, key: &str) -> Option<PathBuf> {
-    let text = table.text(key)?;
-    if text.starts_with('/') && !text.chars().any(char::is_control) {
-        return Some(PathBuf::from(text));
-    }
-    table.refuse(key, format!("{key} = {text:?} is not an absolute path"), "write the whole path, from /dev/")
 }
 
 /// Reads the modules, in the order of the file.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::interlock::{LEVELS, gpio_line};
+use super::input::{LEVELS, gpio_line};
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::Section;
 use crate::registry::spec::{

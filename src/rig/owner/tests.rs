@@ -63,6 +63,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
         modules: Vec::new(),
         stops: Vec::new(),
+        buttons: Vec::new(),
         path: None,
         text: String::new(),
     }

@@ -9,8 +9,8 @@ use std::time::Duration;
 use rapid::modality::ModalityKind;
 use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::{
-    CanProtocol, CanSpec, DeviceSpec, Hook, InterlockInput, InterlockSpec, LanFind, LanProtocol, LanSpec, NodeSpec,
-    ProcessSpec, Registry,
+    ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Hook, InputSpec, InterlockSpec, LanFind, LanProtocol, LanSpec,
+    NodeSpec, ProcessSpec, Registry,
 };
 use yaml_rust2::{Yaml, YamlLoader};
 
@@ -23,6 +23,7 @@ pub(crate) fn check(registry: &Registry) {
     let mut harmless = Registry::builtin();
     harmless.devices = registry.devices.iter().map(harmless_device).collect();
     harmless.stops = registry.stops.iter().map(harmless_stop).collect();
+    harmless.buttons = registry.buttons.iter().map(harmless_button).collect();
     let expected = unit_without_names(&text_of_unit(&harmless).replace(&harmless.rig.name, ""));
     for artifact in artifacts(registry) {
         let text = &artifact.contents;
@@ -41,15 +42,27 @@ fn harmless_stop(stop: &InterlockSpec) -> InterlockSpec {
     let mut harmless = stop.clone();
     "x".clone_into(&mut harmless.name);
     harmless.actuators = Vec::new();
-    match &mut harmless.input {
-        InterlockInput::Key(key) => "x".clone_into(&mut key.device),
-        InterlockInput::Gpio(gpio) => gpio.chip = "/dev/gpiochip0".into(),
-        // Whether it is a port of the board may change the unit.
-        InterlockInput::Serial(line) if line.path.starts_with("/dev/serial") => line.path = "/dev/serial/x".into(),
-        InterlockInput::Serial(line) => line.path = "/dev/x".into(),
-        InterlockInput::Field(field) => "x".clone_into(&mut field.device),
-    }
+    make_harmless(&mut harmless.input);
     harmless
+}
+
+/// A button, likewise.
+fn harmless_button(button: &ButtonSpec) -> ButtonSpec {
+    let mut harmless = button.clone();
+    "x".clone_into(&mut harmless.name);
+    make_harmless(&mut harmless.input);
+    harmless
+}
+
+fn make_harmless(input: &mut InputSpec) {
+    match input {
+        InputSpec::Key(key) => "x".clone_into(&mut key.device),
+        InputSpec::Gpio(gpio) => gpio.chip = "/dev/gpiochip0".into(),
+        // Whether it is a port of the board may change the unit.
+        InputSpec::Serial(line) if line.path.starts_with("/dev/serial") => line.path = "/dev/serial/x".into(),
+        InputSpec::Serial(line) => line.path = "/dev/x".into(),
+        InputSpec::Field(field) => "x".clone_into(&mut field.device),
+    }
 }
 
 /// A device of which the system is asked the same as of `device`, and that has nothing else in common with it.
@@ -137,20 +150,20 @@ fn check_rules(registry: &Registry, text: &str) {
     }
 }
 
-/// The chip of a stop or a brake becomes that of our group, and nothing else happens to it.
+/// The chip of a stop, a button or a brake becomes that of our group, and nothing else happens to it.
 fn check_chip(registry: &Registry, rule: &[Token]) {
     let [subsystem, kernel, group, mode] = rule else { panic!("{} words for a chip", rule.len()) };
     let words = |token: &Token| format!("{}{}{}", token.key, token.operator, token.value);
     assert_eq!([subsystem, group, mode].map(words), ["SUBSYSTEM==gpio", "GROUP=gpio", "MODE=0660"]);
     let chip = Path::new("/dev").join(&kernel.value);
-    let is_its = |stop: &InterlockSpec| matches!(&stop.input, InterlockInput::Gpio(gpio) if gpio.chip == chip);
+    let is_its = |input: &InputSpec| matches!(input, InputSpec::Gpio(gpio) if gpio.chip == chip);
     let has_brake = |device: &DeviceSpec| match &device.node {
         NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(bus), .. }) => {
             bus.motors.iter().filter_map(|motor| motor.brake.as_ref()).any(|brake| brake.chip == chip)
         }
         _ => false,
     };
-    let is_ours = registry.stops.iter().any(is_its) || registry.devices.iter().any(has_brake);
+    let is_ours = registry.inputs().any(|(_, input)| is_its(input)) || registry.devices.iter().any(has_brake);
     assert!(kernel.key == "KERNEL" && is_ours, "a rule for {}", chip.display());
     assert!(kernel.value.bytes().all(|byte| byte.is_ascii_alphanumeric()), "{}", kernel.value);
 }

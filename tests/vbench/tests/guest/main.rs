@@ -6,6 +6,7 @@ mod accidents;
 mod adapters;
 mod brake;
 mod buses;
+mod buttons;
 mod calibrate;
 mod commands;
 mod deaf_child;

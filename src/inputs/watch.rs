@@ -1,6 +1,6 @@
-//! The thread of an input: opens it, follows its state, and reopens it after a loss.
+//! The thread of a place: opens it, follows the levels of its inputs, and reopens it after a loss.
 //!
-//! Invariant: between two states it sleeps in the kernel, and wakes when there is something to read, when the input has
+//! Invariant: between two levels it sleeps in the kernel, and wakes when there is something to read, when the input has
 //! been silent for too long, when it has to be queried, or at the end.
 
 use std::os::fd::{AsFd, OwnedFd};
@@ -8,13 +8,11 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::Reporter;
 use super::source::Source;
-use crate::interlock::InputState;
-use crate::registry::InterlockInput;
+use super::{Place, Report, lost_at_a_panic};
 use crate::time::Stamp;
 
-/// Time between a loss of an input and its reopening.
+/// Time between a loss of a place and its reopening.
 const AGAIN: Duration = Duration::from_millis(500);
 
 /// Why a thread woke.
@@ -54,32 +52,32 @@ pub(super) fn wait(stop: &OwnedFd, input: Option<&dyn AsFd>, until: Option<Stamp
     }
 }
 
-/// Follows `input` until `stop`.
-pub(super) fn watch(input: &InterlockInput, reporter: &Reporter, stop: &OwnedFd) {
-    let _lost = reporter.lost_at_a_panic();
+/// Follows `place` until `stop`.
+pub(super) fn watch(place: &Place, report: &dyn Report, stop: &OwnedFd) {
+    let _lost = lost_at_a_panic(report);
     loop {
-        let why = match Source::open(input) {
-            Ok(mut source) => follow(&mut source, reporter, stop),
+        let why = match Source::open(place) {
+            Ok(mut source) => follow(&mut source, report, stop),
             Err(why) => Some(why),
         };
         let Some(why) = why else { return };
-        reporter.report(InputState::Lost, &why);
+        report.lost(&why);
         if wait(stop, None, Some(Stamp::now().after(AGAIN))) == Woken::Stop {
             return;
         }
     }
 }
 
-/// Why an open input was lost; `None` at the end of the run.
-fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<String> {
+/// Why an open place was lost; `None` at the end of the run.
+fn follow(source: &mut Source, report: &dyn Report, stop: &OwnedFd) -> Option<String> {
     let silence = source.silence();
     let mut received_at = Stamp::now();
     let mut is_silent = false;
     loop {
         let mut has_reported = false;
-        let taken = source.take(&mut |state| {
+        let taken = source.take(&mut |which, is_on| {
             has_reported = true;
-            reporter.report(state, "");
+            report.level(which, is_on);
         });
         if let Err(why) = taken {
             return Some(why);
@@ -96,7 +94,7 @@ fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<St
             Woken::Ready(true) => return Some("unplugged".to_owned()),
             Woken::Late => {
                 is_silent = true;
-                reporter.report(InputState::Lost, &source.why_silent());
+                report.lost(&source.why_silent());
             }
         }
     }

@@ -1,9 +1,9 @@
-//! A number in the samples of a device that is an emergency stop or an enabling switch.
+//! A number in the samples of a device that is an input.
 //!
 //! The stream of the device evaluates each sample before it publishes it; the thread of the tap sleeps until the number
 //! has been missing for too long.
 //!
-//! Invariant: a sample with the same state as the one before is evaluated without a lock and without allocation.
+//! Invariant: a sample with the same level as the one before is evaluated without a lock and without allocation.
 
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
@@ -12,9 +12,8 @@ use std::time::Duration;
 
 use rustix::event::{EventfdFlags, eventfd};
 
-use super::Reporter;
 use super::watch::{Woken, wait};
-use crate::interlock::InputState;
+use super::{Report, lost_at_a_panic};
 use crate::registry::{Bound, FieldInput};
 use crate::sample::Encoding;
 use crate::time::Stamp;
@@ -27,9 +26,10 @@ pub struct Tap(Arc<Inner>);
 struct Inner {
     device: String,
     index: usize,
-    runs: Bound,
+    on: Bound,
+    off: Option<Bound>,
     silence: Duration,
-    reporter: Reporter,
+    report: Arc<dyn Report>,
     /// When the newest sample arrived; 0 while the input is lost.
     received_at: AtomicU64,
     /// Wakes the thread with the first sample after a loss.
@@ -37,13 +37,14 @@ struct Inner {
 }
 
 impl Tap {
-    pub(super) fn new(spec: &FieldInput, reporter: Reporter) -> std::io::Result<Self> {
+    pub(super) fn new(spec: &FieldInput, report: Arc<dyn Report>) -> std::io::Result<Self> {
         Ok(Self(Arc::new(Inner {
             device: spec.device.clone(),
             index: spec.index,
-            runs: spec.runs,
+            on: spec.on,
+            off: spec.off,
             silence: spec.silence,
-            reporter,
+            report,
             received_at: AtomicU64::new(0),
             found: eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?,
         })))
@@ -65,18 +66,21 @@ impl Tap {
             // An eventfd always has room for a number.
             let _ = rustix::io::write(&tap.found, &1_u64.to_ne_bytes());
         }
-        tap.reporter.report(if tap.runs.holds(value) { InputState::Runs } else { InputState::Stopped }, "");
+        let is_on = tap.on.holds(value);
+        if is_on || tap.off.is_none_or(|off| off.holds(value)) {
+            tap.report.level(0, is_on);
+        }
     }
 
     /// No samples arrive any more.
     pub fn lose(&self, why: &str) {
         self.0.received_at.store(0, Ordering::SeqCst);
-        self.0.reporter.report(InputState::Lost, why);
+        self.0.report.lost(why);
     }
 
     /// Reports the input lost when it is silent, until `stop`.
     pub(super) fn watch(&self, stop: &OwnedFd) {
-        let _lost = self.0.reporter.lost_at_a_panic();
+        let _lost = lost_at_a_panic(&*self.0.report);
         let tap = &*self.0;
         loop {
             let received_at = tap.received_at.load(Ordering::SeqCst);
