@@ -5,20 +5,21 @@
 //! tenth of a second later, and also know samples that were in transit.
 //!
 //! Invariant: nothing here blocks: the samples that wait on the bus are looked at when a tick is due. After the first
-//! ticks nothing allocates.
+//! ticks nothing allocates, except for a modality that is added.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::sync::mpsc;
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
 
-use crate::bus::{BusError, Queues, TopicId, Writer};
+use crate::bus::{BusError, Queues, Subscription, TopicId, Writer};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::observation::{HEAD_BYTES, SLOT_BYTES};
-use crate::registry::Registry;
+use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
 use crate::time::Stamp;
@@ -37,12 +38,20 @@ pub struct Alignment {
     hz: f64,
     queues: Queues,
     writer: Arc<Writer>,
+    additions: mpsc::UnboundedReceiver<(Arc<DeviceSpec>, Subscription)>,
 }
 
 impl Alignment {
     /// Of the samples that reach `queues` from now on; `writer` is that of the topic of observations.
     pub fn new(registry: &Registry, queues: Queues, writer: Arc<Writer>) -> Self {
-        Self { aligner: Aligner::new(registry), hz: registry.rig.observation_hz, queues, writer }
+        let (aligner, hz) = (Aligner::new(registry), registry.rig.observation_hz);
+        Self { aligner, hz, queues, writer, additions: mpsc::unbounded_channel().1 }
+    }
+
+    /// Also of the modalities that are added during its run.
+    #[must_use]
+    pub fn extended_by(self, additions: mpsc::UnboundedReceiver<(Arc<DeviceSpec>, Subscription)>) -> Self {
+        Self { additions, ..self }
     }
 
     /// Publishes an observation at each tick until `stop`. Ticks that pass while the machine is suspended, or too slow
@@ -56,6 +65,11 @@ impl Alignment {
             tokio::select! {
                 biased;
                 () = stop.cancelled() => return published,
+                Some((device, subscription)) = self.additions.recv() => {
+                    self.queues.add(subscription);
+                    self.aligner.add(&device);
+                    continue;
+                }
                 () = sleep(grid.tick(next).since(Stamp::now())) => {}
             }
             let now = Stamp::now();
@@ -89,6 +103,10 @@ impl Alignment {
     }
 }
 
+fn modality(device: &DeviceSpec) -> SyncModality {
+    SyncModality::of(device, device.depth + SLACK)
+}
+
 /// The samples and masks so far, and the observation they give.
 #[derive(Debug)]
 struct Aligner {
@@ -100,13 +118,16 @@ struct Aligner {
 
 impl Aligner {
     fn new(registry: &Registry) -> Self {
-        let modalities: Vec<_> =
-            registry.devices.iter().map(|device| SyncModality::of(device, device.depth + SLACK)).collect();
+        let modalities: Vec<_> = registry.devices.iter().map(modality).collect();
         Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             masks: VecDeque::with_capacity(MASKS),
             payload: Vec::with_capacity(HEAD_BYTES + modalities.len() * SLOT_BYTES),
         }
+    }
+
+    fn add(&mut self, device: &DeviceSpec) {
+        self.sync.add(&modality(device));
     }
 
     fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {

@@ -4,7 +4,7 @@
 //!
 //! Shutdown: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
 //! streams and observations stop, the recorder finishes its file, the session is saved, the programs of devices are
-//! waited for, the mask is 0 and its files are removed, the screen shows what was recorded and restores the terminal.
+//! waited for, topics of added entries are closed, the mask is 0 and its files are removed, the screen shows what was recorded and restores the terminal.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
@@ -18,6 +18,7 @@ mod error;
 mod free_space;
 #[cfg_attr(not(feature = "policy"), path = "app/inference_absent.rs")]
 mod inference;
+mod reload;
 mod requests;
 mod screen;
 pub(crate) mod signals;
@@ -60,6 +61,7 @@ use collection::Collection;
 use conductor::Conductor;
 pub use error::AppError;
 pub use inference::PolicyOptions;
+use reload::Reload;
 use requests::Request;
 use signals::Signals;
 use stage::Stage;
@@ -214,7 +216,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let Machine { registry, board, permission, signals, presence, asked } = machine;
     let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
-    let following = recorder.episode();
+    let (following, to_recorder) = (recorder.episode(), recorder.additions());
     // Ending by itself after some time is the run's, unless it has several episodes.
     let Plan { goal, episode_time, reset_time, .. } = options.plan;
     let is_single = goal.is_none() && episode_time.is_none() && reset_time.is_none();
@@ -224,12 +226,13 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let collection = Collection::new(recorder, episode, options.plan, is_kept, &board)?;
     let kind = options.screen;
     let (to_scenario, replugs) = mpsc::unbounded_channel();
+    let (to_alignment, to_align) = mpsc::unbounded_channel();
     if matches!(options.devices, Devices::Simulated(_)) {
         board.set_simulated();
     }
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
-        let alignment = alignment(&registry, bus)?;
+        let alignment = alignment(&registry, bus)?.extended_by(to_align);
         let (discovery, plugged) = discovery::start(options.devices, &registry, replugs)?;
         // The inputs report their first state at once.
         let events = board.events();
@@ -251,7 +254,17 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         }
     };
     let (to_rig, rig_commands) = mpsc::channel(16);
-    let requests = requests::sorted(from_screen, asked, to_rig, to_scenario);
+    let (to_registry, about_registry) = mpsc::unbounded_channel();
+    let reload = Reload {
+        registry: Arc::clone(&registry),
+        bus: bus.membership(),
+        board: Arc::clone(&board),
+        rig: to_rig.clone(),
+        recorder: to_recorder,
+        alignment: to_alignment,
+        topics: Vec::new(),
+    };
+    let requests = requests::sorted(from_screen, asked, to_rig, to_registry, to_scenario);
     let mask_ended = presence.ended();
     let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
     let streaming = Streaming::start(rig.obeying(&permission).tapped(watched.taps()), plugged, rig_commands);
@@ -272,6 +285,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         synchronisation: synchronise(alignment),
         recording,
         inference,
+        reload: reload.start(about_registry),
         mask_ended,
         kind,
         screen,
@@ -335,6 +349,7 @@ struct Running {
     synchronisation: Stage,
     recording: Stage,
     inference: Option<Stage>,
+    reload: Stage,
     mask_ended: CancellationToken,
     kind: Screen,
     screen: Stage,
@@ -374,6 +389,7 @@ async fn finish(
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
         keep_first(&mut outcome, running.discovery.end().await);
+        keep_first(&mut outcome, running.reload.end().await);
     };
     let mut take_down: Pin<Box<_>> = Box::pin(take_down);
     let twice = tokio::select! {

@@ -79,6 +79,16 @@ Examples:
   rapid recover episodes
   rapid recover copied/20260101_place-block_001.mcap";
 
+const RELOAD: &str = "\
+The running rapid reads its devices.toml again. Entries that were added, each with a free bit, get a topic and a bit of \
+the mask while everything else continues; a device that is plugged in starts. They are recorded from the next episode on.
+
+Any other change needs a restart: then nothing is changed, the reasons are printed, and the exit code is 1.
+
+Examples:
+  rapid register && rapid reload
+  rapid reload --instance left --json";
+
 const RUN: &str = "Run options";
 const GENERAL: &str = "General options";
 
@@ -114,7 +124,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "devices" | "register" | "calibrate" => &["sim", "config", "json"],
         "unregister" | "check" | "doctor" | "ablation" => &["config", "json"],
         "artifacts" => &["config"],
-        "mask" | "replay" | "episode" | "session" => &["json", "instance"],
+        "mask" | "replay" | "episode" | "session" | "reload" => &["json", "instance"],
         "arm" | "disarm" => &["instance"],
         "inspect" | "list" | "recover" | "eval" => &["json"],
         _ => &[],
@@ -260,6 +270,9 @@ pub enum Command {
         neither disk nor shared memory.\n\nExamples:\n  rapid disarm\n  rapid disarm --instance left"
     )]
     Disarm,
+    /// Make a running rapid take over entries that were added to its registry
+    #[command(after_long_help = RELOAD)]
+    Reload,
     /// Begin, end, discard or label episodes of a running rapid
     #[command(after_long_help = session::EPISODE)]
     Episode {

@@ -23,7 +23,7 @@ use crate::cli::{
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::inspect::InspectFailure;
 use crate::commands::mask::MaskOptions;
-use crate::commands::register::{self, Dialogue, Target};
+use crate::commands::register::{self, Dialogue};
 use crate::commands::{self, CommandStatus, Format};
 use crate::device::Attachment;
 use crate::driver::replay;
@@ -31,6 +31,7 @@ use crate::hotplug::{HotplugError, udev};
 use crate::palette::Palette;
 use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError};
+use crate::registration::Target;
 use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
@@ -105,6 +106,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             Ok(commands::arm::order(global.instance.as_deref(), order, out)?)
         }
         Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
+        Command::Reload => Ok(commands::session::reload(global.instance.as_deref(), format, out)?),
         Command::Episode { what } => {
             Ok(commands::session::ask(global.instance.as_deref(), &what.into_request(), format, out)?)
         }

@@ -54,7 +54,7 @@ const LAYERS: &[&[&str]] = &[
         "gpio",
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "interlocks", "sync", "calibration"],
-    &["rig", "alignment", "record", "session", "policy"],
+    &["rig", "alignment", "record", "session", "policy", "registration"],
     &["app", "lockstep", "compare", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];

@@ -14,9 +14,10 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
-use super::session::SessionStatus;
+use super::session::{Answered, SessionStatus};
 use super::{
-    DeviceStatus, Event, Grade, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, StopStatus, Verdict, What,
+    DeviceStatus, Event, Grade, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, StopStatus,
+    UnregisteredDevice, Verdict, What,
 };
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
@@ -132,7 +133,10 @@ struct SlotStatus {
 pub struct Board {
     rig: String,
     started: Stamp,
-    entries: Vec<Entry>,
+    /// Ascending by bit.
+    entries: Mutex<Vec<Entry>>,
+    unregistered: Mutex<Vec<UnregisteredDevice>>,
+    registry_answer: Mutex<Option<Answered>>,
     counters: Vec<StreamCounters>,
     slots: Mutex<Vec<SlotStatus>>,
     mask: AtomicU64,
@@ -175,7 +179,9 @@ impl Board {
         Self {
             rig: registry.rig.name.clone(),
             started: Stamp::now(),
-            entries: registry.devices.iter().map(Entry::of).collect(),
+            entries: Mutex::new(registry.devices.iter().map(Entry::of).collect()),
+            unregistered: Mutex::new(Vec::new()),
+            registry_answer: Mutex::new(None),
             counters,
             slots: Mutex::new(vec![SlotStatus::default(); MAX_MODALITIES]),
             mask: AtomicU64::new(0),
@@ -198,6 +204,28 @@ impl Board {
     /// The counters of a stream.
     pub fn counters(&self, id: ModalityId) -> &StreamCounters {
         &self.counters[id.index()]
+    }
+
+    /// Adds an entry, whose bit no other has.
+    pub fn add(&self, device: &DeviceSpec) {
+        let mut entries = lock(&self.entries);
+        let at = entries.partition_point(|entry| entry.id < device.id);
+        entries.insert(at, Entry::of(device));
+    }
+
+    /// Reports connected units that no entry matches.
+    pub fn set_unregistered(&self, mut units: Vec<UnregisteredDevice>) {
+        for unit in &mut units {
+            if let Cow::Owned(plain) = text::plain(&unit.device) {
+                unit.device = plain;
+            }
+        }
+        *lock(&self.unregistered) = units;
+    }
+
+    /// Reports the answer to a request about the registry.
+    pub fn set_registry_answer(&self, answer: Answered) {
+        *lock(&self.registry_answer) = Some(answer);
     }
 
     /// Reports the state of a slot.
@@ -321,7 +349,7 @@ impl Board {
     pub fn snapshot(&self) -> Snapshot {
         let taken = Stamp::now();
         let slots = lock(&self.slots).clone();
-        let devices = self.entries.iter().map(|Entry { id, name, topic, nominal_hz }| {
+        let device = |Entry { id, name, topic, nominal_hz }: &Entry| {
             let counters = &self.counters[id.index()];
             let slot = &slots[id.index()];
             let newest = counters.newest.load(Ordering::Relaxed);
@@ -338,7 +366,8 @@ impl Board {
                 bytes: counters.bytes.load(Ordering::Relaxed),
                 newest: (newest > 0).then_some(Stamp(newest)),
             }
-        });
+        };
+        let devices = lock(&self.entries).iter().map(device).collect();
         let (last_episode, last_verdict) = lock(&self.last_episode).clone().unzip();
         Snapshot {
             rig: self.rig.clone(),
@@ -346,7 +375,9 @@ impl Board {
             uptime: taken.since(self.started),
             mask: self.mask(),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
-            devices: devices.collect(),
+            devices,
+            unregistered: lock(&self.unregistered).clone(),
+            registry_answer: lock(&self.registry_answer).clone(),
             stops: self.stops(),
             recording: lock(&self.recording).clone(),
             not_started: lock(&self.not_started).clone(),
