@@ -224,6 +224,22 @@ mod tests {
     }
 
     #[test]
+    fn an_added_modality_is_in_the_next_observation() {
+        let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
+        let mut aligner = Aligner::new(&registry);
+        aligner.take(TopicId::Mask, &SampleHeader::default(), &PhysicalMask(0b110).payload(1));
+        assert_eq!(read(aligner.observe(Stamp(50 * MS))).1.len(), 2);
+        let text = REGISTRY.replace("tof", "new").replace("bit = 3", "bit = 2");
+        let added = Registry::parse(&text, None).expect("a registry").registry;
+        aligner.add(&added.devices[1]);
+        let header =
+            SampleHeader { seq: 4, capture_ns: 90 * MS, recv_ns: 90 * MS, epoch: 1, ..SampleHeader::default() };
+        aligner.take(TopicId::Modality(added.devices[1].id), &header, b"");
+        let seen = read(aligner.observe(Stamp(100 * MS)));
+        assert_eq!(seen, (0b110, vec![(0, 0, 0, 0), (2, 1 | 2 | 8, 4, 10), (3, 0, 0, 0)]));
+    }
+
+    #[test]
     fn more_changes_of_the_mask_than_are_remembered_leave_the_newest() {
         let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
         let mut aligner = Aligner::new(&registry);

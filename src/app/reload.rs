@@ -63,9 +63,17 @@ impl Reload {
                     () = stop.cancelled() => return Ok(()),
                     Some(request) = requests.recv() => request,
                 };
-                let answer = match request {
-                    RegistryRequest::Reload => self.reload().await,
-                    RegistryRequest::Register { device, name } => self.register(device, name).await,
+                let answer = async {
+                    match request {
+                        RegistryRequest::Reload => self.reload().await,
+                        RegistryRequest::Register { device, name } => self.register(device, name).await,
+                    }
+                };
+                let answer = tokio::select! {
+                    biased;
+                    // A file that cannot be read at the moment does not hold up the end of the run.
+                    () = stop.cancelled() => return Ok(()),
+                    answer = answer => answer,
                 };
                 self.show(&answer);
                 // The requester may have ended.

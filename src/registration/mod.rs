@@ -195,3 +195,52 @@ pub fn free_bit(registry: Option<&Registry>, besides: &[u8]) -> Option<u8> {
     let devices = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
     (0..64).find(|bit| !besides.contains(bit) && !devices.iter().any(|device| device.id.bit() == *bit))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::device::{Unit, UsbIdentity};
+    use crate::registry::BUILTIN;
+    use crate::simulation::{SimDevice, SimSource};
+    use crate::time::Stamp;
+
+    #[test]
+    fn a_described_unit_is_registered_once_with_what_it_suggests() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("devices.toml");
+        std::fs::write(&path, BUILTIN).unwrap();
+        let text = || std::fs::read_to_string(&path).unwrap();
+        let source = SimSource::Camera { width: 320, height: 240, fps: 15, seed: 1, bytes: 0 };
+        let node = DeviceNode::Sim(Arc::new(SimDevice::new("spare", source, Stamp::now())));
+        let product = Some("Spare\u{1b}[2J Camera".to_owned());
+        let usb = UsbIdentity {
+            vid: 7,
+            pid: 8,
+            serial: Some("S".into()),
+            port: "1-4".into(),
+            product,
+            ..UsbIdentity::default()
+        };
+        let attached = [Attachment { syspath: "/sim/1-4".into(), node, unit: Unit::Usb(usb), driver: None }];
+        let units = unregistered(Some(&Registry::builtin()), &attached);
+        // As the board shows it.
+        let device = text::plain(&units[0].describe()).into_owned();
+        for (device, name, reason) in [
+            ("0007:0008", "spare", "it is not plugged in, or it is already registered"),
+            (device.as_str(), "Not a Name", "Not a Name"),
+            (&device, "cam_wrist", "[device.cam_wrist] already exists"),
+        ] {
+            let why = register(&path, &attached, device, name).unwrap_err().to_string();
+            assert!(why.contains(reason), "{why}");
+            assert_eq!(text(), BUILTIN);
+        }
+        register(&path, &attached, &device, "spare").unwrap();
+        let added = text().strip_prefix(BUILTIN).unwrap().to_owned();
+        let keys = "vid = \"0007\"\npid = \"0008\"\nserial = \"S\"\nnode = \"camera\"\nbit = 3\n";
+        assert!(added.contains(&format!("[device.spare]\n{keys}")) && added.contains("fps = 15"), "{added}");
+        let again = register(&path, &attached, &device, "other").unwrap_err();
+        assert!(matches!(again, RegistrationError::NoDevice(_)), "{again}");
+    }
+}

@@ -58,6 +58,8 @@ pub struct Rig {
     board: Arc<Board>,
     /// The mask's JSON file must be written, once for all changes of one event.
     json_is_stale: bool,
+    /// Connected units without an entry must be reported, once nothing else is to be done.
+    units_are_stale: bool,
     streams: JoinSet<Ended>,
     /// The stream of each task.
     tasks: HashMap<Id, (ModalityId, Epoch)>,
@@ -118,6 +120,7 @@ impl Rig {
             presence,
             board,
             json_is_stale: false,
+            units_are_stale: false,
             streams: JoinSet::new(),
             tasks: HashMap::new(),
             reports: mpsc::channel(1).0,
@@ -199,7 +202,7 @@ impl Rig {
                 event = hotplug.next() => match event {
                     Some(Ok(event)) => {
                         self.step(Input::Hotplug(event));
-                        self.show_unregistered();
+                        self.units_are_stale = true;
                     }
                     Some(Err(error)) => break Err(error.into()),
                     None => break Ok(()),
@@ -214,6 +217,7 @@ impl Rig {
                 },
                 () = sleep(deadline.since(Stamp::now())) => self.step(Input::Timer),
                 _ = json.tick() => self.json_is_stale = true,
+                () = std::future::ready(()), if self.units_are_stale => self.show_unregistered(),
                 // The mask that it describes is not published yet.
                 () = sleep(PERIOD), if self.json_is_stale => {}
             }
@@ -255,11 +259,12 @@ impl Rig {
         self.presence.set_devices(self.modalities.len());
         self.json_is_stale = true;
         self.step(Input::Register(device));
-        self.show_unregistered();
+        self.units_are_stale = true;
     }
 
     /// Reports connected units without an entry that a driver could read.
-    fn show_unregistered(&self) {
+    fn show_unregistered(&mut self) {
+        self.units_are_stale = false;
         let attached: Vec<_> = self.core.nodes().cloned().collect();
         let suggested = |unit: &Candidate| {
             let name = unit.suggested_name(Some(&self.registry));

@@ -142,6 +142,8 @@ mod tests {
             mask: PhysicalMask(1),
             mask_sequence: ms / 2,
             stops: Vec::new(),
+            unregistered: Vec::new(),
+            registry_answer: None,
             devices: vec![DeviceStatus {
                 name: "cam".to_owned(),
                 id: id(),

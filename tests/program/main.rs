@@ -31,6 +31,7 @@ mod provenance;
 mod publishers;
 mod python;
 mod register;
+mod reload;
 mod scenarios;
 mod second_run;
 mod session;

@@ -59,8 +59,7 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
         ),
         (
             "removed",
-            RIG.replace("tof", "tof").split("[device.tof]").next().unwrap_or_default().to_owned()
-                + "[module.soft_tip]\nslot = \"tip\"\n",
+            RIG.split("[device.tof]").next().unwrap_or_default().to_owned() + "[module.soft_tip]\nslot = \"tip\"\n",
             &[],
             &["[device.tof]: it is removed"],
         ),
@@ -113,7 +112,16 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
         ),
         // The cameras share what the budget leaves.
         ("less memory for the others", RIG.replace("64MiB", "1000MiB"), &[], &["[rig]: memory_budget changed"]),
-        ("and for itself", spare(&format!("{camera}bit = 3\nmax_bytes = \"3MB\"\ndepth = 16")), &[3], &["its depth"]),
+        (
+            "an entry that takes the memory of others",
+            spare(&format!(
+                "{camera}bit = 3
+max_bytes = \"700KiB\"
+depth = 20"
+            )),
+            &[3],
+            &["[device.cam]: its depth"],
+        ),
     ] {
         let Difference { added, needs_restart } = Difference::between(&parsed(RIG), &parsed(&text));
         assert_eq!(added.iter().map(|device| device.id.bit()).collect::<Vec<_>>(), bits, "{case}: {needs_restart:?}");
