@@ -43,7 +43,7 @@ pub struct Cli {
     #[command(flatten)]
     pub global: Global,
     /// Print version
-    #[arg(long, short = 'V', action = ArgAction::Version, help_heading = GENERAL)]
+    #[arg(long, short = 'V', action = ArgAction::Version, help_heading = GENERAL, hide_short_help = true)]
     version: Option<bool>,
 }
 
@@ -270,7 +270,7 @@ pub enum Command {
         neither disk nor shared memory.\n\nExamples:\n  rapid disarm\n  rapid disarm --instance left"
     )]
     Disarm,
-    /// Make a running rapid take over entries that were added to its registry
+    /// Take entries added to the registry over into a running rapid
     #[command(after_long_help = RELOAD)]
     Reload,
     /// Begin, end, discard or label episodes of a running rapid

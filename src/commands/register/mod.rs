@@ -217,6 +217,7 @@ fn commit(
     if format == Format::Text {
         out.write_all(&written_files)?;
         if !args.dry_run {
+            writeln!(out, "a running rapid takes it over: rapid reload")?;
             writeln!(out, "for stable device names, install the udev rules: rapid artifacts --help")?;
         }
         return Ok(());

@@ -6,7 +6,7 @@ const RIG: &str = r#"
 [rig]
 name = "bench"
 cooldown = "1s"
-memory_budget = "64MiB"
+memory_budget = "256MiB"
 
 [device.cam]
 vid = "1209"
@@ -111,7 +111,7 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
             &[],
         ),
         // The cameras share what the budget leaves.
-        ("less memory for the others", RIG.replace("64MiB", "1000MiB"), &[], &["[rig]: memory_budget changed"]),
+        ("less memory for the others", RIG.replace("256MiB", "1000MiB"), &[], &["[rig]: memory_budget changed"]),
         (
             "an entry that takes the memory of others",
             spare(&format!(
