@@ -5,20 +5,21 @@
 //! tenth of a second later, and also know samples that were in transit.
 //!
 //! Invariant: nothing here blocks: the samples that wait on the bus are looked at when a tick is due. After the first
-//! ticks nothing allocates.
+//! ticks nothing allocates, except for a modality that is added.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::sync::mpsc;
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
 
-use crate::bus::{BusError, Queues, TopicId, Writer};
+use crate::bus::{BusError, Queues, Subscription, TopicId, Writer};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::observation::{HEAD_BYTES, SLOT_BYTES};
-use crate::registry::Registry;
+use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::Board;
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
@@ -40,12 +41,20 @@ pub struct Alignment {
     writer: Arc<Writer>,
     /// Receives the samples that screens look at: no other subscriber is needed for them.
     board: Arc<Board>,
+    additions: mpsc::UnboundedReceiver<(Arc<DeviceSpec>, Subscription)>,
 }
 
 impl Alignment {
     /// Of the samples that reach `queues` from now on; `writer` is that of the topic of observations.
     pub fn new(registry: &Registry, queues: Queues, writer: Arc<Writer>, board: Arc<Board>) -> Self {
-        Self { aligner: Aligner::new(registry), hz: registry.rig.observation_hz, queues, writer, board }
+        let (aligner, hz) = (Aligner::new(registry), registry.rig.observation_hz);
+        Self { aligner, hz, queues, writer, board, additions: mpsc::unbounded_channel().1 }
+    }
+
+    /// Also of the modalities that are added during its run.
+    #[must_use]
+    pub fn extended_by(self, additions: mpsc::UnboundedReceiver<(Arc<DeviceSpec>, Subscription)>) -> Self {
+        Self { additions, ..self }
     }
 
     /// Publishes an observation at each tick until `stop`. Ticks that pass while the machine is suspended, or too slow
@@ -59,6 +68,11 @@ impl Alignment {
             tokio::select! {
                 biased;
                 () = stop.cancelled() => return published,
+                Some((device, subscription)) = self.additions.recv() => {
+                    self.queues.add(subscription);
+                    self.aligner.add(&device);
+                    continue;
+                }
                 () = sleep(grid.tick(next).since(Stamp::now())) => {}
             }
             let now = Stamp::now();
@@ -97,6 +111,10 @@ impl Alignment {
     }
 }
 
+fn modality(device: &DeviceSpec) -> SyncModality {
+    SyncModality::of(device, device.depth + SLACK)
+}
+
 /// The samples and masks so far, and the observation they give.
 #[derive(Debug)]
 struct Aligner {
@@ -108,13 +126,16 @@ struct Aligner {
 
 impl Aligner {
     fn new(registry: &Registry) -> Self {
-        let modalities: Vec<_> =
-            registry.devices.iter().map(|device| SyncModality::of(device, device.depth + SLACK)).collect();
+        let modalities: Vec<_> = registry.devices.iter().map(modality).collect();
         Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             masks: VecDeque::with_capacity(MASKS),
             payload: Vec::with_capacity(HEAD_BYTES + modalities.len() * SLOT_BYTES),
         }
+    }
+
+    fn add(&mut self, device: &DeviceSpec) {
+        self.sync.add(&modality(device));
     }
 
     fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
@@ -208,6 +229,22 @@ mod tests {
         assert_eq!(read(aligner.observe(Stamp(100 * MS))), (0b1001, vec![(0, chosen, 7, 10), (3, stale, 1, 60)]));
         // Unplugged: nothing of it, however fresh; the other is known by now.
         assert_eq!(read(aligner.observe(Stamp(110 * MS))), (0b1000, vec![(0, 0, 0, 0), (3, stale, 1, 70)]));
+    }
+
+    #[test]
+    fn an_added_modality_is_in_the_next_observation() {
+        let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
+        let mut aligner = Aligner::new(&registry);
+        aligner.take(TopicId::Mask, &SampleHeader::default(), &PhysicalMask(0b110).payload(1));
+        assert_eq!(read(aligner.observe(Stamp(50 * MS))).1.len(), 2);
+        let text = REGISTRY.replace("tof", "new").replace("bit = 3", "bit = 2");
+        let added = Registry::parse(&text, None).expect("a registry").registry;
+        aligner.add(&added.devices[1]);
+        let header =
+            SampleHeader { seq: 4, capture_ns: 90 * MS, recv_ns: 90 * MS, epoch: 1, ..SampleHeader::default() };
+        aligner.take(TopicId::Modality(added.devices[1].id), &header, b"");
+        let seen = read(aligner.observe(Stamp(100 * MS)));
+        assert_eq!(seen, (0b110, vec![(0, 0, 0, 0), (2, 1 | 2 | 8, 4, 10), (3, 0, 0, 0)]));
     }
 
     #[test]

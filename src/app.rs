@@ -4,7 +4,7 @@
 //!
 //! Shutdown: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
 //! streams and observations stop, the recorder finishes its file, the session is saved, the programs of devices are
-//! waited for, the mask is 0 and its files are removed, the screen shows what was recorded and restores the terminal.
+//! waited for, topics of added entries are closed, the mask is 0 and its files are removed, the screen shows what was recorded and restores the terminal.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
@@ -20,6 +20,7 @@ mod error;
 mod free_space;
 #[cfg_attr(not(feature = "policy"), path = "app/inference_absent.rs")]
 mod inference;
+mod reload;
 mod requests;
 mod screen;
 pub(crate) mod signals;
@@ -65,6 +66,7 @@ use collection::Collection;
 use conductor::Conductor;
 pub use error::AppError;
 pub use inference::PolicyOptions;
+use reload::Reload;
 use requests::Request;
 use signals::Signals;
 use stage::Stage;
@@ -222,7 +224,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let Machine { registry, board, permission, signals, presence, arrivals } = machine;
     let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
-    let following = recorder.episode();
+    let (following, to_recorder) = (recorder.episode(), recorder.additions());
     // Ending by itself after some time is the run's, unless it has several episodes.
     let Plan { goal, episode_time, reset_time, .. } = options.plan;
     let is_single = goal.is_none() && episode_time.is_none() && reset_time.is_none();
@@ -232,12 +234,13 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let collection = Collection::new(recorder, episode, options.plan, is_kept, &board)?;
     let kind = options.screen;
     let (to_scenario, replugs) = mpsc::unbounded_channel();
+    let (to_alignment, to_align) = mpsc::unbounded_channel();
     if matches!(options.devices, Devices::Simulated(_)) {
         board.set_simulated();
     }
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
-        let alignment = alignment(&registry, bus, &board)?;
+        let alignment = alignment(&registry, bus, &board)?.extended_by(to_align);
         let (discovery, plugged) = discovery::start(options.devices, &registry, replugs)?;
         // The inputs report their first state at once.
         let events = board.events();
@@ -262,7 +265,17 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let (to_rig, rig_commands) = mpsc::channel(16);
     let (to_conductor, requests) = mpsc::unbounded_channel();
     let buttons = Buttons::begin(&registry, &permission, &board, &to_conductor);
-    requests::sorted(to_conductor, from_screen, (arrivals, attached), to_rig, to_scenario);
+    let (to_registry, about_registry) = mpsc::unbounded_channel();
+    let reload = Reload {
+        registry: Arc::clone(&registry),
+        bus: bus.membership(),
+        board: Arc::clone(&board),
+        rig: to_rig.clone(),
+        recorder: to_recorder,
+        alignment: to_alignment,
+        topics: Vec::new(),
+    };
+    requests::sorted(to_conductor, from_screen, (arrivals, attached), to_rig, to_registry, to_scenario);
     let mask_ended = presence.ended();
     let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
     let streaming = Streaming::start(
@@ -288,6 +301,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         synchronisation: synchronise(alignment),
         recording,
         inference,
+        reload: reload.start(about_registry),
         mask_ended,
         kind,
         screen,
@@ -353,6 +367,7 @@ struct Running {
     synchronisation: Stage,
     recording: Stage,
     inference: Option<Stage>,
+    reload: Stage,
     mask_ended: CancellationToken,
     kind: Screen,
     screen: Stage,
@@ -393,6 +408,7 @@ async fn finish(
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
         keep_first(&mut outcome, running.discovery.end().await);
+        keep_first(&mut outcome, running.reload.end().await);
     };
     let mut take_down: Pin<Box<_>> = Box::pin(take_down);
     let twice = tokio::select! {

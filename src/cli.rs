@@ -46,7 +46,7 @@ pub struct Cli {
     #[arg(skip)]
     pub name: String,
     /// Print version
-    #[arg(long, short = 'V', action = ArgAction::Version, help_heading = GENERAL)]
+    #[arg(long, short = 'V', action = ArgAction::Version, help_heading = GENERAL, hide_short_help = true)]
     version: Option<bool>,
 }
 
@@ -109,6 +109,17 @@ Examples:
 
 /// What a run without a command is called in JSON.
 const RUN_NAME: &str = "run";
+
+const RELOAD: &str = "\
+The running rapid reads its devices.toml again. Entries that were added, each with a free bit, get a topic and a bit of \
+the mask while everything else continues; a device that is plugged in starts. They are recorded from the next episode on.
+
+Any other change needs a restart: then nothing is changed, the reasons are printed, and the exit code is 1.
+
+Examples:
+  rapid register && rapid reload
+  rapid reload --instance left --json";
+
 const RUN: &str = "Run options";
 const GENERAL: &str = "General options";
 
@@ -144,7 +155,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "devices" | "register" | "calibrate" => &["sim", "config", "json"],
         "unregister" | "check" | "doctor" | "ablation" => &["config", "json"],
         "artifacts" => &["config"],
-        "mask" | "replay" | "episode" | "session" | "logs" => &["json", "instance"],
+        "mask" | "replay" | "episode" | "session" | "reload" | "logs" => &["json", "instance"],
         "arm" | "disarm" | "monitor" => &["instance"],
         "inspect" | "list" | "recover" | "eval" => &["json"],
         _ => &[],
@@ -340,6 +351,9 @@ pub enum Command {
         #[arg(long)]
         utc: bool,
     },
+    /// Take entries added to the registry over into a running rapid
+    #[command(after_long_help = RELOAD)]
+    Reload,
     /// Begin, end, discard or label episodes of a running rapid
     #[command(after_long_help = session::EPISODE)]
     Episode {

@@ -24,7 +24,7 @@ use crate::commands::devices::{Entries, Formats};
 use crate::commands::inspect::InspectFailure;
 use crate::commands::logs::LogsOptions;
 use crate::commands::mask::MaskOptions;
-use crate::commands::register::{self, Dialogue, Target};
+use crate::commands::register::{self, Dialogue};
 use crate::commands::{self, CommandStatus, Format};
 use crate::device::Attachment;
 use crate::driver::replay;
@@ -32,6 +32,7 @@ use crate::hotplug::{HotplugError, udev};
 use crate::palette::Palette;
 use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError};
+use crate::registration::Target;
 use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
@@ -159,6 +160,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             let options = LogsOptions { device, least, follow, zone, format, palette };
             Ok(commands::logs::logs(global.instance.as_deref(), &options, out)?)
         }
+        Command::Reload => Ok(commands::session::reload(global.instance.as_deref(), format, out)?),
         Command::Episode { what } => {
             Ok(commands::session::ask(global.instance.as_deref(), &what.into_request(), format, out)?)
         }

@@ -53,6 +53,7 @@ pub mod provenance;
 pub mod random;
 pub mod realtime;
 pub mod record;
+pub mod registration;
 pub mod registry;
 pub mod rig;
 pub mod sample;

@@ -55,7 +55,7 @@ const LAYERS: &[&[&str]] = &[
         "pixels",
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "inputs", "interlocks", "sync", "calibration"],
-    &["rig", "alignment", "record", "session", "policy"],
+    &["rig", "alignment", "record", "session", "policy", "registration"],
     &["app", "lockstep", "compare", "plot", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];

@@ -1,7 +1,7 @@
 //! Requests of the screen and of other programs, sorted by receiver.
 //!
 //! Invariant: a request to the rig never waits for a file: it does not pass through the conductor, which waits for
-//! files to be closed. Orders to the actuator take a separate path ([`crate::permission`]).
+//! files to be closed. Nor does one about the registry. Orders to the actuator take a separate path ([`crate::permission`]).
 
 use std::sync::Arc;
 
@@ -9,10 +9,10 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::spawn_blocking;
 
 use super::attached::Attached;
-use crate::orders::receive::Arrival;
+use crate::orders::receive::{Arrival, Wanted};
 use crate::rig::RigCommand;
-use crate::status::Command;
 use crate::status::session::SessionRequest;
+use crate::status::{Command, RegistryRequest};
 use crate::time::Stamp;
 
 /// Receives the answer to a request: what was done, or why it was refused.
@@ -34,9 +34,10 @@ pub(super) fn sorted(
     mut screen: mpsc::Receiver<Command>,
     (mut arrivals, attached): (mpsc::Receiver<Arrival>, Attached),
     rig: mpsc::Sender<RigCommand>,
+    registry: mpsc::UnboundedSender<(RegistryRequest, Reply)>,
     scenario: mpsc::UnboundedSender<String>,
 ) {
-    let (to_conductor, board) = (conductor.clone(), Arc::clone(attached.board()));
+    let (to_conductor, to_registry, board) = (conductor.clone(), registry.clone(), Arc::clone(attached.board()));
     tokio::spawn(async move {
         while let Some(arrival) = arrivals.recv().await {
             let asked = match arrival {
@@ -47,9 +48,11 @@ pub(super) fn sorted(
                 }
             };
             let (reply, answer) = oneshot::channel();
-            let request = Request::Session(asked.request.clone(), asked.at, Some(reply));
             // A receiver is gone only when the run ends; so is then the other end of the answer.
-            let _ = to_conductor.send(request);
+            let _ = match asked.request.clone() {
+                Wanted::Session(request) => to_conductor.send(Request::Session(request, asked.at, Some(reply))).is_ok(),
+                Wanted::Registry(request) => to_registry.send((request, Some(reply))).is_ok(),
+            };
             tokio::spawn(async move {
                 let answer = answer.await.unwrap_or_else(|_| Err("the run is ending".to_owned()));
                 let _ = spawn_blocking(move || asked.answer(answer)).await;
@@ -66,6 +69,10 @@ pub(super) fn sorted(
                 Command::Look(id) => {
                     board.look(id, Stamp::now());
                     true
+                }
+                Command::Reload => registry.send((RegistryRequest::Reload, None)).is_ok(),
+                Command::Register { device, name } => {
+                    registry.send((RegistryRequest::Register { device, name }, None)).is_ok()
                 }
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
             };
@@ -85,12 +92,16 @@ mod tests {
         let (rig, mut at_rig) = mpsc::channel(1);
         let attached = Attached::new(Arc::new(board(&["a"])), mpsc::channel(1).0);
         let (conductor, mut requests) = mpsc::unbounded_channel();
-        sorted(conductor, from_screen, (mpsc::channel(1).1, attached), rig, mpsc::unbounded_channel().0);
+        let (registry, mut at_registry) = mpsc::unbounded_channel();
+        let others = (mpsc::channel(1).1, attached);
+        sorted(conductor, from_screen, others, rig, registry, mpsc::unbounded_channel().0);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }
         screen.send(Command::Restart(ModalityId::new(3).unwrap())).await.unwrap();
-        assert_eq!(at_rig.recv().await, Some(RigCommand::Restart(ModalityId::new(3).unwrap())));
+        assert!(matches!(at_rig.recv().await, Some(RigCommand::Restart(id)) if id.bit() == 3));
+        screen.send(Command::Reload).await.unwrap();
+        assert!(matches!(at_registry.recv().await, Some((RegistryRequest::Reload, None))));
         screen.send(Command::Quit).await.unwrap();
         drop(screen);
         let mut all = Vec::new();

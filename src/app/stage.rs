@@ -7,6 +7,7 @@
 //! | synchronisation | publishes the observation of each tick             | nothing: it looks at the bus at each tick    |
 //! | recording       | waits for its thread and joins it                  | thread `writer`                              |
 //! | inference       | loads the policy, starts it and joins its threads  | threads `grid` and `policy`                  |
+//! | registry        | takes over entries that are added to the registry  | reads of files, opening of topics            |
 //!
 //! Recording and inference do not wait for the observations of synchronisation: they apply the same rules
 //! ([`crate::sync`]) at their own ticks, the recorder once the samples in transit have arrived, the policy on its own

@@ -33,7 +33,8 @@ pub struct Inbox {
     wake: Guarded<Listener<Service>>,
 }
 
-struct Subscription {
+/// The samples of one topic, for one consumer.
+pub struct Subscription {
     id: TopicId,
     name: String,
     /// Maximum number of samples in the queue.
@@ -59,6 +60,23 @@ pub struct Foreign<'a> {
 }
 
 impl Subscription {
+    pub(super) fn open(spec: &TopicSpec, factory: &TopicFactory, writer: &Writer) -> Result<Self, BusError> {
+        let subscriber =
+            factory.subscriber_builder().buffer_size(spec.depth).create().map_err(|error| match error {
+                SubscriberCreateError::ExceedsMaxSupportedSubscribers => BusError::Full { topic: spec.name.clone() },
+                other => topic_error(&spec.name, &other),
+            })?;
+        Ok(Self {
+            id: spec.id,
+            name: spec.name.clone(),
+            depth: spec.depth,
+            subscriber: Guarded::new(subscriber),
+            writer: writer.id(),
+            is_written: Cell::new(false),
+            other: Cell::new(None),
+        })
+    }
+
     /// Whether this publisher belongs to another program.
     fn is_foreign(&self, publisher: UniquePublisherId) -> bool {
         if publisher == self.writer {
@@ -72,6 +90,12 @@ impl Subscription {
             self.other.set(Some((publisher, samples.saturating_add(1))));
         }
         is_foreign
+    }
+}
+
+impl std::fmt::Debug for Subscription {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Subscription").field(&self.name).finish()
     }
 }
 
@@ -107,6 +131,13 @@ impl Inbox {
     }
 }
 
+impl Inbox {
+    /// [`Queues::add`].
+    pub fn add(&mut self, subscription: Subscription) {
+        self.queues.add(subscription);
+    }
+}
+
 impl Deref for Inbox {
     type Target = Queues;
 
@@ -122,27 +153,20 @@ impl Queues {
         writers: impl Iterator<Item = &'a Writer>,
     ) -> Result<Self, BusError> {
         let subscribe = |((spec, factory), writer): (&(TopicSpec, Guarded<TopicFactory>), &Writer)| {
-            let subscriber =
-                factory.subscriber_builder().buffer_size(spec.depth).create().map_err(|error| match error {
-                    SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
-                        BusError::Full { topic: spec.name.clone() }
-                    }
-                    other => topic_error(&spec.name, &other),
-                })?;
-            Ok(Subscription {
-                id: spec.id,
-                name: spec.name.clone(),
-                depth: spec.depth,
-                subscriber: Guarded::new(subscriber),
-                writer: writer.id(),
-                is_written: Cell::new(false),
-                other: Cell::new(None),
-            })
+            Subscription::open(spec, factory, writer)
         };
         let is_consumed = |((spec, _), _): &(&(TopicSpec, _), _)| spec.id != TopicId::Observation;
         let topics =
             topics.iter().zip(writers).filter(is_consumed).map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
         Ok(Self { topics })
+    }
+
+    /// Adds a topic that was opened later. Its samples are handed over before those of mask and actions, like those of
+    /// other modalities.
+    pub fn add(&mut self, subscription: Subscription) {
+        let is_modality = |topic: &Subscription| matches!(topic.id, TopicId::Modality(_));
+        let at = self.topics.iter().position(|topic| !is_modality(topic)).unwrap_or(self.topics.len());
+        self.topics.insert(at, subscription);
     }
 
     /// An error once memory of the bus has been lost: from then on samples may be mixed or empty.

@@ -1,6 +1,6 @@
 //! The bus: every modality and the mask as a topic in shared memory, open for the whole run.
 //!
-//! One iceoryx2 node; all topics are opened once from the registry, so that a plug or unplug reconnects nothing. The
+//! One iceoryx2 node; all topics of the registry are opened once, so that a plug or unplug reconnects nothing. The
 //! payload is the driver's data, the user header a [`SampleHeader`]; any process with an iceoryx2 binding can
 //! subscribe. One event service wakes consumers: the event's id is the modality's bit. The topic of actions has an
 //! event service of its own, which wakes only the actuator.
@@ -13,11 +13,13 @@
 //! Invariant: every segment of this program has all its memory from its creation (`room`); if segments of other
 //! programs lose pages, the run ends in order (`sigbus`). Nothing of the bus is writable by others, and nothing
 //! outlives the processes that use it (`leftovers`).
+//! Invariant: no topic is closed during a run; one is opened for an entry that is added ([`Extension`]).
 //! Invariant: writers live as long as the bus. Samples that a reader has not fetched are lost with their writer
 //! (iceoryx2 0.10), so a writer that ended with its device would take the last samples along.
 
 mod actions;
 mod error;
+mod extension;
 mod guard;
 mod home;
 mod inbox;
@@ -38,7 +40,7 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 
 use crate::modality::ModalityId;
-use crate::registry::{MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
+use crate::registry::{DeviceSpec, MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 use crate::sample::SampleHeader;
 
 use error::topic_error;
@@ -48,7 +50,8 @@ use service::Service;
 
 pub use actions::{Actions, watch};
 pub use error::BusError;
-pub use inbox::{Foreign, Inbox, Queues};
+pub use extension::Extension;
+pub use inbox::{Foreign, Inbox, Queues, Subscription};
 pub use ingress::{Arrivals, Given, Ingress};
 pub use place::memory as check_memory;
 pub use sigbus::lost;
@@ -59,6 +62,8 @@ type TopicFactory = iceoryx2::service::port_factory::publish_subscribe::PortFact
 
 /// Name of the event service that wakes consumers.
 const WAKE_SERVICE: &str = "/rapid/wake";
+/// A notifier for each modality and for actions, and those of other programs.
+const WAKE_NOTIFIERS: usize = crate::modality::MAX_MODALITIES + 1 + MAX_NODES;
 /// Maximum number of processes on the bus: `rapid`, and subscribers or publishers of other programs.
 const MAX_NODES: usize = 32;
 
@@ -128,7 +133,7 @@ impl Bus {
     ) -> Result<Self, BusError> {
         let node = home.node();
         let topics = specs.into_iter().map(|spec| open_topic(node, spec)).collect::<Result<Vec<_>, _>>()?;
-        let wake = open_wake(node, WAKE_SERVICE, crate::modality::MAX_MODALITIES + 1 + MAX_NODES)?;
+        let wake = open_wake(node, WAKE_SERVICE, WAKE_NOTIFIERS)?;
         let action = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
         let action = action.map(|topic| Ok((topic, open_wake(node, &topic.0.name, MAX_NODES)?))).transpose()?;
         let writers = topics
@@ -238,6 +243,16 @@ impl Membership {
         self.home.node().config().global.prefix.to_string()
     }
 
+    /// Opens the topic of an added entry, as [`Bus::open`] does those of the registry. Blocks while the system reserves
+    /// its memory.
+    ///
+    /// # Errors
+    /// When the topic is in use with another layout, or the system lacks memory or descriptors; then nothing is left
+    /// of it.
+    pub fn extend(&self, device: &DeviceSpec) -> Result<Extension, BusError> {
+        Extension::open(&self.home, device)
+    }
+
     /// Releases what killed programs held of the bus: shared memory and subscriber slots. Blocks while it scans the
     /// files.
     pub fn sweep(&self) {
@@ -248,7 +263,7 @@ impl Membership {
 /// The topics of a rig.
 fn specs(registry: &Registry) -> impl Iterator<Item = TopicSpec> {
     let action = registry.actuator().map(|_| TopicSpec::action());
-    let own = [TopicSpec::mask(), TopicSpec::observation(registry.devices.len())];
+    let own = [TopicSpec::mask(), TopicSpec::observation()];
     registry.devices.iter().map(TopicSpec::of_device).chain(own).chain(action)
 }
 

@@ -3,7 +3,7 @@
 use super::room::BOOKS;
 use crate::action::{ACTION_TOPIC, MAX_ACTION};
 use crate::mask::{MASK_TOPIC, PAYLOAD_LEN};
-use crate::modality::ModalityId;
+use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::observation::{HEAD_BYTES, OBSERVATION_TOPIC, SLOT_BYTES};
 use crate::registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
@@ -55,9 +55,9 @@ impl TopicSpec {
         Self { id: TopicId::Mask, name: MASK_TOPIC.to_owned(), depth: MASK_DEPTH, max_bytes: PAYLOAD_LEN }
     }
 
-    /// Of as many devices.
-    pub(super) fn observation(devices: usize) -> Self {
-        let max_bytes = HEAD_BYTES + devices * SLOT_BYTES;
+    /// Of as many devices as there can be: some may be added during the run.
+    pub(super) fn observation() -> Self {
+        let max_bytes = HEAD_BYTES + MAX_MODALITIES * SLOT_BYTES;
         Self { id: TopicId::Observation, name: OBSERVATION_TOPIC.to_owned(), depth: OBSERVATION_DEPTH, max_bytes }
     }
 

@@ -1,9 +1,10 @@
-//! `rapid episode` and `rapid session`: requests to the session of a running `rapid`.
+//! `rapid episode`, `rapid session` and `rapid reload`: requests to a running `rapid`.
 
 use std::io::{self, Write};
 
 use super::Format;
 use crate::orders::give::{GiveError, request};
+use crate::status::RegistryRequest;
 use crate::status::session::{Phase, SessionRequest, SessionStatus};
 use crate::text;
 
@@ -35,8 +36,23 @@ pub fn ask(
     match (wanted, format) {
         (SessionRequest::Show, Format::Json) => writeln!(out, "{answer}")?,
         (SessionRequest::Show, Format::Text) => show(&serde_json::from_str(&answer)?, out)?,
-        (_, Format::Json) => writeln!(out, "{}", super::json_line("answer", &serde_json::json!({ "done": answer }))?)?,
-        (_, Format::Text) => writeln!(out, "{}", text::plain(&answer))?,
+        _ => done(&answer, format, out)?,
+    }
+    Ok(())
+}
+
+/// Makes the run take over what was added to its registry.
+///
+/// # Errors
+/// When no run accepts requests, or it takes over nothing because something else was changed.
+pub fn reload(instance: Option<&str>, format: Format, out: &mut dyn Write) -> Result<(), RequestError> {
+    done(&request(instance, &RegistryRequest::Reload)?, format, out)
+}
+
+fn done(answer: &str, format: Format, out: &mut dyn Write) -> Result<(), RequestError> {
+    match format {
+        Format::Json => writeln!(out, "{}", super::json_line("answer", &serde_json::json!({ "done": answer }))?)?,
+        Format::Text => writeln!(out, "{}", text::plain(answer))?,
     }
     Ok(())
 }

@@ -7,12 +7,12 @@ use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket_with};
+use serde::Serialize;
 
 use super::{Answer, DONE, LONGEST, LONGEST_ANSWER, instance_part, line, this_user};
 use crate::action::Order;
 use crate::peer::Peer;
 use crate::status::attach::ATTACH;
-use crate::status::session::SessionRequest;
 use crate::text::plain;
 use crate::time::Stamp;
 
@@ -140,11 +140,12 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     unreached.map_or(Ok(()), Err)
 }
 
-/// Makes a request to the session of the run of `instance`; the answer, once it is carried out.
+/// Makes a request to the run of `instance`, a [`SessionRequest`](crate::status::session::SessionRequest) or a
+/// [`RegistryRequest`](crate::status::RegistryRequest); the answer, once it is carried out.
 ///
 /// # Errors
 /// When no run has carried it out.
-pub fn request(instance: Option<&str>, request: &SessionRequest) -> Result<String, GiveError> {
+pub fn request(instance: Option<&str>, request: &impl Serialize) -> Result<String, GiveError> {
     let run = the_run(instance)?;
     let process = run.process;
     let answer = run.ask(request).map_err(|error| GiveError::Unanswered { process, error })?;
@@ -203,7 +204,7 @@ impl Run {
     }
 
     /// Waits without a limit: an episode may take minutes to be closed, or to begin.
-    fn ask(mut self, request: &SessionRequest) -> io::Result<Answer> {
+    fn ask(mut self, request: &impl Serialize) -> io::Result<Answer> {
         self.stream.write_all(format!("{}\n", serde_json::to_string(request)?).as_bytes())?;
         self.stream.set_read_timeout(None)?;
         let mut line = String::new();

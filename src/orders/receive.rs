@@ -20,6 +20,7 @@ use super::{Answer, DONE, LONGEST, address, name, order, this_user};
 use crate::action::Order;
 use crate::peer::Peer;
 use crate::permission::Permission;
+use crate::status::RegistryRequest;
 use crate::status::attach::ATTACH;
 use crate::status::session::SessionRequest;
 use crate::time::Stamp;
@@ -29,11 +30,27 @@ const CONNECTIONS: usize = 16;
 /// A connection that has sent no order for this long is closed.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// A request to the session.
+/// What other programs may request of a run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Wanted {
+    /// Something of the session.
+    Session(SessionRequest),
+    /// Something about the registry.
+    Registry(RegistryRequest),
+}
+
+impl Wanted {
+    fn read(json: &str) -> Result<Self, serde_json::Error> {
+        // The words of the two are different; a mistake is more often made in a request to the session.
+        serde_json::from_str(json).map(Self::Registry).or_else(|_| serde_json::from_str(json).map(Self::Session))
+    }
+}
+
+/// A request of another program.
 #[derive(Debug)]
 pub struct Asked {
     /// What is requested.
-    pub request: SessionRequest,
+    pub request: Wanted,
     /// When it arrived.
     pub at: Stamp,
     stream: UnixStream,
@@ -88,8 +105,8 @@ pub struct Orders {
 }
 
 impl Orders {
-    /// Takes orders for the run of `instance` from now on, and hands over requests to its session and screens that are to
-    /// be attached. With `group`, members of that group have the same rights as this user.
+    /// Takes orders for the run of `instance` from now on, and hands over requests to it and screens that are to be attached.
+    /// With `group`, members of that group have the same rights as this user.
     ///
     /// # Errors
     /// When the system provides no socket or no thread.
@@ -206,7 +223,7 @@ enum Taken {
     /// All that it will: it is finished.
     All,
     /// This.
-    Request(SessionRequest),
+    Request(Wanted),
     /// The wish to be attached as a screen.
     Attach { read_only: bool },
 }
@@ -228,7 +245,7 @@ impl Waiting {
         };
         let line = self.line.get(..end).and_then(|line| str::from_utf8(line).ok());
         if let Some(json) = line.filter(|line| line.starts_with('{')) {
-            match serde_json::from_str(json) {
+            match Wanted::read(json) {
                 Ok(request) => return Taken::Request(request),
                 Err(error) => return self.reply(&format!("not a request: {error}")),
             }

@@ -8,9 +8,10 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, 
 use tokio::sync::mpsc::{Receiver, channel};
 
 use super::give::{GiveError, attach, give, request};
-use super::receive::{Arrival, Asked, Orders};
+use super::receive::{Arrival, Asked, Orders, Wanted};
 use super::*;
 use crate::permission::{Attended, Permission};
+use crate::status::RegistryRequest;
 use crate::status::session::SessionRequest;
 use Order::{Arm, Disarm};
 
@@ -186,7 +187,7 @@ fn a_request_is_answered_when_the_run_answers_it() {
     let sent = note.clone();
     let giver = std::thread::spawn(move || request(Some(&instance), &sent).map_err(|error| error.to_string()));
     let asked = run.asked();
-    assert_eq!(asked.request, note);
+    assert_eq!(asked.request, Wanted::Session(note));
     asked.answer(Ok("noted\nin two lines".to_owned()));
     assert_eq!(giver.join().unwrap(), Ok("noted\nin two lines".to_owned()));
     // An answer longer than a socket holds.
@@ -215,7 +216,12 @@ fn what_is_no_request_is_refused_and_disturbs_nothing() {
     gone.write_all(b"{\"do\":\"stop\"}\n").unwrap();
     drop(gone);
     let asked = run.asked();
-    assert_eq!(asked.request, SessionRequest::Stop);
+    assert_eq!(asked.request, Wanted::Session(SessionRequest::Stop));
+    asked.answer(Ok(String::new()));
+    let mut about = run.connect();
+    about.write_all(b"{\"do\":\"reload\"}\n").unwrap();
+    let asked = run.asked();
+    assert_eq!(asked.request, Wanted::Registry(RegistryRequest::Reload));
     asked.answer(Ok(String::new()));
     // With its queue full, a run still answers.
     let waiting: Vec<_> = (0..2)

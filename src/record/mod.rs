@@ -33,7 +33,7 @@ use std::path::PathBuf;
 pub use crate::episode::chunk_writer::Sink;
 pub use episode_path::{EpisodeReport, EpisodeRequest, open_folder};
 pub use quality::{Quality, Spread};
-pub use recorder::{Recorder, RecorderConfig, Source};
+pub use recorder::{Recorder, RecorderAddition, RecorderConfig, Source};
 pub use space::Asker;
 
 use crate::text;

@@ -152,8 +152,11 @@ impl OpenEpisode {
         })
     }
 
-    /// Takes a sample, and the gap before it.
+    /// Takes a sample, and the gap before it. One of a modality that was added after the beginning is not recorded.
     pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
+        if self.measures.meter(id).is_none() {
+            return;
+        }
         let latency = self.latency(id);
         if let (Some(hole), None) = (hole, &self.failed) {
             // Also for a sample after the end: part of the gap may be before it.

@@ -29,7 +29,7 @@ use super::provenance::Attached;
 use super::publishers::Publishers;
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
-use crate::bus::{Foreign, Inbox, Queues, TopicId};
+use crate::bus::{Foreign, Inbox, Queues, Subscription, TopicId};
 use crate::disk::Disk;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::partial::PARTIAL;
@@ -72,6 +72,11 @@ pub trait Source: Send {
         let _ = take;
     }
 
+    /// Delivers the samples of another topic, too; one that cannot does not.
+    fn add(&mut self, subscription: Subscription) {
+        drop(subscription);
+    }
+
     /// Why drained samples can no longer be trusted.
     fn lost(&self) -> Option<String> {
         None
@@ -89,6 +94,10 @@ impl Source for Inbox {
 
     fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
         Queues::foreign(self, take);
+    }
+
+    fn add(&mut self, subscription: Subscription) {
+        Self::add(self, subscription);
     }
 
     fn lost(&self) -> Option<String> {
@@ -135,8 +144,18 @@ impl RecorderConfig {
 pub struct Recorder {
     orders: Option<Sender<RecorderOrder>>,
     thread: Option<JoinHandle<()>>,
+    additions: Sender<RecorderAddition>,
     ended: CancellationToken,
     episode: EpisodeWatch,
+}
+
+/// A modality that is added. An episode in progress keeps the modalities that it began with; the next one has it.
+#[derive(Debug)]
+pub struct RecorderAddition {
+    /// What may be recorded from now on.
+    pub registry: Arc<Registry>,
+    /// Its samples.
+    pub subscription: Subscription,
 }
 
 impl Recorder {
@@ -146,6 +165,7 @@ impl Recorder {
     /// When the system provides no thread.
     pub fn spawn(source: impl Source + 'static, config: RecorderConfig) -> io::Result<Self> {
         let (orders, inbox) = mpsc::channel();
+        let (additions, added) = mpsc::channel();
         let events = config.board.events();
         let ended = CancellationToken::new();
         let (notify, episode) = watch::channel(None);
@@ -153,9 +173,9 @@ impl Recorder {
         let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
-            Writer::new(config, inbox, events, notify).run(source);
+            Writer::new(config, inbox, added, events, notify).run(source);
         })?;
-        Ok(Self { orders: Some(orders), thread: Some(thread), ended, episode })
+        Ok(Self { orders: Some(orders), thread: Some(thread), additions, ended, episode })
     }
 
     /// Cancelled when the thread has ended: before the handle is dropped, by a panic.
@@ -208,6 +228,11 @@ impl Recorder {
         self.ask(RecorderOrder::Await).await
     }
 
+    /// For modalities that are added during the run. It does not keep the thread.
+    pub fn additions(&self) -> Sender<RecorderAddition> {
+        self.additions.clone()
+    }
+
     async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> RecorderOrder) -> Result<T, RecordError> {
         let (reply, answer) = oneshot::channel();
         let orders = self.orders.as_ref().ok_or(RecordError::Ended)?;
@@ -243,6 +268,7 @@ enum RecorderOrder {
 struct Writer {
     config: RecorderConfig,
     inbox: Receiver<RecorderOrder>,
+    added: Receiver<RecorderAddition>,
     events: broadcast::Receiver<Event>,
     streams: Streams,
     attached: Attached,
@@ -267,6 +293,7 @@ impl Writer {
     fn new(
         mut config: RecorderConfig,
         inbox: Receiver<RecorderOrder>,
+        added: Receiver<RecorderAddition>,
         events: broadcast::Receiver<Event>,
         episode: watch::Sender<Option<Arc<Episode>>>,
     ) -> Self {
@@ -274,6 +301,7 @@ impl Writer {
         Self {
             config,
             inbox,
+            added,
             events,
             streams: Streams::new(),
             attached: Attached::default(),
@@ -315,6 +343,10 @@ impl Writer {
 
     fn turn(&mut self, source: &mut impl Source) -> ControlFlow<()> {
         fault::point("writer");
+        while let Ok(RecorderAddition { registry, subscription }) = self.added.try_recv() {
+            source.add(subscription);
+            self.config.registry = registry;
+        }
         if let Err(error) = source.wait(TURN) {
             self.complain_about_bus(&error);
             // A source that cannot be waited on is polled.

@@ -116,9 +116,8 @@ impl Assigner {
         let assignment = self.choose(attachment);
         let assigned = match &assignment {
             Assignment::Entry(id) => Some(*id),
-            // Kept: it may be assigned when an entry is freed.
-            Assignment::Waiting { .. } | Assignment::WrongNode { .. } => None,
-            Assignment::Unregistered { .. } => return assignment,
+            // Kept: it may be assigned when an entry is freed or added.
+            Assignment::Waiting { .. } | Assignment::WrongNode { .. } | Assignment::Unregistered { .. } => None,
         };
         self.place(Node { attachment: attachment.clone(), assigned });
         assignment
@@ -137,6 +136,18 @@ impl Assigner {
         detached.freed.sort_unstable();
         detached.assigned = self.promote();
         detached
+    }
+
+    /// An entry is added, whose name and bit no other has. Returns the attached nodes that are assigned to it.
+    pub fn add(&mut self, device: &DeviceSpec) -> Vec<(ModalityId, Attachment)> {
+        let at = self.entries.partition_point(|entry| entry.id < device.id);
+        self.entries.insert(at, Entry::new(device));
+        self.promote()
+    }
+
+    /// Every attached node, in the order in which they were attached.
+    pub fn nodes(&self) -> impl Iterator<Item = &Attachment> {
+        self.attached.iter().map(|node| &node.attachment)
     }
 
     /// The node that is assigned to entry `id` now.

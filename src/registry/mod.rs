@@ -6,7 +6,9 @@
 
 pub mod ablation;
 pub mod artifacts;
+pub mod candidate;
 mod diagnostic;
+mod difference;
 pub mod edit;
 mod identity;
 pub mod import;
@@ -21,6 +23,7 @@ pub mod units;
 
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
+pub use difference::Difference;
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use parse::{BUILTIN, Loaded, like_a_name, name_problem};
 pub use section::read_file;

@@ -10,6 +10,7 @@
 //! Invariant: the device attached to a slot is the one that the assigner gave to its entry.
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::slot::{self, End, Slot};
@@ -18,7 +19,7 @@ use crate::hotplug::HotplugEvent;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::provenance::UnplugSource;
-use crate::registry::{Assigner, Assignment, Registry};
+use crate::registry::{Assigner, Assignment, DeviceSpec, Registry};
 use crate::sample::Epoch;
 use crate::status::SlotState;
 use crate::time::Stamp;
@@ -39,6 +40,8 @@ pub enum Input {
     },
     /// A user requests a restart of a failed device.
     Restart(ModalityId),
+    /// An entry is added, whose name and bit no other has.
+    Register(Arc<DeviceSpec>),
     /// Time passed; see [`Core::deadline`].
     Timer,
 }
@@ -121,6 +124,7 @@ pub struct Core {
     lanes: Vec<Lane>,
     assigner: Assigner,
     mask: PhysicalMask,
+    cooldown: Duration,
 }
 
 /// One modality.
@@ -134,19 +138,21 @@ struct Lane {
     is_announced_gone: bool,
 }
 
+impl Lane {
+    fn new(id: ModalityId, cooldown: Duration) -> Self {
+        Self { id, slot: Slot::new(cooldown), attached_at: Stamp::default(), is_announced_gone: false }
+    }
+}
+
 impl Core {
     /// A core with nothing attached.
     pub fn new(registry: &Registry) -> Self {
-        let lane = |id| Lane {
-            id,
-            slot: Slot::new(registry.rig.cooldown),
-            attached_at: Stamp::default(),
-            is_announced_gone: false,
-        };
+        let cooldown = registry.rig.cooldown;
         Self {
-            lanes: registry.devices.iter().map(|device| lane(device.id)).collect(),
+            lanes: registry.devices.iter().map(|device| Lane::new(device.id, cooldown)).collect(),
             assigner: Assigner::new(registry),
             mask: PhysicalMask::EMPTY,
+            cooldown,
         }
     }
 
@@ -163,6 +169,7 @@ impl Core {
             }
             Input::Stream { .. } => {}
             Input::Restart(id) => self.apply(id, slot::Input::Restart, None, now, effects),
+            Input::Register(device) => self.register(&device, now, effects),
             Input::Timer => {
                 for index in 0..self.lanes.len() {
                     let due = |lane: &&Lane| lane.slot.deadline().is_some_and(|deadline| deadline <= now);
@@ -205,6 +212,22 @@ impl Core {
     /// When the newest device of this modality was attached.
     pub fn attached_at(&self, id: ModalityId) -> Stamp {
         self.lane(id).map(|lane| lane.attached_at).unwrap_or_default()
+    }
+
+    /// Every attached node, in the order in which they were attached.
+    pub fn nodes(&self) -> impl Iterator<Item = &Attachment> {
+        self.assigner.nodes()
+    }
+
+    fn register(&mut self, device: &DeviceSpec, now: Stamp, effects: &mut Vec<Effect>) {
+        if self.lane(device.id).is_some() {
+            return;
+        }
+        let at = self.lanes.partition_point(|lane| lane.id < device.id);
+        self.lanes.insert(at, Lane::new(device.id, self.cooldown));
+        for (id, attachment) in self.assigner.add(device) {
+            self.attach(id, attachment, now, effects);
+        }
     }
 
     fn added(&mut self, attachment: Attachment, now: Stamp, effects: &mut Vec<Effect>) {

@@ -20,8 +20,15 @@ mod worker;
 
 pub use owner::Rig;
 
+use std::sync::Arc;
+
+use tokio::sync::oneshot;
+
+use crate::bus::Writer;
+use crate::device::Attachment;
 use crate::hotplug::HotplugError;
 use crate::modality::ModalityId;
+use crate::registry::{DeviceSpec, Registry};
 use presence::PresenceError;
 
 /// Why the rig cannot continue.
@@ -36,8 +43,23 @@ pub enum RigError {
 }
 
 /// Commands to the rig.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug)]
 pub enum RigCommand {
     /// Start a failed device again.
     Restart(ModalityId),
+    /// Take over an added entry, whose topic is open and which the board has.
+    Register(Addition),
+    /// Answer with every attached node, registered or not, in the order in which they were attached.
+    Attached(oneshot::Sender<Vec<Attachment>>),
+}
+
+/// An entry that is added during a run, without a program, hooks or actions.
+#[derive(Debug)]
+pub struct Addition {
+    /// The entry.
+    pub device: Arc<DeviceSpec>,
+    /// The registry with it.
+    pub registry: Arc<Registry>,
+    /// The writer of its topic.
+    pub writer: Arc<Writer>,
 }

@@ -20,7 +20,7 @@ use super::programs::Programs;
 use super::slot::End;
 use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
 use super::worker::Seat;
-use super::{RigCommand, RigError};
+use super::{Addition, RigCommand, RigError};
 use crate::action::{ActuatorNotice, Arming};
 use crate::bus::{Bus, TopicId, Writer};
 use crate::device::Attachment;
@@ -30,9 +30,10 @@ use crate::inputs::tap::Tap;
 use crate::mask::SizedMask;
 use crate::modality::ModalityId;
 use crate::permission::Permission;
+use crate::registry::candidate::{Candidate, unregistered};
 use crate::registry::{DeviceSpec, Registry};
 use crate::sample::Epoch;
-use crate::status::{Board, EpisodeWatch, Level, SlotState, What};
+use crate::status::{Board, EpisodeWatch, Level, SlotState, UnregisteredDevice, What};
 use crate::time::Stamp;
 
 /// The JSON file is written this often, and at every change.
@@ -48,6 +49,8 @@ const EFFECTS: usize = 64;
 #[derive(Debug)]
 pub struct Rig {
     core: Core,
+    /// As of the last added entry.
+    registry: Arc<Registry>,
     /// Effects of the step in progress; reused, so that a step allocates nothing.
     effects: Vec<Effect>,
     modalities: Vec<Modality>,
@@ -55,6 +58,8 @@ pub struct Rig {
     board: Arc<Board>,
     /// The mask's JSON file must be written, once for all changes of one event.
     json_is_stale: bool,
+    /// Connected units without an entry must be reported, once nothing else is to be done.
+    units_are_stale: bool,
     streams: JoinSet<Ended>,
     /// The stream of each task.
     tasks: HashMap<Id, (ModalityId, Epoch)>,
@@ -101,32 +106,21 @@ impl Rig {
             let post = programs
                 .as_ref()
                 .map(|programs| Post::new(programs, &spec, prefix.clone(), seat.as_ref().map(Seat::turn)));
-            Some(Modality {
-                writer,
-                numbers: Arc::default(),
-                stop: CancellationToken::new(),
-                // A program that drives its device subscribes to actions itself.
-                controls: spec
-                    .action
-                    .as_ref()
-                    .filter(|_| seat.is_none())
-                    .and_then(|_| Some(Controls::new(bus.actions()?))),
-                taps: Arc::from([]),
-                arming: None,
-                seat,
-                post,
-                spec,
-                detail: String::new(),
-            })
+            // A program that drives its device subscribes to actions itself.
+            let is_driven = spec.action.is_some() && seat.is_none();
+            let controls = if is_driven { bus.actions().map(Controls::new) } else { None };
+            Some(Modality { seat, post, controls, ..Modality::new(spec, writer) })
         };
         Self {
             core: Core::new(registry),
+            registry: Arc::new(registry.clone()),
             effects: Vec::with_capacity(EFFECTS),
             // The bus was opened from the same registry: it has a writer for each modality.
             modalities: registry.devices.iter().filter_map(modality).collect(),
             presence,
             board,
             json_is_stale: false,
+            units_are_stale: false,
             streams: JoinSet::new(),
             tasks: HashMap::new(),
             reports: mpsc::channel(1).0,
@@ -206,16 +200,24 @@ impl Rig {
                     self.stream_ended(ended);
                 }
                 event = hotplug.next() => match event {
-                    Some(Ok(event)) => self.step(Input::Hotplug(event)),
+                    Some(Ok(event)) => {
+                        self.step(Input::Hotplug(event));
+                        self.units_are_stale = true;
+                    }
                     Some(Err(error)) => break Err(error.into()),
                     None => break Ok(()),
                 },
                 Some(reported) = reported.recv() => self.report(reported),
                 Some(command) = commands.recv() => match command {
                     RigCommand::Restart(id) => self.step(Input::Restart(id)),
+                    RigCommand::Register(addition) => self.register(addition),
+                    RigCommand::Attached(reply) => {
+                        let _ = reply.send(self.core.nodes().cloned().collect());
+                    }
                 },
                 () = sleep(deadline.since(Stamp::now())) => self.step(Input::Timer),
                 _ = json.tick() => self.json_is_stale = true,
+                () = std::future::ready(()), if self.units_are_stale => self.show_unregistered(),
                 // The mask that it describes is not published yet.
                 () = sleep(PERIOD), if self.json_is_stale => {}
             }
@@ -247,6 +249,29 @@ impl Rig {
             }
         }
         self.effects = effects;
+    }
+
+    /// Takes over an added entry, and attaches its device if that is plugged in.
+    fn register(&mut self, Addition { device, registry, writer }: Addition) {
+        let at = self.modalities.partition_point(|modality| modality.spec.id < device.id);
+        self.modalities.insert(at, Modality::new(Arc::clone(&device), writer));
+        self.registry = registry;
+        self.presence.set_devices(self.modalities.len());
+        self.json_is_stale = true;
+        self.step(Input::Register(device));
+        self.units_are_stale = true;
+    }
+
+    /// Reports connected units without an entry that a driver could read.
+    fn show_unregistered(&mut self) {
+        self.units_are_stale = false;
+        let attached: Vec<_> = self.core.nodes().cloned().collect();
+        let suggested = |unit: &Candidate| {
+            let name = unit.suggested_name(Some(&self.registry));
+            Some(UnregisteredDevice { device: unit.describe(), node: unit.guess()?.to_owned(), name })
+        };
+        let units = unregistered(Some(&self.registry), &attached);
+        self.board.set_unregistered(units.iter().filter_map(suggested).collect());
     }
 
     fn carry_out(&mut self, id: ModalityId, effect: DeviceEffect) {
@@ -435,6 +460,22 @@ impl Rig {
 }
 
 impl Modality {
+    /// Without a program, hooks or actions.
+    fn new(spec: Arc<DeviceSpec>, writer: Arc<Writer>) -> Self {
+        Self {
+            spec,
+            writer,
+            numbers: Arc::default(),
+            stop: CancellationToken::new(),
+            seat: None,
+            post: None,
+            controls: None,
+            taps: Arc::from([]),
+            arming: None,
+            detail: String::new(),
+        }
+    }
+
     /// The stream has ended, or was asked to. The actuator's last report no longer holds: nothing is sent to it until
     /// the next arm.
     fn disarm(&mut self, board: &Board, is_problem: bool) {

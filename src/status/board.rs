@@ -15,10 +15,10 @@ use tokio::sync::broadcast;
 
 use super::detail::{DeviceDetail, Intervals, StaticDetail};
 use super::preview::{LOOKED_AT, Preview};
-use super::session::SessionStatus;
+use super::session::{Answered, SessionStatus};
 use super::{
     DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance, RecordingStatus, SlotState,
-    Snapshot, StopStatus, Verdict, What,
+    Snapshot, StopStatus, UnregisteredDevice, Verdict, What,
 };
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
@@ -147,7 +147,10 @@ struct SlotStatus {
 pub struct Board {
     rig: String,
     started: Stamp,
-    entries: Vec<Entry>,
+    /// Ascending by bit.
+    entries: Mutex<Vec<Entry>>,
+    unregistered: Mutex<Vec<UnregisteredDevice>>,
+    registry_answer: Mutex<Option<Answered>>,
     counters: Vec<StreamCounters>,
     slots: Mutex<Vec<SlotStatus>>,
     mask: AtomicU64,
@@ -202,7 +205,9 @@ impl Board {
         Self {
             rig: registry.rig.name.clone(),
             started: Stamp::now(),
-            entries: registry.devices.iter().map(Entry::of).collect(),
+            entries: Mutex::new(registry.devices.iter().map(Entry::of).collect()),
+            unregistered: Mutex::new(Vec::new()),
+            registry_answer: Mutex::new(None),
             counters,
             slots: Mutex::new(vec![SlotStatus::default(); MAX_MODALITIES]),
             mask: AtomicU64::new(0),
@@ -228,6 +233,26 @@ impl Board {
     /// The counters of a stream.
     pub fn counters(&self, id: ModalityId) -> &StreamCounters {
         &self.counters[id.index()]
+    }
+
+    /// Adds an entry, whose bit no other has.
+    pub fn add(&self, device: &DeviceSpec) {
+        let mut entries = lock(&self.entries);
+        let at = entries.partition_point(|entry| entry.id < device.id);
+        entries.insert(at, Entry::of(device));
+    }
+
+    /// Reports connected units that no entry matches.
+    pub fn set_unregistered(&self, mut units: Vec<UnregisteredDevice>) {
+        for unit in &mut units {
+            unit.device = text::plain(&unit.device).into_owned();
+        }
+        *lock(&self.unregistered) = units;
+    }
+
+    /// Reports the answer to a request about the registry.
+    pub fn set_registry_answer(&self, answer: Answered) {
+        *lock(&self.registry_answer) = Some(answer);
     }
 
     /// Reports the state of a slot.
@@ -308,16 +333,16 @@ impl Board {
 
     /// Adds a line to the log, now. The device that it is about is the one with which it begins.
     pub fn log(&self, level: Level, text: &str) {
-        self.add(level, text, (self.device_in(text), None));
+        self.write(level, text, (self.device_in(text).as_deref(), None));
     }
 
-    fn device_in(&self, text: &str) -> Option<&str> {
+    fn device_in(&self, text: &str) -> Option<String> {
         let begins = |name: &str| text.strip_prefix(name).is_some_and(|rest| rest.starts_with([':', ' ', ',']));
-        self.entries.iter().map(|entry| entry.name.as_str()).find(|name| begins(name))
+        lock(&self.entries).iter().map(|entry| &entry.name).find(|name| begins(name)).cloned()
     }
 
     /// Without characters from a device that could move a terminal's cursor.
-    fn add(&self, level: Level, text: &str, (device, printed): (Option<&str>, Option<PrintedOn>)) {
+    fn write(&self, level: Level, text: &str, (device, printed): (Option<&str>, Option<PrintedOn>)) {
         let (text, device) = (text::plain(text).into_owned(), device.map(str::to_owned));
         let mut log = lock(&self.log);
         let line = LogLine { number: log.added, wall_ns: realtime_ns(), level, device, printed, text };
@@ -332,7 +357,8 @@ impl Board {
     pub fn announce(&self, what: What) {
         if let Some((level, text)) = what.log_line() {
             let (device, printed) = what.source();
-            self.add(level, &text, (device.or_else(|| self.device_in(&text)), printed));
+            let named = if device.is_none() { self.device_in(&text) } else { None };
+            self.write(level, &text, (device.or(named.as_deref()), printed));
         }
         if let What::Episode { file, seconds, error, verdict, .. } = &what {
             let (file, error, verdict) = (file.clone(), error.clone(), verdict.clone());
@@ -395,7 +421,8 @@ impl Board {
 
     /// Of the devices that are looked at.
     fn details(&self, now: Stamp) -> Vec<DeviceDetail> {
-        let looked_at = self.entries.iter().filter(|entry| self.is_looked_at(entry.id, now));
+        let entries = lock(&self.entries);
+        let looked_at = entries.iter().filter(|entry| self.is_looked_at(entry.id, now));
         let detail = |entry: &Entry| {
             let opened = lock(&self.opened);
             let opened = opened.get(entry.id.index()).and_then(Option::as_ref);
@@ -415,7 +442,7 @@ impl Board {
     pub fn snapshot(&self) -> Snapshot {
         let taken = Stamp::now();
         let slots = lock(&self.slots).clone();
-        let devices = self.entries.iter().map(|Entry { id, name, topic, nominal_hz, .. }| {
+        let device = |Entry { id, name, topic, nominal_hz, .. }: &Entry| {
             let counters = &self.counters[id.index()];
             let slot = &slots[id.index()];
             let newest = counters.newest.load(Ordering::Relaxed);
@@ -432,7 +459,8 @@ impl Board {
                 bytes: counters.bytes.load(Ordering::Relaxed),
                 newest: (newest > 0).then_some(Stamp(newest)),
             }
-        });
+        };
+        let devices = lock(&self.entries).iter().map(device).collect();
         let (last_episode, last_verdict) = lock(&self.last_episode).clone().unzip();
         Snapshot {
             rig: self.rig.clone(),
@@ -440,7 +468,9 @@ impl Board {
             uptime: taken.since(self.started),
             mask: self.mask(),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
-            devices: devices.collect(),
+            devices,
+            unregistered: lock(&self.unregistered).clone(),
+            registry_answer: lock(&self.registry_answer).clone(),
             stops: self.stops(),
             recording: lock(&self.recording).clone(),
             not_started: lock(&self.not_started).clone(),

@@ -52,6 +52,8 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         mask,
         mask_sequence: 377_000,
         devices,
+        unregistered: Vec::new(),
+        registry_answer: None,
         stops: Vec::new(),
         recording: None,
         not_started: None,

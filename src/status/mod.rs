@@ -30,7 +30,7 @@ use crate::time::Stamp;
 
 use detail::DeviceDetail;
 use preview::Preview;
-use session::{SessionRequest, SessionStatus};
+use session::{Answered, SessionRequest, SessionStatus};
 
 pub use board::{Board, EpisodeCounts, EpisodeEnd};
 pub use event::Description;
@@ -114,6 +114,17 @@ pub struct DeviceStatus {
     pub bytes: u64,
     /// Capture time of the newest sample.
     pub newest: Option<Stamp>,
+}
+
+/// A connected unit that no entry matches and that a driver could read.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct UnregisteredDevice {
+    /// The unit for people, unique among connected units: model, port, serial number, product.
+    pub device: String,
+    /// The value of `node` in an entry that would read it: `camera`, `serial`, `can` or `lan`.
+    pub node: String,
+    /// A name for its entry, if the unit suggests one.
+    pub name: Option<String>,
 }
 
 /// The recording in progress.
@@ -234,6 +245,10 @@ pub struct Snapshot {
     pub mask_sequence: u64,
     /// One per modality, ascending by bit.
     pub devices: Vec<DeviceStatus>,
+    /// Connected units that no entry matches.
+    pub unregistered: Vec<UnregisteredDevice>,
+    /// The last answer to a [`RegistryRequest`].
+    pub registry_answer: Option<Answered>,
     /// Emergency stops and enabling switches, in the order of the registry.
     pub stops: Vec<StopStatus>,
     /// The recording in progress.
@@ -262,12 +277,36 @@ pub struct Snapshot {
     pub previews: Vec<Arc<Preview>>,
 }
 
+/// A request about the registry of a run. As JSON: `{"do":"reload"}`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "do", rename_all = "snake_case", deny_unknown_fields)]
+pub enum RegistryRequest {
+    /// Read `devices.toml` again and take over what can be taken over without a restart.
+    Reload,
+    /// Add an entry for a connected unit to `devices.toml`, then do the same.
+    Register {
+        /// [`UnregisteredDevice::device`].
+        device: String,
+        /// The name of the entry.
+        name: String,
+    },
+}
+
 /// A request from a screen.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "request", content = "of", rename_all = "snake_case")]
 pub enum Command {
     /// A request to the session.
     Session(SessionRequest),
+    /// [`RegistryRequest::Reload`]; the answer is [`Snapshot::registry_answer`].
+    Reload,
+    /// [`RegistryRequest::Register`]; the answer is [`Snapshot::registry_answer`].
+    Register {
+        /// [`UnregisteredDevice::device`].
+        device: String,
+        /// The name of the entry.
+        name: String,
+    },
     /// Start a failed device again.
     Restart(ModalityId),
     /// Unplug this simulated device, or plug it in again.

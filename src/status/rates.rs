@@ -144,6 +144,8 @@ mod tests {
             stops: Vec::new(),
             details: Vec::new(),
             previews: Vec::new(),
+            unregistered: Vec::new(),
+            registry_answer: None,
             devices: vec![DeviceStatus {
                 name: "cam".to_owned(),
                 id: id(),

@@ -7,7 +7,7 @@
 //! Invariant: pure: no clock, no input or output; the caller passes the time.
 //! Invariant: the result depends on which samples are in the rings, never on the order or the
 //! moments in which they were pushed.
-//! Invariant: nothing here allocates after construction.
+//! Invariant: nothing here allocates after construction, except for a modality that is added.
 
 mod grid;
 #[cfg(test)]
@@ -90,15 +90,25 @@ impl<T> Synchronizer<T> {
             let lane = &mut lane_of[modality.id.index()];
             if lane.is_none() {
                 *lane = Some(lanes.len());
-                lanes.push(Lane {
-                    when_stale: modality.when_stale,
-                    latency_ns: nanoseconds(modality.latency),
-                    ring: Ring::new(modality.capacity),
-                });
+                lanes.push(Lane::new(modality));
                 ids.push(modality.id);
             }
         }
         Self { window_ns: nanoseconds(window), lanes, lane_of, observation: Observation::new(&ids) }
+    }
+
+    /// Adds a modality, without samples, before the first with a higher bit; one that is there already stays as it is.
+    pub fn add(&mut self, modality: &SyncModality) {
+        if self.lane_of[modality.id.index()].is_some() {
+            return;
+        }
+        let slots = &mut self.observation.slots;
+        let at = slots.iter().position(|slot| slot.id > modality.id).unwrap_or(slots.len());
+        slots.insert(at, ObservationSlot::empty(modality.id));
+        self.lanes.insert(at, Lane::new(modality));
+        for (lane, slot) in slots.iter().enumerate() {
+            self.lane_of[slot.id.index()] = Some(lane);
+        }
     }
 
     /// Keeps a sample of a modality; the oldest one pushed makes room. Samples of a modality that
@@ -144,6 +154,14 @@ impl<T> Synchronizer<T> {
 }
 
 impl<T> Lane<T> {
+    fn new(modality: &SyncModality) -> Self {
+        Self {
+            when_stale: modality.when_stale,
+            latency_ns: nanoseconds(modality.latency),
+            ring: Ring::new(modality.capacity),
+        }
+    }
+
     fn choose(&self, tick: Stamp, now: Stamp, window_ns: u64, slot: &mut ObservationSlot) {
         // The moment a sample stands for.
         let shown = |s: &SyncSample<T>| Stamp(s.capture.0.saturating_sub(self.latency_ns));

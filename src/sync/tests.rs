@@ -33,6 +33,22 @@ fn check(when_stale: WhenStale, samples: &[SyncSample<()>], tick_ms: u64, now_ms
 }
 
 #[test]
+fn an_added_modality_is_in_the_order_of_bits_and_changes_no_other() {
+    let mut sync =
+        Synchronizer::new(&[modality(1, WhenStale::Hold), modality(5, WhenStale::Hold)], Duration::from_millis(25));
+    sync.push(id(1), sample(100, 101, 7, 1));
+    sync.push(id(5), sample(100, 101, 8, 1));
+    sync.push(id(3), sample(100, 101, 9, 1));
+    for bit in [3, 9, 0, 3] {
+        sync.add(&modality(bit, WhenStale::Hold));
+    }
+    sync.push(id(9), sample(101, 101, 4, 1));
+    let seen = sync.observe(Stamp(100 * MS), Stamp(110 * MS), PhysicalMask(u64::MAX));
+    let slots: Vec<_> = seen.slots.iter().map(|slot| (slot.id.bit(), slot.seq)).collect();
+    assert_eq!(slots, [(0, None), (1, Some(7)), (3, None), (5, Some(8)), (9, Some(4))]);
+}
+
+#[test]
 fn each_rule_decides_as_written() {
     use WhenStale::{Hold, Zero};
     let near = [sample(90, 95, 1, 1), sample(105, 110, 2, 1), sample(140, 150, 3, 1)];

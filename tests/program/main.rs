@@ -34,6 +34,7 @@ mod provenance;
 mod publishers;
 mod python;
 mod register;
+mod reload;
 mod scenarios;
 mod second_run;
 mod session;

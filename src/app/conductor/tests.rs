@@ -91,6 +91,7 @@ impl Bench {
             discovery: idle_stage(),
             recording: idle_stage(),
             synchronisation: idle_stage(),
+            reload: idle_stage(),
             streaming: Streaming {
                 stage: idle_stage(),
                 ending: CancellationToken::new(),

@@ -4,13 +4,14 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::units::{Candidate, suggested};
 use super::{Dialogue, Format, RegisterError, listen};
 use crate::cli::RegisterArgs;
 use crate::device::{DeviceNode, UsbIdentity};
 use crate::driver::camera::query;
+use crate::registration::settings::suggested;
+use crate::registry::candidate::Candidate;
 use crate::registry::edit::Setting;
-use crate::registry::{Mount, Registry, like_a_name, name_problem};
+use crate::registry::{Mount, Registry, name_problem};
 use crate::text;
 
 /// A unit that could be registered, as JSON.
@@ -95,25 +96,9 @@ pub(super) fn choose(
 
 /// A unit on a line.
 fn line(unit: &Candidate) -> String {
-    let usb = &unit.usb;
     let nodes: Vec<String> = unit.nodes.iter().map(|node| node.node.label()).collect();
-    let serial = usb.serial.as_ref().map_or("no serial".to_owned(), |serial| format!("serial {serial:?}"));
-    let product = usb.product.as_deref().unwrap_or("(no product name)");
     let what = unit.guess().unwrap_or("needs a program");
-    let line = format!(
-        "{:04x}:{:04x}  port {}  {serial}  {product}  {what} at {}",
-        usb.vid,
-        usb.pid,
-        usb.port,
-        nodes.join(", ")
-    );
-    text::plain(&line).into_owned()
-}
-
-pub(super) fn comments(unit: Option<&Candidate>) -> Vec<String> {
-    let product =
-        unit.and_then(|unit| unit.usb.product.as_deref()).map(|product| text::plain(product).trim().to_owned());
-    product.filter(|product| !product.is_empty()).into_iter().collect()
+    text::plain(&format!("{}  {what} at {}", unit.describe(), nodes.join(", "))).into_owned()
 }
 
 pub(super) fn name(
@@ -126,9 +111,7 @@ pub(super) fn name(
         return args.name.clone().ok_or_else(|| RegisterError::Missing(vec!["--name"]));
     };
     let is_taken = |name: &str| registry.is_some_and(|registry| registry.named(name).is_some());
-    let product = unit.and_then(|unit| unit.usb.product.as_deref());
-    let suggestion = product.and_then(like_a_name).map(|name| name.trim_end_matches('_').to_owned());
-    let suggestion = suggestion.filter(|name| !is_taken(name) && name.len() <= 24);
+    let suggestion = unit.and_then(|unit| unit.suggested_name(registry));
     talk.ask("Name (used by policies, recordings and the monitor)", suggestion.as_deref(), |answer| match name_problem(
         answer,
     ) {
@@ -234,10 +217,4 @@ pub(super) async fn settings(
     }
     let camera = if let DeviceNode::Video(path) = &attachment.node { query(path).ok() } else { None };
     Ok(suggested(&attachment.node, camera.as_ref()))
-}
-
-/// The lowest unused bit.
-pub(super) fn free_bit(registry: Option<&Registry>, besides: &[u8]) -> Option<u8> {
-    let devices = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
-    (0..64).find(|bit| !besides.contains(bit) && !devices.iter().any(|device| device.id.bit() == *bit))
 }

@@ -5,11 +5,11 @@
 
 use std::path::Path;
 
-use super::Target;
-use super::fields::free_bit;
-use super::units::{kind, suggested};
 use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::driver::camera::query;
+use crate::registration::settings::suggested;
+use crate::registration::{Target, free_bit};
+use crate::registry::candidate::kind;
 use crate::registry::edit::{NewEntry, Setting};
 use crate::registry::import::{Foreign, devices, layout};
 use crate::registry::{RegistryErrors, like_a_name, name_problem, read_file};

@@ -7,26 +7,26 @@
 
 mod fields;
 mod import;
-pub mod units;
 
 use std::io::{self, BufRead, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use serde::Serialize;
 use tokio::time::{Instant, timeout_at};
 
-use self::fields::{Selection, choose, comments, free_bit, identity, name, node, settings, slot};
-use self::units::{lines_look_like, unregistered};
+use self::fields::{Selection, choose, identity, name, node, settings, slot};
 use super::artifacts::ArtifactsError;
 use super::{Format, artifacts};
 use crate::cli::{RegisterArgs, UnregisterArgs};
 use crate::device::{Attachment, DeviceNode};
 use crate::driver::serial::Serial;
 use crate::driver::{Driver, DriverError};
-use crate::folder::{Folder, FolderError, Links, Missing, Sync};
+use crate::registration::settings::lines_look_like;
+use crate::registration::{Target, WriteError, comments, free_bit};
+use crate::registry::candidate::unregistered;
 use crate::registry::edit::{self, EditError, NewEntry, Setting};
-use crate::registry::{DeviceSpec, Framing, Loaded, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec, read_file};
+use crate::registry::{DeviceSpec, Framing, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec};
 use crate::sample::Encoding;
 use crate::text;
 
@@ -61,20 +61,9 @@ pub enum RegisterError {
         /// Which entries, and their bits.
         moved: String,
     },
-    /// Another program changed the file meanwhile.
-    #[error("{}: it has changed since it was read; nothing was written: run the command again", .0.display())]
-    Changed(PathBuf),
-    /// The file cannot be read or written.
-    #[error("{}: {error}", path.display())]
-    File {
-        /// Which.
-        path: PathBuf,
-        /// Why.
-        error: io::Error,
-    },
-    /// The folder of the file cannot be used.
+    /// The file cannot be written.
     #[error(transparent)]
-    Folder(#[from] FolderError),
+    Write(#[from] WriteError),
     /// The registry is written, its artifacts are not.
     #[error("the registry is written, its artifacts are not: {0}")]
     Artifacts(#[from] ArtifactsError),
@@ -89,10 +78,7 @@ pub enum RegisterError {
 impl RegisterError {
     /// Whether the arguments are at fault.
     pub const fn is_bad_argument(&self) -> bool {
-        !matches!(
-            self,
-            Self::Ended | Self::Changed(_) | Self::File { .. } | Self::Folder(_) | Self::Artifacts(_) | Self::Output(_)
-        )
+        !matches!(self, Self::Ended | Self::Write(_) | Self::Artifacts(_) | Self::Output(_))
     }
 }
 
@@ -183,7 +169,7 @@ pub fn unregister(
     }
     let mut written_files = Vec::new();
     if !args.dry_run {
-        target.write(&new, &left, &mut written_files)?;
+        write(target, &new, &left, &mut written_files)?;
     }
     match format {
         Format::Json => {
@@ -226,11 +212,12 @@ fn commit(
     }
     let mut written_files = Vec::new();
     if !args.dry_run {
-        target.write(&new, &parsed.registry, &mut written_files)?;
+        write(target, &new, &parsed.registry, &mut written_files)?;
     }
     if format == Format::Text {
         out.write_all(&written_files)?;
         if !args.dry_run {
+            writeln!(out, "a running rapid takes it over: rapid reload")?;
             writeln!(out, "for stable device names, install the udev rules: rapid artifacts --help")?;
         }
         return Ok(());
@@ -318,81 +305,11 @@ impl Dialogue<'_> {
     }
 }
 
-/// The first lines of a new `devices.toml`.
-const FIRST_LINES: &str = "\
-# The devices of this rig, declared here and nowhere else. `rapid check` lists mistakes, `rapid artifacts`
-# writes the udev rules.
-";
-
-/// The registry to be changed.
-#[derive(Debug)]
-pub struct Target {
-    /// The file.
-    pub path: PathBuf,
-    /// Its text; empty if it does not exist yet.
-    pub text: String,
-    /// The parsed text; `None` while no device is registered.
-    pub registry: Option<Registry>,
-}
-
-impl Target {
-    /// Reads the file at `path`, which may be missing: it is created later.
-    ///
-    /// # Errors
-    /// When it cannot be read or is already invalid.
-    pub fn read(path: PathBuf) -> Result<Self, RegistryErrors> {
-        if !path.exists() {
-            return Ok(Self { path, text: String::new(), registry: None });
-        }
-        let text = read_file(&path, "name another with --config FILE")?;
-        let registry = match Registry::parse(&text, Some(&path)) {
-            Ok(loaded) => Some(loaded.registry),
-            // It has settings for all devices, and no device yet.
-            Err(_) if edit::has_no_entries(&text) => None,
-            Err(wrong) => return Err(wrong),
-        };
-        Ok(Self { path, text, registry })
-    }
-
-    /// The text that a new entry is added to.
-    fn base(&self) -> String {
-        if self.text.is_empty() { FIRST_LINES.to_owned() } else { edit::renamed(&self.text) }
-    }
-
-    /// Parses `new` as the text of the file.
-    fn parse(&self, new: &str) -> Result<Loaded, RegistryErrors> {
-        Registry::parse(new, Some(&self.path))
-    }
-
-    /// Writes this text to the file, and the artifacts beside it.
-    fn write(&self, new: &str, registry: &Registry, out: &mut dyn Write) -> Result<(), RegisterError> {
-        let io = |error| RegisterError::File { path: self.path.clone(), error };
-        // A symbolic link to the file is kept.
-        let path = if self.path.exists() { self.path.canonicalize().map_err(io)? } else { self.path.clone() };
-        let parent = path.parent().filter(|parent| *parent != Path::new("")).unwrap_or(Path::new("."));
-        let name = path.file_name().unwrap_or_default();
-        let folder = Folder::open(parent, Links::Own, Missing::Last)?;
-        let (mode, owner) = match folder.open_file(name).and_then(|file| file.metadata()) {
-            Ok(found) => {
-                use std::os::unix::fs::MetadataExt;
-                (found.mode() & 0o777, Some((found.uid(), found.gid())))
-            }
-            Err(_) => (0o644, None),
-        };
-        let now = if owner.is_some() { std::fs::read_to_string(&path).map_err(io)? } else { String::new() };
-        if now != self.text {
-            return Err(RegisterError::Changed(self.path.clone()));
-        }
-        folder.replace(name, new.as_bytes(), mode, Sync::Wait).map_err(io)?;
-        if let Some((user, group)) = owner.filter(|_| rustix::process::geteuid().is_root()) {
-            // A user's file keeps its owner when root changes it.
-            let (user, group) = (rustix::fs::Uid::from_raw(user), rustix::fs::Gid::from_raw(group));
-            let flags = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
-            rustix::fs::chownat(folder.descriptor(), name, Some(user), Some(group), flags).map_err(|e| io(e.into()))?;
-        }
-        writeln!(out, "wrote {}", self.path.display())?;
-        Ok(artifacts::write(registry, &parent.join("udev"), out)?)
-    }
+/// Writes this text to the file, and the artifacts beside it.
+fn write(target: &Target, new: &str, registry: &Registry, out: &mut dyn Write) -> Result<(), RegisterError> {
+    let parent = target.write(new)?;
+    writeln!(out, "wrote {}", target.path.display())?;
+    Ok(artifacts::write(registry, &parent.join("udev"), out)?)
 }
 
 /// How long a device is read.

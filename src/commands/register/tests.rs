@@ -163,7 +163,7 @@ fn a_file_that_changed_meanwhile_is_not_overwritten() {
     std::fs::write(&target.path, &other).unwrap();
     let args = UnregisterArgs { name: "motor_state".into(), yes: true, dry_run: false };
     let error = unregister(&target, &args, None, Format::Text, &mut Vec::new()).unwrap_err();
-    assert!(matches!(error, RegisterError::Changed(_)), "{error}");
+    assert!(matches!(error, RegisterError::Write(WriteError::Changed(_))), "{error}");
     assert_eq!(bench.text(), other);
 }
 

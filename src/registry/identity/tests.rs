@@ -115,6 +115,25 @@ fn an_unknown_unit_of_a_known_model_names_the_difference() {
 }
 
 #[test]
+fn an_added_entry_gets_the_unit_that_is_plugged_in_and_takes_none_from_others() {
+    let mut assigner = Assigner::new(&registry());
+    let (known, spare, other) = (unit(1, Some("A"), "1-1"), unit(7, Some("S"), "1-2"), unit(7, Some("T"), "1-3"));
+    assert_eq!(assigner.attach(&video(0, known.clone())), entry(0));
+    for (number, unit) in [(1, &spare), (2, &spare), (3, &other)] {
+        assert!(matches!(assigner.attach(&video(number, unit.clone())), Assignment::Unregistered { .. }));
+    }
+    let text = "[device.new]\nvid = \"0007\"\npid = \"0007\"\nserial = \"S\"\nnode = \"camera\"\nbit = 9\n";
+    let added = Registry::parse(text, None).unwrap().registry;
+    assert_eq!(assigner.add(&added.devices[0]), [(id(9), video(1, spare.clone()))]);
+    assert_eq!(assigner.attached_as(id(0)), Some(&video(0, known)));
+    // Its second node waits, and takes its place when the first is gone.
+    assert_eq!(assigner.nodes().count(), 4);
+    let first = video(1, spare.clone()).syspath;
+    assert_eq!(assigner.detach(&first), Detached { freed: vec![id(9)], assigned: vec![(id(9), video(2, spare))] });
+    assert_eq!(assigner.detach(&device_path("1-3")), Detached::default());
+}
+
+#[test]
 fn a_device_in_a_new_port_waits_until_its_old_port_is_seen_empty() {
     let mut assigner = Assigner::new(&registry());
     assert_eq!(assigner.attach(&video(0, unit(1, Some("A"), "1-2"))), entry(0));

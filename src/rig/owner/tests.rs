@@ -86,6 +86,8 @@ enum Step {
     Until(&'static str),
     /// The mask that other processes read becomes this.
     Mask(u64),
+    /// The units without an entry on the board become those at these ports.
+    Unregistered(&'static [&'static str]),
     /// A network adapter is reported as attached; its carrier is in a file of this folder.
     Adapter(PathBuf),
     /// Receives events until a logged one contains this.
@@ -93,12 +95,13 @@ enum Step {
     /// The adapter's link comes up after this delay.
     Link(PathBuf, Duration),
 }
-use Step::{Adapter, Give, Link, Logged, Mask, Plug, Pull, Removed, Restart, Resume, Silence, Until};
+use Step::{Adapter, Give, Link, Logged, Mask, Plug, Pull, Removed, Restart, Resume, Silence, Unregistered, Until};
 
 struct Bench {
     hotplug: UnboundedSender<Result<HotplugEvent, HotplugError>>,
     commands: mpsc::Sender<RigCommand>,
     permission: Arc<Permission>,
+    board: Arc<Board>,
     events: broadcast::Receiver<Event>,
     units: HashMap<&'static str, Arc<SimDevice>>,
     path: PathBuf,
@@ -150,6 +153,21 @@ impl Bench {
                     return;
                 }
             },
+            Unregistered(ports) => {
+                let begun = Instant::now();
+                loop {
+                    let units = self.board.snapshot().unregistered;
+                    let is_at = |(unit, port): (&crate::status::UnregisteredDevice, &&str)| {
+                        unit.device == format!("0001:0002  port {port}  no serial  (no product name)")
+                            && (unit.node.as_str(), unit.name.is_none()) == ("serial", true)
+                    };
+                    if units.len() == ports.len() && units.iter().zip(*ports).all(is_at) {
+                        return;
+                    }
+                    assert!(begun.elapsed() < PATIENCE, "{units:?} instead of {ports:?}");
+                    sleep(Duration::from_millis(1)).await;
+                }
+            }
             Adapter(folder) => {
                 let usb = UsbIdentity { vid: 1, pid: 2, port: "1".into(), ..UsbIdentity::default() };
                 self.notify(HotplugEvent::Added(Attachment {
@@ -219,6 +237,7 @@ async fn reported_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<Stri
         hotplug,
         commands,
         permission,
+        board: Arc::clone(&board),
         events: board.events(),
         units: HashMap::new(),
         path,
@@ -348,6 +367,24 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn units_without_an_entry_are_on_the_board_while_they_are_plugged_in() {
+    let steps = [
+        Plug("1", CHANNELS),
+        Plug("2", CHANNELS),
+        Unregistered(&[]),
+        Plug("3", CHANNELS),
+        Plug("4", CHANNELS),
+        Unregistered(&["3", "4"]),
+        Removed("3", UnplugSource::Kernel),
+        Unregistered(&["4"]),
+        // The other takes the entry that is free.
+        Removed("1", UnplugSource::Kernel),
+        Unregistered(&[]),
+    ];
+    reported(Duration::ZERO, Duration::MAX, &steps).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn devices_are_notified_of_the_episode_in_progress() {
     let name = format!("ownere{}", std::process::id());
     let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
@@ -363,7 +400,8 @@ async fn devices_are_notified_of_the_episode_in_progress() {
     let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(episode);
     let permission = Arc::default();
     let events = board.events();
-    let mut bench = Bench { hotplug, commands, permission, events, units: HashMap::new(), path, reported: Vec::new() };
+    let mut bench =
+        Bench { hotplug, commands, permission, board, events, units: HashMap::new(), path, reported: Vec::new() };
     let running = tokio::spawn({
         let stop = stop.clone();
         async move { rig.run(Box::pin(plugged), asked, stop).await }

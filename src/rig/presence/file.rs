@@ -133,6 +133,15 @@ impl MaskFile {
         &self.path
     }
 
+    pub(super) const fn device_count(&self) -> u8 {
+        self.record.device_count
+    }
+
+    /// From the next publication on.
+    pub(super) const fn set_device_count(&mut self, device_count: u8) {
+        self.record.device_count = device_count;
+    }
+
     /// Whether the path still leads to our file.
     fn is_there(&self) -> bool {
         let (Ok(ours), Ok(named)) = (self.file.metadata(), std::fs::symlink_metadata(&self.path)) else { return false };

@@ -12,7 +12,7 @@ mod json;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -49,9 +49,11 @@ pub struct Presence {
     json_failed: AtomicBool,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Shared {
     mask: AtomicU64,
+    /// Number of registered modalities.
+    devices: AtomicU8,
     stop: AtomicBool,
 }
 
@@ -79,7 +81,8 @@ impl Presence {
     /// When the thread cannot be started.
     pub fn start(claim: Claim, writer: Arc<Writer>, board: Arc<Board>) -> Result<Self, PresenceError> {
         let Claim { path, file } = claim;
-        let shared = Arc::new(Shared::default());
+        let devices = AtomicU8::new(file.device_count());
+        let shared = Arc::new(Shared { mask: AtomicU64::new(0), devices, stop: AtomicBool::new(false) });
         let ended = CancellationToken::new();
         let heartbeat =
             Heartbeat { _ended: ended.clone().drop_guard(), shared: Arc::clone(&shared), file, writer, board };
@@ -109,6 +112,11 @@ impl Presence {
         if let Some(thread) = &self.thread {
             thread.thread().unpark();
         }
+    }
+
+    /// From the next publication on the mask is one of so many devices, at most 64. Does not wait.
+    pub fn set_devices(&self, devices: usize) {
+        self.shared.devices.store(u8::try_from(devices).unwrap_or(u8::MAX), Ordering::Release);
     }
 
     /// Writes the whole JSON file, with the sequence of the last publication if that was of `mask`; `false` if `mask`
@@ -223,6 +231,7 @@ impl Heartbeat {
     }
 
     fn publish(&mut self, mask: PhysicalMask, now: Stamp) -> Result<(), String> {
+        self.file.set_device_count(self.shared.devices.load(Ordering::Acquire));
         let sequence = self.file.publish(mask, realtime_ns()).map_err(|error| error.to_string())?;
         self.board.set_mask(mask, sequence);
         let header = SampleHeader {

@@ -1,0 +1,175 @@
+//! Stage registry: takes over entries that are added to `devices.toml` during a run.
+//!
+//! 1. The file is read and compared with the registry of the run ([`Difference`]); whatever else differs refuses it all.
+//! 2. The topics are opened, their memory is reserved, and recorder and synchronisation subscribe: no sample is missed.
+//! 3. The board, the recorder, the synchronisation and the rig get the entries, in this order. The rig attaches devices
+//!    that are plugged in already.
+//!
+//! A policy and the interlocks keep the registry that they were started with.
+//!
+//! Invariant: a request that is refused changes nothing of the run.
+//! Invariant: whatever blocks is done where blocking is allowed; mask, rig, streams and recorder wait for none of it.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::spawn_blocking;
+
+use super::requests::Reply;
+use super::stage::Stage;
+use crate::bus::{BusError, Extension, Membership, Subscription};
+use crate::record::RecorderAddition;
+use crate::registration;
+use crate::registry::{DeviceSpec, Difference, Registry};
+use crate::rig::{Addition, RigCommand};
+use crate::status::session::Answered;
+use crate::status::{Board, Level, RegistryRequest, What};
+use crate::time::Stamp;
+
+/// The answer when the rest of the run is gone.
+const ENDING: &str = "the run is ending";
+const UNCHANGED: &str = "nothing was changed";
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Reload {
+    /// The registry as the run has it: with what the command line changed in it, and with added entries.
+    pub(super) registry: Arc<Registry>,
+    pub(super) bus: Membership,
+    pub(super) board: Arc<Board>,
+    pub(super) rig: mpsc::Sender<RigCommand>,
+    pub(super) recorder: std::sync::mpsc::Sender<RecorderAddition>,
+    pub(super) alignment: mpsc::UnboundedSender<(Arc<DeviceSpec>, Subscription)>,
+    /// Topics of added entries.
+    pub(super) topics: Vec<Extension>,
+}
+
+/// An added entry whose topic is open.
+struct Opened {
+    device: Arc<DeviceSpec>,
+    topic: Extension,
+    recorder: Subscription,
+    alignment: Subscription,
+}
+
+impl Reload {
+    /// Starts the stage. It must end after all that use the topics, and before the bus is dropped.
+    pub(super) fn start(mut self, mut requests: mpsc::UnboundedReceiver<(RegistryRequest, Reply)>) -> Stage {
+        Stage::start("the registry", |stop| async move {
+            loop {
+                let (request, reply) = tokio::select! {
+                    biased;
+                    () = stop.cancelled() => return Ok(()),
+                    Some(request) = requests.recv() => request,
+                };
+                let answer = async {
+                    match request {
+                        RegistryRequest::Reload => self.reload().await,
+                        RegistryRequest::Register { device, name } => self.register(device, name).await,
+                    }
+                };
+                let answer = tokio::select! {
+                    biased;
+                    // A file that cannot be read at the moment does not hold up the end of the run.
+                    () = stop.cancelled() => return Ok(()),
+                    answer = answer => answer,
+                };
+                self.show(&answer);
+                // The requester may have ended.
+                let _ = reply.map(|reply| reply.send(answer));
+            }
+        })
+    }
+
+    fn show(&self, answer: &Result<String, String>) {
+        let (Ok(text) | Err(text)) = answer;
+        let text = text.lines().map(str::trim).collect::<Vec<_>>().join("; ");
+        if answer.is_err() {
+            self.board.announce(What::Log { level: Level::Warn, text: text.clone() });
+        }
+        self.board.set_registry_answer(Answered { at: Stamp::now(), text, refused: answer.is_err() });
+    }
+
+    /// Adds an entry for a connected unit to the file, and takes it over.
+    async fn register(&mut self, device: String, name: String) -> Result<String, String> {
+        let path = file(&self.registry)?.to_owned();
+        let (reply, attached) = oneshot::channel();
+        self.rig.send(RigCommand::Attached(reply)).await.map_err(|_| ENDING)?;
+        let attached = attached.await.map_err(|_| ENDING)?;
+        let entry = name.clone();
+        let written = blocking(move || registration::register(&path, &attached, &device, &entry)).await?;
+        written.map_err(|error| error.to_string())?;
+        self.reload().await.map_err(|why| format!("[device.{name}] is in the file, but not in this run: {why}"))
+    }
+
+    /// Takes over what was added to the file.
+    async fn reload(&mut self) -> Result<String, String> {
+        let running = Arc::clone(&self.registry);
+        let (registry, added) = blocking(move || changed(&running)).await??;
+        if added.is_empty() {
+            return Ok("no entry was added, and no other change needs a restart".to_owned());
+        }
+        let bus = self.bus.clone();
+        let opened = blocking(move || open(&bus, added)).await?;
+        let opened = opened.map_err(|error| format!("{error}; {UNCHANGED}"))?;
+        let names: Vec<_> = opened
+            .iter()
+            .map(|opened| format!("[device.{}] as bit {}", opened.device.name, opened.device.id))
+            .collect();
+        let names = names.join(", ");
+        let episode = if self.board.is_recording() { "; recorded from the next episode on" } else { "" };
+        self.board.announce(What::Log { level: Level::Info, text: format!("registry: added {names}{episode}") });
+        for opened in opened {
+            self.add(opened, &registry).await?;
+        }
+        self.registry = registry;
+        Ok(format!("added {names}{episode}"))
+    }
+
+    async fn add(&mut self, opened: Opened, registry: &Arc<Registry>) -> Result<(), String> {
+        let Opened { device, topic, recorder, alignment } = opened;
+        self.board.add(&device);
+        // A stage that is gone has ended with the run, or ends it.
+        let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(registry), subscription: recorder });
+        let _ = self.alignment.send((Arc::clone(&device), alignment));
+        let writer = topic.writer();
+        self.topics.push(topic);
+        let addition = Addition { device, registry: Arc::clone(registry), writer };
+        Ok(self.rig.send(RigCommand::Register(addition)).await.map_err(|_| ENDING)?)
+    }
+}
+
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, String> {
+    spawn_blocking(work).await.map_err(|_| format!("reading the registry panicked; please report this; {UNCHANGED}"))
+}
+
+fn file(registry: &Registry) -> Result<&Path, String> {
+    let why = "this run has the registry that is built in, and no file: start it with --config FILE";
+    registry.path.as_deref().ok_or_else(|| why.to_owned())
+}
+
+/// The registry of the file, as the run would have it, and the entries that it has more.
+fn changed(running: &Registry) -> Result<(Arc<Registry>, Vec<DeviceSpec>), String> {
+    let path = file(running)?;
+    let mut new = Registry::load(path).map_err(|error| format!("{error}\n{UNCHANGED}"))?.registry;
+    // Without what the command line changed.
+    let declared = Registry::parse(&running.text, Some(path)).map_err(|error| format!("{error}\n{UNCHANGED}"))?;
+    let Difference { added, needs_restart } = Difference::between(&declared.registry, &new);
+    if !needs_restart.is_empty() {
+        let lines: Vec<_> = needs_restart.iter().map(|line| format!("\n  {line}")).collect();
+        return Err(format!("{}: restart rapid to apply this; {UNCHANGED}{}", path.display(), lines.concat()));
+    }
+    new.rig = running.rig.clone();
+    Ok((Arc::new(new), added))
+}
+
+/// Opens the topics of these entries, or none.
+fn open(bus: &Membership, added: Vec<DeviceSpec>) -> Result<Vec<Opened>, BusError> {
+    let open = |device: DeviceSpec| {
+        let topic = bus.extend(&device)?;
+        let (recorder, alignment) = (topic.subscribe()?, topic.subscribe()?);
+        Ok(Opened { device: Arc::new(device), topic, recorder, alignment })
+    };
+    added.into_iter().map(open).collect()
+}

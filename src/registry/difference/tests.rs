@@ -1,0 +1,134 @@
+//! The difference, as data: a text, what is changed in it, and what a run makes of that.
+
+use super::*;
+
+const RIG: &str = r#"
+[rig]
+name = "bench"
+cooldown = "1s"
+memory_budget = "256MiB"
+
+[device.cam]
+vid = "1209"
+pid = "0001"
+serial = "A"
+node = "camera"
+bit = 0
+
+[device.tof]
+vid = "1209"
+pid = "0002"
+node = "serial"
+bit = 2
+tty = { channels = 1 }
+
+[module.soft_tip]
+slot = "tip"
+"#;
+
+fn parsed(text: &str) -> Registry {
+    Registry::parse(text, None).unwrap_or_else(|wrong| panic!("{wrong}\n{text}")).registry
+}
+
+fn with(entry: &str) -> String {
+    format!("{RIG}\n{entry}\n")
+}
+
+fn spare(keys: &str) -> String {
+    with(&format!("[device.spare]\nvid = \"1209\"\npid = \"0003\"\n{keys}"))
+}
+
+#[test]
+fn only_an_added_entry_at_a_free_bit_is_taken_over() {
+    let camera = "node = \"camera\"\n";
+    for (case, text, bits, reasons) in [
+        ("nothing", RIG.to_owned(), &[][..], &[][..]),
+        ("a comment", format!("# text\n{RIG}"), &[], &[]),
+        ("above", spare(&format!("{camera}bit = 7")), &[7], &[]),
+        ("between", spare(&format!("{camera}bit = 1")), &[1], &[]),
+        ("no bit is written", spare(camera), &[1], &[]),
+        ("a serial line", spare("node = \"serial\"\nbit = 3\ntty = { channels = 2 }"), &[3], &[]),
+        (
+            "two",
+            format!(
+                "{}\n[device.b]\nvid = \"1209\"\npid = \"0004\"\nnode = \"camera\"\nbit = 1",
+                spare("node = \"camera\"\nbit = 9")
+            ),
+            &[1, 9],
+            &[],
+        ),
+        (
+            "removed",
+            RIG.split("[device.tof]").next().unwrap_or_default().to_owned() + "[module.soft_tip]\nslot = \"tip\"\n",
+            &[],
+            &["[device.tof]: it is removed"],
+        ),
+        (
+            "renamed",
+            RIG.replace("device.tof", "device.range"),
+            &[],
+            &["[device.tof]: it is removed", "renamed to range?", "[device.range]: its bit 2 is that of [device.tof]"],
+        ),
+        ("another bit", RIG.replace("bit = 2", "bit = 5"), &[], &["[device.tof]: its bit 2 is now 5"]),
+        ("another serial number", RIG.replace("\"A\"", "\"B\""), &[], &["[device.cam]: identity changed"]),
+        ("another format", RIG.replace("channels = 1", "channels = 2"), &[], &["[device.tof]: format", "changed"]),
+        ("another topic", RIG.replace("bit = 2", "bit = 2\ntopic = \"/x\""), &[], &["[device.tof]: topic changed"]),
+        (
+            "another limit",
+            RIG.replace("bit = 2", "bit = 2\nverdict = { gap = \"off\" }"),
+            &[],
+            &["[device.tof]: verdict changed"],
+        ),
+        ("a slot", RIG.replace("bit = 2", "bit = 2\nslot = \"tip\""), &[], &["[device.tof]: slot changed"]),
+        ("hooks", RIG.replace("bit = 2", "bit = 2\non_attach = \"/bin/true\""), &[], &["[device.tof]: hooks changed"]),
+        ("the rig", RIG.replace("\"1s\"", "\"2s\"").replace("bench", "bank"), &[], &["[rig]: name, cooldown changed"]),
+        ("an expectation", RIG.replace("cooldown", "expect = [\"cam\"]\ncooldown"), &[], &["[rig]: expect changed"]),
+        ("a module", RIG.replace("soft_tip", "hard_tip"), &[], &["[module]: soft_tip, hard_tip changed"]),
+        (
+            "its program",
+            spare("node = \"/bin/true\"\nbit = 3\nprocess = { kind = \"bytes\" }"),
+            &[],
+            &["[device.spare]: its program"],
+        ),
+        (
+            "its hooks",
+            spare(&format!("{camera}bit = 3\non_attach = \"/bin/true\"")),
+            &[],
+            &["[device.spare]: its hooks"],
+        ),
+        (
+            "the unit of another",
+            with(
+                "[device.spare]\nvid = \"1209\"\npid = \"0002\"\nserial = \"X\"\nnode = \"serial\"\nbit = 3\ntty = { channels = 1 }",
+            ),
+            &[],
+            &["[device.spare]: it would take a unit that may be attached as [device.tof]"],
+        ),
+        (
+            "another unit of a model",
+            with("[device.spare]\nvid = \"1209\"\npid = \"0001\"\nserial = \"X\"\nnode = \"camera\"\nbit = 3"),
+            &[3],
+            &[],
+        ),
+        // The cameras share what the budget leaves.
+        ("less memory for the others", RIG.replace("256MiB", "1000MiB"), &[], &["[rig]: memory_budget changed"]),
+        (
+            "an entry that takes the memory of others",
+            spare(&format!(
+                "{camera}bit = 3
+max_bytes = \"700KiB\"
+depth = 20"
+            )),
+            &[3],
+            &["[device.cam]: its depth"],
+        ),
+    ] {
+        let Difference { added, needs_restart } = Difference::between(&parsed(RIG), &parsed(&text));
+        assert_eq!(added.iter().map(|device| device.id.bit()).collect::<Vec<_>>(), bits, "{case}: {needs_restart:?}");
+        let lines = needs_restart.join("\n");
+        assert_eq!(needs_restart.is_empty(), reasons.is_empty(), "{case}: {lines}");
+        for reason in reasons {
+            assert!(lines.contains(reason), "{case}: {reason:?} is not in {lines}");
+        }
+    }
+}
