@@ -54,7 +54,8 @@ const STOP: u8 = 2;
 
 /// The other end of a serial port, and the path of the port.
 pub(crate) fn serial_port() -> (OwnedFd, String) {
-    let port: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
+    // A run that inherited it would hold its own port open.
+    let port: OwnedFd = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a terminal");
     grantpt(&port).expect("a terminal");
     unlockpt(&port).expect("a terminal");
     let path = ptsname(&port, Vec::new()).expect("its name").into_string().expect("UTF-8");
