@@ -115,7 +115,13 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         if cli.task.expert {
             return policy::demonstrate(global, &cli.run, &cli.task, format);
         }
-        let rig = rig(global, cli.task.seed)?;
+        let is_shown = !cli.run.headless && !global.json && io::stdout().is_terminal() && io::stdin().is_terminal();
+        let is_new = global.sim.is_none() && cli.policy.infer.is_none() && find_registry(global).is_none();
+        let rig = match is_new && is_shown {
+            // The first minutes: the screen asks for the names of what is plugged in.
+            true => (Registry::empty(Path::new("devices.toml")), Devices::Machine),
+            false => rig(global, cli.task.seed)?,
+        };
         return run(global, &cli.run, rig, cli.task.seed, Some(cli.policy));
     };
     match command {

@@ -154,8 +154,12 @@ fn changed(running: &Registry) -> Result<(Arc<Registry>, Vec<DeviceSpec>), Strin
     let path = file(running)?;
     let mut new = Registry::load(path).map_err(|error| format!("{error}\n{UNCHANGED}"))?.registry;
     // Without what the command line changed.
-    let declared = Registry::parse(&running.text, Some(path)).map_err(|error| format!("{error}\n{UNCHANGED}"))?;
-    let Difference { added, needs_restart } = Difference::between(&declared.registry, &new);
+    let declared = match running.text.as_str() {
+        // The run began without a file.
+        "" => running.clone(),
+        text => Registry::parse(text, Some(path)).map_err(|error| format!("{error}\n{UNCHANGED}"))?.registry,
+    };
+    let Difference { added, needs_restart } = Difference::between(&declared, &new);
     if !needs_restart.is_empty() {
         let lines: Vec<_> = needs_restart.iter().map(|line| format!("\n  {line}")).collect();
         return Err(format!("{}: restart rapid to apply this; {UNCHANGED}{}", path.display(), lines.concat()));

@@ -93,6 +93,12 @@ impl Registry {
     pub fn builtin() -> Self {
         Self::parse(BUILTIN, None).expect("the built-in devices.toml is valid").registry
     }
+
+    /// A rig without entries, to which they are added while it runs; `path` is the file that they are written to.
+    pub fn empty(path: &Path) -> Self {
+        let (devices, modules, stops, buttons) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        Self { rig: rig(None), devices, modules, stops, buttons, path: Some(path.to_owned()), text: String::new() }
+    }
 }
 
 /// The content of the tables of the text.

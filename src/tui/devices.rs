@@ -34,7 +34,16 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u
     let devices = model.rows();
     let rows = usize::from(rows);
     let first = first_row(model.selected, rows, devices.len());
-    let inner = view::panel(frame, area, "Devices", remark(first, rows, devices.len(), theme), theme);
+    let unregistered = model.shown().unregistered.len();
+    let remark = match remark(first, rows, devices.len(), theme) {
+        _ if unregistered > 0 => Span::styled(
+            format!("{} without an entry: N", text::counted(unregistered as u64, "device")),
+            theme.warning(),
+        )
+        .into(),
+        remark => remark,
+    };
+    let inner = view::panel(frame, area, "Devices", remark, theme);
     let name = name_width(model.shown(), inner.width);
     let mut lines = inner.rows();
     if let Some(line) = lines.next() {
@@ -43,7 +52,12 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u
     if devices.is_empty()
         && let Some(line) = lines.next()
     {
-        frame.render_widget(Line::styled("     no devices registered", theme.faint()), line);
+        let text = if unregistered > 0 {
+            "     no devices registered: N names one"
+        } else {
+            "     no devices registered: plug one in"
+        };
+        frame.render_widget(Line::styled(text, theme.faint()), line);
     }
     for (index, device) in devices.iter().enumerate().skip(first).take(rows) {
         let Some(line) = lines.next() else { break };

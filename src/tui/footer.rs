@@ -17,7 +17,8 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
         Quit::No => model.notice().map(|notice| theme.safe(notice)),
     };
     if let Some((question, text)) = model.prompt().filter(|_| model.quit == Quit::No) {
-        return prompt(frame, area, question, &theme.safe(text), theme);
+        let question = text::cut(&theme.safe(&question), usize::from(area.width) / 2, theme.ellipsis()).into_owned();
+        return prompt(frame, area, &question, &theme.safe(text), theme);
     }
     let line = match message {
         Some(message) => {
@@ -31,7 +32,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
 
 /// The question, and the end of what is typed.
 fn prompt(frame: &mut Frame<'_>, area: Rect, question: &str, text: &str, theme: Theme) {
-    let room = usize::from(area.width).saturating_sub(question.len() + 2);
+    let room = usize::from(area.width).saturating_sub(text::width(question) + 2);
     let mut from = 0;
     while text::width(text.get(from..).unwrap_or_default()) > room {
         from += text.get(from..).and_then(|rest| rest.chars().next()).map_or(1, char::len_utf8);

@@ -43,6 +43,8 @@ pub(super) enum Act {
     First,
     /// Select the last device.
     Last,
+    /// Ask for the name of a device that has no entry.
+    Register,
     /// Restart the selected device.
     Restart,
     /// Unplug the selected simulated device, or plug it in.
@@ -108,6 +110,7 @@ impl Act {
                 | Self::Note
                 | Self::Task
                 | Self::EndSession
+                | Self::Register
                 | Self::Restart
                 | Self::Plug
                 | Self::AskToArm
@@ -202,7 +205,7 @@ use KeyCode::{Char, Down, End, Esc, F, Home, Left, PageDown, PageUp, Right, Up};
 use When::{Always, Control, ControlRepeated, Pressed, Repeated};
 
 /// All keys. The footer shows as many as fit, in this order; the help and the last two always.
-pub(super) const TABLE: [Binding; 39] = [
+pub(super) const TABLE: [Binding; 40] = [
     row(Act::Toggle, &[Char(' ')], Pressed, ("space", "start an episode, end the one in progress"), |m| {
         Some(toggles(m))
     }),
@@ -225,6 +228,9 @@ pub(super) const TABLE: [Binding; 39] = [
     row(Act::Down, &[Down, Char('j')], Repeated, ("", ""), never),
     row(Act::First, &[Home], Repeated, ("", ""), never),
     row(Act::Last, &[End], Repeated, ("", ""), never),
+    row(Act::Register, &[Char('N')], Pressed, ("N", "name a plugged device that has no entry"), |m| {
+        (!m.latest().unregistered.is_empty()).then_some("name device")
+    }),
     row(Act::Restart, &[Char('r')], Repeated, ("r", "restart the selected device, if it failed"), restarts),
     row(Act::Plug, &[Char('U')], Pressed, ("U", "simulated device: unplug it or plug it in"), plugs),
     row(Act::AskToArm, &[Char('a')], Pressed, ("a, ctrl-y", "arm the actuator: motors follow actions"), never),

@@ -26,7 +26,7 @@ use crate::sample::Encoding;
 use crate::status::preview::Preview;
 use crate::status::rates::Rates;
 use crate::status::session::{Label, PRESS_AGAIN, SessionRequest};
-use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
+use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot, UnregisteredDevice};
 use crate::time::{Stamp, Zone};
 
 /// How long a changed bit is highlighted.
@@ -150,6 +150,12 @@ pub struct Model {
     looked: Option<Stamp>,
     /// What the previews showed so far.
     seen: Seen,
+    /// The rig had no entry when the screen began: names are asked for as devices are plugged in.
+    is_new_rig: bool,
+    /// Devices without an entry that were asked about.
+    asked: Vec<String>,
+    /// The device whose name is typed.
+    unnamed: Option<UnregisteredDevice>,
     /// The open page of the help, from 1.
     pub(super) help: Option<usize>,
     /// Whether the user has asked to quit.
@@ -210,6 +216,9 @@ impl Model {
             pictures: true,
             looked: None,
             seen: Seen::default(),
+            is_new_rig: false,
+            asked: Vec::new(),
+            unnamed: None,
             help: None,
             quit: Quit::No,
             arming: None,
@@ -219,6 +228,7 @@ impl Model {
             rings: 0,
             notice: None,
         };
+        model.is_new_rig = model.latest.devices.is_empty();
         model.read();
         model
     }
@@ -270,13 +280,12 @@ impl Model {
             snapshot.previews.iter().for_each(|preview| self.seen.take(preview));
         }
         let selected = self.selected_device().map(|device| device.id);
-        let answer = snapshot.session.as_ref().and_then(|session| session.answer.clone());
-        let known = self.latest.session.as_ref().and_then(|session| session.answer.as_ref());
-        let news = answer.filter(|answer| known != Some(answer));
+        let news = news(&self.latest, &snapshot);
         self.latest = snapshot;
-        if let Some(answer) = news {
-            self.notify(&answer.text);
+        for text in news {
+            self.notify(&text);
         }
+        self.ask_for_names();
         if refresh && self.frozen.is_none() {
             self.read();
         }
@@ -393,6 +402,7 @@ impl Model {
             Act::Note => self.ask(Question::Note),
             Act::Task => self.ask(Question::Task),
             Act::EndSession => self.ask(Question::EndSession),
+            Act::Register => self.ask_for_name(),
             Act::Restart => return self.restart(),
             Act::AskToArm => self.ask_to_arm(),
             Act::Plug => return self.plug(),
@@ -711,6 +721,14 @@ const WHEEL: usize = 3;
 /// Lines by which a page key scrolls the log.
 const SCROLL_STEP: usize = 5;
 
+/// Answers to requests that are new in `after`.
+fn news(before: &Snapshot, after: &Snapshot) -> Vec<String> {
+    let of_session = |snapshot: &Snapshot| snapshot.session.as_ref().and_then(|session| session.answer.clone());
+    let pairs =
+        [(of_session(before), of_session(after)), (before.registry_answer.clone(), after.registry_answer.clone())];
+    pairs.into_iter().filter(|(before, after)| before != after).filter_map(|(_, after)| Some(after?.text)).collect()
+}
+
 /// Whether an episode began or ended between two snapshots, or a device that sent samples no longer does.
 fn calls_attention(before: &Snapshot, after: &Snapshot) -> bool {
     let is_lost = |device: &DeviceStatus| {
@@ -801,6 +819,8 @@ enum Question {
     EndSession,
     /// What lines of the log contain.
     Search,
+    /// The name of a device that has no entry.
+    Name,
 }
 
 impl Question {
@@ -810,6 +830,7 @@ impl Question {
             Self::WhyFailed => "why it failed (may be empty): ",
             Self::Task => "task: ",
             Self::Search => "lines of the log with: ",
+            Self::Name => "name of the new device (empty: none): ",
             Self::EndSession => "type end to end the session and delete what was discarded: ",
         }
     }
@@ -824,8 +845,38 @@ struct Prompt {
 
 impl Model {
     /// The question and the answer typed so far.
-    pub fn prompt(&self) -> Option<(&'static str, &str)> {
-        self.prompt.as_ref().map(|prompt| (prompt.question.text(), prompt.text.as_str()))
+    pub fn prompt(&self) -> Option<(String, &str)> {
+        let prompt = self.prompt.as_ref()?;
+        let question = match &self.unnamed {
+            Some(unit) if prompt.question == Question::Name => {
+                format!("name of the {} {} (empty: none): ", unit.node, unit.device)
+            }
+            _ => prompt.question.text().to_owned(),
+        };
+        Some((question, prompt.text.as_str()))
+    }
+
+    /// Devices without an entry that were not asked about.
+    fn unasked(&self) -> impl Iterator<Item = &UnregisteredDevice> {
+        self.latest.unregistered.iter().filter(|unit| !self.asked.contains(&unit.device))
+    }
+
+    /// In a rig without entries, asks for the name of each device that is plugged in, one after the other.
+    fn ask_for_names(&mut self) {
+        let is_free = self.prompt.is_none() && self.help.is_none() && self.quit == Quit::No;
+        if self.is_new_rig && is_free && self.unasked().next().is_some() {
+            self.ask_for_name();
+        }
+    }
+
+    /// Asks for the name of the next device without an entry; of those that were asked about, the first again.
+    fn ask_for_name(&mut self) {
+        let Some(unit) = self.unasked().next().or_else(|| self.latest.unregistered.first()).cloned() else {
+            return self.notify("every device that is plugged in has an entry");
+        };
+        self.asked.push(unit.device.clone());
+        self.unnamed = Some(unit);
+        self.ask(Question::Name);
     }
 
     fn ask(&mut self, question: Question) {
@@ -833,6 +884,7 @@ impl Model {
         let text = match question {
             Question::Task => session.map(|session| session.task.clone()).unwrap_or_default(),
             Question::Search => self.log.search.clone(),
+            Question::Name => self.unnamed.as_ref().and_then(|unit| unit.name.clone()).unwrap_or_default(),
             _ => String::new(),
         };
         self.prompt = Some(Prompt { question, text });
@@ -865,6 +917,14 @@ impl Model {
             Question::Search => {
                 self.log.search = text;
                 return Effect::None;
+            }
+            Question::Name => {
+                let (Some(unit), false) = (self.unnamed.take(), text.trim().is_empty()) else {
+                    self.notify("no entry; N asks again");
+                    return Effect::None;
+                };
+                self.notify("writing the entry");
+                return Effect::Send(Command::Register { device: unit.device, name: text.trim().to_owned() });
             }
             Question::EndSession if text.trim() == "end" => SessionRequest::EndSession,
             Question::EndSession => {

@@ -339,7 +339,7 @@ fn a_text_is_typed_and_sent_by_enter_and_escape_disarms_and_closes_it() {
     let note = |text: &str| Effect::Send(Command::Session(SessionRequest::Note { text: text.to_owned() }));
     let mut model = Model::new(three_streaming());
     typed(&mut model, "nquick dxE");
-    assert_eq!(model.prompt(), Some(("note: ", "quick dxE")));
+    assert_eq!(model.prompt(), Some(("note: ".to_owned(), "quick dxE")));
     model.update(press(KeyCode::Backspace));
     assert_eq!(model.update(press(KeyCode::Enter)), note("quick dx"));
     assert_eq!(model.prompt(), None);
@@ -501,4 +501,53 @@ fn the_mouse_selects_and_opens_and_begins_nothing() {
     assert_eq!(model.selected, 1);
     model.update(Msg::Click(Target::Log));
     assert_eq!(model.page, Page::Log);
+}
+
+fn unregistered(name: Option<&str>) -> UnregisteredDevice {
+    let (device, name) = (format!("046d:0825 {}", name.unwrap_or("unknown")), name.map(str::to_owned));
+    UnregisteredDevice { device, node: "camera".to_owned(), name }
+}
+
+#[test]
+fn in_a_new_rig_the_name_of_each_device_is_asked_for_once() {
+    let mut plugged = three_streaming();
+    plugged.devices.clear();
+    let mut model = Model::new(plugged.clone());
+    model.update(after(&plugged, 100));
+    assert_eq!(model.prompt(), None);
+    plugged.unregistered = vec![unregistered(Some("webcam")), unregistered(None)];
+    model.update(after(&plugged, 200));
+    assert_eq!(model.prompt(), Some(("name of the camera 046d:0825 webcam (empty: none): ".to_owned(), "webcam")));
+    // What is typed is not asked for again by the next snapshot.
+    model.update(press(KeyCode::Char('2')));
+    model.update(after(&plugged, 300));
+    let register = Command::Register { device: "046d:0825 webcam".to_owned(), name: "webcam2".to_owned() };
+    assert_eq!(model.update(press(KeyCode::Enter)), Effect::Send(register));
+    plugged.unregistered.remove(0);
+    model.update(after(&plugged, 400));
+    assert_eq!(model.prompt(), Some(("name of the camera 046d:0825 unknown (empty: none): ".to_owned(), "")));
+    assert_eq!(model.update(press(KeyCode::Enter)), Effect::None, "none");
+    model.update(after(&plugged, 500));
+    assert_eq!(model.prompt(), None, "it is not asked about again");
+    model.update(press(KeyCode::Char('N')));
+    assert!(model.prompt().is_some(), "but on request");
+}
+
+#[test]
+fn in_a_rig_with_entries_nothing_is_asked_by_itself() {
+    let mut plugged = three_streaming();
+    let mut model = Model::new(plugged.clone());
+    plugged.unregistered = vec![unregistered(Some("webcam"))];
+    model.update(after(&plugged, 100));
+    assert_eq!(model.prompt(), None);
+    model.update(press(KeyCode::Char('N')));
+    assert!(model.prompt().is_some());
+    model.update(press(KeyCode::Esc));
+    plugged.registry_answer =
+        Some(Answered { at: TAKEN, text: "added [device.webcam] as bit 3".to_owned(), refused: false });
+    plugged.unregistered.clear();
+    model.update(after(&plugged, 200));
+    assert_eq!(model.notice(), Some("added [device.webcam] as bit 3"));
+    model.update(press(KeyCode::Char('N')));
+    assert_eq!(model.notice(), Some("every device that is plugged in has an entry"));
 }
