@@ -80,6 +80,12 @@ fn ask(place: &Place, words: &[&str]) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
+/// Waits until so many more masks are published: an episode of some length.
+fn publications(place: &Place, count: u64) {
+    let sequence = record(place).sequence;
+    until("the mask is published", || record(place).sequence > sequence + count);
+}
+
 /// The sequence numbers of each topic are without a hole; how many each has.
 fn contiguous(episode: &Episode) -> BTreeMap<String, usize> {
     let mut last: BTreeMap<&str, u32> = BTreeMap::new();
@@ -113,11 +119,10 @@ fn an_added_device_streams_while_nothing_else_is_interrupted() {
     });
     // The text is the same now: there is nothing to take over.
     assert!(reload(&place).expect("no change").starts_with("no entry was added"));
-    let sequence = record(&place).sequence;
-    until("it was streaming for a while in this episode", || record(&place).sequence > sequence + 1000);
+    // It streams for a while in this episode.
+    publications(&place, 1000);
     ask(&place, &["episode", "next"]);
-    let sequence = record(&place).sequence;
-    until("the second episode has some length", || record(&place).sequence > sequence + 1000);
+    publications(&place, 1000);
     ask(&place, &["episode", "stop"]);
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
@@ -184,6 +189,7 @@ fn any_other_change_is_refused_and_leaves_the_run_as_it_was() {
     }
     std::fs::remove_file(place.path("devices.toml")).expect("it is there");
     assert!(reload(&place).expect_err("no file").contains("devices.toml"));
+    publications(&place, 500);
     ask(&place, &["episode", "stop"]);
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
@@ -227,6 +233,7 @@ fn a_connected_device_is_registered_and_taken_over_by_one_request() {
     // An entry that cannot be taken over stays in the file, and the answer says so.
     place.write("devices.toml", &text().replace("bench-1", "bench-2"));
     assert_eq!(register(device, "again")["ok"], false);
+    publications(&place, 500);
     running.signal(Signal::INT);
     assert_eq!(running.end().0, Some(0));
 }
