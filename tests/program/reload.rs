@@ -254,13 +254,14 @@ fn without_memory_for_its_topic_an_entry_is_refused_with_the_numbers() {
     let before = place.shared_memory();
     let spare = "vid = \"2bc5\"\npid = \"0501\"\nserial = \"SPARE1\"\nnode = \"camera\"\nbit = 3\n\
         camera = { width = 320, height = 240 }";
-    place.write("devices.toml", &format!("{rig}\n[device.spare]\n{spare}\nmax_bytes = \"16MiB\"\ndepth = 3500\n"));
+    let huge = "[device.huge]\nvid = \"2bc5\"\npid = \"0502\"\nnode = \"camera\"\nbit = 4\nmax_bytes = \"16MiB\"\ndepth = 3500";
+    place.write("devices.toml", &format!("{rig}\n[device.spare]\n{spare}\n{huge}\n"));
     let why = reload(&place).expect_err("there is not that much");
     for part in ["/dev/shm: ", " free of ", " are needed; ", "nothing was changed"] {
         assert!(why.contains(part), "{why}");
     }
     assert_eq!((record(&place).devices, place.shared_memory()), (3, before));
-    // With less it is taken over.
+    // Both or none were to be taken over; alone the first is.
     place.write("devices.toml", &format!("{rig}\n[device.spare]\n{spare}\n"));
     reload(&place).expect("it is taken over");
     until("its bit is set", || record(&place).mask == 0b1101);
