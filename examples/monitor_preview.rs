@@ -124,8 +124,8 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                     }
                     None => episode = Some((Stamp::now(), "episodes/2026-01-01_place-block_001.mcap".into(), 0)),
                 },
-                // Its episodes have no file, and its devices no cable.
-                Command::Session(_) | Command::Plug(_) => {}
+                // Its episodes and its registry have no file, and its devices no cable.
+                Command::Session(_) | Command::Plug(_) | Command::Reload | Command::Register { .. } => {}
                 Command::Restart(id) => states[id.index()] = SlotState::Absent,
             },
             _ = beat.tick() => {}

@@ -10,7 +10,7 @@ use std::process::Output;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
-use crate::support::{Episode, Place, Running, until};
+use crate::support::{Episode, FrameMessage, Place, Running, until};
 
 const RIG: &str = include_str!("../../devices.toml");
 
@@ -80,6 +80,12 @@ fn ask(place: &Place, words: &[&str]) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
+/// Waits until so many more masks are published: an episode of some length.
+fn publications(place: &Place, count: u64) {
+    let sequence = record(place).sequence;
+    until("the mask is published", || record(place).sequence > sequence + count);
+}
+
 /// The sequence numbers of each topic are without a hole; how many each has.
 fn contiguous(episode: &Episode) -> BTreeMap<String, usize> {
     let mut last: BTreeMap<&str, u32> = BTreeMap::new();
@@ -113,11 +119,10 @@ fn an_added_device_streams_while_nothing_else_is_interrupted() {
     });
     // The text is the same now: there is nothing to take over.
     assert!(reload(&place).expect("no change").starts_with("no entry was added"));
-    let sequence = record(&place).sequence;
-    until("it was streaming for a while in this episode", || record(&place).sequence > sequence + 1000);
+    // It streams for a while in this episode.
+    publications(&place, 1000);
     ask(&place, &["episode", "next"]);
-    let sequence = record(&place).sequence;
-    until("the second episode has some length", || record(&place).sequence > sequence + 1000);
+    publications(&place, 1000);
     ask(&place, &["episode", "stop"]);
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
@@ -130,8 +135,8 @@ fn an_added_device_streams_while_nothing_else_is_interrupted() {
         assert_eq!(verdict["verdict"], "GOOD", "{verdict}");
         let episode = Episode::read(&place.path(&format!("out/{file}")));
         let counts = contiguous(&episode);
-        assert!(["/rapid/mask", "/rapid/camera/wrist"].iter().all(|topic| counts[*topic] > 50), "{counts:?}");
-        assert_eq!(counts.get("/rapid/camera/spare_cam").is_some_and(|count| *count > 50), is_with, "{counts:?}");
+        assert!(["/rapid/mask", "/rapid/camera/wrist"].iter().all(|topic| counts[*topic] > 20), "{counts:?}");
+        assert_eq!(counts.get("/rapid/camera/spare_cam").is_some_and(|count| *count > 20), is_with, "{counts:?}");
         assert_eq!(episode.channels.iter().any(|topic| topic.contains("spare")), is_with);
         // The bit was set in the first episode, too; its frames are of the modalities that it began with.
         let expected = if is_with { vec![0b1101] } else { vec![0b101, 0b1101] };
@@ -142,7 +147,9 @@ fn an_added_device_streams_while_nothing_else_is_interrupted() {
             last.modalities.iter().map(|modality| modality.bit).collect::<Vec<_>>(),
             [0, 1, 2, 3][..3 + usize::from(is_with)]
         );
-        assert_eq!(last.modalities.last().is_some_and(|modality| modality.valid && modality.bit == 3), is_with);
+        // Not at every tick: the phase of its pictures is its own.
+        let is_valid = |frame: &FrameMessage| frame.modalities.iter().any(|slot| slot.bit == 3 && slot.valid);
+        assert_eq!(frames.iter().filter(|(_, frame)| is_valid(frame)).count() > 10, is_with);
     }
 }
 
@@ -184,6 +191,7 @@ fn any_other_change_is_refused_and_leaves_the_run_as_it_was() {
     }
     std::fs::remove_file(place.path("devices.toml")).expect("it is there");
     assert!(reload(&place).expect_err("no file").contains("devices.toml"));
+    publications(&place, 500);
     ask(&place, &["episode", "stop"]);
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
@@ -227,6 +235,7 @@ fn a_connected_device_is_registered_and_taken_over_by_one_request() {
     // An entry that cannot be taken over stays in the file, and the answer says so.
     place.write("devices.toml", &text().replace("bench-1", "bench-2"));
     assert_eq!(register(device, "again")["ok"], false);
+    publications(&place, 500);
     running.signal(Signal::INT);
     assert_eq!(running.end().0, Some(0));
 }
@@ -247,13 +256,14 @@ fn without_memory_for_its_topic_an_entry_is_refused_with_the_numbers() {
     let before = place.shared_memory();
     let spare = "vid = \"2bc5\"\npid = \"0501\"\nserial = \"SPARE1\"\nnode = \"camera\"\nbit = 3\n\
         camera = { width = 320, height = 240 }";
-    place.write("devices.toml", &format!("{rig}\n[device.spare]\n{spare}\nmax_bytes = \"16MiB\"\ndepth = 3500\n"));
+    let huge = "[device.huge]\nvid = \"2bc5\"\npid = \"0502\"\nnode = \"camera\"\nbit = 4\nmax_bytes = \"16MiB\"\ndepth = 3500";
+    place.write("devices.toml", &format!("{rig}\n[device.spare]\n{spare}\n{huge}\n"));
     let why = reload(&place).expect_err("there is not that much");
     for part in ["/dev/shm: ", " free of ", " are needed; ", "nothing was changed"] {
         assert!(why.contains(part), "{why}");
     }
     assert_eq!((record(&place).devices, place.shared_memory()), (3, before));
-    // With less it is taken over.
+    // Both or none were to be taken over; alone the first is.
     place.write("devices.toml", &format!("{rig}\n[device.spare]\n{spare}\n"));
     reload(&place).expect("it is taken over");
     until("its bit is set", || record(&place).mask == 0b1101);

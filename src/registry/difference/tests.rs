@@ -80,7 +80,12 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
             &["[device.tof]: verdict changed"],
         ),
         ("a slot", RIG.replace("bit = 2", "bit = 2\nslot = \"tip\""), &[], &["[device.tof]: slot changed"]),
-        ("hooks", RIG.replace("bit = 2", "bit = 2\non_attach = \"/bin/true\""), &[], &["[device.tof]: hooks changed"]),
+        (
+            "hooks",
+            RIG.replace("bit = 2", "bit = 2\non_attach = [\"/bin/true\"]"),
+            &[],
+            &["[device.tof]: hooks changed"],
+        ),
         ("the rig", RIG.replace("\"1s\"", "\"2s\"").replace("bench", "bank"), &[], &["[rig]: name, cooldown changed"]),
         ("an expectation", RIG.replace("cooldown", "expect = [\"cam\"]\ncooldown"), &[], &["[rig]: expect changed"]),
         ("a module", RIG.replace("soft_tip", "hard_tip"), &[], &["[module]: soft_tip, hard_tip changed"]),
@@ -92,7 +97,7 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
         ),
         (
             "its hooks",
-            spare(&format!("{camera}bit = 3\non_attach = \"/bin/true\"")),
+            spare(&format!("{camera}bit = 3\non_attach = [\"/bin/true\"]")),
             &[],
             &["[device.spare]: its hooks"],
         ),
@@ -110,17 +115,13 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
             &[3],
             &[],
         ),
+        ("another budget", RIG.replace("256MiB", "1000MiB"), &[], &["[rig]: memory_budget changed"]),
         // The cameras share what the budget leaves.
-        ("less memory for the others", RIG.replace("256MiB", "1000MiB"), &[], &["[rig]: memory_budget changed"]),
         (
             "an entry that takes the memory of others",
-            spare(&format!(
-                "{camera}bit = 3
-max_bytes = \"700KiB\"
-depth = 20"
-            )),
+            spare(&format!("{camera}bit = 3\nmax_bytes = \"4MB\"\ndepth = 20")),
             &[3],
-            &["[device.cam]: its depth"],
+            &["[device.cam]: its depth 60 is now"],
         ),
     ] {
         let Difference { added, needs_restart } = Difference::between(&parsed(RIG), &parsed(&text));
