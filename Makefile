@@ -35,7 +35,7 @@ setup-build: ## only what building and running need
 # Built to be seen soon: in a profile of its own, and without what simulated devices do not need.
 demo: setup-build ## build, then the simulated rig: the monitor on a terminal, otherwise a 10 s episode
 	cargo build --locked --profile demo --no-default-features --bin rapid
-	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/demo/rapid' --sim; else scripts/demo.sh '$(TARGET)/demo/rapid' $(DEMO_DIR); fi
+	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/demo/rapid' --sim --tour; else scripts/demo.sh '$(TARGET)/demo/rapid' $(DEMO_DIR); fi
 
 # A test takes the picture again and compares its words and colours with the one in the repository.
 picture: setup-build ## take docs/monitor.svg again: the monitor of the program while a camera is unplugged

@@ -52,6 +52,9 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     let mut config = Config::global_config().clone();
     config.global.prefix = FileName::new(std::env::var("RAPID_BUS_PREFIX")?.as_bytes())?;
+    if let Ok(root) = std::env::var("RAPID_BUS_ROOT") {
+        config.global.set_root_path(&Path::new(root.as_bytes())?);
+    }
     let node = NodeBuilder::new()
         .config(&config)
         // SIGTERM ends this program as it ends any other.

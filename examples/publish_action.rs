@@ -27,6 +27,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     if let Ok(prefix) = std::env::var("RAPID_BUS_PREFIX") {
         config.global.prefix = FileName::new(prefix.as_bytes())?;
     }
+    if let Ok(root) = std::env::var("RAPID_BUS_ROOT") {
+        config.global.set_root_path(&Path::new(root.as_bytes())?);
+    }
     let node = NodeBuilder::new()
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)

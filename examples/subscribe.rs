@@ -25,6 +25,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     if let Ok(instance) = std::env::var("RAPID_INSTANCE") {
         config.global.prefix = FileName::new(format!("iox2_{instance}_").as_bytes())?;
     }
+    if let Ok(root) = std::env::var("RAPID_BUS_ROOT") {
+        config.global.set_root_path(&Path::new(root.as_bytes())?);
+    }
     let node = NodeBuilder::new()
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)

@@ -15,6 +15,7 @@ mod bus_files;
 mod buttons;
 mod collection;
 mod conductor;
+mod controls;
 mod discovery;
 mod error;
 mod free_space;

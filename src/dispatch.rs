@@ -151,7 +151,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         }
         Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
         Command::Monitor { read_only, shown } => {
-            let shown = ScreenOptions { utc: shown.utc, mouse: shown.mouse };
+            let shown = ScreenOptions { utc: shown.utc, mouse: shown.mouse, tour: false };
             Ok(block_on(commands::monitor::monitor(global.instance.as_deref(), read_only, shown))??)
         }
         Command::Logs { device, follow, level, utc } => {
@@ -356,7 +356,7 @@ fn run(
         registry,
         devices,
         screen,
-        shown: ScreenOptions { utc: args.shown.utc, mouse: args.shown.mouse },
+        shown: ScreenOptions { utc: args.shown.utc, mouse: args.shown.mouse, tour: args.tour },
         episode,
         plan: plan(args),
         record: args.record,

@@ -204,6 +204,9 @@ fn subscribe(topic: &str) -> Result<RapidSubscriber, Box<dyn Error>> {
     if let Some(prefix) = std::env::var("RAPID_BUS_PREFIX").ok().or_else(instance) {
         config.global.prefix = FileName::new(prefix.as_bytes())?;
     }
+    if let Ok(root) = std::env::var("RAPID_BUS_ROOT") {
+        config.global.set_root_path(&Path::new(root.as_bytes())?);
+    }
     let node = NodeBuilder::new()
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
@@ -246,6 +249,9 @@ fn open(max_bytes: usize) -> Result<RapidNode, Box<dyn Error>> {
     let topic = variable("RAPID_TOPIC")?;
     let mut config = Config::global_config().clone();
     config.global.prefix = FileName::new(variable("RAPID_BUS_PREFIX")?.as_bytes())?;
+    if let Ok(root) = std::env::var("RAPID_BUS_ROOT") {
+        config.global.set_root_path(&Path::new(root.as_bytes())?);
+    }
     let node = NodeBuilder::new()
         .config(&config)
         // SIGTERM ends this program as it ends any other.

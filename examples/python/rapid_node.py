@@ -50,6 +50,8 @@ class Bus:
         prefix = os.environ.get("RAPID_BUS_PREFIX") or (f"iox2_{instance}_" if instance else None)
         if prefix:
             config.global_cfg.prefix = iox2.FileName.new(prefix)
+        if root := os.environ.get("RAPID_BUS_ROOT"):
+            config.global_cfg.root_path = iox2.Path.new(root)
         # SIGTERM ends this program as it ends any other.
         builder = iox2.NodeBuilder.new().config(config).signal_handling_mode(iox2.SignalHandlingMode.Disabled)
         self._node = builder.create(iox2.ServiceType.Ipc)

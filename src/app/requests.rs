@@ -9,6 +9,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::spawn_blocking;
 
 use super::attached::Attached;
+use super::controls;
 use crate::orders::receive::{Arrival, Wanted};
 use crate::rig::RigCommand;
 use crate::status::session::SessionRequest;
@@ -66,6 +67,10 @@ pub(super) fn sorted(
                 Command::Session(request) => conductor.send(Request::Session(request, Stamp::now(), None)).is_ok(),
                 Command::Quit => conductor.send(Request::Quit).is_ok(),
                 Command::Plug(device) => scenario.send(device).is_ok(),
+                Command::Control { device, name, value } => {
+                    controls::set(&board, device, name, value);
+                    true
+                }
                 Command::Look(id) => {
                     board.look(id, Stamp::now());
                     true

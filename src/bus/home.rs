@@ -141,6 +141,12 @@ fn take_turn(root: &Path) -> Option<File> {
 fn config(instance: Option<&str>) -> Result<Config, BusError> {
     let mut config = Config::global_config().clone();
     config.global.creation_timeout = CREATION_LIMIT;
+    let own = place::of_this_user(&root(&config));
+    if own != root(&config) {
+        let own = iceoryx2::prelude::Path::new(own.as_os_str().as_encoded_bytes());
+        let own = own.map_err(|error| BusError::Node(format!("the folder of this user's bus: {error:?}")))?;
+        config.global.set_root_path(&own);
+    }
     if let Some(instance) = instance {
         let prefix = format!("iox2_{instance}_");
         config.global.prefix = FileName::new(prefix.as_bytes())

@@ -238,6 +238,11 @@ impl std::fmt::Debug for Membership {
 }
 
 impl Membership {
+    /// iceoryx2's `global.root_path` of this bus: usually its default; another one if another user has that.
+    pub fn root(&self) -> String {
+        self.home.node().config().global.root_path().to_string()
+    }
+
     /// iceoryx2's `global.prefix` of this bus: a program with another prefix is on another bus.
     pub fn prefix(&self) -> String {
         self.home.node().config().global.prefix.to_string()

@@ -17,6 +17,16 @@ use super::room::PLACE;
 /// Access to the folders: only the owner, whatever the umask.
 const MODE: u32 = 0o700;
 
+/// Where the bus of this user keeps its files: in iceoryx2's folder or, if another user has that one, in one of its own
+/// beside it, which it also uses as long as it is there.
+pub(super) fn of_this_user(folder: &Path) -> PathBuf {
+    let user = rustix::process::geteuid().as_raw();
+    let own = PathBuf::from(format!("{}-{user}", folder.display()));
+    let owner = |path: &Path| std::fs::symlink_metadata(path).ok().map(|there| there.uid());
+    let is_free = owner(folder).is_none_or(|owner| owner == user);
+    if owner(&own) == Some(user) || !is_free { own } else { folder.to_owned() }
+}
+
 /// Refuses a folder that another user created, that is reached by another user's link, or that this process may not
 /// use. A missing folder is created later.
 pub(super) fn check(folder: &Path) -> Result<(), BusError> {
@@ -111,6 +121,25 @@ mod tests {
     use std::os::unix::fs::{chown, lchown, symlink};
 
     use super::*;
+
+    #[test]
+    fn each_user_has_a_folder_and_keeps_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("bus");
+        let user = rustix::process::geteuid().as_raw();
+        let own = dir.path().join(format!("bus-{user}"));
+        assert_eq!(of_this_user(&folder), folder);
+        std::fs::create_dir(&folder).unwrap();
+        assert_eq!(of_this_user(&folder), folder);
+        // Only root can give a folder away.
+        if user == 0 {
+            chown(&folder, Some(12_345), None).unwrap();
+            assert_eq!(of_this_user(&folder), own);
+        }
+        std::fs::create_dir(&own).unwrap();
+        std::fs::remove_dir(&folder).unwrap();
+        assert_eq!(of_this_user(&folder), own, "as long as it is there");
+    }
 
     #[test]
     fn shared_memory_that_cannot_be_used_is_an_error_with_its_fix() {

@@ -260,6 +260,20 @@ pub fn is_on_usb(node: &Path) -> bool {
     class.canonicalize().is_ok_and(|device| device.to_string_lossy().contains("/usb"))
 }
 
+/// Sets a control of the camera at `path` while it streams: any open descriptor may (V4L2 specification, "Opening and
+/// closing devices"). Returns the value that it has then. Blocks while the device answers.
+///
+/// # Errors
+/// When the node cannot be opened, or has no such control, or not that value: with what it offers.
+pub fn set_control(path: &Path, name: &str, value: i64) -> Result<i64, String> {
+    let node = Node::open(path).map_err(|error| error.to_string())?;
+    let offered = node.controls();
+    let control = format::find_control(&offered, name, value)?;
+    node.set_control(control.id, value)
+        .and_then(|()| node.control(control.id))
+        .map_err(|error| format!("{name}: {error}"))
+}
+
 /// The modes and controls of the camera at `path`. Blocks while the device answers; may set its format, unless another
 /// program streams from it.
 ///

@@ -18,7 +18,7 @@ use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::output::Output;
-use super::programs::{Environment, MARGIN, Programs, environment};
+use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
 use super::worker::{TERM_LIMIT, describe};
 use crate::device::Attachment;
 use crate::driver::process::Launch;
@@ -33,7 +33,7 @@ pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
 pub(super) struct Post {
     programs: Programs,
     spec: Arc<DeviceSpec>,
-    prefix: String,
+    bus: BusNames,
     /// Locked while a program reads the device.
     node: Option<Arc<Mutex<()>>>,
     turn: Arc<Mutex<()>>,
@@ -45,11 +45,11 @@ impl Post {
     pub(super) fn new(
         programs: &Programs,
         spec: &Arc<DeviceSpec>,
-        prefix: String,
+        bus: BusNames,
         node: Option<Arc<Mutex<()>>>,
     ) -> Self {
         let (programs, spec) = (programs.clone(), Arc::clone(spec));
-        Self { programs, spec, prefix, node, turn: Arc::default(), gone: CancellationToken::new() }
+        Self { programs, spec, bus, node, turn: Arc::default(), gone: CancellationToken::new() }
     }
 
     /// A device of the entry was attached.
@@ -60,7 +60,7 @@ impl Post {
         self.removed();
         self.gone = CancellationToken::new();
         let attendant = Attendant {
-            environment: environment(&self.spec, attachment, &self.spec.topic, &self.prefix),
+            environment: environment(&self.spec, attachment, &self.spec.topic, &self.bus),
             programs: self.programs.clone(),
             spec: Arc::clone(&self.spec),
             node: self.node.clone(),

@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 use super::attendant::Post;
 use super::core::{Core, DeviceEffect, Effect, Input, StreamEvent, Transition};
 use super::presence::{JsonDevice, PERIOD, Presence};
-use super::programs::Programs;
+use super::programs::{BusNames, Programs};
 use super::slot::End;
 use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
 use super::worker::Seat;
@@ -98,14 +98,14 @@ impl Rig {
     /// A rig with every slot empty, which publishes through `presence`.
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
         let programs = Programs::new(registry, bus, &board);
-        let prefix = bus.membership().prefix();
+        let names = BusNames::of(&bus.membership());
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             let spec = Arc::new(spec.clone());
             let seat = programs.as_ref().and_then(|programs| Seat::new(programs, &spec, bus));
             let post = programs
                 .as_ref()
-                .map(|programs| Post::new(programs, &spec, prefix.clone(), seat.as_ref().map(Seat::turn)));
+                .map(|programs| Post::new(programs, &spec, names.clone(), seat.as_ref().map(Seat::turn)));
             // A program that drives its device subscribes to actions itself.
             let is_driven = spec.action.is_some() && seat.is_none();
             let controls = if is_driven { bus.actions().map(Controls::new) } else { None };

@@ -11,7 +11,7 @@ use tokio_util::task::TaskTracker;
 use super::attendant::HOOK_LIMIT;
 use super::logbook::Logbook;
 use super::worker::TERM_LIMIT;
-use crate::bus::Bus;
+use crate::bus::{Bus, Membership};
 use crate::device::Attachment;
 use crate::driver::process::Spawner;
 use crate::registry::{DeviceSpec, NodeSpec, Registry};
@@ -66,8 +66,23 @@ impl Programs {
 /// Environment variables of a child; one without a value is unset.
 pub(super) type Environment = Vec<(&'static str, Option<OsString>)>;
 
+/// What a program needs to find the bus.
+#[derive(Debug, Clone)]
+pub(super) struct BusNames {
+    /// iceoryx2's prefix.
+    pub(super) prefix: String,
+    /// iceoryx2's folder.
+    pub(super) root: String,
+}
+
+impl BusNames {
+    pub(super) fn of(membership: &Membership) -> Self {
+        Self { prefix: membership.prefix(), root: membership.root() }
+    }
+}
+
 /// The variables that every child gets about its device.
-pub(super) fn environment(spec: &DeviceSpec, attachment: &Attachment, topic: &str, prefix: &str) -> Environment {
+pub(super) fn environment(spec: &DeviceSpec, attachment: &Attachment, topic: &str, bus: &BusNames) -> Environment {
     let text = |text: &str| Some(OsString::from(text));
     vec![
         ("DEVICE_NAME", text(&spec.name)),
@@ -77,6 +92,7 @@ pub(super) fn environment(spec: &DeviceSpec, attachment: &Attachment, topic: &st
         ("DEVICE_ADDR", text(attachment.unit.place())),
         ("RAPID_TOPIC", text(topic)),
         ("RAPID_BIT", text(&spec.id.to_string())),
-        ("RAPID_BUS_PREFIX", text(prefix)),
+        ("RAPID_BUS_PREFIX", text(&bus.prefix)),
+        ("RAPID_BUS_ROOT", text(&bus.root)),
     ]
 }

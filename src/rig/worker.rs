@@ -17,7 +17,7 @@ use tokio::sync::{Mutex, oneshot};
 use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::programs::{Environment, MARGIN, Programs, environment};
+use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
 use crate::bus::{Arrivals, Bus, Given, Ingress, Membership};
 use crate::device::Attachment;
 use crate::driver::process::Launch;
@@ -106,7 +106,7 @@ impl Worker {
             started,
             ended: ending,
         };
-        let mut env: Environment = environment(spec, attachment, seat.ingress.topic(), &seat.membership.prefix());
+        let mut env: Environment = environment(spec, attachment, seat.ingress.topic(), &BusNames::of(&seat.membership));
         env.push(("RAPID_EPOCH", Some(epoch.0.to_string().into())));
         let launch = Launch { program: process.program.clone(), args: process.args.clone(), env };
         programs.tasks.spawn(keeper.keep(launch));

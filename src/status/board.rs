@@ -419,6 +419,23 @@ impl Board {
         previews.extend(Preview::of(id, header, payload).map(Arc::new));
     }
 
+    /// The node of a device that was opened.
+    pub fn node(&self, id: ModalityId) -> Option<String> {
+        lock(&self.opened).get(id.index())?.as_ref().map(|opened| opened.node.clone())
+    }
+
+    /// Reports that a control of a device was set.
+    pub fn set_control(&self, id: ModalityId, name: &str, value: i64) {
+        if let Some(Some(opened)) = lock(&self.opened).get_mut(id.index()) {
+            opened.negotiated.controls.insert(name.to_owned(), value);
+        }
+    }
+
+    /// The name of the entry of a bit.
+    pub fn name(&self, id: ModalityId) -> Option<String> {
+        lock(&self.entries).iter().find(|entry| entry.id == id).map(|entry| entry.name.clone())
+    }
+
     /// Of the devices that are looked at.
     fn details(&self, now: Stamp) -> Vec<DeviceDetail> {
         let entries = lock(&self.entries);

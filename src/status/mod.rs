@@ -311,6 +311,15 @@ pub enum Command {
     Restart(ModalityId),
     /// Unplug this simulated device, or plug it in again.
     Plug(String),
+    /// Set a control of a camera until it is opened again. What came of it is a line of the log.
+    Control {
+        /// The camera.
+        device: ModalityId,
+        /// The control, as in `devices.toml`.
+        name: String,
+        /// Its value.
+        value: i64,
+    },
     /// Provide previews of this device for the next seconds ([`preview`]).
     Look(ModalityId),
     /// End the program.

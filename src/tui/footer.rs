@@ -7,6 +7,7 @@ use ratatui::text::{Line, Span};
 use super::keys;
 use super::model::{Model, Quit};
 use super::theme::Theme;
+use super::tour::Tour;
 use crate::text;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
@@ -25,7 +26,13 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
             let message = text::cut(&message, usize::from(area.width).saturating_sub(2), theme.ellipsis()).into_owned();
             Line::styled(format!(" {message}"), theme.warning())
         }
-        None => keys(usize::from(area.width), model, theme),
+        None => match model.tour.and_then(Tour::text) {
+            Some(step) => {
+                let step = text::cut(step, usize::from(area.width).saturating_sub(2), theme.ellipsis()).into_owned();
+                Line::styled(format!(" {step}"), theme.title())
+            }
+            None => keys(usize::from(area.width), model, theme),
+        },
     };
     frame.render_widget(line, area);
 }

@@ -79,6 +79,8 @@ pub(super) enum Act {
     Wrap,
     /// Group repeated lines of the log, or list each.
     Group,
+    /// Ask for a control of the selected camera.
+    Control,
     /// Show pictures, or not.
     Pictures,
     /// Scroll to older lines of the log.
@@ -111,6 +113,7 @@ impl Act {
                 | Self::Task
                 | Self::EndSession
                 | Self::Register
+                | Self::Control
                 | Self::Restart
                 | Self::Plug
                 | Self::AskToArm
@@ -205,7 +208,7 @@ use KeyCode::{Char, Down, End, Esc, F, Home, Left, PageDown, PageUp, Right, Up};
 use When::{Always, Control, ControlRepeated, Pressed, Repeated};
 
 /// All keys. The footer shows as many as fit, in this order; the help and the last two always.
-pub(super) const TABLE: [Binding; 40] = [
+pub(super) const TABLE: [Binding; 41] = [
     row(Act::Toggle, &[Char(' ')], Pressed, ("space", "start an episode, end the one in progress"), |m| {
         Some(toggles(m))
     }),
@@ -258,6 +261,7 @@ pub(super) const TABLE: [Binding; 40] = [
     }),
     row(Act::Wrap, &[Char('w')], Pressed, ("w, g", "log: wrap long lines; group repeats"), never),
     row(Act::Group, &[Char('g')], Pressed, ("", ""), never),
+    row(Act::Control, &[Char('C')], Pressed, ("C", "set a control of the selected camera"), never),
     row(Act::Pictures, &[Char('c')], Pressed, ("c", "pictures of cameras: on or off"), never),
     row(Act::Older, &[PageUp], Repeated, ("pgup, pgdn", "scroll the log; esc goes to its end"), never),
     row(Act::Newer, &[PageDown], Repeated, ("", ""), never),

@@ -28,6 +28,7 @@ mod recording;
 mod terminal;
 pub mod theme;
 mod timeline;
+mod tour;
 pub mod view;
 
 use std::io::{self, Write as _};
@@ -75,6 +76,8 @@ pub struct ScreenOptions {
     pub utc: bool,
     /// The mouse selects and scrolls; the terminal's own selection of text then needs shift.
     pub mouse: bool,
+    /// The screen leads through the first minute.
+    pub tour: bool,
 }
 
 /// What a click or the wheel means.
@@ -137,6 +140,7 @@ async fn drive(
     let mut events = std::pin::pin!(events);
     let mut model = Model::new(link.snapshot());
     model.zone = if options.utc { Zone::UTC } else { Zone::local() };
+    model.tour = options.tour.then(tour::Tour::default);
     let theme = Theme::detect(|name| std::env::var(name).ok());
     let mut frames = tokio::time::interval(FRAME);
     frames.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -18,6 +18,7 @@ use super::link::LinkState;
 use super::log_view::LogView;
 use super::picture::Picture;
 use super::theme::Edge;
+use super::tour::Tour;
 use super::view::Target;
 use super::{help, view};
 use crate::action::Order;
@@ -156,6 +157,8 @@ pub struct Model {
     asked: Vec<String>,
     /// The device whose name is typed.
     unnamed: Option<UnregisteredDevice>,
+    /// Leads through the first minute.
+    pub(super) tour: Option<Tour>,
     /// The open page of the help, from 1.
     pub(super) help: Option<usize>,
     /// Whether the user has asked to quit.
@@ -219,6 +222,7 @@ impl Model {
             is_new_rig: false,
             asked: Vec::new(),
             unnamed: None,
+            tour: None,
             help: None,
             quit: Quit::No,
             arming: None,
@@ -286,6 +290,9 @@ impl Model {
             self.notify(&text);
         }
         self.ask_for_names();
+        if let Some(tour) = &mut self.tour {
+            tour.update(&self.latest);
+        }
         if refresh && self.frozen.is_none() {
             self.read();
         }
@@ -403,6 +410,7 @@ impl Model {
             Act::Task => self.ask(Question::Task),
             Act::EndSession => self.ask(Question::EndSession),
             Act::Register => self.ask_for_name(),
+            Act::Control => self.ask(Question::Control),
             Act::Restart => return self.restart(),
             Act::AskToArm => self.ask_to_arm(),
             Act::Plug => return self.plug(),
@@ -821,6 +829,8 @@ enum Question {
     Search,
     /// The name of a device that has no entry.
     Name,
+    /// A control of the selected camera, and its value.
+    Control,
 }
 
 impl Question {
@@ -829,6 +839,7 @@ impl Question {
             Self::Note => "note: ",
             Self::WhyFailed => "why it failed (may be empty): ",
             Self::Task => "task: ",
+            Self::Control => "control of the camera, such as exposure=120: ",
             Self::Search => "lines of the log with: ",
             Self::Name => "name of the new device (empty: none): ",
             Self::EndSession => "type end to end the session and delete what was discarded: ",
@@ -854,6 +865,21 @@ impl Model {
             _ => prompt.question.text().to_owned(),
         };
         Some((question, prompt.text.as_str()))
+    }
+
+    /// `NAME=VALUE`.
+    fn set_control(&mut self, text: &str) -> Effect {
+        let parts = text.split_once('=').and_then(|(name, value)| Some((name.trim(), value.trim().parse().ok()?)));
+        match (parts, self.selected_device().map(|device| device.id)) {
+            (Some((name, value)), Some(device)) if !name.is_empty() => {
+                self.notify("setting it; the log says what came of it");
+                Effect::Send(Command::Control { device, name: name.to_owned(), value })
+            }
+            _ => {
+                self.notify("not set: write NAME=VALUE, with a whole number");
+                Effect::None
+            }
+        }
     }
 
     /// Devices without an entry that were not asked about.
@@ -918,6 +944,7 @@ impl Model {
                 self.log.search = text;
                 return Effect::None;
             }
+            Question::Control => return self.set_control(&text),
             Question::Name => {
                 let (Some(unit), false) = (self.unnamed.take(), text.trim().is_empty()) else {
                     self.notify("no entry; N asks again");

@@ -245,16 +245,22 @@ fn two_users_on_one_machine_do_not_write_through_each_other() {
     assert!(printed.contains("it belongs to user 0") && printed.contains("remove it: rm -r /dev/shm/"), "{printed}");
     fs::remove_file(&mask).expect("clean");
 
-    // The bus's folder is root's by now, as the first user owns it.
+    // iceoryx2's folder is root's by now: the bus of another user has a folder of its own, unless someone else made it.
     let output = place.run(&["--sim", "--headless", "--duration", "100ms"]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let own = PathBuf::from(format!("/tmp/iceoryx2-{NOBODY}"));
+    let _ = fs::remove_dir_all(&own);
+    fs::create_dir(&own).expect("plant");
     let output = shared.as_nobody(&run);
     let printed = text(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{printed}");
-    assert!(
-        printed.contains("/tmp/iceoryx2: belongs to user 0; end the programs that use it and remove it"),
-        "{printed}"
-    );
+    let refused = format!("{}: belongs to user 0; end the programs that use it and remove it", own.display());
+    assert!(printed.contains(&refused), "{printed}");
+    fs::remove_dir(&own).expect("clean");
+    let output = shared.as_nobody(&run);
+    let printed = text(&output.stderr);
+    assert_eq!(output.status.code(), support::recorded_code(&text(&output.stdout)), "{printed}");
+    fs::remove_dir_all(&own).expect("the folder of this user's bus");
 
     // A link of user `nobody` as the folder of root's episodes.
     let link = place.path("link");
