@@ -16,9 +16,9 @@ use rapid::registry::{
 };
 use rapid::sample::Epoch;
 use rapid::status::session::SessionRequest;
-use rapid::status::{Board, Command, Level, LogLine, Outlook, RecordingStatus, SlotState, What};
-use rapid::time::{Stamp, realtime_ns};
-use rapid::tui;
+use rapid::status::{Board, Command, Level, Outlook, RecordingStatus, SlotState, What};
+use rapid::time::Stamp;
+use rapid::tui::{self, ScreenOptions};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -50,7 +50,7 @@ async fn main() -> Result<(), tui::TuiError> {
                 () = async { end.await; std::future::pending().await } => Ok(()),
             }
         }
-        None => tui::run(board, sender, Arc::default(), shutdown.clone()).await,
+        None => tui::run(board, sender, Arc::default(), ScreenOptions::default(), shutdown.clone()).await,
     };
     shutdown.cancel();
     // It ends by the token.
@@ -101,6 +101,7 @@ fn registry(count: u8) -> Registry {
         devices: (0..count).filter_map(device).collect(),
         modules: Vec::new(),
         stops: Vec::new(),
+        buttons: Vec::new(),
         path: None,
         text: String::new(),
     }
@@ -125,7 +126,12 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                     None => episode = Some((Stamp::now(), "episodes/2026-01-01_place-block_001.mcap".into(), 0)),
                 },
                 // Its episodes and its registry have no file, and its devices no cable.
-                Command::Session(_) | Command::Plug(_) | Command::Reload | Command::Register { .. } => {}
+                Command::Session(_)
+                | Command::Plug(_)
+                | Command::Reload
+                | Command::Register { .. }
+                | Command::Control { .. }
+                | Command::Look(_) => {}
                 Command::Restart(id) => states[id.index()] = SlotState::Absent,
             },
             _ = beat.tick() => {}
@@ -195,7 +201,7 @@ fn detail(state: SlotState) -> &'static str {
 }
 
 fn report(board: &Board, level: Level, text: String) {
-    board.log(LogLine { wall_ns: realtime_ns(), level, text });
+    board.log(level, &text);
 }
 
 /// The verdict on an episode that was never recorded.
