@@ -35,6 +35,7 @@ mod publishers;
 mod python;
 mod register;
 mod scenarios;
+mod screen;
 mod second_run;
 mod session;
 mod shared_memory;
