@@ -34,7 +34,8 @@ impl Tmux {
             ("HOME", folder.display().to_string()),
             ("LC_ALL", "C.UTF-8".to_owned()),
             ("TZ", "UTC".to_owned()),
-            ("PS1", format!("{PROMPT} ")),
+            // The variable itself would not do: a shell of root replaces it.
+            ("ENV", place.write("shell", &format!("PS1='{PROMPT} '\n")).display().to_string()),
             ("RAPID_INSTANCE", place.instance.clone()),
             // Pictures depend on what the terminal answers; characters do not.
             ("RAPID_PICTURES", "text".to_owned()),
