@@ -20,6 +20,8 @@ readonly VENV="$CACHE/venv"
 # pkg-config, libudev-dev: crate udev. libclang-dev: the V4L2 bindings. libstdc++6: onnxruntime at run time. python3,
 # python3-venv: pip, which fetches onnxruntime; the program itself needs neither.
 readonly BUILD_PACKAGES=(gcc libc6-dev pkg-config libudev-dev libclang-dev libstdc++6 python3 python3-venv)
+# tmux: the terminals in which tests use the monitor.
+readonly TEST_PACKAGES=(tmux)
 readonly FUZZ_PACKAGES=(g++)
 
 changed=0
@@ -41,7 +43,7 @@ main() {
     for part in "$@"; do
         case "$part" in
             build) wanted+=("${BUILD_PACKAGES[@]}") ;;
-            test) mapfile -t -O "${#wanted[@]}" wanted < <(test_packages) ;;
+            test) wanted+=("${TEST_PACKAGES[@]}") && mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages) ;;
             fuzz) wanted+=("${FUZZ_PACKAGES[@]}") ;;
             *) die "unknown part '$part': build, test or fuzz" ;;
         esac
@@ -64,8 +66,8 @@ lint_tools() {
     rustup component add rustfmt clippy
 }
 
-# The packages of the test part, one per line.
-test_packages() {
+# The packages of the virtual bench, one per line.
+bench_packages() {
     local list=tests/vbench/image/packages.txt
     [[ ! -f $list ]] || sed 's/#.*//' "$list" | tr -s '[:space:]' '\n' | sed '/^$/d'
 }

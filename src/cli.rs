@@ -165,6 +165,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
 /// Options of a run.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = RUN)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
 pub struct RunArgs {
     /// Print events as plain text (no monitor)
     #[arg(long)]

@@ -196,8 +196,8 @@ fn send(outgoing: &Receiver<Outgoing>, failures: &Sender<Msg>) {
             Outgoing::Command(command) => command,
         };
         // Commands have no maps with keys that are not text, the only thing that JSON refuses.
-        let line = serde_json::to_string(&command).unwrap_or_default() + "\n";
-        let sent = link.as_mut().map(|link| link.write_all(line.as_bytes()));
+        let request = serde_json::to_string(&command).unwrap_or_default() + "\n";
+        let sent = link.as_mut().map(|link| link.write_all(request.as_bytes()));
         if !matches!(sent, Some(Ok(()))) {
             let _ = failures.send(Msg::Failed("the run does not take this request".to_owned()));
         }

@@ -129,9 +129,10 @@ impl Decoder {
             if !text.ends_with('\n') {
                 return Err(LinkError::Ended);
             }
-            let message = serde_json::from_str(&text).map_err(|error| match text.starts_with('{') {
-                true => LinkError::Version(error.to_string()),
-                false => LinkError::Refused(text.trim_end().to_owned()),
+            let message = serde_json::from_str(&text).map_err(|error| {
+                let is_object = text.starts_with('{');
+                let refused = || LinkError::Refused(text.trim_end().to_owned());
+                if is_object { LinkError::Version(error.to_string()) } else { refused() }
             })?;
             match message {
                 Message::Hello { protocol: PROTOCOL, .. } => {}

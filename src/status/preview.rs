@@ -69,6 +69,11 @@ impl Preview {
         captured.since(self.captured) >= if bytes <= SMALL { SMALL_EVERY } else { EVERY }
     }
 
+    /// Whether it is a picture, if perhaps a damaged one. The header of numbers has a width too: how many there are.
+    pub fn is_picture(&self) -> bool {
+        self.width > 0 && matches!(self.encoding, Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey)
+    }
+
     /// The numbers of a sample of numbers; empty for any other.
     pub fn numbers(&self) -> Vec<f64> {
         if self.encoding != Encoding::F64 {

@@ -117,7 +117,8 @@ fn draw_sample(
     let preview = model.preview(device.id);
     let remark = preview.map_or_else(String::new, |preview| {
         let age = model.shown().taken.since(preview.captured);
-        let size = if preview.width > 0 { format!("{}x{}, ", preview.width, preview.height) } else { String::new() };
+        let is_picture = preview.is_picture();
+        let size = if is_picture { format!("{}x{}, ", preview.width, preview.height) } else { String::new() };
         format!("{size}{}, {} old", text::size(preview.bytes as u64), text::age(age).trim())
     });
     let inner = view::panel(frame, area, "Newest sample", Span::styled(remark, theme.faint()).into(), theme);

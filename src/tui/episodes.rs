@@ -82,7 +82,7 @@ fn in_full(entry: &EpisodeEntry, session: &SessionStatus, width: u16, theme: The
     };
     let mut lines = vec![fact("begun", &entry.begun), verdict];
     lines.extend(entry.reasons.iter().map(|reason| fact("reason", reason)));
-    lines.extend(entry.sensors.as_ref().map(|sensors| fact("sensors", &sensors.to_string())));
+    lines.extend(entry.sensors.as_ref().map(|sensors| fact("took part", &sensors.to_string())));
     lines.extend(entry.label.map(|label| match entry.label_reason.as_str() {
         "" => fact("label", label.word()),
         why => fact("label", &format!("{}: {why}", label.word())),

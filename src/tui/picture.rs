@@ -39,7 +39,7 @@ impl Picture {
     /// # Errors
     /// When it is damaged: why.
     pub(super) fn decode(preview: &Preview) -> Option<Result<Self, String>> {
-        if preview.width == 0 {
+        if !preview.is_picture() {
             return None;
         }
         let Preview { encoding, width, height, .. } = *preview;
@@ -194,6 +194,8 @@ mod tests {
         short.payload = short.payload[1..].into();
         assert!(Picture::decode(&short).unwrap().is_err());
         assert!(Picture::decode(&Preview::default()).is_none());
+        let numbers = Preview { encoding: Encoding::F64, width: 3, ..Preview::default() };
+        assert!(Picture::decode(&numbers).is_none(), "the width of numbers is their count");
     }
 
     #[test]

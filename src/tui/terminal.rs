@@ -108,8 +108,8 @@ impl Drop for Screen {
 /// Pixels of a cell, if the terminal reports them.
 fn cell() -> Option<(u16, u16)> {
     let size = crossterm::terminal::window_size().ok()?;
-    let side = |pixels: u16, cells: u16| pixels.checked_div(cells).filter(|pixels| *pixels > 0);
-    Some((side(size.width, size.columns)?, side(size.height, size.rows)?))
+    let of_cell = |pixels: u16, cells: u16| pixels.checked_div(cells).filter(|pixels| *pixels > 0);
+    Some((of_cell(size.width, size.columns)?, of_cell(size.height, size.rows)?))
 }
 
 /// A writer to the terminal: standard output or, if that is redirected, the controlling terminal.

@@ -36,6 +36,7 @@ mod python;
 mod register;
 mod reload;
 mod scenarios;
+mod screen;
 mod second_run;
 mod session;
 mod shared_memory;

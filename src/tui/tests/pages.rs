@@ -97,7 +97,7 @@ fn numbers_are_plotted_and_those_with_limits_are_gauges() {
         let at = seq as f64 / 10.0;
         [at.sin(), at.cos() * 2.0].iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>()
     };
-    let sample = |seq| preview(2, seq, Encoding::F64, (0, 0), numbers(seq));
+    let sample = |seq| preview(2, seq, Encoding::F64, (3, 0), numbers(seq));
     let mut snapshot = with(three_streaming(), detail(2, Vec::new()), sample(0));
     let mut model = opened(&snapshot, 2, (80, 24));
     for seq in 1..100 {
@@ -115,7 +115,7 @@ fn numbers_are_plotted_and_those_with_limits_are_gauges() {
         channel("elbow error", None),
     ];
     let payload: Vec<u8> = [0.5_f64, 0.7, 0.0].iter().flat_map(|number| number.to_le_bytes()).collect();
-    let snapshot = with(three_streaming(), detail(2, channels), preview(2, 1, Encoding::F64, (0, 0), payload));
+    let snapshot = with(three_streaming(), detail(2, channels), preview(2, 1, Encoding::F64, (3, 0), payload));
     let screen = draw(&opened(&snapshot, 2, (80, 24)), (80, 24), THEME);
     assert_eq!(style_of(screen.buffer(), "0.700").fg, Some(Color::Reset));
     assert_snapshot!("gauges_80x24", screen);
