@@ -97,7 +97,7 @@ impl Canvas {
     /// For the terminal of this environment, with cells of `cell` pixels if it reports them.
     ///
     /// `RAPID_PICTURES` chooses: `kitty`, `iterm2`, `sixel`, `blocks` or `text`.
-    pub(super) fn detect(variable: impl Fn(&str) -> Option<String>, cell: Option<(u16, u16)>) -> Self {
+    pub fn detect(variable: impl Fn(&str) -> Option<String>, cell: Option<(u16, u16)>) -> Self {
         let set = |name: &str| variable(name).filter(|value| !value.is_empty());
         let is =
             |name: &str, words: &[&str]| set(name).is_some_and(|value| words.iter().any(|word| value.contains(word)));

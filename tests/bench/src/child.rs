@@ -20,6 +20,7 @@ use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
 use crate::Failure;
+use crate::drawn;
 use crate::feed::{self, Feed};
 use crate::heap;
 use crate::process::Running;
@@ -56,6 +57,14 @@ pub(crate) enum Child {
         /// How many
         count: usize,
     },
+    /// A monitor shows simulated hours, and reports what memory it kept
+    #[command(hide = true)]
+    Hours {
+        /// Seconds before the first report
+        first: u64,
+        /// Seconds in all
+        all: u64,
+    },
 }
 
 /// Resources that a child reports.
@@ -85,6 +94,7 @@ impl Child {
         let printed = match self {
             Self::Mcap { folder, seconds } => serde_json::to_string(&mcap_alone(folder, *seconds)?)?,
             Self::Devices { seconds } => serde_json::to_string(&devices_alone(*seconds)?)?,
+            Self::Hours { first, all } => serde_json::to_string(&drawn::kept(*first, *all)?)?,
             Self::Chunks { bundle, count } => serde_json::to_string(&heap::grown(bundle, *count)?)?,
         };
         Ok(writeln!(std::io::stdout(), "{printed}")?)

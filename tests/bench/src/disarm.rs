@@ -54,7 +54,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let presence = Presence::start(claim, mask, Arc::clone(&board))?;
     let permission = Arc::new(Permission::new(false));
     let (session, _requests) = tokio::sync::mpsc::channel(1);
-    let orders = Orders::receive(Some(&instance), Arc::clone(&permission), session)?;
+    let orders = Orders::receive(Some(&instance), None, Arc::clone(&permission), session)?;
     let mut rig = Rig::new(&registry, &bus, presence, board).obeying(&permission);
     let node = DeviceNode::Tty(adapter.path.clone());
     let unit = UsbIdentity { vid: 0x2e88, pid: 0x4603, port: "1-1".to_owned(), ..UsbIdentity::default() };

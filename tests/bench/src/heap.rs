@@ -68,7 +68,8 @@ pub(crate) fn grown(folder: &Path, chunks: usize) -> Result<Memory, Failure> {
     Ok(memory)
 }
 
-fn resident() -> Result<f64, Failure> {
+/// Anonymous memory of this process, KiB.
+pub(crate) fn resident() -> Result<f64, Failure> {
     kibibytes("/proc/self/status", "RssAnon:")
 }
 

@@ -11,6 +11,7 @@ mod can;
 mod child;
 mod control;
 mod disarm;
+mod drawn;
 mod eager;
 mod eval;
 mod feed;
@@ -26,8 +27,10 @@ mod others;
 mod picture;
 mod policy;
 mod process;
+mod pty;
 mod replug;
 mod safety;
+mod screen;
 mod start;
 mod stats;
 mod sync;
@@ -103,6 +106,7 @@ enum Section {
     Write,
     Sync,
     Start,
+    Screen,
     Policy,
     Picture,
     Infer,
@@ -121,7 +125,7 @@ enum Section {
 
 impl Section {
     /// In this order: measurements that must not be disturbed come before those that leave dirty pages behind.
-    const ALL: [Self; 22] = [
+    const ALL: [Self; 23] = [
         Self::Start,
         Self::Infer,
         Self::Sync,
@@ -137,6 +141,7 @@ impl Section {
         Self::Replug,
         Self::Unplug,
         Self::Mask,
+        Self::Screen,
         Self::Many,
         Self::Load,
         Self::Write,
@@ -156,6 +161,7 @@ impl Section {
             Self::Write => "write",
             Self::Sync => "sync",
             Self::Start => "start",
+            Self::Screen => "screen",
             Self::Policy => "policy",
             Self::Picture => "picture",
             Self::Infer => "infer",
@@ -188,6 +194,7 @@ impl Section {
             Self::Write => write::measure(bench),
             Self::Sync => sync::measure(bench),
             Self::Start => start::measure(bench),
+            Self::Screen => screen::measure(bench),
             Self::Policy => policy::measure(bench),
             Self::Picture => picture::measure(bench),
             Self::Infer => infer::measure(bench),

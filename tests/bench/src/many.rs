@@ -92,11 +92,10 @@ fn one(bench: &Bench, count: usize, length: u64) -> Result<Run, Failure> {
     Ok(Run { cpu: 100.0 * (usage.cpu_s - usage.cpu_before_mark_s) / episode.seconds, episode, seen })
 }
 
-/// Options that make `rapid` play this many devices.
-fn scenario(bench: &Bench, count: usize) -> Result<Vec<OsString>, Failure> {
-    let folder = bench.scratch.path();
-    let (mut registry, mut played) = ("[rig]\nname = \"many\"\n".to_owned(), String::new());
-    for number in 0..count.max(1) {
+/// A registry of this many devices, whose names are `d0`, `d1`, ...
+pub(crate) fn registry(count: usize) -> Result<String, Failure> {
+    let mut registry = "[rig]\nname = \"many\"\n".to_owned();
+    for number in 0..count {
         let (name, table) = (format!("d{number}"), KINDS[number % KINDS.len()]);
         write!(registry, "\n[device.{name}]\nbit = {number}\n")?;
         if !table.contains("HOST") {
@@ -108,10 +107,19 @@ fn scenario(bench: &Bench, count: usize) -> Result<Vec<OsString>, Failure> {
                 .replace("HOST", &(number + 1).to_string())
                 .replace("PORT", &(5_600 + number).to_string()),
         );
-        write!(played, "[[device]]\nname = \"{name}\"\nplugged = {}\n", count > 0)?;
+    }
+    Ok(registry)
+}
+
+/// Options that make `rapid` play this many devices.
+pub(crate) fn scenario(bench: &Bench, count: usize) -> Result<Vec<OsString>, Failure> {
+    let folder = bench.scratch.path();
+    let mut played = String::new();
+    for number in 0..count.max(1) {
+        write!(played, "[[device]]\nname = \"d{number}\"\nplugged = {}\n", count > 0)?;
     }
     let (config, scenario) = (folder.join("many.devices.toml"), folder.join("many.toml"));
-    std::fs::write(&config, registry)?;
+    std::fs::write(&config, registry(count.max(1))?)?;
     std::fs::write(&scenario, played)?;
     Ok(vec!["--config".into(), config.into(), "--sim".into(), scenario.into()])
 }

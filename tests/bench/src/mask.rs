@@ -27,7 +27,7 @@ const SETTLE: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub(crate) struct Seen {
     /// Intervals between consecutive publications, by their own stamps, ms.
-    intervals: Sorted,
+    pub(crate) intervals: Sorted,
     /// Publications that the reader missed.
     unseen: u64,
     baseline: Sorted,

@@ -131,6 +131,11 @@ impl Running {
         }
     }
 
+    /// Its process.
+    pub(crate) fn pid(&self) -> Pid {
+        self.pid
+    }
+
     /// Separates the resources used until now from those that follow.
     pub(crate) fn mark(&mut self) {
         self.usage.cpu_before_mark_s = cpu_s(self.pid).unwrap_or_default();
@@ -226,7 +231,8 @@ fn field(status: &str, name: &str) -> Option<u64> {
     line.split_whitespace().next()?.parse().ok()
 }
 
-fn cpu_s(pid: Pid) -> Option<f64> {
+/// User and system time of a process, s.
+pub(crate) fn cpu_s(pid: Pid) -> Option<f64> {
     let stat = fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
     // The second field, the name in parentheses, may contain anything.
     let mut fields = stat.rsplit_once(')')?.1.split_whitespace().skip(11);
