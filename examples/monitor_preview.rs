@@ -120,7 +120,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                 Command::Quit => shutdown.cancel(),
                 Command::Session(SessionRequest::Toggle) => match episode.take() {
                     Some((_, file, _)) => {
-                        report(&board, Level::Info, format!("episode {} finished", file.display()));
+                        report(&board, Level::Info, &format!("episode {} finished", file.display()));
                         board.set_last_episode(file, pretended());
                     }
                     None => episode = Some((Stamp::now(), "episodes/2026-01-01_place-block_001.mcap".into(), 0)),
@@ -155,7 +155,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                     detail: detail(state).to_owned(),
                 });
                 let level = if state == SlotState::Failed { Level::Error } else { Level::Info };
-                report(&board, level, format!("bit {bit} is {state:?}, {}", detail(state)));
+                report(&board, level, &format!("bit {bit} is {state:?}, {}", detail(state)));
             }
             if state == SlotState::Streaming && sequence % (5 * (1 + u64::from(bit) % 4)) == 0 {
                 board.counters(id).count(30_000, now, u64::from(sequence % 5000 == 0));
@@ -200,8 +200,8 @@ fn detail(state: SlotState) -> &'static str {
     }
 }
 
-fn report(board: &Board, level: Level, text: String) {
-    board.log(level, &text);
+fn report(board: &Board, level: Level, text: &str) {
+    board.log(level, text);
 }
 
 /// The verdict on an episode that was never recorded.

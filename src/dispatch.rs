@@ -112,17 +112,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
     let global = &cli.global;
     let format = if global.json { Format::Json } else { Format::Text };
     let Some(command) = cli.command else {
-        if cli.task.expert {
-            return policy::demonstrate(global, &cli.run, &cli.task, format);
-        }
-        let is_shown = !cli.run.headless && !global.json && io::stdout().is_terminal() && io::stdin().is_terminal();
-        let is_new = global.sim.is_none() && cli.policy.infer.is_none() && find_registry(global).is_none();
-        let rig = match is_new && is_shown {
-            // The first minutes: the screen asks for the names of what is plugged in.
-            true => (Registry::empty(Path::new("devices.toml")), Devices::Machine),
-            false => rig(global, cli.task.seed)?,
-        };
-        return run(global, &cli.run, rig, cli.task.seed, Some(cli.policy));
+        return without_command(cli, format);
     };
     match command {
         Command::Check => reported(commands::check::check(&registry_path(global)?, format, out)?),
@@ -213,6 +203,23 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::grammar(), shell, out)?),
         Command::Man { to } => Ok(commands::completions::man(Cli::grammar(), &to, out)?),
     }
+}
+
+/// Runs the rig, or records demonstrations of the simulated task.
+fn without_command(cli: Cli, format: Format) -> Result<(), Failure> {
+    let global = &cli.global;
+    if cli.task.expert {
+        return policy::demonstrate(global, &cli.run, &cli.task, format);
+    }
+    let is_shown = !cli.run.headless && !global.json && io::stdout().is_terminal() && io::stdin().is_terminal();
+    let is_new = global.sim.is_none() && cli.policy.infer.is_none() && find_registry(global).is_none();
+    let rig = if is_new && is_shown {
+        // The first minutes: the screen asks for the names of what is plugged in.
+        (Registry::empty(Path::new("devices.toml")), Devices::Machine)
+    } else {
+        rig(global, cli.task.seed)?
+    };
+    run(global, &cli.run, rig, cli.task.seed, Some(cli.policy))
 }
 
 fn reported(outcome: CommandStatus) -> Result<(), Failure> {

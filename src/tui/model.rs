@@ -151,12 +151,7 @@ pub struct Model {
     looked: Option<Stamp>,
     /// What the previews showed so far.
     seen: Seen,
-    /// The rig had no entry when the screen began: names are asked for as devices are plugged in.
-    is_new_rig: bool,
-    /// Devices without an entry that were asked about.
-    asked: Vec<String>,
-    /// The device whose name is typed.
-    unnamed: Option<UnregisteredDevice>,
+    naming: Naming,
     /// Leads through the first minute.
     pub(super) tour: Option<Tour>,
     /// The open page of the help, from 1.
@@ -174,6 +169,17 @@ pub struct Model {
     /// How often the bell was to ring.
     rings: u64,
     notice: Option<Notice>,
+}
+
+/// Devices without an entry, and their names.
+#[derive(Debug, Default)]
+struct Naming {
+    /// The rig had no entry when the screen began: names are asked for as devices are plugged in.
+    is_new_rig: bool,
+    /// Devices that were asked about.
+    asked: Vec<String>,
+    /// The device whose name is typed.
+    unnamed: Option<UnregisteredDevice>,
 }
 
 /// The answer to a key.
@@ -219,9 +225,7 @@ impl Model {
             pictures: true,
             looked: None,
             seen: Seen::default(),
-            is_new_rig: false,
-            asked: Vec::new(),
-            unnamed: None,
+            naming: Naming::default(),
             tour: None,
             help: None,
             quit: Quit::No,
@@ -232,7 +236,7 @@ impl Model {
             rings: 0,
             notice: None,
         };
-        model.is_new_rig = model.latest.devices.is_empty();
+        model.naming.is_new_rig = model.latest.devices.is_empty();
         model.read();
         model
     }
@@ -857,7 +861,7 @@ impl Model {
     /// The question and the answer typed so far.
     pub fn prompt(&self) -> Option<(String, &str)> {
         let prompt = self.prompt.as_ref()?;
-        let question = match &self.unnamed {
+        let question = match &self.naming.unnamed {
             Some(unit) if prompt.question == Question::Name => {
                 format!("name of the {} {} (empty: none): ", unit.node, unit.device)
             }
@@ -883,13 +887,13 @@ impl Model {
 
     /// Devices without an entry that were not asked about.
     fn unasked(&self) -> impl Iterator<Item = &UnregisteredDevice> {
-        self.latest.unregistered.iter().filter(|unit| !self.asked.contains(&unit.device))
+        self.latest.unregistered.iter().filter(|unit| !self.naming.asked.contains(&unit.device))
     }
 
     /// In a rig without entries, asks for the name of each device that is plugged in, one after the other.
     fn ask_for_names(&mut self) {
         let is_free = self.prompt.is_none() && self.help.is_none() && self.quit == Quit::No;
-        if self.is_new_rig && is_free && self.unasked().next().is_some() {
+        if self.naming.is_new_rig && is_free && self.unasked().next().is_some() {
             self.ask_for_name();
         }
     }
@@ -899,8 +903,8 @@ impl Model {
         let Some(unit) = self.unasked().next().or_else(|| self.latest.unregistered.first()).cloned() else {
             return self.notify("every device that is plugged in has an entry");
         };
-        self.asked.push(unit.device.clone());
-        self.unnamed = Some(unit);
+        self.naming.asked.push(unit.device.clone());
+        self.naming.unnamed = Some(unit);
         self.ask(Question::Name);
     }
 
@@ -909,7 +913,7 @@ impl Model {
         let text = match question {
             Question::Task => session.map(|session| session.task.clone()).unwrap_or_default(),
             Question::Search => self.log.search.clone(),
-            Question::Name => self.unnamed.as_ref().and_then(|unit| unit.name.clone()).unwrap_or_default(),
+            Question::Name => self.naming.unnamed.as_ref().and_then(|unit| unit.name.clone()).unwrap_or_default(),
             _ => String::new(),
         };
         self.prompt = Some(Prompt { question, text });
@@ -945,7 +949,7 @@ impl Model {
             }
             Question::Control => return self.set_control(&text),
             Question::Name => {
-                let (Some(unit), false) = (self.unnamed.take(), text.trim().is_empty()) else {
+                let (Some(unit), false) = (self.naming.unnamed.take(), text.trim().is_empty()) else {
                     self.notify("no entry; N asks again");
                     return Effect::None;
                 };
