@@ -23,7 +23,7 @@ pub use session::{EpisodeCommand, SessionCommand};
 #[derive(Debug, Parser)]
 #[command(
     version, long_version = LONG_VERSION, max_term_width = 100, after_long_help = EXAMPLES,
-    override_usage = "rapid [OPTIONS]\n       rapid <COMMAND> [OPTIONS]", disable_help_flag = true,
+    override_usage = "rapid [COMMAND] [OPTIONS]", disable_help_flag = true,
     disable_version_flag = true
 )]
 pub struct Cli {
@@ -180,7 +180,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
     pub out: PathBuf,
     /// Task, part of the file's name
-    #[arg(long, value_name = "TEXT", default_value = "episode")]
+    #[arg(long, value_name = "TEXT", default_value = "episode", hide_short_help = true)]
     pub task: String,
     /// Property of the episode, such as finger=soft; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = tag, hide_short_help = true)]

@@ -185,7 +185,8 @@ fn row(
     let rate = if running { text::hertz(reading.hz) } else { none.clone() };
     let age = reading.age.filter(|_| running).map_or(none, text::age);
     let is_old = device.state == SlotState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
-    let gaps = if device.gaps > 0 { theme.level(Level::Warn) } else { theme.faint() };
+    let lost = model.lost(device);
+    let gaps = if lost > 0 { theme.level(Level::Warn) } else { theme.faint() };
     let word = format!("{} {}", theme.state_symbol(device.state), device.state.word());
     let total = total_width(name, width);
     let strip = strip(device, width, model, theme);
@@ -209,7 +210,7 @@ fn row(
         Span::styled(format!("{rate:>RATE$}"), figures),
         Span::styled(if wanted > 0 { format!("{:wanted$}", nominal(device)) } else { String::new() }, theme.faint()),
         Span::styled(format!("{age:>AGE$}"), if running && is_old { theme.warning() } else { figures }),
-        Span::styled(format!("{:>GAPS$}", compact(device.gaps)), gaps),
+        Span::styled(format!("{:>GAPS$}", compact(lost)), gaps),
         Span::styled(if total > 0 { format!("{:>total$}", compact(device.samples)) } else { String::new() }, figures),
     ];
     spans.extend(strip);

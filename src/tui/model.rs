@@ -132,6 +132,8 @@ pub struct Model {
     readings: [Reading; MAX_MODALITIES],
     /// Figures of the whole rig.
     pub(super) totals: Totals,
+    /// Samples lost by each device when the episode in progress began.
+    lost_before: [u64; MAX_MODALITIES],
     edges: [Option<Stamp>; MAX_MODALITIES],
     /// When a device was unplugged, if the screen was open then.
     unplugged: [Option<Stamp>; MAX_MODALITIES],
@@ -215,6 +217,7 @@ impl Model {
             by_trouble: false,
             readings: [Reading::default(); MAX_MODALITIES],
             totals: Totals::default(),
+            lost_before: [0; MAX_MODALITIES],
             edges: [None; MAX_MODALITIES],
             unplugged: [None; MAX_MODALITIES],
             selected: 0,
@@ -269,7 +272,12 @@ impl Model {
                 *edge = Some(snapshot.taken);
             }
         }
+        let file = |snapshot: &Snapshot| snapshot.recording.as_ref().map(|recording| recording.file.clone());
+        let begins = file(&snapshot).is_some() && file(&snapshot) != file(&self.latest);
         for device in &snapshot.devices {
+            if let Some(lost) = self.lost_before.get_mut(device.id.index()).filter(|_| begins) {
+                *lost = device.gaps;
+            }
             let before = self.latest.devices.iter().find(|before| before.id == device.id);
             let was_attached = before.is_some_and(|before| before.state != SlotState::Absent);
             if let Some(unplugged) = self.unplugged.get_mut(device.id.index())
@@ -710,6 +718,12 @@ impl Model {
         let unplugged = self.unplugged.get(device.id.index()).copied().flatten()?;
         let shown = self.shown().taken;
         (device.state == SlotState::Absent && unplugged <= shown).then(|| shown.since(unplugged))
+    }
+
+    /// Samples that a device lost: in the episode in progress or, without one, in the run.
+    pub(super) fn lost(&self, device: &DeviceStatus) -> u64 {
+        let before = self.lost_before.get(device.id.index()).filter(|_| self.shown().recording.is_some());
+        device.gaps.saturating_sub(before.copied().unwrap_or(0))
     }
 
     /// The selected device.

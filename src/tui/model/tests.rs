@@ -551,3 +551,21 @@ fn in_a_rig_with_entries_nothing_is_asked_by_itself() {
     model.update(press(KeyCode::Char('N')));
     assert_eq!(model.notice(), Some("every device that is plugged in has an entry"));
 }
+
+#[test]
+fn losses_are_those_of_the_episode_in_progress() {
+    let mut now = three_streaming();
+    now.devices[0].gaps = 5;
+    let mut model = Model::new(now.clone());
+    let lost = |model: &Model| model.lost(&model.shown().devices[0]);
+    assert_eq!(lost(&model), 5, "of the run");
+    now.recording = Some(recording(0));
+    model.update(after(&now, 100));
+    assert_eq!(lost(&model), 0);
+    now.devices[0].gaps = 7;
+    model.update(after(&now, 200));
+    assert_eq!(lost(&model), 2, "of the episode");
+    now.recording = None;
+    model.update(after(&now, 300));
+    assert_eq!(lost(&model), 7);
+}
