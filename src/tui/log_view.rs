@@ -18,7 +18,6 @@ pub(super) struct Entry<'a> {
     pub line: &'a LogLine,
     /// How many lines it stands for.
     pub times: usize,
-    shape: u64,
 }
 
 /// See the module's comment.
@@ -64,12 +63,11 @@ impl LogView {
         let is_shown = |line: &&LogLine| line.number <= until && self.shows(line, &search);
         let mut entries: Vec<Entry<'_>> = Vec::with_capacity(log.len());
         for line in log.iter().map(Arc::as_ref).filter(is_shown) {
-            let mut entry = Entry { line, times: 1, shape: shape(line) };
+            let mut entry = Entry { line, times: 1 };
             let from = entries.len().saturating_sub(GROUP_WITHIN);
             let mut last = entries.iter().skip(from);
             if self.groups
-                && let Some(place) =
-                    last.rposition(|before| before.shape == entry.shape && is_repeat(before.line, line))
+                && let Some(place) = last.rposition(|before| is_repeat(before.line, line))
             {
                 entry.times += entries.remove(from + place).times;
             }
@@ -132,19 +130,16 @@ const fn is_number(byte: u8) -> bool {
     byte.is_ascii_digit() || byte == b'.'
 }
 
-/// A number that repeats have in common (FNV-1a of their last letters): a full log is compared some thousand times a frame,
-/// and of lines that a program prints many differ only at their end.
-fn shape(line: &LogLine) -> u64 {
-    let letters = line.text.bytes().rev().filter(|byte| !is_number(*byte)).take(LETTERS);
-    letters.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
-}
-
-/// Whether two lines differ only in their numbers.
+/// Whether two lines differ only in their numbers. Of a full log this is asked some thousand times a frame: nothing is
+/// copied, and the ends are compared first, since many lines of a program differ only there.
 fn is_repeat(a: &LogLine, b: &LogLine) -> bool {
+    fn ends(line: &LogLine) -> impl Iterator<Item = u8> {
+        line.text.bytes().rev().filter(|byte| !is_number(*byte)).take(LETTERS)
+    }
     fn words(line: &LogLine) -> impl Iterator<Item = &[u8]> {
         line.text.as_bytes().split(|byte| is_number(*byte)).filter(|word| !word.is_empty())
     }
-    (a.level, a.printed) == (b.level, b.printed) && a.device == b.device && words(a).eq(words(b))
+    (a.level, a.printed) == (b.level, b.printed) && a.device == b.device && ends(a).eq(ends(b)) && words(a).eq(words(b))
 }
 
 #[cfg(test)]
