@@ -64,8 +64,8 @@ fn remark(view: &LogView, model: &Model, theme: Theme) -> Line<'static> {
     Span::styled(format!("times in {}", theme.safe(&model.zone.name(newest))), theme.faint()).into()
 }
 
-fn render(entry: &Entry, width: usize, view: &LogView, model: &Model, theme: Theme) -> Vec<Line<'static>> {
-    let line = &entry.line;
+fn render(entry: &Entry<'_>, width: usize, view: &LogView, model: &Model, theme: Theme) -> Vec<Line<'static>> {
+    let line = entry.line;
     let time = model.zone.time_of_day(line.wall_ns);
     let level = match line.printed {
         // A traceback is not a message of rapid, and no greeting either.

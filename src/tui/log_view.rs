@@ -8,12 +8,14 @@ use crate::status::{Level, LogLine};
 
 /// A repeat is grouped with a line at most so many entries before it: two devices in trouble alternate.
 const GROUP_WITHIN: usize = 8;
+/// Letters at the end of a line that are compared before the whole line is.
+const LETTERS: usize = 16;
 
 /// A line, and how often it occurred.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Entry {
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Entry<'a> {
     /// The newest of its kind.
-    pub line: Arc<LogLine>,
+    pub line: &'a LogLine,
     /// How many lines it stands for.
     pub times: usize,
 }
@@ -47,23 +49,25 @@ impl LogView {
         Self { device: Some(device.to_owned()), ..Self::default() }
     }
 
-    fn shows(&self, line: &LogLine) -> bool {
+    /// Whether a line is shown; `search` is what it must contain, in lower case.
+    fn shows(&self, line: &LogLine, search: &str) -> bool {
         let is_of = |device: &String| line.device.as_ref() == Some(device);
         line.level >= self.least
             && self.device.as_ref().is_none_or(is_of)
-            && (self.search.is_empty() || line.text.to_lowercase().contains(&self.search.to_lowercase()))
+            && (search.is_empty() || line.text.to_lowercase().contains(search))
     }
 
     /// What is shown of this log, the oldest first.
-    pub(super) fn entries(&self, log: &[Arc<LogLine>]) -> Vec<Entry> {
-        let is_reached = |line: &Arc<LogLine>| self.until.is_none_or(|until| line.number <= until);
-        let mut entries: Vec<Entry> = Vec::new();
-        for line in log.iter().filter(|line| is_reached(line) && self.shows(line)) {
-            let mut entry = Entry { line: Arc::clone(line), times: 1 };
+    pub(super) fn entries<'a>(&self, log: &'a [Arc<LogLine>]) -> Vec<Entry<'a>> {
+        let (search, until) = (self.search.to_lowercase(), self.until.unwrap_or(u64::MAX));
+        let is_shown = |line: &&LogLine| line.number <= until && self.shows(line, &search);
+        let mut entries: Vec<Entry<'_>> = Vec::with_capacity(log.len());
+        for line in log.iter().map(Arc::as_ref).filter(is_shown) {
+            let mut entry = Entry { line, times: 1 };
             let from = entries.len().saturating_sub(GROUP_WITHIN);
-            let same = |before: &Entry| is_repeat(&before.line, line);
-            if let Some(place) =
-                entries.get(from..).and_then(|last| last.iter().rposition(same)).filter(|_| self.groups)
+            let mut last = entries.iter().skip(from);
+            if self.groups
+                && let Some(place) = last.rposition(|before| is_repeat(before.line, line))
             {
                 entry.times += entries.remove(from + place).times;
             }
@@ -122,13 +126,20 @@ impl LogView {
     }
 }
 
-/// Whether two lines differ only in their numbers.
+const fn is_number(byte: u8) -> bool {
+    byte.is_ascii_digit() || byte == b'.'
+}
+
+/// Whether two lines differ only in their numbers. Of a full log this is asked some thousand times a frame: nothing is
+/// copied, and the ends are compared first, since many lines of a program differ only there.
 fn is_repeat(a: &LogLine, b: &LogLine) -> bool {
-    let is_number = |c: &char| c.is_ascii_digit() || *c == '.';
-    let words = |text: &str| {
-        text.split(|c: char| is_number(&c)).filter(|word| !word.is_empty()).map(str::to_owned).collect::<Vec<_>>()
-    };
-    (a.level, &a.device, a.printed) == (b.level, &b.device, b.printed) && words(&a.text) == words(&b.text)
+    fn ends(line: &LogLine) -> impl Iterator<Item = u8> {
+        line.text.bytes().rev().filter(|byte| !is_number(*byte)).take(LETTERS)
+    }
+    fn words(line: &LogLine) -> impl Iterator<Item = &[u8]> {
+        line.text.as_bytes().split(|byte| is_number(*byte)).filter(|word| !word.is_empty())
+    }
+    (a.level, a.printed) == (b.level, b.printed) && a.device == b.device && ends(a).eq(ends(b)) && words(a).eq(words(b))
 }
 
 #[cfg(test)]
@@ -159,6 +170,13 @@ mod tests {
         assert_eq!(shown(&view, &log()), [(0, 1), (2, 1), (4, 1), (6, 3)]);
         view.groups = false;
         assert_eq!(shown(&view, &log()), [(0, 1), (1, 1), (2, 1), (3, 1), (4, 1), (6, 1)]);
+        // Where the numbers are is a difference.
+        let apart = [
+            line(0, Level::Info, "- step1of 2"),
+            line(1, Level::Info, "- stepof 12"),
+            line(2, Level::Info, "- step7of 0"),
+        ];
+        assert_eq!(shown(&LogView::default(), &apart), [(1, 1), (2, 2)]);
         // What a program printed is not what rapid reports.
         let mut mixed = log();
         mixed.push(Arc::new(LogLine { number: 7, printed: Some(PrintedOn::Stderr), ..LogLine::clone(&mixed[6]) }));

@@ -18,8 +18,10 @@ use crate::process::{Running, cpu_s};
 use crate::pty::OnTerminal;
 use crate::start::await_mask;
 use crate::stats::Sorted;
-use crate::{Bench, Failure, LIMIT, beat, many};
+use crate::{Bench, Failure, beat, many};
 
+/// Upper limit for waiting for a screen: a watchdog, not a figure.
+const LIMIT: Duration = Duration::from_secs(100);
 /// Time from the first mask until all devices stream, and from a key until its page is drawn regularly.
 const SETTLE: Duration = Duration::from_secs(2);
 /// Something that each monitor shows first, and that only a picture shows.
@@ -30,12 +32,21 @@ const NOTICES: [&str; 2] = ["rouble first", "heir bits"];
 /// Time between two keys: each meets another phase of the frames.
 const KEYS: (u64, u64) = (90, 131);
 
+/// A part of the section.
+type Part = fn(&Bench) -> Result<Vec<Figure>, Failure>;
+
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let mut figures = drawn::frames(bench)?;
-    figures.extend(on_terminals(bench)?);
-    figures.extend(recording(bench)?);
-    figures.push(drawn::day(bench)?);
-    Ok(figures)
+    let parts: [(&str, Part); 4] = [
+        ("frame", drawn::frames),
+        ("terminals", on_terminals),
+        ("recording", recording),
+        ("memory", |bench| Ok(vec![drawn::day(bench)?])),
+    ];
+    // What one of them lacks takes nothing from the others.
+    let figures = |(name, part): (&str, Part)| {
+        part(bench).unwrap_or_else(|error| vec![Figure::of_failure(format!("screen/{name}"), &error)])
+    };
+    Ok(parts.into_iter().flat_map(figures).collect())
 }
 
 /// A run with a screen of its own, or without one.
