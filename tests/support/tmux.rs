@@ -22,7 +22,7 @@ pub(crate) struct Pane<'a> {
 pub(crate) const PROMPT: &str = "ready>";
 
 impl Tmux {
-    /// A server in this place; it begins with the first pane.
+    /// A server in this place, which stays when its last pane closes.
     pub(crate) fn new(place: &Place) -> Self {
         let version = Command::new("tmux").arg("-V").output();
         assert!(version.is_ok_and(|version| version.status.success()), "there is no tmux: run `make setup`");
@@ -40,23 +40,26 @@ impl Tmux {
             // Pictures depend on what the terminal answers; characters do not.
             ("RAPID_PICTURES", "text".to_owned()),
         ];
-        Self { socket: folder.join("tmux"), folder, environment }
+        let tmux = Self { socket: folder.join("tmux"), folder, environment };
+        tmux.run(&["start-server", ";", "set-option", "-g", "exit-empty", "off"]).expect("a server");
+        tmux
     }
 
-    /// Runs a command of tmux; returns its output, or nothing if it fails.
-    fn tell(&self, words: &[&str]) -> Option<String> {
+    /// Runs a command of tmux; returns its output, or its error.
+    fn run(&self, words: &[&str]) -> Result<String, String> {
         let mut command = Command::new("tmux");
         command.arg("-S").arg(&self.socket).args(["-f", "/dev/null"]).args(words).current_dir(&self.folder);
         // The server passes the environment of its first client to the panes.
         command.env_clear().envs(self.environment.iter().map(|(name, value)| (*name, value.as_str())));
         let output = command.output().expect("tmux runs");
-        output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned())
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        if output.status.success() { Ok(text(&output.stdout)) } else { Err(text(&output.stderr)) }
     }
 
     /// Opens a terminal of so many columns and rows.
     pub(crate) fn pane(&self, name: &str, (columns, rows): (usize, usize)) -> Pane<'_> {
         let (columns, rows) = (columns.to_string(), rows.to_string());
-        self.tell(&["new-session", "-d", "-s", name, "-x", &columns, "-y", &rows, "sh"]).expect("a pane");
+        self.run(&["new-session", "-d", "-s", name, "-x", &columns, "-y", &rows, "sh"]).expect("a pane");
         let pane = Pane { tmux: self, name: name.to_owned() };
         pane.until("the shell is ready", |screen| screen.contains(PROMPT));
         pane
@@ -65,19 +68,19 @@ impl Tmux {
 
 impl Drop for Tmux {
     fn drop(&mut self) {
-        let _ = self.tell(&["kill-server"]);
+        let _ = self.run(&["kill-server"]);
     }
 }
 
 impl Pane<'_> {
     /// What the terminal shows, a line per row, without the spaces at their ends.
     pub(crate) fn screen(&self) -> String {
-        self.tmux.tell(&["capture-pane", "-p", "-t", &self.name]).unwrap_or_default()
+        self.tmux.run(&["capture-pane", "-p", "-t", &self.name]).unwrap_or_default()
     }
 
     /// The same with the sequences for colours.
     pub(crate) fn coloured(&self) -> String {
-        self.tmux.tell(&["capture-pane", "-p", "-e", "-t", &self.name]).unwrap_or_default()
+        self.tmux.run(&["capture-pane", "-p", "-e", "-t", &self.name]).unwrap_or_default()
     }
 
     /// Waits until the screen is like this; returns it.
@@ -117,12 +120,12 @@ impl Pane<'_> {
 
     /// Types this text.
     pub(crate) fn type_in(&self, text: &str) {
-        self.tmux.tell(&["send-keys", "-t", &self.name, "-l", text]).expect("the pane is there");
+        self.tmux.run(&["send-keys", "-t", &self.name, "-l", "--", text]).expect("the pane is there");
     }
 
     /// Presses a key by tmux's name for it: `Enter`, `Escape`, `Left`, `C-c`.
     pub(crate) fn press(&self, key: &str) {
-        self.tmux.tell(&["send-keys", "-t", &self.name, key]).expect("the pane is there");
+        self.tmux.run(&["send-keys", "-t", &self.name, key]).expect("the pane is there");
     }
 
     /// Gives the shell a command.
@@ -134,22 +137,22 @@ impl Pane<'_> {
     /// Changes the size of the terminal.
     pub(crate) fn resize(&self, (columns, rows): (usize, usize)) {
         let (columns, rows) = (columns.to_string(), rows.to_string());
-        self.tmux.tell(&["resize-window", "-t", &self.name, "-x", &columns, "-y", &rows]).expect("it is resized");
+        self.tmux.run(&["resize-window", "-t", &self.name, "-x", &columns, "-y", &rows]).expect("it is resized");
     }
 
     /// The process on the terminal: the shell, or what it has been replaced by with `exec`.
     pub(crate) fn process(&self) -> rustix::process::Pid {
-        let pid = self.tmux.tell(&["display-message", "-p", "-t", &self.name, "#{pane_pid}"]).expect("a pane");
+        let pid = self.tmux.run(&["display-message", "-p", "-t", &self.name, "#{pane_pid}"]).expect("a pane");
         rustix::process::Pid::from_raw(pid.trim().parse().expect("a number")).expect("a process")
     }
 
     /// Takes the terminal away, as a connection that breaks does.
     pub(crate) fn hang_up(&self) {
-        let _ = self.tmux.tell(&["kill-session", "-t", &self.name]);
+        let _ = self.tmux.run(&["kill-session", "-t", &self.name]);
     }
 
     /// Whether the terminal is still there.
     pub(crate) fn is_open(&self) -> bool {
-        self.tmux.tell(&["has-session", "-t", &self.name]).is_some()
+        self.tmux.run(&["has-session", "-t", &self.name]).is_ok()
     }
 }
