@@ -509,3 +509,60 @@ fn a_terminal_without_colours_or_symbols_shows_shapes_and_words() {
         pane.hang_up();
     }
 }
+
+#[test]
+fn a_device_without_an_entry_is_named_in_the_screen_and_then_recorded() {
+    let place = place();
+    let spare = "[[device]]\nname = \"spare\"\nlike = \"tactile_tip\"\nserial = \"SPARE1\"\nport = \"1-4\"\n";
+    place.write("spare.toml", &format!("{QUIET}{spare}"));
+    let tmux = Tmux::new(&place);
+    let pane = streaming(&tmux, "first", USUAL, "rapid --sim spare.toml --out out");
+    pane.shows(&["1 device without an entry: N", "N name device"]);
+    pane.type_in("N");
+    pane.shows(&["name of the camera", "SPARE1"]);
+    // The name that is suggested is replaced.
+    pane.press("C-u");
+    pane.type_in("spare_cam");
+    pane.press("Enter");
+    let screen = pane.until("it streams, and has a bit", |screen| {
+        row(screen, "spare_cam").contains("streaming") && screen.contains("mask 0x0f")
+    });
+    assert!(!screen.contains("without an entry"), "{screen}");
+    let registry = std::fs::read_to_string(place.path("devices.toml")).expect("the registry");
+    assert!(registry.contains("[device.spare_cam]") && registry.contains("serial = \"SPARE1\""), "{registry}");
+    begin(&pane);
+    pane.until("a second of it", |screen| screen.contains("● REC 00:02"));
+    end(&pane);
+    let episode = Episode::read(&place.path("out").join(&whole(&place)[0]));
+    assert!(episode.topic("/rapid/camera/spare_cam").count() > 10);
+    quit(&pane);
+}
+
+#[test]
+fn the_tour_leads_through_a_first_episode() {
+    let place = place();
+    let tmux = Tmux::new(&place);
+    let pane = streaming(&tmux, "tour", (80, 24), &format!("{RIG} --tour"));
+    pane.shows(&["1/4 space: an episode begins"]);
+    pane.type_in(" ");
+    pane.shows(&["2/4 U: the selected sensor is unplugged"]);
+    pane.type_in("U");
+    pane.shows(&["3/4 the bit is clear", "0x06"]);
+    pane.type_in("U");
+    pane.shows(&["4/4 the bit is set again", "0x07"]);
+    end(&pane);
+    pane.shows(&["? help", "q quit"]);
+    quit(&pane);
+}
+
+#[test]
+fn in_a_folder_without_a_registry_the_screen_begins_with_an_empty_rig() {
+    let place = Place::new();
+    let tmux = Tmux::new(&place);
+    let pane = tmux.pane("empty", (80, 24));
+    pane.order("rapid");
+    pane.shows(&["no devices registered", "0 of 0 present"]);
+    let screen = quit(&pane);
+    assert!(!screen.contains("error"), "{screen}");
+    assert!(!place.path("devices.toml").exists(), "nothing was named");
+}
