@@ -90,7 +90,6 @@ mod tests {
         assert!((sweep.range() - level).abs() < 1e-9);
         packet[0] = 0;
         assert!(!sweep.take(&packet) && !sweep.take(&packet[1..]) && !sweep.take(&[]));
-        assert_eq!(elevation(0), -15.0);
-        assert_eq!(elevation(14), -1.0);
+        assert_eq!((elevation(0), elevation(14)), (-15.0, -1.0));
     }
 }

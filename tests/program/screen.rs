@@ -438,6 +438,11 @@ fn viewers_come_and_go_and_the_episode_continues() {
     run.signal(Signal::INT);
     let screen = later.shows(&["RUN ENDED 00:0", "waiting for the next"]);
     assert!(!screen.contains("● REC"), "{screen}");
+    later.resize((60, 12));
+    later.until("the same on the smallest screen", |screen| {
+        screen.lines().count() == 12 && screen.lines().next().is_some_and(|header| header.contains("  RUN ENDED 00:"))
+    });
+    later.resize(USUAL);
     next_press();
     later.type_in(" ");
     later.shows(&["the run has ended: nothing receives this"]);
