@@ -14,9 +14,10 @@ use tokio_util::sync::CancellationToken;
 
 use crate::action::Order;
 use crate::app::signals::Signals;
+use crate::mask::PhysicalMask;
 use crate::orders::give::{self, GiveError};
 use crate::status::attach::{Decoder, LinkError};
-use crate::status::{Command, Snapshot};
+use crate::status::{Command, SlotState, Snapshot};
 use crate::time::Stamp;
 use crate::tui::model::{Effect, Msg};
 use crate::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
@@ -168,7 +169,10 @@ fn follow(mut connection: Connection, wanted: &Wanted, shown: &watch::Sender<Vie
             }
         }
         let since = Stamp::now();
-        shown.send_modify(|view| view.state = LinkState::Lost { since, read_only });
+        shown.send_modify(|view| {
+            view.state = LinkState::Lost { since, read_only };
+            ended(&mut view.snapshot);
+        });
         let (next, snapshot) = loop {
             thread::sleep(AGAIN);
             if shown.is_closed() {
@@ -181,6 +185,15 @@ fn follow(mut connection: Connection, wanted: &Wanted, shown: &watch::Sender<Vie
         connection = next;
         let state = LinkState::Attached { process: connection.process, read_only };
         shown.send_modify(|view| *view = View { snapshot, state });
+    }
+}
+
+/// What is true of a run that has ended: nothing streams, and nothing is recorded.
+fn ended(snapshot: &mut Snapshot) {
+    (snapshot.recording, snapshot.mask) = (None, PhysicalMask::EMPTY);
+    for device in &mut snapshot.devices {
+        device.state = SlotState::Absent;
+        "the run has ended".clone_into(&mut device.detail);
     }
 }
 
@@ -206,7 +219,12 @@ fn send(outgoing: &Receiver<Outgoing>, failures: &Sender<Msg>) {
 
 impl Link for Remote {
     fn snapshot(&mut self) -> Snapshot {
-        self.view.borrow().snapshot.clone()
+        let View { mut snapshot, state } = self.view.borrow().clone();
+        if matches!(state, LinkState::Lost { .. }) {
+            // Its clock is that of this machine and continues.
+            snapshot.taken = Stamp::now();
+        }
+        snapshot
     }
 
     fn state(&self) -> LinkState {

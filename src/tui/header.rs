@@ -17,8 +17,8 @@ use crate::time::Stamp;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let width = usize::from(area.width);
-    let right = right(model, theme);
     let mut left = identity(model, theme);
+    let right = right(model, width.saturating_sub(left.width() + 2), theme);
     // In this order as long as they fit; the binary form is the longest and is left out first.
     let hex = mask_hex(model, theme);
     let publication = publication(model, theme);
@@ -104,6 +104,9 @@ fn stops(model: &Model, theme: Theme) -> Vec<Span<'static>> {
 
 /// What is wrong, the worst first: what the episode would be judged for, devices that were unplugged, and those in trouble.
 pub(super) fn draw_banner(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
+    if matches!(model.link, LinkState::Lost { .. }) {
+        return;
+    }
     let snapshot = model.latest();
     let finding = snapshot.recording.as_ref().and_then(|recording| recording.outlook.findings.first());
     let mut parts: Vec<(String, Style)> = Vec::new();
@@ -129,7 +132,7 @@ pub(super) fn draw_banner(frame: &mut Frame<'_>, area: Rect, model: &Model, them
     frame.render_widget(line, area);
 }
 
-fn right(model: &Model, theme: Theme) -> Line<'static> {
+fn right(model: &Model, room: usize, theme: Theme) -> Line<'static> {
     let mut spans = stops(model, theme);
     match model.link {
         LinkState::Own => {}
@@ -139,7 +142,9 @@ fn right(model: &Model, theme: Theme) -> Line<'static> {
         }
         LinkState::Lost { since, .. } => {
             let ago = text::clock(Stamp::now().since(since));
-            spans.push(Span::styled(format!("RUN ENDED {ago} ago, waiting for the next  "), theme.alarm()));
+            let ended = format!("RUN ENDED {ago} ago");
+            let all = format!("{ended}, waiting for the next  ");
+            spans.push(Span::styled(if all.len() <= room { all } else { ended }, theme.alarm()));
             // What it last recorded is not being recorded.
             return Line::from(spans);
         }
