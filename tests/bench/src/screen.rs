@@ -231,7 +231,7 @@ fn recorded(bench: &Bench, with_screens: bool) -> Result<(Episode, Sorted), Fail
     let out = tempfile::Builder::new().prefix("screen").tempdir_in(bench.scratch.path())?;
     let instance = format!("bench-screen-{}", std::process::id());
     // Attaching takes a part of it.
-    let length = bench.length(30, 8) + SETTLE * 2;
+    let length = bench.length(30, 8) + SETTLE * 4;
     let mut arguments = load::scenario(bench, "load")?;
     arguments.extend(["--record".into(), "--duration".into(), format!("{}s", length.as_secs()).into()]);
     arguments.extend(["--out".into(), out.path().into()]);
@@ -247,6 +247,8 @@ fn recorded(bench: &Bench, with_screens: bool) -> Result<(Episode, Sorted), Fail
         let mut run = OnTerminal::start(&command(false))?;
         let begun = Instant::now();
         await_mask(&mask)?;
+        // A key before that would be a line's end to the terminal.
+        run.await_text(SHOWN, LIMIT)?;
         show_picture(&mut run, 0)?;
         let mut others = [attach(bench, &instance)?, attach(bench, &instance)?];
         for (place, monitor) in others.iter_mut().enumerate() {
