@@ -160,12 +160,24 @@ impl Folder {
     /// # Errors
     /// When the disk does not accept it, or the name belongs to something that cannot be replaced.
     pub fn replace(&self, name: impl AsRef<OsStr>, contents: &[u8], mode: u32, sync: Sync) -> io::Result<()> {
-        let name = name.as_ref();
-        let (temporary, mut file) = self.temporary(name)?;
-        let written = file
+        self.replace_with(name.as_ref(), contents, Some(mode), sync)
+    }
+
+    /// The same, with the permissions that the umask leaves of 0666, as any new file has.
+    ///
+    /// # Errors
+    /// As [`Self::replace`].
+    pub fn replace_by_umask(&self, name: impl AsRef<OsStr>, contents: &[u8], sync: Sync) -> io::Result<()> {
+        self.replace_with(name.as_ref(), contents, None, sync)
+    }
+
+    fn replace_with(&self, name: &OsStr, contents: &[u8], mode: Option<u32>, sync: Sync) -> io::Result<()> {
+        let (temporary, file) = self.temporary(name, if mode.is_some() { 0o600 } else { 0o666 })?;
+        let set_mode = |mode: u32| rustix::fs::fchmod(&file, Mode::from_raw_mode(mode));
+        let written = (&file)
             .write_all(contents)
             // The umask may have taken bits away.
-            .and_then(|()| Ok(rustix::fs::fchmod(&file, Mode::from_raw_mode(mode))?))
+            .and_then(|()| Ok(mode.map_or(Ok(()), set_mode)?))
             .and_then(|()| if sync == Sync::Wait { file.sync_all() } else { Ok(()) })
             .and_then(|()| Ok(rustix::fs::renameat(&self.open, &temporary, &self.open, name)?));
         if written.is_err() {
@@ -175,7 +187,7 @@ impl Folder {
         written
     }
 
-    fn temporary(&self, name: &OsStr) -> io::Result<(OsString, File)> {
+    fn temporary(&self, name: &OsStr, mode: u32) -> io::Result<(OsString, File)> {
         let mut begin = OsString::from(".");
         begin.push(name);
         begin.push(format!(".{}", std::process::id()));
@@ -184,7 +196,7 @@ impl Folder {
         // Leftovers of a process with this number are removed. Another user's file stays, and is avoided.
         let _ = self.remove(&temporary);
         for _ in 0..TRIES {
-            match self.create_new(&temporary, 0o600) {
+            match self.create_new(&temporary, mode) {
                 Ok(file) => return Ok((temporary, file)),
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(error) => return Err(error),

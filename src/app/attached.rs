@@ -7,12 +7,13 @@
 
 use std::io;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::orders::receive::Viewer;
@@ -33,13 +34,31 @@ const LONGEST_COMMAND: u64 = 16_384;
 pub(super) struct Attached {
     board: Arc<Board>,
     commands: mpsc::Sender<Command>,
-    free: Arc<Semaphore>,
+    /// How many are attached.
+    count: Arc<AtomicUsize>,
+}
+
+/// The place of a screen, which is free again when this is dropped.
+struct Place(Arc<AtomicUsize>);
+
+impl Place {
+    /// `None` when [`SCREENS`] are attached.
+    fn take(count: &Arc<AtomicUsize>) -> Option<Self> {
+        let place = Self(Arc::clone(count));
+        (count.fetch_add(1, Ordering::Relaxed) < SCREENS).then_some(place)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 impl Attached {
     /// Screens that show `board` and send their requests to `commands`.
     pub(super) fn new(board: Arc<Board>, commands: mpsc::Sender<Command>) -> Self {
-        Self { board, commands, free: Arc::new(Semaphore::new(SCREENS)) }
+        Self { board, commands, count: Arc::default() }
     }
 
     pub(super) const fn board(&self) -> &Arc<Board> {
@@ -49,7 +68,7 @@ impl Attached {
     /// Attaches a screen until it or the run ends.
     pub(super) fn attach(&self, viewer: Viewer) {
         let Viewer { stream, read_only } = viewer;
-        let place = Arc::clone(&self.free).try_acquire_owned().ok();
+        let place = Place::take(&self.count);
         let (board, commands) = (Arc::clone(&self.board), self.commands.clone());
         tokio::spawn(async move {
             if let Ok(stream) = stream.set_nonblocking(true).and_then(|()| UnixStream::from_std(stream)) {
@@ -62,7 +81,7 @@ impl Attached {
 
 async fn serve(
     stream: UnixStream,
-    place: Option<OwnedSemaphorePermit>,
+    place: Option<Place>,
     board: &Board,
     commands: &mpsc::Sender<Command>,
     read_only: bool,

@@ -172,7 +172,7 @@ impl Journal {
         let io = |source| JournalError::Io { path: path.clone(), source };
         let text = toml::to_string(file).map_err(|error| io(io::Error::other(error)))?;
         let folder = Folder::open(&self.folder, Links::Own, Missing::Last).map_err(|error| io(error.into()))?;
-        folder.replace(&self.name, format!("{HEAD}{text}").as_bytes(), 0o644, Sync::Wait).map_err(io)?;
+        folder.replace_by_umask(&self.name, format!("{HEAD}{text}").as_bytes(), Sync::Wait).map_err(io)?;
         // A file system without this keeps the name at its own pace.
         let _ = folder.sync();
         self.written = identity(&path);
@@ -187,7 +187,7 @@ impl Journal {
         let name = format!("session-{}.md", compact(&file.begun));
         let io = |source| JournalError::Io { path: self.folder.join(&name), source };
         let folder = Folder::open(&self.folder, Links::Own, Missing::Refused).map_err(|error| io(error.into()))?;
-        folder.replace(&name, super::markdown(file).as_bytes(), 0o644, Sync::Wait).map_err(io)
+        folder.replace_by_umask(&name, super::markdown(file).as_bytes(), Sync::Wait).map_err(io)
     }
 
     /// Gives the file the name of a session that has ended.

@@ -82,6 +82,10 @@ kill $grab
 emu plug 0
 wait_for 30 test -c /dev/panel || fail 'no GPIO chip'
 wait_for 30 said 'button panel is back' || fail 'the chip is not found'
+# A line that nothing pulls low is high, and so pressed when the chip appears: that is no press.
+sleep 0.5
+said 'panel: marked at' && fail 'a panel that appears pressed is pressed'
+emu level 0.2 0
 sleep 0.5
 emu level 0.2 1
 wait_for 30 said 'panel: marked at' || fail 'the panel is not seen'

@@ -113,6 +113,9 @@ await_rapid 60 '"device":"cam_wrist"' '"state":"streaming"' || fail 'cam_wrist d
 await_rapid 60 '"device":"tof"' '"state":"streaming"' || fail 'tof does not stream under the unit'
 awk '/^(Uid|CapEff|NoNewPrivs)/' /proc/$rapid_pid/status >$out/unit.status
 for task in /proc/$rapid_pid/task/*; do [ "$(cat $task/comm)" = mask ] && chrt -p ${task##*/}; done >$out/unit.sched
+# It records when its group asks for it.
+setpriv --reuid=$(key User) --regid=$(key User) --init-groups "${program[@]}" episode start >$out/asked.txt 2>&1 ||
+  fail "rapid episode start: $(cat $out/asked.txt)"
 sleep 1
 kill -$(key KillSignal) $rapid_pid
 rapid_wait
