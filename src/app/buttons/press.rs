@@ -15,6 +15,10 @@ use crate::time::Stamp;
 /// What is released for less than this was not released. A foot needs twice as long between two presses.
 const CHATTER: Duration = Duration::from_millis(30);
 
+/// The kernel releases the keys of a device that is unplugged (`input_unregister_device`), some time before its reader sees
+/// it go: a release followed by a loss within this time was no release.
+const UNPLUGGED_WITHIN: Duration = Duration::from_millis(200);
+
 /// What was done with a button.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Gesture {
@@ -62,6 +66,8 @@ pub(super) struct Presses {
     state: State,
     /// When it was released, if that may still be a contact that chatters.
     released: Option<Stamp>,
+    /// When it was released last.
+    let_go: Option<Stamp>,
     /// When it was pressed last.
     last: Option<Stamp>,
 }
@@ -75,6 +81,7 @@ impl Presses {
     pub(super) fn level(&mut self, is_pressed: bool, at: Stamp) -> Vec<(Gesture, Stamp)> {
         let mut done = self.advance(at);
         if !is_pressed {
+            self.let_go = Some(at);
             if matches!(self.state, State::Ignored | State::Pressed { .. }) {
                 self.released.get_or_insert(at);
             }
@@ -104,8 +111,11 @@ impl Presses {
     /// Its level is unknown from `at` on.
     pub(super) fn lose(&mut self, at: Stamp) -> Vec<(Gesture, Stamp)> {
         let mut done = self.advance(at);
-        // It was pressed and released before.
-        if let State::Clicked { since } = self.state {
+        // It was pressed and released before, and not by its loss.
+        let is_released = self.let_go.is_none_or(|let_go| at.since(let_go) >= UNPLUGGED_WITHIN);
+        if let State::Clicked { since } = self.state
+            && is_released
+        {
             done.push((Gesture::Press, since));
         }
         (self.state, self.released) = (State::Ignored, None);
@@ -127,7 +137,7 @@ impl Presses {
             *is_done = gesture.is_some();
             done.extend(gesture.map(|gesture| (gesture, since)));
         }
-        if self.released.is_some_and(|released| now.since(released) >= CHATTER) {
+        if self.released.is_some_and(|released| now.since(released) >= self.settles_in()) {
             self.released = None;
             self.state = match self.state {
                 State::Pressed { since, is_done: false } if has_double => State::Clicked { since },
@@ -148,6 +158,14 @@ impl Presses {
         done
     }
 
+    /// How long a release must last: one that decides that it was no hold must not be that of an unplugged device.
+    fn settles_in(&self) -> Duration {
+        match self.state {
+            State::Pressed { is_done: false, .. } if !self.rules.has_double => UNPLUGGED_WITHIN,
+            _ => CHATTER,
+        }
+    }
+
     /// When [`Self::advance`] decides something next, if at all.
     pub(super) fn due(&self) -> Option<Stamp> {
         let decided = match self.state {
@@ -158,7 +176,7 @@ impl Presses {
             State::Clicked { since } => Some(since.after(PRESS_AGAIN)),
             State::Ignored | State::Released | State::Pressed { .. } => None,
         };
-        let settled = self.released.map(|released| released.after(CHATTER));
+        let settled = self.released.map(|released| released.after(self.settles_in()));
         decided.into_iter().chain(settled).min()
     }
 }
@@ -240,17 +258,21 @@ mod tests {
         let double = Rules { hold_after: None, has_double: true, counts_once: true };
         let both = Rules { has_double: true, ..hold };
         for (rules, script, expected) in [
-            (hold, "-0 +100 -300", "press 100@330"),
-            (hold, "-0 +100 -1099", "press 100@1129"),
+            (hold, "-0 +100 -300", "press 100@500"),
+            (hold, "-0 +100 -1099", "press 100@1299"),
             (hold, "-0 +100", "hold 100@1100"),
-            (hold, "-0 +100 -5000 +6000 -6100", "hold 100@1100, press 6000@6130"),
+            (hold, "-0 +100 -5000 +6000 -6100", "hold 100@1100, press 6000@6300"),
             // A contact that chatters ends no hold.
             (hold, "-0 +100 -600 +610 -2000", "hold 100@1100"),
             (hold, "-0 +100 -1090 +1110 -2000", "hold 100@1110"),
             // Lost while it is held: it is unknown for how long.
-            (hold, "-0 +100 ?500 -600 +900 -1000", "press 900@1030"),
+            (hold, "-0 +100 ?500 -600 +900 -1000", "press 900@1200"),
             (hold, "+0 -3000", ""),
-            (hold, "-0 +100 -150 +400 -2000", "press 100@180"),
+            (hold, "-0 +100 -150 +400 -2000", "press 100@350"),
+            // The kernel releases what is unplugged.
+            (hold, "-0 +100 -300 ?499", ""),
+            (both, "-0 +100 -300 ?499", ""),
+            (double, "-0 +100 -150 ?250", ""),
             (double, "-0 +100 -150", "press 100@500"),
             (double, "-0 +100 -9000", "press 100@500"),
             (double, "-0 +100 -150 +499 -600", "double 100@499"),
@@ -258,7 +280,7 @@ mod tests {
             // The third of three presses.
             (double, "-0 +100 -150 +300 -350 +500 -550", "double 100@300"),
             (double, "-0 +100 -110 +120 -200", "press 100@500"),
-            (double, "-0 +100 -150 ?250", "press 100@250"),
+            (double, "-0 +100 -150 ?351", "press 100@351"),
             (both, "-0 +100 -150", "press 100@500"),
             (both, "-0 +100 -150 +300 -5000", "double 100@300"),
             (both, "-0 +100 -900", "press 100@930"),
