@@ -889,7 +889,7 @@ impl Model {
         let parts = text.split_once('=').and_then(|(name, value)| Some((name.trim(), value.trim().parse().ok()?)));
         match (parts, self.selected_device().map(|device| device.id)) {
             (Some((name, value)), Some(device)) if !name.is_empty() => {
-                self.notify("setting it; the log says what came of it");
+                self.notify("setting it; the log has the result");
                 Effect::Send(Command::Control { device, name: name.to_owned(), value })
             }
             _ => {

@@ -232,7 +232,7 @@ fn a_connected_device_is_registered_and_taken_over_by_one_request() {
     assert_eq!(answer["text"], "added [device.spare] as bit 3; recorded from the next episode on", "{answer}");
     until("its bit is set", || record(&place).mask == 0b1101);
     ask(&place, &["check"]);
-    // An entry that cannot be taken over stays in the file, and the answer says so.
+    // An entry that cannot be taken over stays in the file, and the answer states it.
     place.write("devices.toml", &text().replace("bench-1", "bench-2"));
     assert_eq!(register(device, "again")["ok"], false);
     publications(&place, 500);

@@ -443,7 +443,7 @@ fn viewers_come_and_go_and_the_episode_continues() {
         screen.lines().count() == 12 && screen.lines().next().is_some_and(|header| header.contains("  RUN ENDED 00:"))
     });
     later.resize(USUAL);
-    // Not the space bar: its presses are told apart by the clock of the snapshots, which stands still.
+    // Not the space bar: its presses are distinguished by the clock of the snapshots, which stands still.
     later.type_in("u");
     later.shows(&["the run has ended: nothing receives this"]);
     assert!(run.end().0.is_some());

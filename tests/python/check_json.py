@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Checks lines of JSON against a schema whose kinds of objects are told apart by `event`.
+"""Checks lines of JSON against a schema whose kinds of objects are distinguished by `event`.
 
     check_json.py SCHEMA < LINES
 
