@@ -41,9 +41,9 @@ pedal_plug() {
 pedal() { echo "$1 $2" >&8; }
 "${usbemu[@]}" --keys 'bench remote' KEY_B </tmp/remote >$out/remote 2>&1 &
 wait_for 30 has_line $out/remote ready || fail "no remote: $(cat $out/remote)"
-logged() { has_line $out/rapid.jsonl '"event":"log"' "$1"; }
-# logged_times N WORDS: lines of the log with these words.
-logged_times() { [ "$(grep -F '"event":"log"' $out/rapid.jsonl | grep -cF "$2")" -ge "$1" ]; }
+in_log() { has_line $out/rapid.jsonl '"event":"log"' "$1"; }
+# in_log_times N WORDS: lines of the log with these words.
+in_log_times() { [ "$(grep -F '"event":"log"' $out/rapid.jsonl | grep -cF "$2")" -ge "$1" ]; }
 event_times() { [ "$(grep -cF "\"event\":\"$2\"" $out/rapid.jsonl)" -ge "$1" ]; }
 echo 'SUBSYSTEM=="gpio", KERNEL=="gpiochip*", ATTRS{serial}=="GPIO1", SYMLINK+="panel"' >/etc/udev/rules.d/90-bench-gpio.rules
 udevadm control --reload
@@ -58,7 +58,7 @@ node_of() { local name; name=$(grep -l "$1" /sys/class/input/event*/device/name)
 is_read() { [ -n "$(find /proc/$rapid_pid/fd -lname "$(node_of "$1")")" ]; }
 wait_for 30 is_read 'bench pedal' || fail 'the pedal is not read'
 sleep 1.5
-logged 'pedal: ' && fail "pressed at the start: $(grep -F 'pedal: ' $out/rapid.jsonl)"
+in_log 'pedal: ' && fail "pressed at the start: $(grep -F 'pedal: ' $out/rapid.jsonl)"
 timeout 1 "${usbemu[@]}" --grab $(node_of 'bench pedal') >$out/grab 2>&1
 has_line $out/grab grabbed && fail 'the pedal is not grabbed'
 pedal release KEY_A
@@ -66,7 +66,7 @@ sleep 0.2
 pedal press KEY_A
 sleep 0.1
 pedal release KEY_A
-wait_for 30 logged 'pedal: begin episode' || fail 'no episode begins'
+wait_for 30 in_log 'pedal: begin episode' || fail 'no episode begins'
 wait_for 30 event_times 1 recording || fail 'no episode has begun'
 
 # A device that another program has grabbed is still read.
@@ -74,37 +74,37 @@ wait_for 30 event_times 1 recording || fail 'no episode has begun'
 grab=$!
 wait_for 30 has_line $out/grabbed grabbed || fail "not grabbed: $(cat $out/grabbed)"
 echo 'press KEY_B' >&9
-wait_for 30 logged 'remote: marked at' || fail 'a grabbed remote is not seen'
+wait_for 30 in_log 'remote: marked at' || fail 'a grabbed remote is not seen'
 echo 'release KEY_B' >&9
 kill $grab
 
 # A line of a chip, plugged in late.
 emu plug 0
 wait_for 30 test -c /dev/panel || fail 'no GPIO chip'
-wait_for 30 logged 'button panel is back' || fail 'the chip is not found'
+wait_for 30 in_log 'button panel is back' || fail 'the chip is not found'
 # A line that nothing pulls low is high, and so pressed when the chip appears: that is no press.
 sleep 0.5
-logged 'panel: marked at' && fail 'a panel that appears pressed is pressed'
+in_log 'panel: marked at' && fail 'a panel that appears pressed is pressed'
 emu level 0.2 0
 sleep 0.5
 emu level 0.2 1
-wait_for 30 logged 'panel: marked at' || fail 'the panel is not seen'
+wait_for 30 in_log 'panel: marked at' || fail 'the panel is not seen'
 
 # Unplugged while it is held, and plugged in again: the episode continues.
 pedal press KEY_A
 sleep 0.2
 kill $pedal
-wait_for 30 logged 'button pedal, good is lost' || fail 'the pedal is not missed'
+wait_for 30 in_log 'button pedal, good is lost' || fail 'the pedal is not missed'
 sleep 1.5
-logged 'pedal: discard' && fail 'a lost pedal is held'
+in_log 'pedal: discard' && fail 'a lost pedal is held'
 pedal_plug
-wait_for 30 logged 'button pedal, good is back' || fail 'the pedal is not found again'
+wait_for 30 in_log 'button pedal, good is back' || fail 'the pedal is not found again'
 event_times 1 episode && fail 'the episode has ended'
 sleep 0.2
 pedal press KEY_C
-wait_for 30 logged 'good: label success' || fail 'the second key of the pedal is not seen'
+wait_for 30 in_log 'good: label success' || fail 'the second key of the pedal is not seen'
 pedal press KEY_A
-wait_for 30 logged 'pedal: discard episode' || fail 'a held pedal is not seen'
+wait_for 30 in_log 'pedal: discard episode' || fail 'a held pedal is not seen'
 wait_for 30 event_times 1 discarded || fail 'it is not discarded'
 rapid_stop
 emu_quit
