@@ -6,10 +6,12 @@
 //! Invariant: no key deletes anything: discarding moves to the trash, and the end of a session is confirmed by a word.
 //! Invariant: pure: no clock, no terminal, no channel; time comes from the snapshots.
 
-use std::collections::VecDeque;
+mod prompt;
+mod seen;
+
 use std::time::Duration;
 
-use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+use crossterm::event::{KeyEvent, KeyEventKind, KeyModifiers};
 
 use super::history::{Bit, Cell, History};
 use super::keys::{self, Act};
@@ -23,12 +25,13 @@ use super::view::Target;
 use super::{help, view};
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::sample::Encoding;
 use crate::status::preview::Preview;
 use crate::status::rates::Rates;
 use crate::status::session::{Label, PRESS_AGAIN, SessionRequest};
-use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot, UnregisteredDevice};
+use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
 use crate::time::{Stamp, Zone};
+use prompt::{Naming, Prompt, Question};
+use seen::Seen;
 
 /// How long a changed bit is highlighted.
 const EDGE_SHOWN: Duration = Duration::from_secs(1);
@@ -171,17 +174,6 @@ pub struct Model {
     /// How often the bell was to ring.
     rings: u64,
     notice: Option<Notice>,
-}
-
-/// Devices without an entry, and their names.
-#[derive(Debug, Default)]
-struct Naming {
-    /// The rig had no entry when the screen began: names are asked for as devices are plugged in.
-    is_new_rig: bool,
-    /// Devices that were asked about.
-    asked: Vec<String>,
-    /// The device whose name is typed.
-    unnamed: Option<UnregisteredDevice>,
 }
 
 /// The answer to a key.
@@ -739,8 +731,6 @@ impl Model {
 
 /// Previews are requested anew after this time, well before the run stops them.
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
-/// Samples of numbers that are kept for a plot: some 15 s.
-const SAMPLES: usize = 300;
 /// Lines by which the wheel scrolls the log.
 const WHEEL: usize = 3;
 /// Lines by which a page key scrolls the log.
@@ -761,37 +751,6 @@ fn calls_attention(before: &Snapshot, after: &Snapshot) -> bool {
         device.state == SlotState::Streaming && now.is_none_or(|now| now.state != SlotState::Streaming)
     };
     before.recording.is_some() != after.recording.is_some() || before.devices.iter().any(is_lost)
-}
-
-/// What the previews of one device showed: of fixed size.
-#[derive(Debug, Default)]
-struct Seen {
-    device: Option<ModalityId>,
-    seq: Option<u64>,
-    picture: Option<Result<Picture, String>>,
-    sweep: Option<Sweep>,
-    numbers: VecDeque<(Stamp, Vec<f64>)>,
-}
-
-impl Seen {
-    fn take(&mut self, preview: &Preview) {
-        if self.device != Some(preview.device) {
-            *self = Self { device: Some(preview.device), ..Self::default() };
-        }
-        if self.seq.replace(preview.seq) == Some(preview.seq) {
-            return;
-        }
-        self.picture = Picture::decode(preview);
-        let numbers = preview.numbers();
-        if !numbers.is_empty() {
-            self.numbers.push_back((preview.captured, numbers));
-            self.numbers.drain(..self.numbers.len().saturating_sub(SAMPLES));
-        }
-        if preview.encoding == Encoding::Bytes {
-            let mut sweep = self.sweep.take().unwrap_or_default();
-            self.sweep = sweep.take(&preview.payload).then_some(sweep);
-        }
-    }
 }
 
 /// How long after the question an arm may be confirmed.
@@ -825,158 +784,6 @@ impl Model {
             self.notify("disarming the actuator");
         }
         Effect::Order(Order::Disarm)
-    }
-}
-
-/// Longest text that is typed, in bytes.
-const LONGEST_TEXT: usize = 500;
-
-/// What is typed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Question {
-    /// A note on the episode.
-    Note,
-    /// Why the episode is a failure.
-    WhyFailed,
-    /// The task of the next episodes.
-    Task,
-    /// Whether the session is to end.
-    EndSession,
-    /// What lines of the log contain.
-    Search,
-    /// The name of a device that has no entry.
-    Name,
-    /// A control of the selected camera, and its value.
-    Control,
-}
-
-impl Question {
-    const fn text(self) -> &'static str {
-        match self {
-            Self::Note => "note: ",
-            Self::WhyFailed => "why it failed (may be empty): ",
-            Self::Task => "task: ",
-            Self::Control => "control of the camera, such as exposure=120: ",
-            Self::Search => "lines of the log with: ",
-            Self::Name => "name of the new device (empty: none): ",
-            Self::EndSession => "type end to end the session and delete what was discarded: ",
-        }
-    }
-}
-
-/// A question, and the text typed so far.
-#[derive(Debug)]
-struct Prompt {
-    question: Question,
-    text: String,
-}
-
-impl Model {
-    /// The question and the answer typed so far.
-    pub fn prompt(&self) -> Option<(String, &str)> {
-        let prompt = self.prompt.as_ref()?;
-        let question = match &self.naming.unnamed {
-            Some(unit) if prompt.question == Question::Name => {
-                format!("name of the {} {} (empty: none): ", unit.node, unit.device)
-            }
-            _ => prompt.question.text().to_owned(),
-        };
-        Some((question, prompt.text.as_str()))
-    }
-
-    /// `NAME=VALUE`.
-    fn set_control(&mut self, text: &str) -> Effect {
-        let parts = text.split_once('=').and_then(|(name, value)| Some((name.trim(), value.trim().parse().ok()?)));
-        match (parts, self.selected_device().map(|device| device.id)) {
-            (Some((name, value)), Some(device)) if !name.is_empty() => {
-                self.notify("setting it; the log has the result");
-                Effect::Send(Command::Control { device, name: name.to_owned(), value })
-            }
-            _ => {
-                self.notify("not set: write NAME=VALUE, with a whole number");
-                Effect::None
-            }
-        }
-    }
-
-    /// Devices without an entry that were not asked about.
-    fn unasked(&self) -> impl Iterator<Item = &UnregisteredDevice> {
-        self.latest.unregistered.iter().filter(|unit| !self.naming.asked.contains(&unit.device))
-    }
-
-    /// In a rig without entries, asks for the name of each device that is plugged in, one after the other.
-    fn ask_for_names(&mut self) {
-        let is_free = self.prompt.is_none() && self.help.is_none() && self.quit == Quit::No;
-        if self.naming.is_new_rig && is_free && self.unasked().next().is_some() {
-            self.ask_for_name();
-        }
-    }
-
-    /// Asks for the name of the next device without an entry; of those that were asked about, the first again.
-    fn ask_for_name(&mut self) {
-        let Some(unit) = self.unasked().next().or_else(|| self.latest.unregistered.first()).cloned() else {
-            return self.notify("every device that is plugged in has an entry");
-        };
-        self.naming.asked.push(unit.device.clone());
-        self.naming.unnamed = Some(unit);
-        self.ask(Question::Name);
-    }
-
-    fn ask(&mut self, question: Question) {
-        let session = self.latest.session.as_ref();
-        let text = match question {
-            Question::Task => session.map(|session| session.task.clone()).unwrap_or_default(),
-            Question::Search => self.log.search.clone(),
-            Question::Name => self.naming.unnamed.as_ref().and_then(|unit| unit.name.clone()).unwrap_or_default(),
-            _ => String::new(),
-        };
-        self.prompt = Some(Prompt { question, text });
-    }
-
-    fn type_into(&mut self, mut prompt: Prompt, key: KeyEvent) -> Effect {
-        let is_text = !key.modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT);
-        match key.code {
-            KeyCode::Enter => return self.answer(prompt),
-            KeyCode::Backspace => {
-                prompt.text.pop();
-            }
-            KeyCode::Char('u') if key.modifiers.contains(KeyModifiers::CONTROL) => prompt.text.clear(),
-            KeyCode::Char(c) if is_text && prompt.text.len() + c.len_utf8() <= LONGEST_TEXT => prompt.text.push(c),
-            _ => {}
-        }
-        if prompt.question == Question::Search {
-            // What matches is seen while it is typed.
-            self.log.search.clone_from(&prompt.text);
-        }
-        self.prompt = Some(prompt);
-        Effect::None
-    }
-
-    fn answer(&mut self, Prompt { question, text }: Prompt) -> Effect {
-        let request = match question {
-            Question::Note => SessionRequest::Note { text },
-            Question::WhyFailed => SessionRequest::Label { label: Label::Failure, reason: text },
-            Question::Task => SessionRequest::Plan { task: Some(text), tags: Vec::new(), goal: None },
-            Question::Search => {
-                self.log.search = text;
-                return Effect::None;
-            }
-            Question::Control => return self.set_control(&text),
-            Question::Name => {
-                let (Some(unit), false) = (self.naming.unnamed.take(), text.trim().is_empty()) else {
-                    self.notify("no entry; N asks again");
-                    return Effect::None;
-                };
-                self.notify("writing the entry");
-                return Effect::Send(Command::Register { device: unit.device, name: text.trim().to_owned() });
-            }
-            Question::EndSession if text.trim() == "end" => SessionRequest::EndSession,
-            Question::EndSession => {
-                self.notify("the session continues");
-                return Effect::None;
-            }
-        };
-        Effect::Send(Command::Session(request))
     }
 }
 

@@ -1,8 +1,10 @@
+use crossterm::event::KeyCode;
+
 use super::*;
 use crate::mask::PhysicalMask;
-use crate::status::Level;
 use crate::status::literal::{TAKEN, every_state, id, line, recording, three_streaming};
 use crate::status::session::{Answered, Label, SessionRequest, SessionStatus};
+use crate::status::{Level, UnregisteredDevice};
 
 fn press(code: KeyCode) -> Msg {
     Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))

@@ -1,0 +1,172 @@
+//! Text that is typed: the questions of the screen, and what follows from their answers.
+//!
+//! Invariant: while a text is typed, letters are text: none of them begins, ends or discards anything.
+
+use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+
+use super::{Effect, Model, Quit};
+use crate::status::session::{Label, SessionRequest};
+use crate::status::{Command, UnregisteredDevice};
+
+/// Devices without an entry, and their names.
+#[derive(Debug, Default)]
+pub(super) struct Naming {
+    /// The rig had no entry when the screen began: names are asked for as devices are plugged in.
+    pub(super) is_new_rig: bool,
+    /// Devices that were asked about.
+    pub(super) asked: Vec<String>,
+    /// The device whose name is typed.
+    pub(super) unnamed: Option<UnregisteredDevice>,
+}
+
+/// Longest text that is typed, in bytes.
+const LONGEST_TEXT: usize = 500;
+
+/// What is typed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Question {
+    /// A note on the episode.
+    Note,
+    /// Why the episode is a failure.
+    WhyFailed,
+    /// The task of the next episodes.
+    Task,
+    /// Whether the session is to end.
+    EndSession,
+    /// What lines of the log contain.
+    Search,
+    /// The name of a device that has no entry.
+    Name,
+    /// A control of the selected camera, and its value.
+    Control,
+}
+
+impl Question {
+    const fn text(self) -> &'static str {
+        match self {
+            Self::Note => "note: ",
+            Self::WhyFailed => "why it failed (may be empty): ",
+            Self::Task => "task: ",
+            Self::Control => "control of the camera, such as exposure=120: ",
+            Self::Search => "lines of the log with: ",
+            Self::Name => "name of the new device (empty: none): ",
+            Self::EndSession => "type end to end the session and delete what was discarded: ",
+        }
+    }
+}
+
+/// A question, and the text typed so far.
+#[derive(Debug)]
+pub(super) struct Prompt {
+    question: Question,
+    text: String,
+}
+
+impl Model {
+    /// The question and the answer typed so far.
+    pub fn prompt(&self) -> Option<(String, &str)> {
+        let prompt = self.prompt.as_ref()?;
+        let question = match &self.naming.unnamed {
+            Some(unit) if prompt.question == Question::Name => {
+                format!("name of the {} {} (empty: none): ", unit.node, unit.device)
+            }
+            _ => prompt.question.text().to_owned(),
+        };
+        Some((question, prompt.text.as_str()))
+    }
+
+    /// `NAME=VALUE`.
+    fn set_control(&mut self, text: &str) -> Effect {
+        let parts = text.split_once('=').and_then(|(name, value)| Some((name.trim(), value.trim().parse().ok()?)));
+        match (parts, self.selected_device().map(|device| device.id)) {
+            (Some((name, value)), Some(device)) if !name.is_empty() => {
+                self.notify("setting it; the log has the result");
+                Effect::Send(Command::Control { device, name: name.to_owned(), value })
+            }
+            _ => {
+                self.notify("not set: write NAME=VALUE, with a whole number");
+                Effect::None
+            }
+        }
+    }
+
+    /// Devices without an entry that were not asked about.
+    fn unasked(&self) -> impl Iterator<Item = &UnregisteredDevice> {
+        self.latest.unregistered.iter().filter(|unit| !self.naming.asked.contains(&unit.device))
+    }
+
+    /// In a rig without entries, asks for the name of each device that is plugged in, one after the other.
+    pub(super) fn ask_for_names(&mut self) {
+        let is_free = self.prompt.is_none() && self.help.is_none() && self.quit == Quit::No;
+        if self.naming.is_new_rig && is_free && self.unasked().next().is_some() {
+            self.ask_for_name();
+        }
+    }
+
+    /// Asks for the name of the next device without an entry; of those that were asked about, the first again.
+    pub(super) fn ask_for_name(&mut self) {
+        let Some(unit) = self.unasked().next().or_else(|| self.latest.unregistered.first()).cloned() else {
+            return self.notify("every device that is plugged in has an entry");
+        };
+        self.naming.asked.push(unit.device.clone());
+        self.naming.unnamed = Some(unit);
+        self.ask(Question::Name);
+    }
+
+    pub(super) fn ask(&mut self, question: Question) {
+        let session = self.latest.session.as_ref();
+        let text = match question {
+            Question::Task => session.map(|session| session.task.clone()).unwrap_or_default(),
+            Question::Search => self.log.search.clone(),
+            Question::Name => self.naming.unnamed.as_ref().and_then(|unit| unit.name.clone()).unwrap_or_default(),
+            _ => String::new(),
+        };
+        self.prompt = Some(Prompt { question, text });
+    }
+
+    pub(super) fn type_into(&mut self, mut prompt: Prompt, key: KeyEvent) -> Effect {
+        let is_text = !key.modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT);
+        match key.code {
+            KeyCode::Enter => return self.answer(prompt),
+            KeyCode::Backspace => {
+                prompt.text.pop();
+            }
+            KeyCode::Char('u') if key.modifiers.contains(KeyModifiers::CONTROL) => prompt.text.clear(),
+            KeyCode::Char(c) if is_text && prompt.text.len() + c.len_utf8() <= LONGEST_TEXT => prompt.text.push(c),
+            _ => {}
+        }
+        if prompt.question == Question::Search {
+            // What matches is seen while it is typed.
+            self.log.search.clone_from(&prompt.text);
+        }
+        self.prompt = Some(prompt);
+        Effect::None
+    }
+
+    fn answer(&mut self, Prompt { question, text }: Prompt) -> Effect {
+        let request = match question {
+            Question::Note => SessionRequest::Note { text },
+            Question::WhyFailed => SessionRequest::Label { label: Label::Failure, reason: text },
+            Question::Task => SessionRequest::Plan { task: Some(text), tags: Vec::new(), goal: None },
+            Question::Search => {
+                self.log.search = text;
+                return Effect::None;
+            }
+            Question::Control => return self.set_control(&text),
+            Question::Name => {
+                let (Some(unit), false) = (self.naming.unnamed.take(), text.trim().is_empty()) else {
+                    self.notify("no entry; N asks again");
+                    return Effect::None;
+                };
+                self.notify("writing the entry");
+                return Effect::Send(Command::Register { device: unit.device, name: text.trim().to_owned() });
+            }
+            Question::EndSession if text.trim() == "end" => SessionRequest::EndSession,
+            Question::EndSession => {
+                self.notify("the session continues");
+                return Effect::None;
+            }
+        };
+        Effect::Send(Command::Session(request))
+    }
+}
