@@ -42,8 +42,6 @@ pedal() { echo "$1 $2" >&8; }
 "${usbemu[@]}" --keys 'bench remote' KEY_B </tmp/remote >$out/remote 2>&1 &
 wait_for 30 has_line $out/remote ready || fail "no remote: $(cat $out/remote)"
 in_log() { has_line $out/rapid.jsonl '"event":"log"' "$1"; }
-# in_log_times N WORDS: lines of the log with these words.
-in_log_times() { [ "$(grep -F '"event":"log"' $out/rapid.jsonl | grep -cF "$2")" -ge "$1" ]; }
 event_times() { [ "$(grep -cF "\"event\":\"$2\"" $out/rapid.jsonl)" -ge "$1" ]; }
 echo 'SUBSYSTEM=="gpio", KERNEL=="gpiochip*", ATTRS{serial}=="GPIO1", SYMLINK+="panel"' >/etc/udev/rules.d/90-bench-gpio.rules
 udevadm control --reload
