@@ -38,9 +38,9 @@ demo: setup-build ## build, then the simulated rig: the monitor on a terminal, o
 	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/demo/rapid' --sim --tour; else scripts/demo.sh '$(TARGET)/demo/rapid' $(DEMO_DIR); fi
 
 # A test takes the picture again and compares its words and colours with the one in the repository.
-picture: setup-build ## take docs/monitor.svg again: the monitor of the program while a camera is unplugged
+picture: setup ## take docs/monitor.svg and docs/device.svg again, from the program in a terminal of tmux
 	cargo build --release --locked
-	scripts/picture.py '$(TARGET)/release/rapid' docs/monitor.svg
+	scripts/picture.py '$(TARGET)/release/rapid' docs
 
 quick: setup-build ## by habit: format, lints, unit tests, layering, registry, the fast tests of the program; leaves out $(SLOW)
 	cargo fmt --all --check

@@ -1,25 +1,21 @@
 #!/usr/bin/env python3
-"""Draws what the monitor of the real program shows while a device is unplugged, as an SVG.
+"""Draws what the monitor of the real program shows, as SVG.
 
-    picture.py RAPID OUTPUT.svg [INSTANCE]
+    picture.py [--light] RAPID FOLDER [INSTANCE]
 
-Runs `RAPID --sim` on a terminal of its own (100 columns, 30 rows) in an empty folder, starts an episode with the space
-bar, waits until the demonstration has unplugged the tactile camera, takes the cells of the screen, and quits. The
-registry is the repository's devices.toml. Nothing is drawn by hand: every character and colour was sent to the terminal.
-Needs Python 3.10 alone.
+Runs `RAPID --sim` in a terminal of tmux, in an empty folder with the repository's devices.toml, and presses keys as a user
+would. FOLDER/device.svg is the page of a camera. FOLDER/monitor.svg is the monitor a second and a half after the
+demonstration has unplugged the tactile camera during an episode. Nothing is drawn by hand: every character and colour is
+what tmux has in its cells. `--light` draws a terminal with a light background. Needs tmux and Python 3.10 alone.
 """
 
-import fcntl
 import html
 import os
-import pty
 import re
-import select
 import shutil
-import struct
+import subprocess
 import sys
 import tempfile
-import termios
 import time
 import unicodedata
 from pathlib import Path
@@ -27,79 +23,51 @@ from pathlib import Path
 COLUMNS, ROWS = 100, 30
 # Pixels of a cell.
 WIDTH, HEIGHT = 8.4, 18
-FOREGROUND, BACKGROUND = "#d4d4d4", "#1e1e1e"
-# The sixteen colours of a terminal, by their numbers.
+DARK, LIGHT = ("#d4d4d4", "#1e1e1e"), ("#333333", "#ffffff")
+# The sixteen colours of a terminal, by their numbers; with a light background, others.
 PALETTE = (
     "#000000 #cd3131 #0dbc79 #e5e510 #2472c8 #bc3fbc #11a8cd #e5e5e5 "
     "#808080 #f14c4c #23d18b #f5f543 #3b8eea #d670d6 #29b8db #ffffff"
 ).split()
-# How long the program may take until the picture can be taken, seconds.
+PALETTE_LIGHT = (
+    "#000000 #cd3131 #00bc00 #949800 #0451a5 #bc05bc #0598bc #555555 "
+    "#666666 #cd3131 #14ce14 #b5ba00 #0451a5 #bc05bc #0598bc #a5a5a5"
+).split()
+# How long the program may take until a picture can be taken, seconds.
 PATIENCE = 120
 
 
-def colour(code, rest):
-    """The colour that follows 38 or 48 in a list of numbers, and what is left of the list."""
-    if rest[:1] == [2]:
-        return "#%02x%02x%02x" % tuple(rest[1:4]), rest[4:]
-    number, rest = rest[1], rest[2:]
-    if number < 16:
-        return PALETTE[number], rest
-    if number >= 232:
-        return "#%02x%02x%02x" % ((8 + 10 * (number - 232),) * 3), rest
-    levels = (0, 95, 135, 175, 215, 255)
-    number -= 16
-    return "#%02x%02x%02x" % (levels[number // 36], levels[number // 6 % 6], levels[number % 6]), rest
-
-
 class Screen:
-    """The cells of a terminal: understands what crossterm sends (cursor, colours, erasing)."""
+    """The cells of a pane, from `capture-pane -e`: rows of characters and SGR sequences."""
 
-    PIECE = re.compile(r"\x1b\[([?>=]?)([0-9;:]*)([@-~])|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)|\x1b[()][A-Z0-9]|\x1b[=>78c]|[^\x1b]")
+    def __init__(self, captured, is_light=False):
+        self.foreground, self.background = LIGHT if is_light else DARK
+        self.palette = PALETTE_LIGHT if is_light else PALETTE
+        self.cells, style = [], {}
+        for line in captured.split("\n")[:ROWS]:
+            row = []
+            for sgr, character in re.findall(r"\x1b\[([0-9;:]*)m|([^\x1b])", line):
+                if character:
+                    row += [(character, style)] + [("", style)] * (unicodedata.east_asian_width(character) in "WF")
+                else:
+                    style = self.styled(style, [int(n) if n else 0 for n in re.split("[;:]", sgr)])
+            self.cells.append((row + [(" ", {})] * COLUMNS)[:COLUMNS])
 
-    def __init__(self):
-        self.cells = [[(" ", {})] * COLUMNS for _ in range(ROWS)]
-        self.row = self.column = 0
-        self.style = {}
-        self.rest = ""
+    def colour(self, rest):
+        """The colour that follows 38 or 48 in a list of numbers, and what is left of the list."""
+        if rest[:1] == [2]:
+            return "#%02x%02x%02x" % tuple(rest[1:4]), rest[4:]
+        number, rest = rest[1], rest[2:]
+        if number < 16:
+            return self.palette[number], rest
+        if number >= 232:
+            return "#%02x%02x%02x" % ((8 + 10 * (number - 232),) * 3), rest
+        levels = (0, 95, 135, 175, 215, 255)
+        number -= 16
+        return "#%02x%02x%02x" % (levels[number // 36], levels[number // 6 % 6], levels[number % 6]), rest
 
-    def feed(self, text):
-        text, at = self.rest + text, 0
-        while match := self.PIECE.match(text, at):
-            at = match.end()
-            if match[3]:
-                if not match[1]:
-                    self.control(match[3], [int(n) if n else 0 for n in re.split("[;:]", match[2])])
-            elif not match[0].startswith("\x1b"):
-                self.put(match[0])
-        self.rest = text[at:]
-
-    def put(self, character):
-        if character == "\r":
-            self.column = 0
-        elif character == "\n":
-            self.row = min(self.row + 1, ROWS - 1)
-        elif character >= " " and self.row < ROWS and self.column < COLUMNS:
-            self.cells[self.row][self.column] = (character, self.style)
-            self.column += 2 if unicodedata.east_asian_width(character) in "WF" else 1
-
-    def control(self, final, numbers):
-        first = numbers[0]
-        if final in "Hf":
-            self.row, self.column = max(first, 1) - 1, (max(numbers[1], 1) if len(numbers) > 1 else 1) - 1
-        elif final == "J":
-            self.cells = [[(" ", {})] * COLUMNS for _ in range(ROWS)]
-        elif final == "K":
-            for column in range(self.column, COLUMNS):
-                self.cells[self.row][column] = (" ", self.style)
-        elif final in "ABCDG":
-            step = max(first, 1)
-            self.row += {"A": -step, "B": step}.get(final, 0)
-            self.column = step - 1 if final == "G" else self.column + {"C": step, "D": -step}.get(final, 0)
-        elif final == "m":
-            self.styled(numbers)
-
-    def styled(self, numbers):
-        style, off = dict(self.style), {22: ("bold", "dim"), 23: ("italic",), 24: ("under",), 27: ("reverse",)}
+    def styled(self, before, numbers):
+        style, off = dict(before), {22: ("bold", "dim"), 23: ("italic",), 24: ("under",), 27: ("reverse",)}
         on = {1: "bold", 2: "dim", 3: "italic", 4: "under", 7: "reverse"}
         while numbers:
             code, *numbers = numbers
@@ -111,25 +79,22 @@ class Screen:
                 for key in off[code]:
                     style.pop(key, None)
             elif code in (38, 48):
-                style["fg" if code == 38 else "bg"], numbers = colour(code, numbers)
+                style["fg" if code == 38 else "bg"], numbers = self.colour(numbers)
             elif code in (39, 49):
                 style.pop("fg" if code == 39 else "bg", None)
             elif 30 <= code <= 37 or 90 <= code <= 97:
-                style["fg"] = PALETTE[code - 30 if code < 40 else code - 82]
+                style["fg"] = self.palette[code - 30 if code < 40 else code - 82]
             elif 40 <= code <= 47 or 100 <= code <= 107:
-                style["bg"] = PALETTE[code - 40 if code < 50 else code - 92]
-        self.style = style
-
-    def text(self):
-        return ["".join(character for character, _ in row).rstrip() for row in self.cells]
+                style["bg"] = self.palette[code - 40 if code < 50 else code - 92]
+        return style
 
     def svg(self, title):
         width, height = COLUMNS * WIDTH + 16, ROWS * HEIGHT + 16
         lines = [
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" '
-            f'font-family="DejaVu Sans Mono, Menlo, Consolas, monospace" font-size="14">',
+            f'font-family="DejaVu Sans Mono, Menlo, Consolas, monospace" font-size="14" shape-rendering="crispEdges">',
             f"<title>{html.escape(title)}</title>",
-            f'<rect width="100%" height="100%" rx="6" fill="{BACKGROUND}"/>',
+            f'<rect width="100%" height="100%" rx="6" fill="{self.background}"/>',
         ]
         for number, row in enumerate(self.cells):
             lines += self.drawn(number, row)
@@ -137,19 +102,24 @@ class Screen:
 
     def drawn(self, number, row):
         """A row: runs of cells of one style, each at its column."""
+        # Half blocks are drawn as rectangles: those of a font leave gaps.
+        kinds = [(style, character if character in ("▀", "▄") else "") for character, style in row]
         start = 0
         while start < COLUMNS:
-            style, end = row[start][1], start
-            while end < COLUMNS and row[end][1] == style:
+            (style, half), end = kinds[start], start
+            while end < COLUMNS and kinds[end] == kinds[start]:
                 end += 1
             text = "".join(character for character, _ in row[start:end])
             x, y = 8 + start * WIDTH, 8 + number * HEIGHT
-            ink, paper = style.get("fg", FOREGROUND), style.get("bg")
+            ink, paper = style.get("fg", self.foreground), style.get("bg")
             if style.get("reverse"):
-                ink, paper = paper or BACKGROUND, ink
+                ink, paper = paper or self.background, ink
             if paper:
                 yield f'<rect x="{x:g}" y="{y:g}" width="{(end - start) * WIDTH:g}" height="{HEIGHT}" fill="{paper}"/>'
-            if text.strip():
+            if half:
+                top = y + HEIGHT / 2 * (half == "▄")
+                yield f'<rect x="{x:g}" y="{top:g}" width="{(end - start) * WIDTH:g}" height="{HEIGHT / 2:g}" fill="{ink}"/>'
+            elif text.strip():
                 looks = ' font-weight="bold"' * bool(style.get("bold")) + ' opacity="0.6"' * bool(style.get("dim"))
                 looks += ' text-decoration="underline"' * bool(style.get("under"))
                 length = (end - start) * WIDTH
@@ -160,57 +130,78 @@ class Screen:
             start = end
 
 
-def start(program, folder, instance):
-    """Starts the program on a terminal of its own; its process and the terminal."""
-    process, terminal = pty.fork()
-    if process == 0:
-        os.chdir(folder)
-        environment = {"HOME": folder, "TERM": "xterm-256color", "COLORTERM": "truecolor", "LANG": "C.UTF-8", "TZ": "UTC"}
-        os.execve(program, [program, "--sim", "--instance", instance, "--task", "place block"], os.environ | environment)
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
-    return process, terminal
+class Terminal:
+    """The program in a terminal of a tmux server of its own."""
 
+    def __init__(self, program, folder, instance):
+        environment = {"HOME": folder, "TERM": "xterm-256color", "COLORTERM": "truecolor", "LC_ALL": "C.UTF-8", "TZ": "UTC"}
+        self.environment = {**os.environ, **environment, "RAPID_PICTURES": "blocks"}
+        self.environment.pop("TMUX", None)
+        self.socket, self.folder = f"{folder}/tmux", folder
+        options = ["set-option", "-g", "default-terminal", "tmux-direct", ";", "set-option", "-g", "status", "off", ";"]
+        pane = ["new-session", "-d", "-x", str(COLUMNS), "-y", str(ROWS)]
+        self.tmux("start-server", ";", *options, *pane, program, "--sim", "--instance", instance, "--task", "place block")
 
-def take(program, folder, instance):
-    """The screen a second and a half after the unplug, while an episode is recorded."""
-    process, terminal = start(program, folder, instance)
-    screen, decoder = Screen(), __import__("codecs").getincrementaldecoder("utf-8")("replace")
-    end, recording, unplugged = time.monotonic() + PATIENCE, False, None
-    try:
-        while unplugged is None or time.monotonic() < unplugged + 1.5:
+    def tmux(self, *words):
+        command = ["tmux", "-S", self.socket, "-f", "/dev/null", *words]
+        ended = subprocess.run(command, cwd=self.folder, env=self.environment, capture_output=True, text=True)
+        if ended.returncode:
+            sys.exit(f"picture.py: the program has ended: {ended.stderr}")
+        return ended.stdout
+
+    def press(self, *keys):
+        self.tmux("send-keys", *keys)
+
+    def screen(self):
+        return self.tmux("capture-pane", "-p", "-e")
+
+    def until(self, what, holds):
+        """The screen, once something holds for its text."""
+        end = time.monotonic() + PATIENCE
+        while not holds(text := self.tmux("capture-pane", "-p")):
             if time.monotonic() > end:
-                sys.exit("picture.py: no unplug was seen on this screen:\n" + "\n".join(screen.text()))
-            if select.select([terminal], [], [], 0.05)[0]:
-                screen.feed(decoder.decode(os.read(terminal, 65536)))
-            shown = "\n".join(screen.text())
-            if not recording and shown.count("● streaming") == 3:
-                os.write(terminal, b" ")
-                recording = True
-            if recording and unplugged is None and "○ absent" in shown:
-                unplugged = time.monotonic()
-        return screen
-    except OSError as error:
-        sys.exit(f"picture.py: the program ended: {error}\n" + "\n".join(screen.text()))
-    finally:
-        try:
-            os.kill(process, 15)
-            while os.waitpid(process, os.WNOHANG)[0] == 0:
-                if select.select([terminal], [], [], 0.05)[0]:
-                    os.read(terminal, 65536)
-        except OSError:
-            os.waitpid(process, 0)
-        os.close(terminal)
+                sys.exit(f"picture.py: {what} was not seen on this screen:\n{text}")
+            time.sleep(0.05)
+        return self.screen()
+
+    def close(self):
+        subprocess.run(["tmux", "-S", self.socket, "send-keys", "C-c"], capture_output=True)
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end and not subprocess.run(["tmux", "-S", self.socket, "ls"], capture_output=True).returncode:
+            time.sleep(0.05)
 
 
-def main(program, output, instance=None):
+def take(terminal):
+    """The screens by the names of their pictures."""
+    terminal.until("three devices", lambda text: text.count("● streaming") == 3)
+    terminal.press(" ")
+    terminal.until("an episode", lambda text: "● REC" in text)
+    terminal.press("Enter")
+    is_whole = lambda text: sum(map(text.count, "▀▄")) > 200 and "30.0 Hz of" in text
+    device = terminal.until("a picture", is_whole)
+    terminal.press("Enter")
+    terminal.until("an unplugged device", lambda text: "○ absent" in text)
+    time.sleep(1.5)
+    return {"device": device, "monitor": terminal.screen()}
+
+
+def main(words):
+    is_light = words[:1] == ["--light"]
+    program, output, *instance = words[is_light:]
     registry = Path(__file__).resolve().parent.parent / "devices.toml"
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(registry, folder)
-        screen = take(os.path.abspath(program), folder, instance or f"picture{os.getpid()}")
-    Path(output).write_text(screen.svg("the monitor of rapid while a camera is unplugged"), encoding="utf-8")
+        terminal = Terminal(os.path.abspath(program), folder, (instance or [f"picture{os.getpid()}"])[0])
+        try:
+            screens = take(terminal)
+        finally:
+            terminal.close()
+    titles = {"device": "a camera in the monitor of rapid", "monitor": "the monitor of rapid while a camera is unplugged"}
+    for name, screen in screens.items():
+        Path(output, f"{name}.svg").write_text(Screen(screen, is_light).svg(titles[name]), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    if not 3 <= len(sys.argv) <= 4:
+    if not 3 <= len(sys.argv) <= 5:
         sys.exit(__doc__)
-    main(*sys.argv[1:])
+    main(sys.argv[1:])

@@ -49,15 +49,15 @@ fn prompt(frame: &mut Frame<'_>, area: Rect, question: &str, text: &str, theme: 
     frame.render_widget(Line::from(vec![Span::styled(format!(" {question}"), theme.warning()), typed, cursor]), area);
 }
 
-/// As many keys as fit, the most used first; `?` and `q` always.
+/// As many keys as fit, the most used before others; `?` and `q` always.
 fn keys(width: usize, model: &Model, theme: Theme) -> Line<'static> {
     let mut keys = keys::footer(model);
     let last = keys.split_off(keys.len().saturating_sub(2));
-    let columns = |(key, meaning): (&str, &str)| text::width(key) + text::width(meaning) + 4;
+    let columns = |(key, meaning): (&str, &str)| text::width(key) + text::width(meaning) + 3;
     let mut room = width.saturating_sub(last.iter().map(|key| columns(*key)).sum::<usize>() + 1);
     let mut spans = vec![Span::raw(" ")];
     for key in keys {
-        let Some(left) = room.checked_sub(columns(key)) else { break };
+        let Some(left) = room.checked_sub(columns(key)) else { continue };
         room = left;
         push(&mut spans, key, theme);
     }
@@ -69,5 +69,5 @@ fn keys(width: usize, model: &Model, theme: Theme) -> Line<'static> {
 
 fn push(spans: &mut Vec<Span<'static>>, (key, meaning): (&'static str, &'static str), theme: Theme) {
     spans.push(Span::styled(key.replace(", ", "/"), theme.title()));
-    spans.push(Span::styled(format!(" {meaning}   "), theme.faint()));
+    spans.push(Span::styled(format!(" {meaning}  "), theme.faint()));
 }

@@ -7,6 +7,7 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 
 use super::keys;
+use super::model::Model;
 use super::theme::Theme;
 use crate::status::SlotState;
 
@@ -39,12 +40,13 @@ fn lines(page: usize, theme: Theme) -> Vec<Line<'static>> {
     keys.chain(states).collect()
 }
 
-pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, page: usize, theme: Theme) {
+pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, page: usize, model: &Model, theme: Theme) {
     let lines = lines(page, theme);
     let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).saturating_add(2).min(area.height);
     let [middle] = Layout::vertical([Constraint::Length(height)]).flex(Flex::Center).areas(area);
     let [middle] = Layout::horizontal([Constraint::Length(WIDTH)]).flex(Flex::Center).areas(middle);
     let title = match page {
+        1 if model.is_read_only() => " Keys: episodes and motion: off, this is read-only ",
         1 => " Keys: episodes and motion (? for the screen's) ",
         _ => " Keys: the screen; states ",
     };

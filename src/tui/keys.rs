@@ -238,9 +238,6 @@ pub(super) const TABLE: [Binding; 41] = [
     row(Act::Plug, &[Char('U')], Pressed, ("U", "simulated device: unplug it or plug it in"), plugs),
     row(Act::AskToArm, &[Char('a')], Pressed, ("a, ctrl-y", "arm the actuator: motors follow actions"), never),
     row(Act::Arm, &[Char('y')], Control, ("", ""), never),
-    row(Act::Pause, &[Char('p')], Repeated, ("p", "pause the view; everything else continues"), |m| {
-        Some(if m.is_paused() { "continue" } else { "pause" })
-    }),
     row(Act::Order, &[Char('o')], Pressed, ("o", "order of devices: trouble first, or by bit"), never),
     row(Act::Bell, &[Char('b')], Pressed, ("b", "bell at begin, end and losses: on or off"), never),
     row(Act::Detail, &[KeyCode::Enter], Pressed, ("enter", "the selected device: picture, plots, facts"), |m| {
@@ -250,6 +247,9 @@ pub(super) const TABLE: [Binding; 41] = [
         Some(if m.page == Page::Log { "back" } else { "log" })
     }),
     row(Act::Episodes, &[Char('e')], Pressed, ("e", "the episodes of the session, with reasons"), never),
+    row(Act::Pause, &[Char('p')], Repeated, ("p", "pause the view; everything else continues"), |m| {
+        Some(if m.is_paused() { "continue" } else { "pause" })
+    }),
     row(Act::Search, &[Char('/')], Pressed, ("/", "only lines of the log that contain a text"), |m| {
         (m.page == Page::Log).then_some("search")
     }),
@@ -287,7 +287,9 @@ pub(super) fn act(key: KeyEvent) -> Option<Act> {
 
 /// The keys of the footer at the moment, with a word each; the last two are always to be shown.
 pub(super) fn footer(model: &Model) -> Vec<(&'static str, &'static str)> {
-    TABLE.iter().filter_map(|row| Some((row.shown.split(", ctrl").next()?, (row.footer)(model)?))).collect()
+    let is_possible = |act: Act| !model.is_read_only() || act == Act::Quit || !act.is_about_the_rig();
+    let rows = TABLE.iter().filter(|row| is_possible(row.act));
+    rows.filter_map(|row| Some((row.shown.split(", ctrl").next()?, (row.footer)(model)?))).collect()
 }
 
 /// The rows of the help: those about episodes and motion, or those about the screen.

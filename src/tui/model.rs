@@ -377,6 +377,11 @@ impl Model {
         effect
     }
 
+    /// Whether the run accepts nothing from this screen.
+    pub(super) const fn is_read_only(&self) -> bool {
+        matches!(self.link, LinkState::Attached { read_only: true, .. } | LinkState::Lost { read_only: true, .. })
+    }
+
     /// The effect, unless the link does not permit it.
     fn permitted(&mut self, effect: Effect) -> Effect {
         let is_request = matches!(effect, Effect::Send(_) | Effect::Order(_));

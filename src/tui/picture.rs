@@ -4,6 +4,7 @@
 //! Invariant: the terminal is never queried: what it can show follows from the environment and from the size of its window,
 //! so that the first frame waits for no answer.
 
+use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage};
 use ratatui::Frame;
 use ratatui::layout::{Rect, Size};
@@ -52,15 +53,16 @@ impl Picture {
     /// Every n-th pixel, so that no side is longer than [`LARGEST`].
     fn thinned(preview: &Preview, [height, width]: [usize; 2], values: &[u8]) -> Self {
         let step = width.max(height).div_ceil(LARGEST).max(1);
-        let rows = values.chunks_exact(width * pixels::CHANNELS).step_by(step);
-        let rgb = rows.flat_map(|row| row.chunks_exact(pixels::CHANNELS).step_by(step).flatten().copied()).collect();
-        let (width, height) = (width.div_ceil(step), height.div_ceil(step));
+        let (width, height, rgb) = every(step, [height, width], values);
         Self { device: preview.device, seq: preview.seq, width, height, rgb }
     }
 
-    fn image(&self) -> Option<DynamicImage> {
+    /// Every n-th pixel, so that none of its sides is much longer than the larger of `sides`.
+    fn image(&self, [width, height]: [usize; 2]) -> Option<DynamicImage> {
+        let step = (self.width / width.max(1)).min(self.height / height.max(1)).max(1);
+        let (width, height, rgb) = every(step, [self.height, self.width], &self.rgb);
         let side = |side: usize| u32::try_from(side).ok();
-        Some(DynamicImage::ImageRgb8(RgbImage::from_raw(side(self.width)?, side(self.height)?, self.rgb.clone())?))
+        Some(DynamicImage::ImageRgb8(RgbImage::from_raw(side(width)?, side(height)?, rgb)?))
     }
 
     /// Brightness, 0 to 1, at a place given by shares of width and height.
@@ -72,6 +74,13 @@ impl Picture {
             self.rgb.get(place..place + pixels::CHANNELS).unwrap_or_default().iter().map(|v| u32::from(*v)).sum();
         f64::from(sum) / (255.0 * pixels::CHANNELS as f64)
     }
+}
+
+/// Every n-th pixel of every n-th row: width, height and the pixels.
+fn every(step: usize, [height, width]: [usize; 2], rgb: &[u8]) -> (usize, usize, Vec<u8>) {
+    let rows = rgb.chunks_exact((width * pixels::CHANNELS).max(1)).step_by(step);
+    let thinned = rows.flat_map(|row| row.chunks_exact(pixels::CHANNELS).step_by(step).flatten().copied()).collect();
+    (width.div_ceil(step), height.div_ceil(step), thinned)
 }
 
 /// Where pictures are drawn, and the last one as the terminal takes it.
@@ -120,17 +129,11 @@ impl Canvas {
         if protocol == ProtocolType::Halfblocks && is("TERM", &["linux", "dumb", "vt"]) && wanted.is_empty() {
             return Self::default();
         }
-        let mut picker = match cell {
-            Some((width, height)) if protocol != ProtocolType::Halfblocks =>
-            {
-                #[expect(deprecated, reason = "the alternative queries the terminal and waits for its answer")]
-                Picker::from_fontsize(FontSize { width, height })
-            }
-            _ => Picker::halfblocks(),
-        };
-        if cell.is_some() {
-            picker.set_protocol_type(protocol);
-        }
+        // A half block is a pixel: nothing larger than what is shown is computed.
+        let (width, height) = cell.filter(|_| protocol != ProtocolType::Halfblocks).unwrap_or((1, 2));
+        #[expect(deprecated, reason = "the alternative queries the terminal and waits for its answer")]
+        let mut picker = Picker::from_fontsize(FontSize { width, height });
+        picker.set_protocol_type(if cell.is_some() { protocol } else { ProtocolType::Halfblocks });
         Self { picker: Some(picker), last: None }
     }
 
@@ -145,7 +148,12 @@ impl Canvas {
         let size = Size::new(area.width, area.height);
         let key = (picture.device, picture.seq, size);
         if self.last.as_ref().is_none_or(|(last, _)| *last != key) {
-            let protocol = picture.image().and_then(|image| picker.new_protocol(image, size, Resize::Scale(None)).ok());
+            let FontSize { width, height } = picker.font_size();
+            let pixels = [(size.width, width), (size.height, height)]
+                .map(|(cells, side)| usize::from(cells) * usize::from(side));
+            let scaled = Resize::Scale(Some(FilterType::Triangle));
+            let image = picture.image(pixels.map(|side| side * 2));
+            let protocol = image.and_then(|image| picker.new_protocol(image, size, scaled).ok());
             self.last = protocol.map(|protocol| (key, protocol));
         }
         match &self.last {

@@ -11,7 +11,7 @@ use super::model::Model;
 use super::theme::Theme;
 use super::view;
 use crate::status::session::Phase;
-use crate::status::{RecordingStatus, Snapshot, Verdict};
+use crate::status::{RecordingStatus, Verdict};
 use crate::text;
 use crate::time::Stamp;
 
@@ -102,7 +102,7 @@ fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Th
 
 fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let shown = model.latest();
-    let mut first = start(shown, usize::from(area.width), theme);
+    let mut first = start(model, usize::from(area.width), theme);
     if let Some(why) = &shown.not_started {
         let text = format!("{} not started: {}", theme.symbol("▲", "!"), theme.safe(why));
         return not_started(first, &text, area, theme);
@@ -140,25 +140,32 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
 }
 
 /// What begins the next episode, and of what it will be.
-fn start(shown: &Snapshot, width: usize, theme: Theme) -> Line<'static> {
+fn start(model: &Model, width: usize, theme: Theme) -> Line<'static> {
+    let shown = model.latest();
     let session = shown.session.as_ref();
     let left = |until: Stamp| text::clock(until.since(shown.taken) + Duration::from_millis(999));
-    let key = Span::styled("space", theme.title());
+    let key = |before: &'static str, does: &'static str| {
+        let spans = vec![Span::raw(before), Span::styled("space", theme.title()), Span::raw(does)];
+        if model.is_read_only() { Vec::new() } else { spans }
+    };
+    let soon = |text: String| {
+        let mut line = Line::from(Span::styled(text, theme.warning()));
+        line.spans.extend(key("; ", " begins it now"));
+        line
+    };
     let mut line = match session.map(|session| session.phase).unwrap_or_default() {
-        Phase::Countdown { until } => {
-            let text = format!("an episode begins in {}", left(until));
-            Line::from(vec![Span::styled(text, theme.warning()), Span::raw("; "), key, Span::raw(" begins it now")])
+        Phase::Countdown { until } => soon(format!("an episode begins in {}", left(until))),
+        Phase::Reset { until } => soon(format!("reset the scene: the next episode begins in {}", left(until))),
+        Phase::Idle | Phase::Recording | Phase::Ending if model.is_read_only() => {
+            Line::styled("no episode", theme.faint())
         }
-        Phase::Reset { until } => {
-            let text = format!("reset the scene: the next episode begins in {}", left(until));
-            Line::from(vec![Span::styled(text, theme.warning()), Span::raw("; "), key, Span::raw(" begins it now")])
-        }
-        Phase::Idle | Phase::Recording | Phase::Ending => Line::from(vec![key, Span::raw(" starts an episode")]),
+        Phase::Idle | Phase::Recording | Phase::Ending => Line::from(key("", " starts an episode")),
     };
     if let Some(session) = session {
         let tags: Vec<_> = session.tags.iter().map(|(key, value)| format!("  {key}={value}")).collect();
         let room = width.saturating_sub(line.width() + 3);
-        let about = theme.safe(&format!("{}{}", session.task, tags.concat()));
+        let task = if session.task.is_empty() { String::new() } else { format!("task: {}", session.task) };
+        let about = theme.safe(&format!("{task}{}", tags.concat()));
         line.push_span(Span::raw("   "));
         line.push_span(Span::styled(text::cut(&about, room, theme.ellipsis()).into_owned(), theme.faint()));
     }

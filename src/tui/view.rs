@@ -56,7 +56,7 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme, canvas: &mut Can
     }
     footer::draw(frame, footer_area, model, theme);
     if let Some(page) = model.help {
-        help::draw(frame, area, page, theme);
+        help::draw(frame, area, page, model, theme);
     }
 }
 

@@ -456,20 +456,31 @@ fn looks(svg: &str) -> (BTreeSet<String>, BTreeSet<String>) {
 }
 
 #[test]
-fn the_monitor_picture_is_current() {
+fn the_monitor_pictures_are_current() {
     let place = Place::new();
-    let drawn = place.path("monitor.svg");
     let ended = Command::new("python3")
         .arg(root().join("scripts/picture.py"))
-        .args([Path::new(env!("CARGO_BIN_EXE_rapid")), &drawn])
+        .args([Path::new(env!("CARGO_BIN_EXE_rapid")), place.folder.path()])
         .arg(&place.instance)
         .output()
         .expect("python3");
     assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stderr));
     let read = |path: &Path| std::fs::read_to_string(path).expect("a picture");
-    let (now, committed) = (looks(&read(&drawn)), looks(&read(&root().join("docs/monitor.svg"))));
+    let (now, committed) = (looks(&read(&place.path("monitor.svg"))), looks(&read(&root().join("docs/monitor.svg"))));
     for word in ["Mask", "streaming", "published", "Devices", "state", "Recording", "messages", "Log", "quit"] {
         assert_eq!(committed.0.contains(word), word != "streaming", "{word}: {:?}", committed.0);
     }
     assert_eq!(now, committed, "the monitor has changed: run `make picture` and look at docs/monitor.svg");
+    // The titles and the names of the facts: in the colours of both, and nothing that moves.
+    let names = |svg: &str| -> BTreeSet<String> {
+        let texts = svg.split("<text ").filter(|text| text.contains("font-weight") || text.contains("opacity"));
+        let words = texts.filter_map(|text| text.split_once('>')?.1.split("</text>").next());
+        let is_name = |word: &&str| word.chars().all(|c| c.is_ascii_lowercase() || c == ' ');
+        words.map(str::trim).filter(is_name).filter(|word| word.len() > 3).map(str::to_owned).collect()
+    };
+    let (now, committed) = (names(&read(&place.path("device.svg"))), names(&read(&root().join("docs/device.svg"))));
+    for word in ["state", "rate", "identity", "topic", "space"] {
+        assert!(committed.contains(word), "{word}: {committed:?}");
+    }
+    assert_eq!(now, committed, "the page of a device has changed: run `make picture` and look at docs/device.svg");
 }

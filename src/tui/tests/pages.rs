@@ -206,3 +206,12 @@ fn a_click_finds_what_is_drawn_there() {
         assert_eq!(view::target(&model, size, THEME, Position::new(1, 0)), None);
     }
 }
+
+#[test]
+fn what_is_read_only_offers_no_key_that_does_nothing() {
+    let mut model = measured(&three_streaming());
+    model.link = LinkState::Attached { process: 1, read_only: true };
+    assert_snapshot!("read_only_80x24", draw(&model, (80, 24), THEME));
+    model.update(press(KeyCode::Char('?')));
+    assert_snapshot!("read_only_help_80x24", draw(&model, (80, 24), THEME));
+}

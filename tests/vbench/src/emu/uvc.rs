@@ -16,6 +16,8 @@ const PAYLOAD: u32 = 16 * 1024;
 const PAYLOAD_HEADER: u8 = 2;
 const PROBE_LEN: usize = 26;
 const VS_INTERFACE: u16 = 1;
+/// The processing unit, of the control interface.
+const PROCESSING_UNIT: u8 = 3;
 /// Interval unit of the class: 100 ns.
 const INTERVALS_PER_SECOND: u32 = 10_000_000;
 
@@ -24,9 +26,28 @@ const GUID_YUYV: [u8; 16] = [b'Y', b'U', b'Y', b'2', 0, 0, 0x10, 0, 0x80, 0, 0, 
 /// The pictures of one size, encoded once and shared by all cameras of that size.
 pub type Pictures = std::sync::Arc<Vec<Vec<u8>>>;
 
+/// A control of the processing unit: its selector (UVC 1.0, table A-13) and its range. What it is set to is kept, and
+/// does not change the pictures.
+#[derive(Debug)]
+struct Control {
+    selector: u16,
+    least: i16,
+    most: i16,
+    default: i16,
+    now: i16,
+}
+
+const fn control(selector: u16, least: i16, most: i16, default: i16) -> Control {
+    Control { selector, least, most, default, now: default }
+}
+
+/// Brightness and contrast.
+const CONTROLS: [Control; 2] = [control(2, -64, 64, 0), control(3, 0, 95, 32)];
+
 /// A camera.
 #[derive(Debug)]
 pub struct Uvc {
+    controls: [Control; 2],
     formats: Vec<FormatGroup>,
     probe: Selection,
     committed: Selection,
@@ -64,6 +85,7 @@ impl Uvc {
         }
         let default = Selection { format: 0, mode: 0, interval: interval(formats[0].modes[0].0.fps[0]) };
         Self {
+            controls: CONTROLS,
             formats,
             probe: default,
             committed: default,
@@ -80,7 +102,7 @@ impl Uvc {
         DeviceClass { class: [0xef, 2, 1], release: 0x0100 }
     }
 
-    /// One camera terminal, one output terminal, one streaming interface.
+    /// One camera terminal, one processing unit, one output terminal, one streaming interface.
     pub fn configuration(&self) -> Vec<u8> {
         let mut formats = Configuration::default();
         for (index, group) in (1u8..).zip(&self.formats) {
@@ -94,13 +116,15 @@ impl Uvc {
         header.resize(usize::from(header_len) - 1, 0);
 
         let clock = 48_000_000u32.to_le_bytes();
-        let control_total = 13 + 18 + 9;
+        let control_total = 13 + 18 + 11 + 9;
         Configuration::default()
             .push(&[11, 0, 2, 0x0e, 3, 0, 2])
             .interface(0, 0, [0x0e, 1, 0])
             .push(&[CS_INTERFACE, 1, 0x00, 0x01, control_total, 0, clock[0], clock[1], clock[2], clock[3], 1, 1])
             .push(&[CS_INTERFACE, 2, 1, 0x01, 0x02, 0, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0])
-            .push(&[CS_INTERFACE, 3, 2, 0x01, 0x01, 0, 1, 0])
+            // Bits 0 and 1: brightness and contrast.
+            .push(&[CS_INTERFACE, 5, PROCESSING_UNIT, 1, 0, 0, 2, 0b11, 0, 0])
+            .push(&[CS_INTERFACE, 3, 2, 0x01, 0x01, 0, PROCESSING_UNIT, 0])
             .interface(1, 1, [0x0e, 2, 0])
             .push(&header)
             .append(&formats)
@@ -108,9 +132,13 @@ impl Uvc {
             .finish()
     }
 
-    /// Probe and commit; the camera has no other controls.
+    /// Probe and commit, and the controls of the processing unit.
     pub fn control(&mut self, setup: Setup, data: &[u8]) -> Answer {
         let selector = setup.value >> 8;
+        if setup.kind & 0x7f == 0x21 && setup.index == u16::from_be_bytes([PROCESSING_UNIT, 0]) {
+            let control = self.controls.iter_mut().find(|control| control.selector == selector);
+            return control.map_or(Answer::Stall, |control| control.answer(setup.request, data));
+        }
         if setup.kind & 0x7f != 0x21 || setup.index & 0xff != VS_INTERFACE || !(1..=2).contains(&selector) {
             return Answer::Stall;
         }
@@ -200,6 +228,30 @@ impl Uvc {
         bytes[18..22].copy_from_slice(&frame_bytes(&self.mode(selection).0).to_le_bytes());
         bytes[22..26].copy_from_slice(&PAYLOAD.to_le_bytes());
         bytes
+    }
+}
+
+impl Control {
+    /// UVC 1.0, section 4.2.2.3: a value out of range is refused.
+    fn answer(&mut self, request: u8, data: &[u8]) -> Answer {
+        let word = |value: i16| Answer::Data(value.to_le_bytes().to_vec());
+        match request {
+            0x01 => match *data {
+                [low, high] if (self.least..=self.most).contains(&i16::from_le_bytes([low, high])) => {
+                    self.now = i16::from_le_bytes([low, high]);
+                    Answer::Done
+                }
+                _ => Answer::Stall,
+            },
+            0x81 => word(self.now),
+            0x82 => word(self.least),
+            0x83 => word(self.most),
+            0x84 => word(1),
+            0x85 => word(2),
+            0x86 => Answer::Data(vec![0b11]),
+            0x87 => word(self.default),
+            _ => Answer::Stall,
+        }
     }
 }
 
@@ -297,6 +349,20 @@ mod tests {
         assert_eq!(camera.control(Setup { value: 0x0900, ..get }, &[]), Answer::Stall);
         camera.stop();
         assert!(camera.live().is_none());
+    }
+
+    #[test]
+    fn a_control_keeps_what_it_is_set_to_within_its_range() {
+        let mut camera = camera();
+        let ask = |request| Setup { kind: 0xa1, request, value: 0x0200, index: 0x0300, length: 2 };
+        let set = Setup { kind: 0x21, ..ask(1) };
+        let word = |value: i16| Answer::Data(value.to_le_bytes().to_vec());
+        assert_eq!(camera.control(ask(0x82), &[]), word(-64));
+        assert_eq!(camera.control(ask(0x83), &[]), word(64));
+        assert_eq!(camera.control(set, &(-40i16).to_le_bytes()), Answer::Done);
+        assert_eq!(camera.control(set, &65i16.to_le_bytes()), Answer::Stall);
+        assert_eq!(camera.control(ask(0x81), &[]), word(-40));
+        assert_eq!(camera.control(Setup { value: 0x0400, ..set }, &[0, 0]), Answer::Stall, "no such control");
     }
 
     #[test]

@@ -34,6 +34,7 @@ width = 320
 height = 240
 fps = 15
 format = "YUYV"
+controls = { contrast = 60 }
 
 [device.force]
 vid = "0x0403"
@@ -73,8 +74,30 @@ wait_for 60 states 1 cam_wide failed || fail 'cam_wide does not fail'
 "${rapid[@]}" --headless --duration 1s $config >$out/second.txt 2>&1; echo $? >$out/second.rc
 # Held by rapid: no other program can stream from it.
 "${usbemu[@]}" --read /dev/rapid/cam_raw 1 >$out/held.txt 2>&1
+# A screen of another process sets a control while the camera streams, and shows it on the page of the camera.
+mkfifo /tmp/keys
+exec 6<>/tmp/keys
+script -qec "stty rows 40 cols 120; ${rapid[*]} monitor" /dev/null </tmp/keys >$out/screen 2>&1 6>&- &
+screen=$!
+keys() { printf "$1" >&6; }
+in_log() { has_line $out/rapid.jsonl '"event":"log"' "$1"; }
+wait_for 60 has_line $out/screen cam_raw || fail 'no screen'
+keys 'oj\r'
+wait_for 30 has_line $out/screen contrast || fail 'the page of the camera does not show its controls'
+keys 'Cbrightness=-40\r'
+wait_for 30 in_log 'cam_raw: brightness is -40' || fail 'brightness is not set'
+keys 'Cbrightness=65\r'
+wait_for 30 in_log 'cam_raw: brightness is not set' || fail 'brightness 65 is not refused'
+keys 'Chue=1\r'
+wait_for 30 in_log 'cam_raw: hue is not set' || fail 'hue is not refused'
+grep -F 'cam_raw: ' $out/rapid.jsonl >$out/controls.jsonl
+keys '\003'
+has_left() { ! kill -0 $screen 2>/dev/null; }
+wait_for 30 has_left || fail 'the screen does not leave'
 sleep 2
 rapid_stop
+# What was set when the camera was opened, as the camera reports it.
+grep -aho '"controls":{[^}]*}' $out/rec/*.mcap >$out/readback
 emu unplug 1 2
 wait_for 30 detached 1 2
 udevadm settle
@@ -98,8 +121,15 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
 
     let listing = outcome.file("devices.txt");
     println!("{listing}");
-    for word in ["[device.cam_wide]", "[device.cam_raw]", "[device.force]", "STRANGER", "MJPG 640x480", "YUYV 320x240"]
-    {
+    for word in [
+        "[device.cam_wide]",
+        "[device.cam_raw]",
+        "[device.force]",
+        "STRANGER",
+        "MJPG 640x480",
+        "YUYV 320x240",
+        "brightness -64..=64 (default 0)",
+    ] {
         assert!(listing.contains(word), "{word} not in:\n{listing}");
     }
     let objects: Vec<serde_json::Value> =
@@ -127,6 +157,10 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
     let detail = failed.expect("cam_wide has failed")["detail"].as_str().unwrap().to_owned();
     println!("{detail}");
     assert!(detail.contains("offers no MJPG 1280x720 at 30 fps; it offers MJPG 640x480"), "{detail}");
+
+    println!("{}", outcome.file("controls.jsonl"));
+    println!("{}", outcome.file("readback"));
+    assert!(outcome.file("readback").contains("\"contrast\":60"), "{}", outcome.file("readback"));
 
     // A second rapid on the same rig ends at once and names the first.
     assert_eq!(outcome.file("second.rc").trim(), "1");
