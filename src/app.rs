@@ -179,7 +179,10 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
     // earlier one left unfinished.
     let _repairs = may_record.then(|| {
-        let repairs = Repairs::start(out.clone(), reserve, Arc::clone(&board));
+        let (unfinished, found) = (conductor.collection.unfinished(), conductor.found());
+        let folder = out.clone();
+        let examine = move || unfinished.into_iter().for_each(|file| collection::examine(&folder, file, &found));
+        let repairs = Repairs::start(out.clone(), reserve, Arc::clone(&board), examine);
         repairs.inspect_err(|error| tracing::warn!(%error, "unfinished episodes are not repaired")).ok()
     });
     // A panic here ends the run like any other error: the shutdown is carried out in order.
@@ -292,6 +295,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         is_single,
         duration: options.duration,
         begin_episode: options.record,
+        found: mpsc::unbounded_channel(),
     };
     let running = Running {
         permission,

@@ -97,14 +97,14 @@ fn rules(spec: &ButtonSpec) -> Rules {
 
 /// What an action requests of the session; `None` for an order.
 fn request(action: ButtonAction) -> Option<SessionRequest> {
-    let label = |label| SessionRequest::Label { label, reason: String::new() };
+    let label = |label| SessionRequest::Label { episode: None, label, reason: String::new() };
     Some(match action {
         ButtonAction::Toggle => SessionRequest::Toggle,
         ButtonAction::Start => SessionRequest::Start,
         ButtonAction::Stop => SessionRequest::Stop,
         ButtonAction::Next => SessionRequest::Next,
         ButtonAction::Redo => SessionRequest::Redo,
-        ButtonAction::Discard => SessionRequest::Discard,
+        ButtonAction::Discard => SessionRequest::Discard { episode: None },
         ButtonAction::Undo => SessionRequest::Undo,
         ButtonAction::Mark => SessionRequest::Mark { text: String::new() },
         ButtonAction::Success => label(Label::Success),

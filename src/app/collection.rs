@@ -1,11 +1,13 @@
 //! What a run collects: its session, with the recorder and the keeper that carry out what the session decides.
 //!
 //! Invariant: the recorder alone knows whether an episode is in progress; the session follows what it reports.
-//! Invariant: a request is answered once, also when what it waits for does not happen.
+//! Invariant: a request is answered once, also when what it waits for does not happen; and when what it changed is on the
+//! disk, not before.
 
+use std::path::Path;
 use std::sync::Arc;
 
-use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender};
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
@@ -13,16 +15,48 @@ use super::AppError;
 use super::conductor::LAST_SAMPLES;
 use super::requests::Reply;
 use super::stage::join;
+use crate::record::inspect::{self, Judgement, Listed};
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
 use crate::session::journal::{Journal, Plan};
-use crate::session::keeper::{Keeper, Operation, Outcome};
+use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
 use crate::session::{Answer, Effect, Session};
 use crate::status::session::{Answered, Phase, SessionRequest, SessionStatus};
-use crate::status::{Board, EpisodeEnd, Level, What};
+use crate::status::{Board, EpisodeEnd, Level, Verdict, What};
 use crate::time::{Stamp, realtime_ns, rfc3339};
 
 /// Answers that wait for an episode to begin, or to end.
 type Waiting = Vec<oneshot::Sender<Result<String, String>>>;
+
+fn reply_all(to: Waiting, answer: &Result<String, String>) {
+    for reply in to {
+        // The requester may have ended.
+        let _ = reply.send(answer.clone());
+    }
+}
+
+/// What became of an episode of which no end was noted.
+pub(super) struct Found {
+    file: String,
+    /// Its length in seconds and its verdict; `None` if nothing was recorded.
+    end: Option<(f64, Verdict)>,
+}
+
+/// Reads an episode of which no end was noted: the run was killed then. Blocks. One that waits to be repaired stays as it is.
+pub(super) fn examine(folder: &Path, file: String, found: &UnboundedSender<Found>) {
+    let is_there = |ending: &str| folder.join(format!("{file}{ending}")).symlink_metadata().is_ok();
+    let end = if is_there("") {
+        let Listed { verdict: Judgement::Episode(verdict), seconds, .. } = inspect::list(&folder.join(&file)) else {
+            return;
+        };
+        Some((seconds, verdict))
+    } else if is_there(".partial") || is_there(".damaged") {
+        return;
+    } else {
+        None
+    };
+    // The run may have ended.
+    let _ = found.send(Found { file, end });
+}
 
 /// See the module's comment.
 pub(super) struct Collection {
@@ -32,6 +66,8 @@ pub(super) struct Collection {
     episode: EpisodeRequest,
     session: Session,
     keeper: Keeper,
+    /// What the keeper is to do for the request that is being carried out.
+    operations: Vec<Operation>,
     outcomes: UnboundedReceiver<Outcome>,
     at_begin: Waiting,
     at_end: Waiting,
@@ -71,6 +107,7 @@ impl Collection {
             episode,
             session,
             keeper,
+            operations: Vec::new(),
             outcomes,
             at_begin: Vec::new(),
             at_end: Vec::new(),
@@ -99,7 +136,7 @@ impl Collection {
     /// When an episode could not begin.
     pub(super) async fn tick(&mut self) -> Result<(), RecordError> {
         let effects = self.session.tick(Stamp::now());
-        self.carry_out(effects).await
+        self.carry_out(effects, None).await
     }
 
     /// Begins an episode, as the command line requested.
@@ -108,7 +145,7 @@ impl Collection {
     /// When it could not begin.
     pub(super) async fn start(&mut self) -> Result<(), RecordError> {
         match self.session.request(&SessionRequest::Start, Stamp::now()) {
-            Ok((_, effects)) => self.carry_out(effects).await,
+            Ok((_, effects)) => self.carry_out(effects, None).await,
             // One is in progress already.
             Err(_) => Ok(()),
         }
@@ -128,15 +165,22 @@ impl Collection {
         self.is_kept |= is_shown;
         match self.session.request(request, at) {
             Ok((answer, effects)) => {
-                match answer {
-                    Answer::Now(text) if is_shown => self.answer(Ok(text), reply),
+                let pending = match answer {
                     Answer::Now(text) => {
-                        let _ = reply.map(|reply| reply.send(Ok(text)));
+                        // The episode has a mark, whatever becomes of the session's file.
+                        let is_done = matches!(request, SessionRequest::Mark { .. });
+                        Some(Pending { text, is_done, is_shown, to: reply.into_iter().collect() })
                     }
-                    Answer::AtBegin => self.at_begin.extend(reply),
-                    Answer::AtEnd => self.at_end.extend(reply),
-                }
-                self.carry_out(effects).await
+                    Answer::AtBegin => {
+                        self.at_begin.extend(reply);
+                        None
+                    }
+                    Answer::AtEnd => {
+                        self.at_end.extend(reply);
+                        None
+                    }
+                };
+                self.carry_out(effects, pending).await
             }
             Err(refusal) => {
                 self.answer(Err(refusal.to_string()), reply);
@@ -151,24 +195,42 @@ impl Collection {
     /// # Errors
     /// When the next one could not begin.
     pub(super) async fn ended(&mut self, end: &EpisodeEnd) -> Result<(), RecordError> {
-        let effects = self.note_end(end);
-        self.carry_out(effects).await
+        let (effects, answer) = self.note_end(end);
+        self.carry_out(effects, answer).await
     }
 
-    fn note_end(&mut self, end: &EpisodeEnd) -> Vec<Effect> {
+    fn note_end(&mut self, end: &EpisodeEnd) -> (Vec<Effect>, Option<Pending>) {
         if self.handled.as_ref() == Some(end) {
-            return Vec::new();
+            return (Vec::new(), None);
         }
         self.handled = Some(end.clone());
-        let text = match &end.error {
-            Some(error) => Err(format!("{}: {error}", end.file.display())),
-            None => Ok(format!("{}: {}, {:.1} s", end.file.display(), end.verdict.grade.word(), end.seconds)),
+        let file = end.file.display();
+        let to = std::mem::take(&mut self.at_end);
+        let answer = if let Some(error) = &end.error {
+            reply_all(to, &Err(format!("{file}: {error}")));
+            None
+        } else {
+            let is_discarded = self.session.discards();
+            let length = format!("{}, {:.1} s", end.verdict.grade.word(), end.seconds);
+            let text = if is_discarded { format!("{file}: in the trash") } else { format!("{file}: {length}") };
+            Some(Pending { text, is_done: !is_discarded, is_shown: false, to })
         };
-        for reply in self.at_end.drain(..) {
-            // The requester may have ended.
-            let _ = reply.send(text.clone());
+        (self.session.ended(&end.file, end.seconds, &end.verdict, Stamp::now()), answer)
+    }
+
+    /// The episodes of which no end was noted.
+    pub(super) fn unfinished(&self) -> Vec<String> {
+        self.session.unfinished()
+    }
+
+    /// What became of an episode of which no end was noted.
+    pub(super) fn examined(&mut self, Found { file, end }: &Found) {
+        let end = end.as_ref().map(|(seconds, verdict)| (*seconds, verdict));
+        for effect in self.session.examined(file, end) {
+            self.change(effect);
         }
-        self.session.ended(&end.file, end.seconds, &end.verdict, Stamp::now())
+        self.submit(None);
+        self.show();
     }
 
     /// The next outcome of the keeper. Cancel-safe.
@@ -186,11 +248,20 @@ impl Collection {
             Outcome::Discarded(file) => self.board.announce(What::Discarded { file: self.episode.out.join(file) }),
             Outcome::Restored(file) => self.board.announce(What::Restored { file: self.episode.out.join(file) }),
             Outcome::NotMoved(file, why) => {
-                self.session.not_moved(&file);
-                self.change(Effect::Save);
+                for effect in self.session.not_moved(&file) {
+                    self.change(effect);
+                }
+                self.submit(None);
                 self.fail(format!("{file} was not moved: {why}"));
             }
-            Outcome::Failed(why) => self.fail(format!("the session is not saved: {why}")),
+            Outcome::Failed(why) => self.fail(why),
+            Outcome::Closed(closed) => {
+                self.session.closed(closed.is_ok(), rfc3339(realtime_ns()));
+                if let Err(why) = closed {
+                    self.fail(why);
+                }
+            }
+            Outcome::Answered(answer) => self.answer(answer, None),
         }
         self.show();
     }
@@ -200,20 +271,22 @@ impl Collection {
         self.answer(Err(text), None);
     }
 
-    /// Carries out effects in order; an episode that cannot begin ends them.
-    async fn carry_out(&mut self, effects: Vec<Effect>) -> Result<(), RecordError> {
+    /// Carries out effects in order, and answers when they are on the disk.
+    async fn carry_out(&mut self, effects: Vec<Effect>, mut answer: Option<Pending>) -> Result<(), RecordError> {
         let mut outcome = Ok(());
         for effect in effects {
             match effect {
-                Effect::Begin => outcome = self.begin().await,
+                Effect::Begin => {
+                    self.submit(answer.take());
+                    outcome = self.begin().await;
+                }
                 effect => self.change(effect),
             }
         }
+        self.submit(answer);
         if self.session.phase() == Phase::Idle {
             // Whatever they waited for was called off.
-            for reply in self.at_begin.drain(..) {
-                let _ = reply.send(Err("no episode begins".to_owned()));
-            }
+            reply_all(std::mem::take(&mut self.at_begin), &Err("no episode begins".to_owned()));
         }
         self.show();
         outcome
@@ -226,25 +299,39 @@ impl Collection {
             Effect::Save if !self.is_kept => {}
             Effect::Save => {
                 self.archive_superseded();
-                self.keeper.request(Operation::Save(self.session.file().clone()));
+                self.operations.push(Operation::Save(self.session.file().clone()));
             }
             Effect::End(at) => self.recorder.end(at),
-            Effect::Discard(file) => self.keeper.request(Operation::Discard(file)),
-            Effect::Restore(file) => self.keeper.request(Operation::Restore(file)),
+            Effect::Discard(file) => self.operations.push(Operation::Discard(file)),
+            Effect::Restore(file) => self.operations.push(Operation::Restore(file)),
             Effect::Mark(text) => self.board.announce(What::Mark { text }),
             Effect::Close(gone) => {
-                let now = rfc3339(realtime_ns());
                 self.archive_superseded();
-                self.keeper.request(Operation::Close(self.session.closed(now.clone()), gone));
-                self.session.renew(now);
+                self.operations.push(Operation::Close(self.session.at_end(rfc3339(realtime_ns())), gone));
             }
+        }
+    }
+
+    /// Hands what was collected to the keeper, with the answer that is to follow it.
+    fn submit(&mut self, answer: Option<Pending>) {
+        let operations = std::mem::take(&mut self.operations);
+        match answer {
+            // What changes nothing on the disk does not wait for it.
+            Some(Pending { text, is_shown, to, .. }) if operations.is_empty() => {
+                reply_all(to, &Ok(text.clone()));
+                if is_shown {
+                    self.answer(Ok(text), None);
+                }
+            }
+            None if operations.is_empty() => {}
+            answer => self.keeper.request(operations, answer),
         }
     }
 
     /// Before this session's file is written for the first time.
     fn archive_superseded(&mut self) {
         if let Some(begun) = self.superseded.take() {
-            self.keeper.request(Operation::Archive(begun));
+            self.operations.push(Operation::Archive(begun));
         }
     }
 
@@ -256,17 +343,21 @@ impl Collection {
             ..self.episode.clone()
         };
         let started = self.recorder.start(request).await;
-        let why = started.as_ref().err().map(ToString::to_string);
-        self.board.set_not_started(why.clone());
+        self.board.set_not_started(started.as_ref().err().map(ToString::to_string));
         let begun = rfc3339(realtime_ns());
         for effect in self.session.began(started.as_deref().ok(), begun, Stamp::now()) {
             self.change(effect);
         }
-        for reply in self.at_begin.drain(..) {
-            let _ = reply.send(match (&started, &why) {
-                (Ok(file), _) => Ok(format!("recording {}", file.display())),
-                (Err(_), why) => Err(why.clone().unwrap_or_default()),
-            });
+        let to: Waiting = std::mem::take(&mut self.at_begin);
+        match &started {
+            Ok(file) => {
+                let text = format!("recording {}", file.display());
+                self.submit(Some(Pending { text, is_done: true, is_shown: false, to }));
+            }
+            Err(error) => {
+                reply_all(to, &Err(error.to_string()));
+                self.submit(None);
+            }
         }
         started.map(|_| ())
     }
@@ -304,9 +395,11 @@ impl Collection {
 
     /// An episode has ended, and no other begins.
     pub(super) fn note_last(&mut self, end: &EpisodeEnd) {
-        for effect in self.note_end(end) {
+        let (effects, answer) = self.note_end(end);
+        for effect in effects {
             self.change(effect);
         }
+        self.submit(answer);
     }
 
     /// Writes the summary and waits until everything about the session is on the disk.
@@ -315,7 +408,7 @@ impl Collection {
     /// When the keeper panicked.
     pub(super) async fn close(&mut self) -> Result<(), AppError> {
         if self.is_kept && !self.session.file().episodes.is_empty() {
-            self.keeper.request(Operation::Summarise(self.session.file().clone()));
+            self.keeper.request(vec![Operation::Summarise(self.session.file().clone())], None);
         }
         let outcome = match self.keeper.close() {
             Some(thread) => join(thread, "thread `session`").await,

@@ -7,11 +7,11 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
+use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 
-use super::collection::Collection;
+use super::collection::{Collection, Found};
 use super::stage::{Stage, join};
 use super::{AppError, Request, Running, Screen};
 use crate::bus;
@@ -43,11 +43,18 @@ pub(super) struct Conductor {
     /// The run is for one episode, and not for a session of several.
     pub(super) is_single: bool,
     pub(super) duration: Option<Duration>,
+    /// What became of episodes of which no end was noted.
+    pub(super) found: (mpsc::UnboundedSender<Found>, mpsc::UnboundedReceiver<Found>),
     /// An episode is still to begin, as soon as every device delivers samples.
     pub(super) begin_episode: bool,
 }
 
 impl Conductor {
+    /// Takes what became of an episode of which no end was noted.
+    pub(super) fn found(&self) -> mpsc::UnboundedSender<Found> {
+        self.found.0.clone()
+    }
+
     /// Returns when the run is to end, with the reason if it is an error.
     pub(super) async fn conduct(&mut self, running: &mut Running) -> Result<(), AppError> {
         let begun = Instant::now();
@@ -108,6 +115,8 @@ impl Conductor {
                     }
                 }
                 outcome = self.collection.outcome() => self.collection.take(outcome),
+                // This holds a sender: it does not end.
+                Some(found) = self.found.1.recv() => self.collection.examined(&found),
                 () = reached(due) => {
                     let begun = self.collection.tick().await;
                     self.tolerate(begun, running.kind)?;

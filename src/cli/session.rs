@@ -5,7 +5,8 @@ use clap::{Subcommand, ValueEnum};
 use crate::status::session::{Label, SessionRequest};
 
 pub(super) const EPISODE: &str = "\
-The running rapid answers when it is done: `stop` when the file is closed, `start` when the episode has begun.
+The running rapid answers when it is done and on the disk: `stop` when the file is closed, `start`, `next` and `redo`
+when the episode has begun.
 
 Examples:
   rapid episode start
@@ -39,8 +40,14 @@ pub enum EpisodeCommand {
     #[command(after_long_help = "Examples:\n  rapid episode redo")]
     Redo,
     /// Move the episode, or the last one, to the trash
-    #[command(after_long_help = "Examples:\n  rapid episode discard")]
-    Discard,
+    #[command(
+        after_long_help = "Examples:\n  rapid episode discard\n  rapid episode discard 20261125_episode_003.mcap"
+    )]
+    Discard {
+        /// Name of an episode of this session
+        #[arg(value_name = "FILE", value_parser = file_name)]
+        episode: Option<String>,
+    },
     /// Take the episode discarded last back from the trash
     #[command(after_long_help = "Examples:\n  rapid episode undo")]
     Undo,
@@ -61,6 +68,9 @@ pub enum EpisodeCommand {
         /// Why
         #[arg(value_name = "TEXT", default_value = "")]
         reason: String,
+        /// Another episode of this session, by its name
+        #[arg(long, value_name = "FILE", value_parser = file_name)]
+        episode: Option<String>,
     },
     /// Attach a note to the episode, or to the last one
     #[command(
@@ -70,6 +80,9 @@ pub enum EpisodeCommand {
         /// The note; an empty one removes it
         #[arg(value_name = "TEXT")]
         text: String,
+        /// Another episode of this session, by its name
+        #[arg(long, value_name = "FILE", value_parser = file_name)]
+        episode: Option<String>,
     },
 }
 
@@ -90,12 +103,17 @@ impl EpisodeCommand {
             Self::Stop => SessionRequest::Stop,
             Self::Next => SessionRequest::Next,
             Self::Redo => SessionRequest::Redo,
-            Self::Discard => SessionRequest::Discard,
+            Self::Discard { episode } => SessionRequest::Discard { episode },
             Self::Undo => SessionRequest::Undo,
             Self::Mark { text } => SessionRequest::Mark { text },
-            Self::Label { label: LabelArg::Success, reason } => SessionRequest::Label { label: Label::Success, reason },
-            Self::Label { label: LabelArg::Failure, reason } => SessionRequest::Label { label: Label::Failure, reason },
-            Self::Note { text } => SessionRequest::Note { text },
+            Self::Label { label, reason, episode } => {
+                let label = match label {
+                    LabelArg::Success => Label::Success,
+                    LabelArg::Failure => Label::Failure,
+                };
+                SessionRequest::Label { episode, label, reason }
+            }
+            Self::Note { text, episode } => SessionRequest::Note { episode, text },
         }
     }
 }
@@ -131,6 +149,13 @@ impl SessionCommand {
             Self::End => SessionRequest::EndSession,
         }
     }
+}
+
+/// The name of a file; of a path, its last part, as a shell completes it.
+#[expect(clippy::unnecessary_wraps, reason = "as clap calls it")]
+fn file_name(text: &str) -> Result<String, String> {
+    let name = std::path::Path::new(text).file_name();
+    Ok(name.map_or_else(|| text.to_owned(), |name| name.to_string_lossy().into_owned()))
 }
 
 /// A tag to set, or to remove.

@@ -24,6 +24,8 @@ use crate::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
 
 /// Time between two attempts to reach the next run.
 const AGAIN: Duration = Duration::from_secs(1);
+/// Time between two attempts to reach the same run.
+const SOON: Duration = Duration::from_millis(200);
 /// A run sends ten snapshots a second: one that sends nothing for this long is stopped.
 const SILENT: Duration = Duration::from_secs(3);
 /// A run that takes no request for this long is stopped.
@@ -131,11 +133,11 @@ impl Remote {
         let (shown, view) = watch::channel(View { snapshot, state });
         let (requests, outgoing) = channel();
         let answers = channel();
-        let (of, failures) = (wanted.clone(), answers.0.clone());
+        let (of, failures, of_link) = (wanted.clone(), answers.0.clone(), answers.0.clone());
         let to_writer = requests.clone();
         let threads = thread::Builder::new()
             .name("link".to_owned())
-            .spawn(move || follow(connection, &of, &shown, &to_writer))
+            .spawn(move || follow(connection, &of, &shown, &to_writer, &of_link))
             .and_then(|_| thread::Builder::new().name("requests".to_owned()).spawn(move || send(&outgoing, &failures)));
         threads.map_err(|error| MonitorError::Link { process, error: error.into() })?;
         Ok(Self { wanted, view, requests, answers })
@@ -156,7 +158,13 @@ impl Remote {
 }
 
 /// Reads snapshots of the run, and of the next when it has ended. Ends with the screen.
-fn follow(mut connection: Connection, wanted: &Wanted, shown: &watch::Sender<View>, requests: &Sender<Outgoing>) {
+fn follow(
+    mut connection: Connection,
+    wanted: &Wanted,
+    shown: &watch::Sender<View>,
+    requests: &Sender<Outgoing>,
+    failures: &Sender<Msg>,
+) {
     let read_only = wanted.read_only;
     loop {
         if let Ok(stream) = connection.stream.try_clone() {
@@ -169,23 +177,40 @@ fn follow(mut connection: Connection, wanted: &Wanted, shown: &watch::Sender<Vie
             }
         }
         let since = Stamp::now();
-        shown.send_modify(|view| {
-            view.state = LinkState::Lost { since, read_only };
-            ended(&mut view.snapshot);
-        });
+        let mut failed = String::new();
         let (next, snapshot) = loop {
-            thread::sleep(AGAIN);
+            let runs = is_alive(connection.process);
+            shown.send_modify(|view| {
+                view.state = LinkState::Lost { since, read_only, runs };
+                if !runs {
+                    ended(&mut view.snapshot);
+                }
+            });
+            thread::sleep(if runs { SOON } else { AGAIN });
             if shown.is_closed() {
                 return;
             }
-            if let Ok(next) = Connection::open(wanted) {
-                break next;
+            match Connection::open(wanted) {
+                Ok(next) => break next,
+                // Why a run that is there cannot be shown; once, and not at each attempt.
+                Err(error) if runs && error.to_string() != failed => {
+                    failed = error.to_string();
+                    let _ = failures.send(Msg::Failed(failed.clone()));
+                }
+                Err(_) => {}
             }
         };
         connection = next;
         let state = LinkState::Attached { process: connection.process, read_only };
         shown.send_modify(|view| *view = View { snapshot, state });
     }
+}
+
+/// Whether the process exists, and is no zombie.
+fn is_alive(process: u32) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat"));
+    // The state follows the name in parentheses, see proc(5).
+    stat.is_ok_and(|stat| stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X'])))
 }
 
 /// What is true of a run that has ended: nothing streams, and nothing is recorded.
@@ -220,7 +245,7 @@ fn send(outgoing: &Receiver<Outgoing>, failures: &Sender<Msg>) {
 impl Link for Remote {
     fn snapshot(&mut self) -> Snapshot {
         let View { mut snapshot, state } = self.view.borrow().clone();
-        if matches!(state, LinkState::Lost { .. }) {
+        if matches!(state, LinkState::Lost { runs: false, .. }) {
             // Its clock is that of this machine and continues.
             snapshot.taken = Stamp::now();
         }

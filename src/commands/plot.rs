@@ -2,7 +2,7 @@
 //!
 //! Invariant: only a picture that this command made is replaced.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -35,6 +35,19 @@ pub enum PlotError {
         /// How many.
         count: usize,
         /// The name.
+        to: PathBuf,
+    },
+    /// Episodes of one name, and one folder for their pictures.
+    #[error(
+        "{} and {} would both be drawn to {}: name a folder for each of their folders, or leave the name out",
+        one.display(), other.display(), to.display()
+    )]
+    Twice {
+        /// An episode.
+        one: PathBuf,
+        /// Another of its name.
+        other: PathBuf,
+        /// The picture.
         to: PathBuf,
     },
     /// The folder of the picture.
@@ -97,9 +110,21 @@ pub fn plot(
     if let (Place::Named(_) | Place::Stdout, Some(to), 2..) = (&place, to, files.len()) {
         return Err(PlotError::Several { count: files.len(), to: to.to_owned() });
     }
+    if let Place::In(folder) = place {
+        let mut names = BTreeMap::new();
+        for file in &files {
+            if let Some(other) = names.insert(picture_of(file), file) {
+                let to = folder.join(picture_of(file));
+                return Err(PlotError::Twice { one: other.clone(), other: file.clone(), to });
+            }
+        }
+    }
     let folders: BTreeSet<&Path> = files.iter().filter_map(|file| file.parent()).collect();
     // A picture without what people noted is one too; `rapid list` reports a session that cannot be read.
     let noted = list::noted(&folders, &|_| {});
+    if files.is_empty() && matches!(format, Format::Text) {
+        writeln!(err, "no episodes in {}", text::plain(&folder_names(paths)))?;
+    }
     let mut outcome = CommandStatus::Done;
     // One after the other: each may hold a large picture of a camera.
     for file in &files {
@@ -129,6 +154,10 @@ pub fn plot(
         }
     }
     Ok(outcome)
+}
+
+fn folder_names(paths: &[PathBuf]) -> String {
+    paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
 /// The name of the picture of an episode: `X.svg` of `X.mcap`, `X.mcap.partial.svg` of `X.mcap.partial`.

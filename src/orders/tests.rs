@@ -182,7 +182,7 @@ fn an_unresponsive_socket_is_named_with_its_process() {
 #[test]
 fn a_request_is_answered_when_the_run_answers_it() {
     let mut run = run("session");
-    let note = SessionRequest::Note { text: "\"a\nnote\" \u{1b}".repeat(100) };
+    let note = SessionRequest::Note { episode: None, text: "\"a\nnote\" \u{1b}".repeat(100) };
     let instance = run.instance.clone();
     let sent = note.clone();
     let giver = std::thread::spawn(move || request(Some(&instance), &sent).map_err(|error| error.to_string()));

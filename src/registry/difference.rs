@@ -114,17 +114,19 @@ impl Difference {
         }
     }
 
-    fn list<T: PartialEq>(&mut self, was: &[T], is: &[T], table: &str, name: impl Fn(&T) -> &String) {
+    fn list<'a, T: PartialEq>(&mut self, was: &'a [T], is: &'a [T], table: &str, name: impl Fn(&T) -> &String) {
         if was == is {
             return;
         }
-        let known = |list: &[T], item: &T| list.iter().any(|other| other == item);
-        let mut changed: Vec<&str> =
-            was.iter().filter(|item| !known(is, item)).map(|item| name(item).as_str()).collect();
-        changed.extend(is.iter().filter(|item| !known(was, item)).map(|item| name(item).as_str()));
-        changed.dedup();
-        let which = if changed.is_empty() { "the order".to_owned() } else { changed.join(", ") };
-        self.needs_restart.push(format!("{table}: {which} changed, which is read at the start"));
+        let named = |list: &'a [T], wanted: &T| list.iter().find(|other| name(other) == name(wanted));
+        let removed = was.iter().filter(|item| named(is, item).is_none()).map(|item| (item, "removed"));
+        let changed = is.iter().filter_map(|item| match named(was, item) {
+            None => Some((item, "added")),
+            Some(before) => (before != item).then_some((item, "changed")),
+        });
+        let which: Vec<String> = removed.chain(changed).map(|(item, how)| format!("{} {how}", name(item))).collect();
+        let which = if which.is_empty() { "the order changed".to_owned() } else { which.join(", ") };
+        self.needs_restart.push(format!("{table}: {which}; it is read at the start"));
     }
 }
 

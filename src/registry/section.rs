@@ -307,7 +307,11 @@ impl<'a> Section<'a> {
     }
 
     pub(super) fn number(&self, key: &str, range: RangeInclusive<f64>) -> Option<f64> {
-        let fix = format!("write a number from {} to {}, without quotes", range.start(), range.end());
+        let fix = if *range.end() >= f64::MAX {
+            "write a finite number, without quotes".to_owned()
+        } else {
+            format!("write a number from {} to {}, without quotes", range.start(), range.end())
+        };
         let value = self.field(key)?.get_ref();
         let shown = match value {
             DeValue::Integer(integer) => integer.to_string(),

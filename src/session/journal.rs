@@ -85,6 +85,14 @@ pub enum JournalError {
         /// Where, and what is wrong.
         why: String,
     },
+    /// The file of a session in progress could not be read, and was moved.
+    #[error("{error}; it is {} now, and what it notes of episodes is not used", moved.display())]
+    Moved {
+        /// What is wrong with it.
+        error: Box<JournalError>,
+        /// Where it is.
+        moved: PathBuf,
+    },
 }
 
 /// Every session of the folder `episodes`, oldest first, and what could not be read.
@@ -114,7 +122,10 @@ pub fn sessions(episodes: &Path) -> (Vec<SessionFile>, Vec<JournalError>) {
 fn read(path: &Path) -> Result<SessionFile, JournalError> {
     let text = folder::read_text(path, LARGEST).map_err(|source| JournalError::Io { path: path.to_owned(), source })?;
     let invalid = |why: String| JournalError::Invalid { path: path.to_owned(), why };
-    let file: SessionFile = toml::from_str(&text).map_err(|error| invalid(error.to_string().trim().to_owned()))?;
+    let file: SessionFile = toml::from_str(&text).map_err(|error| {
+        let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+        invalid(format!("line {}: {}", before.matches('\n').count() + 1, error.message()))
+    })?;
     match file.episodes.iter().find(|episode| !trash::is_name(&episode.file)) {
         Some(episode) => Err(invalid(format!("{:?} is not the name of an episode's file", episode.file))),
         None => Ok(file),
@@ -135,6 +146,7 @@ impl Journal {
     /// was wrong with its file, which is then moved aside.
     pub fn open(folder: &Path) -> (Self, Option<SessionFile>, Option<JournalError>) {
         let mut journal = Self { folder: folder.to_owned(), name: CURRENT.to_owned(), written: None };
+        remove_leftovers(folder);
         let path = folder.join(CURRENT);
         if matches!(path.symlink_metadata(), Err(error) if error.kind() == io::ErrorKind::NotFound) {
             return (journal, None, None);
@@ -153,7 +165,11 @@ impl Journal {
             }
             Err(error) => {
                 let moved = journal.archive(&format!("unreadable-{}", rfc3339(realtime_ns())));
-                (journal, None, Some(moved.err().unwrap_or(error)))
+                let error = match moved {
+                    Ok(moved) => JournalError::Moved { error: Box::new(error), moved },
+                    Err(error) => error,
+                };
+                (journal, None, Some(error))
             }
         }
     }
@@ -190,11 +206,22 @@ impl Journal {
         folder.replace_by_umask(&name, super::markdown(file).as_bytes(), Sync::Wait).map_err(io)
     }
 
+    /// Gives the file its final contents and name, and writes the summary.
+    ///
+    /// # Errors
+    /// When the disk does not accept it; the session is then not closed, and is saved as before.
+    pub fn close(&mut self, file: &SessionFile) -> Result<(), JournalError> {
+        self.save(file)?;
+        self.summarise(file)?;
+        let written = self.written;
+        self.archive(&file.begun).map(drop).inspect_err(|_| self.written = written)
+    }
+
     /// Gives the file the name of a session that has ended.
     ///
     /// # Errors
     /// When it cannot be renamed; then it keeps its name.
-    pub fn archive(&mut self, begun: &str) -> Result<(), JournalError> {
+    pub fn archive(&mut self, begun: &str) -> Result<PathBuf, JournalError> {
         let from = self.folder.join(&self.name);
         let io = |source| JournalError::Io { path: from.clone(), source };
         let folder = Folder::open(&self.folder, Links::Own, Missing::Refused).map_err(|error| io(error.into()))?;
@@ -202,22 +229,36 @@ impl Journal {
         let names = std::iter::once(format!("{stem}.toml")).chain((2..100).map(|n| format!("{stem}-{n}.toml")));
         let mut outcome = Err(io::ErrorKind::AlreadyExists.into());
         for name in names {
-            outcome = folder.rename_new(self.name.as_ref(), name.as_ref());
+            outcome = folder.rename_new(self.name.as_ref(), name.as_ref()).map(|()| self.folder.join(&name));
             if !matches!(&outcome, Err(error) if error.kind() == io::ErrorKind::AlreadyExists) {
                 break;
             }
         }
         // If it keeps its name, the next session takes another.
         self.written = None;
-        outcome.map_err(io)?;
+        let path = outcome.map_err(io)?;
         CURRENT.clone_into(&mut self.name);
-        Ok(())
+        Ok(path)
     }
 }
 
 /// `2026-11-24T14:03:00.000Z` without what a file's name should not contain.
 fn compact(time: &str) -> String {
     time.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect()
+}
+
+/// Removes what a process that was killed had not finished to write: `.session.toml.PROCESS.tmp`.
+fn remove_leftovers(folder: &Path) {
+    let Ok(entries) = std::fs::read_dir(folder) else { return };
+    for entry in entries.flatten() {
+        let name = entry.file_name();
+        let process = name.to_str().and_then(|name| name.strip_prefix(".session.toml.")?.strip_suffix(".tmp"));
+        let is_left = |process: &str| process.parse::<u32>().is_ok() && !Path::new("/proc").join(process).exists();
+        if process.is_some_and(is_left) {
+            // What cannot be removed disturbs nothing.
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
 }
 
 fn identity(path: &Path) -> Option<(u64, u64)> {
@@ -347,6 +388,18 @@ mod tests {
         std::fs::write(folder.path().join(CURRENT), hostile).unwrap();
         let error = Journal::open(folder.path()).2.unwrap().to_string();
         assert!(error.contains("\"../x.mcap\" is not the name of an episode's file"), "{error}");
+    }
+
+    #[test]
+    fn what_a_killed_process_left_is_removed_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let (dead, alive) = (".session.toml.4294967290.tmp", format!(".session.toml.{}.tmp", std::process::id()));
+        for name in [dead, alive.as_str(), ".session.toml.x.tmp", ".other.4294967290.tmp"] {
+            std::fs::write(folder.path().join(name), "x").unwrap();
+        }
+        let _ = Journal::open(folder.path());
+        assert!(!folder.path().join(dead).exists());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 3);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! The keeper: the thread that carries out what a session changes on the disk, one operation after another.
 //!
 //! Invariant: only this thread, and whoever closes the keeper, waits for the disk of the journal.
+//! Invariant: what is answered is on the disk, or the answer names why it is not.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -9,9 +10,11 @@ use std::sync::mpsc;
 use std::thread::{Builder, JoinHandle};
 
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
+use tokio::sync::oneshot;
 
 use super::journal::{Journal, SessionFile};
 use super::trash;
+use crate::episode::partial::TRASH;
 
 /// A change of the disk.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,9 +33,33 @@ pub enum Operation {
     Close(SessionFile, Vec<String>),
 }
 
+/// An answer that is given once the operations before it are carried out.
+#[derive(Debug)]
+pub struct Pending {
+    /// What was done.
+    pub text: String,
+    /// It was done, whatever becomes of the operations: an episode has begun, say.
+    pub is_done: bool,
+    /// It is shown on screens too.
+    pub is_shown: bool,
+    /// Programs that wait for it.
+    pub to: Vec<oneshot::Sender<Result<String, String>>>,
+}
+
+/// Operations of one request, in order, and its answer.
+#[derive(Debug, Default)]
+struct Work {
+    operations: Vec<Operation>,
+    answer: Option<Pending>,
+}
+
 /// What became of an operation, where that is of interest.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Outcome {
+    /// A request was answered so.
+    Answered(Result<String, String>),
+    /// The session is closed, or why it is not.
+    Closed(Result<(), String>),
     /// The episode is in the trash.
     Discarded(String),
     /// The episode is back.
@@ -46,7 +73,7 @@ pub enum Outcome {
 /// A handle to the thread, which ends when this is dropped.
 #[derive(Debug)]
 pub struct Keeper {
-    operations: Option<mpsc::Sender<Operation>>,
+    operations: Option<mpsc::Sender<Work>>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -63,11 +90,11 @@ impl Keeper {
         Ok((Self { operations: Some(operations), thread: Some(thread) }, to_owner))
     }
 
-    /// Requests an operation. Does not wait.
-    pub fn request(&self, operation: Operation) {
-        if let Some(operations) = &self.operations {
+    /// Requests operations, and an answer after them. Does not wait.
+    pub fn request(&self, operations: Vec<Operation>, answer: Option<Pending>) {
+        if let Some(work) = &self.operations {
             // The thread ends only when this is dropped.
-            let _ = operations.send(operation);
+            let _ = work.send(Work { operations, answer });
         }
     }
 
@@ -88,48 +115,84 @@ struct Desk {
 }
 
 impl Desk {
-    fn run(mut self, inbox: &mpsc::Receiver<Operation>) {
-        while let Ok(operation) = inbox.recv() {
-            if let Some(outcome) = self.carry_out(operation) {
-                // The owner may have ended.
-                let _ = self.outcomes.send(outcome);
+    fn run(mut self, inbox: &mpsc::Receiver<Work>) {
+        while let Ok(Work { operations, answer }) = inbox.recv() {
+            let mut failed = None;
+            for operation in operations {
+                let outcome = self.carry_out(operation);
+                failed = failed.or(outcome.err());
+            }
+            let Some(Pending { text, is_done, is_shown, to }) = answer else { continue };
+            let answer = match failed {
+                None => Ok(text),
+                Some(why) if is_done => Ok(format!("{text}; {why}")),
+                Some(why) => Err(why),
+            };
+            for program in to {
+                // It may have ended.
+                let _ = program.send(answer.clone());
+            }
+            if is_shown {
+                self.report(Outcome::Answered(answer));
             }
         }
     }
 
-    fn carry_out(&mut self, operation: Operation) -> Option<Outcome> {
-        let failed = match operation {
-            Operation::Discard(file) => {
-                return Some(match trash::discard(&self.folder, &file) {
-                    Ok(()) => Outcome::Discarded(file),
-                    Err(error) => Outcome::NotMoved(file, error.to_string()),
-                });
-            }
-            Operation::Restore(file) => {
-                return Some(match trash::restore(&self.folder, &file) {
-                    Ok(()) => Outcome::Restored(file),
-                    Err(error) => Outcome::NotMoved(file, error.to_string()),
-                });
-            }
-            Operation::Archive(begun) => self.journal.archive(&begun).err().map(|error| error.to_string()),
-            Operation::Save(file) => self.journal.save(&file).err().map(|error| error.to_string()),
-            Operation::Summarise(file) => self.journal.summarise(&file).err().map(|error| error.to_string()),
-            Operation::Close(file, gone) => self.end(&file, &gone).err(),
-        };
-        let Some(why) = failed else {
-            self.failing.clear();
-            return None;
-        };
-        self.failing.insert(why.clone()).then_some(Outcome::Failed(why))
+    fn report(&self, outcome: Outcome) {
+        // The owner may have ended.
+        let _ = self.outcomes.send(outcome);
     }
 
-    /// The journal first: it still names what is deleted if that fails.
+    /// An error is reported too.
+    fn carry_out(&mut self, operation: Operation) -> Result<(), String> {
+        let saved = match operation {
+            Operation::Discard(file) => {
+                let moved = trash::discard(&self.folder, &file);
+                return self.moved(file, moved, Outcome::Discarded);
+            }
+            Operation::Restore(file) => {
+                let moved = trash::restore(&self.folder, &file);
+                return self.moved(file, moved, Outcome::Restored);
+            }
+            Operation::Close(file, gone) => return self.end(&file, &gone),
+            Operation::Archive(begun) => self.journal.archive(&begun).map(drop),
+            Operation::Save(file) => self.journal.save(&file),
+            Operation::Summarise(file) => self.journal.summarise(&file),
+        };
+        let Err(error) = saved else {
+            self.failing.clear();
+            return Ok(());
+        };
+        let why = format!("the session is not saved: {error}");
+        if self.failing.insert(why.clone()) {
+            self.report(Outcome::Failed(why.clone()));
+        }
+        Err(why)
+    }
+
+    fn moved(&self, file: String, moved: io::Result<()>, done: fn(String) -> Outcome) -> Result<(), String> {
+        let why = moved.map_err(|error| error.to_string());
+        let failed = why.clone().map_err(|why| format!("{file} was not moved: {why}"));
+        self.report(match why {
+            Ok(()) => done(file),
+            Err(why) => Outcome::NotMoved(file, why),
+        });
+        failed
+    }
+
+    /// The journal first: nothing is deleted of a session that is not closed.
     fn end(&mut self, file: &SessionFile, gone: &[String]) -> Result<(), String> {
+        let closed = self.journal.close(file).map_err(|error| format!("the session is not ended: {error}"));
+        self.report(Outcome::Closed(closed.clone()));
+        closed?;
         let emptied = trash::empty(&self.folder, gone.iter().map(String::as_str));
-        let emptied = emptied.map_err(|error| format!("{}: {error}", self.folder.display()));
-        let written = self.journal.save(file).and_then(|()| self.journal.summarise(file));
-        let archived = written.and_then(|()| self.journal.archive(&file.begun));
-        emptied.and(archived.map_err(|error| error.to_string()))
+        let why = |error| {
+            format!(
+                "the session is ended, but its trash is not deleted: {}: {error}",
+                self.folder.join(TRASH).display()
+            )
+        };
+        emptied.map_err(why).inspect_err(|why| self.report(Outcome::Failed(why.clone())))
     }
 }
 
@@ -147,7 +210,7 @@ mod tests {
     fn outcomes(folder: &Path, operations: impl IntoIterator<Item = Operation>) -> Vec<Outcome> {
         let (journal, ..) = Journal::open(folder);
         let (mut keeper, mut outcomes) = Keeper::start(folder, journal).unwrap();
-        operations.into_iter().for_each(|operation| keeper.request(operation));
+        operations.into_iter().for_each(|operation| keeper.request(vec![operation], None));
         keeper.close().unwrap().join().unwrap();
         let mut all = Vec::new();
         while let Some(outcome) = outcomes.blocking_recv() {
@@ -180,13 +243,52 @@ mod tests {
             Operation::Save(session("two")),
         ];
         let found = outcomes(folder.path(), operations);
-        assert_eq!(found.len(), 4, "{found:?}");
+        assert_eq!(found.len(), 5, "{found:?}");
         assert_eq!(found[0], Outcome::Discarded(name("a.mcap")));
         assert!(matches!(&found[1], Outcome::NotMoved(file, _) if file == "missing.mcap"));
-        assert_eq!(found[3], Outcome::Restored(name("b.mcap")));
+        assert_eq!(found[3..], [Outcome::Restored(name("b.mcap")), Outcome::Closed(Ok(()))]);
         let stem = "session-2026-11-24T140200000Z";
         let expected = ["b.mcap", &format!("{stem}.md"), &format!("{stem}.toml"), "session.toml"];
         assert_eq!(names(folder.path()), expected);
+    }
+
+    /// What a request with these operations is answered.
+    fn answer(keeper: &Keeper, operations: Vec<Operation>, is_done: bool) -> Result<String, String> {
+        let (to, answered) = oneshot::channel();
+        let pending = Pending { text: "done".to_owned(), is_done, is_shown: false, to: vec![to] };
+        keeper.request(operations, Some(pending));
+        answered.blocking_recv().unwrap()
+    }
+
+    #[test]
+    fn what_is_answered_is_on_the_disk_and_what_is_not_is_an_error() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("episodes");
+        std::fs::create_dir(&folder).unwrap();
+        let (journal, ..) = Journal::open(&folder);
+        let (keeper, mut outcomes) = Keeper::start(&folder, journal).unwrap();
+        let saved = |task: &str| vec![Operation::Save(session(task))];
+        assert_eq!(answer(&keeper, saved("one"), false), Ok("done".to_owned()));
+        assert!(folder.join("session.toml").exists());
+        // The disk does not accept anything any more.
+        std::fs::remove_dir_all(&folder).unwrap();
+        std::fs::write(&folder, "").unwrap();
+        for operations in [
+            saved("two"),
+            vec![Operation::Discard("a.mcap".to_owned()), Operation::Archive("t".to_owned())],
+            vec![Operation::Close(session("two"), Vec::new())],
+        ] {
+            let why = answer(&keeper, operations.clone(), false).unwrap_err();
+            assert!(why.contains("not"), "{why}");
+            assert_eq!(answer(&keeper, operations, true), Ok(format!("done; {why}")));
+        }
+        drop(keeper);
+        let mut all = Vec::new();
+        while let Ok(outcome) = outcomes.try_recv() {
+            all.push(outcome);
+        }
+        assert!(all.iter().any(|outcome| matches!(outcome, Outcome::Closed(Err(_)))), "{all:?}");
+        assert!(!all.iter().any(|outcome| matches!(outcome, Outcome::Closed(Ok(())))), "{all:?}");
     }
 
     #[test]

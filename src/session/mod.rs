@@ -17,6 +17,7 @@ use std::time::Duration;
 
 use crate::status::session::{EpisodeEntry, Label, Mark, Phase, SessionRequest, SessionStatus};
 use crate::status::{Grade, Verdict};
+use crate::text;
 use crate::time::Stamp;
 use journal::{Plan, SessionFile};
 
@@ -73,6 +74,15 @@ pub enum Refusal {
     /// A text is too long.
     #[error("the text is longer than {LONGEST_TEXT} bytes")]
     TooLong,
+    /// The session is being closed.
+    #[error("the session is being ended")]
+    Closing,
+    /// There is no such episode.
+    #[error("this session has no such episode; `rapid session` lists what it has")]
+    Unknown,
+    /// The task is empty.
+    #[error("a task has a name")]
+    NoTask,
 }
 
 /// What happens to the episode in progress once it is closed.
@@ -113,6 +123,8 @@ pub struct Session {
     current: Option<(usize, Stamp)>,
     /// Entries that were discarded, in that order.
     discarded: Vec<usize>,
+    /// The end of the session was requested, and its file is not closed yet.
+    closing: bool,
 }
 
 impl Session {
@@ -133,6 +145,7 @@ impl Session {
             after: After::default(),
             current: None,
             discarded,
+            closing: false,
         };
         (session, is_new)
     }
@@ -184,33 +197,38 @@ impl Session {
     /// # Errors
     /// When it does not apply at the moment; nothing has changed then.
     pub fn request(&mut self, request: &SessionRequest, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        if self.closing && *request != SessionRequest::Show {
+            return Err(Refusal::Closing);
+        }
         match request {
             SessionRequest::Toggle if self.phase == Phase::Recording => self.end(After::default(), now),
             SessionRequest::Toggle | SessionRequest::Start => self.start(now),
             SessionRequest::Stop => self.stop(now),
             SessionRequest::Next => self.next(now),
             SessionRequest::Redo => self.redo(now),
-            SessionRequest::Discard => self.discard(now),
+            SessionRequest::Discard { episode: None } => self.discard(now),
+            SessionRequest::Discard { episode: Some(file) } => self.discard_other(file, now),
             SessionRequest::Undo => self.undo(),
             SessionRequest::Mark { text } => self.mark(text, now),
-            SessionRequest::Label { label, reason } => {
-                let entry = self.about(reason)?;
+            SessionRequest::Label { episode, label, reason } => {
+                let entry = self.about(episode.as_deref(), reason)?;
                 entry.label = Some(*label);
                 entry.label_reason.clone_from(reason);
                 let text = format!("{}: {label}", entry.file);
                 Ok((Answer::Now(text), vec![Effect::Save]))
             }
-            SessionRequest::Note { text } => {
-                let entry = self.about(text)?;
+            SessionRequest::Note { episode, text } => {
+                let entry = self.about(episode.as_deref(), text)?;
                 entry.note.clone_from(text);
                 let text = format!("{}: noted", entry.file);
                 Ok((Answer::Now(text), vec![Effect::Save]))
             }
+            SessionRequest::Plan { task: Some(task), .. } if task.trim().is_empty() => Err(Refusal::NoTask),
             SessionRequest::Plan { task, tags, goal } => Ok(self.change_plan(task.as_deref(), tags, *goal)),
             SessionRequest::EndSession => self.end_session(),
             SessionRequest::Show => {
                 let shown = Shown { event: "session", session: &self.status() };
-                Ok((Answer::Now(crate::text::json(&shown).unwrap_or_default()), Vec::new()))
+                Ok((Answer::Now(text::json(&shown).unwrap_or_default()), Vec::new()))
             }
         }
     }
@@ -247,10 +265,7 @@ impl Session {
         let After { discard, next } = std::mem::take(&mut self.after);
         if let Some(entry) = self.file.episodes.get_mut(index) {
             entry.file = name(file);
-            entry.seconds = Some((seconds * 1000.0).round() / 1000.0);
-            entry.verdict = Some(verdict.grade);
-            entry.reasons.clone_from(&verdict.reasons);
-            entry.sensors.clone_from(&verdict.sensors);
+            entry.close(seconds, verdict);
         }
         let mut effects = vec![Effect::Save];
         if discard {
@@ -263,6 +278,41 @@ impl Session {
             Next::Planned => self.follow_plan(now),
         });
         effects
+    }
+
+    /// Whether the episode in progress will be discarded.
+    pub fn discards(&self) -> bool {
+        self.after.discard
+    }
+
+    /// The episodes of which no end was noted, apart from the one in progress: the run was killed then.
+    pub fn unfinished(&self) -> Vec<String> {
+        let current = self.current.map(|(index, _)| index);
+        let all = self.file.episodes.iter().enumerate();
+        all.filter(|(index, entry)| entry.verdict.is_none() && Some(*index) != current)
+            .map(|(_, entry)| entry.file.clone())
+            .collect()
+    }
+
+    /// What became of an unfinished episode: its length and verdict, or `None` if there is no file with samples.
+    pub fn examined(&mut self, file: &str, found: Option<(f64, &Verdict)>) -> Vec<Effect> {
+        let is_it = |entry: &EpisodeEntry| entry.file == file && entry.verdict.is_none();
+        let Some(index) = self.file.episodes.iter().position(is_it) else { return Vec::new() };
+        let Some(entry) = self.file.episodes.get_mut(index) else { return Vec::new() };
+        match found {
+            Some((seconds, verdict)) => entry.close(seconds, verdict),
+            None => entry.reasons = vec!["nothing of it was recorded".to_owned()],
+        }
+        vec![Effect::Save]
+    }
+
+    /// The session that was to be closed is, at `now`, and another follows by the same plan; or it is not.
+    pub fn closed(&mut self, is_closed: bool, now: String) {
+        self.closing = false;
+        if is_closed {
+            self.file = SessionFile { begun: now, ended: None, plan: self.file.plan.clone(), episodes: Vec::new() };
+            self.discarded.clear();
+        }
     }
 
     /// An episode could not be moved: it is where it was.
@@ -346,6 +396,12 @@ impl Session {
         }
     }
 
+    /// Ends the episode in progress, and begins another.
+    fn end_and_begin(&mut self, discard: bool, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        let (_, effects) = self.end(After { discard, next: Next::Begin }, now)?;
+        Ok((Answer::AtBegin, effects))
+    }
+
     fn stop(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
         match self.phase {
             Phase::Countdown { .. } | Phase::Reset { .. } => {
@@ -358,14 +414,14 @@ impl Session {
 
     fn next(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
         match self.phase {
-            Phase::Recording | Phase::Ending => self.end(After { discard: false, next: Next::Begin }, now),
+            Phase::Recording | Phase::Ending => self.end_and_begin(false, now),
             _ => self.start(now),
         }
     }
 
     fn redo(&mut self, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
         if matches!(self.phase, Phase::Recording | Phase::Ending) {
-            return self.end(After { discard: true, next: Next::Begin }, now);
+            return self.end_and_begin(true, now);
         }
         let last = self.last().ok_or(Refusal::NoEpisode)?;
         let mut effects = self.put_away(last);
@@ -384,6 +440,22 @@ impl Session {
         let effects = self.put_away(last);
         let file = self.file.episodes.get(last).map(|entry| entry.file.clone()).unwrap_or_default();
         Ok((Answer::Now(format!("{file} is in the trash")), effects))
+    }
+
+    /// Discards an episode of this session that may not be the last one.
+    fn discard_other(&mut self, file: &str, now: Stamp) -> Result<(Answer, Vec<Effect>), Refusal> {
+        let index = self.find(file)?;
+        if self.current.is_some_and(|(current, _)| current == index) || self.last() == Some(index) {
+            return self.discard(now);
+        }
+        let effects = self.put_away(index);
+        Ok((Answer::Now(format!("{file} is in the trash")), effects))
+    }
+
+    /// A kept episode.
+    fn find(&self, file: &str) -> Result<usize, Refusal> {
+        let is_it = |entry: &EpisodeEntry| entry.file == file && !entry.discarded;
+        self.file.episodes.iter().rposition(is_it).ok_or(Refusal::Unknown)
     }
 
     fn undo(&mut self) -> Result<(Answer, Vec<Effect>), Refusal> {
@@ -407,11 +479,12 @@ impl Session {
     }
 
     /// The entry that a label or a note is about.
-    fn about(&mut self, text: &str) -> Result<&mut EpisodeEntry, Refusal> {
+    fn about(&mut self, episode: Option<&str>, text: &str) -> Result<&mut EpisodeEntry, Refusal> {
         if text.len() > LONGEST_TEXT {
             return Err(Refusal::TooLong);
         }
-        let index = self.current.map(|(index, _)| index).or_else(|| self.last()).ok_or(Refusal::NoEpisode)?;
+        let newest = || self.current.map(|(index, _)| index).or_else(|| self.last()).ok_or(Refusal::NoEpisode);
+        let index = episode.map_or_else(newest, |file| self.find(file))?;
         self.file.episodes.get_mut(index).ok_or(Refusal::NoEpisode)
     }
 
@@ -448,7 +521,8 @@ impl Session {
             plan.goal = (goal > 0).then_some(goal);
         }
         let tags: Vec<String> = plan.tags.iter().map(|(key, value)| format!(" {key}={value}")).collect();
-        let goal = plan.goal.map(|goal| format!(", {goal} episodes wanted")).unwrap_or_default();
+        let goal = plan.goal.map(|goal| format!(", {} wanted", text::counted(goal.into(), "episode")));
+        let goal = goal.unwrap_or_default();
         let text = format!("task {:?}{}{goal}", plan.task, tags.concat());
         // A session without episodes leaves no file.
         let save = (!self.file.episodes.is_empty()).then_some(Effect::Save);
@@ -464,19 +538,15 @@ impl Session {
         }
         let (is_gone, kept): (Vec<_>, Vec<_>) = self.file.episodes.iter().partition(|entry| entry.discarded);
         let gone: Vec<String> = is_gone.into_iter().map(|entry| entry.file.clone()).collect();
-        let text = format!("session ended: {} episodes kept, {} deleted", kept.len(), gone.len());
+        let kept = text::counted(kept.len() as u64, "episode");
+        let text = format!("session ended: {kept} kept, {} deleted", gone.len());
         self.phase = Phase::Idle;
+        self.closing = true;
         Ok((Answer::Now(text), vec![Effect::Close(gone)]))
     }
 
-    /// The session that follows one that was closed, by the same plan.
-    pub fn renew(&mut self, begun: String) {
-        self.file = SessionFile { begun, ended: None, plan: self.file.plan.clone(), episodes: Vec::new() };
-        self.discarded.clear();
-    }
-
     /// What is saved of a session that ends at `ended`: without what is deleted.
-    pub fn closed(&self, ended: String) -> SessionFile {
+    pub fn at_end(&self, ended: String) -> SessionFile {
         let episodes = self.file.episodes.iter().filter(|entry| !entry.discarded).cloned().collect();
         SessionFile { ended: Some(ended), episodes, ..self.file.clone() }
     }
@@ -485,24 +555,25 @@ impl Session {
 /// The summary of a session, as Markdown.
 pub fn markdown(file: &SessionFile) -> String {
     use std::fmt::Write as _;
-    let cell = |text: &str| crate::text::plain(text).replace('|', "\\|");
+    let cell = |text: &str| text::plain(text).replace('|', "\\|");
     let kept: Vec<_> = file.episodes.iter().filter(|entry| !entry.discarded).collect();
     let of = |grade: Grade| kept.iter().filter(|entry| entry.verdict == Some(grade)).count();
     let seconds: f64 = kept.iter().filter_map(|entry| entry.seconds).sum();
-    let mut text = format!("# {}\n\n", cell(&file.plan.task));
-    let goal = file.plan.goal.map(|goal| format!(" of {goal} wanted")).unwrap_or_default();
+    let mut page = format!("# {}\n\n", cell(&file.plan.task));
+    let counted = kept.iter().filter(|entry| entry.counts()).count();
+    let goal = file.plan.goal.map(|goal| format!("; {counted} of {goal} wanted")).unwrap_or_default();
     // Writing to a string does not fail.
     let _ = writeln!(
-        text,
-        "{} episodes{goal}, {} in all: {} GOOD, {} SUSPECT, {} BAD. Begun {}.\n",
-        kept.len(),
-        crate::text::about(Duration::from_secs_f64(seconds.max(0.0))),
+        page,
+        "{}, {} in all: {} GOOD, {} SUSPECT, {} BAD{goal}. Begun {}.\n",
+        text::counted(kept.len() as u64, "episode"),
+        text::about(Duration::from_secs_f64(seconds.max(0.0))),
         of(Grade::Good),
         of(Grade::Suspect),
         of(Grade::Bad),
         file.begun,
     );
-    text.push_str("| episode | length | verdict | sensors | label | remarks |\n|---|---|---|---|---|---|\n");
+    page.push_str("| episode | length | verdict | sensors | label | remarks |\n|---|---|---|---|---|---|\n");
     for entry in kept {
         let length = entry.seconds.map(|seconds| format!("{seconds:.1} s")).unwrap_or_default();
         let verdict = entry.verdict.map_or("not closed", Grade::word);
@@ -511,14 +582,14 @@ pub fn markdown(file: &SessionFile) -> String {
         let remarks = [&entry.reasons.join("; "), &entry.label_reason, &entry.note];
         let remarks: Vec<_> = remarks.into_iter().filter(|text| !text.is_empty()).map(|text| cell(text)).collect();
         let _ = writeln!(
-            text,
+            page,
             "| {} | {length} | {verdict} | {} | {label} | {} |",
             cell(&entry.file),
             cell(&sensors),
             remarks.join("; ")
         );
     }
-    text
+    page
 }
 
 fn name(file: &Path) -> String {

@@ -80,11 +80,12 @@ impl Owner {
                     self.carry_out(effects);
                 }
                 Effect::Mark(_) => assert!(self.recording.is_some()),
+                Effect::Close(_) if self.stuck => self.session.closed(false, "t1".to_owned()),
                 Effect::Close(gone) => {
                     for file in gone {
                         assert!(self.trash.remove(&file), "{file} is not in the trash");
                     }
-                    self.session.renew("t1".to_owned());
+                    self.session.closed(true, "t1".to_owned());
                     self.saved = self.session.file().clone();
                 }
             }
@@ -139,10 +140,10 @@ fn an_episode_is_discarded_and_comes_back() {
     owner.record();
     owner.record();
     assert_eq!(owner.session.counted(), 2);
-    owner.request(SessionRequest::Discard).unwrap();
-    owner.request(SessionRequest::Discard).unwrap();
+    owner.request(SessionRequest::Discard { episode: None }).unwrap();
+    owner.request(SessionRequest::Discard { episode: None }).unwrap();
     assert_eq!((owner.session.counted(), owner.trash.len()), (0, 2));
-    assert_eq!(owner.request(SessionRequest::Discard), Err(Refusal::NoEpisode));
+    assert_eq!(owner.request(SessionRequest::Discard { episode: None }), Err(Refusal::NoEpisode));
     owner.request(SessionRequest::Undo).unwrap();
     assert_eq!(owner.files, ["001.mcap".to_owned()].into(), "what was discarded last comes back first");
     owner.request(SessionRequest::Undo).unwrap();
@@ -154,7 +155,7 @@ fn an_episode_is_discarded_and_comes_back() {
 fn redo_replaces_the_episode_in_progress_or_the_last() {
     let mut owner = Owner::new(plan());
     owner.request(SessionRequest::Start).unwrap();
-    assert_eq!(owner.request(SessionRequest::Redo), Ok(Answer::AtEnd));
+    assert_eq!(owner.request(SessionRequest::Redo), Ok(Answer::AtBegin));
     owner.close(Grade::Good);
     assert_eq!((owner.trash.len(), owner.recording.as_deref()), (1, Some("002.mcap")));
     owner.request(SessionRequest::Stop).unwrap();
@@ -228,7 +229,7 @@ fn an_episode_that_does_not_begin_ends_the_plan() {
 #[test]
 fn labels_notes_and_marks_are_of_the_episode_in_progress_or_the_last() {
     let mut owner = Owner::new(plan());
-    let label = SessionRequest::Label { label: Label::Failure, reason: "slipped".to_owned() };
+    let label = SessionRequest::Label { episode: None, label: Label::Failure, reason: "slipped".to_owned() };
     assert_eq!(owner.request(label.clone()), Err(Refusal::NoEpisode));
     assert_eq!(owner.request(SessionRequest::Mark { text: String::new() }), Err(Refusal::Idle));
     owner.record();
@@ -236,8 +237,8 @@ fn labels_notes_and_marks_are_of_the_episode_in_progress_or_the_last() {
     owner.request(SessionRequest::Start).unwrap();
     owner.wait(2 * SECOND);
     owner.request(SessionRequest::Mark { text: "grasp".to_owned() }).unwrap();
-    owner.request(SessionRequest::Note { text: "new gripper".to_owned() }).unwrap();
-    let long = SessionRequest::Note { text: "x".repeat(LONGEST_TEXT + 1) };
+    owner.request(SessionRequest::Note { episode: None, text: "new gripper".to_owned() }).unwrap();
+    let long = SessionRequest::Note { episode: None, text: "x".repeat(LONGEST_TEXT + 1) };
     assert_eq!(owner.request(long), Err(Refusal::TooLong));
     let [first, second] = &owner.session.file().episodes[..] else { panic!("two episodes") };
     assert_eq!((first.label, first.label_reason.as_str()), (Some(Label::Failure), "slipped"));
@@ -251,7 +252,7 @@ fn a_session_is_continued_by_the_same_task_only() {
     let mut owner = Owner::new(Plan { goal: Some(5), ..plan() });
     owner.record();
     owner.record();
-    owner.request(SessionRequest::Discard).unwrap();
+    owner.request(SessionRequest::Discard { episode: None }).unwrap();
     let before = Some(owner.saved.clone());
     let (mut again, is_new) = Session::new(Path::new("episodes"), plan(), before.clone(), "t2".to_owned());
     assert!(!is_new);
@@ -269,13 +270,74 @@ fn ending_a_session_deletes_what_was_discarded_and_nothing_else() {
     assert_eq!(owner.request(SessionRequest::EndSession), Err(Refusal::NoEpisode));
     owner.record();
     owner.record();
-    owner.request(SessionRequest::Discard).unwrap();
-    assert_eq!(owner.session.closed("t9".to_owned()).episodes.len(), 1);
+    owner.request(SessionRequest::Discard { episode: None }).unwrap();
+    assert_eq!(owner.session.at_end("t9".to_owned()).episodes.len(), 1);
     let answer = owner.request(SessionRequest::EndSession).unwrap();
-    assert_eq!(answer, Answer::Now("session ended: 1 episodes kept, 1 deleted".to_owned()));
+    assert_eq!(answer, Answer::Now("session ended: 1 episode kept, 1 deleted".to_owned()));
     assert_eq!((owner.files.len(), owner.trash.len()), (1, 0));
+    assert!(owner.session.file().episodes.is_empty());
     owner.request(SessionRequest::Start).unwrap();
     assert_eq!(owner.request(SessionRequest::EndSession), Err(Refusal::Busy));
+}
+
+#[test]
+fn a_session_that_cannot_be_closed_continues_with_all_that_was_noted() {
+    let mut owner = Owner::new(plan());
+    owner.record();
+    owner.record();
+    owner.request(SessionRequest::Discard { episode: None }).unwrap();
+    owner.request(SessionRequest::Note { episode: None, text: "pads".to_owned() }).unwrap();
+    let before = owner.session.file().clone();
+    let (_, effects) = owner.session.request(&SessionRequest::EndSession, owner.now).unwrap();
+    for request in [SessionRequest::Start, SessionRequest::Undo, SessionRequest::EndSession] {
+        assert_eq!(owner.request(request), Err(Refusal::Closing));
+    }
+    owner.stuck = true;
+    owner.carry_out(effects);
+    assert_eq!((owner.session.file(), owner.trash.len()), (&before, 1));
+    owner.stuck = false;
+    owner.request(SessionRequest::Undo).unwrap();
+    owner.check();
+}
+
+#[test]
+fn an_episode_of_a_killed_run_counts_once_it_is_known_what_became_of_it() {
+    let mut owner = Owner::new(Plan { goal: Some(2), ..plan() });
+    owner.record();
+    owner.request(SessionRequest::Start).unwrap();
+    assert_eq!((owner.session.counted(), owner.session.unfinished().len()), (1, 0), "it is being recorded");
+    // Killed, and started again.
+    let (mut again, _) = Session::new(Path::new("episodes"), plan(), Some(owner.saved.clone()), "t2".to_owned());
+    assert_eq!((again.counted(), again.unfinished()), (1, vec!["002.mcap".to_owned()]));
+    assert!(!again.is_complete());
+    let nothing = again.examined("002.mcap", None);
+    assert_eq!((nothing, again.counted()), (vec![Effect::Save], 1));
+    assert!(markdown(again.file()).contains("| 002.mcap |  | not closed |  |  | nothing of it was recorded |"));
+    let verdict = Verdict { grade: Grade::Suspect, reasons: vec!["cut off".to_owned()], sensors: None };
+    again.examined("002.mcap", Some((1.5, &verdict)));
+    assert!(again.is_complete() && again.unfinished().is_empty());
+    assert_eq!(again.examined("001.mcap", None), [], "it is closed");
+}
+
+#[test]
+fn an_older_episode_is_named() {
+    let mut owner = Owner::new(plan());
+    for _ in 0..3 {
+        owner.record();
+    }
+    let first = || Some("001.mcap".to_owned());
+    owner.request(SessionRequest::Label { episode: first(), label: Label::Success, reason: String::new() }).unwrap();
+    owner.request(SessionRequest::Start).unwrap();
+    let discarded = owner.request(SessionRequest::Discard { episode: first() }).unwrap();
+    assert_eq!(discarded, Answer::Now("001.mcap is in the trash".to_owned()));
+    assert!(owner.recording.is_some() && owner.trash.contains("001.mcap"));
+    assert_eq!(owner.session.file().episodes[0].label, Some(Label::Success));
+    assert_eq!(owner.request(SessionRequest::Discard { episode: first() }), Err(Refusal::Unknown));
+    let current = owner.recording.clone();
+    assert_eq!(owner.request(SessionRequest::Discard { episode: current }), Ok(Answer::AtEnd));
+    owner.close(Grade::Good);
+    owner.request(SessionRequest::Undo).unwrap();
+    owner.check();
 }
 
 #[test]
@@ -283,10 +345,10 @@ fn the_summary_lists_what_is_kept() {
     let mut owner = Owner::new(Plan { goal: Some(3), ..plan() });
     owner.record();
     owner.record();
-    let label = SessionRequest::Label { label: Label::Failure, reason: "a | b\u{1b}[2J".to_owned() };
+    let label = SessionRequest::Label { episode: None, label: Label::Failure, reason: "a | b\u{1b}[2J".to_owned() };
     owner.request(label).unwrap();
     owner.record();
-    owner.request(SessionRequest::Discard).unwrap();
+    owner.request(SessionRequest::Discard { episode: None }).unwrap();
     insta::assert_snapshot!(markdown(owner.session.file()));
 }
 
@@ -307,10 +369,10 @@ fn step() -> impl Strategy<Value = Step> {
             SessionRequest::Stop,
             SessionRequest::Next,
             SessionRequest::Redo,
-            SessionRequest::Discard,
+            SessionRequest::Discard { episode: None },
             SessionRequest::Undo,
             SessionRequest::Mark { text: text() },
-            SessionRequest::Note { text: text() },
+            SessionRequest::Note { episode: None, text: text() },
             SessionRequest::EndSession,
         ])
         .prop_map(Step::Request),

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Grade, Sensors};
+use super::{Grade, Sensors, Verdict};
 use crate::time::Stamp;
 
 /// What a screen, a pedal or another program may request of the session.
@@ -25,8 +25,12 @@ pub enum SessionRequest {
     Next,
     /// Discard the episode in progress, or the last one, and record it again.
     Redo,
-    /// Move the episode in progress, or the last one, to the trash.
-    Discard,
+    /// Move an episode to the trash.
+    Discard {
+        /// The name of its file; `None`: the episode in progress, or the last one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        episode: Option<String>,
+    },
     /// Take the episode discarded last back from the trash.
     Undo,
     /// Mark this moment of the episode in progress.
@@ -35,16 +39,22 @@ pub enum SessionRequest {
         #[serde(default)]
         text: String,
     },
-    /// Label the episode in progress, or the last one.
+    /// Label an episode.
     Label {
+        /// As of a discard.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        episode: Option<String>,
         /// The label.
         label: Label,
         /// Why.
         #[serde(default)]
         reason: String,
     },
-    /// Attach a note to the episode in progress, or to the last one; an empty one removes it.
+    /// Attach a note to an episode; an empty one removes it.
     Note {
+        /// As of a discard.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        episode: Option<String>,
         /// The note.
         text: String,
     },
@@ -73,12 +83,15 @@ pub const PRESS_AGAIN: Duration = Duration::from_millis(400);
 impl SessionRequest {
     /// Whether made twice it does something else than made once: of presses within [`PRESS_AGAIN`] only the first counts.
     pub const fn counts_once(&self) -> bool {
-        matches!(self, Self::Toggle | Self::Next | Self::Redo | Self::Discard)
+        matches!(self, Self::Toggle | Self::Next | Self::Redo | Self::Discard { .. })
     }
 
     /// Whether an episode begins or ends by it.
     pub const fn is_about_recording(&self) -> bool {
-        matches!(self, Self::Toggle | Self::Start | Self::Stop | Self::Next | Self::Redo | Self::Discard)
+        matches!(
+            self,
+            Self::Toggle | Self::Start | Self::Stop | Self::Next | Self::Redo | Self::Discard { episode: None }
+        )
     }
 }
 
@@ -157,9 +170,17 @@ pub struct EpisodeEntry {
 }
 
 impl EpisodeEntry {
-    /// Whether it counts for the goal: it is kept, and not known to be BAD.
+    /// Its file is closed: its length in seconds, rounded to milliseconds, and its verdict.
+    pub fn close(&mut self, seconds: f64, verdict: &Verdict) {
+        self.seconds = Some((seconds * 1000.0).round() / 1000.0);
+        self.verdict = Some(verdict.grade);
+        self.reasons.clone_from(&verdict.reasons);
+        self.sensors.clone_from(&verdict.sensors);
+    }
+
+    /// Whether it counts for the goal: it is closed and kept, and not BAD.
     pub fn counts(&self) -> bool {
-        !self.discarded && self.verdict != Some(Grade::Bad)
+        !self.discarded && self.verdict.is_some_and(|grade| grade != Grade::Bad)
     }
 }
 

@@ -73,11 +73,14 @@ fn in_full(entry: &EpisodeEntry, session: &SessionStatus, width: u16, theme: The
         Line::from(vec![Span::styled(format!("{name:<10}"), theme.faint()), Span::raw(value)])
     };
     let verdict = match entry.verdict {
-        Some(grade) => Line::from(vec![
-            Span::styled(format!("{:<10}", "verdict"), theme.faint()),
-            Span::styled(grade.word(), theme.grade(grade)),
-            Span::raw(format!(", {:.1} s", entry.seconds.unwrap_or_default())),
-        ]),
+        Some(grade) => {
+            let length = entry.seconds.map(|seconds| format!(", {seconds:.1} s")).unwrap_or_default();
+            Line::from(vec![
+                Span::styled(format!("{:<10}", "verdict"), theme.faint()),
+                Span::styled(grade.word(), theme.grade(grade)),
+                Span::raw(length),
+            ])
+        }
         None => fact("verdict", "none yet"),
     };
     let mut lines = vec![fact("begun", &entry.begun), verdict];
@@ -103,10 +106,15 @@ fn counts(session: &SessionStatus) -> String {
 
 fn line(entry: &EpisodeEntry, width: usize, theme: Theme) -> Line<'static> {
     let name = text::left(&theme.safe(&entry.file), NAME, theme.ellipsis());
-    let grade = entry.verdict.map_or_else(Span::default, |grade| {
-        Span::styled(format!("  {:7}", grade.word()), if entry.discarded { theme.faint() } else { theme.grade(grade) })
-    });
-    let length = Span::raw(format!("  {:>7.1} s", entry.seconds.unwrap_or_default()));
+    let grade = entry.verdict.map_or_else(
+        || Span::raw(" ".repeat(9)),
+        |grade| {
+            let style = if entry.discarded { theme.faint() } else { theme.grade(grade) };
+            Span::styled(format!("  {:7}", grade.word()), style)
+        },
+    );
+    let length = entry.seconds.map(|seconds| format!("{seconds:.1} s")).unwrap_or_default();
+    let length = Span::raw(format!("  {length:>9}"));
     let label = match entry.label {
         Some(label @ Label::Success) => Span::styled(format!("  {:7}", label.word()), theme.good()),
         Some(label @ Label::Failure) => Span::styled(format!("  {:7}", label.word()), theme.warning()),

@@ -10,6 +10,9 @@ use super::theme::Theme;
 use super::tour::Tour;
 use crate::text;
 
+/// Columns that a question leaves for its answer.
+const ROOM: usize = 20;
+
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let message = match model.quit {
         Quit::Asked => Some("recording: q again to finish the episode and quit, any other key to continue".to_owned()),
@@ -18,7 +21,9 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
         Quit::No => model.notice().map(|notice| theme.safe(notice)),
     };
     if let Some((question, text)) = model.prompt().filter(|_| model.quit == Quit::No) {
-        let question = text::cut(&theme.safe(&question), usize::from(area.width) / 2, theme.ellipsis()).into_owned();
+        let question =
+            text::cut(&theme.safe(&question), usize::from(area.width).saturating_sub(ROOM), theme.ellipsis())
+                .into_owned();
         return prompt(frame, area, &question, &theme.safe(text), theme);
     }
     let line = match message {

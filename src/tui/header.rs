@@ -140,10 +140,14 @@ fn right(model: &Model, room: usize, theme: Theme) -> Line<'static> {
             let word = if read_only { "attached, read-only  " } else { "attached  " };
             spans.push(Span::styled(word, theme.faint()));
         }
-        LinkState::Lost { since, .. } => {
+        LinkState::Lost { since, runs, .. } => {
             let ago = text::clock(Stamp::now().since(since));
-            let ended = format!("RUN ENDED {ago} ago");
-            let all = format!("{ended}, waiting for the next  ");
+            let (ended, then) = if runs {
+                (format!("LINK LOST {ago} ago"), "connecting again")
+            } else {
+                (format!("RUN ENDED {ago} ago"), "waiting for the next")
+            };
+            let all = format!("{ended}, {then}  ");
             spans.push(Span::styled(if all.len() <= room { all } else { ended }, theme.alarm()));
             // What it last recorded is not being recorded.
             return Line::from(spans);

@@ -7,6 +7,7 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 
 use super::keys;
+use super::link::LinkState;
 use super::model::Model;
 use super::theme::Theme;
 use crate::status::SlotState;
@@ -25,11 +26,12 @@ const STATES: [(SlotState, &str); 6] = [
 ];
 
 /// The lines of a page, from 1: keys about episodes and motion, then keys about the screen, and the states.
-fn lines(page: usize, theme: Theme) -> Vec<Line<'static>> {
+fn lines(page: usize, is_attached: bool, theme: Theme) -> Vec<Line<'static>> {
     let row = |(key, meaning): (&'static str, &'static str)| {
         Line::from(vec![Span::styled(format!("{key:<12}"), theme.title()), Span::raw(meaning)])
     };
-    let keys = keys::help(page == 1).map(row);
+    let last = ("q, ctrl-c", "leave; the run continues, and stays armed");
+    let keys = keys::help(page == 1).map(|shown| row(if is_attached && shown.0 == last.0 { last } else { shown }));
     if page == 1 {
         return keys.collect();
     }
@@ -41,13 +43,13 @@ fn lines(page: usize, theme: Theme) -> Vec<Line<'static>> {
 }
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, page: usize, model: &Model, theme: Theme) {
-    let lines = lines(page, theme);
+    let lines = lines(page, model.link != LinkState::Own, theme);
     let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).saturating_add(2).min(area.height);
     let [middle] = Layout::vertical([Constraint::Length(height)]).flex(Flex::Center).areas(area);
     let [middle] = Layout::horizontal([Constraint::Length(WIDTH)]).flex(Flex::Center).areas(middle);
     let title = match page {
         1 if model.is_read_only() => " Keys: episodes and motion: off, this is read-only ",
-        1 => " Keys: episodes and motion (? for the screen's) ",
+        1 => " Keys: episodes and motion (? shows the others) ",
         _ => " Keys: the screen; states ",
     };
     let block = Block::bordered()
@@ -69,14 +71,14 @@ mod tests {
     /// On 80x24 every key is in the help.
     #[test]
     fn no_key_is_cut() {
-        let shown: usize = (1..=PAGES).map(|page| lines(page, THEME).len()).sum();
-        assert!((1..=PAGES).all(|page| lines(page, THEME).len() + 2 <= 24));
+        let shown: usize = (1..=PAGES).map(|page| lines(page, true, THEME).len()).sum();
+        assert!((1..=PAGES).all(|page| lines(page, true, THEME).len() + 2 <= 24));
         assert_eq!(shown, keys::help(true).count() + keys::help(false).count() + STATES.len());
     }
 
     #[test]
     fn no_line_is_cut() {
-        let longest = (1..=PAGES).flat_map(|page| lines(page, THEME)).map(|line| line.width()).max();
+        let longest = (1..=PAGES).flat_map(|page| lines(page, true, THEME)).map(|line| line.width()).max();
         assert!(longest.expect("lines") <= usize::from(WIDTH) - 4);
     }
 }

@@ -48,6 +48,11 @@ struct Second {
     ever: u64,
 }
 
+/// No snapshot was taken in this second: no bit is both always and never set.
+const MISSED: Second = Second { always: u64::MAX, ever: 0 };
+/// A longer time between two snapshots was not seen.
+const UNSEEN: Duration = Duration::from_secs(3);
+
 /// The last minute of all devices, and the last five of the mask.
 #[derive(Debug, Clone)]
 pub(super) struct History {
@@ -84,6 +89,11 @@ impl History {
     /// Takes a snapshot into account.
     pub(super) fn update(&mut self, snapshot: &Snapshot) {
         let begun = *self.begun.get_or_insert(snapshot.taken);
+        if snapshot.taken.since(begun) >= UNSEEN {
+            self.miss(snapshot.taken.since(begun));
+            self.begun = None;
+            return self.update(snapshot);
+        }
         let elapsed = snapshot.taken.since(begun);
         let is_over = elapsed >= CELL;
         let mask = snapshot.mask.0;
@@ -112,6 +122,23 @@ impl History {
         }
     }
 
+    /// Nothing is known of this time.
+    fn miss(&mut self, time: Duration) {
+        for _ in 0..time.as_secs().min(MASK_SECONDS as u64) {
+            if let Some(place) = self.mask.get_mut(self.seconds % MASK_SECONDS) {
+                *place = MISSED;
+            }
+            for lane in &mut self.lanes {
+                if let Some(place) = lane.cells.get_mut(self.seconds % SECONDS) {
+                    *place = Cell::Unknown;
+                }
+                lane.was_absent = false;
+            }
+            self.seconds += 1;
+        }
+        self.current = None;
+    }
+
     /// The last five minutes of a bit in so many cells, the oldest first.
     pub(super) fn bits(&self, id: ModalityId, columns: usize) -> Vec<Bit> {
         let each = MASK_SECONDS.div_ceil(columns.max(1)).max(1);
@@ -120,6 +147,7 @@ impl History {
         let of = |second: usize| {
             let is_kept = second < self.seconds && second + MASK_SECONDS >= self.seconds;
             self.mask.get(second % MASK_SECONDS).filter(|_| is_kept).map(|second| match second {
+                Second { always, ever } if always & !ever & bit != 0 => Bit::Unknown,
                 Second { always, .. } if always & bit != 0 => Bit::Set,
                 Second { ever, .. } if ever & bit == 0 => Bit::Clear,
                 _ => Bit::Edge,
@@ -179,6 +207,7 @@ impl Lane {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mask::PhysicalMask;
     use crate::status::literal::{device, id, snapshot};
 
     /// A device of 30 Hz: its state and samples at each tenth of a second.
@@ -191,6 +220,26 @@ mod tests {
             now.taken = Stamp(1_000_000_000_000 + tenth as u64 * 100_000_000);
             history.update(&now);
         }
+    }
+
+    #[test]
+    fn what_was_not_seen_is_unknown_and_no_absence() {
+        let mut history = History::default();
+        let mut now = snapshot(vec![device(0, "cam", SlotState::Streaming, "")]);
+        now.mask = PhysicalMask(1);
+        for ms in (0..=5000).step_by(100).chain((35_000..=40_000).step_by(100)) {
+            now.taken = Stamp(1_000_000_000_000 + ms * 1_000_000);
+            now.devices[0].samples = ms * 30 / 1000;
+            history.update(&now);
+        }
+        let known = |cell: &Cell| *cell != Cell::Unknown;
+        let cells = history.strip(id(0), SECONDS);
+        assert!(!cells.contains(&Cell::Absent), "{cells:?}");
+        assert_eq!(cells.iter().filter(|cell| known(cell)).count(), 10, "{cells:?}");
+        let bits = history.bits(id(0), MASK_SECONDS);
+        assert_eq!(bits.iter().filter(|bit| **bit == Bit::Set).count(), 10, "{bits:?}");
+        assert!(bits.iter().all(|bit| matches!(bit, Bit::Set | Bit::Unknown)), "{bits:?}");
+        assert_eq!(history.seconds, 40);
     }
 
     #[test]

@@ -28,12 +28,14 @@ pub enum LinkState {
         /// No request is sent to it.
         read_only: bool,
     },
-    /// A run of another process that has ended: what is shown is its last state.
+    /// No run: what is shown is the last state.
     Lost {
         /// When the screen noticed it.
         since: Stamp,
         /// As before.
         read_only: bool,
+        /// The process of the run is still there, and the link to it is lost: nothing is known of it since then.
+        runs: bool,
     },
 }
 

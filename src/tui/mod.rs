@@ -57,7 +57,9 @@ const FRAME: Duration = Duration::from_millis(67);
 #[derive(Debug, thiserror::Error)]
 pub enum TuiError {
     /// Input or output is not a terminal, or it cannot be switched to raw mode.
-    #[error("no terminal for the monitor: {0}; --headless runs without one")]
+    #[error(
+        "no terminal for the monitor: {0}; without one: `rapid --headless` to run, `rapid logs -f` to follow a run"
+    )]
     NoTerminal(#[source] io::Error),
     /// The terminal went away.
     #[error("the terminal is gone: {0}")]

@@ -283,11 +283,15 @@ impl Model {
             self.rings += 1;
         }
         let refresh = self.rates.update(&snapshot);
-        self.history.update(&snapshot);
+        // Nothing is known of a run while it is not linked.
+        if !matches!(self.link, LinkState::Lost { .. }) {
+            self.history.update(&snapshot);
+        }
         if self.frozen.is_none() {
             snapshot.previews.iter().for_each(|preview| self.seen.take(preview));
         }
         let selected = self.selected_device().map(|device| device.id);
+        let marked = self.marked_episode();
         let news = news(&self.latest, &snapshot);
         self.latest = snapshot;
         for text in news {
@@ -307,6 +311,10 @@ impl Model {
             self.notice = None;
         }
         self.select(selected);
+        if let Some(session) = self.latest.session.as_ref().filter(|_| marked.is_some()) {
+            let place = session.episodes.iter().rev().position(|entry| Some(&entry.file) == marked.as_ref());
+            self.episode = place.unwrap_or(self.episode);
+        }
         self.keep_in_bounds();
     }
 
@@ -393,8 +401,12 @@ impl Model {
                 }
                 Effect::None
             }
-            LinkState::Lost { .. } if is_request => {
-                self.notify("the run has ended: nothing receives this");
+            LinkState::Lost { runs, .. } if is_request => {
+                self.notify(if runs {
+                    "not sent: the link to the run is lost, and is being connected again"
+                } else {
+                    "the run has ended: nothing receives this"
+                });
                 Effect::None
             }
             _ => effect,
@@ -407,12 +419,16 @@ impl Model {
             Act::Toggle => return self.toggle_recording(),
             Act::Next => return self.once(SessionRequest::Next),
             Act::Redo => return self.once(SessionRequest::Redo),
-            Act::Discard => return self.once(SessionRequest::Discard),
+            Act::Discard => {
+                let episode = self.marked_episode();
+                return self.once(SessionRequest::Discard { episode });
+            }
             Act::Stop => return session(SessionRequest::Stop),
             Act::Undo => return session(SessionRequest::Undo),
             Act::Mark => return session(SessionRequest::Mark { text: String::new() }),
             Act::Success => {
-                return session(SessionRequest::Label { label: Label::Success, reason: String::new() });
+                let episode = self.marked_episode();
+                return session(SessionRequest::Label { episode, label: Label::Success, reason: String::new() });
             }
             Act::Failure => self.ask(Question::WhyFailed),
             Act::Note => self.ask(Question::Note),
@@ -445,6 +461,12 @@ impl Model {
     }
 
     /// Opens a page, or returns from it to the rig.
+    /// The episode that is marked on the page of episodes; `None` on any other page, where keys are about the newest.
+    pub(super) fn marked_episode(&self) -> Option<String> {
+        let session = self.latest.session.as_ref().filter(|_| self.page == Page::Episodes)?;
+        session.episodes.iter().rev().nth(self.episode).map(|entry| entry.file.clone())
+    }
+
     fn turn_to(&mut self, page: Page) {
         self.page = if self.page == page { Page::Rig } else { page };
         self.looked = None;

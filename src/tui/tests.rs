@@ -486,7 +486,7 @@ async fn pasted_text_deletes_nothing_whether_the_terminal_marks_it_or_not() {
     let screen = drive(&mut desk, &shutdown, events, ScreenOptions::default(), |_| Ok(()));
     let app = async {
         // It is in the trash, once, and can be taken back.
-        assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Discard)));
+        assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Discard { episode: None })));
         assert_eq!(commands.recv().await, Some(Command::Quit), "only what was typed last");
         end.cancel();
     };

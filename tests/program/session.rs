@@ -40,7 +40,7 @@ fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
     ask(&place, &["episode", "label", "failure", "spilled"]).expect("a label");
     ask(&place, &["episode", "start"]).expect("another");
     ask(&place, &["episode", "discard"]).expect("it is discarded");
-    until("it is in the trash", || place.files("out/.trash").len() == 1);
+    assert_eq!(place.files("out/.trash").len(), 1);
     ask(&place, &["episode", "next"]).expect("a third");
     until("there is something in it", || {
         std::fs::metadata(place.path(&format!("out/{}.partial", third(&place)))).is_ok_and(|file| file.len() > 200_000)
@@ -51,14 +51,16 @@ fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
     // The next run continues the session, and repairs what was being recorded.
     let running = place.start(&["--sim", "--headless", "--out", "out", "--task", "pour"], "motor_state");
     until("the third is repaired", || !place.files("out").iter().any(|name| name.ends_with(".partial")));
+    until("its verdict is known", || session(&place)["episodes"][2]["verdict"] == "SUSPECT");
     let status = session(&place);
     let episodes = status["episodes"].as_array().expect("a list");
+    assert!(episodes[2]["seconds"].as_f64().is_some_and(|seconds| seconds > 0.1), "{status}");
     assert_eq!((episodes.len(), &status["discarded"]), (3, &1.into()), "{status}");
     assert_eq!((&episodes[0]["label"], &episodes[0]["label_reason"]), (&"failure".into(), &"spilled".into()));
     assert_eq!(episodes[0]["marks"][0]["text"], "grasped");
     assert!(place.files("out").contains(&third(&place)), "{status}");
     ask(&place, &["episode", "undo"]).expect("it comes back");
-    until("it is back", || place.files("out/.trash").is_empty());
+    assert!(place.files("out/.trash").is_empty());
     ask(&place, &["session", "plan", "--task", "stack", "--goal", "7", "--tag", "finger=soft"]).expect("a plan");
     let status = session(&place);
     assert_eq!((&status["task"], &status["goal"]), (&"stack".into(), &7.into()));
@@ -72,6 +74,46 @@ fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
         let of_session = |name: &&String| name.starts_with("session-") && name.ends_with(ending);
         assert_eq!(names.iter().filter(of_session).count(), 1, "{names:?}");
     }
+}
+
+/// The episodes that the journal in `out` has at this moment.
+fn journal(place: &Place) -> Vec<toml::Table> {
+    let text = std::fs::read_to_string(place.path("out/session.toml")).expect("a journal");
+    let mut journal: toml::Table = text.parse().expect("TOML");
+    let episodes = journal.remove("episode").expect("episodes");
+    episodes.try_into().expect("a list")
+}
+
+#[test]
+fn what_was_answered_is_on_the_disk_when_the_run_is_killed() {
+    let place = Place::new();
+    let run = || place.start(&["--sim", "--headless", "--out", "out", "--task", "pour"], "motor_state");
+    let killed = |words: &[&[&str]]| {
+        let running = run();
+        for words in words {
+            ask(&place, words).unwrap_or_else(|error| panic!("{words:?}: {error}"));
+        }
+        running.signal(Signal::KILL);
+        drop(running);
+        journal(&place)
+    };
+    let (start, stop): (&[&str], &[&str]) = (&["episode", "start"], &["episode", "stop"]);
+    assert_eq!(killed(&[start]).len(), 1);
+    let stopped = killed(&[start, stop]);
+    assert!(stopped.len() == 2 && stopped[1].contains_key("verdict"), "{stopped:?}");
+    let labelled = killed(&[&["episode", "label", "failure", "slipped"]]);
+    assert_eq!(labelled[1]["label_reason"].as_str(), Some("slipped"), "{labelled:?}");
+    let named = stopped[1]["file"].as_str().expect("a name");
+    let noted = killed(&[start, &["episode", "note", "pads", "--episode", named]]);
+    assert_eq!((noted.len(), noted[1]["note"].as_str()), (3, Some("pads")), "{noted:?}");
+    let discarded = killed(&[start, &["episode", "discard"]]);
+    assert!(discarded.len() == 4 && discarded[3]["discarded"].as_bool() == Some(true), "{discarded:?}");
+    // What a killed run began does not count until there is an episode.
+    let running = run();
+    let counted = session(&place)["counted"].as_u64().expect("a count");
+    assert!((1..=3).contains(&counted), "{}", session(&place));
+    running.signal(Signal::INT);
+    assert_eq!(running.end().0, Some(0));
 }
 
 #[test]

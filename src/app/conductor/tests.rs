@@ -78,6 +78,7 @@ impl Bench {
         let plan = Plan { task: "test".to_owned(), ..plan };
         let collection = Collection::new(recorder, episode, plan, true, &board).unwrap();
         let conductor = Conductor {
+            found: tokio::sync::mpsc::unbounded_channel(),
             events: board.events(),
             board: Arc::clone(&board),
             collection,
@@ -282,11 +283,11 @@ async fn episodes_are_discarded_restored_labelled_and_the_session_ended_by_reque
         // The end of the first is answered when its file is closed, the beginning of the next when it has begun.
         let ended = ask(SessionRequest::Stop).await.unwrap();
         assert!(ended.contains("_001.mcap: "), "{ended}");
-        let label = SessionRequest::Label { label: Label::Failure, reason: "dropped".to_owned() };
+        let label = SessionRequest::Label { episode: None, label: Label::Failure, reason: "dropped".to_owned() };
         let labelled = ask(label).await.unwrap();
         assert!(labelled.ends_with("_001.mcap: failure"), "{labelled}");
         ask(SessionRequest::Start).await.unwrap();
-        let discarded = ask(SessionRequest::Discard).await.unwrap();
+        let discarded = ask(SessionRequest::Discard { episode: None }).await.unwrap();
         assert!(discarded.contains("_002.mcap"), "{discarded}");
         let name = bench.board.last_end().unwrap().file.file_name().unwrap().to_str().unwrap().to_owned();
         when(&bench.board, "it is in the trash", |_| trash(&name)).await;
@@ -323,7 +324,9 @@ async fn a_run_for_several_episodes_ends_when_they_are_recorded() {
     let keys = async {
         for number in ["_001", "_002", "_003"] {
             until(&bench.board, number, |file| file.is_some_and(|file| file.contains(number))).await;
-            let _ = ask(&bench.keys, SessionRequest::Label { label: Label::Success, reason: String::new() }).await;
+            let _ =
+                ask(&bench.keys, SessionRequest::Label { episode: None, label: Label::Success, reason: String::new() })
+                    .await;
             // What has no sample is BAD and does not count: the third is one too many for the goal.
             let request = if number == "_003" { Request::Quit } else { end() };
             bench.keys.send(request).unwrap();
@@ -355,7 +358,7 @@ async fn the_file_of_an_earlier_session_is_kept_whenever_this_one_gets_its_own()
         let plan = Plan { task: "now".to_owned(), ..Plan::default() };
         let mut collection = Collection::new(recorder, episode, plan, is_kept, &board).unwrap();
         collection.start().await.unwrap();
-        let label = SessionRequest::Label { label: Label::Success, reason: String::new() };
+        let label = SessionRequest::Label { episode: None, label: Label::Success, reason: String::new() };
         collection.request(&label, Stamp::now(), None).await.unwrap();
         collection.finish_episode().await.unwrap();
         collection.close().await.unwrap();

@@ -79,11 +79,16 @@ pub struct Repairs {
 
 impl Repairs {
     /// Repairs what an earlier run left unfinished in `folder`, and reports it on `board`; `reserve` is the
-    /// registry's `disk_reserve`.
+    /// registry's `disk_reserve`. Then, unless it was interrupted, the thread does what is to follow.
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub fn start(folder: PathBuf, reserve: Option<u64>, board: Arc<Board>) -> io::Result<Self> {
+    pub fn start(
+        folder: PathBuf,
+        reserve: Option<u64>,
+        board: Arc<Board>,
+        then: impl FnOnce() + Send + 'static,
+    ) -> io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let (notify, ended) = mpsc::channel();
         let asked = Arc::clone(&stop);
@@ -92,6 +97,9 @@ impl Repairs {
             repair_all(&folder, reserve, begun, &board, &asked);
             // The waiting task may have ended.
             let _ = notify.send(());
+            if !asked.load(Ordering::Relaxed) {
+                then();
+            }
         })?;
         Ok(Self { stop, ended })
     }

@@ -60,6 +60,10 @@ impl Question {
 pub(super) struct Prompt {
     question: Question,
     text: String,
+    /// The text is a suggestion: what is typed first replaces it.
+    is_suggested: bool,
+    /// The episode that it is about, if not the newest.
+    episode: Option<String>,
 }
 
 impl Model {
@@ -70,7 +74,10 @@ impl Model {
             Some(unit) if prompt.question == Question::Name => {
                 format!("name of the {} {} (empty: none): ", unit.node, unit.device)
             }
-            _ => prompt.question.text().to_owned(),
+            _ => match &prompt.episode {
+                Some(file) => format!("{file}, {}", prompt.question.text()),
+                None => prompt.question.text().to_owned(),
+            },
         };
         Some((question, prompt.text.as_str()))
     }
@@ -106,7 +113,7 @@ impl Model {
     /// Asks for the name of the next device without an entry; of those that were asked about, the first again.
     pub(super) fn ask_for_name(&mut self) {
         let Some(unit) = self.unasked().next().or_else(|| self.latest.unregistered.first()).cloned() else {
-            return self.notify("every device that is plugged in has an entry");
+            return self.notify("no device without an entry is plugged in");
         };
         self.naming.asked.push(unit.device.clone());
         self.naming.unnamed = Some(unit);
@@ -121,7 +128,10 @@ impl Model {
             Question::Name => self.naming.unnamed.as_ref().and_then(|unit| unit.name.clone()).unwrap_or_default(),
             _ => String::new(),
         };
-        self.prompt = Some(Prompt { question, text });
+        let is_suggested = matches!(question, Question::Task | Question::Name) && !text.is_empty();
+        let is_about = matches!(question, Question::Note | Question::WhyFailed);
+        let episode = if is_about { self.marked_episode() } else { None };
+        self.prompt = Some(Prompt { question, text, is_suggested, episode });
     }
 
     pub(super) fn type_into(&mut self, mut prompt: Prompt, key: KeyEvent) -> Effect {
@@ -129,10 +139,16 @@ impl Model {
         match key.code {
             KeyCode::Enter => return self.answer(prompt),
             KeyCode::Backspace => {
+                prompt.is_suggested = false;
                 prompt.text.pop();
             }
             KeyCode::Char('u') if key.modifiers.contains(KeyModifiers::CONTROL) => prompt.text.clear(),
-            KeyCode::Char(c) if is_text && prompt.text.len() + c.len_utf8() <= LONGEST_TEXT => prompt.text.push(c),
+            KeyCode::Char(c) if is_text && prompt.text.len() + c.len_utf8() <= LONGEST_TEXT => {
+                if std::mem::take(&mut prompt.is_suggested) {
+                    prompt.text.clear();
+                }
+                prompt.text.push(c);
+            }
             _ => {}
         }
         if prompt.question == Question::Search {
@@ -143,10 +159,10 @@ impl Model {
         Effect::None
     }
 
-    fn answer(&mut self, Prompt { question, text }: Prompt) -> Effect {
+    fn answer(&mut self, Prompt { question, text, episode, .. }: Prompt) -> Effect {
         let request = match question {
-            Question::Note => SessionRequest::Note { text },
-            Question::WhyFailed => SessionRequest::Label { label: Label::Failure, reason: text },
+            Question::Note => SessionRequest::Note { episode, text },
+            Question::WhyFailed => SessionRequest::Label { episode, label: Label::Failure, reason: text },
             Question::Task => SessionRequest::Plan { task: Some(text), tags: Vec::new(), goal: None },
             Question::Search => {
                 self.log.search = text;

@@ -3,8 +3,8 @@ use crossterm::event::KeyCode;
 use super::*;
 use crate::mask::PhysicalMask;
 use crate::status::literal::{TAKEN, every_state, id, line, recording, three_streaming};
-use crate::status::session::{Answered, Label, SessionRequest, SessionStatus};
-use crate::status::{Level, UnregisteredDevice};
+use crate::status::session::{Answered, EpisodeEntry, Label, SessionRequest, SessionStatus};
+use crate::status::{Grade, Level, UnregisteredDevice};
 
 fn press(code: KeyCode) -> Msg {
     Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))
@@ -338,7 +338,8 @@ fn typed(model: &mut Model, text: &str) {
 
 #[test]
 fn a_text_is_typed_and_sent_by_enter_and_escape_disarms_and_closes_it() {
-    let note = |text: &str| Effect::Send(Command::Session(SessionRequest::Note { text: text.to_owned() }));
+    let note =
+        |text: &str| Effect::Send(Command::Session(SessionRequest::Note { episode: None, text: text.to_owned() }));
     let mut model = Model::new(three_streaming());
     typed(&mut model, "nquick dxE");
     assert_eq!(model.prompt(), Some(("note: ".to_owned(), "quick dxE")));
@@ -349,7 +350,7 @@ fn a_text_is_typed_and_sent_by_enter_and_escape_disarms_and_closes_it() {
     typed(&mut model, "n");
     assert_eq!(model.update(press(KeyCode::Enter)), note(""));
     typed(&mut model, "-slipped");
-    let label = SessionRequest::Label { label: Label::Failure, reason: "slipped".to_owned() };
+    let label = SessionRequest::Label { episode: None, label: Label::Failure, reason: "slipped".to_owned() };
     assert_eq!(model.update(press(KeyCode::Enter)), Effect::Send(Command::Session(label)));
     typed(&mut model, "nhalf");
     assert_eq!(model.update(press(KeyCode::Esc)), Effect::Order(Order::Disarm));
@@ -417,7 +418,7 @@ fn previews_are_requested_while_they_are_shown_and_never_else() {
     assert_eq!(model.update(after(&cam, 800)), look);
     model.update(press(KeyCode::Down));
     assert_eq!(model.update(after(&cam, 900)), Effect::Send(Command::Look(id(1))), "the other device at once");
-    model.link = LinkState::Lost { since: TAKEN, read_only: false };
+    model.link = LinkState::Lost { since: TAKEN, read_only: false, runs: false };
     assert_eq!(model.update(after(&cam, 2_000)), Effect::None);
     model.link = LinkState::Attached { process: 1, read_only: true };
     assert_eq!(model.update(after(&cam, 2_100)), Effect::Send(Command::Look(id(1))), "looking changes nothing");
@@ -451,7 +452,7 @@ fn what_is_attached_ends_nothing_and_read_only_changes_nothing() {
         assert_eq!(model.update(press(KeyCode::Char('q'))), Effect::Leave);
     }
     let mut model = Model::new(recording_now.clone());
-    model.link = LinkState::Lost { since: TAKEN, read_only: false };
+    model.link = LinkState::Lost { since: TAKEN, read_only: false, runs: false };
     for code in keys() {
         assert_eq!(model.update(press(code)), Effect::None, "{code:?}");
     }
@@ -521,9 +522,10 @@ fn in_a_new_rig_the_name_of_each_device_is_asked_for_once() {
     model.update(after(&plugged, 200));
     assert_eq!(model.prompt(), Some(("name of the camera 046d:0825 webcam (empty: none): ".to_owned(), "webcam")));
     // What is typed is not asked for again by the next snapshot.
+    model.update(press(KeyCode::Char('w')));
     model.update(press(KeyCode::Char('2')));
     model.update(after(&plugged, 300));
-    let register = Command::Register { device: "046d:0825 webcam".to_owned(), name: "webcam2".to_owned() };
+    let register = Command::Register { device: "046d:0825 webcam".to_owned(), name: "w2".to_owned() };
     assert_eq!(model.update(press(KeyCode::Enter)), Effect::Send(register));
     plugged.unregistered.remove(0);
     model.update(after(&plugged, 400));
@@ -551,7 +553,7 @@ fn in_a_rig_with_entries_nothing_is_asked_by_itself() {
     model.update(after(&plugged, 200));
     assert_eq!(model.notice(), Some("added [device.webcam] as bit 3"));
     model.update(press(KeyCode::Char('N')));
-    assert_eq!(model.notice(), Some("every device that is plugged in has an entry"));
+    assert_eq!(model.notice(), Some("no device without an entry is plugged in"));
 }
 
 #[test]
@@ -570,4 +572,44 @@ fn losses_are_those_of_the_episode_in_progress() {
     now.recording = None;
     model.update(after(&now, 300));
     assert_eq!(lost(&model), 7);
+}
+
+#[test]
+fn on_the_page_of_episodes_keys_are_about_the_marked_one() {
+    let file = |number: u8| format!("{number:03}.mcap");
+    let entry = |number: u8| EpisodeEntry {
+        file: file(number),
+        begun: String::new(),
+        seconds: Some(1.0),
+        verdict: Some(Grade::Good),
+        reasons: Vec::new(),
+        label: None,
+        label_reason: String::new(),
+        note: String::new(),
+        discarded: false,
+        marks: Vec::new(),
+        sensors: None,
+    };
+    let with = |count: u8| {
+        let mut snapshot = three_streaming();
+        snapshot.session =
+            Some(SessionStatus { episodes: (1..=count).map(entry).collect(), ..SessionStatus::default() });
+        snapshot
+    };
+    let mut model = Model::new(with(3));
+    let sent = |request| Effect::Send(Command::Session(request));
+    let label = |episode| sent(SessionRequest::Label { episode, label: Label::Success, reason: String::new() });
+    assert_eq!(model.update(press(KeyCode::Char('+'))), label(None), "elsewhere it is the newest");
+    model.update(press(KeyCode::Char('e')));
+    model.update(press(KeyCode::Down));
+    assert_eq!(model.update(press(KeyCode::Char('+'))), label(Some(file(2))));
+    // Another episode begins: the mark stays on its episode.
+    model.update(Msg::Snapshot(Box::new(with(4))));
+    let discard = sent(SessionRequest::Discard { episode: Some(file(2)) });
+    assert_eq!(model.update(press(KeyCode::Char('x'))), discard);
+    model.update(press(KeyCode::Char('n')));
+    assert_eq!(model.prompt().unwrap().0, "002.mcap, note: ");
+    model.update(press(KeyCode::Char('a')));
+    let note = sent(SessionRequest::Note { episode: Some(file(2)), text: "a".to_owned() });
+    assert_eq!(model.update(press(KeyCode::Enter)), note);
 }

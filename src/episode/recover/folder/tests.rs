@@ -16,7 +16,7 @@ async fn a_folder_is_repaired_and_reported_in_the_background() {
     held.lock().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let mut events = board.events();
-    let repairs = Repairs::start(folder.path().to_owned(), Some(1 << 20), Arc::clone(&board)).unwrap();
+    let repairs = Repairs::start(folder.path().to_owned(), Some(1 << 20), Arc::clone(&board), || {}).unwrap();
     let mut report = Vec::new();
     for _ in 0..3 {
         report.push(events.recv().await.unwrap().what);
@@ -29,7 +29,7 @@ async fn a_folder_is_repaired_and_reported_in_the_background() {
     drop(repairs);
     // A finished file is left alone.
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_003.mcap.partial", "a_004.mcap"]);
-    assert!(Repairs::start(folder.path().join("missing"), None, board).is_ok());
+    assert!(Repairs::start(folder.path().join("missing"), None, board, || {}).is_ok());
 }
 
 #[tokio::test]
@@ -40,7 +40,7 @@ async fn a_repair_in_the_background_leaves_disk_space_for_an_episode() {
     let board = Arc::new(Board::new(&registry()));
     let mut events = board.events();
     // Three quarters of what is free: a repair would fit, and an episode be warned of.
-    let _repairs = Repairs::start(folder.path().to_owned(), Some(free / 4 * 3), board).unwrap();
+    let _repairs = Repairs::start(folder.path().to_owned(), Some(free / 4 * 3), board, || {}).unwrap();
     let What::Log { text, .. } = events.recv().await.unwrap().what else { panic!() };
     assert!(text.contains("a_001.mcap.partial: not repaired: it takes ") && text.contains("; make room and"), "{text}");
     assert!(partial.exists());
