@@ -13,6 +13,7 @@ import html
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -165,10 +166,15 @@ class Terminal:
         return self.screen()
 
     def close(self):
-        subprocess.run(["tmux", "-S", self.socket, "send-keys", "C-c"], capture_output=True)
+        """Ends the program as a service is ended; the server ends with it."""
+        tmux = ["tmux", "-S", self.socket]
+        pane = subprocess.run([*tmux, "display-message", "-p", "#{pane_pid}"], capture_output=True, text=True).stdout.strip()
+        if pane:
+            os.kill(int(pane), signal.SIGTERM)
         end = time.monotonic() + PATIENCE
-        while time.monotonic() < end and not subprocess.run(["tmux", "-S", self.socket, "ls"], capture_output=True).returncode:
+        while subprocess.run([*tmux, "ls"], capture_output=True).returncode == 0 and time.monotonic() < end:
             time.sleep(0.05)
+        subprocess.run([*tmux, "kill-server"], capture_output=True)
 
 
 def take(terminal):

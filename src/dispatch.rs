@@ -566,14 +566,10 @@ failures! {
     commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
     commands::session::RequestError: |_| 1;
     commands::logs::LogsError: |error| match error {
-        commands::logs::LogsError::Monitor(commands::monitor::MonitorError::Give(_)) => 3,
         commands::logs::LogsError::NoDevice { .. } => 2,
         commands::logs::LogsError::Monitor(_) | commands::logs::LogsError::Output(_) => 1,
     };
-    commands::monitor::MonitorError: |error| match error {
-        commands::monitor::MonitorError::Give(_) => 3,
-        commands::monitor::MonitorError::Link { .. } | commands::monitor::MonitorError::Screen(_) => 1,
-    };
+    commands::monitor::MonitorError: |_| 1;
     commands::arm::OrderError: |error| match error {
         commands::arm::OrderError::Give(_) => 3,
         commands::arm::OrderError::Output(_) => 1,
@@ -581,7 +577,9 @@ failures! {
     commands::mask::MaskError: |_| 1;
     commands::plot::PlotError: |error| match error {
         commands::plot::PlotError::Episode(error) => read_code(error),
-        commands::plot::PlotError::Foreign(_) | commands::plot::PlotError::Several { .. } => 2,
+        commands::plot::PlotError::Foreign(_)
+        | commands::plot::PlotError::Several { .. }
+        | commands::plot::PlotError::Twice { .. } => 2,
         _ => 1,
     };
     commands::list::ListError: |error| match error {

@@ -96,7 +96,9 @@ pub struct Other {
 impl std::fmt::Display for Other {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { process, user, instance } = self;
-        write!(f, "process {process} of user {user} does")?;
+        let is_this_user = user.parse() == Ok(this_user());
+        let of_user = if is_this_user { String::new() } else { format!(" of user {user}") };
+        write!(f, "process {process}{of_user} does")?;
         // Any user can create a socket of any name.
         instance.iter().try_for_each(|name| write!(f, " (`--instance {}`)", plain(name)))
     }

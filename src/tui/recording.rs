@@ -35,8 +35,7 @@ fn remark(model: &Model, theme: Theme) -> Line<'static> {
     let session = model.latest().session.as_ref();
     let progress = session.filter(|session| session.goal.is_some() || session.counted > 0);
     let count = progress.map(|session| match session.goal {
-        // The one in progress counts, and is not there yet.
-        Some(_) if model.is_recording() => format!("episode {}", session.progress()),
+        Some(goal) if model.is_recording() => format!("episode {} of {goal}", session.counted + 1),
         Some(_) => format!("{} episodes", session.progress()),
         None => text::counted(session.counted as u64, "episode"),
     });

@@ -113,7 +113,6 @@ fn ten_episodes_are_counted_down_recorded_and_counted() {
 
     pane.type_in(" ");
     let mut seen = Vec::new();
-    // The one in progress counts: the tenth is there when it has ended.
     pane.until_seeing("ten episodes", &mut seen, |_| whole(&place).len() == 10);
     for words in ["an episode begins in 00:0", "reset the scene: the next episode begins in 00:0", "● REC 00:0"] {
         assert!(seen.iter().any(|screen| screen.contains(words)), "{words:?} in none of {} screens", seen.len());

@@ -51,7 +51,7 @@ fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
     // The next run continues the session, and repairs what was being recorded.
     let running = place.start(&["--sim", "--headless", "--out", "out", "--task", "pour"], "motor_state");
     until("the third is repaired", || !place.files("out").iter().any(|name| name.ends_with(".partial")));
-    until("its verdict is known", || session(&place)["episodes"][2]["verdict"] == "SUSPECT");
+    until("its verdict is known", || !session(&place)["episodes"][2]["verdict"].is_null());
     let status = session(&place);
     let episodes = status["episodes"].as_array().expect("a list");
     assert!(episodes[2]["seconds"].as_f64().is_some_and(|seconds| seconds > 0.1), "{status}");
@@ -108,10 +108,10 @@ fn what_was_answered_is_on_the_disk_when_the_run_is_killed() {
     assert_eq!((noted.len(), noted[1]["note"].as_str()), (3, Some("pads")), "{noted:?}");
     let discarded = killed(&[start, &["episode", "discard"]]);
     assert!(discarded.len() == 4 && discarded[3]["discarded"].as_bool() == Some(true), "{discarded:?}");
-    // What a killed run began does not count until there is an episode.
+    // What a killed run began does not count: nothing was recorded, or too little.
     let running = run();
     let counted = session(&place)["counted"].as_u64().expect("a count");
-    assert!((1..=3).contains(&counted), "{}", session(&place));
+    assert_eq!(counted, 0, "{}", session(&place));
     running.signal(Signal::INT);
     assert_eq!(running.end().0, Some(0));
 }
