@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation texture lerobot-test clean
+.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation texture lerobot-test fleet-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -75,6 +75,9 @@ bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --o
 fuzz: ## feed every reader of untrusted bytes with generated ones, each for FUZZ_SECONDS=60
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
+
+fleet-test: ## copy episodes to a real S3 server by the units of `rapid artifacts`, with breaks (needs Go; no part of `test`)
+	scripts/fleet.sh
 
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.
 train: setup-build ## record demonstrations, train on them, export models/tactile-id (THREADS=2, MINUTES=)

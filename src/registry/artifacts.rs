@@ -6,6 +6,7 @@
 //! more than itself; where a format cannot express it, a comment in the file states so.
 
 mod rules;
+mod upload;
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -50,6 +51,8 @@ pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     let mut all = vec![
         artifact("99-rapid.rules".into(), rules::rules(registry), ArtifactKind::Rules),
         artifact("rapid.service".into(), unit(registry), ArtifactKind::Unit),
+        artifact("rapid-upload.service".into(), upload::service(), ArtifactKind::Unit),
+        artifact("rapid-upload.timer".into(), upload::timer(), ArtifactKind::Unit),
     ];
     for device in &registry.devices {
         let path = PathBuf::from(DESCRIPTORS).join(format!("{}.yaml", device.name));

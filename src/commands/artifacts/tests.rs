@@ -27,7 +27,7 @@ fn all_files_are_written_and_stale_ones_are_removed() {
     names.sort();
     assert_eq!(names, ["cam_wrist.yaml", "motor_state.yaml", "tactile_tip.yaml", "theirs.yaml"]);
     let listed = String::from_utf8(out).unwrap();
-    assert_eq!(listed.lines().count(), 6);
+    assert_eq!(listed.lines().count(), 8);
     assert!(listed.contains("gone.yaml: the entry no longer exists"), "{listed}");
 }
 
@@ -67,6 +67,8 @@ fn an_installation_puts_each_file_where_it_is_read() {
     for path in [
         "etc/udev/rules.d/99-rapid.rules",
         "etc/systemd/system/rapid.service",
+        "etc/systemd/system/rapid-upload.service",
+        "etc/systemd/system/rapid-upload.timer",
         "etc/rapid/descriptors/cam_wrist.yaml",
         "etc/rapid/descriptors/motor_state.yaml",
     ] {
