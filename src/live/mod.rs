@@ -128,6 +128,8 @@ pub struct Live {
     stop: CancellationToken,
     ended: CancellationToken,
     board: Arc<Board>,
+    /// Its address is the one that is listened on.
+    options: LiveOptions,
 }
 
 impl Live {
@@ -168,13 +170,13 @@ impl Live {
             // A client that does not read must not hold up the end.
             runtime.shutdown_background();
         })?;
-        let live = Self { feed: Some(feed), thread: Some(thread), stop, ended, board };
-        let address = listens.await.unwrap_or(Err(LiveError::Panicked))?;
-        live.announce(address, options.control);
+        let mut live = Self { feed: Some(feed), thread: Some(thread), stop, ended, board, options };
+        live.options.address = listens.await.unwrap_or(Err(LiveError::Panicked))?;
         Ok(live)
     }
 
-    fn announce(&self, address: SocketAddr, control: bool) {
+    fn announce(&self) {
+        let LiveOptions { address, control } = self.options;
         let text = format!("Foxglove: open connection ws://{address}");
         self.board.announce(What::Log { level: Level::Info, text });
         if !address.ip().is_loopback() {
@@ -187,12 +189,13 @@ impl Live {
         }
     }
 
-    /// Shows this from now on.
+    /// Shows this from now on, and announces it.
     pub fn feed(&mut self, feed: Feed) {
         if let Some(fed) = self.feed.take() {
             // The thread has panicked: that is reported by `run`.
             let _ = fed.send(feed);
         }
+        self.announce();
     }
 
     /// Runs until `stop`; then the subscriber of the bus is closed.
