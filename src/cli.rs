@@ -301,10 +301,12 @@ pub enum Command {
         out: PathBuf,
     },
     /// Write the udev rules and systemd unit derived from the registry
-    #[command(after_long_help = "Files: udev rules, one descriptor per entry, and a systemd unit.\n\nExamples:\n  \
+    #[command(
+        after_long_help = "Files: udev rules, one descriptor per entry, a systemd unit, and a layout for Foxglove.\n\nExamples:\n  \
         rapid artifacts                to read them first, in udev/\n  \
         sudo install -D -m 644 devices.toml /etc/rapid/devices.toml\n  \
-        sudo rapid --config /etc/rapid/devices.toml artifacts --install")]
+        sudo rapid --config /etc/rapid/devices.toml artifacts --install"
+    )]
     Artifacts {
         /// Install them below /etc and reload udev (needs root)
         #[arg(long, conflicts_with = "to")]

@@ -1,12 +1,16 @@
-//! Services by which a client begins and ends episodes, and arms and disarms.
+//! Services by which a client begins and ends episodes, and arms and disarms, and parameters: task and tags.
 //!
 //! Invariant: there are none unless the user allowed them: the protocol has no password, and web pages of a browser on
 //! this machine reach a loopback address too.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use foxglove::Schema;
 use foxglove::websocket::service::{Service, ServiceSchema};
+use foxglove::websocket::{
+    AnyClient, GetParametersResponder, Parameter, ParameterHandler, ParameterValue, SetParametersResponder,
+};
 use tokio::sync::oneshot;
 
 use crate::permission::Permission;
@@ -95,5 +99,68 @@ impl Controls {
         let (reply, answer) = oneshot::channel();
         (self.ask)(request, reply);
         answer.await.unwrap_or_else(|_| Err("the run is ending".to_owned()))
+    }
+
+    /// The parameters of these names, or all if none is named; none while the run ends.
+    async fn parameters(&self, names: &[String]) -> Vec<Parameter> {
+        let shown = self.request(SessionRequest::Show).await.unwrap_or_default();
+        let session = serde_json::from_str::<Session>(&shown).unwrap_or_default();
+        let tags = session.tags.into_iter().map(|(key, value)| (key, ParameterValue::String(value))).collect();
+        let all = [(TASK, ParameterValue::String(session.task)), (TAGS, ParameterValue::Dict(tags))];
+        let wanted = all.into_iter().filter(|(name, _)| names.is_empty() || names.iter().any(|other| other == name));
+        wanted.map(|(name, value)| Parameter { name: name.to_owned(), r#type: None, value: Some(value) }).collect()
+    }
+
+    /// Changes what the next episodes are of. What is no task and no tag changes nothing.
+    async fn change(&self, parameters: Vec<Parameter>) {
+        let Some(plan) = plan(parameters) else { return };
+        let (Ok(text) | Err(text)) = self.request(plan).await;
+        tracing::info!("Foxglove: a client set parameters: {text}");
+    }
+}
+
+/// Names of parameters.
+const TASK: &str = "task";
+const TAGS: &str = "tags";
+
+/// What is read of the session.
+#[derive(serde::Deserialize, Default)]
+struct Session {
+    task: String,
+    tags: Vec<(String, String)>,
+}
+
+/// What these parameters request; `None` if nothing. A tag with an empty text is removed.
+fn plan(parameters: Vec<Parameter>) -> Option<SessionRequest> {
+    let (mut task, mut tags) = (None, Vec::new());
+    for Parameter { name, value, .. } in parameters {
+        match (name.as_str(), value) {
+            (TASK, Some(ParameterValue::String(text))) => task = Some(text),
+            (TAGS, Some(ParameterValue::Dict(dict))) => tags.extend(texts(dict)),
+            _ => {}
+        }
+    }
+    (task.is_some() || !tags.is_empty()).then_some(SessionRequest::Plan { task, tags, goal: None })
+}
+
+fn texts(dict: BTreeMap<String, ParameterValue>) -> impl Iterator<Item = (String, String)> {
+    let text = |(key, value)| if let ParameterValue::String(text) = value { Some((key, text)) } else { None };
+    dict.into_iter().filter_map(text)
+}
+
+impl ParameterHandler for Controls {
+    fn get(&self, _: AnyClient, names: Vec<String>, _: Option<String>, responder: GetParametersResponder) {
+        let controls = self.clone();
+        tokio::spawn(async move { responder.respond(controls.parameters(&names).await) });
+    }
+
+    fn set(&self, _: AnyClient, parameters: Vec<Parameter>, _: Option<String>, responder: SetParametersResponder) {
+        let controls = self.clone();
+        tokio::spawn(async move {
+            let names: Vec<_> = parameters.iter().map(|parameter| parameter.name.clone()).collect();
+            controls.change(parameters).await;
+            // As they are now, whether they were changed or not.
+            responder.respond(controls.parameters(&names).await);
+        });
     }
 }

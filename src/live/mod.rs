@@ -180,7 +180,7 @@ impl Live {
         let text = format!("Foxglove: open connection ws://{address}");
         self.board.announce(What::Log { level: Level::Info, text });
         if !address.ip().is_loopback() {
-            let moves = if control { ", and may begin and end episodes, and arm motors" } else { "" };
+            let moves = if control { ", begins and ends episodes, and arms motors" } else { "" };
             let text = format!(
                 "Foxglove: {address} is not of this machine alone: whoever reaches that port sees what the sensors \
                  see{moves}; there is no password. `ssh -L {PORT}:localhost:{PORT}` needs no such address"
@@ -252,6 +252,7 @@ impl Server {
             .listener(Arc::new(audience));
         if let Some(controls) = controls {
             server = server.services(controls.services()).supported_encodings(["json"]);
+            server = server.parameter_handler(Arc::new(controls));
         }
         let handle = server.start().await.map_err(|error| match error {
             FoxgloveError::Bind(source) => LiveError::Listen { address, source },

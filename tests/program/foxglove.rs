@@ -122,7 +122,7 @@ impl Client {
                     self.services.insert(name, number(&service["id"]));
                 }
             }
-            Some("serviceCallFailure" | "status") => self.answers.push(message.clone()),
+            Some("serviceCallFailure" | "status" | "parameterValues") => self.answers.push(message.clone()),
             _ => {}
         }
     }
@@ -146,6 +146,16 @@ impl Client {
 
     fn send(&mut self, message: &Value) {
         self.socket.send(Message::text(message.to_string())).expect("it is sent");
+    }
+
+    /// Sends a request about parameters; returns what they are then, by name.
+    fn parameters(&mut self, request: &Value) -> BTreeMap<String, Value> {
+        self.answers.clear();
+        self.send(request);
+        self.read_until("parameters", |client| !client.answers.is_empty());
+        let answer = self.answers.remove(0);
+        let list = answer["parameters"].as_array().unwrap_or_else(|| panic!("no parameters: {answer}"));
+        list.iter().map(|one| (one["name"].as_str().expect("a name").to_owned(), one["value"].clone())).collect()
     }
 
     /// Calls a service; returns its answer, or why it failed.
@@ -358,7 +368,8 @@ fn the_end_of_its_thread_costs_no_episode() {
     command.env("RAPID_FAULT", format!("foxglove:{}", order.display()));
     let mut running = place.start_as(command, "\"event\":\"recording\"");
     let mut client = Client::connect(&address(&running));
-    client.read_until("a picture", |client| client.count("/rapid/camera/wrist") > 0);
+    // An episode of less than half a second is BAD.
+    client.read_until("a second", |client| client.count("/rapid/mask") > 500);
     std::fs::write(order, "").expect("order");
     running.wait_for("Foxglove: its thread panicked; the run continues without it");
     until("the connection is closed", || {
@@ -383,8 +394,13 @@ fn a_client_controls_a_run_only_if_that_was_allowed() {
     let mut client = Client::connect(&address(&running));
     client.read_until("the services", |client| client.services.len() == 4);
     client.read_until("pictures", |client| client.count("/rapid/camera/wrist") > 0);
+    let all = client.parameters(&json!({ "op": "getParameters", "id": "1", "parameterNames": [] }));
+    assert_eq!((&all["task"], &all["tags"]), (&json!("episode"), &json!({})));
+    let wanted = json!([{ "name": "task", "value": "pour tea" }, { "name": "tags", "value": { "finger": "soft" } }]);
+    let set = client.parameters(&json!({ "op": "setParameters", "id": "2", "parameters": wanted }));
+    assert_eq!((&set["task"], &set["tags"]), (&json!("pour tea"), &json!({ "finger": "soft" })));
     let begun = client.call("/rapid/start");
-    assert!(begun.contains("001.mcap"), "{begun}");
+    assert!(begun.contains("pour-tea_001.mcap"), "{begun}");
     let recorded = client.count("/rapid/mask");
     client.read_until("an episode", |client| client.count("/rapid/mask") > recorded + 500);
     let ended = client.call("/rapid/stop");
