@@ -263,7 +263,7 @@ pub struct TaskArgs {
     #[arg(long, value_name = "N", default_value_t = 0, hide_short_help = true)]
     pub seed: u64,
     /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
-    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm"], hide_short_help = true)]
+    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm", "foxglove"], hide_short_help = true)]
     pub expert: bool,
     /// Demonstrations to record, one trial each
     #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert", hide_short_help = true)]

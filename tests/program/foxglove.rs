@@ -320,6 +320,8 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
     let mut client = Client::connect(&address(&running));
     client.read_until("messages", |client| client.count("/rapid/camera/wrist") > 5 && client.count("/rapid/mask") > 50);
     std::thread::sleep(Duration::from_secs(10));
+    let log = place.run(&["logs"]).stdout;
+    assert!(String::from_utf8_lossy(&log).contains("outbox for client"), "the log has it");
     // What waits for it is bounded, and the newest is in it.
     let resumed = client.received.len();
     let begun = Instant::now();
@@ -348,11 +350,42 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
 }
 
 #[test]
+fn a_ninth_client_gets_nothing_and_why() {
+    let place = lenient_place();
+    let running = start(&place, &[]);
+    let address = address(&running);
+    let mut clients: Vec<_> = (0..8).map(|_| Client::connect(&address)).collect();
+    for client in &mut clients {
+        client.read_until("masks", |client| client.count("/rapid/mask") > 10);
+    }
+    let mut ninth = Client::connect(&address);
+    ninth.read_until("the reason", |client| !client.answers.is_empty());
+    let reason = ninth.answers[0]["message"].as_str().expect("a text");
+    assert!(reason.contains("8 clients at a time"), "{reason}");
+    std::thread::sleep(Duration::from_millis(200));
+    assert!(ninth.received.is_empty(), "{}", ninth.received.len());
+    // The others are served as before.
+    let before = clients[0].received.len();
+    clients[0].read_until("more", |client| client.received.len() > before + 100);
+    drop(clients);
+    until("a place is free", || {
+        let mut next = Client::connect(&address);
+        let begun = Instant::now();
+        while next.count("/rapid/mask") == 0 && begun.elapsed() < Duration::from_secs(2) {
+            next.read_one();
+        }
+        next.count("/rapid/mask") > 0
+    });
+    good(&place, running);
+}
+
+#[test]
 fn a_port_in_use_is_an_error_of_the_start() {
     let place = Place::new();
     let taken = TcpListener::bind(ANY).expect("a port");
     let address = taken.local_addr().expect("an address").to_string();
-    let output = place.run(&["--sim", "--headless", "--record", "--out", "out", "--foxglove", &address]);
+    let options = ["--sim", "--headless", "--record", "--duration", "5s", "--out", "out", "--foxglove", &address];
+    let output = place.run(&options);
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(1), "{errors}");
     let expected = format!("error: --foxglove {address}: Address already in use");
