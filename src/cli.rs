@@ -232,7 +232,7 @@ pub struct RunArgs {
 pub struct LiveArgs {
     /// Show all topics live in Foxglove, as they are recorded [default address: 127.0.0.1:8765]
     ///
-    /// In Foxglove: open connection, ws://localhost:8765. From another machine: `ssh -L 8765:localhost:8765 RIG`. With an
+    /// In Foxglove: open connection, `ws://localhost:8765`. From another machine: `ssh -L 8765:localhost:8765 RIG`. With an
     /// address that is not of this machine alone, such as 0.0.0.0:8765, whoever reaches the port sees what the sensors see.
     #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = live_address, default_missing_value = "127.0.0.1:8765", hide_short_help = true)]
     pub foxglove: Option<SocketAddr>,

@@ -145,7 +145,7 @@ impl Live {
         controls: Option<Controls>,
     ) -> Result<Self, LiveError> {
         let (stop, ended) = (CancellationToken::new(), CancellationToken::new());
-        let (feed, fed) = oneshot::channel();
+        let (feed, first_feed) = oneshot::channel();
         let (listening, listens) = oneshot::channel();
         let (stopped, guard) = (stop.clone(), ended.clone().drop_guard());
         let thread = std::thread::Builder::new().name("foxglove".to_owned()).spawn(move || {
@@ -162,7 +162,7 @@ impl Live {
                     Ok((server, address)) => {
                         // Without a receiver the run has ended.
                         let _ = listening.send(Ok(address));
-                        server.serve(fed, stopped).await;
+                        server.serve(first_feed, stopped).await;
                     }
                     Err(error) => drop(listening.send(Err(error))),
                 }
