@@ -163,7 +163,7 @@ impl Client {
         self.answers.clear();
         let id = self.services[service];
         let mut request = vec![2];
-        [id, 7, 4].iter().for_each(|word| request.extend_from_slice(&word.to_le_bytes()));
+        request.extend([id, 7, 4].iter().flat_map(|word| word.to_le_bytes()));
         request.extend_from_slice(b"json{}");
         self.socket.send(Message::binary(request)).expect("it is sent");
         self.read_until(service, |client| !client.answers.is_empty());
