@@ -56,7 +56,7 @@ test: setup ## the whole truth: format, lints, all tests with the virtual bench,
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
 features: ## compile the program with no cargo feature, and with each alone
-	$(TESTED) scripts/features.sh '' lan motors policy
+	$(TESTED) scripts/features.sh '' foxglove lan motors policy
 
 lint: ## format and clippy
 	cargo fmt --all --check

@@ -21,6 +21,8 @@ mod error;
 mod free_space;
 #[cfg_attr(not(feature = "policy"), path = "app/inference_absent.rs")]
 mod inference;
+#[cfg_attr(not(feature = "foxglove"), path = "app/live_absent.rs")]
+mod live;
 mod reload;
 mod requests;
 mod screen;
@@ -67,6 +69,7 @@ use collection::Collection;
 use conductor::Conductor;
 pub use error::AppError;
 pub use inference::PolicyOptions;
+pub use live::LiveOptions;
 use reload::Reload;
 use requests::Request;
 use signals::Signals;
@@ -131,6 +134,8 @@ pub struct Options {
     pub instance: Option<String>,
     /// Members of this process's group may attach screens and make requests, as this user may.
     pub group_control: bool,
+    /// The Foxglove server, if there is one.
+    pub live: Option<LiveOptions>,
 }
 
 /// Where the mask of an instance is published.
@@ -226,9 +231,14 @@ struct Machine {
 /// Starts the stages and the screen. The bus must outlive them.
 async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running, Conductor), AppError> {
     let Machine { registry, board, permission, signals, presence, arrivals } = machine;
+    let (to_conductor, requests) = mpsc::unbounded_channel();
+    let listening = match options.live {
+        Some(live) => Some(live::listen(live, &registry, &board, &permission, &to_conductor).await?),
+        None => None,
+    };
     let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
-    let (following, to_recorder) = (recorder.episode(), recorder.additions());
+    let (following, to_recorder, clock) = (recorder.episode(), recorder.additions(), recorder.clock());
     // Ending by itself after some time is the run's, unless it has several episodes.
     let Plan { goal, episode_time, reset_time, .. } = options.plan;
     let is_single = goal.is_none() && episode_time.is_none() && reset_time.is_none();
@@ -255,9 +265,10 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration, options.shown);
         let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
         let inference = options.policy.map(start).transpose()?;
-        Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment))
+        let live = listening.map(|listening| listening.start(bus, &board, clock)).transpose()?;
+        Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live))
     };
-    let (discovery, plugged, watched, (from_screen, attached), screen, inference, alignment) = match others() {
+    let (discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live) = match others() {
         Ok(others) => others,
         Err(error) => {
             // The recorder's thread releases the bus before the bus is dropped: no files of it remain.
@@ -267,7 +278,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         }
     };
     let (to_rig, rig_commands) = mpsc::channel(16);
-    let (to_conductor, requests) = mpsc::unbounded_channel();
+    let (live, to_live) = live.unzip();
     let buttons = Buttons::begin(&registry, &permission, &board, &to_conductor);
     let (to_registry, about_registry) = mpsc::unbounded_channel();
     let reload = Reload {
@@ -277,6 +288,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         rig: to_rig.clone(),
         recorder: to_recorder,
         alignment: to_alignment,
+        live: to_live,
         topics: Vec::new(),
     };
     requests::sorted(to_conductor, from_screen, (arrivals, attached), to_rig, to_registry, to_scenario);
@@ -306,6 +318,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         synchronisation: synchronise(alignment),
         recording,
         inference,
+        live,
         reload: reload.start(about_registry),
         mask_ended,
         kind,
@@ -372,6 +385,7 @@ struct Running {
     synchronisation: Stage,
     recording: Stage,
     inference: Option<Stage>,
+    live: Option<Stage>,
     reload: Stage,
     mask_ended: CancellationToken,
     kind: Screen,
@@ -413,6 +427,10 @@ async fn finish(
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
         keep_first(&mut outcome, running.discovery.end().await);
+        if let Some(live) = &mut running.live {
+            // The last events are shown by then. It is no reason for the run to fail.
+            let _ = live.end().await;
+        }
         keep_first(&mut outcome, running.reload.end().await);
     };
     let mut take_down: Pin<Box<_>> = Box::pin(take_down);

@@ -6,6 +6,7 @@ mod list;
 mod session;
 
 use std::ffi::OsString;
+use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeBounds;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -218,9 +219,29 @@ pub struct RunArgs {
     /// Half width of the synchronisation window of an observation [default: from the registry]
     #[arg(long, value_name = "TIME", value_parser = window, hide_short_help = true)]
     pub window: Option<Duration>,
+    /// What other programs see live.
+    #[command(flatten)]
+    pub live: LiveArgs,
     /// How the monitor is shown.
     #[command(flatten)]
     pub shown: ShownArgs,
+}
+
+/// What other programs see live.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct LiveArgs {
+    /// Show all topics live in Foxglove, as they are recorded [default address: 127.0.0.1:8765]
+    ///
+    /// In Foxglove: open connection, `ws://localhost:8765`. From another machine: `ssh -L 8765:localhost:8765 RIG`. With an
+    /// address that is not of this machine alone, such as 0.0.0.0:8765, whoever reaches the port sees what the sensors see.
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = live_address, default_missing_value = "127.0.0.1:8765", hide_short_help = true)]
+    pub foxglove: Option<SocketAddr>,
+    /// Let Foxglove begin and end episodes, arm and disarm
+    ///
+    /// There is no password: every program and every user that reaches the port may do so, and so may web pages that are
+    /// open in a browser on this machine.
+    #[arg(long, requires = "foxglove", hide_short_help = true)]
+    pub foxglove_control: bool,
 }
 
 /// How the monitor is shown.
@@ -242,7 +263,7 @@ pub struct TaskArgs {
     #[arg(long, value_name = "N", default_value_t = 0, hide_short_help = true)]
     pub seed: u64,
     /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
-    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm"], hide_short_help = true)]
+    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm", "foxglove"], hide_short_help = true)]
     pub expert: bool,
     /// Demonstrations to record, one trial each
     #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert", hide_short_help = true)]
@@ -280,10 +301,12 @@ pub enum Command {
         out: PathBuf,
     },
     /// Write the udev rules and systemd unit derived from the registry
-    #[command(after_long_help = "Files: udev rules, one descriptor per entry, and a systemd unit.\n\nExamples:\n  \
+    #[command(
+        after_long_help = "Files: udev rules, one descriptor per entry, a systemd unit, and a layout for Foxglove.\n\nExamples:\n  \
         rapid artifacts                to read them first, in udev/\n  \
         sudo install -D -m 644 devices.toml /etc/rapid/devices.toml\n  \
-        sudo rapid --config /etc/rapid/devices.toml artifacts --install")]
+        sudo rapid --config /etc/rapid/devices.toml artifacts --install"
+    )]
     Artifacts {
         /// Install them below /etc and reload udev (needs root)
         #[arg(long, conflicts_with = "to")]
@@ -506,6 +529,15 @@ impl Cli {
         };
         Some(format!("--sim takes {name:?} for the name of a scenario file: {fix}"))
     }
+}
+
+/// An address to listen on: an IP address and a port, or one of them.
+fn live_address(text: &str) -> Result<SocketAddr, String> {
+    const PORT: u16 = 8765;
+    let address = text.parse().ok();
+    let address = address.or_else(|| Some(SocketAddr::new(text.parse::<IpAddr>().ok()?, PORT)));
+    let address = address.or_else(|| Some(SocketAddr::from(([127, 0, 0, 1], text.parse().ok()?))));
+    address.ok_or_else(|| "write an IP address and a port, such as 127.0.0.1:8765, or one of them".to_owned())
 }
 
 /// A key with more than one value.

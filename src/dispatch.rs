@@ -2,6 +2,8 @@
 //!
 //! Invariant: every error is printed here, once.
 
+#[cfg_attr(not(feature = "foxglove"), path = "dispatch/live_absent.rs")]
+mod live;
 #[cfg_attr(not(feature = "policy"), path = "dispatch/policy_absent.rs")]
 mod policy;
 
@@ -371,6 +373,7 @@ fn run(
         duration: args.duration,
         instance: global.instance.clone(),
         group_control: args.group_control,
+        live: live::options_of(args.live)?,
     };
     Ok(block_on(app::run(options))??)
 }

@@ -1,7 +1,7 @@
 #![doc = include_str!("../docs/architecture.md")]
 // The whole program is linted with all features; with fewer, code that only they use is unused.
 #![cfg_attr(
-    not(all(feature = "lan", feature = "motors", feature = "policy")),
+    not(all(feature = "foxglove", feature = "lan", feature = "motors", feature = "policy")),
     allow(dead_code, unused_imports, unused_variables, clippy::match_same_arms, clippy::needless_pass_by_value)
 )]
 
@@ -33,6 +33,8 @@ pub mod interlock;
 pub mod interlocks;
 #[cfg(feature = "lan")]
 pub mod link;
+#[cfg(feature = "foxglove")]
+pub mod live;
 #[cfg(feature = "policy")]
 pub mod lockstep;
 pub mod logging;

@@ -34,8 +34,10 @@ use crate::status::{Board, Level};
 use crate::text;
 use crate::time::realtime_ns;
 
-/// What is logged without `RAPID_LOG`. iceoryx2 warns of errors that it then handles.
-pub const DEFAULT: &str = "warn,rapid=info,iceoryx2=error";
+/// What is logged without `RAPID_LOG`. iceoryx2 warns of errors that it then handles; of the Foxglove server only what it
+/// drops is of interest, every half minute, and no client that has gone.
+pub const DEFAULT: &str =
+    "warn,rapid=info,iceoryx2=error,foxglove=off,foxglove::websocket::connected_client::send_lossy=info";
 /// Most characters of a line; longer ones are cut.
 pub const LONGEST: usize = 2000;
 

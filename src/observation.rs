@@ -57,6 +57,21 @@ impl ObservationSlot {
         self.handle = Some(handle);
     }
 
+    fn decode(bytes: &[u8; SLOT_BYTES]) -> Option<Self> {
+        let (words, numbers) = bytes.split_at_checked(8)?;
+        let ([bit, flags], [seq, age]) = (words.as_chunks().0, numbers.as_chunks().0) else { return None };
+        let (bit, flags) = (u32::from_le_bytes(*bit), u32::from_le_bytes(*flags));
+        Some(Self {
+            id: ModalityId::new(u8::try_from(bit).ok()?)?,
+            present: flags & PRESENT != 0,
+            valid: flags & VALID != 0,
+            stale: flags & STALE != 0,
+            age_ns: i64::from_le_bytes(*age),
+            seq: (flags & CHOSEN != 0).then_some(u64::from_le_bytes(*seq)),
+            handle: None,
+        })
+    }
+
     pub(crate) fn empty(id: ModalityId) -> Self {
         Self { id, present: false, valid: false, stale: false, age_ns: 0, seq: None, handle: None }
     }
@@ -101,6 +116,14 @@ impl Observation {
         }
     }
 
+    /// Reads the published form of the observation of `tick`; `None` if it is none.
+    pub fn decode(tick: Stamp, bytes: &[u8]) -> Option<Self> {
+        let (mask, slots) = bytes.split_first_chunk()?;
+        let (slots, []) = slots.as_chunks::<SLOT_BYTES>() else { return None };
+        let slots = slots.iter().map(ObservationSlot::decode).collect::<Option<_>>()?;
+        Some(Self { tick, mask: PhysicalMask(u64::from_le_bytes(*mask)), slots })
+    }
+
     /// The slot of a modality.
     pub fn slot(&self, id: ModalityId) -> Option<&ObservationSlot> {
         self.slots.iter().find(|slot| slot.id == id)
@@ -129,5 +152,14 @@ mod tests {
         let expected = [&0x21_u64.to_le_bytes()[..], &slot(0, 1 | 2 | 8, 7, -2), &slot(5, 1 | 4, 0, 0)].concat();
         assert_eq!(bytes, expected);
         assert_eq!(bytes.len(), HEAD_BYTES + 2 * SLOT_BYTES);
+
+        // The place in a ring is of the process that published it.
+        observation.tick = Stamp(100);
+        observation.slots[0].handle = None;
+        assert_eq!(Observation::decode(Stamp(100), &bytes), Some(observation));
+        assert_eq!(Observation::decode(Stamp(100), &bytes[..bytes.len() - 1]), None);
+        bytes[HEAD_BYTES] = 64;
+        assert_eq!(Observation::decode(Stamp(100), &bytes), None);
+        assert_eq!(Observation::decode(Stamp(100), b""), None);
     }
 }

@@ -55,7 +55,7 @@ const LAYERS: &[&[&str]] = &[
         "pixels",
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "inputs", "interlocks", "sync", "calibration"],
-    &["rig", "alignment", "record", "session", "policy", "registration"],
+    &["rig", "alignment", "record", "session", "policy", "registration", "live"],
     &["app", "lockstep", "compare", "plot", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
@@ -102,6 +102,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("crc32fast", &["episode"]),
     ("crossterm", &["tui"]),
     ("evdev", &["registry/parse", "inputs"]),
+    ("foxglove", &["live"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
     ("gpiocdev", &["gpio"]),
     ("gpiocdev_uapi", &["gpio"]),

@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use super::LAST_CHUNK;
 use crate::bus::BusError;
 use crate::hotplug::HotplugError;
+#[cfg(feature = "foxglove")]
+use crate::live::LiveError;
 use crate::logging::LoggingError;
 #[cfg(feature = "policy")]
 use crate::policy::{library::LibraryError, sampler::PolicyError};
@@ -38,6 +40,10 @@ pub enum AppError {
     /// The monitor.
     #[error(transparent)]
     Tui(#[from] TuiError),
+    /// The Foxglove server.
+    #[cfg(feature = "foxglove")]
+    #[error(transparent)]
+    Live(#[from] LiveError),
     /// The output of a headless run.
     #[error("output: {0}")]
     Output(io::Error),

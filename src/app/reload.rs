@@ -16,6 +16,7 @@ use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::spawn_blocking;
 
+use super::live::LiveAddition;
 use super::requests::Reply;
 use super::stage::Stage;
 use crate::bus::{BusError, Extension, Membership, Subscription};
@@ -41,6 +42,8 @@ pub(super) struct Reload {
     pub(super) rig: mpsc::Sender<RigCommand>,
     pub(super) recorder: std::sync::mpsc::Sender<RecorderAddition>,
     pub(super) alignment: mpsc::UnboundedSender<(Arc<DeviceSpec>, Subscription)>,
+    /// The Foxglove server, if there is one.
+    pub(super) live: Option<std::sync::mpsc::Sender<LiveAddition>>,
     /// Topics of added entries.
     pub(super) topics: Vec<Extension>,
 }
@@ -51,6 +54,7 @@ struct Opened {
     topic: Extension,
     recorder: Subscription,
     alignment: Subscription,
+    live: Option<Subscription>,
 }
 
 impl Reload {
@@ -110,8 +114,8 @@ impl Reload {
         if added.is_empty() {
             return Ok("no entry was added, and no other change needs a restart".to_owned());
         }
-        let bus = self.bus.clone();
-        let opened = blocking(move || open(&bus, added)).await?;
+        let (bus, is_live) = (self.bus.clone(), self.live.is_some());
+        let opened = blocking(move || open(&bus, added, is_live)).await?;
         let opened = opened.map_err(|error| format!("{error}; {UNCHANGED}"))?;
         let names: Vec<_> = opened
             .iter()
@@ -128,11 +132,14 @@ impl Reload {
     }
 
     async fn add(&mut self, opened: Opened, registry: &Arc<Registry>) -> Result<(), String> {
-        let Opened { device, topic, recorder, alignment } = opened;
+        let Opened { device, topic, recorder, alignment, live } = opened;
         self.board.add(&device);
         // A stage that is gone has ended with the run, or ends it.
         let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(registry), subscription: recorder });
         let _ = self.alignment.send((Arc::clone(&device), alignment));
+        if let Some((to_live, live)) = self.live.as_ref().zip(live) {
+            let _ = to_live.send((Arc::clone(&device), live));
+        }
         let writer = topic.writer();
         self.topics.push(topic);
         let addition = Addition { device, registry: Arc::clone(registry), writer };
@@ -169,11 +176,12 @@ fn changed(running: &Registry) -> Result<(Arc<Registry>, Vec<DeviceSpec>), Strin
 }
 
 /// Opens the topics of these entries, or none.
-fn open(bus: &Membership, added: Vec<DeviceSpec>) -> Result<Vec<Opened>, BusError> {
+fn open(bus: &Membership, added: Vec<DeviceSpec>, is_live: bool) -> Result<Vec<Opened>, BusError> {
     let open = |device: DeviceSpec| {
         let topic = bus.extend(&device)?;
         let (recorder, alignment) = (topic.subscribe()?, topic.subscribe()?);
-        Ok(Opened { device: Arc::new(device), topic, recorder, alignment })
+        let live = is_live.then(|| topic.subscribe()).transpose()?;
+        Ok(Opened { device: Arc::new(device), topic, recorder, alignment, live })
     };
     added.into_iter().map(open).collect()
 }

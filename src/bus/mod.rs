@@ -195,6 +195,17 @@ impl Bus {
         contained(|| Queues::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref())))?
     }
 
+    /// The observations from now on, which are in no [`Queues`] by themselves.
+    ///
+    /// # Errors
+    /// As [`Self::inbox`].
+    pub fn observations(&self) -> Result<Option<Subscription>, BusError> {
+        let mut topics = self.topics.iter().zip(&self.writers);
+        let topic = topics.find(|((spec, _), _)| spec.id == TopicId::Observation);
+        let Some(((spec, factory), (_, writer))) = topic else { return Ok(None) };
+        contained(|| Subscription::open(spec, factory, writer))?.map(Some)
+    }
+
     /// Actions for the actuator; `None` without an actuator in the registry.
     pub fn actions(&self) -> Option<Arc<Actions>> {
         self.actions.clone()

@@ -86,6 +86,7 @@ fn install_below(registry: &Registry, root: &Path, out: &mut dyn Write) -> Resul
             ArtifactKind::Rules => root.join("etc/udev/rules.d"),
             ArtifactKind::Unit => root.join("etc/systemd/system"),
             ArtifactKind::Descriptor => descriptors.clone(),
+            ArtifactKind::Layout => root.join("etc/rapid"),
         };
         folder.join(artifact.path.file_name().unwrap_or_default())
     };

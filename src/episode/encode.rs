@@ -11,7 +11,7 @@ use super::schema::SampleSchema;
 use crate::mask::PhysicalMask;
 use crate::observation::Observation;
 use crate::sample::{Encoding, SampleHeader};
-use crate::status::Level;
+use crate::status::{Event, Level, What};
 
 const VARINT: u8 = 0;
 const FIXED64: u8 = 1;
@@ -106,6 +106,39 @@ pub struct EventText<'a> {
     pub text: &'a str,
     /// All of it as JSON.
     pub json: &'a str,
+}
+
+/// What a `rapid.Event` holds of an announced event.
+#[derive(Debug)]
+pub struct Announced {
+    json: serde_json::Value,
+    text: String,
+    whole: String,
+}
+
+impl Announced {
+    /// Of this event.
+    ///
+    /// # Errors
+    /// When it has no form as JSON.
+    pub fn of(event: &Event) -> Result<Self, serde_json::Error> {
+        let json = serde_json::to_value(event)?;
+        Ok(Self { text: event.what.describe().sentence, whole: json.to_string(), json })
+    }
+
+    /// The fields of the message.
+    pub fn fields(&self) -> EventText<'_> {
+        let field = |name| self.json.get(name).and_then(serde_json::Value::as_str).unwrap_or_default();
+        EventText { kind: field("event"), device: field("device"), text: &self.text, json: &self.whole }
+    }
+}
+
+/// What of an event is a `foxglove.Log` as well.
+pub fn logged(event: &Event) -> Option<(Level, &str)> {
+    match &event.what {
+        What::Log { level, text } | What::Printed { level, text, .. } => Some((*level, text)),
+        _ => None,
+    }
 }
 
 /// Writes a `rapid.Event`.

@@ -5,6 +5,7 @@
 //!
 //! Invariant: no bytes cause a panic here, and memory holds one record of a file at a time.
 
+pub(crate) mod channel;
 mod chunk;
 pub(crate) mod chunk_writer;
 pub(crate) mod decode;

@@ -17,6 +17,7 @@ use mcap::records::MessageHeader;
 
 use super::guard::Guard;
 use crate::action::ACTION_TOPIC;
+use crate::episode::channel;
 use crate::episode::chunk_writer::{self, ChunkWriter, Sink, io_error};
 use crate::episode::encode::{self, EventText};
 use crate::episode::own::EpisodeId;
@@ -147,10 +148,7 @@ impl EpisodeFile {
         let log = add_channel(&mut writer, schema::LOG, LOG_TOPIC, &none)?;
         let action = match registry.actuator() {
             Some((device, action)) => {
-                let names = serde_json::json!(action.names).to_string();
-                let units = serde_json::json!(action.units).to_string();
-                let metadata = [("actuator", device.name.clone()), ("names", names), ("units", units)];
-                let metadata = metadata.map(|(key, value)| (key.to_owned(), value)).into();
+                let metadata = channel::of_action(device, action);
                 Some(add_channel(&mut writer, SampleSchema::Scalars.schema(), ACTION_TOPIC, &metadata)?)
             }
             None => None,
@@ -174,13 +172,7 @@ impl EpisodeFile {
             bytes: 0,
         };
         for device in &registry.devices {
-            let kind = serde_json::to_value(device.modality().kind).ok();
-            let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
-            let metadata = BTreeMap::from([
-                ("modality".to_owned(), device.name.clone()),
-                ("bit".to_owned(), device.id.to_string()),
-                ("kind".to_owned(), kind),
-            ]);
+            let metadata = channel::of_device(device);
             let (name, topic) = (device.name.clone(), device.topic.clone());
             // Grows to the largest sample: the maximum of the registry is usually far more.
             let (message, newest) = (Vec::new(), None);

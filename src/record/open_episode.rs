@@ -34,7 +34,7 @@ use super::streams::{Hole, MaskHistory};
 use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge};
 use super::writeback::Writeback;
 use crate::episode::chunk_writer::Sink;
-use crate::episode::encode::EventText;
+use crate::episode::encode::{Announced as Report, logged};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::{DeviceSpec, Registry};
@@ -227,15 +227,15 @@ impl OpenEpisode {
             return;
         }
         // An event that is not valid JSON is dropped; it is no reason to lose the episode.
-        let json = match serde_json::to_value(event) {
-            Ok(json) => json,
+        let report = match Report::of(event) {
+            Ok(report) => report,
             Err(error) => {
                 tracing::error!(%error, ?event, "an event is not recorded");
                 self.missing.events += 1;
                 return;
             }
         };
-        self.failed = self.write_event(event, &json).err();
+        self.failed = self.write_event(event, &report).err();
         self.events += 1;
         if let What::Attach { bit, .. } | What::Detach { bit, .. } = &event.what {
             self.measures.plugged(*bit, event.stamp.0, matches!(event.what, What::Attach { .. }));
@@ -421,13 +421,10 @@ impl OpenEpisode {
         self.next_tick += 1;
     }
 
-    fn write_event(&mut self, event: &Event, json: &serde_json::Value) -> io::Result<()> {
-        let field = |name| json.get(name).and_then(serde_json::Value::as_str).unwrap_or_default();
-        let text = event.what.describe().sentence;
-        let report = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
-        self.file.event(self.events, event.stamp, &report)?;
-        if let What::Log { level, text } | What::Printed { level, text, .. } = &event.what {
-            self.file.log(self.logs, event.stamp, *level, text)?;
+    fn write_event(&mut self, event: &Event, report: &Report) -> io::Result<()> {
+        self.file.event(self.events, event.stamp, &report.fields())?;
+        if let Some((level, text)) = logged(event) {
+            self.file.log(self.logs, event.stamp, level, text)?;
             self.logs += 1;
         }
         Ok(())

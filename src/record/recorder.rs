@@ -147,6 +147,7 @@ pub struct Recorder {
     additions: Sender<RecorderAddition>,
     ended: CancellationToken,
     episode: EpisodeWatch,
+    clock: watch::Receiver<WallClock>,
 }
 
 /// A modality that is added. An episode in progress keeps the modalities that it began with; the next one has it.
@@ -163,19 +164,20 @@ impl Recorder {
     ///
     /// # Errors
     /// When the system provides no thread.
-    pub fn spawn(source: impl Source + 'static, config: RecorderConfig) -> io::Result<Self> {
+    pub fn spawn(source: impl Source + 'static, mut config: RecorderConfig) -> io::Result<Self> {
         let (orders, inbox) = mpsc::channel();
         let (additions, added) = mpsc::channel();
         let events = config.board.events();
         let ended = CancellationToken::new();
         let (notify, episode) = watch::channel(None);
+        let (in_force, clock) = watch::channel((config.clock)());
         let guard = ended.clone().drop_guard();
         let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
-            Writer::new(config, inbox, added, events, notify).run(source);
+            Writer::new(config, inbox, added, events, notify, in_force).run(source);
         })?;
-        Ok(Self { orders: Some(orders), thread: Some(thread), additions, ended, episode })
+        Ok(Self { orders: Some(orders), thread: Some(thread), additions, ended, episode, clock })
     }
 
     /// Cancelled when the thread has ended: before the handle is dropped, by a panic.
@@ -191,6 +193,12 @@ impl Recorder {
     /// The episode in progress: from when its file is open until its last sample is written.
     pub fn episode(&self) -> EpisodeWatch {
         self.episode.clone()
+    }
+
+    /// The clock of the episode in progress, otherwise the present one. It changes before an episode begins: whoever
+    /// reads it after the capture of a sample of an episode has the clock of that episode.
+    pub fn clock(&self) -> watch::Receiver<WallClock> {
+        self.clock.clone()
     }
 
     /// Begins an episode; returns the name its file will have.
@@ -280,6 +288,8 @@ struct Writer {
     /// Room for the episode's file.
     space: Option<Space>,
     clock: ClockWatch,
+    /// Receives the clock of each episode.
+    in_force: watch::Sender<WallClock>,
     clock_looked: Stamp,
     waiting: Vec<Reply<EpisodeReport>>,
     flushed: Stamp,
@@ -291,13 +301,14 @@ struct Writer {
 
 impl Writer {
     fn new(
-        mut config: RecorderConfig,
+        config: RecorderConfig,
         inbox: Receiver<RecorderOrder>,
         added: Receiver<RecorderAddition>,
         events: broadcast::Receiver<Event>,
         episode: watch::Sender<Option<Arc<Episode>>>,
+        in_force: watch::Sender<WallClock>,
     ) -> Self {
-        let clock = ClockWatch::new((config.clock)());
+        let clock = ClockWatch::new(*in_force.borrow());
         Self {
             config,
             inbox,
@@ -310,6 +321,7 @@ impl Writer {
             episode,
             space: None,
             clock,
+            in_force,
             clock_looked: Stamp::default(),
             waiting: Vec::new(),
             flushed: Stamp::default(),
@@ -428,6 +440,8 @@ impl Writer {
             return Err(RecordError::Busy(open.name().to_owned()));
         }
         let clock = (self.config.clock)();
+        // Before the beginning: see `Recorder::clock`.
+        self.in_force.send_replace(clock);
         let begin = (self.config.begin)();
         let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
@@ -513,7 +527,11 @@ impl Writer {
             return;
         }
         self.clock_looked = now;
-        if let Some(step_ns) = self.clock.look((self.config.clock)()) {
+        let now = (self.config.clock)();
+        if let Some(step_ns) = self.clock.look(now) {
+            if self.open.is_none() {
+                self.in_force.send_replace(now);
+            }
             self.config.board.announce(What::ClockStep { seconds: step_ns as f64 / 1e9 });
         }
     }

@@ -1,10 +1,11 @@
-//! Files generated from the registry: udev rules, module descriptors, the systemd unit.
+//! Files generated from the registry: udev rules, module descriptors, the systemd unit, a layout for Foxglove.
 //!
 //! Pure: what to write, not where or how (`commands::artifacts` writes).
 //!
 //! Invariant: a serial number, which a device chose, can neither add a line to a file nor match
 //! more than itself; where a format cannot express it, a comment in the file states so.
 
+mod layout;
 mod rules;
 mod upload;
 
@@ -15,7 +16,7 @@ use std::path::PathBuf;
 use super::spec::{CanAdapter, CanProtocol, CanSpec, DeviceSpec, IdentitySpec, InputSpec, NodeSpec, Opens, Registry};
 use crate::modality::ModalityKind;
 
-/// First line of every generated file: a file that begins otherwise must not be removed.
+/// First line of every generated file but the layout, which is JSON: a file that begins otherwise must not be removed.
 pub const HEADER: &str = "# Written by `rapid artifacts` from devices.toml: change that file and run it again.";
 
 /// Folder of the descriptors among the artifacts.
@@ -43,6 +44,8 @@ pub enum ArtifactKind {
     Unit,
     /// Descriptor of one module.
     Descriptor,
+    /// Layout for the Foxglove app.
+    Layout,
 }
 
 /// Every file generated from `registry`.
@@ -53,6 +56,7 @@ pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
         artifact("rapid.service".into(), unit(registry), ArtifactKind::Unit),
         artifact("rapid-upload.service".into(), upload::service(), ArtifactKind::Unit),
         artifact("rapid-upload.timer".into(), upload::timer(), ArtifactKind::Unit),
+        artifact("foxglove.json".into(), layout::layout(registry), ArtifactKind::Layout),
     ];
     for device in &registry.devices {
         let path = PathBuf::from(DESCRIPTORS).join(format!("{}.yaml", device.name));

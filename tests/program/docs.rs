@@ -39,6 +39,10 @@ const NOT_RUN: &[(&str, &str)] = &[
     ("docs/benchmarks.md", "make bench                                  # everything, about 30 minutes"),
     ("docs/episodes.md", "sudo install -m 755 rapid /usr/local/bin/"),
     (
+        "docs/interfaces.md",
+        "rapid --foxglove                            # on the rig; then in Foxglove: open connection, ws://localhost:8765",
+    ),
+    (
         "docs/monitor.md",
         "rapid monitor                         # the monitor of a rapid that runs headless, as a service or in another terminal",
     ),

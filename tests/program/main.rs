@@ -16,6 +16,8 @@ mod buttons;
 mod calibrate;
 mod docs;
 mod ends;
+#[cfg(feature = "foxglove")]
+mod foxglove;
 mod hooks;
 mod hostile;
 mod infer;

@@ -89,6 +89,7 @@ impl Bench {
         };
         let running = Running {
             inference: None,
+            live: None,
             discovery: idle_stage(),
             recording: idle_stage(),
             synchronisation: idle_stage(),

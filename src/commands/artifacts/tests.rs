@@ -27,7 +27,7 @@ fn all_files_are_written_and_stale_ones_are_removed() {
     names.sort();
     assert_eq!(names, ["cam_wrist.yaml", "motor_state.yaml", "tactile_tip.yaml", "theirs.yaml"]);
     let listed = String::from_utf8(out).unwrap();
-    assert_eq!(listed.lines().count(), 8);
+    assert_eq!(listed.lines().count(), 9);
     assert!(listed.contains("gone.yaml: the entry no longer exists"), "{listed}");
 }
 
@@ -71,6 +71,7 @@ fn an_installation_puts_each_file_where_it_is_read() {
         "etc/systemd/system/rapid-upload.timer",
         "etc/rapid/descriptors/cam_wrist.yaml",
         "etc/rapid/descriptors/motor_state.yaml",
+        "etc/rapid/foxglove.json",
     ] {
         assert!(dir.path().join(path).is_file(), "{path}");
     }

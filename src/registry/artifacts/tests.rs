@@ -39,6 +39,54 @@ fn the_repository_contains_the_artifacts_of_devices_toml() {
     assert_eq!(found, expected);
 }
 
+/// The panels of a tree, in order.
+fn leaves(layout: &serde_json::Value) -> Vec<&str> {
+    match layout.as_str() {
+        Some(id) => vec![id],
+        None => ["first", "second"].iter().flat_map(|half| leaves(&layout[half])).collect(),
+    }
+}
+
+#[test]
+fn the_layout_shows_every_device_and_places_every_panel_once() {
+    let camera =
+        |bit: u8| format!("[device.cam_{bit}]\nvid = \"0001\"\npid = \"{bit:04}\"\nnode = \"camera\"\nbit = {bit}\n");
+    let many: String = (0..7).map(camera).collect();
+    let registries = [
+        Registry::builtin(),
+        Registry::task(),
+        Registry::parse(&many, None).unwrap().registry,
+        Registry::empty(Path::new("devices.toml")),
+    ];
+    for registry in &registries {
+        let layout: serde_json::Value = serde_json::from_str(&layout::layout(registry)).unwrap();
+        let panels = layout["configById"].as_object().unwrap();
+        let tabs = panels["Tab!presence"]["tabs"].as_array().unwrap();
+        let mut placed = leaves(&layout["layout"]);
+        placed.extend(tabs.iter().flat_map(|tab| leaves(&tab["layout"])));
+        assert_eq!(placed.iter().copied().collect::<BTreeSet<_>>(), panels.keys().map(String::as_str).collect());
+        assert_eq!(placed.len(), panels.len());
+        let text = layout.to_string();
+        for device in &registry.devices {
+            let present = format!("/rapid/observation.modalities[:]{{bit=={}}}.present", device.id.bit());
+            assert!(text.contains(&present), "{}", device.name);
+            match device.modality().kind {
+                ModalityKind::Image => {
+                    assert_eq!(panels[&format!("Image!{}", device.name)]["imageMode"]["imageTopic"], device.topic);
+                }
+                ModalityKind::Scalars => {
+                    let paths = panels[&format!("Plot!{}", device.name)]["paths"].as_array().unwrap();
+                    assert_eq!(paths[0]["value"], format!("{}.values[0]", device.topic));
+                    assert_eq!(paths.len(), usize::try_from(device.modality().shape[0].min(16)).unwrap());
+                }
+                ModalityKind::Bytes => {}
+            }
+        }
+        assert_eq!(panels.contains_key("Plot!action"), registry.actuator().is_some());
+    }
+    assert_eq!((layout::FRAME_TOPIC, layout::LOG_TOPIC), (crate::episode::FRAME_TOPIC, crate::episode::LOG_TOPIC));
+}
+
 #[test]
 fn a_unit_is_matched_by_serial_by_port_or_as_the_only_one_of_its_model() {
     let text = r#"

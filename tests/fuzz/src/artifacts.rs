@@ -33,7 +33,18 @@ pub(crate) fn check(registry: &Registry) {
                 assert_eq!(unit_without_names(text), expected, "the unit differs in more than its name")
             }
             ArtifactKind::Descriptor => check_descriptor(registry, &artifact.path, text),
+            ArtifactKind::Layout => check_layout(registry, text),
         }
+    }
+}
+
+/// The layout is JSON, and has the topic of every camera.
+fn check_layout(registry: &Registry, text: &str) {
+    let layout: serde_json::Value = serde_json::from_str(text).expect("JSON");
+    let text = layout["configById"].to_string();
+    for device in registry.devices.iter().filter(|device| device.modality().kind == ModalityKind::Image) {
+        let topic = serde_json::Value::from(device.topic.as_str()).to_string();
+        assert!(text.contains(topic.trim_matches('"')), "{}: not in the layout", device.name);
     }
 }
 

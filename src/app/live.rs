@@ -1,0 +1,66 @@
+//! Stage Foxglove: thread `foxglove`, which serves the topics of the run over a websocket ([`crate::live`]).
+//!
+//! Invariant: no recording ends because of it: its failure is an error of the log.
+
+use std::sync::{Arc, mpsc};
+
+use tokio::sync::mpsc::UnboundedSender;
+
+pub(super) use crate::live::LiveAddition;
+pub use crate::live::LiveOptions;
+
+use super::AppError;
+use super::requests::Request;
+use super::stage::Stage;
+use crate::bus::Bus;
+use crate::live::{Controls, Feed, Live};
+use crate::permission::Permission;
+use crate::registry::Registry;
+use crate::status::Board;
+use crate::time::{Stamp, WallClock};
+
+/// Listens, before anything of the run is started: a port in use is an error of the start.
+pub(super) async fn listen(
+    options: LiveOptions,
+    registry: &Arc<Registry>,
+    board: &Arc<Board>,
+    permission: &Arc<Permission>,
+    conductor: &UnboundedSender<Request>,
+) -> Result<Listening, AppError> {
+    let conductor = conductor.clone();
+    let controls = options.control.then(|| Controls {
+        ask: Arc::new(move |request, reply| {
+            // Without a receiver the run is ending; so is then the other end of the answer.
+            let _ = conductor.send(Request::Session(request, Stamp::now(), Some(reply)));
+        }),
+        permission: Arc::clone(permission),
+    });
+    Ok(Listening(Live::listen(options, Arc::clone(registry), Arc::clone(board), controls).await?))
+}
+
+/// A server that shows nothing yet.
+#[derive(Debug)]
+pub(super) struct Listening(Live);
+
+impl Listening {
+    /// Shows the topics of the bus, and starts the stage. Entries that are added go to the sender.
+    pub(super) fn start(
+        self,
+        bus: &Bus,
+        board: &Board,
+        clock: tokio::sync::watch::Receiver<WallClock>,
+    ) -> Result<(Stage, mpsc::Sender<LiveAddition>), AppError> {
+        let Self(mut live) = self;
+        let mut queues = bus.queues()?;
+        if let Some(observations) = bus.observations()? {
+            queues.add(observations);
+        }
+        let (added, additions) = mpsc::channel();
+        live.feed(Feed { queues, events: board.events(), clock, additions });
+        let stage = Stage::start("the Foxglove server", |stop| async move {
+            live.run(stop).await;
+            Ok(())
+        });
+        Ok((stage, added))
+    }
+}

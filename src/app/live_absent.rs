@@ -1,0 +1,50 @@
+//! Stage Foxglove of a program that was built without cargo feature `foxglove`: there is nothing to start.
+
+use std::sync::{Arc, mpsc};
+
+use tokio::sync::mpsc::UnboundedSender;
+use tokio::sync::watch;
+
+use super::AppError;
+use super::requests::Request;
+use super::stage::Stage;
+use crate::bus::{Bus, Subscription};
+use crate::permission::Permission;
+use crate::registry::{DeviceSpec, Registry};
+use crate::status::Board;
+use crate::time::WallClock;
+
+/// No server can be requested.
+#[derive(Debug, Clone, Copy)]
+pub enum LiveOptions {}
+
+/// An entry that was added during the run, and its samples.
+pub type LiveAddition = (Arc<DeviceSpec>, Subscription);
+
+/// Listens on nothing.
+#[expect(clippy::unused_async, reason = "as with the feature")]
+pub(super) async fn listen(
+    options: LiveOptions,
+    _: &Arc<Registry>,
+    _: &Arc<Board>,
+    _: &Arc<Permission>,
+    _: &UnboundedSender<Request>,
+) -> Result<Listening, AppError> {
+    match options {}
+}
+
+/// There is none.
+#[derive(Debug)]
+pub(super) enum Listening {}
+
+impl Listening {
+    /// Starts nothing.
+    pub(super) fn start(
+        self,
+        _: &Bus,
+        _: &Board,
+        _: watch::Receiver<WallClock>,
+    ) -> Result<(Stage, mpsc::Sender<LiveAddition>), AppError> {
+        match self {}
+    }
+}

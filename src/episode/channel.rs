@@ -1,0 +1,19 @@
+//! Metadata of channels: what a reader needs to know of a topic besides its schema.
+
+use std::collections::BTreeMap;
+
+use super::text_map;
+use crate::registry::{ActionSpec, DeviceSpec};
+
+/// Of the topic of a device.
+pub(crate) fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {
+    let kind = serde_json::to_value(device.modality().kind).ok();
+    let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
+    text_map([("modality", device.name.clone()), ("bit", device.id.to_string()), ("kind", kind)])
+}
+
+/// Of the topic of actions, which move `device`.
+pub(crate) fn of_action(device: &DeviceSpec, action: &ActionSpec) -> BTreeMap<String, String> {
+    let (names, units) = (serde_json::json!(action.names), serde_json::json!(action.units));
+    text_map([("actuator", device.name.clone()), ("names", names.to_string()), ("units", units.to_string())])
+}

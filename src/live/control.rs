@@ -1,0 +1,166 @@
+//! Services by which a client begins and ends episodes, and arms and disarms, and parameters: task and tags.
+//!
+//! Invariant: there are none unless the user allowed them: the protocol has no password, and web pages of a browser on
+//! this machine reach a loopback address too.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use foxglove::Schema;
+use foxglove::websocket::service::{Service, ServiceSchema};
+use foxglove::websocket::{
+    AnyClient, GetParametersResponder, Parameter, ParameterHandler, ParameterValue, SetParametersResponder,
+};
+use tokio::sync::oneshot;
+
+use crate::permission::Permission;
+use crate::status::session::SessionRequest;
+use crate::time::Stamp;
+
+/// Passes a request to the session on; the answer is what was done, or why it was refused.
+pub type Asker = Arc<dyn Fn(SessionRequest, oneshot::Sender<Result<String, String>>) + Send + Sync>;
+
+/// What clients may request.
+#[derive(Clone)]
+pub struct Controls {
+    /// The session.
+    pub ask: Asker,
+    /// The actuator.
+    pub permission: Arc<Permission>,
+}
+
+impl std::fmt::Debug for Controls {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Controls").finish_non_exhaustive()
+    }
+}
+
+/// A service.
+#[derive(Debug, Clone, Copy)]
+enum Control {
+    Start,
+    Stop,
+    Arm,
+    Disarm,
+}
+
+impl Control {
+    const ALL: [(Self, &'static str); 4] = [
+        (Self::Start, "/rapid/start"),
+        (Self::Stop, "/rapid/stop"),
+        (Self::Arm, "/rapid/arm"),
+        (Self::Disarm, "/rapid/disarm"),
+    ];
+}
+
+/// JSON Schema of a request, which has no fields, and of an answer.
+const REQUEST: &str = r#"{"type":"object","properties":{}}"#;
+const ANSWER: &str = r#"{"type":"object","properties":{"text":{"type":"string"}}}"#;
+
+impl Controls {
+    /// The services.
+    pub(super) fn services(&self) -> Vec<Service> {
+        let service = |(control, name): (Control, &'static str)| {
+            let schema = |name, text: &'static str| Schema::new(name, "jsonschema", text.as_bytes());
+            let described = ServiceSchema::new("rapid.Control")
+                .with_request("json", schema("rapid.ControlRequest", REQUEST))
+                .with_response("json", schema("rapid.ControlAnswer", ANSWER));
+            let controls = self.clone();
+            Service::builder(name, described).async_handler_fn(move |_| {
+                let controls = controls.clone();
+                async move {
+                    let answer = controls.carry_out(control).await;
+                    let (Ok(text) | Err(text)) = &answer;
+                    tracing::info!("Foxglove: a client called {name}: {text}");
+                    answer.map(|text| serde_json::json!({ "text": text }).to_string())
+                }
+            })
+        };
+        Control::ALL.into_iter().map(service).collect()
+    }
+
+    async fn carry_out(&self, control: Control) -> Result<String, String> {
+        let now = Stamp::now();
+        match control {
+            Control::Start => self.request(SessionRequest::Start).await,
+            Control::Stop => self.request(SessionRequest::Stop).await,
+            Control::Arm => {
+                let armed = self.permission.arm(now, Stamp::now());
+                armed.map(|()| "armed".to_owned()).map_err(|void| void.to_string())
+            }
+            Control::Disarm => {
+                let is_plugged_in = self.permission.disarm(now);
+                Ok(if is_plugged_in { "disarmed" } else { "disarmed; no actuator is plugged in" }.to_owned())
+            }
+        }
+    }
+
+    async fn request(&self, request: SessionRequest) -> Result<String, String> {
+        let (reply, answer) = oneshot::channel();
+        (self.ask)(request, reply);
+        answer.await.unwrap_or_else(|_| Err("the run is ending".to_owned()))
+    }
+
+    /// The parameters of these names, or all if none is named; none while the run ends.
+    async fn parameters(&self, names: &[String]) -> Vec<Parameter> {
+        let shown = self.request(SessionRequest::Show).await.unwrap_or_default();
+        let session = serde_json::from_str::<Session>(&shown).unwrap_or_default();
+        let tags = session.tags.into_iter().map(|(key, value)| (key, ParameterValue::String(value))).collect();
+        let all = [(TASK, ParameterValue::String(session.task)), (TAGS, ParameterValue::Dict(tags))];
+        let wanted = all.into_iter().filter(|(name, _)| names.is_empty() || names.iter().any(|other| other == name));
+        wanted.map(|(name, value)| Parameter { name: name.to_owned(), r#type: None, value: Some(value) }).collect()
+    }
+
+    /// Changes what the next episodes are of. What is no task and no tag changes nothing.
+    async fn change(&self, parameters: Vec<Parameter>) {
+        let Some(plan) = plan(parameters) else { return };
+        let (Ok(text) | Err(text)) = self.request(plan).await;
+        tracing::info!("Foxglove: a client set parameters: {text}");
+    }
+}
+
+/// Names of parameters.
+const TASK: &str = "task";
+const TAGS: &str = "tags";
+
+/// What is read of the session.
+#[derive(serde::Deserialize, Default)]
+struct Session {
+    task: String,
+    tags: Vec<(String, String)>,
+}
+
+/// What these parameters request; `None` if nothing. A tag with an empty text is removed.
+fn plan(parameters: Vec<Parameter>) -> Option<SessionRequest> {
+    let (mut task, mut tags) = (None, Vec::new());
+    for Parameter { name, value, .. } in parameters {
+        match (name.as_str(), value) {
+            (TASK, Some(ParameterValue::String(text))) => task = Some(text),
+            (TAGS, Some(ParameterValue::Dict(dict))) => tags.extend(texts(dict)),
+            _ => {}
+        }
+    }
+    (task.is_some() || !tags.is_empty()).then_some(SessionRequest::Plan { task, tags, goal: None })
+}
+
+fn texts(dict: BTreeMap<String, ParameterValue>) -> impl Iterator<Item = (String, String)> {
+    let text = |(key, value)| if let ParameterValue::String(text) = value { Some((key, text)) } else { None };
+    dict.into_iter().filter_map(text)
+}
+
+impl ParameterHandler for Controls {
+    fn get(&self, _: AnyClient, names: Vec<String>, _: Option<String>, responder: GetParametersResponder) {
+        let controls = self.clone();
+        tokio::spawn(async move { responder.respond(controls.parameters(&names).await) });
+    }
+
+    fn set(&self, _: AnyClient, parameters: Vec<Parameter>, _: Option<String>, responder: SetParametersResponder) {
+        let controls = self.clone();
+        tokio::spawn(async move {
+            let names: Vec<_> = parameters.iter().map(|parameter| parameter.name.clone()).collect();
+            controls.change(parameters).await;
+            // As they are now, whether they were changed or not.
+            responder.respond(controls.parameters(&names).await);
+        });
+    }
+}

@@ -1,0 +1,355 @@
+//! Foxglove: the topics of a running rig over a websocket, as they are recorded.
+//!
+//! Thread `foxglove` has everything: a subscriber of the bus of its own, the server with its connections, and the
+//! encoder, which is that of the recorder ([`crate::episode::encode`]). Messages and times are those of the episode in
+//! progress, byte for byte: the clock comes from the recorder.
+//!
+//! The protocol is `foxglove.sdk.v1` (<https://github.com/foxglove/ws-protocol>), by the crate `foxglove`.
+//!
+//! Invariant: nothing else waits for this thread: a client that reads slowly, or not at all, loses the oldest of what
+//! waits for it, and holds no more than [`QUEUE_BYTES`].
+//! Invariant: nothing is encoded for a topic to which no client subscribes.
+//! Invariant: whatever ends the thread, the run continues.
+
+mod control;
+mod pictures;
+mod topics;
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Weak, mpsc};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use foxglove::websocket::{ChannelView, Client, ServerListener, Status};
+use foxglove::{Context, FoxgloveError, WebSocketServerHandle};
+use tokio::sync::broadcast::{self, error::TryRecvError};
+use tokio::sync::{oneshot, watch};
+use tokio::time::{sleep, timeout};
+use tokio_util::sync::CancellationToken;
+
+pub use control::{Asker, Controls};
+use topics::Topics;
+
+use crate::bus::{BusError, Queues, Subscription};
+use crate::fault;
+use crate::registry::{DeviceSpec, Registry};
+use crate::status::{Board, Event, Level, What};
+use crate::time::{Stamp, WallClock};
+
+/// Port of a Foxglove server, if none is named.
+const PORT: u16 = 8765;
+
+/// What waits for one client, at most, as far as [`LEAST_QUEUED`] allows it.
+const QUEUE_BYTES: usize = 128 << 20;
+/// Messages that may wait for one client: at least and at most.
+const LEAST_QUEUED: usize = 64;
+const MOST_QUEUED: usize = 1024;
+/// Clients that may subscribe at a time: they hold memory.
+const CLIENTS: usize = 8;
+/// Time between two looks at the bus, with clients and without.
+const TURN: Duration = Duration::from_millis(5);
+const IDLE_TURN: Duration = Duration::from_millis(50);
+/// A client gets the end of the connection within this time, or it is closed.
+const LAST: Duration = Duration::from_millis(500);
+/// Shortest time between two lines of the log about what was left out.
+const REPORT_EVERY: Duration = Duration::from_secs(5);
+/// Niceness: everything else on the machine comes first.
+const NICE: i32 = 10;
+
+/// Where the server listens, and what clients may request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LiveOptions {
+    /// Its address; with port 0 a free one is chosen.
+    pub address: SocketAddr,
+    /// Clients may begin and end episodes, and arm and disarm.
+    pub control: bool,
+}
+
+/// Why there is no server.
+#[derive(Debug, thiserror::Error)]
+pub enum LiveError {
+    /// The address cannot be listened on.
+    #[error("--foxglove {address}: {source}{}", fix(source))]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// The error of the system.
+        source: io::Error,
+    },
+    /// The server did not start for another reason.
+    #[error("--foxglove: {0}")]
+    Server(#[from] FoxgloveError),
+    /// The system provides no thread, or no runtime.
+    #[error("--foxglove: {0}")]
+    System(#[from] io::Error),
+    /// Its subscriber of the bus.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// The thread ended while it started.
+    #[error("--foxglove: thread `foxglove` panicked; please report this")]
+    Panicked,
+}
+
+fn fix(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::AddrInUse => {
+            ": another program listens there, perhaps another rapid; end it, or name another port: \
+             --foxglove 127.0.0.1:8766"
+        }
+        io::ErrorKind::AddrNotAvailable => ": this machine has no such address; `ip address` lists those that it has",
+        io::ErrorKind::PermissionDenied => ": ports below 1024 are for root; name another",
+        _ => "",
+    }
+}
+
+/// An entry that was added during the run, and its samples.
+pub type LiveAddition = (Arc<DeviceSpec>, Subscription);
+
+/// What the server shows.
+#[derive(Debug)]
+pub struct Feed {
+    /// Samples of every topic.
+    pub queues: Queues,
+    /// Events from now on.
+    pub events: broadcast::Receiver<Event>,
+    /// The clock of the episode in progress.
+    pub clock: watch::Receiver<WallClock>,
+    /// Entries that are added.
+    pub additions: mpsc::Receiver<LiveAddition>,
+}
+
+/// A server that listens, and its thread.
+#[derive(Debug)]
+pub struct Live {
+    feed: Option<oneshot::Sender<Feed>>,
+    thread: Option<JoinHandle<()>>,
+    stop: CancellationToken,
+    ended: CancellationToken,
+    board: Arc<Board>,
+    /// Its address is the one that is listened on.
+    options: LiveOptions,
+}
+
+impl Live {
+    /// Listens for clients. They get the topics of `registry`, and samples from [`Self::feed`] on. With `controls` they
+    /// may request something.
+    ///
+    /// # Errors
+    /// When the address is in use or none of this machine, or the system provides no thread.
+    pub async fn listen(
+        options: LiveOptions,
+        registry: Arc<Registry>,
+        board: Arc<Board>,
+        controls: Option<Controls>,
+    ) -> Result<Self, LiveError> {
+        let (stop, ended) = (CancellationToken::new(), CancellationToken::new());
+        let (feed, first_feed) = oneshot::channel();
+        let (listening, listens) = oneshot::channel();
+        let (stopped, guard) = (stop.clone(), ended.clone().drop_guard());
+        let thread = std::thread::Builder::new().name("foxglove".to_owned()).spawn(move || {
+            // Dropped by a panic too.
+            let _guard = guard;
+            // Only less of the processor is a change that no system refuses.
+            let _ = rustix::process::setpriority_process(None, NICE);
+            let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
+                Ok(runtime) => runtime,
+                Err(error) => return drop(listening.send(Err(error.into()))),
+            };
+            runtime.block_on(async {
+                match Server::start(options, &registry, controls).await {
+                    Ok((server, address)) => {
+                        // Without a receiver the run has ended.
+                        let _ = listening.send(Ok(address));
+                        server.serve(first_feed, stopped).await;
+                    }
+                    Err(error) => drop(listening.send(Err(error))),
+                }
+            });
+            // A client that does not read must not hold up the end.
+            runtime.shutdown_background();
+        })?;
+        let mut live = Self { feed: Some(feed), thread: Some(thread), stop, ended, board, options };
+        live.options.address = listens.await.unwrap_or(Err(LiveError::Panicked))?;
+        Ok(live)
+    }
+
+    fn announce(&self) {
+        let LiveOptions { address, control } = self.options;
+        let text = format!("Foxglove: open connection ws://{address}");
+        self.board.announce(What::Log { level: Level::Info, text });
+        if !address.ip().is_loopback() {
+            let moves = if control { ", begins and ends episodes, and arms motors" } else { "" };
+            let text = format!(
+                "Foxglove: {address} is not of this machine alone: whoever reaches that port sees what the sensors \
+                 see{moves}; there is no password. `ssh -L {PORT}:localhost:{PORT}` needs no such address"
+            );
+            self.board.announce(What::Log { level: Level::Warn, text });
+        }
+    }
+
+    /// Shows this from now on, and announces it.
+    pub fn feed(&mut self, feed: Feed) {
+        if let Some(fed) = self.feed.take() {
+            // The thread has panicked: that is reported by `run`.
+            let _ = fed.send(feed);
+        }
+        self.announce();
+    }
+
+    /// Runs until `stop`; then the subscriber of the bus is closed.
+    pub async fn run(mut self, stop: CancellationToken) {
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = self.ended.cancelled() => {
+                let text = "Foxglove: its thread panicked; the run continues without it. Please report this".to_owned();
+                self.board.announce(What::Log { level: Level::Error, text });
+            }
+        }
+        self.stop.cancel();
+        if let Some(thread) = self.thread.take() {
+            // A panic is reported above.
+            let _ = tokio::task::spawn_blocking(move || thread.join()).await;
+        }
+        stop.cancelled().await;
+    }
+}
+
+impl Drop for Live {
+    /// The subscriber of the bus must not outlive the bus.
+    fn drop(&mut self) {
+        self.stop.cancel();
+        self.feed = None;
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The work of the thread.
+struct Server {
+    handle: WebSocketServerHandle,
+    topics: Topics,
+    reported: Stamp,
+}
+
+impl Server {
+    async fn start(
+        options: LiveOptions,
+        registry: &Registry,
+        controls: Option<Controls>,
+    ) -> Result<(Self, SocketAddr), LiveError> {
+        let LiveOptions { address, .. } = options;
+        let context = Context::new();
+        let topics = Topics::advertise(&context, registry);
+        let audience = Audience { context: Arc::downgrade(&context), clients: AtomicUsize::new(0) };
+        let mut server = context
+            .websocket_server()
+            .name(format!("rapid {}", registry.rig.name))
+            .bind(address.ip().to_string(), address.port())
+            .message_backlog_size(queued(registry))
+            .listener(Arc::new(audience));
+        if let Some(controls) = controls {
+            server = server.services(controls.services()).supported_encodings(["json"]);
+            server = server.parameter_handler(Arc::new(controls));
+        }
+        let handle = server.start().await.map_err(|error| match error {
+            FoxgloveError::Bind(source) => LiveError::Listen { address, source },
+            other => other.into(),
+        })?;
+        let address = SocketAddr::new(address.ip(), handle.port());
+        Ok((Self { handle, topics, reported: Stamp::now() }, address))
+    }
+
+    /// Serves until `stop`, or until there will be nothing to serve.
+    async fn serve(mut self, feed: oneshot::Receiver<Feed>, stop: CancellationToken) {
+        let served = async {
+            let Ok(mut feed) = feed.await else { return };
+            loop {
+                let is_idle = self.handle.client_count() == 0;
+                sleep(if is_idle { IDLE_TURN } else { TURN }).await;
+                self.turn(&mut feed);
+            }
+        };
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = served => {}
+        }
+        let _ = timeout(LAST, self.handle.stop().wait()).await;
+    }
+
+    fn turn(&mut self, feed: &mut Feed) {
+        fault::point("foxglove");
+        let Self { topics, .. } = self;
+        while let Ok((device, subscription)) = feed.additions.try_recv() {
+            feed.queues.add(subscription);
+            topics.add(&device);
+        }
+        let Feed { queues, events, clock, .. } = feed;
+        // After the capture of whatever is taken below: an episode's clock is in force before it begins.
+        let drained = queues.drain(&mut |topic, header, payload| {
+            topics.take(topic, header, payload, *clock.borrow());
+        });
+        topics.send_pictures();
+        loop {
+            match events.try_recv() {
+                Ok(event) => topics.event(&event, *clock.borrow()),
+                Err(TryRecvError::Lagged(count)) => topics.missed(count),
+                Err(TryRecvError::Empty | TryRecvError::Closed) => break,
+            }
+        }
+        self.report(drained.err());
+    }
+
+    /// Reports what was left out, now and then.
+    fn report(&mut self, error: Option<BusError>) {
+        let now = Stamp::now();
+        if now.since(self.reported) < REPORT_EVERY {
+            return;
+        }
+        self.reported = now;
+        let left_out = self.topics.left_out();
+        if let Some(left_out) = left_out {
+            tracing::info!("Foxglove: {left_out}");
+        }
+        if let Some(error) = error {
+            tracing::warn!(%error, "Foxglove: the bus cannot be read");
+        }
+    }
+}
+
+/// Messages that may wait for one client.
+fn queued(registry: &Registry) -> usize {
+    let largest = registry.devices.iter().map(|device| device.max_bytes).max().unwrap_or_default();
+    (QUEUE_BYTES / largest.max(1)).clamp(LEAST_QUEUED, MOST_QUEUED)
+}
+
+/// Counts the clients, and refuses the subscriptions of too many.
+struct Audience {
+    context: Weak<Context>,
+    clients: AtomicUsize,
+}
+
+impl ServerListener for Audience {
+    fn on_subscribe(&self, client: Client, channel: ChannelView) {
+        if self.clients.load(Ordering::Relaxed) <= CLIENTS {
+            return;
+        }
+        if let (Some(context), Some(sink)) = (self.context.upgrade(), client.sink_id()) {
+            context.unsubscribe_channels(sink, &[channel.id()]);
+        }
+        client
+            .send_status(Status::error(format!("rapid serves {CLIENTS} clients at a time: close one, and try again")));
+    }
+
+    fn on_client_connect(&self) {
+        let clients = self.clients.fetch_add(1, Ordering::Relaxed) + 1;
+        tracing::info!("Foxglove: a client has connected, {clients} now");
+    }
+
+    fn on_client_disconnect(&self) {
+        let clients = self.clients.fetch_sub(1, Ordering::Relaxed).saturating_sub(1);
+        tracing::info!("Foxglove: a client has disconnected, {clients} now");
+    }
+}

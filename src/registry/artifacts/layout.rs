@@ -1,0 +1,131 @@
+//! `foxglove.json`: a layout for the Foxglove app, with the pictures, the mask, the numbers and the log of the rig.
+//!
+//! It has the form in which the app exports and imports layouts: the settings of each panel by its id, `KIND!NAME`, and a
+//! binary tree of panels. Expressions are message paths
+//! (<https://docs.foxglove.dev/docs/visualization/message-path-syntax>).
+//!
+//! Invariant: a live connection and a recorded file are shown by the same layout: presence, whose topics differ, has a
+//! tab for each.
+
+use serde_json::{Map, Value, json};
+
+use crate::action::ACTION_TOPIC;
+use crate::mask::MASK_TOPIC;
+use crate::modality::ModalityKind;
+use crate::observation::OBSERVATION_TOPIC;
+use crate::registry::{DeviceSpec, Registry};
+
+/// Topics that only files have, and their readers know.
+pub(super) const FRAME_TOPIC: &str = "/rapid/frame";
+pub(super) const LOG_TOPIC: &str = "/rapid/log";
+
+/// Numbers of a device that are plotted.
+const MOST_PLOTTED: u32 = 16;
+
+/// The text of the file.
+pub(super) fn layout(registry: &Registry) -> String {
+    let mut panels = Panels::default();
+    let of = |kind| registry.devices.iter().filter(move |device| device.modality().kind == kind);
+    let pictures: Vec<_> = of(ModalityKind::Image).map(|device| panels.picture(device)).collect();
+    let mut plots: Vec<_> = of(ModalityKind::Scalars).map(|device| panels.numbers(device)).collect();
+    if let Some((_, action)) = registry.actuator() {
+        let names: Vec<_> = action.names.iter().map(String::as_str).collect();
+        plots.push(panels.plot("action", ACTION_TOPIC, &names));
+    }
+    let tabs = [("Live", OBSERVATION_TOPIC), ("Recorded", FRAME_TOPIC)]
+        .map(|(title, topic)| json!({ "title": title, "layout": panels.presence(registry, title, topic) }));
+    let presence = panels.add("Tab", "presence", json!({ "activeTabIdx": 0, "tabs": tabs }));
+    let log = json!({ "searchTerms": [], "minLogLevel": 1, "topicToRender": LOG_TOPIC });
+    let log = panels.add("RosOut", "log", log);
+    let left = [(tree(&pictures, "row"), 75), (Some(log), 25)];
+    let right = [(Some(presence), 40), (tree(&plots, "column"), 60)];
+    let halves = [(beside(left, "column"), 60), (beside(right, "column"), 40)];
+    let whole = json!({
+        "configById": panels.0,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": { "speed": 1 },
+        "layout": beside(halves, "row"),
+    });
+    // A value of texts and numbers always has a form as JSON.
+    serde_json::to_string_pretty(&whole).unwrap_or_default() + "\n"
+}
+
+/// Settings by id.
+#[derive(Default)]
+struct Panels(Map<String, Value>);
+
+impl Panels {
+    /// Returns the id.
+    fn add(&mut self, kind: &str, name: &str, settings: Value) -> Value {
+        let id = format!("{kind}!{name}");
+        self.0.insert(id.clone(), settings);
+        Value::from(id)
+    }
+
+    fn picture(&mut self, device: &DeviceSpec) -> Value {
+        let settings = json!({ "foxglovePanelTitle": device.name, "imageMode": { "imageTopic": device.topic } });
+        self.add("Image", &device.name, settings)
+    }
+
+    fn numbers(&mut self, device: &DeviceSpec) -> Value {
+        let count = device.modality().shape.first().copied().unwrap_or_default().min(MOST_PLOTTED);
+        let names: Vec<_> = (0..count).map(|index| index.to_string()).collect();
+        self.plot(&device.name, &device.topic, &names.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+
+    /// `names`: of the numbers in a message of `topic`.
+    fn plot(&mut self, name: &str, topic: &str, names: &[&str]) -> Value {
+        let series = |(index, label): (usize, &&str)| {
+            let value = format!("{topic}.values[{index}]");
+            json!({ "value": value, "label": label, "enabled": true, "timestampMethod": "receiveTime" })
+        };
+        let paths: Vec<_> = names.iter().enumerate().map(series).collect();
+        let settings = json!({
+            "foxglovePanelTitle": name,
+            "paths": paths,
+            "showLegend": true,
+            "legendDisplay": "floating",
+            "isSynced": true,
+            "xAxisVal": "timestamp",
+        });
+        self.add("Plot", name, settings)
+    }
+
+    /// The mask, and which sensors a tick has.
+    fn presence(&mut self, registry: &Registry, title: &str, topic: &str) -> Value {
+        let state =
+            |value: String, label: &str| json!({ "value": value, "label": label, "timestampMethod": "receiveTime" });
+        let mask = state(format!("{MASK_TOPIC}.mask"), "mask");
+        let sensors = registry.devices.iter().map(|device| {
+            let value = format!("{topic}.modalities[:]{{bit=={}}}.present", device.id.bit());
+            state(value, &device.name)
+        });
+        let paths: Vec<_> = [mask].into_iter().chain(sensors).collect();
+        self.add("StateTransitions", title, json!({ "paths": paths, "isSynced": true, "showPoints": false }))
+    }
+}
+
+/// Panels of equal size, split in `direction` and then in the other; `None` without any.
+fn tree(panels: &[Value], direction: &str) -> Option<Value> {
+    match panels {
+        [] => None,
+        [one] => Some(one.clone()),
+        several => {
+            let (first, second) = several.split_at(several.len().div_ceil(2));
+            let across = if direction == "row" { "column" } else { "row" };
+            beside([(tree(first, across), first.len()), (tree(second, across), second.len())], direction)
+        }
+    }
+}
+
+/// Two parts with their shares of the space, or the one that there is.
+fn beside(parts: [(Option<Value>, usize); 2], direction: &str) -> Option<Value> {
+    match parts {
+        [(Some(first), one), (Some(second), other)] => {
+            let share = 100 * one / (one + other).max(1);
+            Some(json!({ "first": first, "second": second, "direction": direction, "splitPercentage": share }))
+        }
+        [(first, _), (second, _)] => first.or(second),
+    }
+}

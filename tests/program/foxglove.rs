@@ -1,0 +1,444 @@
+//! `rapid --foxglove`: a client that shares no code with the server gets the bytes that are recorded, and one that does
+//! not read costs the recording nothing.
+
+use std::collections::BTreeMap;
+use std::io::ErrorKind;
+use std::net::{TcpListener, TcpStream};
+use std::time::{Duration, Instant};
+
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor};
+use rustix::process::Signal;
+use serde_json::{Value, json};
+use tungstenite::client::IntoClientRequest as _;
+use tungstenite::{Error, Message, WebSocket};
+
+use crate::support::{Episode, MaskMessage, PATIENCE, Place, Running, logged, until};
+
+/// A port that is free: the kernel chooses it.
+const ANY: &str = "127.0.0.1:0";
+/// A run that records until it is interrupted.
+const RECORD: [&str; 8] = ["--sim", "--headless", "--json", "--record", "--out", "out", "--foxglove", ANY];
+/// Of the binary messages of the protocol: samples, and the answers of services.
+const MESSAGE_DATA: u8 = 1;
+const SERVICE_ANSWER: u8 = 3;
+
+/// A channel as the server advertises it.
+struct Channel {
+    topic: String,
+    schema: String,
+    /// `FileDescriptorSet`.
+    descriptors: Vec<u8>,
+    message: MessageDescriptor,
+}
+
+struct Received {
+    channel: u32,
+    log_time: u64,
+    data: Vec<u8>,
+}
+
+/// A client by the protocol's description (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>).
+struct Client {
+    socket: WebSocket<TcpStream>,
+    channels: BTreeMap<u32, Channel>,
+    /// Names of the services and their numbers.
+    services: BTreeMap<String, u32>,
+    received: Vec<Received>,
+    /// Answers of services, and texts of status messages.
+    answers: Vec<Value>,
+    is_open: bool,
+}
+
+impl Client {
+    /// Connects, and subscribes to every topic that is advertised.
+    fn connect(address: &str) -> Self {
+        let mut request = format!("ws://{address}").into_client_request().expect("a request");
+        request.headers_mut().insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().expect("a header"));
+        let stream = TcpStream::connect(address).expect("a connection");
+        let (socket, _) = tungstenite::client(request, stream).expect("a handshake");
+        socket.get_ref().set_read_timeout(Some(Duration::from_millis(100))).expect("a timeout");
+        let (channels, services, received, answers) = Default::default();
+        Self { socket, channels, services, received, answers, is_open: true }
+    }
+
+    /// Takes what has come.
+    fn read(&mut self) {
+        loop {
+            match self.socket.read() {
+                Ok(Message::Text(text)) => self.text(&serde_json::from_str(&text).expect("JSON")),
+                Ok(Message::Binary(bytes)) => self.binary(&bytes),
+                Ok(_) => {}
+                Err(Error::Io(error)) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => return,
+                Err(_) => {
+                    self.is_open = false;
+                    return;
+                }
+            }
+        }
+    }
+
+    fn read_until(&mut self, what: &str, mut holds: impl FnMut(&Self) -> bool) {
+        let begun = Instant::now();
+        while !holds(self) {
+            assert!(self.is_open && begun.elapsed() < PATIENCE, "{what}: not met in time");
+            self.read_one();
+        }
+    }
+
+    /// At most one message: there is always a next one.
+    fn read_one(&mut self) {
+        match self.socket.read() {
+            Ok(Message::Text(text)) => self.text(&serde_json::from_str(&text).expect("JSON")),
+            Ok(Message::Binary(bytes)) => self.binary(&bytes),
+            Err(Error::Io(error)) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
+            Ok(_) => {}
+            Err(_) => self.is_open = false,
+        }
+    }
+
+    fn text(&mut self, message: &Value) {
+        let list = |of: &str| message[of].as_array().expect("a list").clone();
+        let number = |value: &Value| u32::try_from(value.as_u64().expect("a number")).expect("32 bits");
+        match message["op"].as_str() {
+            Some("advertise") => {
+                for channel in list("channels") {
+                    let text = |of: &str| channel[of].as_str().expect("a text").to_owned();
+                    assert_eq!([text("encoding"), text("schemaEncoding")], ["protobuf", "protobuf"]);
+                    let descriptors = BASE64_STANDARD.decode(text("schema")).expect("base 64");
+                    let pool = DescriptorPool::decode(descriptors.as_slice()).expect("descriptors");
+                    let schema = text("schemaName");
+                    let message = pool.get_message_by_name(&schema).expect("the message of the schema");
+                    let id = number(&channel["id"]);
+                    let subscription = json!({ "id": id, "channelId": channel["id"] });
+                    self.send(&json!({ "op": "subscribe", "subscriptions": [subscription] }));
+                    self.channels.insert(id, Channel { topic: text("topic"), schema, descriptors, message });
+                }
+            }
+            Some("advertiseServices") => {
+                for service in list("services") {
+                    let name = service["name"].as_str().expect("a name").to_owned();
+                    self.services.insert(name, number(&service["id"]));
+                }
+            }
+            Some("serviceCallFailure" | "status" | "parameterValues") => self.answers.push(message.clone()),
+            _ => {}
+        }
+    }
+
+    fn binary(&mut self, bytes: &[u8]) {
+        let (kind, rest) = bytes.split_first().expect("a kind");
+        let word = |at: usize| u32::from_le_bytes(rest[at..at + 4].try_into().expect("4 bytes"));
+        match *kind {
+            MESSAGE_DATA => {
+                let (log_time, data) = (rest[4..12].try_into().expect("8 bytes"), rest[12..].to_vec());
+                self.received.push(Received { channel: word(0), log_time: u64::from_le_bytes(log_time), data });
+            }
+            // Service, call, encoding, payload.
+            SERVICE_ANSWER => {
+                let payload = &rest[12 + word(8) as usize..];
+                self.answers.push(serde_json::from_slice(payload).expect("JSON"));
+            }
+            _ => {}
+        }
+    }
+
+    fn send(&mut self, message: &Value) {
+        self.socket.send(Message::text(message.to_string())).expect("it is sent");
+    }
+
+    /// Sends a request about parameters; returns what they are then, by name.
+    fn parameters(&mut self, request: &Value) -> BTreeMap<String, Value> {
+        self.answers.clear();
+        self.send(request);
+        self.read_until("parameters", |client| !client.answers.is_empty());
+        let answer = self.answers.remove(0);
+        let list = answer["parameters"].as_array().unwrap_or_else(|| panic!("no parameters: {answer}"));
+        list.iter().map(|one| (one["name"].as_str().expect("a name").to_owned(), one["value"].clone())).collect()
+    }
+
+    /// Calls a service; returns its answer, or why it failed.
+    fn call(&mut self, service: &str) -> String {
+        self.answers.clear();
+        let id = self.services[service];
+        let mut request = vec![2];
+        request.extend([id, 7, 4].iter().flat_map(|word| word.to_le_bytes()));
+        request.extend_from_slice(b"json{}");
+        self.socket.send(Message::binary(request)).expect("it is sent");
+        self.read_until(service, |client| !client.answers.is_empty());
+        let answer = self.answers.remove(0);
+        let text = answer.get("text").or_else(|| answer.get("message"));
+        text.and_then(Value::as_str).unwrap_or_else(|| panic!("no text: {answer}")).to_owned()
+    }
+
+    fn count(&self, topic: &str) -> usize {
+        self.received.iter().filter(|message| self.channels[&message.channel].topic == topic).count()
+    }
+
+    /// Asserts that what was received and belongs to an episode is what its file holds, and returns how many messages
+    /// of each topic were compared.
+    fn compare(&self, place: &Place, file: &str) -> BTreeMap<&str, usize> {
+        let path = place.path(file);
+        let episode = Episode::read(&path);
+        let bytes = std::fs::read(&path).expect("the episode");
+        let summary = mcap::Summary::read(&bytes).expect("a summary").expect("a finished file");
+        let begin: u64 = episode.value("rapid", "begin_wall_ns").parse().expect("a number");
+        let mut recorded: BTreeMap<(&str, u64), Vec<&[u8]>> = BTreeMap::new();
+        let mut last: BTreeMap<&str, u64> = BTreeMap::new();
+        for message in &episode.messages {
+            recorded.entry((&message.topic, message.log_time)).or_default().push(&message.data);
+            let last = last.entry(&message.topic).or_default();
+            *last = message.log_time.max(*last);
+        }
+        for channel in self.channels.values() {
+            let Some(file) = summary.channels.values().find(|other| other.topic == channel.topic) else { continue };
+            let schema = file.schema.as_ref().expect("a schema");
+            assert_eq!((&schema.name, &*schema.data), (&channel.schema, &channel.descriptors[..]), "{}", channel.topic);
+        }
+        let mut counts = BTreeMap::new();
+        for Received { channel, log_time, data } in &self.received {
+            let Channel { topic, message, .. } = &self.channels[channel];
+            let decoded = DynamicMessage::decode(message.clone(), &data[..]).expect("a message of the schema");
+            assert_eq!(decoded.unknown_fields().count(), 0, "{topic}");
+            if (begin..=last.get(topic.as_str()).copied().unwrap_or_default()).contains(log_time) {
+                let same = recorded.get(&(topic.as_str(), *log_time)).is_some_and(|all| all.contains(&&data[..]));
+                assert!(same, "{topic} at {log_time}: {} bytes that are not in the file", data.len());
+                *counts.entry(topic.as_str()).or_default() += 1;
+            }
+        }
+        counts
+    }
+}
+
+/// Where a run listens.
+fn address(running: &Running) -> String {
+    let reported = running.reported();
+    let text = logged(&reported, "Foxglove: open connection ws://").first().copied().expect("an address");
+    text.rsplit_once("ws://").expect("an address").1.to_owned()
+}
+
+fn start(place: &Place, options: &[&str]) -> Running {
+    place.start(&[&RECORD[..], options].concat(), "\"event\":\"recording\"")
+}
+
+/// Ends a run that recorded one GOOD episode, and returns its file.
+fn good(place: &Place, running: Running) -> String {
+    running.signal(Signal::INT);
+    let (code, output, errors) = running.end();
+    assert_eq!(code, Some(0), "{output}{errors}");
+    let episode = crate::support::events(&output).into_iter().find(|event| event["event"] == "episode");
+    let episode = episode.expect("an episode");
+    assert_eq!((&episode["verdict"], &episode["dropped"]), (&json!("GOOD"), &json!(0)), "{episode}");
+    format!("out/{}", place.episodes("out")[0])
+}
+
+/// A busy machine is no defect of the program: what remains are losses and damage.
+const LENIENT: &str = "\n[verdict]\nlate = \"off\"\ngap = \"off\"\nclock = \"off\"\nrate = \"off\"\nvalid = \"off\"\n\
+    opening = \"off\"\nfrozen = \"off\"\n";
+
+fn lenient_place() -> Place {
+    let place = Place::new();
+    place.write("devices.toml", &[include_str!("../../devices.toml"), LENIENT].concat());
+    place
+}
+
+#[test]
+fn every_message_is_the_one_that_is_recorded() {
+    let place = lenient_place();
+    let running = start(&place, &[]);
+    let mut client = Client::connect(&address(&running));
+    let has_enough = |client: &Client| {
+        let most = [("/rapid/mask", 2000), ("/rapid/camera/wrist", 60), ("/rapid/serial/motor", 200)];
+        most.iter().all(|(topic, count)| client.count(topic) > *count) && client.count("/rapid/event") > 0
+    };
+    client.read_until("messages of every topic", has_enough);
+    // A line of the log.
+    let marked = place.run(&["episode", "mark", "here"]);
+    assert!(marked.status.success());
+    let file = good(&place, running);
+    client.read();
+    assert!(!client.is_open, "the connection is closed with the run");
+    let topics: Vec<_> = client.channels.values().map(|channel| channel.topic.as_str()).collect();
+    for topic in ["/rapid/observation", "/rapid/log", "/rapid/camera/tactile"] {
+        assert!(topics.contains(&topic), "{topics:?}");
+    }
+    assert!(!topics.contains(&"/action"), "there is no actuator: {topics:?}");
+    let counts = client.compare(&place, &file);
+    for (topic, least) in
+        [("/rapid/mask", 1500), ("/rapid/camera/wrist", 40), ("/rapid/serial/motor", 150), ("/rapid/event", 1)]
+    {
+        assert!(counts[topic] >= least, "{counts:?}");
+    }
+    assert!(client.count("/rapid/observation") > 20);
+}
+
+#[cfg(feature = "policy")]
+#[test]
+fn actions_of_a_policy_are_shown_as_they_are_recorded() {
+    let place = Place::new();
+    let options = ["--sim", "task", "--infer", "--json", "--record", "--out", "out", "--duration", "6s"];
+    let running = place.start(&[&options[..], &["--foxglove", ANY]].concat(), "\"event\":\"recording\"");
+    let mut client = Client::connect(&address(&running));
+    while client.is_open {
+        client.read_one();
+    }
+    let (code, output, errors) = running.end();
+    assert!(matches!(code, Some(0 | 4)), "{code:?}: {output}{errors}");
+    let counts = client.compare(&place, &format!("out/{}", place.episodes("out")[0]));
+    assert!(counts["/action"] > 10, "{counts:?}");
+}
+
+#[test]
+fn an_added_entry_is_shown_from_then_on() {
+    const SCENARIO: &str = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"spare\"\nlike = \"tactile_tip\"\n\
+                            serial = \"SPARE1\"\nport = \"1-4\"\nproduct = \"Spare Camera\"\n";
+    let place = lenient_place();
+    place.write("scenario.toml", SCENARIO);
+    let options = ["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out", "--foxglove", ANY];
+    let running = place.start(&options, "\"event\":\"recording\"");
+    let mut client = Client::connect(&address(&running));
+    client.read_until("pictures", |client| client.count("/rapid/camera/wrist") > 5);
+    let add = ["register", "--sim", "scenario.toml", "--serial", "SPARE1", "--name", "spare_cam", "--yes"];
+    assert!(place.run(&add).status.success() && place.run(&["reload"]).status.success());
+    client.read_until("pictures of the added camera", |client| client.count("/rapid/camera/spare_cam") > 5);
+    let file = good(&place, running);
+    client.read();
+    assert!(client.compare(&place, &file)["/rapid/camera/wrist"] > 5);
+}
+
+/// 50 MB of pictures a second, far more than the socket takes.
+const LARGE: &str = "[[device]]\nname = \"cam_wrist\"\nbytes = \"560kB\"\n[[device]]\nname = \"tactile_tip\"\nbytes = \"140kB\"\n\
+                     [[device]]\nname = \"motor_state\"\n";
+
+#[test]
+fn a_client_that_does_not_read_costs_the_recording_nothing() {
+    let place = lenient_place();
+    place.write("scenario.toml", LARGE);
+    let options = ["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out", "--foxglove", ANY];
+    let running = place.start(&options, "\"event\":\"recording\"");
+    let mut client = Client::connect(&address(&running));
+    client.read_until("messages", |client| client.count("/rapid/camera/wrist") > 5 && client.count("/rapid/mask") > 50);
+    std::thread::sleep(Duration::from_secs(10));
+    let log = place.run(&["logs"]).stdout;
+    assert!(String::from_utf8_lossy(&log).contains("outbox for client"), "the log has it");
+    // What waits for it is bounded, and the newest is in it.
+    let resumed = client.received.len();
+    let begun = Instant::now();
+    while begun.elapsed() < Duration::from_secs(3) {
+        client.read_one();
+    }
+    let file = good(&place, running);
+    client.compare(&place, &file);
+    let masks = client.received.iter().filter(|message| client.channels[&message.channel].topic == "/rapid/mask");
+    let sequences: Vec<_> = masks
+        .map(|message| <MaskMessage as prost::Message>::decode(&message.data[..]).expect("a mask").sequence)
+        .collect();
+    assert!(client.received.len() > resumed + 100, "it goes on when the client reads again");
+    let largest = sequences.windows(2).map(|pair| pair[1] - pair[0]).max().expect("two masks");
+    assert!(largest > 500, "it was never stuck: {largest} masks were left out at a time");
+
+    // The mask as in the file: whole, and every 2 ms.
+    let episode = Episode::read(&place.path(&file));
+    let masks: Vec<_> = episode.topic("/rapid/mask").collect();
+    assert!(masks.windows(2).all(|pair| pair[1].sequence == pair[0].sequence + 1));
+    let mut intervals: Vec<_> = masks.windows(2).map(|pair| pair[1].log_time - pair[0].log_time).collect();
+    intervals.sort_unstable();
+    let share = |percent: usize| intervals[intervals.len() * percent / 100];
+    assert!(masks.len() > 5000 && share(50).abs_diff(2_000_000) < 200_000, "{} of {}", share(50), masks.len());
+    assert!(share(99) < 10_000_000, "{}", share(99));
+}
+
+#[test]
+fn a_ninth_client_gets_nothing_and_why() {
+    let place = lenient_place();
+    let running = start(&place, &[]);
+    let address = address(&running);
+    let mut clients: Vec<_> = (0..8).map(|_| Client::connect(&address)).collect();
+    for client in &mut clients {
+        client.read_until("masks", |client| client.count("/rapid/mask") > 10);
+    }
+    let mut ninth = Client::connect(&address);
+    ninth.read_until("the reason", |client| !client.answers.is_empty());
+    let reason = ninth.answers[0]["message"].as_str().expect("a text");
+    assert!(reason.contains("8 clients at a time"), "{reason}");
+    std::thread::sleep(Duration::from_millis(200));
+    assert!(ninth.received.is_empty(), "{}", ninth.received.len());
+    // The others are served as before.
+    let before = clients[0].received.len();
+    clients[0].read_until("more", |client| client.received.len() > before + 100);
+    drop(clients);
+    until("a place is free", || {
+        let mut next = Client::connect(&address);
+        let begun = Instant::now();
+        while next.count("/rapid/mask") == 0 && begun.elapsed() < Duration::from_secs(2) {
+            next.read_one();
+        }
+        next.count("/rapid/mask") > 0
+    });
+    good(&place, running);
+}
+
+#[test]
+fn a_port_in_use_is_an_error_of_the_start() {
+    let place = Place::new();
+    let taken = TcpListener::bind(ANY).expect("a port");
+    let address = taken.local_addr().expect("an address").to_string();
+    let options = ["--sim", "--headless", "--record", "--duration", "5s", "--out", "out", "--foxglove", &address];
+    let output = place.run(&options);
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{errors}");
+    let expected = format!("error: --foxglove {address}: Address already in use");
+    assert!(errors.starts_with(&expected) && errors.contains("name another port"), "{errors}");
+    assert!(place.episodes("out").is_empty() && place.shared_memory().is_empty(), "{:?}", place.shared_memory());
+}
+
+#[test]
+fn the_end_of_its_thread_costs_no_episode() {
+    let place = lenient_place();
+    let order = place.path("now");
+    let mut command = place.command(&RECORD);
+    command.env("RAPID_FAULT", format!("foxglove:{}", order.display()));
+    let mut running = place.start_as(command, "\"event\":\"recording\"");
+    let mut client = Client::connect(&address(&running));
+    // An episode of less than half a second is BAD.
+    client.read_until("a second", |client| client.count("/rapid/mask") > 500);
+    std::fs::write(order, "").expect("order");
+    running.wait_for("Foxglove: its thread panicked; the run continues without it");
+    until("the connection is closed", || {
+        client.read();
+        !client.is_open
+    });
+    good(&place, running);
+}
+
+#[test]
+fn a_client_controls_a_run_only_if_that_was_allowed() {
+    let place = lenient_place();
+    let options = ["--sim", "--headless", "--json", "--out", "out", "--foxglove", ANY];
+    let running = place.start(&options, "Foxglove: open connection");
+    let mut client = Client::connect(&address(&running));
+    client.read_until("masks", |client| client.count("/rapid/mask") > 100);
+    assert!(client.services.is_empty(), "{:?}", client.services);
+    running.signal(Signal::INT);
+    running.end();
+
+    let running = place.start(&[&options[..], &["--foxglove-control"]].concat(), "Foxglove: open connection");
+    let mut client = Client::connect(&address(&running));
+    client.read_until("the services", |client| client.services.len() == 4);
+    client.read_until("pictures", |client| client.count("/rapid/camera/wrist") > 0);
+    let all = client.parameters(&json!({ "op": "getParameters", "id": "1", "parameterNames": [] }));
+    assert_eq!((&all["task"], &all["tags"]), (&json!("episode"), &json!({})));
+    let wanted = json!([{ "name": "task", "value": "pour tea" }, { "name": "tags", "value": { "finger": "soft" } }]);
+    let set = client.parameters(&json!({ "op": "setParameters", "id": "2", "parameters": wanted }));
+    assert_eq!((&set["task"], &set["tags"]), (&json!("pour tea"), &json!({ "finger": "soft" })));
+    let begun = client.call("/rapid/start");
+    assert!(begun.contains("pour-tea_001.mcap"), "{begun}");
+    let recorded = client.count("/rapid/mask");
+    client.read_until("an episode", |client| client.count("/rapid/mask") > recorded + 500);
+    let ended = client.call("/rapid/stop");
+    assert!(ended.contains("001.mcap"), "{ended}");
+    assert_eq!(client.call("/rapid/arm"), "no actuator is plugged in: plug it in, then arm it");
+    assert_eq!(client.call("/rapid/disarm"), "disarmed; no actuator is plugged in");
+    good(&place, running);
+}
