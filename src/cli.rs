@@ -2,6 +2,8 @@
 //!
 //! Invariant: a command shows and accepts only the options that have an effect on it.
 
+#[cfg(feature = "export")]
+mod export;
 mod list;
 mod session;
 
@@ -16,6 +18,8 @@ use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, 
 
 #[cfg(feature = "policy")]
 use crate::lockstep::evaluate::Condition;
+#[cfg(feature = "export")]
+pub use export::{ExportArgs, Layout};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
 pub use session::{EpisodeCommand, SessionCommand};
 
@@ -157,7 +161,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "artifacts" => &["config"],
         "mask" | "replay" | "episode" | "session" | "reload" | "logs" => &["json", "instance"],
         "arm" | "disarm" | "monitor" => &["instance"],
-        "inspect" | "list" | "recover" | "eval" => &["json"],
+        "inspect" | "list" | "recover" | "eval" | "export" => &["json"],
         _ => &[],
     }
 }
@@ -385,6 +389,10 @@ pub enum Command {
     /// List episodes by verdict, label, task, tag, sensor or date
     #[command(after_long_help = list::LIST)]
     List(ListArgs),
+    /// Export episodes as a data set of LeRobot
+    #[cfg(feature = "export")]
+    #[command(after_long_help = export::EXPORT)]
+    Export(ExportArgs),
     /// Repair unfinished episodes after a kill, power loss or full disk
     #[command(after_long_help = RECOVER)]
     Recover {

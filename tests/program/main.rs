@@ -16,6 +16,7 @@ mod buttons;
 mod calibrate;
 mod docs;
 mod ends;
+mod export;
 mod hooks;
 mod hostile;
 mod infer;
