@@ -28,7 +28,7 @@ pub use session::{EpisodeCommand, SessionCommand};
 #[command(
     version, long_version = LONG_VERSION, max_term_width = 100, after_long_help = EXAMPLES,
     override_usage = "rapid [COMMAND] [OPTIONS]", disable_help_flag = true,
-    disable_version_flag = true
+    disable_version_flag = true, disable_help_subcommand = true
 )]
 pub struct Cli {
     /// What to do instead of running the rig.

@@ -10,7 +10,7 @@
 //! Invariant: files get their names in this order when they are complete, so that a set whose writer was killed has all
 //! its earlier episodes, or all and the last one.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::ffi::OsStr;
 use std::fs::File;
 use std::io;
@@ -25,8 +25,7 @@ use arrow_array::{Array, ArrayRef, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 use parquet::arrow::ArrowWriter;
 use parquet::errors::ParquetError;
-use parquet::file::metadata::KeyValue;
-use parquet::file::properties::WriterProperties;
+use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use rustix::fs::FlockOperation;
 use serde_json::{Map, Value, json};
 
@@ -35,7 +34,7 @@ use super::features::{Features, IMAGES, OWN};
 use super::rows::{Index, Refusal};
 use super::statistics::Column;
 use super::survey::Survey;
-use super::table::{Position, Table, one_row, properties, timestamp};
+use super::table::{CREATED_BY, Position, Table, one_row, timestamp};
 use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 
 /// Files of a folder; also `chunks_size` in `info.json`.
@@ -375,7 +374,7 @@ impl DataSet {
             // By column: those of a sensor that was absent have none.
             row.push(&format!("rapid/counts/{key}"), integers(columns.iter().map(|column| column.count)));
         }
-        self.write_parquet(&self.entry_path(position.episode), row.batch(), properties(&[]))
+        self.write_parquet(&self.entry_path(position.episode), row.batch())
     }
 
     fn read_tasks(&mut self) -> Result<(), SetError> {
@@ -413,20 +412,20 @@ impl DataSet {
         let mut row = OneRow::default();
         row.push("task_index", Arc::new(Int64Array::from_iter_values(numbers)));
         row.push(TASK, Arc::new(StringArray::from_iter_values(&self.tasks)));
-        let properties = WriterProperties::builder()
-            .set_key_value_metadata(Some(vec![KeyValue::new("pandas".to_owned(), pandas.to_string())]))
-            .build();
-        self.write_parquet(&self.folder.join("meta/tasks.parquet"), row.batch(), properties)
+        row.metadata.insert("pandas".to_owned(), pandas.to_string());
+        self.write_parquet(&self.folder.join("meta/tasks.parquet"), row.batch())
     }
 
-    fn write_parquet(
-        &self,
-        path: &Path,
-        batch: Result<RecordBatch, ArrowError>,
-        properties: WriterProperties,
-    ) -> Result<(), SetError> {
+    fn write_parquet(&self, path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<(), SetError> {
         let written = batch.map_err(ParquetError::from).and_then(|batch| {
             let mut bytes = Vec::new();
+            // Of one row in hundreds of columns, dictionaries and indices would be most of the file.
+            let properties = WriterProperties::builder()
+                .set_dictionary_enabled(false)
+                .set_statistics_enabled(EnabledStatistics::None)
+                .set_offset_index_disabled(true)
+                .set_created_by(CREATED_BY.to_owned())
+                .build();
             let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties))?;
             writer.write(&batch)?;
             writer.close()?;
@@ -565,6 +564,7 @@ fn by_name(columns: &[Column]) -> Vec<(&'static str, Vec<f64>)> {
 struct OneRow {
     fields: Vec<Field>,
     columns: Vec<ArrayRef>,
+    metadata: HashMap<String, String>,
 }
 
 impl OneRow {
@@ -578,7 +578,7 @@ impl OneRow {
     }
 
     fn batch(self) -> Result<RecordBatch, ArrowError> {
-        RecordBatch::try_new(Arc::new(Schema::new(self.fields)), self.columns)
+        RecordBatch::try_new(Arc::new(Schema::new_with_metadata(self.fields, self.metadata)), self.columns)
     }
 }
 

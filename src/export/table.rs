@@ -29,6 +29,9 @@ const GROUP: (usize, usize) = (32 << 20, 1000);
 /// Rows read at once.
 const READ: usize = 64;
 
+/// What is in a file of Parquet about its writer.
+pub(super) const CREATED_BY: &str = concat!("rapid ", env!("CARGO_PKG_VERSION"));
+
 /// Where an episode is in a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Position {
@@ -50,13 +53,13 @@ pub(super) fn timestamp(row: u64, fps: u32) -> f32 {
     super::survey::narrow(row as f64 / f64::from(fps))
 }
 
-/// How Parquet files are written here.
-pub(super) fn properties(uncounted: &[String]) -> WriterProperties {
+/// How the rows are written, with these features of pictures: they are compressed already, and none is there twice.
+fn properties(pictures: &[String]) -> WriterProperties {
     let mut properties = WriterProperties::builder()
         .set_compression(Compression::UNCOMPRESSED)
-        .set_created_by(concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned());
-    for column in uncounted {
-        let path = ColumnPath::new(vec![column.clone(), "bytes".to_owned()]);
+        .set_created_by(CREATED_BY.to_owned());
+    for key in pictures {
+        let path = ColumnPath::new(vec![key.clone(), "bytes".to_owned()]);
         properties = properties
             .set_column_dictionary_enabled(path.clone(), false)
             .set_column_statistics_enabled(path, EnabledStatistics::None);
