@@ -94,14 +94,14 @@ texture: ## what a tactile picture reveals of the texture: models/results/textur
 
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
 lerobot-test: LEROBOT := $(CACHE)/venv-lerobot
-lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 GB of Python packages once)
+lerobot-test: ## the exports from and to LeRobot, against LeRobot (fetches 8 GB of Python packages once)
 	@stamp=$$(sha256sum <models/requirements-lerobot.txt); \
 	if [[ $$(cat '$(LEROBOT)/stamp' 2>/dev/null) != "$$stamp" ]]; then \
 	    rm -rf '$(LEROBOT)' && python3 -m venv '$(LEROBOT)'; \
 	    '$(LEROBOT)/bin/python' -m pip install --quiet --disable-pip-version-check --only-binary=:all: --no-deps -r models/requirements-lerobot.txt; \
 	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
 	fi
-	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
+	RAPID_BIN='$(firstword $(wildcard $(TARGET)/release/rapid $(TARGET)/debug/rapid))' '$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean

@@ -332,3 +332,44 @@ impl Known {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn features() -> Features {
+        Features {
+            fps: 30,
+            modalities: ["cam", "arm", "force", "raw"].map(str::to_owned).into(),
+            cameras: vec![(0, Shape { height: 480, width: 640, channels: 3 })],
+            state: vec![(2, 1), (1, 3)],
+            actions: Actions::Topic(2),
+        }
+    }
+
+    #[test]
+    fn features_are_read_back_from_what_is_written() {
+        for actions in [Actions::Absent, Actions::Topic(2), Actions::Modality(1, 3)] {
+            let features = Features { actions, ..features() };
+            let info = json!({ "fps": 30, "features": features.json() });
+            assert_eq!(Features::of_set(&info), Some(features));
+        }
+        let mut info = json!({ "fps": 30, "features": features().json() });
+        info["features"]["observation.state"]["shape"] = json!([5]);
+        assert_eq!(Features::of_set(&info), None, "of another program");
+        assert_eq!(features().choice(), Choice { state: vec!["force".to_owned(), "arm".to_owned()], action: None });
+    }
+
+    #[test]
+    fn a_difference_is_named() {
+        let refused = |other: &Features| features().check(other).unwrap_err().to_string();
+        assert!(features().check(&features()).is_ok());
+        assert_eq!(refused(&Features { fps: 20, ..features() }), "20 frames a second, and 30 in the data set");
+        let mut wide = features();
+        wide.cameras[0].1.width = 1280;
+        let text = refused(&wide);
+        assert!(text.starts_with("observation.images.cam is [480,1280,3]") && text.contains("[480,640,3]"), "{text}");
+        let text = refused(&Features { actions: Actions::Absent, ..features() });
+        assert!(text.starts_with("action is absent, and [2]"), "{text}");
+    }
+}

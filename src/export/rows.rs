@@ -489,3 +489,81 @@ impl<'a> Waiting<'a> {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn actions(times: &[u64]) -> Actions {
+        let values = times.iter().flat_map(|time| [*time as f64, -(*time as f64)]).collect();
+        Actions { times: times.to_vec(), values, length: 2 }
+    }
+
+    #[test]
+    fn the_action_of_a_tick_is_the_nearest_within_half_a_period_or_the_one_in_force() {
+        let all = actions(&[100, 140, 200]);
+        // A period of 100: half of it is 50.
+        for (tick, expected) in [(0, 100), (60, 100), (100, 100), (119, 100), (121, 140), (169, 140), (171, 200), (900, 200)] {
+            assert_eq!(all.at(tick, 100), [f64::from(expected), -f64::from(expected)], "{tick}");
+        }
+        // The next one is too far away: the last is still in force.
+        assert_eq!(actions(&[0, 400]).at(300, 100), [0.0, -0.0]);
+        assert_eq!(Actions::default().at(3, 100), [0.0; 0]);
+        let mut mixed = actions(&[140, 100]);
+        mixed.sort();
+        assert_eq!((mixed.at(100, 10), mixed.at(140, 10)), (&[100.0, -100.0][..], &[140.0, -140.0][..]));
+    }
+
+    fn frame(number: u32, time_ns: u64, seq: Option<u64>, present: bool) -> Frame {
+        let id = ModalityId::new(3).unwrap();
+        let slot = FrameSlot { id, present, valid: present, stale: false, age_ns: 10, seq };
+        Frame { number, time_ns, slots: vec![slot] }
+    }
+
+    fn listed(text: &str) -> Result<Vec<Listed>, Refusal> {
+        modalities(Some(text))
+    }
+
+    #[test]
+    fn a_row_has_the_sample_that_its_frame_names_and_no_other() {
+        let modalities =
+            listed(r#"[{"name": "b", "bit": 5, "kind": "bytes"}, {"name": "a", "bit": 3, "kind": "scalars"}]"#).unwrap();
+        assert_eq!(modalities.iter().map(|modality| &*modality.name).collect::<Vec<_>>(), ["a", "b"]);
+        // Number 1 is there twice, because the device began to count again.
+        let samples = [(ModalityId::new(3).unwrap(), vec![(1, 90), (2, 190), (1, 390)])].into();
+        let frames = [
+            frame(0, 100, Some(1), true),
+            frame(1, 200, Some(2 + (1 << 32)), true),
+            frame(2, 300, Some(2), false),
+            frame(3, 400, Some(1), true),
+            frame(4, 500, Some(7), true),
+            frame(5, 600, None, true),
+        ];
+        let slots = chosen(&modalities, &frames, &samples);
+        let found: Vec<_> = slots.iter().step_by(2).map(|slot| (slot.present, slot.valid, slot.sample)).collect();
+        let there = |sample| (true, true, Some(sample));
+        let without = (true, false, None);
+        assert_eq!(found, [there(0), there(1), (false, false, None), there(2), without, without]);
+        assert!(slots.iter().skip(1).step_by(2).all(|slot| *slot == Slot::default()));
+    }
+
+    #[test]
+    fn what_makes_rows_unequal_is_refused() {
+        let ticks = |numbers: &[u32]| {
+            let frames: Vec<Frame> = numbers.iter().map(|number| frame(*number, 0, None, true)).collect();
+            check_ticks(&frames).map_err(|refusal| refusal.to_string())
+        };
+        assert_eq!(ticks(&[7, 8, 9]), Ok(()));
+        assert!(ticks(&[]).unwrap_err().starts_with("no frames"));
+        assert!(ticks(&[0, 1, 5]).unwrap_err().starts_with("ticks 2 to 4 are missing"));
+        assert!(ticks(&[0, 0]).is_err());
+        assert_eq!(rate(Some("30")).unwrap(), 30);
+        for wrong in [Some("29.97"), Some("0"), Some("-3"), Some("x"), Some("NaN"), None] {
+            assert!(rate(wrong).is_err(), "{wrong:?}");
+        }
+        let twice = r#"[{"name": "a", "bit": 3, "kind": "bytes"}, {"name": "b", "bit": 3, "kind": "bytes"}]"#;
+        for wrong in [twice, r#"[{"name": "a/b", "bit": 3, "kind": "bytes"}]"#, "[{}]", "7"] {
+            assert!(listed(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -2,12 +2,16 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
+use std::io::Write;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Int64Type};
 use arrow_array::{Array, RecordBatch};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use rapid::cli::{ExportArgs, Layout};
+use rapid::commands::{self, Format};
 use serde_json::Value;
 
 use crate::support::Place;
@@ -217,6 +221,55 @@ fn nothing_left(place: &Place, short: &str, slow: &str) {
     let foreign = place.run(&["export", slow, "--to", "lerobot", "--out", "out"]);
     assert_eq!(foreign.status.code(), Some(2), "{foreign:?}");
     assert!(String::from_utf8_lossy(&foreign.stderr).contains("--out takes a new folder"), "{foreign:?}");
+}
+
+/// Sets a flag as soon as an episode is exported.
+struct Interrupting<'a>(&'a AtomicBool, Vec<u8>);
+
+impl Write for Interrupting<'_> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.1.extend(bytes);
+        if String::from_utf8_lossy(&self.1).contains("\"exported\",\"episode\"") {
+            self.0.store(true, Ordering::Relaxed);
+        }
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn an_interrupted_export_has_the_episodes_so_far() {
+    let place = Place::new();
+    for _ in 0..3 {
+        record(&place, "out", "1s", &["--sim"]);
+    }
+    let args = ExportArgs {
+        paths: vec![place.path("out")],
+        to: Layout::Lerobot,
+        out: place.path("set"),
+        include_bad: true,
+        state: Vec::new(),
+        action: None,
+        verify: true,
+    };
+    let stop = AtomicBool::new(true);
+    let interrupted = |stop: &AtomicBool| {
+        let mut out = Interrupting(stop, Vec::new());
+        let ended = commands::export::export(&args, Format::Json, stop, &mut out, &mut std::io::sink());
+        ended.expect_err("interrupted").to_string()
+    };
+    assert!(interrupted(&stop).ends_with("has 0 episodes, and the same command continues"));
+    assert!(!place.path("set").exists());
+    stop.store(false, Ordering::Relaxed);
+    assert!(interrupted(&stop).ends_with("has 1 episode, and the same command continues"));
+    assert_eq!(json(&place, "set/meta/info.json")["total_episodes"], 1);
+    let (objects, code) = export(&place, &["out", "--include-bad", "--verify"]);
+    let summary = of(&objects, "export")[0];
+    assert_eq!((code, &summary["already"], &summary["exported"]), (0, &1.into(), &2.into()), "{objects:?}");
+    assert_eq!(summary["differences"], 0);
 }
 
 #[test]
