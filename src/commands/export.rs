@@ -268,18 +268,22 @@ fn verify(
     let numbers: BTreeMap<&Path, usize> = sources.iter().map(|(number, file)| (file.as_path(), *number)).collect();
     let number = |file: &Path| numbers.get(file).copied().unwrap_or_default();
     report.summary.verified = Some(0);
-    progress::each(&files, |file| export::verify(set, number(file), file, stop), |file, verified| {
-        let (rows, differences) = match verified {
-            Ok(verified) => verified,
-            Err(SetError::Refused(Refusal::Interrupted)) => return Ok(()),
-            Err(error) => (0, vec![Difference { frame: None, feature: None, what: error.to_string() }]),
-        };
-        report.summary.verified = report.summary.verified.map(|before| before + rows);
-        for difference in &differences {
-            report.difference(&Differing { file, episode: number(file), difference })?;
-        }
-        Ok::<_, ExportError>(())
-    })
+    progress::each(
+        &files,
+        |file| export::verify(set, number(file), file, stop),
+        |file, verified| {
+            let (rows, differences) = match verified {
+                Ok(verified) => verified,
+                Err(SetError::Refused(Refusal::Interrupted)) => return Ok(()),
+                Err(error) => (0, vec![Difference { frame: None, feature: None, what: error.to_string() }]),
+            };
+            report.summary.verified = report.summary.verified.map(|before| before + rows);
+            for difference in &differences {
+                report.difference(&Differing { file, episode: number(file), difference })?;
+            }
+            Ok::<_, ExportError>(())
+        },
+    )
 }
 
 /// Writes a line for each episode, and counts.
@@ -299,29 +303,35 @@ impl Report<'_> {
             let samples = text::counted(*unusable, "frame");
             line = format!("{line}; in {samples} a damaged sample is left out");
         }
-        self.episode(&line, &Exported {
-            file,
-            outcome: Outcome::Exported,
-            episode: Some(number),
-            frames: Some(*rows),
-            unusable: Some(*unusable),
-            verdict: Some(*grade),
-            reason: None,
-        })
+        self.episode(
+            &line,
+            &Exported {
+                file,
+                outcome: Outcome::Exported,
+                episode: Some(number),
+                frames: Some(*rows),
+                unusable: Some(*unusable),
+                verdict: Some(*grade),
+                reason: None,
+            },
+        )
     }
 
     fn already(&mut self, file: &Path, number: usize) -> io::Result<()> {
         self.summary.already += 1;
         let line = format!("{}: episode {number} already", file.display());
-        self.episode(&line, &Exported {
-            file,
-            outcome: Outcome::Already,
-            episode: Some(number),
-            frames: None,
-            unusable: None,
-            verdict: None,
-            reason: None,
-        })
+        self.episode(
+            &line,
+            &Exported {
+                file,
+                outcome: Outcome::Already,
+                episode: Some(number),
+                frames: None,
+                unusable: None,
+                verdict: None,
+                reason: None,
+            },
+        )
     }
 
     fn left_out(&mut self, file: &Path, refusal: &Refusal) -> io::Result<()> {

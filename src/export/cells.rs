@@ -79,8 +79,9 @@ impl<'f> CellMaker<'f> {
         let pictures: Vec<_> = self.features.cameras.iter().map(|(place, _)| usable(*place)).collect();
         for (payload, black) in pictures.into_iter().zip(&self.black) {
             cells.pictures.push(match payload {
-                Some(payload) => picture::file(payload, &mut self.pixels)
-                    .map_err(|error| Refusal::Different(error.to_string()))?,
+                Some(payload) => {
+                    picture::file(payload, &mut self.pixels).map_err(|error| Refusal::Different(error.to_string()))?
+                }
                 None => Cow::Owned(black.clone()),
             });
         }

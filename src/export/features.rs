@@ -194,7 +194,7 @@ impl Features {
             let Some(feature) = features.get(&format!("{IMAGES}{modality}")) else { continue };
             let side = |axis: usize| feature.get("shape")?.get(axis)?.as_u64();
             let (height, width) = (u32::try_from(side(0)?).ok()?, u32::try_from(side(1)?).ok()?);
-            cameras.push((at, Shape { height, width, channels: u8::try_from(side(2)?).ok()? }));
+            cameras.push((at, Shape::new(height, width, u8::try_from(side(2)?).ok()?)?));
         }
         let mut state: Vec<(usize, usize)> = Vec::new();
         for name in names(STATE).unwrap_or_default() {
@@ -304,12 +304,10 @@ impl Known {
     /// What a data set has.
     pub fn of(features: &Features) -> Self {
         let name = |place: usize| features.modalities.get(place).cloned().unwrap_or_default();
-        let camera = |(place, shape): &(usize, Shape)| {
-            (name(*place), Content::Camera { found: Some(*shape), declared: None })
-        };
-        let vector = |(place, length): &(usize, usize)| {
-            (name(*place), Content::Vector { found: Some(*length), declared: None })
-        };
+        let camera =
+            |(place, shape): &(usize, Shape)| (name(*place), Content::Camera { found: Some(*shape), declared: None });
+        let vector =
+            |(place, length): &(usize, usize)| (name(*place), Content::Vector { found: Some(*length), declared: None });
         let action = match features.actions {
             Actions::Modality(place, length) => Some((place, length)),
             Actions::Absent | Actions::Topic(_) => None,
@@ -335,7 +333,9 @@ impl Known {
 
 #[cfg(test)]
 mod tests {
+    use super::super::survey::Stream;
     use super::*;
+    use crate::status::Grade;
 
     fn features() -> Features {
         Features {
@@ -358,6 +358,68 @@ mod tests {
         info["features"]["observation.state"]["shape"] = json!([5]);
         assert_eq!(Features::of_set(&info), None, "of another program");
         assert_eq!(features().choice(), Choice { state: vec!["force".to_owned(), "arm".to_owned()], action: None });
+    }
+
+    fn episode(contents: &[(&str, Content)]) -> Survey {
+        let stream = |(name, content): &(&str, Content)| Stream {
+            name: (*name).to_owned(),
+            content: *content,
+            columns: Vec::new(),
+            present: Column::default(),
+            valid: Column::default(),
+            age: Column::default(),
+        };
+        Survey {
+            file: "a.mcap".into(),
+            bytes: 0,
+            sha256: String::new(),
+            grade: Grade::Good,
+            rows: 1,
+            unusable: 0,
+            fps: 30,
+            task: String::new(),
+            streams: contents.iter().map(stream).collect(),
+            action: None,
+            time_ns: Column::default(),
+            kinds: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn the_shape_of_what_is_absent_comes_from_the_set_before_the_registry() {
+        let shape = |height| Shape::new(height, 640, 3);
+        let camera = |found, declared| ("cam", Content::Camera { found, declared });
+        let arm = ("arm", Content::Vector { found: Some(3), declared: None });
+        let of = |content, known: &Known| Features::of(&episode(&[content, arm]), &Choice::default(), known);
+        let height = |found: Result<Features, Refusal>| found.map(|features| features.cameras[0].1.height);
+        let mut known = Known::default();
+        assert_eq!(height(of(camera(shape(480), shape(240)), &known)).unwrap(), 480);
+        assert_eq!(height(of(camera(None, shape(240)), &known)).unwrap(), 240);
+        let refused = height(of(camera(None, None), &known)).unwrap_err().to_string();
+        assert!(refused.starts_with("cam: no usable sample to know the size of"), "{refused}");
+        known.learn(&episode(&[camera(shape(720), None), arm]));
+        assert_eq!(height(of(camera(None, shape(240)), &known)).unwrap(), 720);
+        assert_eq!(Known::of(&features()).length("arm"), Some(3));
+    }
+
+    #[test]
+    fn columns_are_chosen_by_name_and_in_that_order() {
+        let vector = |name, length| (name, Content::Vector { found: Some(length), declared: None });
+        let episode = episode(&[vector("arm", 3), ("raw", Content::Bytes), vector("force", 1)]);
+        let of = |state: &[&str], action: Option<&str>| {
+            let choice = Choice {
+                state: state.iter().map(|name| (*name).to_owned()).collect(),
+                action: action.map(str::to_owned),
+            };
+            Features::of(&episode, &choice, &Known::default()).map_err(|refusal| refusal.to_string())
+        };
+        assert_eq!(of(&[], None).unwrap().state, [(0, 3), (2, 1)]);
+        let chosen = of(&["force", "arm"], Some("arm")).unwrap();
+        assert_eq!((chosen.state.as_slice(), chosen.actions), (&[(2, 1), (0, 3)][..], Actions::Modality(0, 3)));
+        let unknown = of(&["raw"], None).unwrap_err();
+        assert_eq!(unknown, "\"raw\" is no sensor of numbers; of this episode they are arm, force");
+        assert!(of(&[], Some("legs")).is_err());
+        assert_eq!(of(&["arm", "arm"], None).unwrap_err(), "\"arm\" is chosen twice");
     }
 
     #[test]

@@ -8,7 +8,7 @@ use std::fmt;
 
 use super::rows::Payload;
 use crate::episode::decode::jpeg_frame;
-use crate::pixels::{Picture, PixelError, Pixels};
+use crate::pixels::{LARGEST, Picture, PixelError, Pixels};
 use crate::record::is_whole_jpeg;
 use crate::sample::Encoding;
 
@@ -23,6 +23,14 @@ pub(super) struct Shape {
     pub channels: u8,
 }
 
+impl Shape {
+    /// `None` if no picture of `rapid` has this shape: what a file claims may be anything.
+    pub(super) fn new(height: u32, width: u32, channels: u8) -> Option<Self> {
+        let is_side = |side: u32| usize::try_from(side).is_ok_and(|side| (1..=LARGEST).contains(&side));
+        (is_side(height) && is_side(width) && matches!(channels, 1 | 3)).then_some(Self { height, width, channels })
+    }
+}
+
 impl fmt::Display for Shape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}x{}", self.width, self.height)?;
@@ -34,14 +42,14 @@ impl fmt::Display for Shape {
 pub(super) fn shape(payload: &Payload) -> Option<Shape> {
     let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
     let (width, height) = (*width, *height);
-    let pixels = usize::try_from(u64::from(width) * u64::from(height)).ok().filter(|pixels| *pixels > 0)?;
+    let pixels = usize::try_from(u64::from(width) * u64::from(height)).ok()?;
     let channels = match encoding {
         Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components).filter(|_| is_whole_jpeg(bytes)),
         Encoding::Grey => (bytes.len() == pixels).then_some(3),
         Encoding::Yuyv => (Some(bytes.len()) == pixels.checked_mul(2) && pixels.is_multiple_of(2)).then_some(3),
         Encoding::Bytes | Encoding::F64 | Encoding::Mask => None,
     };
-    channels.filter(|channels| matches!(channels, 1 | 3)).map(|channels| Shape { height, width, channels })
+    Shape::new(height, width, channels?)
 }
 
 /// The file of a picture.
@@ -111,12 +119,8 @@ mod tests {
 
     #[test]
     fn a_jpeg_is_not_changed_and_needs_its_end() {
-        let picture = |bytes: &[u8]| Payload::Picture {
-            encoding: Encoding::Mjpeg,
-            width: 8,
-            height: 4,
-            bytes: bytes.to_vec(),
-        };
+        let picture =
+            |bytes: &[u8]| Payload::Picture { encoding: Encoding::Mjpeg, width: 8, height: 4, bytes: bytes.to_vec() };
         let mut jpeg = Vec::new();
         jpeg_encoder::Encoder::new(&mut jpeg, 90).encode(&[9; 32], 8, 4, jpeg_encoder::ColorType::Luma).unwrap();
         let whole = picture(&jpeg);

@@ -79,8 +79,8 @@ pub enum Refusal {
         /// That of the first one.
         expected: String,
     },
-    /// A camera without any picture, here or in the set.
-    #[error("{0}: no usable picture to know the size of, and none in the metadata or in the other episodes")]
+    /// A sensor without any sample, here or in the set.
+    #[error("{0}: no usable sample to know the size of, and neither the other episodes nor the registry have it")]
     NoSize(String),
     /// Numbers of several lengths.
     #[error("{name}: {found} numbers, and {expected} before")]
@@ -390,11 +390,7 @@ fn check_ticks(frames: &[Frame]) -> Result<(), Refusal> {
 }
 
 /// The slots of all rows, with the samples that the frames name.
-fn chosen(
-    modalities: &[Listed],
-    frames: &[Frame],
-    samples: &BTreeMap<ModalityId, Vec<(u32, u64)>>,
-) -> Vec<Slot> {
+fn chosen(modalities: &[Listed], frames: &[Frame], samples: &BTreeMap<ModalityId, Vec<(u32, u64)>>) -> Vec<Slot> {
     // By modality: the places of the samples of a number. A counter that began again has several.
     let by_number: BTreeMap<ModalityId, BTreeMap<u32, Vec<(u32, u64)>>> = samples
         .iter()
@@ -415,9 +411,17 @@ fn chosen(
         let captured = frame.time_ns.saturating_add_signed(age_ns.saturating_neg()).saturating_add(modality.latency_ns);
         let nearest = |(_, time): &&(u32, u64)| time.abs_diff(captured);
         let sample = candidates.and_then(|candidates| candidates.iter().min_by_key(nearest)).map(|(place, _)| *place);
-        Some(Slot { present, valid: valid && sample.is_some(), age_ns: if sample.is_some() { age_ns } else { 0 }, sample })
+        Some(Slot {
+            present,
+            valid: valid && sample.is_some(),
+            age_ns: if sample.is_some() { age_ns } else { 0 },
+            sample,
+        })
     };
-    frames.iter().flat_map(|frame| modalities.iter().map(move |modality| slot(frame, modality).unwrap_or_default())).collect()
+    frames
+        .iter()
+        .flat_map(|frame| modalities.iter().map(move |modality| slot(frame, modality).unwrap_or_default()))
+        .collect()
 }
 
 /// Samples that were read and whose row is still to come.
@@ -503,7 +507,9 @@ mod tests {
     fn the_action_of_a_tick_is_the_nearest_within_half_a_period_or_the_one_in_force() {
         let all = actions(&[100, 140, 200]);
         // A period of 100: half of it is 50.
-        for (tick, expected) in [(0, 100), (60, 100), (100, 100), (119, 100), (121, 140), (169, 140), (171, 200), (900, 200)] {
+        for (tick, expected) in
+            [(0, 100), (60, 100), (100, 100), (119, 100), (121, 140), (169, 140), (171, 200), (900, 200)]
+        {
             assert_eq!(all.at(tick, 100), [f64::from(expected), -f64::from(expected)], "{tick}");
         }
         // The next one is too far away: the last is still in force.
@@ -527,7 +533,8 @@ mod tests {
     #[test]
     fn a_row_has_the_sample_that_its_frame_names_and_no_other() {
         let modalities =
-            listed(r#"[{"name": "b", "bit": 5, "kind": "bytes"}, {"name": "a", "bit": 3, "kind": "scalars"}]"#).unwrap();
+            listed(r#"[{"name": "b", "bit": 5, "kind": "bytes"}, {"name": "a", "bit": 3, "kind": "scalars"}]"#)
+                .unwrap();
         assert_eq!(modalities.iter().map(|modality| &*modality.name).collect::<Vec<_>>(), ["a", "b"]);
         // Number 1 is there twice, because the device began to count again.
         let samples = [(ModalityId::new(3).unwrap(), vec![(1, 90), (2, 190), (1, 390)])].into();

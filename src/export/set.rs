@@ -193,7 +193,7 @@ impl DataSet {
 
     /// How many rows it has.
     pub fn rows(&self) -> u64 {
-        self.entries.iter().map(|entry| entry.rows).sum()
+        self.entries.iter().fold(0, |rows, entry| rows.saturating_add(entry.rows))
     }
 
     /// What its episodes have in common; `None` without any.
@@ -353,7 +353,7 @@ impl DataSet {
             ("data/chunk_index", chunk),
             ("data/file_index", file),
             ("dataset_from_index", entry.first),
-            ("dataset_to_index", entry.first + entry.rows),
+            ("dataset_to_index", entry.first.saturating_add(entry.rows)),
             ("meta/episodes/chunk_index", chunk),
             ("meta/episodes/file_index", file),
             (BYTES, episode.bytes),
@@ -394,9 +394,7 @@ impl DataSet {
 
     /// A table of pandas whose index are the texts, as `pandas.DataFrame.to_parquet` writes it.
     fn write_tasks(&self) -> Result<(), SetError> {
-        let index = |name: Value, field: &str, of: &str, numpy: &str| {
-            json!({"name": name, "field_name": field, "pandas_type": of, "numpy_type": numpy, "metadata": null})
-        };
+        let index = |name: Value, field: &str, of: &str, numpy: &str| json!({"name": name, "field_name": field, "pandas_type": of, "numpy_type": numpy, "metadata": null});
         let pandas = json!({
             "index_columns": [TASK],
             "column_indexes": [{"name": null, "field_name": null, "pandas_type": "unicode", "numpy_type": "object",
@@ -495,9 +493,8 @@ impl<'a> NewFile<'a> {
         let temporary = format!(".{}.tmp", name.to_string_lossy());
         // The set is locked: it is what a program left that was killed.
         let _ = folder.remove(&temporary);
-        let file = folder
-            .create_new(&temporary, 0o666)
-            .map_err(|source| SetError::Io { path: path.to_owned(), source })?;
+        let file =
+            folder.create_new(&temporary, 0o666).map_err(|source| SetError::Io { path: path.to_owned(), source })?;
         Ok(Self { path, folder, temporary, file, is_kept: false })
     }
 

@@ -4,8 +4,7 @@
 //! but for the quantiles, which are the weighted mean of the episodes'.
 
 /// The quantiles of `LeRobot`, by name.
-pub(super) const QUANTILES: [(&str, f64); 5] =
-    [("q01", 0.01), ("q10", 0.1), ("q50", 0.5), ("q90", 0.9), ("q99", 0.99)];
+pub(super) const QUANTILES: [(&str, f64); 5] = [("q01", 0.01), ("q10", 0.1), ("q50", 0.5), ("q90", 0.9), ("q99", 0.99)];
 
 /// One column over its valid rows.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -66,11 +65,11 @@ impl Column {
         if self.count == 0 || other.count == 0 {
             return if self.count == 0 { other } else { self };
         }
-        let count = self.count + other.count;
+        let count = self.count.saturating_add(other.count);
         let [a, b] = [self.count, other.count].map(|part| part as f64 / count as f64);
         let mean = a * self.mean + b * other.mean;
-        let variance = a * (self.std.powi(2) + (self.mean - mean).powi(2))
-            + b * (other.std.powi(2) + (other.mean - mean).powi(2));
+        let variance =
+            a * (self.std.powi(2) + (self.mean - mean).powi(2)) + b * (other.std.powi(2) + (other.mean - mean).powi(2));
         let mut quantiles = self.quantiles.map(|value| a * value);
         for (quantile, value) in quantiles.iter_mut().zip(other.quantiles) {
             *quantile += b * value;

@@ -11,8 +11,8 @@ use sha2::{Digest, Sha256};
 use super::picture::{self, Shape};
 use super::rows::{Index, Listed, Payload, Refusal, Row};
 use super::statistics::Column;
-use crate::episode::record_iter::FileEnd;
 use crate::episode;
+use crate::episode::record_iter::FileEnd;
 use crate::modality::ModalityKind;
 use crate::pixels::{CHANNELS, Picture, Pixels};
 use crate::record::inspect::{self, Inspection, Judgement};
@@ -21,6 +21,8 @@ use crate::text;
 
 /// Bytes read at once.
 const PIECE: usize = 1 << 20;
+/// Numbers that a registry may declare of a sample; what a file claims may be anything.
+const LONGEST: usize = 1 << 16;
 /// Of a picture with more pixels along a side, every n-th of each row and column counts for the statistics, so that
 /// about 150 are left, as in `lerobot.datasets.compute_stats.auto_downsample_height_width`.
 const WIDE: u32 = 300;
@@ -244,14 +246,14 @@ impl Gatherer {
         let content = match modality.kind {
             ModalityKind::Image => {
                 let declared = match shape {
-                    [height, width] if *height > 0 && *width > 0 => Some(Shape { height: *height, width: *width, channels: 3 }),
+                    [height, width] => Shape::new(*height, *width, 3),
                     _ => None,
                 };
                 Content::Camera { found: None, declared }
             }
             ModalityKind::Scalars => {
-                let declared = shape.first().filter(|length| **length > 0);
-                Content::Vector { found: None, declared: declared.and_then(|length| usize::try_from(*length).ok()) }
+                let declared = shape.first().and_then(|length| usize::try_from(*length).ok());
+                Content::Vector { found: None, declared: declared.filter(|length| (1..=LONGEST).contains(length)) }
             }
             ModalityKind::Bytes => Content::Bytes,
         };

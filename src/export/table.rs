@@ -44,7 +44,8 @@ pub(super) struct Position {
 impl Position {
     /// The values of [`OWN`] but the first, in their order.
     pub(super) fn own(self, row: u64) -> [i64; 4] {
-        [row, self.episode, self.first + row, self.task].map(|value| i64::try_from(value).unwrap_or(i64::MAX))
+        [row, self.episode, self.first.saturating_add(row), self.task]
+            .map(|value| i64::try_from(value).unwrap_or(i64::MAX))
     }
 }
 
@@ -55,9 +56,8 @@ pub(super) fn timestamp(row: u64, fps: u32) -> f32 {
 
 /// How the rows are written, with these features of pictures: they are compressed already, and none is there twice.
 fn properties(pictures: &[String]) -> WriterProperties {
-    let mut properties = WriterProperties::builder()
-        .set_compression(Compression::UNCOMPRESSED)
-        .set_created_by(CREATED_BY.to_owned());
+    let mut properties =
+        WriterProperties::builder().set_compression(Compression::UNCOMPRESSED).set_created_by(CREATED_BY.to_owned());
     for key in pictures {
         let path = ColumnPath::new(vec![key.clone(), "bytes".to_owned()]);
         properties = properties

@@ -44,30 +44,35 @@ pub fn verify(
     let mut found = Found { features, position, differences: Vec::new() };
     let names: Vec<&str> = index.modalities.iter().map(|modality| modality.name.as_str()).collect();
     if names != features.modalities {
-        found.add(None, None, format!("sensors {} of the data set, {} of the episode", features.modalities.join(", "), names.join(", ")));
+        found.add(
+            None,
+            None,
+            format!("sensors {} of the data set, {} of the episode", features.modalities.join(", "), names.join(", ")),
+        );
         return Ok((0, found.differences));
     }
     let kinds = index.modalities.iter().map(|modality| modality.kind).collect();
     let mut maker = CellMaker::new(features, kinds)?;
     let mut count = 0;
     let mut broken = None;
-    index.rows(path, stop, |row| {
-        let cells = maker.cells(row)?;
-        match rows.advance() {
-            Ok(Some(view)) => {
-                count += 1;
-                found.compare(row.number, &cells, view);
-                Ok(())
+    index
+        .rows(path, stop, |row| {
+            let cells = maker.cells(row)?;
+            match rows.advance() {
+                Ok(Some(view)) => {
+                    count += 1;
+                    found.compare(row.number, &cells, view);
+                    Ok(())
+                }
+                Ok(None) => Ok(()),
+                Err(error) => {
+                    broken = Some(error);
+                    // Only ends the reading.
+                    Err(Refusal::Interrupted)
+                }
             }
-            Ok(None) => Ok(()),
-            Err(error) => {
-                broken = Some(error);
-                // Only ends the reading.
-                Err(Refusal::Interrupted)
-            }
-        }
-    })
-    .or_else(|refusal| if broken.is_some() { Ok(()) } else { Err(refusal) })?;
+        })
+        .or_else(|refusal| if broken.is_some() { Ok(()) } else { Err(refusal) })?;
     if let Some(error) = broken {
         return Err(SetError::Parquet { path: data, source: error.into() });
     }

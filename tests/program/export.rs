@@ -6,9 +6,9 @@ use std::io::Write;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use arrow_array::RecordBatch;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Int64Type};
-use arrow_array::{Array, RecordBatch};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use rapid::cli::{ExportArgs, Layout};
 use rapid::commands::{self, Format};
@@ -149,10 +149,10 @@ fn manipulated(place: &Place, wrist: &[(Vec<f32>, Vec<f32>, Vec<u8>)]) {
 fn what_does_not_fit_is_named_and_the_rest_is_appended() {
     let place = Place::new();
     let first = record(&place, "out", "1500ms", &["--sim", "--task", "push"]);
-    // One of each reason.
-    let short = record(&place, "out", "300ms", &["--sim"]);
-    let slow = record(&place, "out", "1500ms", &["--sim", "--rate", "20"]);
-    let odd = record(&place, "out", "1500ms", &["--sim", "--rate", "12.5"]);
+    // One of each reason. The features are those of the first by name.
+    let short = record(&place, "out", "300ms", &["--sim", "--task", "short"]);
+    let slow = record(&place, "out", "1500ms", &["--sim", "--rate", "20", "--task", "slow"]);
+    let odd = record(&place, "out", "1500ms", &["--sim", "--rate", "12.5", "--task", "slow"]);
     let bytes = std::fs::read(place.path(&first)).expect("the episode");
     let mut holed = bytes.clone();
     let third = holed.len() / 3;
@@ -297,7 +297,10 @@ fn a_killed_export_is_continued_from_every_state_that_it_may_leave() {
     std::fs::write(place.path("set/meta/info.json"), of_one.to_string()).expect("written");
     let (objects, code) = export(&place, &["out", "--verify"]);
     assert_eq!((code, &of(&objects, "export")[0]["already"]), (0, &2.into()), "{objects:?}");
-    assert_eq!((json(&place, "set/meta/info.json"), json(&place, "set/meta/stats.json")), (info.clone(), stats.clone()));
+    assert_eq!(
+        (json(&place, "set/meta/info.json"), json(&place, "set/meta/stats.json")),
+        (info.clone(), stats.clone())
+    );
     assert!(!place.path(third).exists());
 
     // Killed between the table of the second and its facts.
