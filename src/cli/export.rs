@@ -51,6 +51,6 @@ pub struct ExportArgs {
 /// A format of data sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Layout {
-    /// `LeRobot` v3.0.
+    /// LeRobot v3.0.
     Lerobot,
 }

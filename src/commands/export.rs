@@ -239,7 +239,9 @@ fn fitting(
     report: &mut Report<'_>,
 ) -> Result<Vec<(Survey, Features)>, ExportError> {
     let mut known = set.features().map(Known::of).unwrap_or_default();
-    episodes.iter().for_each(|episode| known.learn(episode));
+    for episode in &episodes {
+        known.learn(episode);
+    }
     let of_set = set.features().map(Features::choice).unwrap_or_default();
     let choice = Choice {
         state: if args.state.is_empty() { of_set.state } else { args.state.clone() },

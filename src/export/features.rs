@@ -1,8 +1,10 @@
 //! The features of a data set: what all of its episodes have in common, and `info.json` says.
 //!
 //! The modalities of `rapid.mask`, `rapid.valid` and `rapid.age` are those of the registry, ascending by bit, also those
-//! whose samples are not exported. A feature whose name begins with `observation.` is an input of a policy in `LeRobot`;
+//! whose samples are not exported. A feature whose name begins with `observation.` is an input of a policy in LeRobot;
 //! those three are none.
+
+use std::collections::BTreeSet;
 
 use serde_json::{Map, Value, json};
 
@@ -21,7 +23,7 @@ pub(super) const MASK: &str = "rapid.mask";
 pub(super) const VALID: &str = "rapid.valid";
 pub(super) const AGE: &str = "rapid.age";
 pub(super) const TIME: &str = "rapid.time_ns";
-/// What every data set of `LeRobot` has, as 64-bit integers but for the first, which is f32 and seconds.
+/// What every data set of LeRobot has, as 64-bit integers but for the first, which is f32 and seconds.
 pub(super) const OWN: [&str; 5] = ["timestamp", "frame_index", "episode_index", "index", "task_index"];
 
 /// Which columns the user chose.
@@ -122,8 +124,8 @@ impl Features {
             (None, Some(length)) => Actions::Topic(length),
             (None, None) => Actions::Absent,
         };
-        let mut names = std::collections::BTreeSet::new();
-        if let Some(twice) = choice.state.iter().find(|name| !names.insert(*name)) {
+        let mut seen = BTreeSet::new();
+        if let Some(twice) = choice.state.iter().find(|name| !seen.insert(*name)) {
             return Err(ChoiceError::Twice(twice.clone()).into());
         }
         let all: Vec<String> = vectors.iter().map(|(_, name, _)| (*name).clone()).collect();

@@ -1,4 +1,4 @@
-//! Episodes as a data set of `LeRobot` v3.0: Parquet tables, one row for each tick of the frame index.
+//! Episodes as a data set of LeRobot v3.0: Parquet tables, one row for each tick of the frame index.
 //!
 //! `rows` reads an episode tick by tick, `survey` finds out what it holds and whether it can be exported, `features` is
 //! what all episodes of a data set have in common, `cells` the values of one row, `table` and `set` the files, and

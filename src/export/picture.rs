@@ -1,6 +1,6 @@
 //! Pictures of a data set: a JPEG as the camera sent it, and what is not compressed as PNG, which loses nothing.
 //!
-//! Grey is written as three equal channels. YUYV becomes red, green and blue first, by the rule of `pixels`: `LeRobot`
+//! Grey is written as three equal channels. YUYV becomes red, green and blue first, by the rule of `pixels`: LeRobot
 //! and its policies know no other pictures.
 
 use std::borrow::Cow;

@@ -24,6 +24,7 @@ use arrow_array::types::{Float64Type, Int64Type};
 use arrow_array::{Array, ArrayRef, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::errors::ParquetError;
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use rustix::fs::FlockOperation;
@@ -374,15 +375,16 @@ impl DataSet {
             // By column: those of a sensor that was absent have none.
             row.push(&format!("rapid/counts/{key}"), integers(columns.iter().map(|column| column.count)));
         }
-        self.write_parquet(&self.entry_path(position.episode), row.batch())
+        write_parquet(&self.entry_path(position.episode), row.batch())
     }
 
     fn read_tasks(&mut self) -> Result<(), SetError> {
         let path = self.folder.join("meta/tasks.parquet");
         let wrong = |source| SetError::Parquet { path: path.clone(), source };
         let file = File::open(&path).map_err(|source| SetError::Io { path: path.clone(), source })?;
-        let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(file);
-        for batch in reader.and_then(|builder| builder.build()).map_err(wrong)? {
+        let reader =
+            ParquetRecordBatchReaderBuilder::try_new(file).and_then(ParquetRecordBatchReaderBuilder::<File>::build);
+        for batch in reader.map_err(wrong)? {
             let batch = batch.map_err(|error| wrong(error.into()))?;
             let names = batch.column_by_name(TASK).and_then(|column| column.as_string_opt::<i32>());
             let problem = || format!("no column {TASK}");
@@ -394,7 +396,11 @@ impl DataSet {
 
     /// A table of pandas whose index are the texts, as `pandas.DataFrame.to_parquet` writes it.
     fn write_tasks(&self) -> Result<(), SetError> {
-        let index = |name: Value, field: &str, of: &str, numpy: &str| json!({"name": name, "field_name": field, "pandas_type": of, "numpy_type": numpy, "metadata": null});
+        let index = |name: Value, field: &str, of: &str, numpy: &str| {
+            json!({
+                "name": name, "field_name": field, "pandas_type": of, "numpy_type": numpy, "metadata": null,
+            })
+        };
         let pandas = json!({
             "index_columns": [TASK],
             "column_indexes": [{"name": null, "field_name": null, "pandas_type": "unicode", "numpy_type": "object",
@@ -411,32 +417,7 @@ impl DataSet {
         row.push("task_index", Arc::new(Int64Array::from_iter_values(numbers)));
         row.push(TASK, Arc::new(StringArray::from_iter_values(&self.tasks)));
         row.metadata.insert("pandas".to_owned(), pandas.to_string());
-        self.write_parquet(&self.folder.join("meta/tasks.parquet"), row.batch())
-    }
-
-    fn write_parquet(&self, path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<(), SetError> {
-        let written = batch.map_err(ParquetError::from).and_then(|batch| {
-            let mut bytes = Vec::new();
-            // Of one row in hundreds of columns, dictionaries and indices would be most of the file.
-            let properties = WriterProperties::builder()
-                .set_dictionary_enabled(false)
-                .set_statistics_enabled(EnabledStatistics::None)
-                .set_offset_index_disabled(true)
-                .set_created_by(CREATED_BY.to_owned())
-                .build();
-            let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties))?;
-            writer.write(&batch)?;
-            writer.close()?;
-            Ok(bytes)
-        });
-        self.write(path, &written.map_err(|source| SetError::Parquet { path: path.to_owned(), source })?)
-    }
-
-    fn write(&self, path: &Path, contents: &[u8]) -> Result<(), SetError> {
-        let (folder, name) = place(path)?;
-        folder
-            .replace_by_umask(name, contents, Sync::Wait)
-            .map_err(|source| SetError::Io { path: path.to_owned(), source })
+        write_parquet(&self.folder.join("meta/tasks.parquet"), row.batch())
     }
 
     /// Writes what is true of all episodes.
@@ -462,10 +443,33 @@ impl DataSet {
             "features": features.json(),
         });
         for (name, value) in [("meta/stats.json", Value::Object(statistics)), ("meta/info.json", info)] {
-            self.write(&self.folder.join(name), format!("{value:#}\n").as_bytes())?;
+            write(&self.folder.join(name), format!("{value:#}\n").as_bytes())?;
         }
         Ok(())
     }
+}
+
+fn write_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<(), SetError> {
+    let written = batch.map_err(ParquetError::from).and_then(|batch| {
+        let mut bytes = Vec::new();
+        // Of one row in hundreds of columns, dictionaries and indices would be most of the file.
+        let properties = WriterProperties::builder()
+            .set_dictionary_enabled(false)
+            .set_statistics_enabled(EnabledStatistics::None)
+            .set_offset_index_disabled(true)
+            .set_created_by(CREATED_BY.to_owned())
+            .build();
+        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties))?;
+        writer.write(&batch)?;
+        writer.close()?;
+        Ok(bytes)
+    });
+    write(path, &written.map_err(|source| SetError::Parquet { path: path.to_owned(), source })?)
+}
+
+fn write(path: &Path, contents: &[u8]) -> Result<(), SetError> {
+    let (folder, name) = place(path)?;
+    folder.replace_by_umask(name, contents, Sync::Wait).map_err(|source| SetError::Io { path: path.to_owned(), source })
 }
 
 fn numbered(folder: &str, episode: u64) -> String {

@@ -1,9 +1,9 @@
-//! Statistics of a column of a data set, as `LeRobot` normalises with them: over an episode, and of episodes together.
+//! Statistics of a column of a data set, as LeRobot normalises with them: over an episode, and of episodes together.
 //!
 //! Those of several episodes are made of each episode's as `lerobot.datasets.compute_stats.aggregate_stats` does: exact
 //! but for the quantiles, which are the weighted mean of the episodes'.
 
-/// The quantiles of `LeRobot`, by name.
+/// The quantiles of LeRobot, by name.
 pub(super) const QUANTILES: [(&str, f64); 5] = [("q01", 0.01), ("q10", 0.1), ("q50", 0.5), ("q90", 0.9), ("q99", 0.99)];
 
 /// One column over its valid rows.
@@ -78,7 +78,7 @@ impl Column {
         Self { min, max, mean, std: variance.sqrt(), quantiles, count }
     }
 
-    /// The statistics by name, as `LeRobot` has them.
+    /// The statistics by name, as LeRobot has them.
     pub(super) fn named(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let moments = [("min", self.min), ("max", self.max), ("mean", self.mean), ("std", self.std)];
         moments.into_iter().chain(QUANTILES.iter().zip(self.quantiles).map(|((name, _), value)| (*name, value)))

@@ -352,7 +352,7 @@ impl Survey {
         self.action.as_ref().map(Vec::len)
     }
 
-    /// The task in words: `LeRobot` needs one.
+    /// The task in words: LeRobot needs one.
     pub(super) fn task(&self) -> &str {
         if self.task.is_empty() { "episode" } else { &self.task }
     }

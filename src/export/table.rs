@@ -1,6 +1,6 @@
 //! The rows of an episode as a Parquet file, and the way back.
 //!
-//! Format: <https://parquet.apache.org/docs/file-format/>, columns as `datasets` stores the features of `LeRobot`: a
+//! Format: <https://parquet.apache.org/docs/file-format/>, columns as `datasets` stores the features of LeRobot: a
 //! feature of shape `[1]` is a plain number, one of `[n]` a list of fixed size, a picture `{bytes, path}`.
 
 use std::fs::File;
@@ -49,7 +49,7 @@ impl Position {
     }
 }
 
-/// The time of a row from the beginning of its episode, seconds: what `LeRobot` expects, within 1e-4.
+/// The time of a row from the beginning of its episode, seconds: what LeRobot expects, within 1e-4.
 pub(super) fn timestamp(row: u64, fps: u32) -> f32 {
     super::survey::narrow(row as f64 / f64::from(fps))
 }

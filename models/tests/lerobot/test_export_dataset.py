@@ -1,4 +1,4 @@
-"""`rapid export --to lerobot`, loaded by LeRobot itself (`make lerobot-test`): of episodes that the program records here.
+"""`rapid export --to lerobot`, loaded by LeRobot itself (`make lerobot-test`); the episodes are recorded here.
 
 The episodes are read once more by code that shares nothing with the program: what belongs to a row is taken from
 `/rapid/frame` and from nothing else.
@@ -6,7 +6,6 @@ The episodes are read once more by code that shares nothing with the program: wh
 
 import json
 import os
-import struct
 import subprocess
 import tempfile
 import unittest
@@ -126,7 +125,7 @@ class ExportedDataSet(unittest.TestCase):
                 else:
                     self.assertEqual(picture, sample.data)
             sample = expected["samples"][2]
-            values = [0.0] * 3 if sample is None else [struct.unpack("f", struct.pack("f", v))[0] for v in sample.values]
+            values = [0.0] * 3 if sample is None else np.array(sample.values, np.float32).tolist()
             self.assertEqual(found["observation.state"], values)
         self.assertGreater(absent, 10)
 
@@ -157,7 +156,8 @@ class ExportedDataSet(unittest.TestCase):
         rows = [row for row in self.rows if row["valid"][2]]
         values = np.array([row["samples"][2].values for row in rows], np.float32).astype(float)
         found = stats["observation.state"]
-        for name, expected in [("min", values.min(0)), ("max", values.max(0)), ("mean", values.mean(0)), ("std", values.std(0))]:
+        for name in ("min", "max", "mean", "std"):
+            expected = getattr(values, name)(0)
             np.testing.assert_allclose(found[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
         self.assertEqual(int(found["count"][0]), len(rows))
         # LeRobot's own of every valid picture; ours are of a part of their pixels.
