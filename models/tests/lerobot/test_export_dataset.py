@@ -38,6 +38,14 @@ def rapid(*words: str, cwd: Path) -> str:
     return done.stdout
 
 
+def decoder(schema):
+    """The class of a schema's messages, from the schema in the file."""
+    pool = descriptor_pool.DescriptorPool()
+    for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+        pool.Add(proto)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+
+
 def read_episode(path: Path) -> list[dict]:
     """The rows of an episode: by modality the sample, or None; mask, valid, age."""
     classes, samples, frames = {}, defaultdict(dict), []
@@ -50,10 +58,7 @@ def read_episode(path: Path) -> list[dict]:
             if channel.topic != "/rapid/frame" and channel.topic not in topics:
                 continue
             if schema.name not in classes:
-                pool = descriptor_pool.DescriptorPool()
-                for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-                    pool.Add(proto)
-                classes[schema.name] = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+                classes[schema.name] = decoder(schema)
             body = classes[schema.name].FromString(message.data)
             if channel.topic == "/rapid/frame":
                 frames.append((message.log_time, body))
@@ -188,6 +193,36 @@ class ExportedDataSet(unittest.TestCase):
             for key in ours:
                 if isinstance(ours[key], torch.Tensor):
                     torch.testing.assert_close(merged[key], ours[key], msg=key)
+
+
+@unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")
+class ExportedActions(unittest.TestCase):
+    """Demonstrations of the simulated task, which have an action at each tick."""
+
+    def test_a_row_has_the_action_of_its_tick(self) -> None:
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            rapid("--sim", "task", "--headless", "--record", "--expert", "--episodes", "2", "--out", "out", cwd=folder)
+            rapid("export", "out", "--to", "lerobot", "--out", "set", "--include-bad", cwd=folder)
+            data = LeRobotDataset("rapid/set", root=folder / "set")
+            expected = [action for path in sorted((folder / "out").glob("*.mcap")) for action in read_actions(path)]
+            found = [data[at]["action"].tolist() for at in range(len(data))]
+            self.assertEqual(found, np.array(expected, np.float32).tolist())
+            np.testing.assert_allclose(data.meta.stats["action"]["mean"], np.mean(found, axis=0), atol=1e-6)
+
+
+def read_actions(path: Path) -> list[list[float]]:
+    """Of each tick the action nearest to it."""
+    body, times, values, ticks = None, [], [], []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            if channel.topic == "/rapid/frame":
+                ticks.append(message.log_time)
+            elif channel.topic == "/action":
+                body = body or decoder(schema)
+                times.append(message.log_time)
+                values.append(list(body.FromString(message.data).values))
+    return [values[int(np.abs(np.array(times) - tick).argmin())] for tick in ticks]
 
 
 if __name__ == "__main__":
