@@ -64,7 +64,6 @@ pub(crate) struct FrameSlot {
     /// Age of the sample at the tick, ns; negative if it was captured after it.
     pub(crate) age_ns: i64,
     /// Number of the sample that belongs to the tick, if one does; its message has the lower 32 bits.
-    #[cfg_attr(not(feature = "export"), expect(dead_code, reason = "an export alone looks up the samples of a tick"))]
     pub(crate) seq: Option<u64>,
 }
 

@@ -21,6 +21,8 @@ mod set;
 mod statistics;
 mod survey;
 mod table;
+#[cfg(test)]
+mod tests;
 mod verify;
 
 pub use features::{Choice, ChoiceError, Features, Known};
