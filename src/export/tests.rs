@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use super::cells::CellMaker;
 use super::features::{Actions, Features, MASK, STATE, VALID};
 use super::picture::Shape;
-use super::rows::{Index, Refusal};
+use super::rows::{Index, Refusal, Row};
 use super::table::{Position, Rows, Table};
 use crate::action::ACTION_TOPIC;
 use crate::episode::encode;
@@ -129,7 +129,11 @@ fn raw_pictures_lose_nothing_and_what_cannot_be_used_is_black_and_not_valid() {
     let table = folder.path().join("a.parquet");
     let position = Position { episode: 3, first: 70, task: 1 };
     let mut written = Table::new(File::create(&table).unwrap(), &features, position).unwrap();
-    index.rows(&path, &stop, |row| Ok(written.push(&maker.cells(row)?).unwrap())).unwrap();
+    let write = |row: &Row<'_>| {
+        written.push(&maker.cells(row)?).unwrap();
+        Ok(())
+    };
+    index.rows(&path, &stop, write).unwrap();
     written.finish().unwrap();
 
     let mut rows = Rows::open(File::open(&table).unwrap()).unwrap();

@@ -6,9 +6,9 @@ use std::io::Write;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use arrow_array::RecordBatch;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Int64Type};
+use arrow_array::{ArrayRef, RecordBatch};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use rapid::cli::{ExportArgs, Layout};
 use rapid::commands::{self, Format};
@@ -59,8 +59,11 @@ fn rows(place: &Place, name: &str) -> Vec<RecordBatch> {
     reader.collect::<Result<_, _>>().expect("rows")
 }
 
+/// Mask, valid modalities, the file of a picture.
+type Pictured = (Vec<bool>, Vec<bool>, Vec<u8>);
+
 /// Of each row: the mask, which modalities are valid, and the picture of `camera`.
-fn pictures(place: &Place, name: &str, camera: &str) -> Vec<(Vec<f32>, Vec<f32>, Vec<u8>)> {
+fn pictures(place: &Place, name: &str, camera: &str) -> Vec<Pictured> {
     let mut all = Vec::new();
     for batch in rows(place, name) {
         let lists = |key: &str| batch.column_by_name(key).expect("a column").as_fixed_size_list().clone();
@@ -68,8 +71,9 @@ fn pictures(place: &Place, name: &str, camera: &str) -> Vec<(Vec<f32>, Vec<f32>,
         let files = batch.column_by_name(camera).expect("a camera").as_struct();
         let files = files.column_by_name("bytes").expect("bytes").as_binary::<i32>();
         for at in 0..batch.num_rows() {
-            let floats = |row: arrow_array::ArrayRef| row.as_primitive::<Float32Type>().values().to_vec();
-            all.push((floats(masks.value(at)), floats(valid.value(at)), files.value(at).to_vec()));
+            let flags =
+                |row: ArrayRef| row.as_primitive::<Float32Type>().values().iter().map(|flag| *flag > 0.5).collect();
+            all.push((flags(masks.value(at)), flags(valid.value(at)), files.value(at).to_vec()));
         }
     }
     all
@@ -102,27 +106,27 @@ fn an_unplugged_sensor_is_black_with_its_mask_and_a_changed_byte_is_found() {
 
     let tactile = pictures(&place, DATA, "observation.images.tactile_tip");
     let wrist = pictures(&place, DATA, "observation.images.cam_wrist");
-    let absent = tactile.iter().filter(|(mask, ..)| mask[1] == 0.0).count();
+    let absent = tactile.iter().filter(|(mask, ..)| !mask[1]).count();
     assert!((15..150).contains(&absent), "{absent}");
     for (mask, valid, picture) in &tactile {
         let is_black = picture.starts_with(PNG);
         assert!(is_black || picture.starts_with(JPEG));
-        assert!(valid[1] <= mask[1] && (mask[1] == 1.0 || is_black) && !(is_black && valid[1] == 1.0));
+        assert!((mask[1] || !valid[1]) && (mask[1] || is_black) && !(is_black && valid[1]));
     }
-    assert!(wrist.iter().filter(|(mask, ..)| mask[0] == 1.0).all(|(.., picture)| picture.starts_with(JPEG)));
+    assert!(wrist.iter().filter(|(mask, ..)| mask[0]).all(|(.., picture)| picture.starts_with(JPEG)));
     // Over the valid rows alone: the black ones would be the least.
-    let stats = json(&place, "set/meta/stats.json");
-    let count = stats["observation.images.tactile_tip"]["count"][0].as_u64().expect("a count");
-    let valid = tactile.iter().filter(|(_, valid, _)| valid[1] == 1.0).count() as u64;
+    let statistics = json(&place, "set/meta/stats.json");
+    let count = statistics["observation.images.tactile_tip"]["count"][0].as_u64().expect("a count");
+    let valid = tactile.iter().filter(|(_, valid, _)| valid[1]).count() as u64;
     assert_eq!(count, valid);
-    let mean = stats["rapid.valid"]["mean"][1].as_f64().expect("a mean");
+    let mean = statistics["rapid.valid"]["mean"][1].as_f64().expect("a mean");
     assert!((mean - valid as f64 / frames as f64).abs() < 1e-9, "{mean}");
 
     manipulated(&place, &wrist);
 }
 
 /// A byte of a picture, and then of the mask's column, is changed in the table.
-fn manipulated(place: &Place, wrist: &[(Vec<f32>, Vec<f32>, Vec<u8>)]) {
+fn manipulated(place: &Place, wrist: &[Pictured]) {
     let whole = std::fs::read(place.path(DATA)).expect("the table");
     let frame = 100;
     let picture = &wrist[frame].2;
@@ -187,11 +191,11 @@ fn what_does_not_fit_is_named_and_the_rest_is_appended() {
     let summary = of(&objects, "export")[0];
     assert_eq!((&summary["episodes"], &summary["differences"]), (&3.into(), &0.into()), "{summary}");
     let last = pictures(&place, "set/data/chunk-000/file-002.parquet", "observation.images.tactile_tip");
-    assert!(last.iter().all(|(mask, valid, picture)| mask[1] + valid[1] == 0.0 && picture.starts_with(PNG)));
+    assert!(last.iter().all(|(mask, valid, picture)| !mask[1] && !valid[1] && picture.starts_with(PNG)));
     let batch = &rows(&place, "set/data/chunk-000/file-002.parquet")[0];
     let first_of = |key: &str| batch.column_by_name(key).expect("a column").as_primitive::<Int64Type>().value(0);
     assert_eq!((first_of("episode_index"), first_of("frame_index"), first_of("task_index")), (2, 0, 2));
-    let before = summary["frames"].as_i64().expect("frames") - last.len() as i64;
+    let before = summary["frames"].as_i64().expect("frames") - i64::try_from(last.len()).expect("a length");
     assert_eq!(first_of("index"), before);
     nothing_left(&place, &short, &slow);
 }
