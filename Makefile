@@ -21,7 +21,7 @@ TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' R
 TESTS := cargo test --locked --workspace
 # What `make quick` runs, and the tests of the program that it leaves out: those that wait for long, or need Python or C.
 QUICK := --lib --test layering --test library --test memory --test guard --test short
-SLOW := calibrate docs ends hooks infer json kill lan many_devices nodes process python scenarios screen second_run shared_memory stops task verdict
+SLOW := calibrate docs ends export hooks infer json kill lan many_devices nodes process python scenarios screen second_run shared_memory stops task verdict
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | sed 's/[$$](SLOW)/$(SLOW)/' | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
@@ -56,7 +56,7 @@ test: setup ## the whole truth: format, lints, all tests with the virtual bench,
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
 features: ## compile the program with no cargo feature, and with each alone
-	$(TESTED) scripts/features.sh '' foxglove lan motors policy
+	$(TESTED) scripts/features.sh '' export foxglove lan motors policy
 
 lint: ## format and clippy
 	cargo fmt --all --check
@@ -97,14 +97,14 @@ texture: ## what a tactile picture reveals of the texture: models/results/textur
 
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
 lerobot-test: LEROBOT := $(CACHE)/venv-lerobot
-lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 GB of Python packages once)
+lerobot-test: ## the exports from and to LeRobot, against LeRobot (fetches 8 GB of Python packages once)
 	@stamp=$$(sha256sum <models/requirements-lerobot.txt); \
 	if [[ $$(cat '$(LEROBOT)/stamp' 2>/dev/null) != "$$stamp" ]]; then \
 	    rm -rf '$(LEROBOT)' && python3 -m venv '$(LEROBOT)'; \
 	    '$(LEROBOT)/bin/python' -m pip install --quiet --disable-pip-version-check --only-binary=:all: --no-deps -r models/requirements-lerobot.txt; \
 	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
 	fi
-	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
+	RAPID_BIN='$(firstword $(wildcard $(TARGET)/release/rapid $(TARGET)/debug/rapid))' '$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean

@@ -2,6 +2,8 @@
 //!
 //! Invariant: a command shows and accepts only the options that have an effect on it.
 
+#[cfg(feature = "export")]
+mod export;
 mod list;
 mod session;
 
@@ -17,6 +19,8 @@ use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, 
 
 #[cfg(feature = "policy")]
 use crate::lockstep::evaluate::Condition;
+#[cfg(feature = "export")]
+pub use export::{ExportArgs, Layout};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
 pub use session::{EpisodeCommand, SessionCommand};
 
@@ -25,7 +29,7 @@ pub use session::{EpisodeCommand, SessionCommand};
 #[command(
     version, long_version = LONG_VERSION, max_term_width = 100, after_long_help = EXAMPLES,
     override_usage = "rapid [COMMAND] [OPTIONS]", disable_help_flag = true,
-    disable_version_flag = true
+    disable_version_flag = true, disable_help_subcommand = true
 )]
 pub struct Cli {
     /// What to do instead of running the rig.
@@ -158,7 +162,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "artifacts" => &["config"],
         "mask" | "replay" | "episode" | "session" | "reload" | "logs" => &["json", "instance"],
         "arm" | "disarm" | "monitor" => &["instance"],
-        "inspect" | "list" | "recover" | "eval" => &["json"],
+        "inspect" | "list" | "recover" | "eval" | "export" => &["json"],
         _ => &[],
     }
 }
@@ -408,6 +412,10 @@ pub enum Command {
     /// List episodes by verdict, label, task, tag, sensor or date
     #[command(after_long_help = list::LIST)]
     List(ListArgs),
+    /// Export episodes as a data set of LeRobot
+    #[cfg(feature = "export")]
+    #[command(after_long_help = export::EXPORT)]
+    Export(ExportArgs),
     /// Repair unfinished episodes after a kill, power loss or full disk
     #[command(after_long_help = RECOVER)]
     Recover {

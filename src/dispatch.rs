@@ -184,6 +184,8 @@ fn execute(cli: Cli) -> Result<(), Failure> {
                 print_warning(&format_args!("labels and notes are missing: {error}"));
             })?)
         }
+        #[cfg(feature = "export")]
+        Command::Export(args) => export(args, format),
         Command::Recover { paths } => recover(paths, format),
         Command::Ablation(args) => {
             let registry = registry_or_builtin(global)?;
@@ -317,12 +319,30 @@ fn no_mask(error: &PresenceError) -> String {
 
 fn recover(paths: Vec<PathBuf>, format: Format) -> Result<(), Failure> {
     let progress = io::stderr().is_terminal() && format == Format::Text;
+    // Files that are already repaired stay repaired.
+    let (outcome, written) = until_interrupted("the repair", move |stop| {
+        commands::recover::run(&paths, format, progress, stop, &mut io::stdout(), &mut io::stderr())
+    })?;
+    if outcome.is_done() { Ok(written?) } else { Err(Failure::printed(argument_code(outcome.is_bad_argument()))) }
+}
+
+#[cfg(feature = "export")]
+fn export(args: crate::cli::ExportArgs, format: Format) -> Result<(), Failure> {
+    let exported = until_interrupted("the export", move |stop| {
+        commands::export::export(&args, format, stop, &mut io::stdout(), &mut io::stderr())
+    })?;
+    if exported? { Ok(()) } else { Err(Failure::printed(1)) }
+}
+
+/// Does `work`, called `what`, which ends soon after its argument is set: that is at the first interrupt.
+fn until_interrupted<T: Send + 'static>(
+    what: &'static str,
+    work: impl FnOnce(&AtomicBool) -> T + Send + 'static,
+) -> Result<T, Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     let requested = Arc::clone(&stop);
     let ended = block_on(async move {
-        let mut work = tokio::task::spawn_blocking(move || {
-            commands::recover::run(&paths, format, progress, &requested, &mut io::stdout(), &mut io::stderr())
-        });
+        let mut work = tokio::task::spawn_blocking(move || work(&requested));
         let interrupted = tokio::select! {
             done = &mut work => return Ok(done),
             interrupted = tokio::signal::ctrl_c() => interrupted,
@@ -331,12 +351,11 @@ fn recover(paths: Vec<PathBuf>, format: Format) -> Result<(), Failure> {
         stop.store(true, Ordering::Relaxed);
         tokio::select! {
             done = &mut work => Ok(done),
-            // The disk may be slow; files that are already repaired stay repaired.
+            // The disk may be slow.
             _ = tokio::signal::ctrl_c() => Err(Failure::from(AppError::InterruptedTwice)),
         }
     })??;
-    let (outcome, written) = ended.map_err(|_| AppError::Panicked("the repair"))?;
-    if outcome.is_done() { Ok(written?) } else { Err(Failure::printed(argument_code(outcome.is_bad_argument()))) }
+    ended.map_err(|_| AppError::Panicked(what).into())
 }
 
 /// Runs the rig of a registry, `(registry, devices)`.
@@ -589,6 +608,13 @@ failures! {
         commands::list::ListError::Date { .. } => 2,
         commands::list::ListError::Episode(error) => read_code(error),
         commands::list::ListError::Output(_) => 1,
+    };
+    #[cfg(feature = "export")]
+    commands::export::ExportError: |error| match error {
+        commands::export::ExportError::Episodes(error) => read_code(error),
+        commands::export::ExportError::NoEpisodes(_)
+        | commands::export::ExportError::Set(crate::export::SetError::Foreign { .. }) => 2,
+        _ => 1,
     };
     commands::calibrate::CalibrateError: |error| argument_code(error.is_bad_argument());
     commands::ablation::AblationError: |error| argument_code(error.is_bad_argument());

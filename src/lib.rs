@@ -22,6 +22,8 @@ pub mod disk;
 pub mod dispatch;
 pub mod driver;
 pub mod episode;
+#[cfg(feature = "export")]
+pub mod export;
 pub mod fault;
 pub mod flash;
 pub mod folder;

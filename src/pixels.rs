@@ -12,7 +12,7 @@ use crate::sample::Encoding;
 /// Values of a pixel.
 pub const CHANNELS: usize = 3;
 /// Pixels a picture may have along a side, as in the registry.
-const LARGEST: usize = 8192;
+pub(crate) const LARGEST: usize = 8192;
 
 /// Why a payload has no pixels.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

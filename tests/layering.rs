@@ -56,7 +56,7 @@ const LAYERS: &[&[&str]] = &[
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "inputs", "interlocks", "sync", "calibration"],
     &["rig", "alignment", "record", "session", "policy", "registration", "live"],
-    &["app", "lockstep", "compare", "plot", "tui", "headless", "logging"],
+    &["app", "lockstep", "compare", "export", "plot", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
@@ -96,6 +96,8 @@ const NARROW: &[(&str, &[&str], &str)] = &[
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).
 const HOMES: &[(&str, &[&str])] = &[
+    ("arrow_array", &["export"]),
+    ("arrow_schema", &["export"]),
     ("clap", &["cli", "dispatch", "main", "commands"]),
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("clap_mangen", &["commands"]),
@@ -125,6 +127,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("nokhwa", &["driver/camera"]),
     ("ort", &["policy/library", "policy/graphs"]),
     ("parking_lot", &["bus/shared"]),
+    ("parquet", &["export"]),
+    ("png", &["export"]),
     ("rand_distr", &["random"]),
     ("rand_pcg", &["random"]),
     ("ratatui", &["tui"]),
@@ -134,7 +138,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
     ("serde_path_to_error", &["policy/bundle"]),
-    ("sha2", &["policy/bundle", "episode/recover"]),
+    ("sha2", &["policy/bundle", "episode/recover", "export"]),
     ("socketcan", &["driver/can"]),
     ("strsim", &["registry"]),
     ("thiserror", &[ANYWHERE]),

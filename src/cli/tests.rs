@@ -40,10 +40,11 @@ fn short_help_is_short_and_long_help_has_examples() {
     }
 }
 
-/// A value that is accepted, after a space.
-fn word(positional: &clap::Arg) -> String {
-    let values = positional.get_possible_values();
-    format!(" {}", values.first().map_or("bash", |value| value.get_name()))
+/// An argument with a value that is accepted, after a space.
+fn word(argument: &clap::Arg) -> String {
+    let option = argument.get_long().map(|name| format!(" --{name}")).unwrap_or_default();
+    let values = argument.get_possible_values();
+    format!("{option} {}", values.first().map_or("bash", |value| value.get_name()))
 }
 
 #[test]
@@ -54,7 +55,7 @@ fn a_general_option_is_shown_exactly_where_it_is_accepted_and_has_an_effect() {
     for (words, command) in commands("", grammar).into_iter().filter(|(words, _)| !words.is_empty()) {
         let name = words.split(' ').next().unwrap();
         let help = printed(&format!("{words} --help"));
-        let positional: String = command.get_positionals().filter(|value| value.is_required_set()).map(word).collect();
+        let positional: String = command.get_arguments().filter(|value| value.is_required_set()).map(word).collect();
         for (option, argument) in general {
             let known = general_options(name).contains(&option);
             assert_eq!(help.contains(&format!("--{option}")), known, "{words} --{option}");

@@ -14,6 +14,8 @@ pub mod devices;
 pub mod doctor;
 #[cfg(feature = "policy")]
 pub mod eval;
+#[cfg(feature = "export")]
+pub mod export;
 pub mod inspect;
 pub mod list;
 pub mod logs;

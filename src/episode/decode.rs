@@ -63,6 +63,8 @@ pub(crate) struct FrameSlot {
     pub(crate) stale: bool,
     /// Age of the sample at the tick, ns; negative if it was captured after it.
     pub(crate) age_ns: i64,
+    /// Number of the sample that belongs to the tick, if one does; its message has the lower 32 bits.
+    pub(crate) seq: Option<u64>,
 }
 
 /// Memory for content that must be converted; reused for every message.
@@ -125,18 +127,19 @@ fn frame<'a>(message: &[u8], slots: &'a mut Vec<FrameSlot>) -> Option<&'a [Frame
 }
 
 fn frame_slot(message: &[u8]) -> Option<FrameSlot> {
-    let (mut bit, mut present, mut valid, mut stale, mut age_ns) = (0, false, false, false, 0);
+    let (mut bit, mut present, mut valid, mut stale, mut age_ns, mut seq) = (0, false, false, false, 0, None);
     for field in whole_protobuf(message) {
         match field? {
             (1, value) => bit = value.number(),
             (2, value) => valid = value.number() != 0,
             (3, value) => stale = value.number() != 0,
             (4, value) => age_ns = value.zigzag(),
+            (5, value) => seq = Some(value.number()),
             (6, value) => present = value.number() != 0,
             _ => {}
         }
     }
-    Some(FrameSlot { id: ModalityId::new(u8::try_from(bit).ok()?)?, present, valid, stale, age_ns })
+    Some(FrameSlot { id: ModalityId::new(u8::try_from(bit).ok()?)?, present, valid, stale, age_ns, seq })
 }
 
 fn event(message: &[u8]) -> Option<EventText<'_>> {
@@ -161,7 +164,7 @@ fn compressed(message: &[u8]) -> Option<Sample<'_>> {
     }
     let payload = last_bytes(message, 2)?;
     // A picture without a readable header is played as it was recorded.
-    let (width, height) = jpeg_size(payload).unwrap_or((0, 0));
+    let (width, height, _) = jpeg_frame(payload).unwrap_or_default();
     Some(Sample { encoding: Encoding::Mjpeg, width, height, payload })
 }
 
@@ -235,8 +238,9 @@ fn last_bytes(message: &[u8], requested: u64) -> Option<&[u8]> {
     Some(found)
 }
 
-/// Width and height in a JPEG's frame header (ITU-T T.81, B.2.2): any SOF marker except DHT, JPG, DAC.
-fn jpeg_size(bytes: &[u8]) -> Option<(u32, u32)> {
+/// Width, height and the number of components in a JPEG's frame header (ITU-T T.81, B.2.2): any SOF marker except DHT,
+/// JPG, DAC.
+pub(crate) fn jpeg_frame(bytes: &[u8]) -> Option<(u32, u32, u8)> {
     let mut rest = bytes.strip_prefix(&[0xff, 0xd8])?;
     loop {
         let (&[0xff, marker], after) = rest.split_first_chunk()? else { return None };
@@ -249,7 +253,8 @@ fn jpeg_size(bytes: &[u8]) -> Option<(u32, u32)> {
         let segment = after.get(2..usize::from(u16::from_be_bytes(length)))?;
         if matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc) {
             let &[_, h1, h0, w1, w0] = segment.first_chunk()?;
-            return Some((u16::from_be_bytes([w1, w0]).into(), u16::from_be_bytes([h1, h0]).into()));
+            let components = segment.get(5).copied().unwrap_or(0);
+            return Some((u16::from_be_bytes([w1, w0]).into(), u16::from_be_bytes([h1, h0]).into(), components));
         }
         // Start of scan: no frame header follows.
         if marker == 0xda {

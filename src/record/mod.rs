@@ -32,6 +32,8 @@ use std::path::PathBuf;
 
 pub use crate::episode::chunk_writer::Sink;
 pub use episode_path::{EpisodeReport, EpisodeRequest, open_folder};
+#[cfg(feature = "export")]
+pub(crate) use quality::is_whole_jpeg;
 pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderAddition, RecorderConfig, Source};
 pub use space::Asker;

@@ -417,6 +417,7 @@ macro_rules! pages_are_run {
 pages_are_run! {
     the_readme_runs: "README.md",
     episodes_run: "docs/episodes.md",
+    export_runs: "docs/export.md",
     registry_runs: "docs/registry.md",
     policies_run: "docs/policies.md",
     interfaces_run: "docs/interfaces.md",

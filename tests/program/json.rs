@@ -129,6 +129,10 @@ fn finished(place: &Place, printed: &mut String) {
     run(&["inspect", &episode, "--json"], 0);
     run(&["inspect", &episode, "--plot", "--json"], 0);
     assert!(run(&["recover", "out", "--json"], 0).contains("\"nothing\""));
+    run(&["export", "out", "--to", "lerobot", "--out", "set", "--include-bad", "--json"], 0);
+    let table = "set/data/chunk-000/file-000.parquet";
+    std::fs::write(place.path(table), "no table").expect("a file");
+    run(&["export", "out", "--to", "lerobot", "--out", "set", "--verify", "--json"], 1);
     let bytes = std::fs::read(place.path(&episode)).expect("the episode");
     std::fs::write(place.path("out/cut.mcap.partial"), &bytes[..bytes.len() / 2]).expect("a file");
     assert!(run(&["recover", "out", "--json"], 0).contains("\"repaired\""));
@@ -195,6 +199,9 @@ const EVENTS: &[&str] = &[
     "listed",
     "inspection",
     "plotted",
+    "exported",
+    "difference",
+    "export",
     "repair",
     "configuration",
     "registered",

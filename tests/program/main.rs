@@ -16,6 +16,7 @@ mod buttons;
 mod calibrate;
 mod docs;
 mod ends;
+mod export;
 #[cfg(feature = "foxglove")]
 mod foxglove;
 mod hooks;

@@ -143,7 +143,7 @@ proptest! {
         for kind in [Kind::Mask, Kind::Frame, Kind::Event, Kind::Other] {
             content(kind, &bytes, &mut Scratch::default());
         }
-        jpeg_size(&bytes);
+        jpeg_frame(&bytes);
     }
 
     #[test]

@@ -1,0 +1,229 @@
+"""`rapid export --to lerobot`, loaded by LeRobot itself (`make lerobot-test`); the episodes are recorded here.
+
+The episodes are read once more by code that shares nothing with the program: what belongs to a row is taken from
+`/rapid/frame` and from nothing else.
+"""
+
+import json
+import os
+import subprocess
+import tempfile
+import unittest
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import torch
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.compute_stats import get_feature_stats
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from mcap.reader import make_reader
+
+FPS = 30
+CAMERAS = {"cam_wrist": (480, 640), "tactile_tip": (240, 320)}
+MODALITIES = ["cam_wrist", "tactile_tip", "motor_state"]
+LOWER = 0xFFFF_FFFF
+PROGRAM = os.environ.get("RAPID_BIN")
+
+
+def rapid(*words: str, cwd: Path) -> str:
+    """Runs the program; returns what it prints."""
+    environment = {**os.environ, "RAPID_INSTANCE": f"lerobot-{os.getpid()}", "HOME": str(cwd)}
+    done = subprocess.run([PROGRAM, *words], cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    # 4: an episode is BAD, as on a busy machine it may be.
+    if done.returncode not in (0, 4):
+        raise AssertionError(f"rapid {' '.join(words)}: {done.returncode}\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def decoder(schema):
+    """The class of a schema's messages, from the schema in the file."""
+    pool = descriptor_pool.DescriptorPool()
+    for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+        pool.Add(proto)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+
+
+def read_episode(path: Path) -> list[dict]:
+    """The rows of an episode: by modality the sample, or None; mask, valid, age."""
+    classes, samples, frames = {}, defaultdict(dict), []
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        about = next(record.metadata for record in reader.iter_metadata() if record.name == "rapid")
+        listed = sorted(json.loads(about["modalities"]), key=lambda entry: entry["bit"])
+        topics = {entry["topic"]: entry["bit"] for entry in listed}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic != "/rapid/frame" and channel.topic not in topics:
+                continue
+            if schema.name not in classes:
+                classes[schema.name] = decoder(schema)
+            body = classes[schema.name].FromString(message.data)
+            if channel.topic == "/rapid/frame":
+                frames.append((message.log_time, body))
+            else:
+                samples[topics[channel.topic]][message.sequence] = body
+    rows = []
+    for time_ns, frame in frames:
+        slots = {slot.bit: slot for slot in frame.modalities}
+        row = {"time_ns": time_ns, "mask": [], "valid": [], "age": [], "samples": []}
+        for entry in listed:
+            slot = slots[entry["bit"]]
+            shown = slot.present and slot.HasField("seq")
+            sample = samples[entry["bit"]].get(slot.seq & LOWER) if shown else None
+            row["samples"].append(sample)
+            row["mask"].append(float(slot.present))
+            row["valid"].append(float(slot.valid and sample is not None))
+            row["age"].append(slot.age_ns / 1e9 if sample is not None else 0.0)
+        rows.append(row)
+    return rows
+
+
+@unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")
+class ExportedDataSet(unittest.TestCase):
+    """A data set of two episodes, the tactile camera unplugged in the first; the second is appended."""
+
+    @classmethod
+    def setUpClass(cls) -> None:
+        cls.temporary = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(cls.temporary.cleanup)
+        cls.folder = folder = Path(cls.temporary.name)
+        record = ("--sim", "--headless", "--record", "--out", "episodes")
+        export = ("export", "episodes", "--to", "lerobot", "--out", "set", "--include-bad", "--json")
+        # The demonstration unplugs the tactile camera after 4 s.
+        rapid(*record, "--duration", "6s", "--task", "a place block", cwd=folder)
+        rapid(*export, cwd=folder)
+        rapid(*record, "--duration", "2s", "--task", "b push", cwd=folder)
+        lines = [json.loads(line) for line in rapid(*export, "--verify", cwd=folder).splitlines()]
+        cls.summary = lines[-1]
+        exported = {line["episode"]: line["file"] for line in lines if line["event"] == "exported"}
+        cls.episodes = [read_episode(folder / exported[number]) for number in sorted(exported)]
+        cls.rows = [row for episode in cls.episodes for row in episode]
+        cls.data = LeRobotDataset("rapid/set", root=folder / "set")
+
+    def test_lerobot_loads_all_rows_and_features(self) -> None:
+        data = self.data
+        self.assertEqual((data.num_episodes, len(data), data.fps), (2, len(self.rows), FPS))
+        self.assertEqual(sorted(data.meta.camera_keys), [f"observation.images.{name}" for name in sorted(CAMERAS)])
+        self.assertEqual(data.features["rapid.mask"]["names"], MODALITIES)
+        self.assertEqual((self.summary["verified"], self.summary["differences"]), (len(self.rows), 0))
+        begins = [int(value) for value in data.meta.episodes["dataset_from_index"]]
+        self.assertEqual(begins, [0, len(self.episodes[0])])
+
+    def test_every_picture_is_the_cameras_own_and_every_number_its_f32(self) -> None:
+        files = sorted((self.folder / "set/data").glob("*/*.parquet"))
+        columns = [pq.read_table(file).to_pylist() for file in files]
+        table = [row for rows in columns for row in rows]
+        self.assertEqual(len(table), len(self.rows))
+        absent = 0
+        for found, expected in zip(table, self.rows, strict=True):
+            self.assertEqual(found["rapid.mask"], expected["mask"])
+            self.assertEqual(found["rapid.valid"], expected["valid"])
+            self.assertEqual(found["rapid.age"], expected["age"])
+            self.assertEqual(found["rapid.time_ns"], expected["time_ns"])
+            for place, name in enumerate(MODALITIES[:2]):
+                picture, sample = found[f"observation.images.{name}"]["bytes"], expected["samples"][place]
+                if sample is None:
+                    absent += 1
+                    self.assertEqual(picture[:4], b"\x89PNG")
+                else:
+                    self.assertEqual(picture, sample.data)
+            sample = expected["samples"][2]
+            values = [0.0] * 3 if sample is None else np.array(sample.values, np.float32).tolist()
+            self.assertEqual(found["observation.state"], values)
+        self.assertGreater(absent, 10)
+
+    def test_random_access_and_deltas(self) -> None:
+        data, generator = self.data, np.random.default_rng(0)
+        for at in generator.integers(0, len(data), 40):
+            item, row = data[int(at)], self.rows[at]
+            self.assertEqual(item["rapid.mask"].tolist(), row["mask"])
+            self.assertEqual(item["task"], "a place block" if at < len(self.episodes[0]) else "b push")
+            for place, (name, (height, width)) in enumerate(CAMERAS.items()):
+                picture = item[f"observation.images.{name}"]
+                self.assertEqual(tuple(picture.shape), (3, height, width))
+                self.assertEqual(bool(picture.any()), row["samples"][place] is not None)
+        deltas = {"observation.state": [-1 / FPS, 0.0], "observation.images.cam_wrist": [-1 / FPS, 0.0]}
+        paired = LeRobotDataset("rapid/set", root=self.folder / "set", delta_timestamps=deltas)
+        item = paired[50]
+        self.assertEqual(item["observation.state"].shape, (2, 3))
+        torch.testing.assert_close(item["observation.state"][1], data[50]["observation.state"])
+        torch.testing.assert_close(item["observation.images.cam_wrist"][0], data[49]["observation.images.cam_wrist"])
+        # The first row of the second episode has nothing before it.
+        begin = len(self.episodes[0])
+        self.assertTrue(paired[begin]["observation.state_is_pad"][0])
+        batch = next(iter(torch.utils.data.DataLoader(data, batch_size=8, shuffle=True)))
+        self.assertEqual(batch["observation.images.cam_wrist"].shape, (8, 3, 480, 640))
+
+    def test_statistics_are_those_of_the_valid_rows(self) -> None:
+        stats = self.data.meta.stats
+        rows = [row for row in self.rows if row["valid"][2]]
+        values = np.array([row["samples"][2].values for row in rows], np.float32).astype(float)
+        found = stats["observation.state"]
+        for name in ("min", "max", "mean", "std"):
+            expected = getattr(values, name)(0)
+            np.testing.assert_allclose(found[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
+        self.assertEqual(int(found["count"][0]), len(rows))
+        # LeRobot's own of every valid picture; ours are of a part of their pixels.
+        pictures = [
+            self.data[at]["observation.images.tactile_tip"].numpy()
+            for at, row in enumerate(self.rows)
+            if row["valid"][1]
+        ]
+        own = get_feature_stats(np.stack(pictures), axis=(0, 2, 3), keepdims=True)
+        found = stats["observation.images.tactile_tip"]
+        self.assertEqual((found["mean"].shape, int(found["count"][0])), ((3, 1, 1), len(pictures)))
+        for name in ("mean", "std", "q50"):
+            np.testing.assert_allclose(found[name], own[name][0], atol=0.03, err_msg=name)
+        self.assertEqual(sorted(set(own) - set(found)), [])
+
+    def test_lerobot_merges_two_of_them(self) -> None:
+        folder = self.folder
+        names = sorted(path.name for path in (folder / "episodes").glob("*.mcap"))
+        for out, name in zip(("one", "two"), names, strict=True):
+            words = ("--to", "lerobot", "--out", out, "--include-bad")
+            rapid("export", f"episodes/{name}", *words, cwd=folder)
+        roots = [folder / "one", folder / "two"]
+        aggregate_datasets(["rapid/one", "rapid/two"], "rapid/both", roots=roots, aggr_root=folder / "both")
+        both = LeRobotDataset("rapid/both", root=folder / "both")
+        self.assertEqual((both.num_episodes, len(both)), (2, len(self.rows)))
+        for at in range(0, len(both), 17):
+            merged, ours = both[at], self.data[at]
+            for key in ours:
+                if isinstance(ours[key], torch.Tensor):
+                    torch.testing.assert_close(merged[key], ours[key], msg=key)
+
+
+@unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")
+class ExportedActions(unittest.TestCase):
+    """Demonstrations of the simulated task, which have an action at each tick."""
+
+    def test_a_row_has_the_action_of_its_tick(self) -> None:
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            rapid("--sim", "task", "--headless", "--record", "--expert", "--episodes", "2", "--out", "out", cwd=folder)
+            rapid("export", "out", "--to", "lerobot", "--out", "set", "--include-bad", cwd=folder)
+            data = LeRobotDataset("rapid/set", root=folder / "set")
+            expected = [action for path in sorted((folder / "out").glob("*.mcap")) for action in read_actions(path)]
+            found = [data[at]["action"].tolist() for at in range(len(data))]
+            self.assertEqual(found, np.array(expected, np.float32).tolist())
+            np.testing.assert_allclose(data.meta.stats["action"]["mean"], np.mean(found, axis=0), atol=1e-6)
+
+
+def read_actions(path: Path) -> list[list[float]]:
+    """Of each tick the action nearest to it."""
+    body, times, values, ticks = None, [], [], []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            if channel.topic == "/rapid/frame":
+                ticks.append(message.log_time)
+            elif channel.topic == "/action":
+                body = body or decoder(schema)
+                times.append(message.log_time)
+                values.append(list(body.FromString(message.data).values))
+    return [values[int(np.abs(np.array(times) - tick).argmin())] for tick in ticks]
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,56 @@
+//! The grammar of `rapid export`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum, ValueHint};
+
+pub(super) const EXPORT: &str = "\
+A row is a tick of the frame index (/rapid/frame), with the sample of each sensor that belongs to it: pictures as \
+observation.images.NAME, JPEGs byte for byte and others as PNG; numbers as observation.state; /action as action; and \
+rapid.mask, rapid.valid, rapid.age, rapid.time_ns. What is absent is black or zero, with its mask.
+
+Episodes that DIR has already are skipped, new ones are appended. An episode that does not fit is left out and named; so \
+is one that is BAD. Interrupted, DIR has the episodes so far, and the same command continues.
+
+Examples:
+  rapid export episodes --to lerobot --out place-block
+  rapid export episodes --to lerobot --out place-block --verify
+  rapid export monday tuesday/*.mcap --to lerobot --out both --state motor_state,force
+  rapid export episodes --to lerobot --out own --state force --action motor_state
+  rapid export $(rapid list --label success --json | jq -r .file) --to lerobot --out good
+
+Exit code: 0 if DIR has at least one of the episodes, otherwise 1; 1 also if --verify finds a difference or it is \
+interrupted.";
+
+/// Which episodes, and where to.
+#[derive(Debug, Clone, Args)]
+pub struct ExportArgs {
+    /// Episodes, or folders of them
+    #[arg(required = true, value_name = "FILE|DIR", value_hint = ValueHint::AnyPath)]
+    pub paths: Vec<PathBuf>,
+    /// Format of the data set: lerobot (v3.0)
+    #[arg(long, value_name = "FORMAT", hide_possible_values = true)]
+    pub to: Layout,
+    /// Folder of the data set: a new one, or one to append to
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub out: PathBuf,
+    /// Also those that are BAD
+    #[arg(long)]
+    pub include_bad: bool,
+    /// Sensors whose numbers are observation.state, in this order [default: all, by bit; or as in DIR]
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    pub state: Vec<String>,
+    /// Sensor whose numbers are action [default: the topic /action; or as in DIR]
+    #[arg(long, value_name = "NAME")]
+    pub action: Option<String>,
+    /// Read DIR back and compare it with the episodes, bit for bit
+    #[arg(long)]
+    pub verify: bool,
+}
+
+/// A format of data sets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Layout {
+    /// LeRobot v3.0.
+    Lerobot,
+}

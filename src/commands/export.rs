@@ -1,0 +1,399 @@
+//! `rapid export`: episodes become a data set, or are appended to one.
+//!
+//! Episodes are surveyed in parallel and written one after the other, because a row has its number in the whole set.
+//!
+//! Invariant: an episode that cannot be exported is named with the reason, and the others are exported nevertheless.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use serde::Serialize;
+
+use super::progress::Bar;
+use super::{Format, json_line, progress};
+use crate::cli::ExportArgs;
+use crate::export::{self, Choice, DataSet, Difference, Features, Known, Refusal, SetError, Survey};
+use crate::record::inspect::{self, ReadError};
+use crate::status::Grade;
+use crate::text;
+
+/// Why the export ended.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// The episodes cannot be listed.
+    #[error(transparent)]
+    Episodes(#[from] ReadError),
+    /// Nothing to export.
+    #[error("no episodes in {0}")]
+    NoEpisodes(String),
+    /// The data set.
+    #[error(transparent)]
+    Set(#[from] SetError),
+    /// No episode fits.
+    #[error("nothing exported: none of {0} can be, for the reasons above")]
+    Nothing(String),
+    /// The user interrupted.
+    #[error("interrupted; {} has {episodes}, and the same command continues", out.display())]
+    Interrupted {
+        /// The data set.
+        out: PathBuf,
+        /// Its episodes.
+        episodes: String,
+    },
+    /// Standard output.
+    #[error("output: {0}")]
+    Output(#[from] io::Error),
+}
+
+/// What became of an episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Outcome {
+    Exported,
+    /// The set had it.
+    Already,
+    LeftOut,
+}
+
+/// A line about an episode.
+#[derive(Debug, Serialize)]
+struct Exported<'a> {
+    #[serde(serialize_with = "text::lossy")]
+    file: &'a Path,
+    outcome: Outcome,
+    /// Its number in the set.
+    episode: Option<usize>,
+    frames: Option<usize>,
+    /// Samples that could not be used.
+    unusable: Option<u64>,
+    verdict: Option<Grade>,
+    /// Why it is left out.
+    reason: Option<String>,
+}
+
+/// The last line.
+#[derive(Debug, Serialize)]
+struct Summary<'a> {
+    #[serde(serialize_with = "text::lossy")]
+    out: &'a Path,
+    exported: usize,
+    already: usize,
+    left_out: usize,
+    /// How many of those are BAD.
+    bad: usize,
+    /// Episodes and frames of the set.
+    episodes: usize,
+    frames: u64,
+    /// Frames compared with their episodes; `None` without `--verify`.
+    verified: Option<usize>,
+    differences: usize,
+}
+
+impl<'a> Summary<'a> {
+    const fn of(out: &'a Path) -> Self {
+        Self {
+            out,
+            exported: 0,
+            already: 0,
+            left_out: 0,
+            bad: 0,
+            episodes: 0,
+            frames: 0,
+            verified: None,
+            differences: 0,
+        }
+    }
+}
+
+/// A line about a difference.
+#[derive(Debug, Serialize)]
+struct Differing<'a> {
+    #[serde(serialize_with = "text::lossy")]
+    file: &'a Path,
+    episode: usize,
+    #[serde(flatten)]
+    difference: &'a Difference,
+}
+
+/// Exports the episodes that `args` names. A line for each goes to `out`, and to `err` for each that is left out; with
+/// `--json` all are objects on `out`. `stop` interrupts after the episode so far. Returns whether the data set is as the
+/// episodes, as far as that was requested.
+///
+/// # Errors
+/// When no episode fits, the data set cannot be written, or `stop` was set.
+pub fn export(
+    args: &ExportArgs,
+    format: Format,
+    stop: &AtomicBool,
+    out: &mut dyn Write,
+    err: &mut dyn Write,
+) -> Result<bool, ExportError> {
+    let files = inspect::episodes(&args.paths)?;
+    if files.is_empty() {
+        let places: Vec<_> = args.paths.iter().map(|path| path.display().to_string()).collect();
+        return Err(ExportError::NoEpisodes(places.join(", ")));
+    }
+    let mut set = DataSet::open(&args.out)?;
+    let mut report = Report { format, out, err, summary: Summary::of(&args.out) };
+    let found = found(&files, args, &set, stop, &mut report)?;
+    let mut sources = found.already;
+    let fitting = fitting(found.new, args, &set, &mut report)?;
+    let mut bar = Bar::new("exporting", fitting.len(), fitting.len() > 1);
+    for (done, (episode, features)) in fitting.iter().enumerate() {
+        bar.at(done);
+        if stop.load(Ordering::Relaxed) {
+            break;
+        }
+        let appended = set.append(episode, features, stop);
+        bar.clear();
+        match appended {
+            Ok(number) => {
+                report.exported(episode, number)?;
+                sources.insert(number, episode.file.clone());
+            }
+            Err(SetError::Refused(Refusal::Interrupted)) => break,
+            Err(SetError::Refused(refusal)) => report.left_out(&episode.file, &refusal)?,
+            Err(error) => return Err(error.into()),
+        }
+    }
+    drop(bar);
+    interrupted(&set, stop)?;
+    if args.verify {
+        verify(&set, &sources, stop, &mut report)?;
+        interrupted(&set, stop)?;
+    }
+    report.summary.episodes = set.episodes();
+    report.summary.frames = set.rows();
+    report.end()?;
+    if sources.is_empty() {
+        return Err(ExportError::Nothing(text::counted(files.len() as u64, "episode")));
+    }
+    Ok(report.summary.differences == 0)
+}
+
+fn interrupted(set: &DataSet, stop: &AtomicBool) -> Result<(), ExportError> {
+    if !stop.load(Ordering::Relaxed) {
+        return Ok(());
+    }
+    let episodes = text::counted(set.episodes() as u64, "episode");
+    Err(ExportError::Interrupted { out: set.folder().to_owned(), episodes })
+}
+
+/// The files, as they were found.
+struct Found {
+    /// By number in the set.
+    already: BTreeMap<usize, PathBuf>,
+    new: Vec<Survey>,
+}
+
+fn found(
+    files: &[PathBuf],
+    args: &ExportArgs,
+    set: &DataSet,
+    stop: &AtomicBool,
+    report: &mut Report<'_>,
+) -> Result<Found, ExportError> {
+    enum Read {
+        Already(usize),
+        New(Box<Survey>),
+    }
+    let read = |file: &Path| {
+        if stop.load(Ordering::Relaxed) {
+            return Err(Refusal::Interrupted);
+        }
+        let sha256 = export::sha256(file)?;
+        match set.find(&sha256) {
+            Some(number) => Ok(Read::Already(number)),
+            None => export::survey(file, sha256, args.include_bad, stop).map(|survey| Read::New(Box::new(survey))),
+        }
+    };
+    let mut found = Found { already: BTreeMap::new(), new: Vec::new() };
+    progress::each(files, read, |file, read| {
+        match read {
+            Ok(Read::Already(number)) => {
+                report.already(file, number)?;
+                found.already.insert(number, file.to_owned());
+            }
+            Ok(Read::New(survey)) => match found.new.iter().find(|other| other.sha256 == survey.sha256) {
+                Some(other) => {
+                    let same = format!("the same as {}", other.file.display());
+                    report.left_out(file, &Refusal::Different(same))?;
+                }
+                None => found.new.push(*survey),
+            },
+            Err(Refusal::Interrupted) => {}
+            Err(refusal) => report.left_out(file, &refusal)?,
+        }
+        Ok::<_, ExportError>(())
+    })?;
+    Ok(found)
+}
+
+/// Those that the set can have, with its features: of a new one those of the first.
+fn fitting(
+    episodes: Vec<Survey>,
+    args: &ExportArgs,
+    set: &DataSet,
+    report: &mut Report<'_>,
+) -> Result<Vec<(Survey, Features)>, ExportError> {
+    let mut known = set.features().map(Known::of).unwrap_or_default();
+    for episode in &episodes {
+        known.learn(episode);
+    }
+    let of_set = set.features().map(Features::choice).unwrap_or_default();
+    let choice = Choice {
+        state: if args.state.is_empty() { of_set.state } else { args.state.clone() },
+        action: args.action.clone().or(of_set.action),
+    };
+    let mut common = set.features().cloned();
+    let mut fitting = Vec::new();
+    for episode in episodes {
+        let features = Features::of(&episode, &choice, &known)
+            .and_then(|features| common.get_or_insert_with(|| features.clone()).check(&features).map(|()| features));
+        match features {
+            Ok(features) => fitting.push((episode, features)),
+            Err(refusal) => report.left_out(&episode.file, &refusal)?,
+        }
+    }
+    Ok(fitting)
+}
+
+fn verify(
+    set: &DataSet,
+    sources: &BTreeMap<usize, PathBuf>,
+    stop: &AtomicBool,
+    report: &mut Report<'_>,
+) -> Result<(), ExportError> {
+    let files: Vec<PathBuf> = sources.values().cloned().collect();
+    let numbers: BTreeMap<&Path, usize> = sources.iter().map(|(number, file)| (file.as_path(), *number)).collect();
+    let number = |file: &Path| numbers.get(file).copied().unwrap_or_default();
+    report.summary.verified = Some(0);
+    progress::each(
+        &files,
+        |file| export::verify(set, number(file), file, stop),
+        |file, verified| {
+            let (rows, differences) = match verified {
+                Ok(verified) => verified,
+                Err(SetError::Refused(Refusal::Interrupted)) => return Ok(()),
+                Err(error) => (0, vec![Difference { frame: None, feature: None, what: error.to_string() }]),
+            };
+            report.summary.verified = report.summary.verified.map(|before| before + rows);
+            for difference in &differences {
+                report.difference(&Differing { file, episode: number(file), difference })?;
+            }
+            Ok::<_, ExportError>(())
+        },
+    )
+}
+
+/// Writes a line for each episode, and counts.
+struct Report<'a> {
+    format: Format,
+    out: &'a mut dyn Write,
+    err: &'a mut dyn Write,
+    summary: Summary<'a>,
+}
+
+impl Report<'_> {
+    fn exported(&mut self, episode: &Survey, number: usize) -> io::Result<()> {
+        self.summary.exported += 1;
+        let Survey { file, rows, unusable, grade, .. } = episode;
+        let mut line = format!("{}: episode {number}, {}", file.display(), text::counted(*rows as u64, "frame"));
+        if *unusable > 0 {
+            let samples = text::counted(*unusable, "frame");
+            line = format!("{line}; in {samples} a damaged sample is left out");
+        }
+        self.episode(
+            &line,
+            &Exported {
+                file,
+                outcome: Outcome::Exported,
+                episode: Some(number),
+                frames: Some(*rows),
+                unusable: Some(*unusable),
+                verdict: Some(*grade),
+                reason: None,
+            },
+        )
+    }
+
+    fn already(&mut self, file: &Path, number: usize) -> io::Result<()> {
+        self.summary.already += 1;
+        let line = format!("{}: episode {number} already", file.display());
+        self.episode(
+            &line,
+            &Exported {
+                file,
+                outcome: Outcome::Already,
+                episode: Some(number),
+                frames: None,
+                unusable: None,
+                verdict: None,
+                reason: None,
+            },
+        )
+    }
+
+    fn left_out(&mut self, file: &Path, refusal: &Refusal) -> io::Result<()> {
+        self.summary.left_out += 1;
+        self.summary.bad += usize::from(matches!(refusal, Refusal::Bad(_)));
+        if self.format == Format::Text {
+            let line = format!("left out: {}: {refusal}", file.display());
+            return writeln!(self.err, "{}", text::plain(&line));
+        }
+        let line = Exported {
+            file,
+            outcome: Outcome::LeftOut,
+            episode: None,
+            frames: None,
+            unusable: None,
+            verdict: None,
+            reason: Some(refusal.to_string()),
+        };
+        self.episode("", &line)
+    }
+
+    fn episode(&mut self, line: &str, object: &Exported<'_>) -> io::Result<()> {
+        match self.format {
+            Format::Json => writeln!(self.out, "{}", json_line("exported", object)?),
+            Format::Text => writeln!(self.out, "{}", text::plain(line)),
+        }
+    }
+
+    fn difference(&mut self, differing: &Differing<'_>) -> io::Result<()> {
+        self.summary.differences += 1;
+        if self.format == Format::Json {
+            return writeln!(self.out, "{}", json_line("difference", differing)?);
+        }
+        let Difference { frame, feature, what } = differing.difference;
+        let mut line = format!("different: {}: episode {}", differing.file.display(), differing.episode);
+        if let Some(frame) = frame {
+            line = format!("{line}, frame {frame}");
+        }
+        if let Some(feature) = feature {
+            line = format!("{line}, {feature}");
+        }
+        writeln!(self.err, "{}", text::plain(&format!("{line}: {what}")))
+    }
+
+    fn end(&mut self) -> io::Result<()> {
+        if self.format == Format::Json {
+            return writeln!(self.out, "{}", json_line("export", &self.summary)?);
+        }
+        let Summary { out, exported, already, left_out, bad, episodes, frames, verified, differences } = &self.summary;
+        let (episodes, frames) = (text::counted(*episodes as u64, "episode"), text::counted(*frames, "frame"));
+        let bad = if *bad > 0 { format!(" ({bad} BAD)") } else { String::new() };
+        let mut line = format!(
+            "{exported} exported, {already} already there, {left_out} left out{bad}; {}: {episodes}, {frames}",
+            out.display()
+        );
+        if let Some(verified) = verified {
+            let (verified, differences) =
+                (text::counted(*verified as u64, "frame"), text::counted(*differences as u64, "difference"));
+            line = format!("{line}; {verified} compared, {differences}");
+        }
+        writeln!(self.out, "{}", text::plain(&line))
+    }
+}

@@ -1,0 +1,90 @@
+//! The values of a row in a data set.
+//!
+//! Invariant: of a modality that is not there, or whose sample cannot be used, pictures are black and numbers zero, and it
+//! is not valid.
+
+use std::borrow::Cow;
+
+use super::features::{Actions, Features};
+use super::picture;
+use super::rows::{Payload, Refusal, Row};
+use super::survey::{is_usable, narrow};
+use crate::modality::ModalityKind;
+use crate::pixels::Pixels;
+
+/// The values of a row.
+#[derive(Debug, Default)]
+pub(super) struct Cells<'a> {
+    /// The file of each camera's picture.
+    pub(super) pictures: Vec<Cow<'a, [u8]>>,
+    pub(super) state: Vec<f32>,
+    pub(super) action: Vec<f32>,
+    /// By modality, 0 or 1.
+    pub(super) mask: Vec<f32>,
+    pub(super) valid: Vec<f32>,
+    /// By modality, seconds; 0 without a sample.
+    pub(super) age: Vec<f64>,
+    pub(super) time_ns: i64,
+}
+
+/// Makes them.
+#[derive(Debug)]
+pub(super) struct CellMaker<'f> {
+    features: &'f Features,
+    kinds: Vec<ModalityKind>,
+    /// A black picture of each camera.
+    black: Vec<Vec<u8>>,
+    pixels: Pixels,
+}
+
+impl<'f> CellMaker<'f> {
+    /// For rows of an episode whose modalities are of these kinds.
+    pub(super) fn new(features: &'f Features, kinds: Vec<ModalityKind>) -> Result<Self, Refusal> {
+        let black = features.cameras.iter().map(|(_, shape)| picture::black(*shape)).collect::<Result<_, _>>();
+        let black = black.map_err(|error| Refusal::Different(error.to_string()))?;
+        Ok(Self { features, kinds, black, pixels: Pixels::default() })
+    }
+
+    pub(super) fn cells<'a>(&mut self, row: &'a Row<'_>) -> Result<Cells<'a>, Refusal>
+    where
+        'f: 'a,
+    {
+        let usable = |place: usize| -> Option<&'a Payload> {
+            let kind = self.kinds.get(place)?;
+            row.samples.get(place)?.as_deref().filter(|payload| is_usable(*kind, payload))
+        };
+        let vector = |place: usize, length: usize, into: &mut Vec<f32>| {
+            let end = into.len() + length;
+            if let Some(Payload::Numbers(numbers)) = usable(place) {
+                into.extend(numbers.iter().take(length).map(|number| narrow(*number)));
+            }
+            into.resize(end, 0.0);
+        };
+        let mut cells = Cells { time_ns: i64::try_from(row.time_ns).unwrap_or(i64::MAX), ..Cells::default() };
+        for (place, length) in &self.features.state {
+            vector(*place, *length, &mut cells.state);
+        }
+        match self.features.actions {
+            Actions::Absent => {}
+            Actions::Topic(_) => cells.action.extend(row.action.iter().map(|value| narrow(*value))),
+            Actions::Modality(place, length) => vector(place, length, &mut cells.action),
+        }
+        for (place, slot) in row.slots.iter().enumerate() {
+            let flag = |is_set: bool| f32::from(u8::from(is_set));
+            let has_sample = usable(place).is_some();
+            cells.mask.push(flag(slot.present));
+            cells.valid.push(flag(slot.valid && has_sample));
+            cells.age.push(if has_sample { slot.age_ns as f64 / 1e9 } else { 0.0 });
+        }
+        let pictures: Vec<_> = self.features.cameras.iter().map(|(place, _)| usable(*place)).collect();
+        for (payload, black) in pictures.into_iter().zip(&self.black) {
+            cells.pictures.push(match payload {
+                Some(payload) => {
+                    picture::file(payload, &mut self.pixels).map_err(|error| Refusal::Different(error.to_string()))?
+                }
+                None => Cow::Owned(black.clone()),
+            });
+        }
+        Ok(cells)
+    }
+}

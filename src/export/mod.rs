@@ -1,0 +1,32 @@
+//! Episodes as a data set of LeRobot v3.0: Parquet tables, one row for each tick of the frame index.
+//!
+//! `rows` reads an episode tick by tick, `survey` finds out what it holds and whether it can be exported, `features` is
+//! what all episodes of a data set have in common, `cells` the values of one row, `table` and `set` the files, and
+//! `verify` compares them with the episodes again.
+//!
+//! The format is that of `lerobot` 0.4.4, `CODEBASE_VERSION` v3.0:
+//! <https://huggingface.co/docs/lerobot/lerobot-dataset-v3>.
+//!
+//! Invariant: which sample belongs to a row follows from `/rapid/frame` alone.
+//! Invariant: a picture in JPEG is copied byte for byte, and what is absent has its mask.
+//! Invariant: an episode is in the set once its file in `meta/episodes` has its name, and everything of it is complete
+//! by then; a program that is killed leaves files without a name in the set, and the next one removes them.
+//! Invariant: memory holds what is between a sample and its frame, and one group of rows.
+
+mod cells;
+mod features;
+mod picture;
+mod rows;
+mod set;
+mod statistics;
+mod survey;
+mod table;
+#[cfg(test)]
+mod tests;
+mod verify;
+
+pub use features::{Choice, ChoiceError, Features, Known};
+pub use rows::Refusal;
+pub use set::{DataSet, SetError};
+pub use survey::{Survey, sha256, survey};
+pub use verify::{Difference, verify};

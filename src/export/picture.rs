@@ -1,0 +1,132 @@
+//! Pictures of a data set: a JPEG as the camera sent it, and what is not compressed as PNG, which loses nothing.
+//!
+//! Grey is written as three equal channels. YUYV becomes red, green and blue first, by the rule of `pixels`: LeRobot
+//! and its policies know no other pictures.
+
+use std::borrow::Cow;
+use std::fmt;
+
+use super::rows::Payload;
+use crate::episode::decode::jpeg_frame;
+use crate::pixels::{LARGEST, Picture, PixelError, Pixels};
+use crate::record::is_whole_jpeg;
+use crate::sample::Encoding;
+
+/// Pixels along each side, and values of a pixel: 3, and 1 in the pictures of a camera that sends grey JPEGs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Shape {
+    /// Rows.
+    pub height: u32,
+    /// Pixels per row.
+    pub width: u32,
+    /// Values of a pixel.
+    pub channels: u8,
+}
+
+impl Shape {
+    /// `None` if no picture of `rapid` has this shape: what a file claims may be anything.
+    pub(super) fn new(height: u32, width: u32, channels: u8) -> Option<Self> {
+        let is_side = |side: u32| usize::try_from(side).is_ok_and(|side| (1..=LARGEST).contains(&side));
+        (is_side(height) && is_side(width) && matches!(channels, 1 | 3)).then_some(Self { height, width, channels })
+    }
+}
+
+impl fmt::Display for Shape {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}x{}", self.width, self.height)?;
+        if self.channels == 1 { write!(f, " grey") } else { Ok(()) }
+    }
+}
+
+/// The shape of a picture that can be used: of a JPEG, one with its beginning, its end and a size.
+pub(super) fn shape(payload: &Payload) -> Option<Shape> {
+    let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
+    let (width, height) = (*width, *height);
+    let pixels = usize::try_from(u64::from(width) * u64::from(height)).ok()?;
+    let channels = match encoding {
+        Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components).filter(|_| is_whole_jpeg(bytes)),
+        Encoding::Grey => (bytes.len() == pixels).then_some(3),
+        Encoding::Yuyv => (Some(bytes.len()) == pixels.checked_mul(2) && pixels.is_multiple_of(2)).then_some(3),
+        Encoding::Bytes | Encoding::F64 | Encoding::Mask => None,
+    };
+    Shape::new(height, width, channels?)
+}
+
+/// The file of a picture.
+///
+/// # Errors
+/// When it has no pixels.
+pub(super) fn file<'a>(payload: &'a Payload, pixels: &mut Pixels) -> Result<Cow<'a, [u8]>, PixelError> {
+    match payload {
+        Payload::Picture { encoding: Encoding::Mjpeg, bytes, .. } => Ok(Cow::Borrowed(bytes)),
+        Payload::Picture { encoding, width, height, bytes } => {
+            let (encoding, width, height) = (*encoding, *width, *height);
+            pixels.decode(&Picture { encoding, width, height, bytes })?;
+            png(Shape { height, width, channels: 3 }, pixels.values()).map(Cow::Owned)
+        }
+        Payload::Numbers(_) => Err(PixelError::NoPicture(Encoding::F64)),
+    }
+}
+
+/// The file of a black picture.
+///
+/// # Errors
+/// When it is too large.
+pub(super) fn black(shape: Shape) -> Result<Vec<u8>, PixelError> {
+    let values = u64::from(shape.width) * u64::from(shape.height) * u64::from(shape.channels);
+    png(shape, &vec![0; usize::try_from(values).unwrap_or(usize::MAX)])
+}
+
+fn png(shape: Shape, values: &[u8]) -> Result<Vec<u8>, PixelError> {
+    let mut file = Vec::new();
+    let mut encoder = png::Encoder::new(&mut file, shape.width, shape.height);
+    encoder.set_color(if shape.channels == 1 { png::ColorType::Grayscale } else { png::ColorType::Rgb });
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::Fast);
+    let written = encoder.write_header().and_then(|mut writer| {
+        writer.write_image_data(values)?;
+        writer.finish()
+    });
+    written.map_err(|error| PixelError::Damaged(error.to_string()))?;
+    Ok(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn decoded(file: &[u8]) -> (u32, u32, Vec<u8>) {
+        let mut reader = png::Decoder::new(std::io::Cursor::new(file)).read_info().unwrap();
+        let mut values = vec![0; reader.output_buffer_size().unwrap()];
+        let frame = reader.next_frame(&mut values).unwrap();
+        (frame.width, frame.height, values)
+    }
+
+    #[test]
+    fn what_is_not_compressed_loses_nothing() {
+        let mut pixels = Pixels::default();
+        let bytes: Vec<u8> = (0..=255).cycle().take(40 * 30).collect();
+        let grey = Payload::Picture { encoding: Encoding::Grey, width: 40, height: 30, bytes: bytes.clone() };
+        assert_eq!(shape(&grey), Some(Shape { height: 30, width: 40, channels: 3 }));
+        let values: Vec<u8> = bytes.iter().flat_map(|grey| [*grey; 3]).collect();
+        assert_eq!(decoded(&file(&grey, &mut pixels).unwrap()), (40, 30, values));
+        let yuyv = Payload::Picture { encoding: Encoding::Yuyv, width: 20, height: 30, bytes: bytes.clone() };
+        let (_, _, values) = decoded(&file(&yuyv, &mut pixels).unwrap());
+        assert_eq!(values, pixels.values());
+        let short = Payload::Picture { encoding: Encoding::Grey, width: 41, height: 30, bytes };
+        assert_eq!(shape(&short), None);
+    }
+
+    #[test]
+    fn a_jpeg_is_not_changed_and_needs_its_end() {
+        let picture =
+            |bytes: &[u8]| Payload::Picture { encoding: Encoding::Mjpeg, width: 8, height: 4, bytes: bytes.to_vec() };
+        let mut jpeg = Vec::new();
+        jpeg_encoder::Encoder::new(&mut jpeg, 90).encode(&[9; 32], 8, 4, jpeg_encoder::ColorType::Luma).unwrap();
+        let whole = picture(&jpeg);
+        assert_eq!(shape(&whole), Some(Shape { height: 4, width: 8, channels: 1 }));
+        assert_eq!(file(&whole, &mut Pixels::default()).unwrap(), jpeg);
+        assert_eq!(shape(&picture(&jpeg[..jpeg.len() - 2])), None);
+        assert_eq!(decoded(&black(shape(&whole).unwrap()).unwrap()), (8, 4, vec![0; 32]));
+    }
+}

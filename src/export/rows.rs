@@ -1,0 +1,576 @@
+//! The rows of an episode: one for each tick of the frame index, with the sample of each modality that belongs to it.
+//!
+//! The file is read twice: for the frames, which are small, and for the samples that they name, each of which is kept
+//! until the last row that needs it.
+//!
+//! Invariant: a row shows a modality only if its bit is set at the tick, the frame names a sample and the file has it.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+use std::rc::Rc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use crate::action::ACTION_TOPIC;
+use crate::episode::decode::{Content, FrameSlot, Kind, Sample, Scratch};
+use crate::episode::reader::{Item, Message, Reader};
+use crate::episode::{ABOUT, FRAME_TOPIC, ReadError};
+use crate::modality::{ModalityId, ModalityKind};
+use crate::sample::Encoding;
+
+/// Bytes of samples that may wait for their frame: a minute of four cameras, where a second is usual.
+const MOST_WAITING: usize = 1 << 30;
+
+/// Why an episode, or the rest of it, is not exported. Without the name of the file.
+#[derive(Debug, thiserror::Error)]
+pub enum Refusal {
+    /// It cannot be read.
+    #[error("{}", without_name(.0))]
+    Read(#[from] ReadError),
+    /// It cannot be read to the end.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// Another program wrote it.
+    #[error("not an episode of rapid")]
+    NotOurs,
+    /// Its recorder did not end it.
+    #[error("unfinished: `rapid recover` makes an episode of it")]
+    Unfinished,
+    /// A part of it is left out by every reader.
+    #[error("damaged ({0}): `rapid recover` saves its readable data to a new file")]
+    Damaged(String),
+    /// Its verdict.
+    #[error("BAD ({0}); --include-bad exports it nevertheless")]
+    Bad(String),
+    /// A value of its metadata.
+    #[error("metadata record `{ABOUT}`, key `{key}`: {problem}")]
+    Metadata {
+        /// The key.
+        key: &'static str,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// Observations that are no whole number a second.
+    #[error("{0} observations a second, and LeRobot takes whole numbers alone: record with `--rate 30`")]
+    Rate(f64),
+    /// Without a frame index.
+    #[error("no frames: nothing on {FRAME_TOPIC}")]
+    NoFrames,
+    /// The rows would not be at equal distances.
+    #[error("ticks {first} to {last} are missing of the frame index, and the rows of a data set have equal distances")]
+    Hole {
+        /// The first tick that is missing.
+        first: u64,
+        /// The last one.
+        last: u64,
+    },
+    /// Neither a camera nor a vector.
+    #[error("neither a camera nor a sensor of numbers")]
+    Nothing,
+    /// The pictures of a camera have several sizes.
+    #[error("{name}: a picture of {found} in frame {frame}, and {expected} before")]
+    Size {
+        /// The camera.
+        name: String,
+        /// The row.
+        frame: usize,
+        /// Its size.
+        found: String,
+        /// That of the first one.
+        expected: String,
+    },
+    /// A sensor without any sample, here or in the set.
+    #[error("{0}: no usable sample to know the size of, and neither the other episodes nor the registry have it")]
+    NoSize(String),
+    /// Numbers of several lengths.
+    #[error("{name}: {found} numbers, and {expected} before")]
+    Length {
+        /// The modality, or the topic of actions.
+        name: String,
+        /// How many.
+        found: usize,
+        /// How many there were before.
+        expected: usize,
+    },
+    /// An action that is not a number.
+    #[error("{ACTION_TOPIC}: a number that is not finite in message {0}")]
+    NotFinite(u32),
+    /// It does not match the other episodes of the set.
+    #[error("{0}")]
+    Different(String),
+    /// What was requested is not in it.
+    #[error(transparent)]
+    Choice(#[from] super::ChoiceError),
+    /// The frames do not follow their samples.
+    #[error("more than {} MiB of samples before the frames that name them", MOST_WAITING >> 20)]
+    Order,
+    /// Two readings differ.
+    #[error("it changed while it was read")]
+    Changed,
+    /// The user asked for the end.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+/// The reason, without the name that every message of the export has before it.
+fn without_name(error: &ReadError) -> String {
+    let text = error.to_string();
+    match error {
+        ReadError::Io { path, .. } | ReadError::NotFile(path) | ReadError::NotMcap(path) => {
+            text.strip_prefix(&format!("{}: ", path.display())).map_or(text.clone(), str::to_owned)
+        }
+    }
+}
+
+/// A modality, as the metadata of an episode lists it.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Deserialize)]
+pub(super) struct Listed {
+    pub(super) name: String,
+    pub(super) bit: ModalityId,
+    pub(super) kind: ModalityKind,
+    /// Image: `[height, width]` in pixels. Scalars: `[channels]`. What the registry declares, zeros where it does not.
+    #[serde(default)]
+    pub(super) shape: Vec<u32>,
+    #[serde(default)]
+    latency_ns: u64,
+}
+
+/// A modality at a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Slot {
+    pub(super) present: bool,
+    pub(super) valid: bool,
+    pub(super) age_ns: i64,
+    /// The sample that belongs to the tick: its place among those of its modality in the file.
+    sample: Option<u32>,
+}
+
+/// A sample that a row shows.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Payload {
+    Picture { encoding: Encoding, width: u32, height: u32, bytes: Vec<u8> },
+    Numbers(Vec<f64>),
+}
+
+impl Payload {
+    fn of(sample: &Sample<'_>) -> Option<Self> {
+        match sample.encoding {
+            encoding @ (Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey) => {
+                let (width, height) = (sample.width, sample.height);
+                Some(Self::Picture { encoding, width, height, bytes: sample.payload.to_owned() })
+            }
+            Encoding::F64 => Some(Self::Numbers(numbers(sample.payload))),
+            Encoding::Bytes | Encoding::Mask => None,
+        }
+    }
+
+    fn size(&self) -> usize {
+        match self {
+            Self::Picture { bytes, .. } => bytes.len(),
+            Self::Numbers(numbers) => 8 * numbers.len(),
+        }
+    }
+}
+
+fn numbers(payload: &[u8]) -> Vec<f64> {
+    let (numbers, _) = payload.as_chunks();
+    numbers.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect()
+}
+
+/// One row.
+#[derive(Debug)]
+pub(super) struct Row<'a> {
+    pub(super) number: usize,
+    /// The tick, wall time in ns since 1970.
+    pub(super) time_ns: u64,
+    /// By modality, ascending by bit.
+    pub(super) slots: &'a [Slot],
+    /// By modality: its sample, if there is one to show.
+    pub(super) samples: &'a [Option<Rc<Payload>>],
+    /// The action that belongs to the tick; empty without any.
+    pub(super) action: &'a [f64],
+}
+
+/// The frames of an episode.
+#[derive(Debug)]
+pub(super) struct Index {
+    pub(super) fps: u32,
+    pub(super) task: String,
+    /// Ascending by bit.
+    pub(super) modalities: Vec<Listed>,
+    /// Of each row, wall time in ns since 1970.
+    pub(super) ticks: Vec<u64>,
+    /// Of each row, one for each modality.
+    slots: Vec<Slot>,
+    actions: Actions,
+}
+
+/// What was sent to the actuator.
+#[derive(Debug, Default)]
+struct Actions {
+    times: Vec<u64>,
+    /// One behind the other, each of `length`.
+    values: Vec<f64>,
+    length: usize,
+}
+
+impl Actions {
+    fn push(&mut self, message: &Message<'_>, sample: &Sample<'_>) -> Result<(), Refusal> {
+        let values = numbers(sample.payload);
+        if self.times.is_empty() {
+            self.length = values.len();
+        } else if self.length != values.len() {
+            let (found, expected) = (values.len(), self.length);
+            return Err(Refusal::Length { name: ACTION_TOPIC.to_owned(), found, expected });
+        }
+        if values.iter().any(|value| !value.is_finite()) {
+            return Err(Refusal::NotFinite(message.sequence));
+        }
+        self.times.push(message.log_time);
+        self.values.extend(values);
+        Ok(())
+    }
+
+    /// The action of a tick: the one nearest to it within half a period, as the training of this project chooses them;
+    /// without one the last before it, which is still in force, and before all of them the first.
+    fn at(&self, tick: u64, period_ns: u64) -> &[f64] {
+        // The writer orders actions by their time of receipt, which is that of the file.
+        let after = self.times.partition_point(|time| *time < tick);
+        let distance = |at: usize| self.times.get(at).map(|time| time.abs_diff(tick));
+        let (before, next) = (after.checked_sub(1), distance(after).filter(|ns| *ns < period_ns / 2));
+        let chosen = match (before, next) {
+            (Some(before), Some(next)) if distance(before).is_some_and(|ns| ns < next) => before,
+            (_, Some(_)) | (None, None) => after,
+            (Some(before), None) => before,
+        };
+        self.values.get(chosen * self.length..(chosen + 1) * self.length).unwrap_or_default()
+    }
+
+    /// Sorts by time, of equal ones in the order of the file.
+    fn sort(&mut self) {
+        if self.times.is_sorted() {
+            return;
+        }
+        let mut order: Vec<usize> = (0..self.times.len()).collect();
+        order.sort_by_key(|at| self.times.get(*at));
+        let value = |at: &usize| self.values.get(at * self.length..(at + 1) * self.length).unwrap_or_default().to_vec();
+        self.values = order.iter().flat_map(value).collect();
+        self.times.sort_unstable();
+    }
+}
+
+/// A frame as it is in the file.
+struct Frame {
+    number: u32,
+    time_ns: u64,
+    slots: Vec<FrameSlot>,
+}
+
+impl Index {
+    /// Reads the frames of the episode at `path`.
+    pub(super) fn read(path: &Path, stop: &AtomicBool) -> Result<Self, Refusal> {
+        let mut reader = Reader::open(path)?;
+        let mut scratch = Scratch::default();
+        let mut frames = Vec::new();
+        let mut actions = Actions::default();
+        // By modality, in the order of the file: number and capture time.
+        let mut samples: BTreeMap<ModalityId, Vec<(u32, u64)>> = BTreeMap::new();
+        while reader.advance()? {
+            let Item::Message(message) = reader.item() else { continue };
+            match message.channel.kind {
+                Kind::Frame => {
+                    check(stop)?;
+                    if let Some(Content::Frame(slots)) = message.content(&mut scratch) {
+                        let (number, time_ns) = (message.sequence, message.log_time);
+                        frames.push(Frame { number, time_ns, slots: slots.to_vec() });
+                    }
+                }
+                Kind::Sample(_) => {
+                    let Some(Content::Sample(sample)) = message.content(&mut scratch) else { continue };
+                    if let Some(id) = message.channel.bit {
+                        samples.entry(id).or_default().push((message.sequence, message.log_time));
+                    } else if message.channel.topic == ACTION_TOPIC && sample.encoding == Encoding::F64 {
+                        actions.push(&message, &sample)?;
+                    }
+                }
+                Kind::Mask | Kind::Event | Kind::Other => {}
+            }
+        }
+        actions.sort();
+        let modalities = modalities(reader.about("modalities"))?;
+        let fps = rate(reader.about("observation_hz"))?;
+        let task = reader.about("task").unwrap_or_default().to_owned();
+        check_ticks(&frames)?;
+        let slots = chosen(&modalities, &frames, &samples);
+        let ticks = frames.iter().map(|frame| frame.time_ns).collect();
+        Ok(Self { fps, task, modalities, ticks, slots, actions })
+    }
+
+    /// The modalities at a row.
+    pub(super) fn slots(&self, row: usize) -> &[Slot] {
+        let count = self.modalities.len();
+        self.slots.get(row * count..(row + 1) * count).unwrap_or_default()
+    }
+
+    /// The length of an action; `None` without any.
+    pub(super) fn action_length(&self) -> Option<usize> {
+        (!self.actions.times.is_empty()).then_some(self.actions.length)
+    }
+
+    /// Reads the samples of the episode at `path` and passes every row to `take`, in order.
+    pub(super) fn rows(
+        &self,
+        path: &Path,
+        stop: &AtomicBool,
+        mut take: impl FnMut(&Row<'_>) -> Result<(), Refusal>,
+    ) -> Result<(), Refusal> {
+        let mut waiting = Waiting::new(self);
+        let mut reader = Reader::open(path)?;
+        let mut scratch = Scratch::default();
+        waiting.flush(&mut take)?;
+        while waiting.row < self.ticks.len() && reader.advance()? {
+            let Item::Message(message) = reader.item() else { continue };
+            let (Kind::Sample(_), Some(id)) = (message.channel.kind, message.channel.bit) else { continue };
+            let Some(Content::Sample(sample)) = message.content(&mut scratch) else { continue };
+            if waiting.push(id, &sample)? {
+                check(stop)?;
+                waiting.flush(&mut take)?;
+            }
+        }
+        // All samples were there when the frames were read.
+        if waiting.row < self.ticks.len() { Err(Refusal::Changed) } else { Ok(()) }
+    }
+}
+
+fn check(stop: &AtomicBool) -> Result<(), Refusal> {
+    if stop.load(Ordering::Relaxed) { Err(Refusal::Interrupted) } else { Ok(()) }
+}
+
+fn modalities(text: Option<&str>) -> Result<Vec<Listed>, Refusal> {
+    let wrong = |problem| Refusal::Metadata { key: "modalities", problem };
+    let text = text.ok_or(Refusal::NotOurs)?;
+    let mut listed: Vec<Listed> = serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
+    listed.sort_by_key(|modality| modality.bit);
+    if let Some((first, second)) = pairs(&listed).find(|(first, second)| first.bit == second.bit) {
+        return Err(wrong(format!("{} and {} have the same bit", first.name, second.name)));
+    }
+    // LeRobot takes no such name for a feature.
+    match listed.iter().find(|modality| modality.name.is_empty() || modality.name.contains(['/', '.'])) {
+        Some(modality) => Err(wrong(format!("{:?} is no name of a modality", modality.name))),
+        None => Ok(listed),
+    }
+}
+
+fn rate(text: Option<&str>) -> Result<u32, Refusal> {
+    let wrong = |problem: &str| Refusal::Metadata { key: "observation_hz", problem: problem.to_owned() };
+    let hertz: f64 = text.ok_or_else(|| wrong("missing"))?.parse().map_err(|_| wrong("not a number"))?;
+    if hertz.fract() != 0.0 || !(1.0..=1e6).contains(&hertz) {
+        return Err(Refusal::Rate(hertz));
+    }
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a whole number in that range")]
+    Ok(hertz as u32)
+}
+
+/// Each with the next one.
+fn pairs<T>(all: &[T]) -> impl Iterator<Item = (&T, &T)> {
+    all.iter().zip(all.iter().skip(1))
+}
+
+/// Rows are at equal distances: no tick is missing, and none is there twice.
+fn check_ticks(frames: &[Frame]) -> Result<(), Refusal> {
+    if frames.is_empty() {
+        return Err(Refusal::NoFrames);
+    }
+    match pairs(frames).find(|(one, next)| next.number != one.number.wrapping_add(1)) {
+        Some((one, next)) => {
+            Err(Refusal::Hole { first: u64::from(one.number) + 1, last: u64::from(next.number).saturating_sub(1) })
+        }
+        None => Ok(()),
+    }
+}
+
+/// The slots of all rows, with the samples that the frames name.
+fn chosen(modalities: &[Listed], frames: &[Frame], samples: &BTreeMap<ModalityId, Vec<(u32, u64)>>) -> Vec<Slot> {
+    // By modality: the places of the samples of a number. A counter that began again has several.
+    let by_number: BTreeMap<ModalityId, BTreeMap<u32, Vec<(u32, u64)>>> = samples
+        .iter()
+        .map(|(id, samples)| {
+            let mut places: BTreeMap<u32, Vec<(u32, u64)>> = BTreeMap::new();
+            for (place, (number, captured)) in (0..).zip(samples) {
+                places.entry(*number).or_default().push((place, *captured));
+            }
+            (*id, places)
+        })
+        .collect();
+    let slot = |frame: &Frame, modality: &Listed| {
+        let found = frame.slots.iter().find(|slot| slot.id == modality.bit)?;
+        let FrameSlot { present, valid, age_ns, seq, .. } = *found;
+        #[expect(clippy::cast_possible_truncation, reason = "a message has the lower 32 bits of a number")]
+        let named = seq.filter(|_| present).map(|seq| seq as u32);
+        let candidates = named.and_then(|number| by_number.get(&modality.bit)?.get(&number));
+        let captured = frame.time_ns.saturating_add_signed(age_ns.saturating_neg()).saturating_add(modality.latency_ns);
+        let nearest = |(_, time): &&(u32, u64)| time.abs_diff(captured);
+        let sample = candidates.and_then(|candidates| candidates.iter().min_by_key(nearest)).map(|(place, _)| *place);
+        Some(Slot {
+            present,
+            valid: valid && sample.is_some(),
+            age_ns: if sample.is_some() { age_ns } else { 0 },
+            sample,
+        })
+    };
+    frames
+        .iter()
+        .flat_map(|frame| modalities.iter().map(move |modality| slot(frame, modality).unwrap_or_default()))
+        .collect()
+}
+
+/// Samples that were read and whose row is still to come.
+struct Waiting<'a> {
+    index: &'a Index,
+    /// By modality: how many samples were read, and the last row that needs each of those that are needed.
+    read: Vec<u32>,
+    last_use: Vec<BTreeMap<u32, usize>>,
+    samples: Vec<BTreeMap<u32, Rc<Payload>>>,
+    bytes: usize,
+    /// The next row.
+    row: usize,
+    shown: Vec<Option<Rc<Payload>>>,
+}
+
+impl<'a> Waiting<'a> {
+    fn new(index: &'a Index) -> Self {
+        let count = index.modalities.len();
+        let mut last_use = vec![BTreeMap::new(); count];
+        for row in 0..index.ticks.len() {
+            for (uses, slot) in last_use.iter_mut().zip(index.slots(row)) {
+                uses.extend(slot.sample.map(|sample| (sample, row)));
+            }
+        }
+        let samples = vec![BTreeMap::new(); count];
+        Self { index, read: vec![0; count], last_use, samples, bytes: 0, row: 0, shown: vec![None; count] }
+    }
+
+    /// Takes the next sample of a modality; returns whether a row needs it.
+    fn push(&mut self, id: ModalityId, sample: &Sample<'_>) -> Result<bool, Refusal> {
+        let Some(at) = self.index.modalities.iter().position(|modality| modality.bit == id) else { return Ok(false) };
+        let (Some(read), Some(uses), Some(samples)) =
+            (self.read.get_mut(at), self.last_use.get(at), self.samples.get_mut(at))
+        else {
+            return Ok(false);
+        };
+        let place = *read;
+        *read = read.saturating_add(1);
+        if !uses.contains_key(&place) {
+            return Ok(false);
+        }
+        let payload = Payload::of(sample).unwrap_or(Payload::Numbers(Vec::new()));
+        self.bytes += payload.size();
+        samples.insert(place, Rc::new(payload));
+        if self.bytes > MOST_WAITING { Err(Refusal::Order) } else { Ok(true) }
+    }
+
+    /// Passes on all rows whose samples are there.
+    fn flush(&mut self, take: &mut impl FnMut(&Row<'_>) -> Result<(), Refusal>) -> Result<(), Refusal> {
+        while let Some(tick) = self.index.ticks.get(self.row) {
+            let slots = self.index.slots(self.row);
+            for ((shown, samples), slot) in self.shown.iter_mut().zip(&self.samples).zip(slots) {
+                *shown = slot.sample.and_then(|sample| samples.get(&sample)).map(Rc::clone);
+                if slot.sample.is_some() && shown.is_none() {
+                    return Ok(());
+                }
+            }
+            let period_ns = 1_000_000_000 / u64::from(self.index.fps.max(1));
+            let action = self.index.actions.at(*tick, period_ns);
+            take(&Row { number: self.row, time_ns: *tick, slots, samples: &self.shown, action })?;
+            for ((samples, uses), slot) in self.samples.iter_mut().zip(&self.last_use).zip(slots) {
+                let done = slot.sample.filter(|sample| uses.get(sample) == Some(&self.row));
+                if let Some(payload) = done.and_then(|sample| samples.remove(&sample)) {
+                    self.bytes = self.bytes.saturating_sub(payload.size());
+                }
+            }
+            self.row += 1;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn actions(times: &[u64]) -> Actions {
+        let values = times.iter().flat_map(|time| [*time as f64, -(*time as f64)]).collect();
+        Actions { times: times.to_vec(), values, length: 2 }
+    }
+
+    #[test]
+    fn the_action_of_a_tick_is_the_nearest_within_half_a_period_or_the_one_in_force() {
+        let all = actions(&[100, 140, 200]);
+        // A period of 100: half of it is 50.
+        for (tick, expected) in
+            [(0, 100), (60, 100), (100, 100), (119, 100), (121, 140), (169, 140), (171, 200), (900, 200)]
+        {
+            assert_eq!(all.at(tick, 100), [f64::from(expected), -f64::from(expected)], "{tick}");
+        }
+        // The next one is too far away: the last is still in force.
+        assert_eq!(actions(&[0, 400]).at(300, 100), [0.0, -0.0]);
+        assert_eq!(Actions::default().at(3, 100), [0.0; 0]);
+        let mut mixed = actions(&[140, 100]);
+        mixed.sort();
+        assert_eq!((mixed.at(100, 10), mixed.at(140, 10)), (&[100.0, -100.0][..], &[140.0, -140.0][..]));
+    }
+
+    fn frame(number: u32, time_ns: u64, seq: Option<u64>, present: bool) -> Frame {
+        let id = ModalityId::new(3).unwrap();
+        let slot = FrameSlot { id, present, valid: present, stale: false, age_ns: 10, seq };
+        Frame { number, time_ns, slots: vec![slot] }
+    }
+
+    fn listed(text: &str) -> Result<Vec<Listed>, Refusal> {
+        modalities(Some(text))
+    }
+
+    #[test]
+    fn a_row_has_the_sample_that_its_frame_names_and_no_other() {
+        let modalities =
+            listed(r#"[{"name": "b", "bit": 5, "kind": "bytes"}, {"name": "a", "bit": 3, "kind": "scalars"}]"#)
+                .unwrap();
+        assert_eq!(modalities.iter().map(|modality| &*modality.name).collect::<Vec<_>>(), ["a", "b"]);
+        // Number 1 is there twice, because the device began to count again.
+        let samples = [(ModalityId::new(3).unwrap(), vec![(1, 90), (2, 190), (1, 390)])].into();
+        let frames = [
+            frame(0, 100, Some(1), true),
+            frame(1, 200, Some(2 + (1 << 32)), true),
+            frame(2, 300, Some(2), false),
+            frame(3, 400, Some(1), true),
+            frame(4, 500, Some(7), true),
+            frame(5, 600, None, true),
+        ];
+        let slots = chosen(&modalities, &frames, &samples);
+        let found: Vec<_> = slots.iter().step_by(2).map(|slot| (slot.present, slot.valid, slot.sample)).collect();
+        let there = |sample| (true, true, Some(sample));
+        let without = (true, false, None);
+        assert_eq!(found, [there(0), there(1), (false, false, None), there(2), without, without]);
+        assert!(slots.iter().skip(1).step_by(2).all(|slot| *slot == Slot::default()));
+    }
+
+    #[test]
+    fn what_makes_rows_unequal_is_refused() {
+        let ticks = |numbers: &[u32]| {
+            let frames: Vec<Frame> = numbers.iter().map(|number| frame(*number, 0, None, true)).collect();
+            check_ticks(&frames).map_err(|refusal| refusal.to_string())
+        };
+        assert_eq!(ticks(&[7, 8, 9]), Ok(()));
+        assert!(ticks(&[]).unwrap_err().starts_with("no frames"));
+        assert!(ticks(&[0, 1, 5]).unwrap_err().starts_with("ticks 2 to 4 are missing"));
+        assert!(ticks(&[0, 0]).is_err());
+        assert_eq!(rate(Some("30")).unwrap(), 30);
+        for wrong in [Some("29.97"), Some("0"), Some("-3"), Some("x"), Some("NaN"), None] {
+            assert!(rate(wrong).is_err(), "{wrong:?}");
+        }
+        let twice = r#"[{"name": "a", "bit": 3, "kind": "bytes"}, {"name": "b", "bit": 3, "kind": "bytes"}]"#;
+        for wrong in [twice, r#"[{"name": "a/b", "bit": 3, "kind": "bytes"}]"#, "[{}]", "7"] {
+            assert!(listed(wrong).is_err(), "{wrong}");
+        }
+    }
+}

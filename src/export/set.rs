@@ -1,0 +1,621 @@
+//! A data set on the disk: a file of rows and a file of facts for each episode, and what is true of all of them.
+//!
+//! | file | |
+//! |---|---|
+//! | `data/chunk-CCC/file-FFF.parquet` | the rows of an episode |
+//! | `meta/episodes/chunk-CCC/file-FFF.parquet` | its length, task and statistics, and the file that it was made of (`rapid/...`) |
+//! | `meta/tasks.parquet` | the tasks by number, as pandas writes them |
+//! | `meta/stats.json`, `meta/info.json` | the statistics of all episodes; how many there are, and the features |
+//!
+//! Invariant: files get their names in this order when they are complete, so that a set whose writer was killed has all
+//! its earlier episodes, or all and the last one.
+
+use std::collections::{BTreeMap, HashMap};
+use std::ffi::OsStr;
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use arrow_array::builder::{Float64Builder, Int64Builder, ListBuilder, StringBuilder};
+use arrow_array::cast::AsArray;
+use arrow_array::types::{Float64Type, Int64Type};
+use arrow_array::{Array, ArrayRef, Int64Array, RecordBatch, StringArray};
+use arrow_schema::{ArrowError, DataType, Field, Schema};
+use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::errors::ParquetError;
+use parquet::file::properties::{EnabledStatistics, WriterProperties};
+use rustix::fs::FlockOperation;
+use serde_json::{Map, Value, json};
+
+use super::cells::CellMaker;
+use super::features::{Features, IMAGES, OWN};
+use super::rows::{Index, Refusal};
+use super::statistics::Column;
+use super::survey::Survey;
+use super::table::{CREATED_BY, Position, Table, one_row, timestamp};
+use crate::folder::{Folder, FolderError, Links, Missing, Sync};
+
+/// Files of a folder; also `chunks_size` in `info.json`.
+const CHUNK: u64 = 1000;
+/// Bytes of a file in JSON, at most.
+const LARGEST_JSON: u64 = 64 << 20;
+/// Column of an episode's facts: the file's name, its SHA-256, its size, the verdict; and by modality the valid rows.
+const SOURCE: &str = "rapid/source";
+const SHA256: &str = "rapid/sha256";
+const BYTES: &str = "rapid/bytes";
+const VERDICT: &str = "rapid/verdict";
+/// As pandas names an index without a name.
+const TASK: &str = "__index_level_0__";
+
+/// Why a data set cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum SetError {
+    /// A folder.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// A file.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The error of the system.
+        source: io::Error,
+    },
+    /// A table.
+    #[error("{}: {source}", path.display())]
+    Parquet {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: ParquetError,
+    },
+    /// A file that this program did not write.
+    #[error("{}: {problem}; --out takes a new folder, or a data set that `rapid export` made", path.display())]
+    Foreign {
+        /// The file or folder.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// Another program writes to it.
+    #[error("{}: another `rapid export` writes to this data set: wait for its end", .0.display())]
+    Busy(PathBuf),
+    /// The episode.
+    #[error(transparent)]
+    Refused(#[from] Refusal),
+}
+
+/// An episode of a data set.
+#[derive(Debug, Clone)]
+pub(super) struct Entry {
+    pub(super) source: String,
+    sha256: String,
+    pub(super) first: u64,
+    pub(super) rows: u64,
+    pub(super) task: u64,
+    statistics: Statistics,
+}
+
+/// By feature, a column of it after the other.
+type Statistics = BTreeMap<String, Vec<Column>>;
+
+/// See the module's comment.
+#[derive(Debug)]
+pub struct DataSet {
+    folder: PathBuf,
+    /// Held open for its lock; `None` if there is none yet.
+    lock: Option<Folder>,
+    features: Option<Features>,
+    tasks: Vec<String>,
+    pub(super) entries: Vec<Entry>,
+    statistics: Statistics,
+}
+
+impl DataSet {
+    /// Opens the data set in `folder`, or prepares a new one: a folder that does not exist is created with the first
+    /// episode.
+    ///
+    /// # Errors
+    /// When the folder holds anything else, or another program writes to it.
+    pub fn open(folder: &Path) -> Result<Self, SetError> {
+        let mut set = Self {
+            folder: folder.to_owned(),
+            lock: None,
+            features: None,
+            tasks: Vec::new(),
+            entries: Vec::new(),
+            statistics: Statistics::new(),
+        };
+        if !folder.exists() {
+            return Ok(set);
+        }
+        set.lock(Missing::Refused)?;
+        let info = folder.join("meta/info.json");
+        if !info.exists() {
+            return set.unnamed();
+        }
+        let foreign = |problem: &str| SetError::Foreign { path: info.clone(), problem: problem.to_owned() };
+        let text = crate::folder::read_text(&info, LARGEST_JSON)
+            .map_err(|source| SetError::Io { path: info.clone(), source })?;
+        let value: Value = serde_json::from_str(&text).map_err(|error| foreign(&error.to_string()))?;
+        let features = Features::of_set(&value);
+        set.features = Some(features.ok_or_else(|| foreign("not the features of a data set of rapid"))?);
+        set.read_tasks()?;
+        while let Some(entry) = set.read_entry()? {
+            merge(&mut set.statistics, &entry.statistics);
+            set.entries.push(entry);
+        }
+        // Rows whose facts are missing: the program was killed between the two, and LeRobot would read them.
+        let (left, name) = (set.data_path(set.entries.len() as u64), numbered("data", set.entries.len() as u64));
+        if set.lock.is_some() && left.exists() {
+            std::fs::remove_file(&left).map_err(|source| SetError::Io { path: name.into(), source })?;
+        }
+        // The program was killed between an episode and the files about all of them.
+        if value["total_episodes"].as_u64() != Some(set.entries.len() as u64) {
+            set.publish()?;
+        }
+        Ok(set)
+    }
+
+    /// A folder without `info.json`: what a program left that was killed with its first episode, or an empty one.
+    fn unnamed(self) -> Result<Self, SetError> {
+        let folder = &self.folder;
+        let entries = std::fs::read_dir(folder).map_err(|source| SetError::Io { path: folder.clone(), source })?;
+        let other = entries.flatten().find(|entry| entry.file_name() != "data" && entry.file_name() != "meta");
+        match other {
+            Some(other) => Err(SetError::Foreign { path: other.path(), problem: "not of a data set".to_owned() }),
+            None => Ok(self),
+        }
+    }
+
+    fn lock(&mut self, missing: Missing) -> Result<(), SetError> {
+        if self.lock.is_some() {
+            return Ok(());
+        }
+        let open = Folder::open(&self.folder, Links::Own, missing)?;
+        rustix::fs::flock(open.descriptor(), FlockOperation::NonBlockingLockExclusive)
+            .map_err(|_| SetError::Busy(self.folder.clone()))?;
+        self.lock = Some(open);
+        Ok(())
+    }
+
+    /// Its folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// How many episodes it has.
+    pub fn episodes(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// How many rows it has.
+    pub fn rows(&self) -> u64 {
+        self.entries.iter().fold(0, |rows, entry| rows.saturating_add(entry.rows))
+    }
+
+    /// What its episodes have in common; `None` without any.
+    pub fn features(&self) -> Option<&Features> {
+        self.features.as_ref()
+    }
+
+    /// The number of the episode that was made of a file with this SHA-256.
+    pub fn find(&self, sha256: &str) -> Option<usize> {
+        self.entries.iter().position(|entry| entry.sha256 == sha256)
+    }
+
+    /// Appends an episode, and returns its number. Its features are those of the set, or become them.
+    ///
+    /// # Errors
+    /// When a file cannot be written, or the episode has changed since it was surveyed. The set is then as it was.
+    pub fn append(&mut self, episode: &Survey, features: &Features, stop: &AtomicBool) -> Result<usize, SetError> {
+        self.lock(Missing::All)?;
+        let number = self.entries.len();
+        let known = self.tasks.iter().position(|task| task == episode.task());
+        let task = known.unwrap_or(self.tasks.len()) as u64;
+        let position = Position { episode: number as u64, first: self.rows(), task };
+        self.write_rows(episode, features, position, stop)?;
+        if known.is_none() {
+            self.tasks.push(episode.task().to_owned());
+            self.write_tasks()?;
+        }
+        let entry = Entry {
+            source: episode.file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            sha256: episode.sha256.clone(),
+            first: position.first,
+            rows: episode.rows as u64,
+            task,
+            statistics: statistics(episode, features, position),
+        };
+        self.write_entry(&entry, episode, features, position)?;
+        self.features.get_or_insert_with(|| features.clone());
+        merge(&mut self.statistics, &entry.statistics);
+        self.entries.push(entry);
+        self.publish()?;
+        Ok(number)
+    }
+
+    fn write_rows(
+        &self,
+        episode: &Survey,
+        features: &Features,
+        position: Position,
+        stop: &AtomicBool,
+    ) -> Result<(), SetError> {
+        let path = self.data_path(position.episode);
+        let new = NewFile::create(&path)?;
+        let wrong = |source| SetError::Parquet { path: path.clone(), source };
+        let file = new.file.try_clone().map_err(|source| SetError::Io { path: path.clone(), source })?;
+        let mut table = Table::new(file, features, position).map_err(wrong)?;
+        let mut maker = CellMaker::new(features, episode.kinds.clone())?;
+        let index = Index::read(&episode.file, stop)?;
+        let mut failed = None;
+        let read = index.rows(&episode.file, stop, |row| {
+            table.push(&maker.cells(row)?).map_err(|error| {
+                failed = Some(error);
+                // Only ends the reading.
+                Refusal::Interrupted
+            })
+        });
+        match failed {
+            Some(error) => return Err(wrong(error)),
+            None => read?,
+        }
+        table.finish().map_err(wrong)?;
+        // The statistics, and the name by which it is found again, are those of the survey.
+        if super::sha256(&episode.file)? != episode.sha256 {
+            return Err(Refusal::Changed.into());
+        }
+        new.keep()
+    }
+
+    pub(super) fn data_path(&self, episode: u64) -> PathBuf {
+        self.folder.join(numbered("data", episode))
+    }
+
+    fn entry_path(&self, episode: u64) -> PathBuf {
+        self.folder.join(numbered("meta/episodes", episode))
+    }
+
+    /// Reads the facts of the next episode, if there is one.
+    fn read_entry(&self) -> Result<Option<Entry>, SetError> {
+        let path = self.entry_path(self.entries.len() as u64);
+        if !path.exists() {
+            return Ok(None);
+        }
+        let batch = one_row(&path).map_err(|source| SetError::Parquet { path: path.clone(), source })?;
+        let entry = batch.and_then(|batch| self.entry_of(&batch));
+        let problem = || "not the facts of an episode of rapid".to_owned();
+        let entry = entry.ok_or_else(|| SetError::Foreign { path: path.clone(), problem: problem() })?;
+        let data = self.data_path(self.entries.len() as u64);
+        let missing = |source| SetError::Io { path: data.clone(), source };
+        std::fs::metadata(&data).map_err(missing)?;
+        Ok(Some(entry))
+    }
+
+    fn entry_of(&self, batch: &RecordBatch) -> Option<Entry> {
+        let text = |key: &str| {
+            let column = batch.column_by_name(key)?.as_string_opt::<i32>()?;
+            Some(column.value(0).to_owned())
+        };
+        let number = |key: &str| {
+            let column = batch.column_by_name(key)?.as_primitive_opt::<Int64Type>()?;
+            u64::try_from(column.value(0)).ok()
+        };
+        let task = batch.column_by_name("tasks")?.as_list_opt::<i32>()?.value(0);
+        let task = task.as_string_opt::<i32>()?.iter().next()??.to_owned();
+        let first = number("dataset_from_index")?;
+        if number("episode_index")? != self.entries.len() as u64 || first != self.rows() {
+            return None;
+        }
+        let mut statistics = Statistics::new();
+        for feature in self.features.as_ref()?.all() {
+            let key = feature.key;
+            let counts = flat(batch.column_by_name(&format!("rapid/counts/{key}"))?)?;
+            let mut columns: Vec<Column> = Vec::new();
+            for count in counts.as_primitive_opt::<Int64Type>()?.values() {
+                columns.push(Column { count: u64::try_from(*count).ok()?, ..Column::default() });
+            }
+            for (name, _) in Column::default().named() {
+                let values = flat(batch.column_by_name(&format!("stats/{key}/{name}"))?)?;
+                let values = values.as_primitive_opt::<Float64Type>()?;
+                for (column, value) in columns.iter_mut().zip(values.values()) {
+                    *column.place(name)? = *value;
+                }
+            }
+            statistics.insert(key, columns);
+        }
+        Some(Entry {
+            source: text(SOURCE)?,
+            sha256: text(SHA256)?,
+            first,
+            rows: number("length")?,
+            task: self.tasks.iter().position(|known| *known == task)? as u64,
+            statistics,
+        })
+    }
+
+    fn write_entry(
+        &self,
+        entry: &Entry,
+        episode: &Survey,
+        features: &Features,
+        position: Position,
+    ) -> Result<(), SetError> {
+        let mut row = OneRow::default();
+        let (chunk, file) = (position.episode / CHUNK, position.episode % CHUNK);
+        row.number("episode_index", position.episode);
+        row.push("tasks", list(StringBuilder::new(), |builder| builder.append_value(episode.task())));
+        row.number("length", entry.rows);
+        for (key, value) in [
+            ("data/chunk_index", chunk),
+            ("data/file_index", file),
+            ("dataset_from_index", entry.first),
+            ("dataset_to_index", entry.first.saturating_add(entry.rows)),
+            ("meta/episodes/chunk_index", chunk),
+            ("meta/episodes/file_index", file),
+            (BYTES, episode.bytes),
+        ] {
+            row.number(key, value);
+        }
+        for (key, text) in [(SOURCE, &*entry.source), (SHA256, &*entry.sha256), (VERDICT, episode.grade.word())] {
+            row.push(key, Arc::new(StringArray::from(vec![text])));
+        }
+        for feature in features.all() {
+            let key = feature.key;
+            let columns = entry.statistics.get(&key).map_or(&[][..], Vec::as_slice);
+            for (name, values) in by_name(columns) {
+                let is_picture = key.starts_with(IMAGES);
+                row.push(&format!("stats/{key}/{name}"), if is_picture { nested(&values) } else { floats(&values) });
+            }
+            row.push(&format!("stats/{key}/count"), integers([most(columns)]));
+            // By column: those of a sensor that was absent have none.
+            row.push(&format!("rapid/counts/{key}"), integers(columns.iter().map(|column| column.count)));
+        }
+        write_parquet(&self.entry_path(position.episode), row.batch())
+    }
+
+    fn read_tasks(&mut self) -> Result<(), SetError> {
+        let path = self.folder.join("meta/tasks.parquet");
+        let wrong = |source| SetError::Parquet { path: path.clone(), source };
+        let file = File::open(&path).map_err(|source| SetError::Io { path: path.clone(), source })?;
+        let reader =
+            ParquetRecordBatchReaderBuilder::try_new(file).and_then(ParquetRecordBatchReaderBuilder::<File>::build);
+        for batch in reader.map_err(wrong)? {
+            let batch = batch.map_err(|error| wrong(error.into()))?;
+            let names = batch.column_by_name(TASK).and_then(|column| column.as_string_opt::<i32>());
+            let problem = || format!("no column {TASK}");
+            let names = names.ok_or_else(|| SetError::Foreign { path: path.clone(), problem: problem() })?;
+            self.tasks.extend(names.iter().flatten().map(str::to_owned));
+        }
+        Ok(())
+    }
+
+    /// A table of pandas whose index are the texts, as `pandas.DataFrame.to_parquet` writes it.
+    fn write_tasks(&self) -> Result<(), SetError> {
+        let index = |name: Value, field: &str, of: &str, numpy: &str| {
+            json!({
+                "name": name, "field_name": field, "pandas_type": of, "numpy_type": numpy, "metadata": null,
+            })
+        };
+        let pandas = json!({
+            "index_columns": [TASK],
+            "column_indexes": [{"name": null, "field_name": null, "pandas_type": "unicode", "numpy_type": "object",
+                "metadata": {"encoding": "UTF-8"}}],
+            "columns": [
+                index(json!("task_index"), "task_index", "int64", "int64"),
+                index(Value::Null, TASK, "unicode", "object"),
+            ],
+            "creator": {"library": "rapid", "version": env!("CARGO_PKG_VERSION")},
+            "pandas_version": "2.0.0",
+        });
+        let numbers = (0_i64..).zip(&self.tasks).map(|(number, _)| number);
+        let mut row = OneRow::default();
+        row.push("task_index", Arc::new(Int64Array::from_iter_values(numbers)));
+        row.push(TASK, Arc::new(StringArray::from_iter_values(&self.tasks)));
+        row.metadata.insert("pandas".to_owned(), pandas.to_string());
+        write_parquet(&self.folder.join("meta/tasks.parquet"), row.batch())
+    }
+
+    /// Writes what is true of all episodes.
+    fn publish(&self) -> Result<(), SetError> {
+        let Some(features) = &self.features else { return Ok(()) };
+        let mut statistics = Map::new();
+        for (key, columns) in &self.statistics {
+            let is_picture = key.starts_with(IMAGES);
+            let shaped = |value: f64| if is_picture { json!([[value]]) } else { json!(value) };
+            let mut named = Map::new();
+            for (name, values) in by_name(columns) {
+                named.insert(name.to_owned(), values.into_iter().map(shaped).collect());
+            }
+            named.insert("count".to_owned(), json!([most(columns)]));
+            statistics.insert(key.clone(), Value::Object(named));
+        }
+        let (episodes, rows) = (self.entries.len(), self.rows());
+        let info = json!({
+            "codebase_version": "v3.0", "robot_type": "rapid", "total_episodes": episodes, "total_frames": rows,
+            "total_tasks": self.tasks.len(), "chunks_size": CHUNK, "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200, "fps": features.fps, "splits": {"train": format!("0:{episodes}")},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", "video_path": null,
+            "features": features.json(),
+        });
+        for (name, value) in [("meta/stats.json", Value::Object(statistics)), ("meta/info.json", info)] {
+            write(&self.folder.join(name), format!("{value:#}\n").as_bytes())?;
+        }
+        Ok(())
+    }
+}
+
+fn write_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<(), SetError> {
+    let written = batch.map_err(ParquetError::from).and_then(|batch| {
+        let mut bytes = Vec::new();
+        // Of one row in hundreds of columns, dictionaries and indices would be most of the file.
+        let properties = WriterProperties::builder()
+            .set_dictionary_enabled(false)
+            .set_statistics_enabled(EnabledStatistics::None)
+            .set_offset_index_disabled(true)
+            .set_created_by(CREATED_BY.to_owned())
+            .build();
+        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties))?;
+        writer.write(&batch)?;
+        writer.close()?;
+        Ok(bytes)
+    });
+    write(path, &written.map_err(|source| SetError::Parquet { path: path.to_owned(), source })?)
+}
+
+fn write(path: &Path, contents: &[u8]) -> Result<(), SetError> {
+    let (folder, name) = place(path)?;
+    folder.replace_by_umask(name, contents, Sync::Wait).map_err(|source| SetError::Io { path: path.to_owned(), source })
+}
+
+fn numbered(folder: &str, episode: u64) -> String {
+    format!("{folder}/chunk-{:03}/file-{:03}.parquet", episode / CHUNK, episode % CHUNK)
+}
+
+/// The folder of a file, which is created, and its name in it.
+fn place(path: &Path) -> Result<(Folder, &OsStr), SetError> {
+    let parent = path.parent().unwrap_or(Path::new("."));
+    Ok((Folder::open(parent, Links::Own, Missing::All)?, path.file_name().unwrap_or_default()))
+}
+
+/// A file that gets its name when it is complete, and disappears if it is not.
+struct NewFile<'a> {
+    path: &'a Path,
+    folder: Folder,
+    temporary: String,
+    file: File,
+    is_kept: bool,
+}
+
+impl<'a> NewFile<'a> {
+    fn create(path: &'a Path) -> Result<Self, SetError> {
+        let (folder, name) = place(path)?;
+        let temporary = format!(".{}.tmp", name.to_string_lossy());
+        // The set is locked: it is what a program left that was killed.
+        let _ = folder.remove(&temporary);
+        let file =
+            folder.create_new(&temporary, 0o666).map_err(|source| SetError::Io { path: path.to_owned(), source })?;
+        Ok(Self { path, folder, temporary, file, is_kept: false })
+    }
+
+    fn keep(mut self) -> Result<(), SetError> {
+        let name = self.path.file_name().unwrap_or_default();
+        // Rows without facts: of a program that was killed between the two.
+        let _ = self.folder.remove(name);
+        let kept = self
+            .file
+            .sync_all()
+            .and_then(|()| self.folder.rename_new(self.temporary.as_ref(), name))
+            .and_then(|()| self.folder.sync());
+        self.is_kept = kept.is_ok();
+        kept.map_err(|source| SetError::Io { path: self.path.to_owned(), source })
+    }
+}
+
+impl Drop for NewFile<'_> {
+    fn drop(&mut self) {
+        if !self.is_kept {
+            let _ = self.folder.remove(&self.temporary);
+        }
+    }
+}
+
+/// The statistics of an episode, with those of the columns that every data set has.
+fn statistics(episode: &Survey, features: &Features, position: Position) -> Statistics {
+    let mut statistics: Statistics = features.statistics(episode).into_iter().collect();
+    let rows = 0..episode.rows as u64;
+    let mut times: Vec<f64> = rows.clone().map(|row| f64::from(timestamp(row, features.fps))).collect();
+    let [first, others @ ..] = OWN;
+    statistics.insert(first.to_owned(), vec![Column::of(&mut times)]);
+    for (at, key) in others.into_iter().enumerate() {
+        let value = |row| position.own(row).get(at).map_or(0.0, |value| *value as f64);
+        let mut values: Vec<f64> = rows.clone().map(value).collect();
+        statistics.insert(key.to_owned(), vec![Column::of(&mut values)]);
+    }
+    statistics
+}
+
+fn merge(all: &mut Statistics, episode: &Statistics) {
+    for (key, columns) in episode {
+        let known = all.entry(key.clone()).or_default();
+        known.resize(columns.len().max(known.len()), Column::default());
+        for (known, column) in known.iter_mut().zip(columns) {
+            *known = known.with(*column);
+        }
+    }
+}
+
+/// The most rows that a column has.
+fn most(columns: &[Column]) -> u64 {
+    columns.iter().map(|column| column.count).max().unwrap_or_default()
+}
+
+/// The columns' values of each statistic.
+fn by_name(columns: &[Column]) -> Vec<(&'static str, Vec<f64>)> {
+    let value = |at: usize| columns.iter().filter_map(move |column| column.named().nth(at)).map(|(_, value)| value);
+    Column::default().named().enumerate().map(|(at, (name, _))| (name, value(at).collect())).collect()
+}
+
+/// A table of few rows, column by column.
+#[derive(Default)]
+struct OneRow {
+    fields: Vec<Field>,
+    columns: Vec<ArrayRef>,
+    metadata: HashMap<String, String>,
+}
+
+impl OneRow {
+    fn push(&mut self, key: &str, column: ArrayRef) {
+        self.fields.push(Field::new(key, column.data_type().clone(), true));
+        self.columns.push(column);
+    }
+
+    fn number(&mut self, key: &str, value: u64) {
+        self.push(key, Arc::new(Int64Array::from(vec![i64::try_from(value).unwrap_or(i64::MAX)])));
+    }
+
+    fn batch(self) -> Result<RecordBatch, ArrowError> {
+        RecordBatch::try_new(Arc::new(Schema::new_with_metadata(self.fields, self.metadata)), self.columns)
+    }
+}
+
+/// One list, filled by `fill`.
+fn list<B: arrow_array::builder::ArrayBuilder>(values: B, fill: impl FnOnce(&mut B)) -> ArrayRef {
+    let mut list = ListBuilder::new(values);
+    fill(list.values());
+    list.append(true);
+    Arc::new(list.finish())
+}
+
+fn floats(values: &[f64]) -> ArrayRef {
+    list(Float64Builder::new(), |builder| builder.append_slice(values))
+}
+
+fn integers(values: impl IntoIterator<Item = u64>) -> ArrayRef {
+    let values = values.into_iter().map(|value| i64::try_from(value).unwrap_or(i64::MAX));
+    list(Int64Builder::new(), |builder| values.for_each(|value| builder.append_value(value)))
+}
+
+/// `[[[a]], [[b]], [[c]]]`: a value for each channel, in the shape of a picture.
+fn nested(values: &[f64]) -> ArrayRef {
+    list(ListBuilder::new(ListBuilder::new(Float64Builder::new())), |channels| {
+        for value in values {
+            channels.values().values().append_value(*value);
+            channels.values().append(true);
+            channels.append(true);
+        }
+    })
+}
+
+/// The values of a list of lists, of all levels and rows.
+fn flat(column: &ArrayRef) -> Option<ArrayRef> {
+    let mut values = Arc::clone(column.as_list_opt::<i32>()?.values());
+    while let DataType::List(_) = values.data_type() {
+        values = Arc::clone(values.as_list_opt::<i32>()?.values());
+    }
+    Some(values)
+}

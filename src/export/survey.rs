@@ -1,0 +1,359 @@
+//! What an episode holds and whether it can be exported: everything that can refuse it is found here, before anything is
+//! written.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use sha2::{Digest, Sha256};
+
+use super::picture::{self, Shape};
+use super::rows::{Index, Listed, Payload, Refusal, Row};
+use super::statistics::Column;
+use crate::episode;
+use crate::episode::record_iter::FileEnd;
+use crate::modality::ModalityKind;
+use crate::pixels::{CHANNELS, Picture, Pixels};
+use crate::record::inspect::{self, Inspection, Judgement};
+use crate::status::{Grade, Verdict};
+use crate::text;
+
+/// Bytes read at once.
+const PIECE: usize = 1 << 20;
+/// Numbers that a registry may declare of a sample; what a file claims may be anything.
+const LONGEST: usize = 1 << 16;
+/// Of a picture with more pixels along a side, every n-th of each row and column counts for the statistics, so that
+/// about 150 are left, as in `lerobot.datasets.compute_stats.auto_downsample_height_width`.
+const WIDE: u32 = 300;
+const ABOUT_LEFT: u32 = 150;
+
+/// An episode that can be exported.
+#[derive(Debug)]
+pub struct Survey {
+    /// The file.
+    pub file: PathBuf,
+    /// Its size in bytes.
+    pub bytes: u64,
+    /// SHA-256 of the file, hexadecimal: by it an episode is recognised in a data set.
+    pub sha256: String,
+    /// The verdict on it.
+    pub grade: Grade,
+    /// Rows it becomes.
+    pub rows: usize,
+    /// Samples that belong to a row and cannot be used: damaged pictures, numbers that are not finite. Their rows are
+    /// black or zero, and not valid.
+    pub unusable: u64,
+    pub(super) fps: u32,
+    pub(super) task: String,
+    /// Ascending by bit.
+    pub(super) streams: Vec<Stream>,
+    /// By axis; `None` without actions.
+    pub(super) action: Option<Vec<Column>>,
+    pub(super) time_ns: Column,
+    /// By modality.
+    pub(super) kinds: Vec<ModalityKind>,
+}
+
+/// What a modality has in all rows of an episode.
+#[derive(Debug)]
+pub(super) struct Stream {
+    pub(super) name: String,
+    pub(super) content: Content,
+    /// A picture's channels or a vector's columns, over the valid rows.
+    pub(super) columns: Vec<Column>,
+    pub(super) present: Column,
+    pub(super) valid: Column,
+    pub(super) age: Column,
+}
+
+/// What the samples of a modality are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Content {
+    /// Pictures; their shape, if one is there.
+    Camera { found: Option<Shape>, declared: Option<Shape> },
+    /// Numbers; how many.
+    Vector { found: Option<usize>, declared: Option<usize> },
+    /// Bytes, which are not exported.
+    Bytes,
+}
+
+/// SHA-256 of a file, hexadecimal.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn sha256(path: &Path) -> Result<String, Refusal> {
+    let (mut file, _) = episode::open(path)?;
+    let mut hasher = Sha256::new();
+    let mut piece = vec![0; PIECE];
+    loop {
+        match read(&mut file, &mut piece)? {
+            0 => return Ok(text::hexadecimal(&hasher.finalize())),
+            count => hasher.update(piece.get(..count).unwrap_or_default()),
+        }
+    }
+}
+
+fn read(file: &mut File, piece: &mut [u8]) -> io::Result<usize> {
+    loop {
+        match file.read(piece) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            read => return read,
+        }
+    }
+}
+
+/// Looks at the episode at `path`; `sha256` is that of the file. One that is BAD is refused unless `include_bad`.
+///
+/// # Errors
+/// When it cannot be exported, whatever the data set; also when `stop` is set.
+pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool) -> Result<Survey, Refusal> {
+    let inspection = inspect::inspect(path)?;
+    let grade = judged(&inspection, include_bad)?;
+    let index = Index::read(path, stop)?;
+    if index.modalities.iter().all(|modality| modality.kind == ModalityKind::Bytes) {
+        return Err(Refusal::Nothing);
+    }
+    let mut found = Found::new(&index);
+    index.rows(path, stop, |row| found.take(row))?;
+    let Found { gatherers, time_ns: mut times, actions, unusable, .. } = found;
+    let rows = index.ticks.len();
+    Ok(Survey {
+        file: path.to_owned(),
+        bytes: inspection.bytes,
+        sha256,
+        grade,
+        rows,
+        unusable,
+        fps: index.fps,
+        task: index.task.clone(),
+        streams: gatherers.into_iter().map(|gatherer| gatherer.stream(rows)).collect(),
+        action: index.action_length().map(|_| columns(actions)),
+        time_ns: Column::of(&mut times),
+        kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
+    })
+}
+
+/// The verdict, of a whole file.
+fn judged(inspection: &Inspection, include_bad: bool) -> Result<Grade, Refusal> {
+    let Judgement::Episode(Verdict { grade, .. }) = &inspection.verdict else { return Err(Refusal::NotOurs) };
+    match inspection.end {
+        FileEnd::Finished => {}
+        FileEnd::Unfinished => return Err(Refusal::Unfinished),
+        FileEnd::Torn => return Err(Refusal::Damaged("its end is missing".to_owned())),
+        FileEnd::Damaged => return Err(Refusal::Damaged("its end is not a record".to_owned())),
+    }
+    let (chunks, bytes) = (inspection.damaged_chunks, inspection.unread_bytes);
+    if chunks > 0 || bytes > 0 || inspection.left_out != inspect::LeftOut::default() {
+        let chunks = text::counted(chunks, "damaged chunk");
+        return Err(Refusal::Damaged(format!("{chunks}, {} that cannot be read", text::size(bytes))));
+    }
+    if *grade == Grade::Bad && !include_bad {
+        return Err(Refusal::Bad(inspection.verdict.reasons().join("; ")));
+    }
+    Ok(*grade)
+}
+
+/// Collects what is in the rows.
+struct Found {
+    gatherers: Vec<Gatherer>,
+    time_ns: Vec<f64>,
+    /// By axis.
+    actions: Vec<Vec<f64>>,
+    unusable: u64,
+}
+
+impl Found {
+    fn new(index: &Index) -> Self {
+        let of = |(at, modality)| Gatherer::new(modality, pictured_rows(index, at));
+        let gatherers = index.modalities.iter().enumerate().map(of).collect();
+        let actions = vec![Vec::new(); index.action_length().unwrap_or_default()];
+        Self { gatherers, time_ns: Vec::new(), actions, unusable: 0 }
+    }
+
+    fn take(&mut self, row: &Row<'_>) -> Result<(), Refusal> {
+        self.time_ns.push(row.time_ns as f64);
+        for (axis, value) in self.actions.iter_mut().zip(row.action) {
+            // In the precision of the data set.
+            axis.push(f64::from(narrow(*value)));
+        }
+        for ((gatherer, slot), sample) in self.gatherers.iter_mut().zip(row.slots).zip(row.samples) {
+            let is_usable = match sample {
+                Some(payload) => gatherer.take(row.number, payload, slot.valid)?,
+                None => false,
+            };
+            self.unusable += u64::from(sample.is_some() && !is_usable);
+            gatherer.present += u64::from(slot.present);
+            if slot.valid && is_usable {
+                gatherer.ages.push(slot.age_ns as f64 / 1e9);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The nearest number of the precision that a data set has.
+pub(super) fn narrow(value: f64) -> f32 {
+    #[expect(clippy::cast_possible_truncation, reason = "features of LeRobot are f32")]
+    let narrow = value as f32;
+    narrow
+}
+
+fn columns(values: Vec<Vec<f64>>) -> Vec<Column> {
+    values.into_iter().map(|mut values| Column::of(&mut values)).collect()
+}
+
+/// Can a sample of this kind of modality be used?
+pub(super) fn is_usable(kind: ModalityKind, payload: &Payload) -> bool {
+    match (kind, payload) {
+        (ModalityKind::Image, payload) => picture::shape(payload).is_some(),
+        (ModalityKind::Scalars, Payload::Numbers(numbers)) => {
+            !numbers.is_empty() && numbers.iter().all(|number| narrow(*number).is_finite())
+        }
+        (ModalityKind::Scalars, Payload::Picture { .. }) => false,
+        (ModalityKind::Bytes, _) => true,
+    }
+}
+
+/// Rows of which the picture is decoded for the statistics, ascending: as many as
+/// `lerobot.datasets.compute_stats.estimate_num_samples` takes of so many, at equal distances among the valid ones.
+fn pictured_rows(index: &Index, modality: usize) -> Vec<usize> {
+    let is_valid = |row: &usize| index.slots(*row).get(modality).is_some_and(|slot| slot.valid);
+    let valid: Vec<usize> = (0..index.ticks.len()).filter(is_valid).collect();
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "less than the number of rows")]
+    let wanted = ((valid.len() as f64).powf(0.75) as usize).clamp(100, 10_000).min(valid.len());
+    (0..wanted).filter_map(|at| valid.get(at * valid.len() / wanted).copied()).collect()
+}
+
+/// Collects what one modality has.
+struct Gatherer {
+    name: String,
+    kind: ModalityKind,
+    content: Content,
+    present: u64,
+    ages: Vec<f64>,
+    /// By column, of the valid rows.
+    numbers: Vec<Vec<f64>>,
+    /// By channel.
+    levels: [[u64; 256]; CHANNELS],
+    pictured: Vec<usize>,
+    pixels: Pixels,
+}
+
+impl Gatherer {
+    fn new(modality: &Listed, pictured: Vec<usize>) -> Self {
+        let shape = modality.shape.as_slice();
+        let content = match modality.kind {
+            ModalityKind::Image => {
+                let declared = match shape {
+                    [height, width] => Shape::new(*height, *width, 3),
+                    _ => None,
+                };
+                Content::Camera { found: None, declared }
+            }
+            ModalityKind::Scalars => {
+                let declared = shape.first().and_then(|length| usize::try_from(*length).ok());
+                Content::Vector { found: None, declared: declared.filter(|length| (1..=LONGEST).contains(length)) }
+            }
+            ModalityKind::Bytes => Content::Bytes,
+        };
+        Self {
+            name: modality.name.clone(),
+            kind: modality.kind,
+            content,
+            present: 0,
+            ages: Vec::new(),
+            numbers: Vec::new(),
+            levels: [[0; 256]; CHANNELS],
+            pictured,
+            pixels: Pixels::default(),
+        }
+    }
+
+    /// Takes the sample of a row; returns whether it can be used.
+    fn take(&mut self, row: usize, payload: &Payload, is_valid: bool) -> Result<bool, Refusal> {
+        if !is_usable(self.kind, payload) {
+            return Ok(false);
+        }
+        match (&mut self.content, payload) {
+            (Content::Camera { found, .. }, Payload::Picture { encoding, width, height, bytes }) => {
+                let Some(shape) = picture::shape(payload) else { return Ok(false) };
+                let expected = *found.get_or_insert(shape);
+                if shape != expected {
+                    let (found, expected) = (shape.to_string(), expected.to_string());
+                    return Err(Refusal::Size { name: self.name.clone(), frame: row, found, expected });
+                }
+                if is_valid && self.pictured.binary_search(&row).is_ok() {
+                    let picture = Picture { encoding: *encoding, width: *width, height: *height, bytes };
+                    self.count_levels(&picture);
+                }
+            }
+            (Content::Vector { found, .. }, Payload::Numbers(numbers)) => {
+                let expected = *found.get_or_insert(numbers.len());
+                if numbers.len() != expected {
+                    return Err(Refusal::Length { name: self.name.clone(), found: numbers.len(), expected });
+                }
+                self.numbers.resize(expected, Vec::new());
+                if is_valid {
+                    for (column, number) in self.numbers.iter_mut().zip(numbers) {
+                        column.push(f64::from(narrow(*number)));
+                    }
+                }
+            }
+            _ => {}
+        }
+        Ok(true)
+    }
+
+    /// Counts the levels of a picture's pixels; one that is damaged within does not count.
+    fn count_levels(&mut self, picture: &Picture<'_>) {
+        let Ok([height, width]) = self.pixels.decode(picture) else { return };
+        let longest = picture.width.max(picture.height);
+        let step = usize::try_from(if longest < WIDE { 1 } else { longest / ABOUT_LEFT }).unwrap_or(1).max(1);
+        for row in (0..height).step_by(step) {
+            let line = self.pixels.values().get(CHANNELS * width * row..CHANNELS * width * (row + 1));
+            for pixel in line.unwrap_or_default().chunks_exact(CHANNELS).step_by(step) {
+                for (levels, value) in self.levels.iter_mut().zip(pixel) {
+                    if let Some(count) = levels.get_mut(usize::from(*value)) {
+                        *count += 1;
+                    }
+                }
+            }
+        }
+    }
+
+    fn stream(mut self, rows: usize) -> Stream {
+        let (rows, valid) = (rows as u64, self.ages.len() as u64);
+        let columns = match self.content {
+            Content::Camera { found, .. } => {
+                let channels = found.map_or(CHANNELS, |shape| usize::from(shape.channels));
+                self.levels.iter().take(channels).map(|levels| Column::of_levels(levels, valid)).collect()
+            }
+            Content::Vector { found, declared } => {
+                self.numbers.resize(found.or(declared).unwrap_or_default(), Vec::new());
+                columns(self.numbers)
+            }
+            Content::Bytes => Vec::new(),
+        };
+        Stream {
+            name: self.name,
+            content: self.content,
+            columns,
+            present: Column::of_flags(self.present, rows),
+            valid: Column::of_flags(valid, rows),
+            age: Column::of(&mut self.ages),
+        }
+    }
+}
+
+impl Survey {
+    /// How many axes an action has; `None` without any on `/action`.
+    pub(super) fn action_length(&self) -> Option<usize> {
+        self.action.as_ref().map(Vec::len)
+    }
+
+    /// The task in words: LeRobot needs one.
+    pub(super) fn task(&self) -> &str {
+        if self.task.is_empty() { "episode" } else { &self.task }
+    }
+}

@@ -1,0 +1,316 @@
+//! `rapid export`: a data set of recorded episodes, read back; what is left out, continued, damaged and manipulated.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Write;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use arrow_array::cast::AsArray;
+use arrow_array::types::{Float32Type, Int64Type};
+use arrow_array::{ArrayRef, RecordBatch};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use rapid::cli::{ExportArgs, Layout};
+use rapid::commands::{self, Format};
+use serde_json::Value;
+
+use crate::support::Place;
+
+const DATA: &str = "set/data/chunk-000/file-000.parquet";
+const PNG: &[u8] = b"\x89PNG";
+const JPEG: &[u8] = &[0xff, 0xd8];
+
+/// `rapid export WORDS --to lerobot --out set --json`: its objects and its exit code.
+fn export(place: &Place, words: &[&str]) -> (Vec<Value>, i32) {
+    let output = place.run(&[&["export", "--to", "lerobot", "--out", "set", "--json"], words].concat());
+    let text = String::from_utf8(output.stdout).expect("text");
+    let objects = text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    (objects, output.status.code().expect("a code"))
+}
+
+/// The objects of this kind.
+fn of<'a>(objects: &'a [Value], event: &str) -> Vec<&'a Value> {
+    objects.iter().filter(|object| object["event"] == event).collect()
+}
+
+/// The outcome of each episode by its name, with its reason if it is left out.
+fn outcomes(objects: &[Value]) -> BTreeMap<String, String> {
+    let outcome = |object: &&Value| {
+        let file = PathBuf::from(object["file"].as_str().expect("a file"));
+        let name = file.file_name().expect("a name").to_string_lossy().into_owned();
+        let reason = object["reason"].as_str().map(|reason| format!(": {reason}")).unwrap_or_default();
+        (name, format!("{}{reason}", object["outcome"].as_str().expect("an outcome")))
+    };
+    of(objects, "exported").iter().map(outcome).collect()
+}
+
+fn record(place: &Place, out: &str, duration: &str, words: &[&str]) -> String {
+    let before = place.episodes(out);
+    let common = ["--headless", "--record", "--out", out, "--duration", duration];
+    place.run(&[&common, words].concat());
+    let new = place.episodes(out).into_iter().find(|name| !before.contains(name));
+    format!("{out}/{}", new.expect("an episode"))
+}
+
+/// The rows of a table.
+fn rows(place: &Place, name: &str) -> Vec<RecordBatch> {
+    let file = File::open(place.path(name)).expect("the table");
+    let reader = ParquetRecordBatchReaderBuilder::try_new(file).expect("Parquet").build().expect("Parquet");
+    reader.collect::<Result<_, _>>().expect("rows")
+}
+
+/// Mask, valid modalities, the file of a picture.
+type Pictured = (Vec<bool>, Vec<bool>, Vec<u8>);
+
+/// Of each row: the mask, which modalities are valid, and the picture of `camera`.
+fn pictures(place: &Place, name: &str, camera: &str) -> Vec<Pictured> {
+    let mut all = Vec::new();
+    for batch in rows(place, name) {
+        let lists = |key: &str| batch.column_by_name(key).expect("a column").as_fixed_size_list().clone();
+        let (masks, valid) = (lists("rapid.mask"), lists("rapid.valid"));
+        let files = batch.column_by_name(camera).expect("a camera").as_struct();
+        let files = files.column_by_name("bytes").expect("bytes").as_binary::<i32>();
+        for at in 0..batch.num_rows() {
+            let flags =
+                |row: ArrayRef| row.as_primitive::<Float32Type>().values().iter().map(|flag| *flag > 0.5).collect();
+            all.push((flags(masks.value(at)), flags(valid.value(at)), files.value(at).to_vec()));
+        }
+    }
+    all
+}
+
+fn json(place: &Place, name: &str) -> Value {
+    serde_json::from_slice(&std::fs::read(place.path(name)).expect("a file")).expect("JSON")
+}
+
+#[test]
+fn an_unplugged_sensor_is_black_with_its_mask_and_a_changed_byte_is_found() {
+    let place = Place::new();
+    // The demonstration unplugs the tactile camera after 4 s and plugs it in again.
+    record(&place, "out", "8s", &["--sim", "--task", "place block"]);
+    let (objects, code) = export(&place, &["out", "--verify"]);
+    assert_eq!(code, 0, "{objects:?}");
+    let summary = of(&objects, "export")[0];
+    let frames = summary["frames"].as_u64().expect("frames");
+    assert!((200..=241).contains(&frames), "{summary}");
+    assert_eq!((&summary["verified"], &summary["differences"]), (&frames.into(), &0.into()));
+
+    let info = json(&place, "set/meta/info.json");
+    assert_eq!((&info["fps"], &info["total_episodes"], &info["total_frames"]), (&30.into(), &1.into(), &frames.into()));
+    let features = info["features"].as_object().expect("features");
+    assert!(features.keys().all(|key| !key.contains('/')), "{features:?}");
+    assert_eq!(features["observation.images.cam_wrist"]["shape"], serde_json::json!([480, 640, 3]));
+    let state = features["observation.state"]["names"].as_array().expect("names");
+    assert_eq!((state[0].as_str(), &features["rapid.age"]["dtype"]), (Some("motor_state.0"), &"float64".into()));
+    assert_eq!(features["rapid.mask"]["names"], serde_json::json!(["cam_wrist", "tactile_tip", "motor_state"]));
+
+    let tactile = pictures(&place, DATA, "observation.images.tactile_tip");
+    let wrist = pictures(&place, DATA, "observation.images.cam_wrist");
+    let absent = tactile.iter().filter(|(mask, ..)| !mask[1]).count();
+    assert!((15..150).contains(&absent), "{absent}");
+    for (mask, valid, picture) in &tactile {
+        let is_black = picture.starts_with(PNG);
+        assert!(is_black || picture.starts_with(JPEG));
+        assert!((mask[1] || !valid[1]) && (mask[1] || is_black) && !(is_black && valid[1]));
+    }
+    assert!(wrist.iter().filter(|(mask, ..)| mask[0]).all(|(.., picture)| picture.starts_with(JPEG)));
+    // Over the valid rows alone: the black ones would be the least.
+    let statistics = json(&place, "set/meta/stats.json");
+    let count = statistics["observation.images.tactile_tip"]["count"][0].as_u64().expect("a count");
+    let valid = tactile.iter().filter(|(_, valid, _)| valid[1]).count() as u64;
+    assert_eq!(count, valid);
+    let mean = statistics["rapid.valid"]["mean"][1].as_f64().expect("a mean");
+    assert!((mean - valid as f64 / frames as f64).abs() < 1e-9, "{mean}");
+
+    manipulated(&place, &wrist);
+}
+
+/// A byte of a picture, and then of the mask's column, is changed in the table.
+fn manipulated(place: &Place, wrist: &[Pictured]) {
+    let whole = std::fs::read(place.path(DATA)).expect("the table");
+    let frame = 100;
+    let picture = &wrist[frame].2;
+    let at = whole.windows(picture.len()).position(|bytes| bytes == picture.as_slice()).expect("its bytes, unchanged");
+    let mut changed = whole.clone();
+    changed[at + 321] ^= 1;
+    std::fs::write(place.path(DATA), &changed).expect("written");
+    let (objects, code) = export(place, &["out", "--verify"]);
+    let differences = of(&objects, "difference");
+    let [difference] = differences.as_slice() else { panic!("{objects:?}") };
+    assert_eq!((code, &difference["episode"], &difference["frame"]), (1, &0.into(), &frame.into()));
+    assert_eq!(difference["feature"], "observation.images.cam_wrist");
+    assert!(difference["what"].as_str().expect("text").contains("from byte 321 on"), "{difference}");
+
+    // A table that is none any more.
+    std::fs::write(place.path(DATA), &whole[..whole.len() - 10]).expect("written");
+    let (objects, code) = export(place, &["out", "--verify"]);
+    assert!(code == 1 && of(&objects, "difference").len() == 1, "{objects:?}");
+    std::fs::write(place.path(DATA), &whole).expect("written");
+    assert_eq!(export(place, &["out", "--verify"]).1, 0);
+}
+
+#[test]
+fn what_does_not_fit_is_named_and_the_rest_is_appended() {
+    let place = Place::new();
+    let first = record(&place, "out", "1500ms", &["--sim", "--task", "push"]);
+    // One of each reason. The features are those of the first by name.
+    let short = record(&place, "out", "300ms", &["--sim", "--task", "short"]);
+    let slow = record(&place, "out", "1500ms", &["--sim", "--rate", "20", "--task", "slow"]);
+    let odd = record(&place, "out", "1500ms", &["--sim", "--rate", "12.5", "--task", "slow"]);
+    let bytes = std::fs::read(place.path(&first)).expect("the episode");
+    let mut holed = bytes.clone();
+    let third = holed.len() / 3;
+    holed[third..third + 5000].fill(0);
+    std::fs::write(place.path("out/holed.mcap"), holed).expect("written");
+    std::fs::write(place.path("out/cut.mcap.partial"), &bytes[..bytes.len() / 2]).expect("written");
+    std::fs::write(place.path("out/same.mcap"), &bytes).expect("written");
+    place.write("out/text.mcap", "no episode");
+
+    let (objects, code) = export(&place, &["out"]);
+    assert_eq!(code, 0);
+    let found = outcomes(&objects);
+    let outcome = |name: &str| found[name.rsplit('/').next().expect("a name")].as_str();
+    assert_eq!(outcome(&first), "exported");
+    assert!(outcome(&short).starts_with("left_out: BAD (") && outcome(&short).contains("--include-bad"), "{found:?}");
+    assert_eq!(outcome(&slow), "left_out: 20 frames a second, and 30 in the data set");
+    assert!(outcome(&odd).starts_with("left_out: 12.5 observations a second"), "{found:?}");
+    assert!(outcome("holed.mcap").starts_with("left_out: damaged (1 damaged chunk"), "{found:?}");
+    assert!(outcome("cut.mcap.partial").starts_with("left_out: "), "{found:?}");
+    assert_eq!(outcome("same.mcap"), format!("left_out: the same as {first}"));
+    assert_eq!(outcome("text.mcap"), "left_out: not an MCAP file");
+    let summary = of(&objects, "export")[0];
+    assert_eq!((&summary["exported"], &summary["left_out"], &summary["bad"]), (&1.into(), &7.into(), &1.into()));
+
+    // Now with the BAD one, and another whose tactile camera was never there: its size is known from the first.
+    place.write("two.toml", "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"motor_state\"\n");
+    let without = record(&place, "out", "1500ms", &["--sim", "two.toml", "--task", "pull"]);
+    let (objects, code) = export(&place, &[&short, &without, &first, "--include-bad", "--verify"]);
+    let found = outcomes(&objects);
+    let outcome = |name: &str| found[name.rsplit('/').next().expect("a name")].as_str();
+    assert_eq!((outcome(&short), outcome(&without), outcome(&first), code), ("exported", "exported", "already", 0));
+    let summary = of(&objects, "export")[0];
+    assert_eq!((&summary["episodes"], &summary["differences"]), (&3.into(), &0.into()), "{summary}");
+    let last = pictures(&place, "set/data/chunk-000/file-002.parquet", "observation.images.tactile_tip");
+    assert!(last.iter().all(|(mask, valid, picture)| !mask[1] && !valid[1] && picture.starts_with(PNG)));
+    let batch = &rows(&place, "set/data/chunk-000/file-002.parquet")[0];
+    let first_of = |key: &str| batch.column_by_name(key).expect("a column").as_primitive::<Int64Type>().value(0);
+    assert_eq!((first_of("episode_index"), first_of("frame_index"), first_of("task_index")), (2, 0, 2));
+    let before = summary["frames"].as_i64().expect("frames") - i64::try_from(last.len()).expect("a length");
+    assert_eq!(first_of("index"), before);
+    nothing_left(&place, &short, &slow);
+}
+
+fn nothing_left(place: &Place, short: &str, slow: &str) {
+    // A different choice of columns is another data set.
+    let state = |words: &[&str]| {
+        let common = ["export", slow, "--to", "lerobot", "--out", "other"];
+        place.run(&[&common, words].concat())
+    };
+    let unknown = state(&["--state", "cam_wrist"]);
+    let text = String::from_utf8_lossy(&unknown.stderr).into_owned();
+    assert!(text.contains("\"cam_wrist\" is no sensor of numbers; of this episode they are motor_state"), "{text}");
+    assert!(text.contains("error: nothing exported: none of 1 episode"), "{text}");
+    assert_eq!((unknown.status.code(), place.path("other").exists()), (Some(1), false));
+    let as_action = state(&["--state", "motor_state", "--action", "motor_state"]);
+    assert_eq!(as_action.status.code(), Some(0), "{as_action:?}");
+    let info = json(place, "other/meta/info.json");
+    assert_eq!(info["features"]["action"]["names"], info["features"]["observation.state"]["names"]);
+
+    let output = place.run(&["export", short, "--to", "lerobot", "--out", "third", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    let last: Value = serde_json::from_str(text.lines().last().expect("a line")).expect("JSON");
+    assert_eq!((&last["event"], &last["exit_code"]), (&"error".into(), &1.into()), "{text}");
+    // A folder with anything else is not written to.
+    let foreign = place.run(&["export", slow, "--to", "lerobot", "--out", "out"]);
+    assert_eq!(foreign.status.code(), Some(2), "{foreign:?}");
+    assert!(String::from_utf8_lossy(&foreign.stderr).contains("--out takes a new folder"), "{foreign:?}");
+}
+
+/// Sets a flag as soon as an episode is exported.
+struct Interrupting<'a>(&'a AtomicBool, Vec<u8>);
+
+impl Write for Interrupting<'_> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.1.extend(bytes);
+        if String::from_utf8_lossy(&self.1).contains("\"exported\",\"episode\"") {
+            self.0.store(true, Ordering::Relaxed);
+        }
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn an_interrupted_export_has_the_episodes_so_far() {
+    let place = Place::new();
+    for _ in 0..3 {
+        record(&place, "out", "1s", &["--sim"]);
+    }
+    let args = ExportArgs {
+        paths: vec![place.path("out")],
+        to: Layout::Lerobot,
+        out: place.path("set"),
+        include_bad: true,
+        state: Vec::new(),
+        action: None,
+        verify: true,
+    };
+    let stop = AtomicBool::new(true);
+    let interrupted = |stop: &AtomicBool| {
+        let mut out = Interrupting(stop, Vec::new());
+        let ended = commands::export::export(&args, Format::Json, stop, &mut out, &mut std::io::sink());
+        ended.expect_err("interrupted").to_string()
+    };
+    assert!(interrupted(&stop).ends_with("has 0 episodes, and the same command continues"));
+    assert!(!place.path("set").exists());
+    stop.store(false, Ordering::Relaxed);
+    assert!(interrupted(&stop).ends_with("has 1 episode, and the same command continues"));
+    assert_eq!(json(&place, "set/meta/info.json")["total_episodes"], 1);
+    let (objects, code) = export(&place, &["out", "--include-bad", "--verify"]);
+    let summary = of(&objects, "export")[0];
+    assert_eq!((code, &summary["already"], &summary["exported"]), (0, &1.into(), &2.into()), "{objects:?}");
+    assert_eq!(summary["differences"], 0);
+}
+
+#[test]
+fn a_killed_export_is_continued_from_every_state_that_it_may_leave() {
+    let place = Place::new();
+    for _ in 0..2 {
+        record(&place, "out", "1500ms", &["--sim"]);
+    }
+    let kill = ["export", "out", "--to", "lerobot", "--out", "set", "--json"];
+    // After the first episode, at some moment of the second.
+    drop(place.start(&kill, "\"outcome\":\"exported\""));
+    let (objects, code) = export(&place, &["out", "--verify"]);
+    let summary = of(&objects, "export")[0];
+    assert_eq!((code, &summary["episodes"], &summary["differences"]), (0, &2.into(), &0.into()), "{objects:?}");
+    assert!(summary["already"].as_u64() >= Some(1), "{summary}");
+
+    let [info, stats] = ["set/meta/info.json", "set/meta/stats.json"].map(|name| json(&place, name));
+    let facts = place.path("set/meta/episodes/chunk-000/file-001.parquet");
+    let third = "set/data/chunk-000/file-002.parquet";
+    // A table of a third episode without a name, and one without facts; a set without the facts about all.
+    std::fs::write(place.path("set/data/chunk-000/.file-002.parquet.tmp"), "half").expect("written");
+    std::fs::copy(place.path(DATA), place.path(third)).expect("copied");
+    let mut of_one = info.clone();
+    of_one["total_episodes"] = 1.into();
+    std::fs::write(place.path("set/meta/info.json"), of_one.to_string()).expect("written");
+    let (objects, code) = export(&place, &["out", "--verify"]);
+    assert_eq!((code, &of(&objects, "export")[0]["already"]), (0, &2.into()), "{objects:?}");
+    assert_eq!(
+        (json(&place, "set/meta/info.json"), json(&place, "set/meta/stats.json")),
+        (info.clone(), stats.clone())
+    );
+    assert!(!place.path(third).exists());
+
+    // Killed between the table of the second and its facts.
+    std::fs::remove_file(&facts).expect("removed");
+    let (objects, code) = export(&place, &["out", "--verify"]);
+    let summary = of(&objects, "export")[0];
+    assert_eq!((code, &summary["already"], &summary["exported"]), (0, &1.into(), &1.into()), "{objects:?}");
+    assert_eq!((json(&place, "set/meta/info.json"), json(&place, "set/meta/stats.json")), (info, stats));
+}
