@@ -19,7 +19,7 @@ use crate::time::WallClock;
 pub enum LiveOptions {}
 
 /// An entry that was added during the run, and its samples.
-pub type LiveAddition = (Arc<DeviceSpec>, Subscription);
+pub(super) type LiveAddition = (Arc<DeviceSpec>, Subscription);
 
 /// Listens on nothing.
 #[expect(clippy::unused_async, reason = "as with the feature")]

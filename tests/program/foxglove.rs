@@ -304,7 +304,9 @@ fn an_added_entry_is_shown_from_then_on() {
     client.read_until("pictures of the added camera", |client| client.count("/rapid/camera/spare_cam") > 5);
     let file = good(&place, running);
     client.read();
-    assert!(client.compare(&place, &file)["/rapid/camera/wrist"] > 5);
+    let counts = client.compare(&place, &file);
+    // The log reports the entry.
+    assert!(counts["/rapid/camera/wrist"] > 5 && counts["/rapid/log"] > 0, "{counts:?}");
 }
 
 /// 50 MB of pictures a second, far more than the socket takes.
