@@ -463,6 +463,16 @@ pub enum LevelArg {
     Error,
 }
 
+/// `rapid help COMMAND` is `rapid COMMAND --help`: the list of commands has no line for it.
+fn without_help_first(typed: impl IntoIterator<Item = OsString>) -> Vec<OsString> {
+    let mut words: Vec<OsString> = typed.into_iter().collect();
+    if words.get(1).is_some_and(|word| word == "help") {
+        words.remove(1);
+        words.push("--help".into());
+    }
+    words
+}
+
 impl Cli {
     /// Parses a command line, the name of the program first.
     ///
@@ -470,7 +480,7 @@ impl Cli {
     /// When it is invalid; help and version are also such an "error".
     pub fn read(typed: impl IntoIterator<Item = OsString>) -> Result<Self, clap::Error> {
         let mut command = Self::grammar();
-        let matches = command.try_get_matches_from_mut(typed).map_err(|error| explained(error, &mut command))?;
+        let matches = command.try_get_matches_from_mut(without_help_first(typed)).map_err(|error| explained(error, &mut command))?;
         let mut cli = Self::from_arg_matches(&matches)?;
         matches.subcommand_name().unwrap_or(RUN_NAME).clone_into(&mut cli.name);
         match misplaced(&matches, &command).or_else(|| cli.contradiction(&command)) {

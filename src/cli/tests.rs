@@ -86,6 +86,12 @@ fn a_renamed_option_is_still_accepted_by_its_old_name() {
 }
 
 #[test]
+fn help_of_a_command_is_reached_both_ways() {
+    assert_eq!(printed("help episode label"), printed("episode label --help"));
+    assert_eq!(printed("help"), printed("--help"));
+}
+
+#[test]
 fn the_command_is_well_formed() {
     Cli::grammar().debug_assert();
 }
