@@ -8,7 +8,7 @@ use super::HEADER;
 /// The unit. Its configuration is in `/etc/rapid/upload.conf`.
 pub(super) fn service() -> String {
     format!(
-        r#"{HEADER}
+        r"{HEADER}
 # Before the first start, as root:
 #   apt install rclone
 #   rclone config --config /etc/rapid/rclone.conf                   # names a store, such as lab
@@ -43,7 +43,7 @@ ProtectHome=yes
 ReadWritePaths=/var/lib/rapid
 NoNewPrivileges=yes
 CapabilityBoundingSet=
-"#
+"
     )
 }
 
