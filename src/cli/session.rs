@@ -5,8 +5,8 @@ use clap::{Subcommand, ValueEnum};
 use crate::status::session::{Label, SessionRequest};
 
 pub(super) const EPISODE: &str = "\
-The running rapid answers when it is done and on the disk: `stop` when the file is closed, `start`, `next` and `redo`
-when the episode has begun.
+The running rapid answers when it is done and on the disk: `stop` when the file is closed,
+`start`, `next` and `redo` when the episode has begun.
 
 Examples:
   rapid episode start

@@ -377,7 +377,9 @@ mod tests {
             std::fs::write(folder.path().join(CURRENT), text).unwrap();
             let (mut journal, none, error) = Journal::open(folder.path());
             assert!(none.is_none());
-            assert!(matches!(error, Some(JournalError::Invalid { .. })), "{text:?}: {error:?}");
+            let Some(JournalError::Moved { error: why, moved }) = error else { panic!("{text:?}: {error:?}") };
+            assert!(matches!(*why, JournalError::Invalid { .. }), "{text:?}: {why:?}");
+            assert_eq!(std::fs::read_to_string(moved).unwrap(), text);
             journal.save(&session(Vec::new())).unwrap();
             let names = names(folder.path());
             assert_eq!(names.len(), 2, "{names:?}");

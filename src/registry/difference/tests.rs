@@ -88,7 +88,7 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
         ),
         ("the rig", RIG.replace("\"1s\"", "\"2s\"").replace("bench", "bank"), &[], &["[rig]: name, cooldown changed"]),
         ("an expectation", RIG.replace("cooldown", "expect = [\"cam\"]\ncooldown"), &[], &["[rig]: expect changed"]),
-        ("a module", RIG.replace("soft_tip", "hard_tip"), &[], &["[module]: soft_tip, hard_tip changed"]),
+        ("a module", RIG.replace("soft_tip", "hard_tip"), &[], &["[module]: soft_tip removed, hard_tip added"]),
         (
             "its program",
             spare("node = \"/bin/true\"\nbit = 3\nprocess = { kind = \"bytes\" }"),
