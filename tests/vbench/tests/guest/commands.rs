@@ -128,7 +128,7 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
         "STRANGER",
         "MJPG 640x480",
         "YUYV 320x240",
-        "brightness -64..=64 (default 0)",
+        "Brightness -64..=64 (default 0)",
     ] {
         assert!(listing.contains(word), "{word} not in:\n{listing}");
     }
