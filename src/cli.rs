@@ -480,7 +480,9 @@ impl Cli {
     /// When it is invalid; help and version are also such an "error".
     pub fn read(typed: impl IntoIterator<Item = OsString>) -> Result<Self, clap::Error> {
         let mut command = Self::grammar();
-        let matches = command.try_get_matches_from_mut(without_help_first(typed)).map_err(|error| explained(error, &mut command))?;
+        let matches = command
+            .try_get_matches_from_mut(without_help_first(typed))
+            .map_err(|error| explained(error, &mut command))?;
         let mut cli = Self::from_arg_matches(&matches)?;
         matches.subcommand_name().unwrap_or(RUN_NAME).clone_into(&mut cli.name);
         match misplaced(&matches, &command).or_else(|| cli.contradiction(&command)) {
