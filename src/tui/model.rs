@@ -287,10 +287,12 @@ impl Model {
         if !matches!(self.link, LinkState::Lost { .. }) {
             self.history.update(&snapshot);
         }
-        if self.frozen.is_none() {
-            snapshot.previews.iter().for_each(|preview| self.seen.take(preview));
-        }
         let selected = self.selected_device().map(|device| device.id);
+        if self.frozen.is_none() {
+            // Other screens look at other devices.
+            let own = snapshot.previews.iter().filter(|preview| Some(preview.device) == selected);
+            own.for_each(|preview| self.seen.take(preview));
+        }
         let marked = self.marked_episode();
         let news = news(&self.latest, &snapshot);
         self.latest = snapshot;

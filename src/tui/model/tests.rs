@@ -613,3 +613,32 @@ fn on_the_page_of_episodes_keys_are_about_the_marked_one() {
     let note = sent(SessionRequest::Note { episode: Some(file(2)), text: "a".to_owned() });
     assert_eq!(model.update(press(KeyCode::Enter)), note);
 }
+
+#[test]
+fn what_other_screens_look_at_takes_nothing_from_the_plot_of_this_one() {
+    let mut now = three_streaming();
+    let mut model = Model::new(now.clone());
+    model.update(press(KeyCode::Enter));
+    for step in 0..5_u8 {
+        let preview = |bit: u8| {
+            let payload: Vec<u8> = f64::from(step).to_le_bytes().to_vec();
+            let (seq, bytes) = (u64::from(step), payload.len());
+            let captured = Stamp(TAKEN.0 + u64::from(step));
+            let encoding = crate::sample::Encoding::F64;
+            std::sync::Arc::new(Preview {
+                device: id(bit),
+                seq,
+                captured,
+                encoding,
+                width: 1,
+                height: 1,
+                bytes,
+                payload: payload.into(),
+            })
+        };
+        now.previews = vec![preview(0), preview(1), preview(2)];
+        model.update(after(&now, u64::from(step) * 100));
+    }
+    assert_eq!(model.numbers(id(0)).count(), 5);
+    assert_eq!(model.numbers(id(1)).count(), 0);
+}
