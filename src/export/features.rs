@@ -1,4 +1,4 @@
-//! The features of a data set: what all of its episodes have in common, and `info.json` says.
+//! The features of a data set: what all of its episodes have in common, and `info.json` contains.
 //!
 //! The modalities of `rapid.mask`, `rapid.valid` and `rapid.age` are those of the registry, ascending by bit, also those
 //! whose samples are not exported. A feature whose name begins with `observation.` is an input of a policy in LeRobot;

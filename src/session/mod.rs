@@ -243,19 +243,7 @@ impl Session {
         self.phase = Phase::Recording;
         self.after = After::default();
         self.current = Some((self.file.episodes.len(), now));
-        self.file.episodes.push(EpisodeEntry {
-            file: name(file),
-            begun,
-            seconds: None,
-            verdict: None,
-            reasons: Vec::new(),
-            label: None,
-            label_reason: String::new(),
-            note: String::new(),
-            discarded: false,
-            marks: Vec::new(),
-            sensors: None,
-        });
+        self.file.episodes.push(EpisodeEntry::begin(name(file), begun));
         vec![Effect::Save]
     }
 

@@ -170,6 +170,23 @@ pub struct EpisodeEntry {
 }
 
 impl EpisodeEntry {
+    /// An episode that has begun, and of which nothing else is known.
+    pub const fn begin(file: String, begun: String) -> Self {
+        Self {
+            file,
+            begun,
+            seconds: None,
+            verdict: None,
+            reasons: Vec::new(),
+            label: None,
+            label_reason: String::new(),
+            note: String::new(),
+            discarded: false,
+            marks: Vec::new(),
+            sensors: None,
+        }
+    }
+
     /// Its file is closed: its length in seconds, rounded to milliseconds, and its verdict.
     pub fn close(&mut self, seconds: f64, verdict: &Verdict) {
         self.seconds = Some((seconds * 1000.0).round() / 1000.0);

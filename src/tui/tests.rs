@@ -109,18 +109,12 @@ fn the_last_verdict_is_shown_with_its_file_and_the_reasons_that_fit() {
 }
 
 fn entry(number: usize, verdict: Option<Grade>) -> EpisodeEntry {
+    let file = format!("20231114_place-block_{number:03}.mcap");
     EpisodeEntry {
-        file: format!("20231114_place-block_{number:03}.mcap"),
-        begun: "2023-11-14T22:13:20.000Z".to_owned(),
         seconds: verdict.map(|_| 29.8),
         verdict,
-        reasons: Vec::new(),
-        label: None,
-        label_reason: String::new(),
-        note: String::new(),
-        discarded: false,
-        marks: Vec::new(),
         sensors: verdict.map(|_| Sensors { registered: 3, recorded: 3, without: Vec::new() }),
+        ..EpisodeEntry::begin(file, "2023-11-14T22:13:20.000Z".to_owned())
     }
 }
 

@@ -577,19 +577,8 @@ fn losses_are_those_of_the_episode_in_progress() {
 #[test]
 fn on_the_page_of_episodes_keys_are_about_the_marked_one() {
     let file = |number: u8| format!("{number:03}.mcap");
-    let entry = |number: u8| EpisodeEntry {
-        file: file(number),
-        begun: String::new(),
-        seconds: Some(1.0),
-        verdict: Some(Grade::Good),
-        reasons: Vec::new(),
-        label: None,
-        label_reason: String::new(),
-        note: String::new(),
-        discarded: false,
-        marks: Vec::new(),
-        sensors: None,
-    };
+    let entry =
+        |number: u8| EpisodeEntry { verdict: Some(Grade::Good), ..EpisodeEntry::begin(file(number), String::new()) };
     let with = |count: u8| {
         let mut snapshot = three_streaming();
         snapshot.session =
