@@ -304,7 +304,7 @@ pub enum Command {
         #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
         out: PathBuf,
     },
-    /// Write the udev rules and systemd unit derived from the registry
+    /// Write udev rules, systemd units and a layout for Foxglove from the registry
     #[command(
         after_long_help = "Files: udev rules, one descriptor per entry, a systemd unit, and a layout for Foxglove.\n\nExamples:\n  \
         rapid artifacts                to read them first, in udev/\n  \

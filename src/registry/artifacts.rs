@@ -1,4 +1,4 @@
-//! Files generated from the registry: udev rules, module descriptors, the systemd unit, a layout for Foxglove.
+//! Files generated from the registry: udev rules, module descriptors, systemd units, a layout for Foxglove.
 //!
 //! Pure: what to write, not where or how (`commands::artifacts` writes).
 //!
