@@ -415,7 +415,10 @@ fn check_any(text: &str) {
             let total: u64 = devices.iter().map(|device| device.max_bytes as u64 * device.depth as u64).sum();
             assert!(total <= loaded.registry.rig.memory_budget);
             let files = rapid::registry::artifacts::artifacts(&loaded.registry);
-            assert_eq!(files.len(), 2 + devices.len());
+            // Rules, three units, a layout, and a descriptor of each device.
+            assert_eq!(files.len(), 5 + devices.len());
+            let paths: BTreeSet<_> = files.iter().map(|file| &file.path).collect();
+            assert_eq!(paths.len(), files.len(), "no file replaces another");
             let demo = Scenario::demo(&loaded.registry);
             assert_eq!(demo.devices.len(), devices.len());
         }

@@ -1,8 +1,9 @@
 #!/bin/bash
 # PID 1 of the guest: mounts, the real systemd-udevd, then run.sh of the share, whose results go back through it.
 # Whatever run.sh does, the machine ends by powering off, with the exit code in share/rc (written last, by rename).
-# Where the share has a file `systemd`, systemd takes over as PID 1 after the mounts: it starts udevd, and then this
-# script once more, as a service.
+# Before the share is mounted this waits for a line on ttyS1: here the machine is saved, and guests continue from here.
+# With `bench.systemd` on the kernel's command line systemd takes over as PID 1 after the mounts: it starts udevd, and
+# then this script once more, as a service.
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LANG=C TERM=dumb
 share=/mnt/share
 
@@ -17,8 +18,26 @@ mounts() {
   hostname bench
   ip link set lo up
   modprobe -a 9pnet_virtio 9p
+}
+
+# The clock of a saved machine continues from the moment it was saved. Without `now` the host stops sending lines.
+mount_share() {
   mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 share $share
-  cp $share/rules/*.rules /etc/udev/rules.d/ 2>/dev/null
+  date -s "@$(cat $share/now)" >/dev/null
+  rm $share/now
+}
+
+drivers() {
+  modprobe -a vhci_hcd uvcvideo cdc_acm ftdi_sio
+  udevadm settle
+}
+
+wait_for_the_host() {
+  local line
+  exec 5</dev/ttyS1
+  echo "bench: waiting" >/dev/console
+  read -r line <&5
+  exec 5<&-
 }
 
 # Units of no use here; each costs time on an emulated processor. Without an id systemd would set the machine up first.
@@ -53,8 +72,6 @@ udev_alone() {
 }
 
 script() {
-  modprobe -a vhci_hcd uvcvideo cdc_acm ftdi_sio
-  udevadm settle
   echo "bench: ready after $(cut -d' ' -f1 /proc/uptime) s" >/dev/kmsg
 
   # Programs and results live in the guest's memory: 9p costs a round trip to the host for every read and write.
@@ -73,9 +90,17 @@ script() {
   sleep 30
 }
 
-if [ "${1:-}" != script ]; then
+if [ "${1:-}" = script ]; then
+  drivers
+elif grep -qw bench.systemd /proc/cmdline; then
   mounts
-  [ ! -e $share/systemd ] || as_systemd
+  mount_share
+  as_systemd
+else
+  mounts
   udev_alone
+  drivers
+  wait_for_the_host
+  mount_share
 fi
 script

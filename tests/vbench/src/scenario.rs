@@ -193,13 +193,8 @@ impl Scenario {
         write("devices.toml", self.registry.as_bytes())?;
         self.files.iter().try_for_each(|(name, contents)| write(name, contents))?;
         write("run.sh", self.guest_script(&usbemu, &rapid).as_bytes())?;
-        if self.systemd {
-            let path = share.join("systemd");
-            fs::write(&path, "").map_err(|error| ScenarioError::Share(path, error))?;
-        }
-        let boot = image
-            .boot(&share, self.limit)
-            .inspect_err(|_| eprintln!("vbench: the share is kept in {}", share.display()))?;
+        let boot = if self.systemd { image.boot(&share, self.limit) } else { image.resume(&share, self.limit) };
+        let boot = boot.inspect_err(|_| eprintln!("vbench: the share is kept in {}", share.display()))?;
         Ok(Outcome::collect(self.name, share, boot))
     }
 
