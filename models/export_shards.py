@@ -178,7 +178,7 @@ def shard(folder: str, name: str, files: list[str], rapid: str, words: list[str]
 
 
 def pack(folder: Path) -> None:
-    """Makes few large files of the file of each episode."""
+    """Makes few large files of the file of each episode; most of it are JPEGs, which do not become smaller."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -192,7 +192,7 @@ def pack(folder: Path) -> None:
             writer, number = None, number + 1
             name = packed / f"file-{number:03}.parquet"
         source = pq.ParquetFile(path)
-        writer = writer or pq.ParquetWriter(name, source.schema_arrow, use_dictionary=False)
+        writer = writer or pq.ParquetWriter(name, source.schema_arrow, use_dictionary=False, compression="none")
         for group in range(source.num_row_groups):
             writer.write_table(source.read_row_group(group))
         places.append(number)
