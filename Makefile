@@ -10,6 +10,8 @@ export PATH := $(PATH):$(HOME)/.cargo/bin
 TARGET := $(or $(CARGO_TARGET_DIR),$(CURDIR)/target)
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/rapid
 DEMO_DIR := demo-episodes
+# What the tests in Python record episodes with: what is built already.
+BUILT = $(firstword $(wildcard $(TARGET)/release/rapid $(TARGET)/debug/rapid))
 # Clippy's compiler builds the tests: it makes the programs that rustc makes, and no dependency is compiled for lints alone. Both commands of `test` need the same environment: with another wrapper cargo builds the workspace again.
 LINTED := RUSTC_WORKSPACE_WRAPPER=clippy-driver CLIPPY_ARGS=-Dwarnings__CLIPPY_HACKERY__
 # A fresh clone builds faster and in half the space without the state of incremental builds. Where there is such state,
@@ -76,8 +78,8 @@ fuzz: ## feed every reader of untrusted bytes with generated ones, each for FUZZ
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
 
-fleet-test: ## copy episodes to a real S3 server by the units of `rapid artifacts`, with breaks (needs Go; no part of `test`)
-	scripts/fleet.sh
+fleet-test: ## upload to a real S3 server, export on a cluster of Ray, UMI's buffer, Rerun, with breaks (fetches 1 GB once)
+	RAPID_BIN='$(BUILT)' scripts/fleet.sh
 
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.
 train: setup-build ## record demonstrations, train on them, export models/tactile-id (THREADS=2, MINUTES=)
@@ -96,15 +98,9 @@ texture: ## what a tactile picture reveals of the texture: models/results/textur
 	scripts/train.sh texture
 
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
-lerobot-test: LEROBOT := $(CACHE)/venv-lerobot
 lerobot-test: ## the exports from and to LeRobot, against LeRobot (fetches 8 GB of Python packages once)
-	@stamp=$$(sha256sum <models/requirements-lerobot.txt); \
-	if [[ $$(cat '$(LEROBOT)/stamp' 2>/dev/null) != "$$stamp" ]]; then \
-	    rm -rf '$(LEROBOT)' && python3 -m venv '$(LEROBOT)'; \
-	    '$(LEROBOT)/bin/python' -m pip install --quiet --disable-pip-version-check --only-binary=:all: --no-deps -r models/requirements-lerobot.txt; \
-	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
-	fi
-	RAPID_BIN='$(firstword $(wildcard $(TARGET)/release/rapid $(TARGET)/debug/rapid))' '$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
+	python=$$(scripts/venv.sh venv-lerobot models/requirements-lerobot.txt --no-deps); \
+	RAPID_BIN='$(BUILT)' "$$python" -m unittest discover -s models/tests/lerobot -v
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean

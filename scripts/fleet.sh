@@ -1,5 +1,7 @@
 #!/usr/bin/env bash
-# Tests what happens to episodes after a rig: needs a network for Go's modules once, and is no part of `make test`.
+# Tests what happens to episodes after a rig: the upload, a cluster's export, UMI's replay buffer, Rerun. Fetches 1 GB of
+# Go's modules and Python packages once, and is no part of `make test`. RAPID_BIN is the program; without one, what needs
+# episodes reports that it is skipped.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -17,4 +19,12 @@ if [[ ! -x $cache/versitygw ]]; then
   echo "fleet: building the S3 server of the test, once" >&2
   GOBIN=$cache go install "$server"
 fi
-exec python3 tests/fleet/upload.py udev/rapid-upload.service "$cache/versitygw"
+python3 tests/fleet/upload.py udev/rapid-upload.service "$cache/versitygw"
+
+python=$(scripts/venv.sh venv-fleet models/requirements-fleet.txt --no-deps)
+RERUN=$(dirname "$(scripts/venv.sh venv-rerun models/requirements-rerun.txt --no-deps)")/rerun
+export RERUN
+# The merge is LeRobot's: gigabytes that are not fetched for this alone.
+lerobot=${cache%/*}/venv-lerobot
+[[ ! -f $lerobot/stamp ]] || export LEROBOT_PYTHON=$lerobot/bin/python
+exec "$python" -m unittest discover -s models/tests/fleet -v

@@ -15,7 +15,6 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-readonly VENV="${XDG_CACHE_HOME:-$HOME/.cache}/rapid/train-venv"
 RUNS="$(realpath -m "${RUNS:-models/runs}")"
 readonly RUNS
 readonly EPISODES="${EPISODES:-72}" SEED="${SEED:-1000}" THREADS="${THREADS:-2}"
@@ -47,28 +46,11 @@ main() {
 }
 
 in_models() {
-    (cd models && exec "$VENV/bin/python" "$@")
+    (cd models && exec "$PYTHON" "$@")
 }
 
-# Complete if its stamp, written last, names the present requirements and its Python runs.
 environment() {
-    local requirements=models/requirements.txt stamp
-    stamp=$(sha256sum <"$requirements")
-    # Two simultaneous runs would create it in the same place.
-    mkdir -p "$(dirname "$VENV")"
-    exec 9>"$VENV.lock"
-    flock 9
-    if [[ $(cat "$VENV/stamp" 2>/dev/null) = "$stamp" ]] && "$VENV/bin/python" -c 'import torch' 2>/dev/null; then
-        exec 9>&-
-        return
-    fi
-    report "creating the Python environment for training: $VENV"
-    rm -rf "$VENV"
-    python3 -m venv "$VENV"
-    "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary=:all: -r "$requirements"
-    "$VENV/bin/python" -c 'import torch'
-    echo "$stamp" >"$VENV/stamp"
-    exec 9>&-
+    PYTHON=$(scripts/venv.sh train-venv models/requirements.txt)
 }
 
 demonstrations() {

@@ -138,7 +138,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
     ("serde_path_to_error", &["policy/bundle"]),
-    ("sha2", &["policy/bundle", "episode/recover", "export"]),
+    ("sha2", &["policy/bundle", "episode/hash"]),
     ("socketcan", &["driver/can"]),
     ("strsim", &["registry"]),
     ("thiserror", &[ANYWHERE]),

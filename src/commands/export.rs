@@ -14,6 +14,7 @@ use serde::Serialize;
 use super::progress::Bar;
 use super::{Format, json_line, progress};
 use crate::cli::ExportArgs;
+use crate::episode::sha256;
 use crate::export::{self, Choice, DataSet, Difference, Features, Known, Refusal, SetError, Survey};
 use crate::record::inspect::{self, ReadError};
 use crate::status::Grade;
@@ -203,7 +204,7 @@ fn found(
         if stop.load(Ordering::Relaxed) {
             return Err(Refusal::Interrupted);
         }
-        let sha256 = export::sha256(file)?;
+        let sha256 = sha256(file)?;
         match set.find(&sha256) {
             Some(number) => Ok(Read::Already(number)),
             None => export::survey(file, sha256, args.include_bad, stop).map(|survey| Read::New(Box::new(survey))),

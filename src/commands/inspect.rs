@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use super::{CommandStatus, Format, json_line, progress};
+use crate::episode::sha256;
 use crate::palette::Palette;
 use crate::record::inspect::{self, Judgement, ReadError};
 use crate::text;
@@ -18,6 +19,16 @@ pub enum InspectFailure {
     /// The output.
     #[error("output: {0}")]
     Output(#[from] io::Error),
+}
+
+/// A line of `--json`: the report, and the SHA-256 of the file. `rapid list` does not read files for it.
+#[derive(serde::Serialize)]
+struct Hashed<'a, T> {
+    #[serde(flatten)]
+    report: &'a T,
+    /// Hexadecimal; none of a file that cannot be read.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sha256: Option<String>,
 }
 
 /// Reports on the episodes at `paths`. In a list, a file that cannot be read has a line too; then the
@@ -37,7 +48,10 @@ pub fn inspect(
     {
         let inspection = inspect::inspect(path)?;
         match format {
-            Format::Json => writeln!(out, "{}", json_line("inspection", &inspection)?)?,
+            Format::Json => {
+                let line = Hashed { report: &inspection, sha256: Some(sha256(path)?) };
+                writeln!(out, "{}", json_line("inspection", &line)?)?;
+            }
             Format::Text => out.write_all(inspect::render(&inspection, columns, palette).as_bytes())?,
         }
         return Ok(CommandStatus::Done);
@@ -55,12 +69,18 @@ pub fn inspect(
     };
     let name = files.iter().map(|file| text::width(&name_of(file))).max().unwrap_or(0);
     let mut outcome = CommandStatus::Done;
-    progress::each(&files, inspect::list, |file, listed| {
+    let read = |file: &Path| {
+        let sha256 = if format == Format::Json { sha256(file).ok() } else { None };
+        (inspect::list(file), sha256)
+    };
+    progress::each(&files, read, |file, (listed, sha256)| {
         if matches!(listed.verdict, Judgement::Unreadable(_)) {
             outcome = CommandStatus::BadConfiguration;
         }
         match format {
-            Format::Json => json_line("listed", &listed).and_then(|line| writeln!(out, "{line}")),
+            Format::Json => {
+                json_line("listed", &Hashed { report: &listed, sha256 }).and_then(|line| writeln!(out, "{line}"))
+            }
             Format::Text => writeln!(out, "{}", inspect::render_list(&listed, &name_of(file), name, palette)),
         }
     })?;

@@ -11,6 +11,7 @@ pub(crate) mod chunk_writer;
 pub(crate) mod decode;
 pub mod encode;
 mod failed;
+mod hash;
 mod index;
 mod integrity;
 mod names;
@@ -31,6 +32,7 @@ pub(crate) mod wire;
 
 pub use decode::decode;
 pub(crate) use failed::Failed;
+pub use hash::sha256;
 pub(crate) use integrity::Writer;
 pub(crate) use source::ReadAt;
 

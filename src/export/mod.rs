@@ -28,5 +28,5 @@ mod verify;
 pub use features::{Choice, ChoiceError, Features, Known};
 pub use rows::Refusal;
 pub use set::{DataSet, SetError};
-pub use survey::{Survey, sha256, survey};
+pub use survey::{Survey, survey};
 pub use verify::{Difference, verify};

@@ -36,6 +36,7 @@ use super::rows::{Index, Refusal};
 use super::statistics::Column;
 use super::survey::Survey;
 use super::table::{CREATED_BY, Position, Table, one_row, timestamp};
+use crate::episode::sha256;
 use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 
 /// Files of a folder; also `chunks_size` in `info.json`.
@@ -266,7 +267,7 @@ impl DataSet {
         }
         table.finish().map_err(wrong)?;
         // The statistics, and the name by which it is found again, are those of the survey.
-        if super::sha256(&episode.file)? != episode.sha256 {
+        if sha256(&episode.file).map_err(Refusal::from)? != episode.sha256 {
             return Err(Refusal::Changed.into());
         }
         new.keep()

@@ -1,17 +1,12 @@
 //! What an episode holds and whether it can be exported: everything that can refuse it is found here, before anything is
 //! written.
 
-use std::fs::File;
-use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
-
-use sha2::{Digest, Sha256};
 
 use super::picture::{self, Shape};
 use super::rows::{Index, Listed, Payload, Refusal, Row};
 use super::statistics::Column;
-use crate::episode;
 use crate::episode::record_iter::FileEnd;
 use crate::modality::ModalityKind;
 use crate::pixels::{CHANNELS, Picture, Pixels};
@@ -19,8 +14,6 @@ use crate::record::inspect::{self, Inspection, Judgement};
 use crate::status::{Grade, Verdict};
 use crate::text;
 
-/// Bytes read at once.
-const PIECE: usize = 1 << 20;
 /// Numbers that a registry may declare of a sample; what a file claims may be anything.
 const LONGEST: usize = 1 << 16;
 /// Of a picture with more pixels along a side, every n-th of each row and column counts for the statistics, so that
@@ -76,31 +69,6 @@ pub(super) enum Content {
     Vector { found: Option<usize>, declared: Option<usize> },
     /// Bytes, which are not exported.
     Bytes,
-}
-
-/// SHA-256 of a file, hexadecimal.
-///
-/// # Errors
-/// When it cannot be read.
-pub fn sha256(path: &Path) -> Result<String, Refusal> {
-    let (mut file, _) = episode::open(path)?;
-    let mut hasher = Sha256::new();
-    let mut piece = vec![0; PIECE];
-    loop {
-        match read(&mut file, &mut piece)? {
-            0 => return Ok(text::hexadecimal(&hasher.finalize())),
-            count => hasher.update(piece.get(..count).unwrap_or_default()),
-        }
-    }
-}
-
-fn read(file: &mut File, piece: &mut [u8]) -> io::Result<usize> {
-    loop {
-        match file.read(piece) {
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            read => return read,
-        }
-    }
 }
 
 /// Looks at the episode at `path`; `sha256` is that of the file. One that is BAD is refused unless `include_bad`.

@@ -38,10 +38,17 @@ const NOT_RUN: &[(&str, &str)] = &[
     ("README.md", "rapid devices                     # what is plugged in: vendor, product, serial number, port"),
     ("docs/benchmarks.md", "make bench                                  # everything, about 30 minutes"),
     ("docs/episodes.md", "sudo install -m 755 rapid /usr/local/bin/"),
+    ("docs/export.md", "python=$(scripts/venv.sh venv-lerobot models/requirements-lerobot.txt --no-deps)"),
+    ("docs/export.md", "python=$(scripts/venv.sh venv-fleet models/requirements-fleet.txt --no-deps)"),
+    (
+        "docs/fleet.md",
+        "ray start --head                                        # on the first machine; on the others: ray start --address=FIRST:6379",
+    ),
     (
         "docs/interfaces.md",
         "rapid --foxglove                            # on the rig; then in Foxglove: open connection, ws://localhost:8765",
     ),
+    ("docs/interfaces.md", "rerun episodes/20261125_place-block_001.mcap"),
     (
         "docs/monitor.md",
         "rapid monitor                         # the monitor of a rapid that runs headless, as a service or in another terminal",

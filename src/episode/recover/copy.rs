@@ -9,20 +9,17 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use mcap::McapError;
-use sha2::{Digest, Sha256};
 
 use super::super::chunk_writer::{Channel, ChunkWriter, Sink, io_error};
 use super::super::reader::Entry;
 use super::super::record_iter::{Record, RecordIter, op};
 use super::report;
 use super::{ProgressFn, Repaired, summary::Summary};
-use crate::episode::{Failed, RECOVERED, ReadAt, SUMMARY, own};
-use crate::{text, time};
+use crate::episode::{Failed, RECOVERED, ReadAt, SUMMARY, hash, own};
+use crate::time;
 
 /// Bytes read between two calls of a [`ProgressFn`], including those searched in vain for a chunk.
 const WATCH_EVERY: u64 = 1 << 20;
-/// Bytes read at once where only their hash is wanted.
-const PIECE: usize = 256 << 10;
 
 /// Why copying ended.
 #[derive(Debug)]
@@ -133,23 +130,7 @@ fn finish<S: Sink>(mut writer: ChunkWriter<S>, copied: &Copied, about: &About<'_
 /// The SHA-256 of the first `size` bytes of `file`, hexadecimal.
 pub(super) fn sha256(file: &File, size: u64, watch: &mut ProgressFn<'_>) -> Result<String, Error> {
     let file = Watched::new(file, size, watch);
-    let (mut hasher, mut piece) = (Sha256::new(), vec![0; PIECE]);
-    let mut done = 0;
-    while done < size {
-        let count = usize::try_from(size - done).unwrap_or(usize::MAX).min(PIECE);
-        let Some(room) = piece.get_mut(..count) else { break };
-        let read = match file.read_at(room, done) {
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            read => read.map_err(|error| file.error(error))?,
-        };
-        if read == 0 {
-            break;
-        }
-        hasher.update(room.get(..read).unwrap_or_default());
-        done += read as u64;
-        file.done.set(done);
-    }
-    Ok(text::hexadecimal(&hasher.finalize()))
+    hash::sha256_of(&file, size, |done| file.done.set(done)).map_err(|error| file.error(error))
 }
 
 /// The whole file that repair makes of `bytes`, which may be any; `None` if they are not an MCAP file.
