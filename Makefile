@@ -18,7 +18,7 @@ LINTED := RUSTC_WORKSPACE_WRAPPER=clippy-driver CLIPPY_ARGS=-Dwarnings__CLIPPY_H
 # someone is at work, and changing the setting would rebuild the workspace.
 INCREMENTAL := $(if $(wildcard $(TARGET)/debug/incremental),,CARGO_INCREMENTAL=0)
 # Most tests wait most of their time, for clocks and for programs: more of them than processors run side by side.
-TEST_THREADS := RUST_TEST_THREADS=$(shell echo $$((3 * $$(nproc))))
+TEST_THREADS := RUST_TEST_THREADS=$(shell echo $$((2 * $$(nproc))))
 TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
 TESTS := cargo test --locked --workspace
 # What `make quick` runs, and the tests of the program that it leaves out: those that wait for long, or need Python or C.
