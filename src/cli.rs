@@ -304,7 +304,7 @@ pub enum Command {
         #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
         out: PathBuf,
     },
-    /// Write udev rules, systemd units and a layout for Foxglove from the registry
+    /// Write udev rules, systemd units and the layout of Foxglove
     #[command(
         after_long_help = "Files: udev rules, one descriptor per entry, a systemd unit, and a layout for Foxglove.\n\nExamples:\n  \
         rapid artifacts                to read them first, in udev/\n  \

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use vbench::check::{assert_lines, assert_whole, play};
 use vbench::emu::spec::{DeviceSpec, Format};
-use vbench::entries::{camera, registry, scalars};
+use vbench::entries::{camera, registry, scalars, without_limits_of_time};
 use vbench::outcome::{Outcome, json_lines};
 use vbench::recording::Recording;
 use vbench::scenario::Scenario;
@@ -82,6 +82,7 @@ fn an_episode_survives_clock_steps_a_full_disk_and_a_removed_folder() {
             .registry(&registry(&[
                 camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480)),
                 scalars("tof", TOF, 1, "2e8a:000a", "TOF1"),
+                without_limits_of_time(),
             ]))
             .script(SCRIPT)
             .limit(Duration::from_secs(240)),

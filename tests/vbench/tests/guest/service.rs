@@ -4,7 +4,7 @@
 use vbench::check::{assert_whole, play};
 use vbench::emu::can::adapter::Protocol;
 use vbench::emu::spec::{DeviceSpec, Format};
-use vbench::entries::{camera, can, lan, registry};
+use vbench::entries::{camera, can, lan, registry, without_limits_of_time};
 use vbench::outcome::{Outcome, json_lines};
 use vbench::recording::{Recording, falls, rises};
 use vbench::scenario::Scenario;
@@ -12,9 +12,6 @@ use vbench::scenario::Scenario;
 const WRIST: &str = "/rapid/camera/wrist";
 const BUS: &str = "/rapid/bus";
 const LIDAR: &str = "/rapid/lidar";
-
-/// Checks that compare with the speed of the machine, which is an emulated one here.
-const OFF: &[&str] = &["lost", "dropped", "repeated", "frozen", "late", "gap", "clock", "rate", "opening", "duplicate"];
 
 const SCRIPT: &str = r#"
 config=/tmp/bench/devices.toml
@@ -128,11 +125,6 @@ emu_quit
 exit 0
 "#;
 
-fn limits() -> String {
-    let off: String = OFF.iter().map(|check| format!("{check} = \"off\"\n")).collect();
-    format!("[verdict]\n{off}[verdict.bad]\n{off}")
-}
-
 #[test]
 fn the_installed_unit_records_cameras_buses_and_the_network() {
     let wrist = camera("wrist", WRIST, 0, Some("CAM00A1"), (320, 240)).replace("fps = 30", "fps = 10");
@@ -140,7 +132,7 @@ fn the_installed_unit_records_cameras_buses_and_the_network() {
         wrist,
         can("bus", BUS, 1, "1d50:606f", "CAN1", "protocol = \"raw\""),
         lan("lidar", LIDAR, 2, "2672:0059", "VLP16", "protocol = \"udp\"\nport = 2368"),
-        limits(),
+        without_limits_of_time(),
     ]);
     // A picture each 100 ms is in the window of every tick.
     let entries = entries.replace("[rig]\n", "[rig]\nsync_window = \"60ms\"\n");
