@@ -30,6 +30,7 @@ const WAITING: &str = "bench: waiting";
 const KERNEL_ARGUMENTS: &str = "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off nokaslr audit=0 \
      random.trust_cpu=on no_timer_check tsc=reliable usbcore.autosuspend=-1";
 
+/// The machine; a saved one continues only in the same.
 const MACHINE: [&str; 17] = [
     "-M",
     "q35,usb=off,vmport=off",
@@ -164,25 +165,34 @@ impl Image {
         }
         let share = path.with_extension("share");
         fs::create_dir_all(&share).map_err(|error| GuestError::Io(share.clone(), error))?;
-        let partial = share.join("state");
         let console = share.join("console.log");
         let mut qemu = self.command(&share, "");
-        qemu.args(["-serial", "null", "-monitor", "stdio"]).stdin(Stdio::piped());
+        // To a file: the monitor repeats the line with each character of it, which is more than a pipe holds.
+        let reports = share.join("monitor.log");
+        let monitor = File::create(&reports).map_err(|error| GuestError::Io(reports.clone(), error))?;
+        qemu.args(["-serial", "null", "-monitor", "stdio"]).stdin(Stdio::piped()).stdout(monitor);
         let mut machine = Machine(qemu.spawn().map_err(GuestError::NoQemu)?);
         let begun = Instant::now();
         while !fs::read_to_string(&console).unwrap_or_default().contains(WAITING) && begun.elapsed() < SAVED_WITHIN {
             thread::sleep(Duration::from_millis(50));
         }
-        // The monitor executes a command after the one before it has ended.
-        let orders = format!("migrate \"exec:cat >'{}'\"\nquit\n", partial.display());
-        let monitor = machine.0.stdin.as_mut().map(|input| input.write_all(orders.as_bytes()));
-        let is_saved = monitor.is_some_and(|written| written.is_ok())
-            && machine.wait(SAVED_WITHIN.saturating_sub(begun.elapsed())).is_some_and(|status| status.success())
-            && fs::metadata(&partial).is_ok_and(|state| state.len() > 0);
-        if !is_saved {
+        // The monitor executes a command after the one before it has ended. The file gets its name when all of it is written,
+        // and QEMU reports whether that was all of the machine.
+        let (state, saved) = (share.join("state"), share.join("saved"));
+        let whole = format!("cat >'{0}' && mv '{0}' '{1}'", state.display(), saved.display());
+        let orders = format!("migrate \"exec:{whole}\"\ninfo migrate\nquit\n");
+        let _where_qemu_has_ended = machine.0.stdin.as_mut().map(|input| input.write_all(orders.as_bytes()));
+        let left = SAVED_WITHIN.saturating_sub(begun.elapsed());
+        let is_complete = machine.wait(left).is_some_and(|status| status.success())
+            && fs::read(&reports)
+                .is_ok_and(|text| String::from_utf8_lossy(&text).contains("Migration status: completed"));
+        while is_complete && !saved.is_file() && begun.elapsed() < SAVED_WITHIN {
+            thread::sleep(Duration::from_millis(50));
+        }
+        if !is_complete || !saved.is_file() {
             return Err(GuestError::NotSaved(tail(&console, 30)));
         }
-        fs::rename(&partial, &path).map_err(|error| GuestError::Io(path.clone(), error))?;
+        fs::rename(&saved, &path).map_err(|error| GuestError::Io(path.clone(), error))?;
         let _gone = fs::remove_dir_all(&share);
         Ok(path)
     }
@@ -195,7 +205,7 @@ impl Image {
         Ok(file)
     }
 
-    /// The machine, but for its second serial line; a saved one continues only in the same.
+    /// The machine with its disk and `share`, but for its second serial line.
     fn command(&self, share: &Path, argument: &str) -> Command {
         let mut qemu = Command::new("qemu-system-x86_64");
         qemu.args(MACHINE)
