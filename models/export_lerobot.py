@@ -17,6 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import commandline
 from lerobot_export import Unsupported
 from lerobot_export import config as checkpoint_config
 
@@ -27,18 +28,12 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         export(options)
     except Unsupported as error:
-        # Text from a foreign checkpoint must not control the terminal.
-        line = "".join(c if c.isprintable() else " " for c in str(error))
-        print(f"export_lerobot: {line}", file=sys.stderr)
-        return 1
+        return commandline.failed("export_lerobot", error)
     return 0
 
 
 def parser() -> argparse.ArgumentParser:
-    head, _, rest = __doc__.partition("\n")
-    out = argparse.ArgumentParser(
-        description=head, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    out = commandline.parser(__doc__)
     add = out.add_argument
     add(
         "path",

@@ -28,6 +28,8 @@ import tempfile
 import time
 from pathlib import Path
 
+import commandline
+
 LIST, REPORT = "shards.jsonl", "report.jsonl"
 # Below the 100 MB of LeRobot's files: its merge appends small files to one another and rewrites the result each time.
 FILE_BYTES = 90_000_000
@@ -46,16 +48,14 @@ def main(arguments: list[str]) -> int:
             return merge(options.shards.resolve(), options.out.resolve())
         return export(options, arguments[at + 1 :])
     except (Failed, OSError) as error:
-        print(f"export_shards: {error}", file=sys.stderr)
-        return 1
+        return commandline.failed("export_shards", error)
 
 
 def parser() -> argparse.ArgumentParser:
-    head, _, rest = __doc__.partition("\n")
-    raw = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-    out = argparse.ArgumentParser(description=head, epilog=rest, **raw)
+    out = commandline.parser(__doc__)
     commands = out.add_subparsers(dest="command", required=True, metavar="export|merge")
-    of_export = commands.add_parser("export", help="make shards of episodes", epilog=rest, **raw)
+    plain = {"epilog": out.epilog, **commandline.PLAIN}
+    of_export = commands.add_parser("export", help="make shards of episodes", **plain)
     add = of_export.add_argument
     add("episodes", metavar="FILE|DIR", nargs="+", type=Path, help="episodes, or folders of them")
     add("--out", metavar="SHARDS", type=Path, required=True, help="folder of the shards")
@@ -63,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     add("--rapid", metavar="PROGRAM", default="rapid", help="the program on each machine (default: rapid)")
     add("--address", help="of the cluster (default: RAY_ADDRESS, or that of this machine; without one: this machine)")
     add("--retries", metavar="N", type=int, default=3, help="of a shard whose machine died (default: 3)")
-    of_merge = commands.add_parser("merge", help="make one data set of them, with LeRobot", epilog=rest, **raw)
+    of_merge = commands.add_parser("merge", help="make one data set of them, with LeRobot", **plain)
     of_merge.add_argument("shards", metavar="SHARDS", type=Path, help="folder of the shards")
     of_merge.add_argument("--out", metavar="SET", type=Path, required=True, help="the data set; must not exist")
     return out

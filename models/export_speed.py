@@ -19,13 +19,13 @@ import tempfile
 import time
 from pathlib import Path
 
+import commandline
+
 IMAGES = "observation.images."
 
 
 def main() -> int:
-    head, _, rest = __doc__.partition("\n")
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=head, epilog=rest, formatter_class=raw)
+    parser = commandline.parser(__doc__)
     parser.add_argument("episode", metavar="FILE", type=Path)
     parser.add_argument("--rapid", metavar="PROGRAM", default="rapid")
     parser.add_argument("--times", metavar="N", type=int, default=3, help="the fastest of N (default: 3)")

@@ -31,6 +31,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import commandline
+
 try:
     import numpy
     import pyarrow.parquet as pq
@@ -85,18 +87,12 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         export(options)
     except (Unfit, OSError) as error:
-        # Text from a foreign file must not control the terminal.
-        line = "".join(c if c.isprintable() else " " for c in str(error))
-        print(f"export_umi: {line}", file=sys.stderr)
-        return 1
+        return commandline.failed("export_umi", error)
     return 0
 
 
 def parser() -> argparse.ArgumentParser:
-    head, _, rest = __doc__.partition("\n")
-    out = argparse.ArgumentParser(
-        description=head, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    out = commandline.parser(__doc__)
     add = out.add_argument
     add("set", metavar="SET", type=Path, help="folder of the data set: LeRobot v3.0 without videos")
     add("out", metavar="OUT", type=Path, help="the buffer, NAME.zarr.zip; must not exist")

@@ -6,6 +6,8 @@ What belongs to a row is taken from `/rapid/frame` and from nothing else.
 import json
 import os
 import subprocess
+import tempfile
+import unittest
 from collections import defaultdict
 from pathlib import Path
 
@@ -24,6 +26,17 @@ def rapid(*words: str, cwd: Path) -> str:
     if done.returncode not in (0, 4):
         raise AssertionError(f"rapid {' '.join(words)}: {done.returncode}\n{done.stdout}{done.stderr}")
     return done.stdout
+
+
+@unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")
+class Folder(unittest.TestCase):
+    """Tests on what is in one folder, which is there before the first and gone after the last."""
+
+    @classmethod
+    def setUpClass(cls) -> None:
+        temporary = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(temporary.cleanup)
+        cls.folder = Path(temporary.name)
 
 
 def decoder(schema):

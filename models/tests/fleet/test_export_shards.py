@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
 import export_shards
-from recorded import PROGRAM, rapid, read_episode
+from recorded import PROGRAM, Folder, rapid, read_episode
 
 SCRIPT = Path(export_shards.__file__)
 LEROBOT = os.environ.get("LEROBOT_PYTHON")
@@ -76,13 +76,11 @@ def tables(shard: Path, what: str) -> pa.Table:
     return pa.concat_tables(pq.read_table(path) for path in sorted((shard / what).glob("*/*.parquet")))
 
 
-@unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")
-class Cluster(unittest.TestCase):
+class Cluster(Folder):
     @classmethod
     def setUpClass(cls) -> None:
-        cls.temporary = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(cls.temporary.cleanup)
-        cls.folder = folder = Path(cls.temporary.name)
+        super().setUpClass()
+        folder = cls.folder
         task = ("--sim", "task", "--headless", "--expert", "--record", "--episodes", "6", "--out", "episodes")
         rapid(*task, cwd=folder)
         cls.episodes = sorted((folder / "episodes").glob("*.mcap"))

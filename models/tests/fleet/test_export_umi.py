@@ -4,7 +4,6 @@ import contextlib
 import io
 import subprocess
 import sys
-import tempfile
 import unittest
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from PIL import Image
 
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
 import export_umi
-from recorded import PROGRAM, rapid, read_episode
+from recorded import Folder, rapid, read_episode
 
 CAMERAS = ["cam_wrist", "tactile_tip"]
 
@@ -43,13 +42,11 @@ def run(*words: str) -> tuple[int, str]:
     return status, printed.getvalue()
 
 
-@unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")
-class Buffer(unittest.TestCase):
+class Buffer(Folder):
     @classmethod
     def setUpClass(cls) -> None:
-        cls.temporary = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(cls.temporary.cleanup)
-        cls.folder = folder = Path(cls.temporary.name)
+        super().setUpClass()
+        folder = cls.folder
         # The demonstration unplugs the tactile camera after 4 s.
         rapid("--sim", "--headless", "--record", "--out", "episodes", "--duration", "6s", cwd=folder)
         rapid("export", "episodes", "--to", "lerobot", "--out", "set", "--include-bad", cwd=folder)

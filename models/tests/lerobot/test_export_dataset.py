@@ -18,22 +18,20 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from mcap.reader import make_reader
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from recorded import PROGRAM, decoder, rapid, read_episode
+from recorded import PROGRAM, Folder, decoder, rapid, read_episode
 
 FPS = 30
 CAMERAS = {"cam_wrist": (480, 640), "tactile_tip": (240, 320)}
 MODALITIES = ["cam_wrist", "tactile_tip", "motor_state"]
 
 
-@unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")
-class ExportedDataSet(unittest.TestCase):
+class ExportedDataSet(Folder):
     """A data set of two episodes, the tactile camera unplugged in the first; the second is appended."""
 
     @classmethod
     def setUpClass(cls) -> None:
-        cls.temporary = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(cls.temporary.cleanup)
-        cls.folder = folder = Path(cls.temporary.name)
+        super().setUpClass()
+        folder = cls.folder
         record = ("--sim", "--headless", "--record", "--out", "episodes")
         export = ("export", "episodes", "--to", "lerobot", "--out", "set", "--include-bad", "--json")
         # The demonstration unplugs the tactile camera after 4 s.

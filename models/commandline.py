@@ -1,0 +1,23 @@
+"""What the commands under models/ share: a parser made of the text of their module, and errors that are one line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+# Of a parser, and of those of its subcommands.
+PLAIN = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+
+
+def parser(text: str) -> argparse.ArgumentParser:
+    """The first line is the description, the rest is printed after the options."""
+    head, _, rest = text.partition("\n")
+    return argparse.ArgumentParser(description=head, epilog=rest, **PLAIN)
+
+
+def failed(name: str, error: Exception) -> int:
+    """Prints what is wrong in one line, and returns the exit status."""
+    # Text from a foreign file must not control the terminal.
+    line = "".join(c if c.isprintable() else " " for c in str(error))
+    print(f"{name}: {line}", file=sys.stderr)
+    return 1
