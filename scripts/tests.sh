@@ -21,10 +21,11 @@ idle() {
     if chrt --idle 0 true 2>/dev/null; then chrt --idle 0 "$@"; else nice -n 19 "$@"; fi
 }
 
-# With any test of a package its programs are built, too. The examples are those that guests run: `cargo test` gives them
-# their place only when everything else is built.
+# With any test of a package its programs are built, too. The unit tests are the longest compilation: here it is beside that
+# of the library, which takes one processor, and beside the guests it would take as long as they do. The examples are those
+# that guests run: `cargo test` gives them their place only when everything else is built.
+guest=$(programs "$@" --lib --test guest --test layering | grep /guest-) || { echo "tests.sh: the tests of $package are not built" >&2; exit 1; }
 "$1" build "${@:3}" --example process_node --example publish_action
-guest=$(programs "$@" --test guest --test layering | grep /guest-) || { echo "tests.sh: the tests of $package are not built" >&2; exit 1; }
 # A guest needs the machine's two cores, so they run in sequence. While one runs, the next is prepared.
 bench() {
     printf '     Running %s\n' "$guest"
