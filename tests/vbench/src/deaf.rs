@@ -10,14 +10,14 @@ use crate::rhythm::Rhythm;
 use crate::scenario::Scenario;
 
 /// Length of each span: SIGTERM may take 5 s, after which the program is killed.
-pub const SPAN_MS: u64 = 7_000;
-const IDLE_MS: u64 = 2_000;
-const PROMPT_MS: u64 = 10_000;
-const DEAF_MS: u64 = 18_000;
-const CRASH_MS: u64 = 26_000;
-const FLOOD_MS: u64 = 34_000;
+pub const SPAN_MS: u64 = 6_000;
+const IDLE_MS: u64 = 1_000;
+const PROMPT_MS: u64 = 7_000;
+const DEAF_MS: u64 = 13_000;
+const CRASH_MS: u64 = 19_000;
+const FLOOD_MS: u64 = 25_000;
 /// Time until the end of the last span.
-const SECONDS: u32 = 42;
+const SECONDS: u32 = 31;
 /// Between the first and the fifth crash are 7.5 s of waiting and four starts, which take seconds in the guest.
 const CRASHED: &str = r#"eval '[ "$(grep -c "crashes after 50 samples" $out/rapid.jsonl)" -ge 5 ]'"#;
 const REGISTRY: &str = r#"
@@ -119,11 +119,11 @@ pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
 pub fn figures(outcome: &Outcome) -> Vec<Figure> {
     let idle = rhythm(outcome, Span::Idle).map(|rhythm| rhythm.longest_ms);
     let spans = [
-        (Span::Idle, "mask_silence_idle", "longest silence of the mask in 7 s in which nothing happens"),
-        (Span::Prompt, "mask_silence_prompt_child", "in the 7 s after an unplug whose program ends on SIGTERM"),
-        (Span::Deaf, "mask_silence_deaf_child", "in the 7 s after an unplug whose program ignores SIGTERM"),
-        (Span::Crashing, "mask_silence_crashing_child", "in 7 s in which a program crashes again and again"),
-        (Span::Flooding, "mask_silence_flooding_child", "in 7 s in which a program floods its stderr"),
+        (Span::Idle, "mask_silence_idle", "longest silence of the mask in 6 s in which nothing happens"),
+        (Span::Prompt, "mask_silence_prompt_child", "in the 6 s after an unplug whose program ends on SIGTERM"),
+        (Span::Deaf, "mask_silence_deaf_child", "in the 6 s after an unplug whose program ignores SIGTERM"),
+        (Span::Crashing, "mask_silence_crashing_child", "in 6 s in which a program crashes again and again"),
+        (Span::Flooding, "mask_silence_flooding_child", "in 6 s in which a program floods its stderr"),
     ];
     let figure = |(span, name, note): (Span, &str, &str)| {
         let rhythm = rhythm(outcome, span);

@@ -20,6 +20,8 @@ pub struct Rhythm {
     pub publications: u64,
     /// Tenths of a second in which the sampler read often and every processor ran, and no publication was seen.
     pub silent_tenths: usize,
+    /// Tenths of a second in which the sampler or a processor did not run: nothing in the guest could be expected to.
+    pub halted_tenths: usize,
 }
 
 impl Rhythm {
@@ -30,14 +32,15 @@ impl Rhythm {
         let inside = |line: &&Value| line["action"] == "beat" && (from..until).contains(&number(line, "mono_ns"));
         let mut rhythm = None;
         for line in outcome.mask.iter().filter(inside) {
-            let Self { longest_ms, pause_ms, publications, silent_tenths } = rhythm.unwrap_or_default();
-            let is_silent =
-                number(line, "publications") == 0 && number(line, "looks") >= OFTEN && number(line, "woken") >= WOKEN;
+            let Self { longest_ms, pause_ms, publications, silent_tenths, halted_tenths } = rhythm.unwrap_or_default();
+            let ran = number(line, "looks") >= OFTEN && number(line, "woken") >= WOKEN;
+            let is_silent = number(line, "publications") == 0 && ran;
             rhythm = Some(Self {
                 longest_ms: longest_ms.max(number(line, "longest_ns") as f64 / 1e6),
                 pause_ms: pause_ms.max(number(line, "pause_ns") as f64 / 1e6),
                 publications: publications + number(line, "publications"),
                 silent_tenths: silent_tenths + usize::from(is_silent),
+                halted_tenths: halted_tenths + usize::from(!ran),
             });
         }
         rhythm

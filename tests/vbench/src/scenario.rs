@@ -43,12 +43,20 @@ pub struct Scenario {
     registry: String,
     files: Vec<(String, Vec<u8>)>,
     play: Play,
-    timeline: Vec<(u64, String)>,
+    timeline: Vec<Step>,
     until: Vec<String>,
     watch_mask: bool,
     examples: Vec<&'static str>,
     systemd: bool,
     limit: Duration,
+}
+
+#[derive(Clone, Debug)]
+enum Step {
+    /// A command of the emulator, ms after the start of the timeline or the last condition.
+    At(u64, String),
+    /// The timeline waits for a condition, and its clock starts again.
+    When(String),
 }
 
 #[derive(Clone, Debug)]
@@ -107,7 +115,7 @@ impl Scenario {
     }
 
     /// Makes `rapid` record; the timeline starts when these registry entries stream, and the recording ends `seconds`
-    /// later, or once all conditions of [`Scenario::until`] are met, if that is later.
+    /// after that or the last [`Scenario::when`], or once all conditions of [`Scenario::until`] are met, if that is later.
     #[must_use]
     pub fn record(mut self, seconds: u32, streaming: &[&str]) -> Self {
         self.play = Play::Record { seconds, streaming: streaming.iter().map(ToString::to_string).collect() };
@@ -117,7 +125,14 @@ impl Scenario {
     /// Sends the emulator a command at this time of the timeline. Times must not decrease.
     #[must_use]
     pub fn at(mut self, ms: u64, command: &str) -> Self {
-        self.timeline.push((ms, command.into()));
+        self.timeline.push(Step::At(ms, command.into()));
+        self
+    }
+
+    /// The timeline waits until this condition, in the functions of `guest/bench.sh`, is met; what follows is timed from then on.
+    #[must_use]
+    pub fn when(mut self, condition: &str) -> Self {
+        self.timeline.push(Step::When(condition.into()));
         self
     }
 
@@ -228,16 +243,21 @@ impl Scenario {
                     ));
                 }
                 line("emu t0".into());
-                for (ms, command) in &self.timeline {
-                    line(format!("emu at {ms} {command}"));
+                let done = format!("emu_done {}", seconds + READY_WITHIN_S);
+                let wait = |condition: &str| {
+                    let why = words(&[format!("never met: {condition}")]);
+                    format!("wait_for {READY_WITHIN_S} {condition} || fail {why}")
+                };
+                for step in &self.timeline {
+                    line(match step {
+                        Step::At(ms, command) => format!("emu at {ms} {command}"),
+                        Step::When(condition) => format!("{done}\n{}\nemu t0", wait(condition)),
+                    });
                 }
                 line(format!("emu at {}", u64::from(*seconds) * 1_000));
                 // The emulator runs for as long as the timeline.
-                line(format!("emu_done {}", seconds + READY_WITHIN_S));
-                for condition in &self.until {
-                    let why = words(&[format!("not so at the end: {condition}")]);
-                    line(format!("wait_for {READY_WITHIN_S} {condition} || fail {why}"));
-                }
+                line(done);
+                self.until.iter().for_each(|condition| line(wait(condition)));
                 // Also records some samples of devices that returned at the last moment.
                 line("sleep 1\nrapid_stop\nemu_quit".into());
                 if self.watch_mask {
@@ -287,6 +307,8 @@ mod tests {
             .spare(DeviceSpec::uvc(0x046d, 0x0825))
             .record(20, &["cam"])
             .at(5000, "plug 1")
+            .when("states 1 cam streaming")
+            .at(700, "unplug 1")
             .until("is streaming published cam")
             .guest_script(&["usbemu".into()], &["rapid".into()]);
         assert!(script.contains(r"serial=it'\''s"));
@@ -295,6 +317,10 @@ mod tests {
         let place = |text: &str| script.find(text).unwrap();
         assert!(place("--record") < place("\"streaming\"") && place("\"streaming\"") < place("emu t0"));
         assert!(place("emu t0") < place("emu at 5000 plug 1") && place("emu at 5000 plug 1") < place("emu at 20000"));
+        assert!(place("emu at 5000 plug 1") < place("states 1 cam streaming"), "{script}");
+        let again = script.rfind("emu t0").unwrap();
+        assert!(place("states 1 cam streaming") < again && again < place("emu at 700 unplug 1"), "{script}");
+        assert!(place("emu at 700 unplug 1") < place("emu at 20000"), "{script}");
         assert!(place("emu at 20000") < place("is streaming published cam"), "{script}");
         assert!(place("is streaming published cam") < place("rapid_stop"), "{script}");
     }

@@ -33,13 +33,17 @@ fn a_pulled_hub_takes_all_bits_and_brings_them_back() {
                 scalars("tof", TOF, 2, "2e8a:000a", "TOF1"),
                 scalars("force", FORCE, 3, "0403:6001", "FT1"),
             ]))
-            .record(20, &["cam_wrist", "cam_side", "tof", "force"])
-            .at(4_000, "hub out")
-            .at(4_000, "port 0 1")
-            .at(4_000, "port 1 0")
-            .at(4_000, "port 2 6")
-            .at(4_000, "port 3 5")
-            .at(8_000, "hub in")
+            .record(6, &["cam_wrist", "cam_side", "tof", "force"])
+            .at(2_000, "hub out")
+            .at(2_000, "port 0 1")
+            .at(2_000, "port 1 0")
+            .at(2_000, "port 2 6")
+            .at(2_000, "port 3 5")
+            .at(5_000, "hub in")
+            .until("states 2 cam_wrist streaming")
+            .until("states 2 cam_side streaming")
+            .until("states 2 tof streaming")
+            .until("states 2 force streaming")
             .until("is 0x0f published mask"),
     );
     let episode = episode(&outcome);

@@ -8,6 +8,7 @@ use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
 use vbench::outcome::{Outcome, json_lines};
 use vbench::recording::Recording;
+use vbench::rhythm::Rhythm;
 use vbench::scenario::Scenario;
 
 const WRIST: &str = "/rapid/camera/wrist";
@@ -27,20 +28,27 @@ wait_for 60 attached 0 1 || fail 'not attached'
 udevadm settle
 record
 streaming
+"${usbemu[@]}" --watch-mask >$out/mask.jsonl &
+watch_pid=$!
 partial=$(echo $out/rec/*.partial)
 # Some seconds of the episode, and then the moment just before more of it would be written.
 for _ in 1 2 3 4 5 6 7 8; do
   wait_for 60 larger_than "$(stat -c %s "$partial")" "$partial" || fail 'the file does not grow'
 done
 sleep 0.3
-held_up=$(cat /proc/$rapid_pid/task/*/schedstat | awk '{ waited += $2 } END { printf "%.0f\n", waited }')
+# Stopped first: its threads wait no longer while it is written down how long they did.
+kill -STOP $rapid_pid
 date +%s%N >$out/killed
+awk '{ printf "%.0f\n", $1 * 1e9 }' /proc/uptime >$out/killed_mono
+cat /proc/$rapid_pid/task/*/schedstat | awk '{ waited += $2 } END { printf "%.0f\n", waited }' >$out/held_up
 kill -9 $rapid_pid
 wait $rapid_pid
-echo "$held_up" >$out/held_up
+kill $watch_pid
 stat -c '%n %s' $out/rec/* >$out/left
 record
 streaming
+# A repair leaves the processors to everything else, and the end of a run interrupts it.
+await_rapid 60 '"event":"recovered"' || fail 'not repaired'
 sleep 3
 rapid_stop
 ls $out/rec >$out/files
@@ -78,14 +86,18 @@ fn a_killed_recording_is_repaired_at_the_next_start() {
     assert_whole(&episode, WRIST, ..);
     assert_lines(&episode, TOF);
 
-    // What was published until the kill is there but for its last second, or what a guest on busy
-    // processors makes of it.
+    // What was published until the kill is there but for its last second, longer by the time in which the machine ran
+    // neither: the guest's processors, or in the guest the threads of rapid.
     let number = |name: &str| outcome.file(name).trim().parse::<u64>().expect("a number");
     let last = episode.topic("/rapid/mask").map(|message| message.log_time).max().expect("a mask");
     let lost = Duration::from_nanos(number("killed").saturating_sub(last));
     let held_up = Duration::from_nanos(number("held_up"));
-    println!("the last {lost:?} are missing; threads of rapid were held up {held_up:?}");
-    assert!(lost <= Duration::from_secs(1) + held_up, "{lost:?} are missing");
+    let killed = number("killed_mono");
+    let from = killed.saturating_sub(lost.as_nanos().try_into().expect("seconds"));
+    let halted = Rhythm::between(&outcome, from, killed).expect("the sampler saw it").halted_tenths;
+    let halted = Duration::from_millis(100) * u32::try_from(halted).expect("few");
+    println!("the last {lost:?} are missing; threads of rapid were held up {held_up:?}, the guest {halted:?}");
+    assert!(lost <= Duration::from_secs(1) + held_up + halted, "{lost:?} are missing");
 
     // The emulator counts the frames it sent, on across runs: those of the second run come after.
     let next = open(&outcome, files[1]);
