@@ -14,7 +14,7 @@ use rapid::cli::{ExportArgs, Layout};
 use rapid::commands::{self, Format};
 use serde_json::Value;
 
-use crate::support::Place;
+use crate::support::{Episode, Place};
 
 const DATA: &str = "set/data/chunk-000/file-000.parquet";
 const PNG: &[u8] = b"\x89PNG";
@@ -87,12 +87,12 @@ fn json(place: &Place, name: &str) -> Value {
 fn an_unplugged_sensor_is_black_with_its_mask_and_a_changed_byte_is_found() {
     let place = Place::new();
     // The demonstration unplugs the tactile camera after 4 s and plugs it in again.
-    record(&place, "out", "8s", &["--sim", "--task", "place block"]);
+    let episode = record(&place, "out", "8s", &["--sim", "--task", "place block"]);
     let (objects, code) = export(&place, &["out", "--verify"]);
     assert_eq!(code, 0, "{objects:?}");
     let summary = of(&objects, "export")[0];
     let frames = summary["frames"].as_u64().expect("frames");
-    assert!((200..=241).contains(&frames), "{summary}");
+    assert_eq!(frames, Episode::read(&place.path(&episode)).topic("/rapid/frame").count() as u64, "{summary}");
     assert_eq!((&summary["verified"], &summary["differences"]), (&frames.into(), &0.into()));
 
     let info = json(&place, "set/meta/info.json");
@@ -116,7 +116,10 @@ fn an_unplugged_sensor_is_black_with_its_mask_and_a_changed_byte_is_found() {
             assert!(mask[1] && !is_black);
         }
     }
-    assert!(wrist.iter().filter(|(mask, ..)| mask[0]).all(|(.., picture)| picture.starts_with(JPEG)));
+    // Present from its first sample on: later, a sample that is late repeats the last one.
+    let first = wrist.iter().position(|(.., picture)| picture.starts_with(JPEG)).expect("a picture");
+    assert!(wrist[..first].iter().all(|(_, valid, _)| !valid[0]));
+    assert!(wrist[first..].iter().all(|(mask, _, picture)| mask[0] && picture.starts_with(JPEG)));
     // Over the valid rows alone: the black ones would be the least.
     let statistics = json(&place, "set/meta/stats.json");
     let count = statistics["observation.images.tactile_tip"]["count"][0].as_u64().expect("a count");
@@ -131,7 +134,9 @@ fn an_unplugged_sensor_is_black_with_its_mask_and_a_changed_byte_is_found() {
 /// A byte of a picture, and then of the mask's column, is changed in the table.
 fn manipulated(place: &Place, wrist: &[Pictured]) {
     let whole = std::fs::read(place.path(DATA)).expect("the table");
-    let frame = 100;
+    // One that no earlier row repeats: a late sample repeats the last one.
+    let is_new = |at: &usize| wrist[..*at].iter().all(|(.., before)| *before != wrist[*at].2);
+    let frame = (wrist.len() / 2..wrist.len()).find(is_new).expect("a new picture in half of the episode");
     let picture = &wrist[frame].2;
     let at = whole.windows(picture.len()).position(|bytes| bytes == picture.as_slice()).expect("its bytes, unchanged");
     let mut changed = whole.clone();
