@@ -52,6 +52,8 @@ use crate::compare::CompareError;
 
 /// Tasks that are still running at the end must finish within this time.
 const TASKS_TIMEOUT: Duration = Duration::from_millis(500);
+/// How long a thread that opened or closed a device waits for another one.
+const IDLE_THREAD: Duration = Duration::from_secs(2);
 /// The reader of an output must accept an error message within this time: it may never read.
 const STDERR_TIMEOUT: Duration = Duration::from_secs(2);
 /// The mask's JSON file lists 64 devices at most; a larger file is not one.
@@ -432,7 +434,9 @@ fn check_writable(out: &Path) -> Result<(), RecordError> {
 /// Runs `work` on a separate runtime, and afterwards does not wait for other threads: one that is still opening an
 /// unresponsive device would delay the exit for as long as the kernel blocks it.
 fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()?;
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    // Devices are opened in threads of their own, seldom: what is at rest holds no thread for the next one.
+    let runtime = runtime.enable_all().thread_name("worker").thread_keep_alive(IDLE_THREAD).build()?;
     let done = catch_unwind(AssertUnwindSafe(|| runtime.block_on(work)));
     runtime.shutdown_timeout(TASKS_TIMEOUT);
     done.map_err(|_| Failure::panicked())
