@@ -346,7 +346,8 @@ impl<R: ReadAt> RecordIter<R> {
 /// May the content of a chunk that has a check value begin with these bytes? A few comparisons, for every byte of a file.
 fn may_be_chunk(bytes: &[u8]) -> bool {
     let Some(&[name @ (0 | 3 | 4), 0, 0, 0]) = bytes.get(28..32) else { return false };
-    let number = |at: usize| bytes.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u64::from_le_bytes(*bytes));
+    let number =
+        |at: usize| bytes.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u64::from_le_bytes(*bytes));
     let size = number(16);
     let is_sized = (9..=MAX_RECORD).contains(&size) && bytes.get(24..28).is_some_and(|crc| crc != [0; 4]);
     is_sized
