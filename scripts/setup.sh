@@ -96,20 +96,14 @@ packages() {
 
 # The virtual environment is complete if its stamp, written last, names the present requirements and its Python runs.
 python_venv() {
-    local requirements=tests/python/requirements.txt stamp
     # iceoryx2 is published only for x86-64.
-    local imports='import mcap'
+    local imports='import mcap' before
     [[ $(uname -m) != x86_64 ]] || imports='import iceoryx2, mcap'
-    stamp=$(sha256sum <"$requirements")
-    if [[ $(cat "$VENV/stamp" 2>/dev/null) = "$stamp" ]] && "$VENV/bin/python" -c "$imports" 2>/dev/null; then
-        return
-    fi
-    change "making the Python environment of the tests: $VENV"
-    rm -rf "$VENV"
-    python3 -m venv "$VENV"
-    "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary=:all: --require-hashes -r "$requirements"
+    "$VENV/bin/python" -c "$imports" 2>/dev/null || rm -f "$VENV/stamp"
+    before=$(cat "$VENV/stamp" 2>/dev/null || true)
+    scripts/venv.sh venv tests/python/requirements.txt --require-hashes >/dev/null
     "$VENV/bin/python" -c "$imports"
-    echo "$stamp" >"$VENV/stamp"
+    [[ $(cat "$VENV/stamp") = "$before" ]] || changed=1
 }
 
 onnxruntime() {

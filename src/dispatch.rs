@@ -219,12 +219,16 @@ fn without_command(cli: Cli, format: Format) -> Result<(), Failure> {
     }
     let is_shown = !cli.run.headless && !global.json && io::stdout().is_terminal() && io::stdin().is_terminal();
     let is_new = global.sim.is_none() && cli.policy.infer.is_none() && find_registry(global).is_none();
-    let rig = if is_new && is_shown {
+    let mut rig = if is_new && is_shown {
         // The first minutes: the screen asks for the names of what is plugged in.
         (Registry::empty(Path::new("devices.toml")), Devices::Machine)
     } else {
         rig(global, cli.task.seed)?
     };
+    if let (Devices::Simulated(scenario), true, Some(None)) = (&mut rig.1, cli.run.tour, &global.sim) {
+        // A step of the tour ends with what its user does.
+        scenario.leave_plugging_to_the_user();
+    }
     run(global, &cli.run, rig, cli.task.seed, Some(cli.policy))
 }
 

@@ -75,6 +75,11 @@ impl Scenario {
         Self { devices: every_entry(registry), events: Vec::new(), repeat: None }
     }
 
+    /// Nothing happens by itself any more.
+    pub fn leave_plugging_to_the_user(&mut self) {
+        (self.events, self.repeat) = (Vec::new(), None);
+    }
+
     /// What `rapid --sim` plays without a file: everything is plugged; the second camera, or if
     /// there is none the last device, is unplugged at 3 s and plugged again at 6 s, every 12 s.
     pub fn demo(registry: &Registry) -> Self {

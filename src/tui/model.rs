@@ -716,11 +716,13 @@ impl Model {
         self.readings.get(id.index()).copied().unwrap_or_default()
     }
 
-    /// How long the disk lasts at the rate at which the devices deliver now; `None` if unknown.
+    /// How long the disk lasts at the rate at which the devices deliver now; `None` if unknown, or longer than anyone plans
+    /// for: most devices are out then.
     pub fn disk_left(&self) -> Option<Duration> {
+        const A_MONTH: Duration = Duration::from_hours(30 * 24);
         let rate = self.totals.delivered.max(self.totals.recorded);
         let free = self.latest.disk_free.filter(|_| rate >= 1.0)?;
-        Duration::try_from_secs_f64(free as f64 / rate).ok()
+        Duration::try_from_secs_f64(free as f64 / rate).ok().filter(|left| *left < A_MONTH)
     }
 
     /// Has the bit of `id` just changed?

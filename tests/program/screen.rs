@@ -546,10 +546,11 @@ fn a_device_without_an_entry_is_named_in_the_screen_and_then_recorded() {
 fn the_tour_leads_through_a_first_episode() {
     let place = place();
     let tmux = Tmux::new(&place);
-    let pane = streaming(&tmux, "tour", (80, 24), &format!("{RIG} --tour"));
+    let pane = streaming(&tmux, "tour", (80, 24), "rapid --sim --tour --out out");
     pane.shows(&["1/4 space: an episode begins"]);
     pane.type_in(" ");
-    pane.shows(&["2/4 U: the selected sensor is unplugged"]);
+    // Without the tour a camera would be out by now: here only the user unplugs.
+    pane.shows(&["REC 00:05", "2/4 U: the selected sensor is unplugged", "0x07"]);
     pane.type_in("U");
     pane.shows(&["3/4 the bit is clear", "0x06"]);
     pane.type_in("U");
