@@ -6,7 +6,7 @@
 #![cfg(target_arch = "x86_64")]
 #![expect(clippy::expect_used, reason = "a test ends where what it needs is missing")]
 
-use std::io::{BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::Arc;
@@ -226,9 +226,11 @@ fn observations_name_samples_that_are_on_their_topics() {
     place.write("sim.toml", scenario);
     let wide = ["--sim", "sim.toml", "--headless", "--json", "--window", "50ms"];
     let running = place.start(&wide, "\"mask\":\"0x07\"");
+    let shapes = ["/rapid/camera/wrist=480x640x3", "/rapid/camera/tactile=240x320x3", "/rapid/serial/motor=3"];
     let ended = Command::new(python())
         .arg(example("observe.py"))
-        .args(["240", "/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/motor"])
+        .arg("240")
+        .args(shapes)
         .env("RAPID_INSTANCE", &place.instance)
         .output()
         .expect("python");
@@ -238,15 +240,49 @@ fn observations_name_samples_that_are_on_their_topics() {
     let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split("; ").collect()).collect();
     assert_eq!(lines.len(), 240, "{text}");
     // What came before the example subscribed is named and not received.
-    let whole = |line: &&Vec<&str>| line[1..].iter().all(|slot| slot.contains("valid seq") && slot.contains(" bytes"));
-    assert!(lines.iter().filter(whole).count() > 20, "{text}");
-    let unplugged = |line: &&Vec<&str>| {
-        line[0].ends_with("mask 0x05")
-            && line[2] == "1: absent"
-            && line[1].contains("valid")
-            && line[3].contains("bytes")
+    let is_valid = |slot: &&str| slot.contains(": valid ") && !slot.contains("mean 0.000");
+    assert!(lines.iter().filter(|line| line[1..].iter().all(|slot| is_valid(slot))).count() > 20, "{text}");
+    let absent = "/rapid/camera/tactile: absent nan ms (240, 320, 3) mean 0.000";
+    let unplugged = |line: &&Vec<&str>| line[0].ends_with("mask 0x05") && line[2] == absent;
+    let out: Vec<_> = lines.iter().filter(unplugged).collect();
+    assert!(
+        out.len() > 20 && out.iter().filter(|line| is_valid(&line[1]) && is_valid(&line[3])).count() > 20,
+        "{text}"
+    );
+    // Each observation has the same shapes.
+    let shapes = |line: &Vec<&str>| {
+        ["(480, 640, 3)", "(240, 320, 3)", "(3,)"].iter().zip(&line[1..]).all(|(shape, slot)| slot.contains(shape))
     };
-    assert!(lines.iter().filter(unplugged).count() > 20, "{text}");
-    let absent = lines.iter().filter(|line| line[2] == "1: absent");
-    assert!(absent.clone().count() > 20 && absent.clone().all(|line| !line[0].ends_with("0x07")), "{text}");
+    assert!(lines.iter().all(shapes), "{text}");
+}
+
+#[test]
+fn the_ten_lines_of_the_readme_print_observations() {
+    let place = Place::new();
+    let _running = place.start(&["--sim", "--headless", "--json", "--window", "50ms"], "\"mask\":\"0x07\"");
+    let mut child = Command::new(python())
+        .arg(example("ten_lines.py"))
+        .env("RAPID_INSTANCE", &place.instance)
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("python");
+    let lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
+    let whole = lines.map_while(Result::ok).find(|line| line.ends_with("missing: []")).expect("a whole observation");
+    child.kill().expect("killed");
+    child.wait().expect("ended");
+    assert!(whole.starts_with("brightness ") && !whole.starts_with("brightness 0,"), "{whole}");
+}
+
+#[test]
+fn what_the_client_makes_of_samples_is_as_documented() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let tested = Command::new(python())
+        .args(["-m", "unittest", "-v", "test_client"])
+        .current_dir(root.join("tests/python"))
+        .env("PYTHONPATH", root.join("examples/python"))
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .output()
+        .expect("python");
+    let text = String::from_utf8_lossy(&tested.stderr);
+    assert!(tested.status.success() && text.contains("Ran 5 tests"), "{text}");
 }

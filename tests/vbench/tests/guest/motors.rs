@@ -31,7 +31,12 @@ actuator() { has_line $out/rapid.jsonl '"event":"actuator"' "\"arming\":\"$1\"";
 again() {
   sleep 1
   mark $1
-  arm
+  # On a busy machine a motor may be found silent before its first command, which the next arm clears.
+  local attempt
+  for attempt in 1 2 3; do
+    arm
+    for _ in $(seq 100); do both commands_begin && break 2; sleep 0.1; done
+  done
   wait_for 30 both motor_enabled || fail "not enabled: $1"
   wait_for 20 both commands_begin || fail "no commands: $1"
   sleep 1
