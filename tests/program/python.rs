@@ -241,7 +241,7 @@ fn observations_name_samples_that_are_on_their_topics() {
     assert_eq!(lines.len(), 240, "{text}");
     // What came before the example subscribed is named and not received.
     let is_valid = |slot: &&str| slot.contains(": valid ") && !slot.contains("mean 0.000");
-    assert!(lines.iter().filter(|line| line[1..].iter().all(|slot| is_valid(slot))).count() > 20, "{text}");
+    assert!(lines.iter().filter(|line| line[1..].iter().all(is_valid)).count() > 20, "{text}");
     let absent = "/rapid/camera/tactile: absent nan ms (240, 320, 3) mean 0.000";
     let unplugged = |line: &&Vec<&str>| line[0].ends_with("mask 0x05") && line[2] == absent;
     let out: Vec<_> = lines.iter().filter(unplugged).collect();
