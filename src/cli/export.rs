@@ -17,7 +17,7 @@ Examples:
   rapid export episodes --to lerobot --out place-block --verify
   rapid export monday tuesday/*.mcap --to lerobot --out both --state motor_state,force
   rapid export episodes --to lerobot --out own --state force --action motor_state
-  rapid export $(rapid list --label success --json | jq -r .file) --to lerobot --out good
+  rapid export $(cat training.txt) --to lerobot --out good        # of `rapid list`
 
 Exit code: 0 if DIR has at least one of the episodes, otherwise 1; 1 also if --verify finds a difference or it is \
 interrupted.";

@@ -16,7 +16,7 @@ Examples:
   rapid list --verdict good --label success --task place
   rapid list --without tactile_tip --since 2026-11-24
   rapid list /data/monday /data/tuesday --tag finger=soft --sort length
-  rapid list --verdict good --label success --json | jq -r .file > training.txt";
+  rapid list --verdict good --label success --json | jq -r 'select(.verdict).file' > training.txt";
 
 /// Which episodes, and how.
 #[derive(Debug, Args)]

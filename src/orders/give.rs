@@ -207,7 +207,11 @@ impl Run {
 
     /// Waits without a limit: an episode may take minutes to be closed, or to begin.
     fn ask(mut self, request: &impl Serialize) -> io::Result<Answer> {
-        self.stream.write_all(format!("{}\n", serde_json::to_string(request)?).as_bytes())?;
+        let line = format!("{}\n", serde_json::to_string(request)?);
+        if line.len() > LONGEST {
+            return Ok(Answer { ok: false, text: format!("a request of {} bytes, of at most {LONGEST}", line.len()) });
+        }
+        self.stream.write_all(line.as_bytes())?;
         self.stream.set_read_timeout(None)?;
         let mut line = String::new();
         BufReader::new(self.stream.take(LONGEST_ANSWER)).read_line(&mut line)?;

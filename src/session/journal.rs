@@ -132,6 +132,16 @@ fn read(path: &Path) -> Result<SessionFile, JournalError> {
     }
 }
 
+/// Whether an episode is discarded, by what was noted and where files with its name are. The run may have been killed
+/// between the move of a file and the note of it, and its file may be gone from the trash.
+fn was_discarded(noted: bool, is_here: bool, is_in_trash: bool) -> bool {
+    match (is_here, is_in_trash) {
+        (true, false) => false,
+        (false, true) => true,
+        _ => noted,
+    }
+}
+
 /// The file of the session in progress.
 #[derive(Debug)]
 pub struct Journal {
@@ -155,7 +165,9 @@ impl Journal {
             Ok(mut file) if file.ended.is_none() => {
                 journal.written = identity(&path);
                 for episode in &mut file.episodes {
-                    episode.discarded = trash::holds(folder, &episode.file) && !folder.join(&episode.file).exists();
+                    let is_here = folder.join(&episode.file).exists();
+                    let is_in_trash = trash::holds(folder, &episode.file);
+                    episode.discarded = was_discarded(episode.discarded, is_here, is_in_trash);
                 }
                 (journal, Some(file), None)
             }
@@ -324,6 +336,39 @@ mod tests {
             std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
         names.sort();
         names
+    }
+
+    #[test]
+    fn what_was_discarded_stays_so_unless_it_was_moved_back() {
+        let name = "20261124_place-block_001.mcap";
+        for (noted, is_here, is_in_trash, expected) in [
+            (false, true, false, false),
+            (true, false, true, true),
+            // Killed between a move and the note of it.
+            (false, false, true, true),
+            (true, true, false, false),
+            // Its file was deleted from the trash: it is not kept for that.
+            (true, false, false, true),
+            // Being recorded when the run was killed.
+            (false, false, false, false),
+            // Another file has the name.
+            (true, true, true, true),
+            (false, true, true, false),
+        ] {
+            let folder = tempfile::tempdir().unwrap();
+            let noted_entry = EpisodeEntry { discarded: noted, ..entry(name) };
+            Journal::open(folder.path()).0.save(&session(vec![noted_entry])).unwrap();
+            let trash = folder.path().join(crate::episode::partial::TRASH);
+            std::fs::create_dir(&trash).unwrap();
+            let places = [(is_here, folder.path().join(name)), (is_in_trash, trash.join(name))];
+            for (_, place) in places.into_iter().filter(|(is_there, _)| *is_there) {
+                std::fs::write(place, "an episode").unwrap();
+            }
+            let (_, opened, error) = Journal::open(folder.path());
+            assert!(error.is_none(), "{error:?}");
+            let found = opened.unwrap().episodes[0].discarded;
+            assert_eq!(found, expected, "noted {noted}, here {is_here}, in the trash {is_in_trash}");
+        }
     }
 
     #[test]

@@ -220,7 +220,7 @@ impl Session {
             SessionRequest::Note { episode, text } => {
                 let entry = self.about(episode.as_deref(), text)?;
                 entry.note.clone_from(text);
-                let text = format!("{}: noted", entry.file);
+                let text = format!("{}: {}", entry.file, if text.is_empty() { "note removed" } else { "noted" });
                 Ok((Answer::Now(text), vec![Effect::Save]))
             }
             SessionRequest::Plan { task: Some(task), .. } if task.trim().is_empty() => Err(Refusal::NoTask),

@@ -158,7 +158,7 @@ async fn drive(
                 Some(Ok(Event::Key(key))) => model.update(Msg::Key(key)),
                 Some(Ok(Event::Mouse(mouse))) => pointed(mouse, &model, theme).map_or(model::Effect::None, |msg| model.update(msg)),
                 Some(Ok(Event::Resize(columns, rows))) => model.update(Msg::Size(columns, rows)),
-                // Pasted text is no request.
+                Some(Ok(Event::Paste(text))) => model.update(Msg::Paste(text)),
                 Some(Ok(_)) => model::Effect::None,
                 Some(Err(error)) => return Err(TuiError::Gone(error)),
                 None => return Err(TuiError::Gone(io::ErrorKind::UnexpectedEof.into())),

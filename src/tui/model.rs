@@ -45,6 +45,8 @@ pub enum Msg {
     Snapshot(Box<Snapshot>),
     /// A key.
     Key(KeyEvent),
+    /// Text that was pasted: an answer to a question, and otherwise no request.
+    Paste(String),
     /// The size of the terminal, columns and rows.
     Size(u16, u16),
     /// A click.
@@ -247,6 +249,7 @@ impl Model {
             Msg::Click(target) => self.click(target),
             Msg::Wheel(target, is_up) => self.wheel(target, is_up),
             Msg::Key(key) if key.kind == KeyEventKind::Release => {}
+            Msg::Paste(text) => self.paste(&text),
             Msg::Key(key) => {
                 let effect = self.key(key);
                 return self.permitted(effect);

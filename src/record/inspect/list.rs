@@ -1,6 +1,6 @@
 //! Many episodes at a glance: one line each.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -43,7 +43,7 @@ pub struct Listed {
     pub error: Option<String>,
 }
 
-/// The episodes that are meant: a file is itself, a folder those in it (`.mcap`, `.mcap.partial`), by
+/// The episodes that are meant, each once: a file is itself, a folder those in it (`.mcap`, `.mcap.partial`), by
 /// name.
 ///
 /// # Errors
@@ -66,6 +66,9 @@ pub fn episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReadError> {
         inside.sort();
         files.extend(inside);
     }
+    let mut seen = BTreeSet::new();
+    // What does not exist is reported by whoever opens it.
+    files.retain(|file| file.canonicalize().map_or(true, |place| seen.insert(place)));
     Ok(files)
 }
 

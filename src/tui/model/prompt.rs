@@ -5,7 +5,7 @@
 use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::{Effect, Model, Quit};
-use crate::status::session::{Label, SessionRequest};
+use crate::status::session::{EpisodeEntry, Label, SessionRequest, SessionStatus};
 use crate::status::{Command, UnregisteredDevice};
 
 /// Devices without an entry, and their names.
@@ -122,16 +122,29 @@ impl Model {
 
     pub(super) fn ask(&mut self, question: Question) {
         let session = self.latest.session.as_ref();
+        let is_about = matches!(question, Question::Note | Question::WhyFailed);
+        let episode = if is_about { self.marked_episode() } else { None };
+        let noted = |session: &SessionStatus| {
+            let is_it = |entry: &&EpisodeEntry| episode.as_ref().map_or(!entry.discarded, |file| entry.file == *file);
+            session.episodes.iter().rev().find(is_it).map(|entry| entry.note.clone())
+        };
         let text = match question {
+            Question::Note => session.and_then(noted).unwrap_or_default(),
             Question::Task => session.map(|session| session.task.clone()).unwrap_or_default(),
             Question::Search => self.log.search.clone(),
             Question::Name => self.naming.unnamed.as_ref().and_then(|unit| unit.name.clone()).unwrap_or_default(),
             _ => String::new(),
         };
         let is_suggested = matches!(question, Question::Task | Question::Name) && !text.is_empty();
-        let is_about = matches!(question, Question::Note | Question::WhyFailed);
-        let episode = if is_about { self.marked_episode() } else { None };
         self.prompt = Some(Prompt { question, text, is_suggested, episode });
+    }
+
+    /// Adds pasted text to the answer, without line ends and other control characters.
+    pub(super) fn paste(&mut self, text: &str) {
+        for c in text.chars().filter(|c| !c.is_control()) {
+            let Some(prompt) = self.prompt.take() else { return };
+            let _only_text = self.type_into(prompt, KeyEvent::new(KeyCode::Char(c), KeyModifiers::NONE));
+        }
     }
 
     pub(super) fn type_into(&mut self, mut prompt: Prompt, key: KeyEvent) -> Effect {

@@ -349,6 +349,12 @@ fn a_text_is_typed_and_sent_by_enter_and_escape_disarms_and_closes_it() {
     // It is empty again, and an empty one removes the note.
     typed(&mut model, "n");
     assert_eq!(model.update(press(KeyCode::Enter)), note(""));
+    // Pasted text is an answer, and without a question no request.
+    assert_eq!(model.update(Msg::Paste("nq".to_owned())), Effect::None);
+    assert_eq!(model.prompt(), None);
+    typed(&mut model, "n");
+    model.update(Msg::Paste("two\nlines\x1b".to_owned()));
+    assert_eq!(model.update(press(KeyCode::Enter)), note("twolines"));
     typed(&mut model, "-slipped");
     let label = SessionRequest::Label { episode: None, label: Label::Failure, reason: "slipped".to_owned() };
     assert_eq!(model.update(press(KeyCode::Enter)), Effect::Send(Command::Session(label)));
