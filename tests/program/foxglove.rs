@@ -303,6 +303,8 @@ fn an_added_entry_is_shown_from_then_on() {
     let add = ["register", "--sim", "scenario.toml", "--serial", "SPARE1", "--name", "spare_cam", "--yes"];
     assert!(place.run(&add).status.success() && place.run(&["reload"]).status.success());
     client.read_until("pictures of the added camera", |client| client.count("/rapid/camera/spare_cam") > 5);
+    // A second of the wrist's: an episode of less than half a one is too short to be GOOD.
+    client.read_until("an episode that is long enough", |client| client.count("/rapid/camera/wrist") > 30);
     let file = good(&place, running);
     client.read();
     let counts = client.compare(&place, &file);

@@ -335,10 +335,11 @@ async fn a_folder_is_listed_with_one_line_per_episode() {
     std::fs::write(folder.join("notes.txt"), "no episode").unwrap();
     let whole = std::fs::read(&file).unwrap();
     std::fs::write(folder.join("99990101_t_001.mcap.partial"), &whole[..whole.len() / 2]).unwrap();
-    let files = episodes(&[folder.to_owned(), file.clone()]).unwrap();
+    // What is named twice is listed once.
+    let files = episodes(&[folder.to_owned(), file.clone(), folder.join(".")]).unwrap();
     let names: Vec<_> = files.iter().map(|file| file.file_name().unwrap().to_str().unwrap()).collect();
     let name = file.file_name().unwrap().to_str().unwrap();
-    assert_eq!(names, ["20231114_t_001.mcap", name, "99990101_t_001.mcap.partial", name]);
+    assert_eq!(names, ["20231114_t_001.mcap", name, "99990101_t_001.mcap.partial"]);
 
     let lines: Vec<_> = files
         .iter()
