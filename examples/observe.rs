@@ -44,8 +44,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         let service = node.service_builder(&ServiceName::new(topic)?).publish_subscribe::<[u8]>();
         Ok(service.user_header::<SampleHeader>().open()?.subscriber_builder().create()?)
     };
-    let ticks = inbox(OBSERVATION_TOPIC)?;
+    // The observations last: fewer of them name samples from before the subscription.
     let inboxes = topics.iter().map(|topic| inbox(topic)).collect::<Result<Vec<_>, _>>()?;
+    let ticks = inbox(OBSERVATION_TOPIC)?;
 
     let mut samples: BTreeMap<u32, VecDeque<(u64, Vec<u8>)>> = BTreeMap::new();
     while left > 0 {

@@ -94,7 +94,7 @@ packages() {
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "${missing[@]}"
 }
 
-# The virtual environment is complete if its stamp, written last, names the present requirements and its Python runs.
+# One whose packages cannot be imported is made anew, whatever its stamp names.
 python_venv() {
     # iceoryx2 is published only for x86-64.
     local imports='import mcap' before

@@ -49,7 +49,7 @@ finish() {
 trap finish EXIT
 code=0
 units=$(programs idle "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
-# Guests come first here, too.
+# These wait more than they compute, and guests need what they can get of the processors.
 nice -n 10 "$@" --no-fail-fast --exclude vbench || code=1
 for unit in $units; do
     (cd "$package" && "$unit") || { code=1; echo "error: $unit failed"; }

@@ -225,9 +225,9 @@ fn without_command(cli: Cli, format: Format) -> Result<(), Failure> {
     } else {
         rig(global, cli.task.seed)?
     };
-    if let (Devices::Simulated(scenario), true, Some(None)) = (&mut rig.1, cli.run.tour, &global.sim) {
+    if cli.run.tour && global.sim == Some(None) {
         // A step of the tour ends with what its user does.
-        scenario.leave_plugging_to_the_user();
+        rig.1 = Devices::Simulated(Scenario::quiet(&rig.0));
     }
     run(global, &cli.run, rig, cli.task.seed, Some(cli.policy))
 }

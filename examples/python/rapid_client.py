@@ -90,9 +90,9 @@ class Client:
         self._shapes = {topic: tuple(shape) for topic, shape in shapes.items()}
         self._decode = decode
         self._bus = Bus()
-        # The observations first: a sample that one of them names is then never older than its subscription.
-        self._ticks = self._bus.inbox(OBSERVATIONS)
+        # The observations last: fewer of them name samples from before the subscription.
         self._inboxes = {topic: self._bus.inbox(topic) for topic in self._shapes}
+        self._ticks = self._bus.inbox(OBSERVATIONS)
         self._samples = {topic: {} for topic in self._shapes}
         self._bits = {}
 

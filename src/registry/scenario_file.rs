@@ -71,13 +71,8 @@ impl Scenario {
     }
 
     /// Every entry is plugged in, and there are no events.
-    pub(super) fn quiet(registry: &Registry) -> Self {
+    pub fn quiet(registry: &Registry) -> Self {
         Self { devices: every_entry(registry), events: Vec::new(), repeat: None }
-    }
-
-    /// Nothing happens by itself any more.
-    pub fn leave_plugging_to_the_user(&mut self) {
-        (self.events, self.repeat) = (Vec::new(), None);
     }
 
     /// What `rapid --sim` plays without a file: everything is plugged; the second camera, or if
