@@ -98,6 +98,11 @@ impl Reload {
     /// Adds an entry for a connected unit to the file, and takes it over.
     async fn register(&mut self, device: String, name: String) -> Result<String, String> {
         let path = file(&self.registry)?.to_owned();
+        if !self.registry.devices.is_empty() && !path.exists() {
+            // A new file would give the bits of this run to other devices.
+            let gone = format!("{} is gone, and this run has entries of it", path.display());
+            return Err(format!("{gone}: put it back, or restart rapid; nothing was written"));
+        }
         let (reply, attached) = oneshot::channel();
         self.rig.send(RigCommand::Attached(reply)).await.map_err(|_| ENDING)?;
         let attached = attached.await.map_err(|_| ENDING)?;
