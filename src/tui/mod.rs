@@ -36,8 +36,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crossterm::event::{Event, EventStream, MouseButton, MouseEvent, MouseEventKind};
-use futures::{Stream, StreamExt};
+use futures::{FutureExt, Stream, StreamExt};
 use ratatui::layout::Position;
+use rustix::process::Signal;
+use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
@@ -126,7 +128,14 @@ pub async fn show(mut link: impl Link, options: ScreenOptions, shutdown: Cancell
     // The size comes with later changes of it.
     let size = futures::stream::iter(size.map(|(columns, rows)| Ok(Event::Resize(columns, rows))));
     let events = size.chain(EventStream::new());
-    let outcome = drive(&mut link, &shutdown, events, options, |model| screen.draw(model, theme)).await;
+    let mut continued = signal(SignalKind::from_raw(Signal::CONT.as_raw())).map_err(TuiError::NoTerminal)?;
+    let draw = |model: &Model| {
+        if continued.recv().now_or_never().is_some() {
+            screen.resume()?;
+        }
+        screen.draw(model, theme)
+    };
+    let outcome = drive(&mut link, &shutdown, events, options, draw).await;
     screen.close().await;
     outcome
 }

@@ -13,7 +13,8 @@ use std::time::Duration;
 use crossterm::cursor::{Hide, Show};
 use crossterm::event::{DisableBracketedPaste, DisableMouseCapture, EnableBracketedPaste, EnableMouseCapture};
 use crossterm::terminal::{
-    DisableLineWrap, EnableLineWrap, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+    Clear, ClearType, DisableLineWrap, EnableLineWrap, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode,
+    enable_raw_mode,
 };
 use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
@@ -39,6 +40,7 @@ pub(super) struct Screen {
     /// How often the bell has rung.
     rung: u64,
     canvas: Canvas,
+    mouse: bool,
 }
 
 impl Screen {
@@ -53,18 +55,37 @@ impl Screen {
         let outlet = Some(outlet);
         let canvas = Canvas::detect(|name| std::env::var(name).ok(), cell());
         let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
-            Ok(terminal) => Self { terminal, frame, outlet, rung: 0, canvas },
+            Ok(terminal) => Self { terminal, frame, outlet, rung: 0, canvas, mouse },
             Err(error) => {
                 restore();
                 return Err(error);
             }
         };
-        if mouse {
-            crossterm::queue!(screen.frame, EnableMouseCapture)?;
+        screen.enter()?;
+        Ok(screen)
+    }
+
+    fn enter(&mut self) -> io::Result<()> {
+        if self.mouse {
+            crossterm::queue!(self.frame, EnableMouseCapture)?;
         }
         // Pasted text is marked, so it is not read as keys.
-        crossterm::queue!(screen.frame, EnterAlternateScreen, DisableLineWrap, Hide, EnableBracketedPaste)?;
-        Ok(screen)
+        crossterm::queue!(self.frame, EnterAlternateScreen, DisableLineWrap, Hide, EnableBracketedPaste)
+    }
+
+    /// Takes the terminal again after the process was stopped: the shell has used it meanwhile. One in the background is left
+    /// alone, because setting its modes from there stops the process; the shell continues it again in the foreground.
+    pub(super) fn resume(&mut self) -> io::Result<()> {
+        if rustix::termios::tcgetpgrp(io::stdout()).ok() != Some(rustix::process::getpgrp()) {
+            return Ok(());
+        }
+        disable_raw_mode()?;
+        enable_raw_mode()?;
+        self.enter()?;
+        crossterm::queue!(self.frame, Clear(ClearType::All))?;
+        // The next frame is compared with an empty one. `Terminal::clear` would wait for the terminal to report its cursor.
+        self.terminal.swap_buffers();
+        Ok(())
     }
 
     /// Draws the model, unless the terminal has not yet accepted the previous frame.

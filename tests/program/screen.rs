@@ -543,6 +543,45 @@ fn a_device_without_an_entry_is_named_in_the_screen_and_then_recorded() {
 }
 
 #[test]
+fn a_registry_that_is_gone_is_not_replaced_by_one_entry() {
+    let place = place();
+    let spare = "[[device]]\nname = \"spare\"\nlike = \"tactile_tip\"\nserial = \"SPARE1\"\nport = \"1-4\"\n";
+    place.write("spare.toml", &format!("{QUIET}{spare}"));
+    let tmux = Tmux::new(&place);
+    let pane = streaming(&tmux, "gone", USUAL, "rapid --sim spare.toml --out out");
+    pane.shows(&["N name device"]);
+    std::fs::remove_file(place.path("devices.toml")).expect("removed");
+    pane.type_in("N");
+    pane.shows(&["name of the camera"]);
+    pane.press("Enter");
+    pane.shows(&["devices.toml is gone"]);
+    assert!(!place.path("devices.toml").exists());
+    quit(&pane);
+}
+
+#[test]
+fn a_stopped_and_continued_monitor_has_its_terminal_again() {
+    let place = place();
+    let tmux = Tmux::new(&place);
+    let pane = streaming(&tmux, "stopped", USUAL, RIG);
+    let record = std::fs::read(format!("{}.json", place.mask_file().display())).expect("the mask");
+    let record: serde_json::Value = serde_json::from_slice(&record).expect("JSON");
+    let pid = record["pid"].as_i64().and_then(|pid| i32::try_from(pid).ok()).and_then(rustix::process::Pid::from_raw);
+    rustix::process::kill_process(pid.expect("a process"), rustix::process::Signal::STOP).expect("stopped");
+    pane.until("the shell has the terminal", |screen| screen.contains("Stopped"));
+    // This shell leaves the terminal as it finds it: return is no end of a line there.
+    pane.type_in("fg");
+    pane.press("C-j");
+    pane.until("everything is drawn again", |screen| {
+        screen.matches(" streaming ").count() >= 3 && !screen.contains("Stopped")
+    });
+    // Keys are read one by one.
+    begin(&pane);
+    end(&pane);
+    quit(&pane);
+}
+
+#[test]
 fn the_tour_leads_through_a_first_episode() {
     let place = place();
     let tmux = Tmux::new(&place);
