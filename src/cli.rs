@@ -10,7 +10,7 @@ mod session;
 use std::ffi::OsString;
 use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeBounds;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
@@ -101,7 +101,7 @@ Examples:
 
 const MONITOR: &str = "\
 It shows a rapid that runs without a screen, as a service or in another terminal, with the same keys; up to eight \
-may be attached. The run continues when the monitor or its connection ends. When the run ends, the \
+may be attached, `rapid logs -f` among them. The run continues when the monitor or its connection ends. When the run ends, the \
 monitor shows its last state and waits for the next.
 
 Allowed are the user of the run, root and, if the run was started with --group-control as the service is, the \
@@ -185,7 +185,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
     pub out: PathBuf,
     /// Task, part of the file's name
-    #[arg(long, value_name = "TEXT", default_value = "episode", hide_short_help = true)]
+    #[arg(long, value_name = "TEXT", default_value = "episode", value_parser = task, hide_short_help = true)]
     pub task: String,
     /// Property of the episode, such as finger=soft; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = tag, hide_short_help = true)]
@@ -485,7 +485,8 @@ impl Cli {
             .map_err(|error| explained(error, &mut command))?;
         let mut cli = Self::from_arg_matches(&matches)?;
         matches.subcommand_name().unwrap_or(RUN_NAME).clone_into(&mut cli.name);
-        match misplaced(&matches, &command).or_else(|| cli.contradiction(&command)) {
+        let without_effect = || misplaced(&matches, &command).or_else(|| cli.without_effect(&matches));
+        match without_effect().or_else(|| cli.contradiction(&command)) {
             Some(text) => Err(command.error(ErrorKind::ArgumentConflict, text)),
             None => Ok(cli),
         }
@@ -515,6 +516,28 @@ impl Cli {
             command.mut_arg("ort_lib", |option| option.requires("infer").hide_short_help(true))
         };
         require(command).mut_subcommand("replay", require)
+    }
+
+    /// An option of a run that has no effect beside the others, and the fix.
+    fn without_effect(&self, matches: &ArgMatches) -> Option<String> {
+        let (of_run, run) = match (&self.command, matches.subcommand()) {
+            (None, _) => (matches, &self.run),
+            (Some(Command::Replay(replay)), Some((_, of_command))) => (of_command, &replay.run),
+            _ => return None,
+        };
+        let given = |id: &str| {
+            of_run.try_contains_id(id).unwrap_or(false) && of_run.value_source(id) == Some(ValueSource::CommandLine)
+        };
+        if run.headless || self.policy.infer.is_some() && !self.policy.monitor {
+            let shown = ["tour", "mouse", "utc"].into_iter().find(|id| given(id))?;
+            let why = if run.headless { "--headless opens none" } else { "--infer opens none without --monitor" };
+            return Some(format!("--{shown} is of the monitor, and {why}: leave one of them out"));
+        }
+        let is_task = self.global.sim.as_ref().and_then(Option::as_deref).is_some_and(|sim| sim == Path::new("task"));
+        let is_used = is_task || self.policy.infer.is_some();
+        (given("seed") && !is_used).then(|| {
+            "--seed is of `--sim task` and of a policy (--infer), and there is neither: leave it out".to_owned()
+        })
     }
 
     /// A combination of arguments that cannot be intended, and the fix.
@@ -558,6 +581,15 @@ fn live_address(text: &str) -> Result<SocketAddr, String> {
     let address = address.or_else(|| Some(SocketAddr::new(text.parse::<IpAddr>().ok()?, PORT)));
     let address = address.or_else(|| Some(SocketAddr::from(([127, 0, 0, 1], text.parse().ok()?))));
     address.ok_or_else(|| "write an IP address and a port, such as 127.0.0.1:8765, or one of them".to_owned())
+}
+
+/// The name of a task.
+fn task(text: &str) -> Result<String, String> {
+    if text.trim().is_empty() {
+        Err("write a name, for example \"place block\"".to_owned())
+    } else {
+        Ok(text.to_owned())
+    }
 }
 
 /// A key with more than one value.
@@ -822,7 +854,7 @@ pub struct EvalArgs {
     /// Seed of the first trial; demonstrations start at 0 unless recorded with another --seed
     #[arg(long, value_name = "N", default_value_t = 50_000)]
     pub seed: u64,
-    /// Condition, see --help; repeatable [default: all]
+    /// Condition, all of which --help explains; repeatable [default: all]
     #[arg(long, value_name = "NAME", value_parser = condition)]
     pub condition: Vec<Condition>,
     /// Baseline with a fixed set of sensors: losing one ends the run
@@ -847,7 +879,8 @@ fn condition(text: &str) -> Result<Condition, String> {
 
 const REGISTER: &str = "\
 On a terminal it asks for missing values. Without --serial and --port the entry matches the connected unit \
-by its serial number, or by its port if it has no unique one and is not the only unit.
+by its serial number, or by its port if it has no unique one and is not the only unit. The udev rules and descriptors \
+that `rapid artifacts` writes are written too, to udev/ beside the registry.
 
 Examples:
   rapid register

@@ -412,6 +412,7 @@ fn request(args: &RunArgs, registry: &Registry) -> Result<EpisodeRequest, Failur
         tags: args.tag.clone(),
         modules: mounted.into_iter().map(|module| module.name.clone()).collect(),
         duration: args.duration,
+        taken: Vec::new(),
     })
 }
 
@@ -544,8 +545,8 @@ impl Failure {
     fn no_registry() -> Self {
         let places: Vec<_> = usual_places().iter().map(|path| path.display().to_string()).collect();
         Self::argument(format_args!(
-            "no devices.toml: looked for {}\n    fix: write one (`rapid devices` lists connected devices), name one with \
-             --config, or try `rapid --sim`",
+            "no devices.toml: looked for {}\n    fix: register what is plugged in (`rapid register`, or `rapid` on a terminal), name a registry \
+             with --config, or try `rapid --sim`",
             places.join(", ")
         ))
     }

@@ -1,4 +1,5 @@
-//! The identity of the other end of a local socket, as the kernel reports it: `SO_PEERCRED`, unix(7).
+//! The other end of a local socket: its identity as the kernel reports it (`SO_PEERCRED`, unix(7)), and the state of its
+//! process.
 
 use std::io;
 use std::mem::size_of;
@@ -63,6 +64,30 @@ impl Peer {
         };
         let found = usize::try_from(length).unwrap_or_default() / size_of::<u32>();
         outcome == 0 && groups.iter().take(found).any(|found| *found == group)
+    }
+}
+
+/// What the scheduler has a process as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ProcessState {
+    /// It runs, or waits.
+    Alive,
+    /// It was stopped, by a signal or a debugger.
+    Stopped,
+    /// It does not exist, or is a zombie.
+    Ended,
+}
+
+impl ProcessState {
+    /// The state of `process`, see proc(5).
+    pub fn of(process: u32) -> Self {
+        let stat = std::fs::read_to_string(format!("/proc/{process}/stat"));
+        // The state follows the name in parentheses, which may contain anything.
+        match stat.ok().as_deref().and_then(|stat| stat.rsplit_once(") ")?.1.bytes().next()) {
+            None | Some(b'Z' | b'X' | b'x') => Self::Ended,
+            Some(b'T' | b't') => Self::Stopped,
+            Some(_) => Self::Alive,
+        }
     }
 }
 

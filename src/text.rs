@@ -17,6 +17,15 @@ use serde_json::ser::Formatter;
 use unicode_segmentation::UnicodeSegmentation;
 use unicode_width::UnicodeWidthStr;
 
+/// Why another process of this machine did not answer, where the system's words are those of its calls.
+pub fn unanswered(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => "no answer in time".to_owned(),
+        io::ErrorKind::UnexpectedEof => "it ended, or closed the connection, without an answer".to_owned(),
+        _ => error.to_string(),
+    }
+}
+
 /// The message about a failed open, read or write of a device; `group` is the one that may open it.
 pub fn not_opened(what: &str, group: &str, error: &io::Error) -> String {
     match Errno::from_io_error(error) {

@@ -252,7 +252,10 @@ impl Collection {
                     self.change(effect);
                 }
                 self.submit(None);
-                self.fail(format!("{file} was not moved: {why}"));
+                let why = format!("{file} was not moved: {why}");
+                // A redo that still counts down.
+                reply_all(std::mem::take(&mut self.at_begin), &Err(why.clone()));
+                self.fail(why);
             }
             Outcome::Failed(why) => self.fail(why),
             Outcome::Closed(closed) => {
@@ -277,7 +280,10 @@ impl Collection {
         for effect in effects {
             match effect {
                 Effect::Begin => {
-                    self.submit(answer.take());
+                    // What no program waits for is carried out with what the beginning changes, and answered with it.
+                    if let Some(answer) = answer.take_if(|answer| !answer.to.is_empty()) {
+                        self.submit(Some(answer));
+                    }
                     outcome = self.begin().await;
                 }
                 effect => self.change(effect),
@@ -340,6 +346,7 @@ impl Collection {
         let request = EpisodeRequest {
             task: plan.task.clone(),
             tags: plan.tags.iter().map(|(key, value)| (key.clone(), value.clone())).collect(),
+            taken: self.session.file().episodes.iter().map(|entry| entry.file.clone()).collect(),
             ..self.episode.clone()
         };
         let started = self.recorder.start(request).await;
@@ -352,7 +359,9 @@ impl Collection {
         match &started {
             Ok(file) => {
                 let text = format!("recording {}", file.display());
-                self.submit(Some(Pending { text, is_done: true, is_shown: false, to }));
+                // A redo is not done while the episode that it replaces is still among the kept ones.
+                let is_done = !self.operations.iter().any(|operation| matches!(operation, Operation::Discard(_)));
+                self.submit(Some(Pending { text, is_done, is_shown: false, to }));
             }
             Err(error) => {
                 reply_all(to, &Err(error.to_string()));

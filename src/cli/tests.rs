@@ -115,9 +115,28 @@ fn options_before_or_after_a_command_parse_or_the_error_names_the_position() {
         ("--sim --headless play.toml", "right after --sim (rapid --sim play.toml)"),
         ("a.mcap", "rapid inspect a.mcap"),
         ("devces", "'devices'"),
+        ("--sim --tour --headless", "--tour is of the monitor, and --headless opens none"),
+        ("replay a.mcap --utc --headless", "--utc is of the monitor, and --headless opens none"),
+        ("--infer --sim task --mouse", "--mouse is of the monitor, and --infer opens none without --monitor"),
+        ("--sim --seed 3", "--seed is of `--sim task` and of a policy"),
     ] {
         let message = printed(words);
         assert!(message.contains(expected), "{words}: {message}");
+    }
+}
+
+#[test]
+fn an_option_that_has_an_effect_is_accepted() {
+    for words in [
+        "--infer --monitor --sim task --mouse",
+        "--sim task --seed 3 --record --expert",
+        "--infer x --seed 3",
+        "--sim --tour --utc",
+        "replay a.mcap --mouse",
+        "monitor --utc",
+        "eval --seed 4",
+    ] {
+        read(words).unwrap_or_else(|error| panic!("{words}: {error}"));
     }
 }
 
@@ -131,6 +150,7 @@ fn an_error_in_a_quantity_shows_how_it_is_written() {
         ("--rate abc", "a number, for example 30"),
         ("--rate 0", "between 0.1 and 1000 Hz"),
         ("--tag soft", "finger=soft"),
+        ("--task=", "a name, for example \"place block\""),
         ("replay a.mcap --infer --tolerance=-1", "a number from 0 on"),
         ("replay a.mcap --infer --tolerance NaN", "a number from 0 on"),
         ("eval --trials 0", "at least 1"),

@@ -16,6 +16,7 @@ use crate::action::Order;
 use crate::app::signals::Signals;
 use crate::mask::PhysicalMask;
 use crate::orders::give::{self, GiveError};
+use crate::peer::ProcessState;
 use crate::status::attach::{Decoder, LinkError};
 use crate::status::{Command, SlotState, Snapshot};
 use crate::time::Stamp;
@@ -179,7 +180,7 @@ fn follow(
         let since = Stamp::now();
         let mut failed = String::new();
         let (next, snapshot) = loop {
-            let runs = is_alive(connection.process);
+            let runs = ProcessState::of(connection.process) != ProcessState::Ended;
             shown.send_modify(|view| {
                 view.state = LinkState::Lost { since, read_only, runs };
                 if !runs {
@@ -204,13 +205,6 @@ fn follow(
         let state = LinkState::Attached { process: connection.process, read_only };
         shown.send_modify(|view| *view = View { snapshot, state });
     }
-}
-
-/// Whether the process exists, and is no zombie.
-fn is_alive(process: u32) -> bool {
-    let stat = std::fs::read_to_string(format!("/proc/{process}/stat"));
-    // The state follows the name in parentheses, see proc(5).
-    stat.is_ok_and(|stat| stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X'])))
 }
 
 /// What is true of a run that has ended: nothing streams, and nothing is recorded.

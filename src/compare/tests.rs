@@ -83,8 +83,7 @@ impl Recorded {
         let board = Arc::new(Board::new(&registry));
         let mut recorder = Stepped::new(Arc::clone(&registry), board, WallClock::now());
         let out = folder.path().to_owned();
-        let request =
-            EpisodeRequest { out, task: "sort".into(), tags: Vec::new(), modules: Vec::new(), duration: None };
+        let request = EpisodeRequest { out, task: "sort".into(), ..EpisodeRequest::default() };
         let library = &environment.origin.to_string();
         let recording = Recording { recorder: &mut recorder, request: &request, library, begun: Stamp(9_000_000_000) };
         let (trial, report) = bench.record(Condition::HotReplug, SEED, recording).unwrap();

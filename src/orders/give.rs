@@ -11,9 +11,9 @@ use serde::Serialize;
 
 use super::{Answer, DONE, LONGEST, LONGEST_ANSWER, instance_part, line, this_user};
 use crate::action::Order;
-use crate::peer::Peer;
+use crate::peer::{Peer, ProcessState};
 use crate::status::attach::ATTACH;
-use crate::text::plain;
+use crate::text::{plain, unanswered};
 use crate::time::Stamp;
 
 /// A run answers within milliseconds; a stopped process does not.
@@ -53,8 +53,8 @@ pub enum GiveError {
     },
     /// The run does not answer.
     #[error(
-        "process {process} does not answer ({error}): its motors may still move, so cut their power, or end it with `kill \
-         -9 {process}`, after which its guard stops them"
+        "process {process} does not answer ({}): its motors may still move, so cut their power, or end it with `kill \
+         -9 {process}`, after which its guard stops them", unanswered(.error)
     )]
     NoAnswer {
         /// Its process.
@@ -63,13 +63,19 @@ pub enum GiveError {
         error: io::Error,
     },
     /// The run did not answer a request.
-    #[error("process {process} ended or did not answer ({error})")]
+    #[error("process {process}: {}", unanswered(.error))]
     Unanswered {
         /// Its process.
         process: u32,
         /// Why not.
         error: io::Error,
     },
+    /// The run is stopped, and has a request that it will carry out once it continues.
+    #[error(
+        "process {0} is stopped (by ctrl-z, or `kill -STOP`) and carries this out only when it continues: \
+         `kill -CONT {0}`, or `fg` in its terminal"
+    )]
+    Stopped(u32),
     /// The running instances cannot be determined.
     #[error("{SOCKETS}: {0}")]
     Sockets(#[from] io::Error),
@@ -150,7 +156,7 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
 pub fn request(instance: Option<&str>, request: &impl Serialize) -> Result<String, GiveError> {
     let run = the_run(instance)?;
     let process = run.process;
-    let answer = run.ask(request).map_err(|error| GiveError::Unanswered { process, error })?;
+    let answer = run.ask(request)?;
     if answer.ok { Ok(answer.text) } else { Err(GiveError::Refused { process, why: answer.text }) }
 }
 
@@ -205,21 +211,32 @@ impl Run {
         Ok(self.stream)
     }
 
-    /// Waits without a limit: an episode may take minutes to be closed, or to begin.
-    fn ask(mut self, request: &impl Serialize) -> io::Result<Answer> {
-        let line = format!("{}\n", serde_json::to_string(request)?);
+    /// Waits as long as the run does not stand still: an episode may take minutes to be closed, or to begin.
+    fn ask(mut self, request: &impl Serialize) -> Result<Answer, GiveError> {
+        let process = self.process;
+        let failed = |error| GiveError::Unanswered { process, error };
+        let line = format!("{}\n", serde_json::to_string(request).map_err(|error| failed(error.into()))?);
         if line.len() > LONGEST {
             return Ok(Answer { ok: false, text: format!("a request of {} bytes, of at most {LONGEST}", line.len()) });
         }
-        self.stream.write_all(line.as_bytes())?;
-        self.stream.set_read_timeout(None)?;
-        let mut line = String::new();
-        BufReader::new(self.stream.take(LONGEST_ANSWER)).read_line(&mut line)?;
+        self.stream.write_all(line.as_bytes()).map_err(failed)?;
+        let mut from = BufReader::new(self.stream.take(LONGEST_ANSWER));
+        let mut line = Vec::new();
+        // What was read before a limit is kept.
+        while let Err(error) = from.read_until(b'\n', &mut line) {
+            if error.kind() != ErrorKind::WouldBlock {
+                return Err(failed(error));
+            }
+            if ProcessState::of(process) == ProcessState::Stopped {
+                return Err(GiveError::Stopped(process));
+            }
+        }
         if line.is_empty() {
-            return Err(io::ErrorKind::UnexpectedEof.into());
+            return Err(failed(ErrorKind::UnexpectedEof.into()));
         }
         // An older rapid knows no requests; its answer is its reason.
-        serde_json::from_str(&line).map_err(|_| io::Error::other(line.trim_end().to_owned()))
+        let other = |_| failed(io::Error::other(String::from_utf8_lossy(&line).trim_end().to_owned()));
+        serde_json::from_slice(&line).map_err(other)
     }
 }
 

@@ -41,6 +41,8 @@ pub struct EpisodeRequest {
     pub modules: Vec<String>,
     /// The episode ends by itself after exactly this time of capture, if given.
     pub duration: Option<Duration>,
+    /// Names that the session gave before: none is given twice, also when its file was moved away meanwhile.
+    pub taken: Vec<String>,
 }
 
 /// How an episode ended.
@@ -78,13 +80,15 @@ pub(super) struct EpisodePath {
 }
 
 impl EpisodePath {
-    /// Takes the next free number in `out` for `task` on the day of `wall_ns` (UTC) and creates the partial file.
-    pub(super) fn create(out: &Path, task: &str, wall_ns: u64) -> Result<Self, RecordError> {
-        let refused = |source| RecordError::Io { path: out.to_owned(), source };
+    /// Takes the next free number in the folder for the task, on the day of `wall_ns` (UTC), and creates the partial file.
+    pub(super) fn create(request: &EpisodeRequest, wall_ns: u64) -> Result<Self, RecordError> {
+        let EpisodeRequest { out, task, taken, .. } = request;
+        let refused = |source| RecordError::Io { path: out.clone(), source };
         let folder = open_folder(out)?;
         // The day in UTC: names sort by time and do not depend on the rig's time zone.
         let stem = format!("{}_{}_", time::compact_date(wall_ns), slug(task));
-        let first = next_number(&folder, &stem).map_err(refused)?;
+        let taken = taken.iter().filter_map(|name| number_of(name, &stem)).max().unwrap_or(0);
+        let first = next_number(&folder, &stem).map_err(refused)?.max(taken + 1);
         for number in first..first.saturating_add(ATTEMPTS) {
             let name = format!("{stem}{number:03}.mcap");
             let failed = |source| RecordError::Io { path: out.join(format!("{name}.{PARTIAL}")), source };
@@ -168,8 +172,6 @@ pub fn open_folder(out: &Path) -> Result<Folder, RecordError> {
 
 /// One more than the highest number of any file, finished, repaired, discarded or not, whose name begins with
 /// `stem`.
-///
-/// Numbers too high for our count are ignored: another program made that name.
 fn next_number(folder: &Folder, stem: &str) -> io::Result<u32> {
     let highest = highest_number(folder.descriptor(), stem)?;
     // Other programs know a discarded episode by its name. A trash that cannot be read has none.
@@ -183,11 +185,16 @@ fn highest_number(folder: impl AsFd, stem: &str) -> io::Result<u32> {
     let mut highest = 0;
     for entry in rustix::fs::Dir::read_from(folder)? {
         let entry = entry?;
-        let name = entry.file_name().to_str().ok().and_then(|name| name.strip_prefix(stem));
-        let number = name.and_then(|rest| rest.split_once('.')?.0.parse::<u32>().ok());
-        highest = highest.max(number.filter(|number| *number < LARGEST).unwrap_or(0));
+        let number = entry.file_name().to_str().ok().and_then(|name| number_of(name, stem));
+        highest = highest.max(number.unwrap_or(0));
     }
     Ok(highest)
+}
+
+/// The number in `name` after `stem`. One too high for our count is ignored: another program made that name.
+fn number_of(name: &str, stem: &str) -> Option<u32> {
+    let number = name.strip_prefix(stem)?.split_once('.')?.0.parse().ok()?;
+    (number < LARGEST).then_some(number)
 }
 
 /// The task as part of a file name: letters and digits of any script in lower case, one hyphen for
@@ -363,26 +370,35 @@ mod tests {
         assert_eq!(slug(&"木".repeat(1000)).len(), 63);
     }
 
+    fn request(out: &Path, task: &str) -> EpisodeRequest {
+        EpisodeRequest { out: out.to_owned(), task: task.to_owned(), ..EpisodeRequest::default() }
+    }
+
     #[test]
     fn numbers_increase_and_no_existing_file_is_touched() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("made");
-        let first = EpisodePath::create(&out, "t", WALL).unwrap();
+        let first = EpisodePath::create(&request(&out, "t"), WALL).unwrap();
         assert_eq!(first.finished.file_name().unwrap(), "20231114_t_001.mcap");
-        let second = EpisodePath::create(&out, "t", WALL).unwrap();
+        let second = EpisodePath::create(&request(&out, "t"), WALL).unwrap();
         assert_eq!(second.partial.file_name().unwrap(), "20231114_t_002.mcap.partial");
         first.publish().unwrap();
         fs::write(out.join("20231114_t_041.mcap"), "kept").unwrap();
         fs::write(out.join("20231114_t_nonsense.mcap"), "kept").unwrap();
-        let third = EpisodePath::create(&out, "t", WALL).unwrap();
+        let third = EpisodePath::create(&request(&out, "t"), WALL).unwrap();
         assert_eq!(third.finished.file_name().unwrap(), "20231114_t_042.mcap");
         for (number, ending) in [(50, "partial"), (60, "recovering"), (70, "damaged"), (80, "empty")] {
             fs::write(out.join(format!("20231114_t_0{number}.mcap.{ending}")), "kept").unwrap();
-            let next = EpisodePath::create(&out, "t", WALL).unwrap();
+            let next = EpisodePath::create(&request(&out, "t"), WALL).unwrap();
             assert_eq!(next.finished.file_name().unwrap(), format!("20231114_t_0{}.mcap", number + 1).as_str());
         }
-        let other = EpisodePath::create(&out, "other", WALL).unwrap();
+        let other = EpisodePath::create(&request(&out, "other"), WALL).unwrap();
         assert_eq!(other.finished.file_name().unwrap(), "20231114_other_001.mcap");
+        // Another program may have moved an episode of this session elsewhere, where its name is taken.
+        let taken = ["20231114_moved_007.mcap", "20231114_moved_99999999999.mcap", "20231113_moved_009.mcap"];
+        let moved = EpisodeRequest { taken: taken.map(str::to_owned).to_vec(), ..request(&out, "moved") };
+        let moved = EpisodePath::create(&moved, WALL).unwrap();
+        assert_eq!(moved.finished.file_name().unwrap(), "20231114_moved_008.mcap");
         // A file that took the name meanwhile stays as it is; what another recorder writes and what is in the
         // trash keep their names too.
         fs::write(&third.finished, "kept").unwrap();
@@ -409,7 +425,7 @@ mod tests {
         let fifo = rustix::fs::FileType::Fifo;
         rustix::fs::mknodat(rustix::fs::CWD, out.join("20231114_t_004.mcap.partial"), fifo, 0o666.into(), 0).unwrap();
         fs::write(out.join("20231114_t_4294967295.mcap"), "").unwrap();
-        let path = EpisodePath::create(&out, "t", WALL).unwrap();
+        let path = EpisodePath::create(&request(&out, "t"), WALL).unwrap();
         assert_eq!(path.finished.file_name().unwrap(), "20231114_t_005.mcap");
         // Planted in the middle of the episode, under the name it was to get.
         symlink(&nowhere, &path.finished).unwrap();
@@ -431,7 +447,7 @@ mod tests {
             println!("NOT CHECKED: only root can give links away");
             return;
         }
-        let error = EpisodePath::create(&out, "t", WALL).unwrap_err().to_string();
+        let error = EpisodePath::create(&request(&out, "t"), WALL).unwrap_err().to_string();
         assert!(error.contains("out: a symbolic link of user 12345, which is not followed here; name"), "{error}");
     }
 
@@ -439,12 +455,12 @@ mod tests {
     fn an_impossible_folder_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let missing = folder.path().join("a/b");
-        let error = EpisodePath::create(&missing, "t", WALL).unwrap_err();
+        let error = EpisodePath::create(&request(&missing, "t"), WALL).unwrap_err();
         assert!(matches!(error, RecordError::NoFolder(_)), "{error}");
         assert!(error.to_string().contains("--out") && error.to_string().contains("a/b"));
         let file = folder.path().join("file");
         fs::write(&file, "").unwrap();
-        let error = EpisodePath::create(&file, "t", WALL).unwrap_err();
+        let error = EpisodePath::create(&request(&file, "t"), WALL).unwrap_err();
         assert!(error.to_string().contains("file: "), "{error}");
     }
 }

@@ -443,7 +443,7 @@ impl Writer {
         // Before the beginning: see `Recorder::clock`.
         self.in_force.send_replace(clock);
         let begin = (self.config.begin)();
-        let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
+        let path = EpisodePath::create(request, clock.wall_ns(begin))?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
         // Nothing was recorded into it, and it was just created.
         let refuse = |error| {

@@ -52,7 +52,7 @@ impl Stepped {
     /// # Errors
     /// When its file cannot be made or written.
     pub fn begin(&mut self, request: &EpisodeRequest, begin: Stamp) -> Result<(), RecordError> {
-        let path = EpisodePath::create(&request.out, &request.task, self.clock.wall_ns(begin))?;
+        let path = EpisodePath::create(request, self.clock.wall_ns(begin))?;
         let partial = path.partial.clone();
         let failed = |source| RecordError::Io { path: partial.clone(), source };
         let sink: Box<dyn Sink> = Box::new(path.file.try_clone().map_err(failed)?);

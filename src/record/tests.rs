@@ -216,8 +216,8 @@ impl Bench {
             out: self.folder.path().join("out"),
             task: "place block".to_owned(),
             tags: vec![("finger".to_owned(), "soft".to_owned())],
-            modules: Vec::new(),
             duration,
+            ..EpisodeRequest::default()
         }
     }
 

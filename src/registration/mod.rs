@@ -32,6 +32,9 @@ pub enum WriteError {
         /// Why.
         error: io::Error,
     },
+    /// The file was made read-only.
+    #[error("{}: it is read-only; nothing was written: `chmod u+w` it, or name another registry with --config", .0.display())]
+    ReadOnly(PathBuf),
     /// The folder of the file cannot be used.
     #[error(transparent)]
     Folder(#[from] FolderError),
@@ -127,6 +130,10 @@ impl Target {
             }
             Err(_) => (0o644, None),
         };
+        // It would be replaced, and root may write to anything: the mode is the wish of whoever set it.
+        if mode & 0o222 == 0 {
+            return Err(WriteError::ReadOnly(self.path.clone()));
+        }
         let now = if owner.is_some() { std::fs::read_to_string(&path).map_err(io)? } else { String::new() };
         if now != self.text {
             return Err(WriteError::Changed(self.path.clone()));
@@ -205,6 +212,21 @@ mod tests {
     use crate::registry::BUILTIN;
     use crate::simulation::{SimDevice, SimSource};
     use crate::time::Stamp;
+
+    #[test]
+    fn a_registry_that_was_made_read_only_is_not_replaced() {
+        use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("devices.toml");
+        std::fs::write(&path, BUILTIN).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o444)).unwrap();
+        let before = path.metadata().unwrap().ino();
+        let target = Target::read(path.clone()).unwrap();
+        let why = target.write(&format!("{BUILTIN}# more\n")).unwrap_err().to_string();
+        assert!(why.contains("devices.toml: it is read-only; nothing was written: `chmod u+w`"), "{why}");
+        assert_eq!(path.metadata().unwrap().ino(), before);
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), BUILTIN);
+    }
 
     #[test]
     fn a_described_unit_is_registered_once_with_what_it_suggests() {

@@ -109,7 +109,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     let verdict = verdict::read(root, Whose::Rig);
     let mut drafts = drafts(root, programs);
     if drafts.is_empty() && root.is_faultless() {
-        let fix = "add a [device.NAME] table with vid, pid and node; `lsusb` shows vid:pid of what is plugged in";
+        let fix = "`rapid register` adds what is plugged in; by hand, add a [device.NAME] table with vid, pid and node";
         return Err(RegistryErrors::whole_file(file.to_owned(), "no device is registered", fix));
     }
     check_identities(&drafts);

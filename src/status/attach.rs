@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use super::preview::Preview;
 use super::{LogLine, Snapshot};
+use crate::text::unanswered;
 
 /// Changes when the messages do.
 pub const PROTOCOL: u32 = 1;
@@ -100,7 +101,7 @@ pub enum LinkError {
     #[error("the run has ended")]
     Ended,
     /// The link cannot be read.
-    #[error("the link to the run: {0}")]
+    #[error("{}", unanswered(.0))]
     Io(#[from] io::Error),
     /// Another version of the program sends other messages.
     #[error("the run is another version of rapid ({0}): use the same one here")]

@@ -25,7 +25,7 @@ def commands(unit):
     """The commands of a unit, as systemd reads them: continued lines joined, `$$` is `$`."""
     text = Path(unit).read_text(encoding="utf-8").replace("\\\n", " ")
     lines = [line.removeprefix("ExecStart=") for line in text.splitlines() if line.startswith("ExecStart=")]
-    assert len(lines) == 3, lines
+    assert len(lines) == 4, lines
     return [shlex.split(line) for line in lines]
 
 
@@ -69,13 +69,14 @@ def run(command, variables, check=True):
 
 
 def main(unit, server):
-    copy, check, remove = commands(unit)
+    sessions, copy, check, remove = commands(unit)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         store, episodes = Store(place, server), place / "episodes"
         try:
             variables = configure(place, store, episodes)
             breaks_off(copy, variables, store)
+            run(sessions, variables)
             run(copy, variables)
             run(check, variables)
             expected = ["a_001.mcap", "a_002.mcap", "a_003.mcap", "session-2026.md", "session-2026.toml", "session.toml"]
@@ -90,6 +91,7 @@ def main(unit, server):
             left = sorted(path.name for path in episodes.glob("*.mcap*"))
             assert left == ["a_002.mcap", "a_004.mcap", "a_005.mcap.partial"] and ended.returncode != 0, (left, ended)
             print("removed: what was read back and is equal; not: what changed in the store, or is not there")
+            names_are_taken(copy, variables, store, episodes)
         finally:
             store.process.kill()
             store.process.wait()
@@ -126,6 +128,18 @@ def breaks_off(copy, variables, store):
         path = store.folder / "episodes/rig-1" / name
         assert path.read_bytes() == (Path(variables["EPISODES"]) / name).read_bytes(), f"{name} is half an object"
     print(f"killed with {len(there)} of 3 episodes in the store, whole")
+
+
+def names_are_taken(copy, variables, store, episodes):
+    """An episode of a name that the store has already: the one there stays, and the others are copied."""
+    there = store.folder / "episodes/rig-1/a_001.mcap"
+    before = there.read_bytes()
+    for name in ("a_001.mcap", "a_006.mcap"):
+        (episodes / name).write_bytes(os.urandom(MIB))
+    ended = run(copy, variables, check=False)
+    assert ended.returncode != 0 and there.read_bytes() == before, ended
+    assert "a_006.mcap" in store.names(), store.names()
+    print("an episode in the store is not replaced by another of its name")
 
 
 def damage(path):

@@ -76,6 +76,67 @@ fn a_script_records_discards_and_labels_and_a_killed_run_loses_none_of_it() {
     }
 }
 
+#[test]
+fn a_redo_that_cannot_discard_is_answered_so() {
+    for countdown in ["1ms", "1s"] {
+        let place = Place::new();
+        let words = ["--sim", "--headless", "--out", "out", "--countdown", countdown];
+        let running = place.start(&words, "motor_state");
+        std::fs::create_dir(place.path("out")).expect("a folder");
+        std::fs::write(place.path("out/.trash"), "not a folder").expect("a file");
+        ask(&place, &["episode", "start"]).expect("it starts");
+        let file = session(&place)["episodes"][0]["file"].as_str().expect("a name").to_owned();
+        // While it is recorded, and when it is not.
+        for stops in [false, true] {
+            if stops {
+                ask(&place, &["episode", "stop"]).expect("it stops");
+            }
+            let why = ask(&place, &["episode", "redo"]).expect_err("it cannot be discarded");
+            assert!(why.contains(".mcap was not moved: ") && why.contains(".trash"), "{why}");
+            assert!(place.files("out").contains(&file));
+            until("the next is recorded", || session(&place)["phase"]["phase"] == "recording");
+            assert_eq!(session(&place)["discarded"], 0, "{}", session(&place));
+        }
+        running.signal(Signal::INT);
+        assert_eq!(running.end().0, Some(0));
+    }
+}
+
+#[test]
+fn a_name_is_not_given_twice_in_a_session() {
+    let place = Place::new();
+    let running = place.start(&["--sim", "--headless", "--out", "out", "--task", "pour"], "motor_state");
+    for number in 1..3 {
+        let started = ask(&place, &["episode", "start"]).expect("it starts");
+        assert!(started.ends_with(&format!("_pour_{number:03}.mcap")), "{started}");
+        ask(&place, &["episode", "stop"]).expect("it stops");
+        // As the upload does with what is in the store.
+        std::fs::remove_file(place.path("out").join(started.rsplit('/').next().expect("a name"))).expect("it is there");
+    }
+    running.signal(Signal::INT);
+    assert_eq!(running.end().0, Some(0));
+}
+
+#[test]
+fn a_stopped_run_does_not_hold_up_who_requests_something_of_it() {
+    let place = Place::new();
+    let running = place.start(&["--sim", "--headless", "--out", "out"], "motor_state");
+    running.signal(Signal::STOP);
+    for words in [&["session"][..], &["episode", "start"], &["reload"]] {
+        let why = ask(&place, words).expect_err("it is stopped");
+        assert!(why.contains(" is stopped ") && why.contains("`kill -CONT "), "{words:?}: {why}");
+    }
+    for words in [&["logs"][..], &["arm"]] {
+        let why = ask(&place, words).expect_err("it is stopped");
+        assert!(why.contains("no answer in time") && !why.contains("os error"), "{words:?}: {why}");
+    }
+    running.signal(Signal::CONT);
+    // What was requested meanwhile is carried out.
+    until("the episode is recorded", || session(&place)["episodes"].as_array().is_some_and(|all| all.len() == 1));
+    running.signal(Signal::INT);
+    assert_eq!(running.end().0, Some(0));
+}
+
 /// The episodes that the journal in `out` has at this moment.
 fn journal(place: &Place) -> Vec<toml::Table> {
     let text = std::fs::read_to_string(place.path("out/session.toml")).expect("a journal");

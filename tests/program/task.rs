@@ -79,8 +79,7 @@ fn the_frames_of_the_rig_are_valid_whatever_the_phases_are() {
         }
         let out = place.path(&seed.to_string());
         std::fs::create_dir(&out).expect("folder");
-        let request =
-            EpisodeRequest { out, task: "phases".into(), tags: Vec::new(), modules: Vec::new(), duration: None };
+        let request = EpisodeRequest { out, task: "phases".into(), ..EpisodeRequest::default() };
         recorder.begin(&request, rig.now()).expect("an episode");
         for _ in 0..30 {
             rig.step(0.0, &mut recorder).expect("a step");

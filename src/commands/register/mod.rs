@@ -36,7 +36,7 @@ pub use import::ImportError;
 #[derive(Debug, thiserror::Error)]
 pub enum RegisterError {
     /// The new text would not be a registry.
-    #[error("{0}\nnothing was written")]
+    #[error("{0}\nnothing was written; the lines are those of the file with the new entry")]
     Refused(RegistryErrors),
     /// A key cannot be written.
     #[error("{0}")]

@@ -15,7 +15,11 @@ fn open(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {
 
 fn open_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {
     let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
-    let path = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
+    let path = EpisodePath::create(
+        &EpisodeRequest { out: folder.to_owned(), task: "t".into(), ..EpisodeRequest::default() },
+        clock.wall_ns(Stamp(0)),
+    )
+    .unwrap();
     let beginning = Beginning {
         registry: Arc::new(registry),
         board: Arc::clone(board),

@@ -31,8 +31,10 @@ Environment=EPISODES=/var/lib/rapid
 Environment=RCLONE_CONFIG=/etc/rapid/rclone.conf
 EnvironmentFile=/etc/rapid/upload.conf
 # A file that was copied is known by its checksum, and a break costs the file that was being copied. What is being written,
-# or waits to be repaired, is called *.mcap.partial.
-ExecStart=/usr/bin/rclone copy ${{EPISODES}} ${{STORE}} {EPISODES} {SESSIONS} --checksum
+# or waits to be repaired, is called *.mcap.partial. An episode in the store is never replaced: another of its name is an
+# error here.
+ExecStart=/usr/bin/rclone copy ${{EPISODES}} ${{STORE}} {SESSIONS} --checksum
+ExecStart=/usr/bin/rclone copy ${{EPISODES}} ${{STORE}} {EPISODES} --checksum --immutable
 ExecStart=/usr/bin/rclone check ${{EPISODES}} ${{STORE}} {EPISODES} --one-way
 ExecStart=/bin/sh -euc '{REMOVE}'
 Nice=10
@@ -68,7 +70,7 @@ WantedBy=timers.target
 /// Finished episodes.
 const EPISODES: &str = "--max-depth 1 --include=*.mcap";
 /// The files of sessions, of which one may change at any moment.
-const SESSIONS: &str = "--include=session*.toml --include=session*.md";
+const SESSIONS: &str = "--max-depth 1 --include=session*.toml --include=session*.md";
 
 /// Only what rclone lists as equal after reading both sides is removed; `$$` is a `$` of the shell.
 const REMOVE: &str = r#"[ -n "$${REMOVE_AFTER:-}" ] || exit 0; equal=$$(mktemp); \
