@@ -3,14 +3,16 @@
 //! Invariant: the sender never waits for the reader at the other end longer than it chooses to.
 
 use std::io::{self, Write};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{Notify, mpsc, oneshot};
 
 /// A thread that writes the pieces sent to it, in order.
 #[derive(Debug)]
 pub struct Outlet {
     sender: mpsc::Sender<Vec<u8>>,
+    room: Arc<Notify>,
     ended: oneshot::Receiver<io::Result<()>>,
 }
 
@@ -22,18 +24,28 @@ impl Outlet {
     pub fn new(name: &str, depth: usize, mut out: impl Write + Send + 'static) -> io::Result<Self> {
         let (sender, mut pieces) = mpsc::channel::<Vec<u8>>(depth);
         let (report, ended) = oneshot::channel();
+        let room = Arc::new(Notify::new());
+        let made = Arc::clone(&room);
         std::thread::Builder::new().name(name.to_owned()).spawn(move || {
             let mut outcome = Ok(());
             while let Some(piece) = pieces.blocking_recv() {
+                made.notify_one();
                 outcome = out.write_all(&piece).and_then(|()| out.flush());
                 if outcome.is_err() {
                     break;
                 }
             }
+            // One that waits for room sees that the writer is gone.
+            made.notify_one();
             // The receiver may be gone.
             let _ = report.send(outcome);
         })?;
-        Ok(Self { sender, ended })
+        Ok(Self { sender, room, ended })
+    }
+
+    /// Notified when the writer has taken a piece, or has ended.
+    pub fn room(&self) -> Arc<Notify> {
+        Arc::clone(&self.room)
     }
 
     /// Whether everything sent so far has been passed to the writer.
@@ -77,7 +89,7 @@ impl Outlet {
 
     /// The same for callers that cannot await: blocks, at most `within`.
     pub fn finish_blocking(self, within: Duration) {
-        let Self { sender, mut ended } = self;
+        let Self { sender, mut ended, .. } = self;
         drop(sender);
         let deadline = Instant::now() + within;
         while Instant::now() < deadline && matches!(ended.try_recv(), Err(oneshot::error::TryRecvError::Empty)) {

@@ -40,7 +40,7 @@ use futures::{FutureExt, Stream, StreamExt};
 use ratatui::layout::Position;
 use rustix::process::Signal;
 use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::mpsc;
+use tokio::sync::{Notify, mpsc};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
@@ -129,24 +129,27 @@ pub async fn show(mut link: impl Link, options: ScreenOptions, shutdown: Cancell
     let size = futures::stream::iter(size.map(|(columns, rows)| Ok(Event::Resize(columns, rows))));
     let events = size.chain(EventStream::new());
     let mut continued = signal(SignalKind::from_raw(Signal::CONT.as_raw())).map_err(TuiError::NoTerminal)?;
+    let room = screen.room();
     let draw = |model: &Model| {
         if continued.recv().now_or_never().is_some() {
             screen.resume()?;
         }
         screen.draw(model, theme)
     };
-    let outcome = drive(&mut link, &shutdown, events, options, draw).await;
+    let outcome = drive(&mut link, &shutdown, events, options, &room, draw).await;
     screen.close().await;
     outcome
 }
 
-/// The loop itself, with any source of terminal events and any way to draw.
+/// The loop itself, with any source of terminal events and any way to draw: one that returns false has drawn nothing, and is
+/// repeated when `room` is notified.
 async fn drive(
     link: &mut impl Link,
     shutdown: &CancellationToken,
     events: impl Stream<Item = io::Result<Event>>,
     options: ScreenOptions,
-    mut draw: impl FnMut(&Model) -> io::Result<()>,
+    room: &Notify,
+    mut draw: impl FnMut(&Model) -> io::Result<bool>,
 ) -> Result<(), TuiError> {
     let mut events = std::pin::pin!(events);
     let mut model = Model::new(link.snapshot());
@@ -155,6 +158,7 @@ async fn drive(
     let theme = Theme::detect(|name| std::env::var(name).ok());
     let mut frames = tokio::time::interval(FRAME);
     frames.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut is_drawn = true;
     loop {
         model.link = link.state();
         if let Some(answer) = link.answer() {
@@ -172,6 +176,7 @@ async fn drive(
                 Some(Err(error)) => return Err(TuiError::Gone(error)),
                 None => return Err(TuiError::Gone(io::ErrorKind::UnexpectedEof.into())),
             },
+            () = room.notified(), if !is_drawn => model::Effect::None,
             _ = frames.tick() => model.update(Msg::Snapshot(Box::new(link.snapshot()))),
         };
         match link.carry_out(effect) {
@@ -179,7 +184,7 @@ async fn drive(
             Ok(None) => {}
             Err(Closed) => return Ok(()),
         }
-        draw(&model).map_err(TuiError::Gone)?;
+        is_drawn = draw(&model).map_err(TuiError::Gone)?;
     }
 }
 

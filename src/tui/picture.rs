@@ -89,6 +89,8 @@ pub struct Canvas {
     /// `None`: as characters.
     picker: Option<Picker>,
     last: Option<(Key, Protocol)>,
+    /// Where this frame, and the one before it, have a picture.
+    drawn: [Option<Rect>; 2],
 }
 
 /// What a drawn picture depends on.
@@ -121,7 +123,12 @@ impl Canvas {
             // A multiplexer passes graphics on only where it is set up for them.
             _ if in_multiplexer => ProtocolType::Halfblocks,
             _ if set("KITTY_WINDOW_ID").is_some() || is("TERM", &["kitty", "ghostty"]) => ProtocolType::Kitty,
-            _ if is("TERM_PROGRAM", &["iTerm", "WezTerm"]) || is("LC_TERMINAL", &["iTerm"]) => ProtocolType::Iterm2,
+            _ if is("TERM_PROGRAM", &["iTerm", "WezTerm"])
+                || is("LC_TERMINAL", &["iTerm"])
+                || set("KONSOLE_VERSION").is_some() =>
+            {
+                ProtocolType::Iterm2
+            }
             _ if is("TERM", &["foot", "mlterm", "sixel", "yaft", "contour"]) => ProtocolType::Sixel,
             _ => ProtocolType::Halfblocks,
         };
@@ -134,7 +141,20 @@ impl Canvas {
         #[expect(deprecated, reason = "the alternative queries the terminal and waits for its answer")]
         let mut picker = Picker::from_fontsize(FontSize { width, height });
         picker.set_protocol_type(if cell.is_some() { protocol } else { ProtocolType::Halfblocks });
-        Self { picker: Some(picker), last: None }
+        Self { picker: Some(picker), ..Self::default() }
+    }
+
+    /// Begins a frame.
+    pub(super) fn begin_frame(&mut self) {
+        self.drawn = [None, self.drawn[0]];
+    }
+
+    /// Whether a picture of the frame before would stay on the screen: this one has none there, and by these protocols some
+    /// terminals (Konsole) keep a picture beneath the text that is written over it.
+    pub(super) fn leaves_a_trace(&self) -> bool {
+        let [now, before] = self.drawn;
+        let stays = |picker: &Picker| matches!(picker.protocol_type(), ProtocolType::Sixel | ProtocolType::Iterm2);
+        before.is_some() && before != now && self.picker.as_ref().is_some_and(stays)
     }
 
     /// Draws a picture as large as it fits, in its proportions.
@@ -157,7 +177,10 @@ impl Canvas {
             self.last = protocol.map(|protocol| (key, protocol));
         }
         match &self.last {
-            Some((_, protocol)) => frame.render_widget(Image::new(protocol), area),
+            Some((_, protocol)) => {
+                frame.render_widget(Image::new(protocol), area);
+                self.drawn[0] = Some(area);
+            }
             None => as_text(frame, area, picture),
         }
     }
@@ -219,6 +242,7 @@ mod tests {
         for (environment, cell, expected) in [
             (&[("TERM", "xterm-256color")][..], cell, Some(ProtocolType::Halfblocks)),
             (&[("TERM", "xterm-kitty")], cell, Some(ProtocolType::Kitty)),
+            (&[("TERM", "xterm-256color"), ("KONSOLE_VERSION", "221203")], cell, Some(ProtocolType::Iterm2)),
             (&[("TERM", "xterm-kitty")], None, Some(ProtocolType::Halfblocks)),
             (&[("TERM", "xterm-kitty"), ("TMUX", "/tmp/x")], cell, Some(ProtocolType::Halfblocks)),
             (&[("TERM", "xterm-256color"), ("LC_TERMINAL", "iTerm2")], cell, Some(ProtocolType::Iterm2)),
@@ -228,6 +252,32 @@ mod tests {
             (&[("TERM", "foot"), ("RAPID_PICTURES", "text")], cell, None),
         ] {
             assert_eq!(detected(environment, cell), expected, "{environment:?} {cell:?}");
+        }
+    }
+
+    #[test]
+    fn a_picture_that_is_no_longer_there_is_cleared_where_text_does_not_cover_it() {
+        use ratatui::Terminal;
+        use ratatui::backend::TestBackend;
+        let picture = Picture::decode(&grey(8, 8, |x, _| if x < 4 { 0 } else { 255 })).unwrap().unwrap();
+        for (protocol, stays) in
+            [("sixel", true), ("iterm2", true), ("kitty", false), ("blocks", false), ("text", false)]
+        {
+            let wanted = |name: &str| (name == "RAPID_PICTURES").then(|| protocol.to_owned());
+            let mut canvas = Canvas::detect(wanted, Some((8, 16)));
+            let mut terminal = Terminal::new(TestBackend::new(20, 10)).unwrap();
+            let places = [None, Some(0), Some(0), Some(2), None, None];
+            let traces = places.map(|x| {
+                canvas.begin_frame();
+                let draw = |frame: &mut Frame<'_>| {
+                    if let Some(x) = x {
+                        canvas.draw(frame, Rect::new(x, 0, 10, 5), &picture, Theme::detect(|_| None));
+                    }
+                };
+                terminal.draw(draw).unwrap();
+                canvas.leaves_a_trace()
+            });
+            assert_eq!(traces, [false, false, false, stays, stays, false], "{protocol}");
         }
     }
 }

@@ -18,6 +18,7 @@ use crossterm::terminal::{
 };
 use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
+use tokio::sync::Notify;
 
 use super::model::Model;
 use super::picture::Canvas;
@@ -82,30 +83,46 @@ impl Screen {
         disable_raw_mode()?;
         enable_raw_mode()?;
         self.enter()?;
+        self.clear()
+    }
+
+    /// Clears the screen: the next frame is compared with an empty one. `Terminal::clear` would wait for the terminal to
+    /// report its cursor.
+    fn clear(&mut self) -> io::Result<()> {
         crossterm::queue!(self.frame, Clear(ClearType::All))?;
-        // The next frame is compared with an empty one. `Terminal::clear` would wait for the terminal to report its cursor.
         self.terminal.swap_buffers();
         Ok(())
     }
 
-    /// Draws the model, unless the terminal has not yet accepted the previous frame.
-    pub(super) fn draw(&mut self, model: &Model, theme: Theme) -> io::Result<()> {
-        let Some(outlet) = &self.outlet else { return Ok(()) };
-        if !outlet.is_idle() {
-            return Ok(());
+    /// Notified when the terminal has accepted a frame.
+    pub(super) fn room(&self) -> Arc<Notify> {
+        self.outlet.as_ref().map(Outlet::room).unwrap_or_default()
+    }
+
+    /// Draws the model, unless the terminal has not yet accepted the previous frame: then it returns false.
+    pub(super) fn draw(&mut self, model: &Model, theme: Theme) -> io::Result<bool> {
+        if !self.outlet.as_ref().is_some_and(Outlet::is_idle) {
+            return Ok(false);
         }
-        // Before the picture, and with it: one that is not drawn because the terminal is blocked rings with the next.
+        self.canvas.begin_frame();
+        self.terminal.draw(|frame| view::draw(frame, model, theme, &mut self.canvas))?;
+        if self.canvas.leaves_a_trace() {
+            self.frame.take();
+            self.clear()?;
+            self.terminal.draw(|frame| view::draw(frame, model, theme, &mut self.canvas))?;
+        }
+        // With the picture: what is not drawn because the terminal is blocked rings with the next.
         if std::mem::replace(&mut self.rung, model.rings()) != model.rings() {
             self.frame.write_all(b"\x07")?;
         }
-        self.terminal.draw(|frame| view::draw(frame, model, theme, &mut self.canvas))?;
         let bytes = self.frame.take();
+        let Some(outlet) = &self.outlet else { return Ok(false) };
         if outlet.is_closed() {
             return Err(io::ErrorKind::BrokenPipe.into());
         }
         // There is space: this is the only sender.
         let _ = outlet.try_send(bytes);
-        Ok(())
+        Ok(true)
     }
 
     /// Restores the terminal after the last frame.

@@ -409,7 +409,8 @@ async fn keys_become_commands_and_shutdown_ends_the_screen() {
     let end = shutdown.clone();
     let keys = typed(&[KeyCode::Char(' '), KeyCode::Char('q')]);
     let mut desk = desk(&board, &sender);
-    let screen = drive(&mut desk, &shutdown, keys, ScreenOptions::default(), |_| Ok(()));
+    let room = Notify::new();
+    let screen = drive(&mut desk, &shutdown, keys, ScreenOptions::default(), &room, |_| Ok(true));
     let app = async {
         assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Toggle)));
         assert_eq!(commands.recv().await, Some(Command::Quit));
@@ -427,13 +428,20 @@ async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     let shutdown = CancellationToken::new();
     let end = shutdown.clone();
     let mut notice = None;
-    drive(&mut desk(&board, &sender), &shutdown, typed(&[KeyCode::Char(' ')]), ScreenOptions::default(), |model| {
-        if let Some(report) = model.notice() {
-            notice = Some(report.to_owned());
-            end.cancel();
-        }
-        Ok(())
-    })
+    drive(
+        &mut desk(&board, &sender),
+        &shutdown,
+        typed(&[KeyCode::Char(' ')]),
+        ScreenOptions::default(),
+        &Notify::new(),
+        |model| {
+            if let Some(report) = model.notice() {
+                notice = Some(report.to_owned());
+                end.cancel();
+            }
+            Ok(true)
+        },
+    )
     .await
     .unwrap();
     assert_eq!(notice.as_deref(), Some("busy: request dropped, try again"));
@@ -444,10 +452,33 @@ async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
         &CancellationToken::new(),
         typed(&[KeyCode::Char('q')]),
         ScreenOptions::default(),
-        |_| Ok(()),
+        &Notify::new(),
+        |_| Ok(true),
     )
     .await
     .unwrap();
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_busy_terminal_did_not_take_is_drawn_when_it_has_room_and_not_a_frame_later() {
+    let board = Arc::new(board(&["cam"]));
+    let (sender, _commands) = mpsc::channel(1);
+    let (shutdown, room) = (CancellationToken::new(), Notify::new());
+    let begun = tokio::time::Instant::now();
+    let mut drawn = Vec::new();
+    drive(&mut desk(&board, &sender), &shutdown, futures::stream::pending(), ScreenOptions::default(), &room, |_| {
+        drawn.push(begun.elapsed());
+        match drawn.len() {
+            2 => room.notify_one(),
+            4 => shutdown.cancel(),
+            _ => {}
+        }
+        Ok(drawn.len() != 2)
+    })
+    .await
+    .unwrap();
+    // At the first and the second frame, at once again, and not between two frames when nothing is left to draw.
+    assert_eq!(drawn, [Duration::ZERO, FRAME, FRAME, 2 * FRAME]);
 }
 
 #[tokio::test]
@@ -455,10 +486,16 @@ async fn a_terminal_that_goes_away_is_an_error() {
     let board = Arc::new(board(&["cam"]));
     let (sender, _commands) = mpsc::channel(1);
     let hung_up = futures::stream::iter([]);
-    let error =
-        drive(&mut desk(&board, &sender), &CancellationToken::new(), hung_up, ScreenOptions::default(), |_| Ok(()))
-            .await
-            .unwrap_err();
+    let error = drive(
+        &mut desk(&board, &sender),
+        &CancellationToken::new(),
+        hung_up,
+        ScreenOptions::default(),
+        &Notify::new(),
+        |_| Ok(true),
+    )
+    .await
+    .unwrap_err();
     assert!(matches!(error, TuiError::Gone(_)), "{error}");
 }
 
@@ -477,7 +514,8 @@ async fn pasted_text_deletes_nothing_whether_the_terminal_marks_it_or_not() {
     let events = events.chain(futures::stream::pending());
     let end = shutdown.clone();
     let mut desk = desk(&board, &sender);
-    let screen = drive(&mut desk, &shutdown, events, ScreenOptions::default(), |_| Ok(()));
+    let room = Notify::new();
+    let screen = drive(&mut desk, &shutdown, events, ScreenOptions::default(), &room, |_| Ok(true));
     let app = async {
         // It is in the trash, once, and can be taken back.
         assert_eq!(commands.recv().await, Some(Command::Session(SessionRequest::Discard { episode: None })));
