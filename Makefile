@@ -35,9 +35,9 @@ setup-build: ## only what building and running need
 	@scripts/setup.sh build
 
 # Built to be seen soon: in a profile of its own, and without what simulated devices do not need.
-demo: setup-build ## build, then the simulated rig: the monitor on a terminal, otherwise a 10 s episode
-	cargo build --locked --profile demo --no-default-features --bin rapid
-	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/demo/rapid' --sim --tour; else scripts/demo.sh '$(TARGET)/demo/rapid' $(DEMO_DIR); fi
+demo: setup-build ## build, then the simulated rig and a policy: the monitor on a terminal, otherwise a 10 s episode
+	cargo build --locked --profile demo --no-default-features --features policy --bin rapid
+	@scripts/demo.sh '$(TARGET)/demo/rapid' $(DEMO_DIR)
 
 # A test takes the picture again and compares its words and colours with the one in the repository.
 picture: setup ## take docs/monitor.svg and docs/device.svg again, from the program in a terminal of tmux

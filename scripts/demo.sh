@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Records ten seconds of the simulated rig and shows the contents of the file.
+# The demonstration. On a terminal: the monitor leads through an unplug, and then a policy through another. Otherwise: ten
+# seconds of the simulated rig are recorded, and the contents of the file are shown.
 #
 #     demo.sh RAPID FOLDER
 set -euo pipefail
@@ -7,6 +8,13 @@ rapid=$1
 folder=$2
 
 mkdir -p "$folder"
+if [[ -t 0 && -t 1 ]]; then
+  "$rapid" --sim --tour --out "$folder" --task demo
+  echo
+  echo 'Next: a policy moves a simulated arm and loses a sensor. Enter: start, ctrl-c: end.'
+  read -r
+  exec "$rapid" --infer --sim task --monitor --tour --out "$folder" --task demo
+fi
 began=$(mktemp "$folder/.began.XXXXXX")
 trap 'rm -f "$began"' EXIT
 "$rapid" --sim --headless --record --duration 10s --out "$folder" --task demo

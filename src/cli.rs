@@ -217,7 +217,7 @@ pub struct RunArgs {
     /// Enable the actuator as soon as it is connected, instead of by `rapid arm` or the monitor
     #[arg(long, hide_short_help = true)]
     pub arm: bool,
-    /// Let the monitor lead through a first episode of the simulated rig
+    /// Let the monitor lead through a first episode of the simulated rig, or with --infer through a policy's loss of a sensor
     #[arg(long, requires = "sim", hide_short_help = true)]
     pub tour: bool,
     /// Half width of the synchronisation window of an observation [default: from the registry]

@@ -600,6 +600,23 @@ fn the_tour_leads_through_a_first_episode() {
 }
 
 #[test]
+fn the_tour_of_a_policy_leads_through_the_loss_of_a_sensor() {
+    let place = place();
+    let tmux = Tmux::new(&place);
+    let pane = streaming(&tmux, "policy", (80, 24), "rapid --infer --sim task --monitor --tour --out out");
+    pane.shows(&["1/2 a policy moves the arm", "acting", "0x07"]);
+    pane.press("Down");
+    pane.until("tactile_tip is selected", |screen| {
+        screen.lines().any(|line| line.contains('▸') && line.contains("tactile_tip"))
+    });
+    pane.type_in("U");
+    pane.shows(&["2/2 its bit is clear, and the policy acts without it", "acting", "saw mask 0x05"]);
+    pane.type_in("U");
+    pane.shows(&["? help", "acting", "saw mask 0x07"]);
+    quit(&pane);
+}
+
+#[test]
 fn in_a_folder_without_a_registry_the_screen_begins_with_an_empty_rig() {
     let place = Place::new();
     let tmux = Tmux::new(&place);
