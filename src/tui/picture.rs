@@ -1,8 +1,8 @@
 //! Pictures in the terminal: by its graphics protocol where it has one, otherwise as half blocks, or as characters where
 //! there are no colours.
 //!
-//! Invariant: the terminal is never queried: what it can show follows from the environment and from the size of its window,
-//! so that the first frame waits for no answer.
+//! Invariant: what a terminal can show follows from the environment and from the size of its window, so that the first frame
+//! waits for no answer. Only one that calls itself kitty is asked for its version, because an old one would show boxes.
 
 use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage};
@@ -108,7 +108,14 @@ impl Canvas {
     /// For the terminal of this environment, with cells of `cell` pixels if it reports them.
     ///
     /// `RAPID_PICTURES` chooses: `kitty`, `iterm2`, `sixel`, `blocks` or `text`.
-    pub fn detect(variable: impl Fn(&str) -> Option<String>, cell: Option<(u16, u16)>) -> Self {
+    ///
+    /// Kitty's pictures need a terminal that has them among text (kitty 0.28 or newer), which `places_pictures_in_text` finds
+    /// out.
+    pub fn detect(
+        variable: impl Fn(&str) -> Option<String>,
+        cell: Option<(u16, u16)>,
+        places_pictures_in_text: impl FnOnce() -> bool,
+    ) -> Self {
         let set = |name: &str| variable(name).filter(|value| !value.is_empty());
         let is =
             |name: &str, words: &[&str]| set(name).is_some_and(|value| words.iter().any(|word| value.contains(word)));
@@ -122,7 +129,10 @@ impl Canvas {
             "blocks" => ProtocolType::Halfblocks,
             // A multiplexer passes graphics on only where it is set up for them.
             _ if in_multiplexer => ProtocolType::Halfblocks,
-            _ if set("KITTY_WINDOW_ID").is_some() || is("TERM", &["kitty", "ghostty"]) => ProtocolType::Kitty,
+            _ if set("KITTY_WINDOW_ID").is_some() || is("TERM", &["kitty", "ghostty"]) => {
+                // Not needed where it reports no size.
+                if cell.is_some() && places_pictures_in_text() { ProtocolType::Kitty } else { ProtocolType::Halfblocks }
+            }
             _ if is("TERM_PROGRAM", &["iTerm", "WezTerm"])
                 || is("LC_TERMINAL", &["iTerm"])
                 || set("KONSOLE_VERSION").is_some() =>
@@ -235,6 +245,7 @@ mod tests {
             let canvas = Canvas::detect(
                 |name| environment.iter().find(|(key, _)| *key == name).map(|(_, value)| (*value).to_owned()),
                 cell,
+                || true,
             );
             canvas.picker.map(|picker| picker.protocol_type())
         };
@@ -264,7 +275,7 @@ mod tests {
             [("sixel", true), ("iterm2", true), ("kitty", false), ("blocks", false), ("text", false)]
         {
             let wanted = |name: &str| (name == "RAPID_PICTURES").then(|| protocol.to_owned());
-            let mut canvas = Canvas::detect(wanted, Some((8, 16)));
+            let mut canvas = Canvas::detect(wanted, Some((8, 16)), || false);
             let mut terminal = Terminal::new(TestBackend::new(20, 10)).unwrap();
             let places = [None, Some(0), Some(0), Some(2), None, None];
             let traces = places.map(|x| {

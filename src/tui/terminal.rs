@@ -8,7 +8,7 @@ use std::fs::File;
 use std::io::{self, IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crossterm::cursor::{Hide, Show};
 use crossterm::event::{DisableBracketedPaste, DisableMouseCapture, EnableBracketedPaste, EnableMouseCapture};
@@ -18,6 +18,8 @@ use crossterm::terminal::{
 };
 use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
+use rustix::event::{PollFd, PollFlags, Timespec};
+use rustix::io::Errno;
 use tokio::sync::Notify;
 
 use super::model::Model;
@@ -54,7 +56,7 @@ impl Screen {
         enter_raw_mode()?;
         let frame = Frame::default();
         let outlet = Some(outlet);
-        let canvas = Canvas::detect(|name| std::env::var(name).ok(), cell());
+        let canvas = Canvas::detect(|name| std::env::var(name).ok(), cell(), places_pictures_in_text);
         let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
             Ok(terminal) => Self { terminal, frame, outlet, rung: 0, canvas, mouse },
             Err(error) => {
@@ -150,6 +152,51 @@ fn cell() -> Option<(u16, u16)> {
     Some((of_cell(size.width, size.columns)?, of_cell(size.height, size.rows)?))
 }
 
+/// How long the terminal may take to answer: no longer than a far one over SSH.
+const ANSWER: Duration = Duration::from_millis(500);
+/// Its name and version (XTVERSION), and its attributes (DA1), which every terminal answers: the end of the answers.
+const NAME_AND_ATTRIBUTES: &[u8] = b"\x1b[>q\x1b[c";
+
+/// Whether the terminal draws pictures in the place of text, by its version. Keys that are pressed meanwhile are lost.
+fn places_pictures_in_text() -> bool {
+    let (mut answer, end) = (Vec::new(), Instant::now() + ANSWER);
+    let mut terminal = io::stdout();
+    if terminal.write_all(NAME_AND_ATTRIBUTES).and_then(|()| terminal.flush()).is_err() {
+        return false;
+    }
+    while !is_answered(&answer) {
+        let left = end.saturating_duration_since(Instant::now());
+        // Half a second fits.
+        let limit = Timespec::try_from(left).unwrap_or_default();
+        let input = rustix::stdio::stdin();
+        let mut bytes = [0; 256];
+        match rustix::event::poll(&mut [PollFd::new(&input, PollFlags::IN)], Some(&limit)) {
+            Ok(1..) => match rustix::io::read(input, &mut bytes) {
+                Ok(count @ 1..) => answer.extend_from_slice(bytes.get(..count).unwrap_or_default()),
+                _ => return false,
+            },
+            Err(Errno::INTR) => {}
+            _ => return false,
+        }
+    }
+    has_placeholders(&String::from_utf8_lossy(&answer))
+}
+
+/// Whether the attributes have arrived: `ESC [ ? 62 ; 22 c`.
+fn is_answered(answer: &[u8]) -> bool {
+    let Some(begin) = answer.windows(3).position(|three| three == b"\x1b[?") else { return false };
+    answer.iter().skip(begin).any(|byte| *byte == b'c')
+}
+
+/// Whether a terminal with this answer has the placeholders of kitty's graphics: `ESC P > | kitty(0.35.2) ESC \`. Other
+/// terminals with that protocol have had them from the beginning.
+fn has_placeholders(answer: &str) -> bool {
+    let Some(name) = answer.split("\x1bP>|").nth(1) else { return false };
+    let Some(version) = name.strip_prefix("kitty(") else { return true };
+    let mut numbers = version.split(['.', ')']).map_while(|number| number.parse::<u32>().ok());
+    (numbers.next(), numbers.next()) >= (Some(0), Some(28))
+}
+
 /// A writer to the terminal: standard output or, if that is redirected, the controlling terminal.
 pub(super) fn writer() -> io::Result<Box<dyn Write>> {
     if io::stdout().is_terminal() {
@@ -222,4 +269,28 @@ impl Write for Frame {
 /// A poisoned lock here guards complete values: continue with them.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_old_kitty_shows_no_pictures_among_text() {
+        for (answer, expected) in [
+            ("\x1bP>|kitty(0.26.5)\x1b\\\x1b[?62;c", false),
+            ("\x1bP>|kitty(0.27.9)\x1b\\\x1b[?62;c", false),
+            ("\x1bP>|kitty(0.28.0)\x1b\\\x1b[?62;c", true),
+            ("j\x1bP>|kitty(0.35.2)\x1b\\\x1b[?62;c", true),
+            ("\x1bP>|kitty(1.0)\x1b\\\x1b[?62;c", true),
+            ("\x1bP>|ghostty 1.1.3\x1b\\\x1b[?62;22c", true),
+            ("\x1bP>|kitty(\x1b\\\x1b[?62;c", false),
+            ("\x1b[?62;c", false),
+            ("", false),
+        ] {
+            assert_eq!(has_placeholders(answer), expected, "{answer:?}");
+            assert_eq!(is_answered(answer.as_bytes()), !answer.is_empty(), "{answer:?}");
+        }
+        assert!(!is_answered(b"\x1bP>|kitty(0.35.2)\x1b\\\x1b[?6"), "the c of its name is not the end");
+    }
 }

@@ -98,7 +98,7 @@ impl Monitor {
         let set = |name: &str| (name == "LC_ALL").then(|| "C.UTF-8".to_owned());
         let (sink, lanes) = (Sink::default(), Feed::full_load()?.lanes.to_vec());
         let (model, terminal) = (Model::new(board.snapshot()), terminal(&sink)?);
-        let (canvas, theme) = (Canvas::detect(|_| None, None), Theme::detect(set));
+        let (canvas, theme) = (Canvas::detect(|_| None, None, || false), Theme::detect(set));
         let mut monitor = Self { board, ids, lanes, now, model, terminal, sink, canvas, theme };
         (0..LOGGED).for_each(|number| monitor.log(number));
         monitor.model.update(Msg::Size(SIZE.0, SIZE.1));
