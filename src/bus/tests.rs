@@ -34,6 +34,7 @@ pub(super) fn registry(depth: usize) -> Registry {
             depth,
             when_stale: WhenStale::Hold,
             latency: Duration::ZERO,
+            form: None,
             action: None,
             hooks: crate::registry::Hooks::default(),
             verdict: crate::registry::VerdictSpec::of(

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::form::Derived;
 use super::text_map;
 use crate::registry::{ActionSpec, DeviceSpec};
 
@@ -10,6 +11,14 @@ pub(crate) fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {
     let kind = serde_json::to_value(device.modality().kind).ok();
     let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
     text_map([("modality", device.name.clone()), ("bit", device.id.to_string()), ("kind", kind)])
+}
+
+/// Of a topic derived from that of a device; that of transforms is derived from several.
+pub(crate) fn of_derived(device: &DeviceSpec, derived: Derived) -> BTreeMap<String, String> {
+    match derived {
+        Derived::Transform => BTreeMap::new(),
+        Derived::Pose | Derived::Joints => text_map([("derived_from", device.topic.clone())]),
+    }
 }
 
 /// Of the topic of actions, which move `device`.

@@ -73,25 +73,19 @@ pub fn frame(out: &mut Vec<u8>, wall_ns: u64, index: u64, observation: &Observat
     varint_field(out, 2, index);
     fixed64(out, 3, observation.mask.0);
     for slot in &observation.slots {
-        key(out, 4, BYTES);
-        // Every field but the age and the sequence number takes 2 bytes, those at most 11: the
-        // length always fits one byte and is put in once it is known.
-        let at = out.len();
-        out.push(0);
-        varint_field(out, 1, u64::from(slot.id.bit()));
-        varint_field(out, 2, u64::from(slot.valid));
-        varint_field(out, 3, u64::from(slot.stale));
-        if let Some(seq) = slot.seq {
-            key(out, 4, VARINT);
-            varint(out, zigzag(slot.age_ns));
-            key(out, 5, VARINT);
-            varint(out, seq);
-        }
-        varint_field(out, 6, u64::from(slot.present));
-        let length = out.len() - at - 1;
-        if let (Some(byte), Ok(length)) = (out.get_mut(at), u8::try_from(length)) {
-            *byte = length;
-        }
+        // Every field but the age and the sequence number takes 2 bytes, those at most 11.
+        nested(out, 4, |out| {
+            varint_field(out, 1, u64::from(slot.id.bit()));
+            varint_field(out, 2, u64::from(slot.valid));
+            varint_field(out, 3, u64::from(slot.stale));
+            if let Some(seq) = slot.seq {
+                key(out, 4, VARINT);
+                varint(out, zigzag(slot.age_ns));
+                key(out, 5, VARINT);
+                varint(out, seq);
+            }
+            varint_field(out, 6, u64::from(slot.present));
+        });
     }
 }
 
@@ -164,6 +158,90 @@ pub fn log(out: &mut Vec<u8>, wall_ns: u64, level: Level, text: &str) {
     varint_field(out, 2, level);
     bytes(out, 3, text.as_bytes());
     bytes(out, 4, b"rapid");
+}
+
+/// A position in m, and a rotation as a quaternion `x y z w` of length 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pose {
+    /// Where.
+    pub position: [f64; 3],
+    /// How it is turned.
+    pub rotation: [f64; 4],
+}
+
+/// The state of a joint.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Joint<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// rad, or m.
+    pub position: Option<f64>,
+    /// rad/s, or m/s.
+    pub velocity: Option<f64>,
+    /// Nm, or N.
+    pub effort: Option<f64>,
+}
+
+/// Writes a `foxglove.PoseInFrame`.
+pub fn pose(out: &mut Vec<u8>, wall_ns: u64, frame_id: &str, pose: &Pose) {
+    out.clear();
+    timestamp(out, wall_ns);
+    bytes(out, 2, frame_id.as_bytes());
+    nested(out, 3, |out| {
+        nested(out, 1, |out| doubles(out, &pose.position));
+        nested(out, 2, |out| doubles(out, &pose.rotation));
+    });
+}
+
+/// Writes a `foxglove.FrameTransform` of the second frame in the first.
+pub fn transform(out: &mut Vec<u8>, wall_ns: u64, [parent, child]: [&str; 2], pose: &Pose) {
+    out.clear();
+    timestamp(out, wall_ns);
+    bytes(out, 2, parent.as_bytes());
+    bytes(out, 3, child.as_bytes());
+    nested(out, 4, |out| doubles(out, &pose.position));
+    nested(out, 5, |out| doubles(out, &pose.rotation));
+}
+
+/// Writes a `foxglove.JointStates`.
+pub fn joints<'a>(out: &mut Vec<u8>, wall_ns: u64, joints: impl Iterator<Item = Joint<'a>>) {
+    const OF_A_DOUBLE: u64 = 9;
+    out.clear();
+    timestamp(out, wall_ns);
+    for Joint { name, position, velocity, effort } in joints {
+        let numbers = [(2, position), (3, velocity), (5, effort)];
+        let written = numbers.iter().filter(|(_, number)| number.is_some()).count() as u64;
+        let name_length = if name.is_empty() { 0 } else { field_length(name.len() as u64) + name.len() as u64 };
+        key(out, 2, BYTES);
+        varint(out, name_length + OF_A_DOUBLE * written);
+        bytes(out, 1, name.as_bytes());
+        // Present, though it may be 0.
+        for (field, number) in numbers {
+            if let Some(number) = number {
+                key(out, field, FIXED64);
+                out.extend_from_slice(&number.to_le_bytes());
+            }
+        }
+    }
+}
+
+/// Fields from 1 on.
+fn doubles(out: &mut Vec<u8>, values: &[f64]) {
+    for (field, value) in (1..).zip(values) {
+        fixed64(out, field, value.to_bits());
+    }
+}
+
+/// A message within a message, of less than 128 bytes: its length is put in once it is known.
+fn nested(out: &mut Vec<u8>, field: u8, write: impl FnOnce(&mut Vec<u8>)) {
+    key(out, field, BYTES);
+    let at = out.len();
+    out.push(0);
+    write(out);
+    let length = out.len() - at - 1;
+    if let (Some(byte), Ok(length)) = (out.get_mut(at), u8::try_from(length)) {
+        *byte = length;
+    }
 }
 
 /// `google.protobuf.Timestamp timestamp = 1`: seconds = 1, nanos = 2.

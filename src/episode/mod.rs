@@ -11,6 +11,7 @@ pub(crate) mod chunk_writer;
 pub(crate) mod decode;
 pub mod encode;
 mod failed;
+pub mod form;
 mod hash;
 mod index;
 mod integrity;

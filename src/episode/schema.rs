@@ -32,6 +32,12 @@ pub const LOG: Schema = schema!("foxglove.Log");
 pub const EVENT: Schema = schema!("rapid.Event");
 /// `rapid.Frame`.
 pub const FRAME: Schema = schema!("rapid.Frame");
+/// `foxglove.PoseInFrame`.
+pub const POSE: Schema = schema!("foxglove.PoseInFrame");
+/// `foxglove.FrameTransform`.
+pub const TRANSFORM: Schema = schema!("foxglove.FrameTransform");
+/// `foxglove.JointStates`.
+pub const JOINTS: Schema = schema!("foxglove.JointStates");
 /// `rapid.Mask`.
 pub const MASK: Schema = schema!("rapid.Mask");
 

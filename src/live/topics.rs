@@ -12,12 +12,13 @@ use super::pictures::Pace;
 use crate::action::ACTION_TOPIC;
 use crate::bus::TopicId;
 use crate::episode::encode::{self, Announced, logged};
+use crate::episode::form::Derived;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{EVENT_TOPIC, LOG_TOPIC, channel};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::MAX_MODALITIES;
 use crate::observation::{OBSERVATION_TOPIC, Observation};
-use crate::registry::{DeviceSpec, Registry};
+use crate::registry::{DeviceSpec, Form, Registry};
 use crate::sample::SampleHeader;
 use crate::status::Event;
 use crate::time::{Stamp, WallClock};
@@ -28,6 +29,8 @@ pub(super) struct Topics {
     tracks: Vec<Option<Track>>,
     mask: Option<Arc<RawChannel>>,
     observation: Option<Arc<RawChannel>>,
+    /// None without a pose in the registry.
+    transforms: Option<Arc<RawChannel>>,
     event: Option<Arc<RawChannel>>,
     log: Option<Arc<RawChannel>>,
     /// None without an actuator in the registry.
@@ -49,6 +52,8 @@ struct Track {
     topic: String,
     metadata: BTreeMap<String, String>,
     channels: [Option<Arc<RawChannel>>; SampleSchema::COUNT],
+    form: Option<Form>,
+    derived: Vec<(Derived, Arc<RawChannel>)>,
     pace: Pace,
     /// The newest picture that was not sent yet: its schema and its log time.
     waiting: Option<(SampleSchema, u64)>,
@@ -70,6 +75,7 @@ impl Topics {
             tracks: std::iter::repeat_with(|| None).take(MAX_MODALITIES).collect(),
             mask: own(schema::MASK, MASK_TOPIC),
             observation: own(schema::FRAME, OBSERVATION_TOPIC),
+            transforms: None,
             event: own(schema::EVENT, EVENT_TOPIC),
             log: own(schema::LOG, LOG_TOPIC),
             action,
@@ -87,11 +93,27 @@ impl Topics {
             topic: device.topic.clone(),
             metadata: channel::of_device(device),
             channels: [const { None }; SampleSchema::COUNT],
+            form: device.form.clone(),
+            derived: Vec::new(),
             pace: Pace::default(),
             waiting: None,
             picture: Vec::new(),
         };
         track.channel(&self.context, SampleSchema::expected(device));
+        for derived in Derived::of(device) {
+            let made = || {
+                let metadata = channel::of_derived(device, *derived);
+                advertise(&self.context, derived.schema(), &derived.topic(device), &metadata)
+            };
+            let channel = match derived {
+                Derived::Transform => self.transforms.clone().or_else(made),
+                Derived::Pose | Derived::Joints => made(),
+            };
+            if *derived == Derived::Transform {
+                self.transforms.clone_from(&channel);
+            }
+            track.derived.extend(channel.map(|channel| (*derived, channel)));
+        }
         if let Some(place) = self.tracks.get_mut(device.id.index()) {
             *place = Some(track);
         }
@@ -191,6 +213,13 @@ impl Track {
         log_time: u64,
     ) -> u64 {
         let schema = SampleSchema::of(header, payload);
+        if let Some(form) = self.form.as_ref().filter(|_| schema == SampleSchema::Scalars) {
+            for (derived, channel) in self.derived.iter().filter(|(_, channel)| channel.has_sinks()) {
+                if derived.encode(message, log_time, &self.name, form, payload) {
+                    send(channel, message, log_time);
+                }
+            }
+        }
         if wanted(self.channel(context, schema)).is_none() {
             return 0;
         }

@@ -20,13 +20,14 @@ use crate::action::ACTION_TOPIC;
 use crate::episode::channel;
 use crate::episode::chunk_writer::{self, ChunkWriter, Sink, io_error};
 use crate::episode::encode::{self, EventText};
+use crate::episode::form::Derived;
 use crate::episode::own::EpisodeId;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::observation::Observation;
-use crate::registry::Registry;
+use crate::registry::{Form, Registry};
 use crate::sample::SampleHeader;
 use crate::status::Level;
 use crate::time::{Stamp, WallClock};
@@ -111,6 +112,9 @@ struct Track {
     topic: String,
     metadata: BTreeMap<String, String>,
     channels: [Option<u16>; SampleSchema::COUNT],
+    /// What its numbers mean, and the channels of the messages derived from them.
+    form: Option<Form>,
+    derived: Vec<(Derived, u16)>,
     /// Its newest message, and the position of the sample in it.
     message: Vec<u8>,
     newest: Option<Range<usize>>,
@@ -176,8 +180,14 @@ impl EpisodeFile {
             let (name, topic) = (device.name.clone(), device.topic.clone());
             // Grows to the largest sample: the maximum of the registry is usually far more.
             let (message, newest) = (Vec::new(), None);
-            let mut track = Track { name, topic, metadata, channels: [None; SampleSchema::COUNT], message, newest };
+            let (channels, form, derived) = ([None; SampleSchema::COUNT], device.form.clone(), Vec::new());
+            let mut track = Track { name, topic, metadata, channels, form, derived, message, newest };
             track.channel(&mut file.writer, SampleSchema::expected(device))?;
+            for derived in Derived::of(device) {
+                let metadata = channel::of_derived(device, *derived);
+                let channel = add_channel(&mut file.writer, derived.schema(), &derived.topic(device), &metadata)?;
+                track.derived.push((*derived, channel));
+            }
             if let Some(place) = file.tracks.get_mut(device.id.index()) {
                 *place = Some(track);
             }
@@ -203,6 +213,17 @@ impl EpisodeFile {
         let message = message_header(channel, header.seq, log_time, self.clock.wall_ns(Stamp(header.recv_ns)));
         self.writer.message(&message, &track.message).map_err(io_error)?;
         self.messages += 1;
+        if schema != SampleSchema::Scalars {
+            return Ok(());
+        }
+        let Track { name, form: Some(form), derived, .. } = track else { return Ok(()) };
+        for (derived, channel_id) in derived {
+            if derived.encode(&mut self.message, log_time, name, form, payload) {
+                let message = MessageHeader { channel_id: *channel_id, ..message };
+                self.writer.message(&message, &self.message).map_err(io_error)?;
+                self.messages += 1;
+            }
+        }
         Ok(())
     }
 

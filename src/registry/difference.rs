@@ -81,6 +81,7 @@ impl Difference {
             when_stale,
             latency,
             verdict,
+            form,
             action,
             hooks,
         } = was;
@@ -106,6 +107,7 @@ impl Difference {
             ("when_stale", differs(when_stale, &is.when_stale)),
             ("latency", differs(latency, &is.latency)),
             ("verdict", differs(verdict, &is.verdict)),
+            ("form", differs(form, &is.form)),
             ("action", differs::<Option<ActionSpec>>(action, &is.action)),
             ("hooks", differs::<Hooks>(hooks, &is.hooks)),
         ]);

@@ -8,6 +8,7 @@
 
 mod button;
 mod device;
+mod form;
 mod identity;
 mod input;
 mod interlock;
@@ -37,8 +38,8 @@ pub use identity::{like_a_name, name_problem};
 pub const BUILTIN: &str = include_str!("../../devices.toml");
 
 /// Topics `rapid` publishes itself.
-const OWN_TOPICS: [&str; 6] =
-    ["/rapid/mask", "/rapid/frame", "/rapid/observation", "/rapid/event", "/rapid/log", "/action"];
+const OWN_TOPICS: [&str; 7] =
+    ["/rapid/mask", "/rapid/frame", "/rapid/observation", "/rapid/event", "/rapid/log", "/action", "/tf"];
 
 /// A registry, and the warnings about it.
 #[derive(Debug, Clone, PartialEq)]
@@ -249,7 +250,11 @@ fn check_topics(drafts: &[Draft<'_>]) {
             let fix = format!("choose another, for example {:?}", device::default_topic(draft.kind, &draft.name));
             draft.section.report("topic", message, fix);
         }
-        let Some(earlier) = drafts.iter().take(index).find(|earlier| earlier.topic == draft.topic) else { continue };
+        let has_it = |(at, other): &(usize, &Draft<'_>)| {
+            let derived = other.form.as_ref().map(|form| format!("{}{}", other.topic, form.ending()));
+            (*at < index && other.topic == draft.topic) || derived.as_ref() == Some(&draft.topic)
+        };
+        let Some((_, earlier)) = drafts.iter().enumerate().find(has_it) else { continue };
         let message = format!(
             "topic {:?} is already used by [{}] on line {}",
             draft.topic,

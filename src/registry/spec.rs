@@ -7,6 +7,7 @@
 //! The reason for every default limit of the verdict is given here; `[verdict]` changes it for all devices,
 //! `[device.NAME.verdict]` for one.
 
+mod form;
 mod input;
 mod lan;
 mod motors;
@@ -20,6 +21,7 @@ use serde::Serialize;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
+pub use form::{Form, JointsSpec, PoseLayout, PoseSpec, Quantity};
 pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
@@ -112,6 +114,8 @@ pub struct DeviceSpec {
     pub latency: Duration,
     /// Limits for the verdict on its part of an episode.
     pub verdict: VerdictSpec,
+    /// What its numbers mean, if viewers know messages for it.
+    pub form: Option<Form>,
     /// The device is an actuator, and takes these actions.
     pub action: Option<ActionSpec>,
     /// Programs that are run at its events.
@@ -571,6 +575,10 @@ words! {
     Stop, 4: "limp" = Limp, "damp" = Damp, "hold" = Hold, "brake" = Brake;
     /// Every node a program may open and its name.
     Opens, 3: "video" = Video, "tty" = Tty, "usb" = Usb; "net" = Net;
+    /// Every order of a pose's numbers and its name.
+    PoseLayout, 3: "columns" = Columns, "rows" = Rows, "quaternion" = Quaternion;
+    /// Everything that a joint's number may be, and its name.
+    Quantity, 4: "position" = Position, "velocity" = Velocity, "effort" = Effort, "other" = Other;
     /// Every policy and its name.
     WhenStale, 2: "hold" = Hold, "zero" = Zero;
 }

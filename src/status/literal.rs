@@ -162,6 +162,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         depth: 8,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        form: None,
         action: None,
         hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(

@@ -42,6 +42,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         depth: 4,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        form: None,
         action: None,
         hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(

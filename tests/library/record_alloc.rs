@@ -114,6 +114,7 @@ async fn only_chunks_allocate() {
         depth: 64,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        form: None,
         action: None,
         hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(

@@ -12,9 +12,9 @@ use rapid::interlock::StopKind;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InputSpec, LanFind, LanPicture,
-    LanProtocol, LineOff, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
-    Probe, Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
+    BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Form, Framing, Hook, InputSpec, JointsSpec,
+    LanFind, LanPicture, LanProtocol, LineOff, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE,
+    Parse, PhoneStream, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -193,6 +193,31 @@ fn every_key_is_parsed() {
     assert_eq!((serial.baud, serial.framing, serial.parse, serial.channels), (9600, Framing::Cobs, Parse::Raw, 0));
     assert_eq!((tof.max_bytes, tof.depth), (4096, 2048));
     assert_eq!(registry.rig.sync_window.as_micros(), 12_500);
+}
+
+#[test]
+fn what_numbers_mean_is_written_or_follows_from_the_device() {
+    use Quantity::{Effort, Other, Position, Velocity};
+    let Loaded { registry, warnings } = valid("forms");
+    assert_eq!(warnings, []);
+    let form = |name: &str| registry.named(name).unwrap().form.clone().unwrap();
+    let pose = |layout, parent: &str| Form::Pose(PoseSpec { layout, parent: parent.to_owned() });
+    assert_eq!(form("tracker"), pose(PoseLayout::Quaternion, "world"));
+    assert_eq!(form("phone"), pose(PoseLayout::Columns, "arkit"));
+    assert_eq!(form("marker"), pose(PoseLayout::Rows, "camera"));
+    let joints = |names: &[&str], quantities: &[Quantity]| {
+        let names = names.iter().map(|name| (*name).to_owned()).collect();
+        Form::Joints(JointsSpec { names, quantities: quantities.to_vec() })
+    };
+    assert_eq!(form("fingers"), joints(&["left", "right"], &[Position, Other, Effort]));
+    assert_eq!(form("encoder"), joints(&["gripper"], &[Position]));
+    let Loaded { registry, .. } = valid("can");
+    let motors = registry.devices.iter().find_map(|device| device.form.clone());
+    let Some(Form::Joints(JointsSpec { names, quantities })) = motors else { panic!("motors are joints: {motors:?}") };
+    assert_eq!((names.len(), quantities), (4, vec![Position, Velocity, Effort, Other, Other, Other]));
+    let Loaded { registry, .. } = valid("lan");
+    assert_eq!(registry.named("phone_pose").unwrap().form, Some(pose(PoseLayout::Columns, "world")));
+    assert_eq!(registry.named("phone").unwrap().form, None, "pictures");
 }
 
 #[test]

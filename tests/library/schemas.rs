@@ -5,9 +5,12 @@ use std::path::Path;
 /// Set, the compiled schemas are written.
 const WRITE: &str = "RAPID_WRITE_SCHEMAS";
 
-const SCHEMAS: [&str; 8] = [
+const SCHEMAS: [&str; 11] = [
     "foxglove/CompressedImage",
+    "foxglove/FrameTransform",
+    "foxglove/JointStates",
     "foxglove/Log",
+    "foxglove/PoseInFrame",
     "foxglove/RawImage",
     "rapid/Bytes",
     "rapid/Event",

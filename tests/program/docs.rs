@@ -33,7 +33,7 @@ const NOT_RUN: &[(&str, &str)] = &[
     ("README.md", "cargo build --release --locked"),
     (
         "README.md",
-        "make demo       # build, then the simulated rig: three devices; the monitor leads through an unplug",
+        "make demo       # build, then the simulated rig: the monitor leads through an unplug, and a policy through another",
     ),
     ("README.md", "rapid devices                     # what is plugged in: vendor, product, serial number, port"),
     ("docs/benchmarks.md", "make bench                                  # everything, about 30 minutes"),

@@ -274,6 +274,51 @@ fn every_message_is_the_one_that_is_recorded() {
     assert!(client.count("/rapid/observation") > 20);
 }
 
+#[test]
+fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
+    let place = Place::new();
+    let tracker = "[device.tracker]\nvid = \"1209\"\npid = \"0001\"\nserial = \"T\"\nnode = \"serial\"\nbit = 5\n\
+        [device.tracker.tty]\nbaud = 115200\nparse = \"csv\"\nchannels = 7\n[device.tracker.pose]\nlayout = \"quaternion\"\n";
+    let joints =
+        "[device.motor_state.joints]\nnames = [\"gripper\"]\nquantities = [\"effort\", \"other\", \"position\"]\n";
+    place.write("devices.toml", &[include_str!("../../devices.toml"), joints, tracker, LENIENT].concat());
+    let running = start(&place, &[]);
+    let mut client = Client::connect(&address(&running));
+    let topics = ["/rapid/serial/motor/joints", "/rapid/serial/tracker/pose", "/tf"];
+    client.read_until("derived messages", |client| topics.iter().all(|topic| client.count(topic) > 100));
+    let file = good(&place, running);
+    client.read();
+    let counts = client.compare(&place, &file);
+    assert!(topics.iter().all(|topic| counts[topic] > 50), "{counts:?}");
+    // Each sample has its own, of the same time and number, and they are its numbers.
+    let episode = Episode::read(&place.path(&file));
+    let of = |topic: &str| episode.messages.iter().filter(|message| message.topic == topic).collect::<Vec<_>>();
+    let decoded = |topic: &str, data: &[u8]| {
+        let channel = client.channels.values().find(|channel| channel.topic == topic).expect("the channel");
+        DynamicMessage::decode(channel.message.clone(), data).expect("a message of the schema")
+    };
+    let (numbers, states) = (of("/rapid/serial/motor"), of(topics[0]));
+    assert_eq!(numbers.len(), states.len());
+    for (numbers, states) in numbers.iter().zip(&states) {
+        assert_eq!((numbers.log_time, numbers.sequence), (states.log_time, states.sequence));
+        let values =
+            decoded("/rapid/serial/motor", &numbers.data).get_field_by_name("values").expect("values").into_owned();
+        let values: Vec<f64> =
+            values.as_list().expect("a list").iter().filter_map(prost_reflect::Value::as_f64).collect();
+        let joints = decoded(topics[0], &states.data).get_field_by_name("joints").expect("joints").into_owned();
+        let joint = joints.as_list().expect("a list")[0].as_message().expect("a joint").clone();
+        let of = |field: &str| joint.get_field_by_name(field).expect("a field").as_f64();
+        assert_eq!((of("effort"), of("position")), (Some(values[0]), Some(values[2])));
+        assert!(!joint.has_field_by_name("velocity"));
+    }
+    assert_eq!(of("/rapid/serial/tracker").len(), of(topics[1]).len());
+    assert_eq!(of(topics[1]).len(), of(topics[2]).len());
+    // They are no devices of their own.
+    let report = place.run(&["inspect", "--json", &file]).stdout;
+    let report: Value = serde_json::from_slice(&report).expect("JSON");
+    assert_eq!(report["modalities"].as_array().map(Vec::len), Some(4), "{report}");
+}
+
 #[cfg(feature = "policy")]
 #[test]
 fn actions_of_a_policy_are_shown_as_they_are_recorded() {

@@ -13,7 +13,7 @@ use crate::action::ACTION_TOPIC;
 use crate::mask::MASK_TOPIC;
 use crate::modality::ModalityKind;
 use crate::observation::OBSERVATION_TOPIC;
-use crate::registry::{DeviceSpec, Registry};
+use crate::registry::{DeviceSpec, Form, Quantity, Registry};
 
 /// Topics that only files have, and their readers know.
 pub(super) const FRAME_TOPIC: &str = "/rapid/frame";
@@ -26,11 +26,12 @@ const MOST_PLOTTED: u32 = 16;
 pub(super) fn layout(registry: &Registry) -> String {
     let mut panels = Panels::default();
     let of = |kind| registry.devices.iter().filter(move |device| device.modality().kind == kind);
-    let pictures: Vec<_> = of(ModalityKind::Image).map(|device| panels.picture(device)).collect();
+    let mut pictures: Vec<_> = of(ModalityKind::Image).map(|device| panels.picture(device)).collect();
+    pictures.extend(panels.scene(registry));
     let mut plots: Vec<_> = of(ModalityKind::Scalars).map(|device| panels.numbers(device)).collect();
     if let Some((_, action)) = registry.actuator() {
         let names: Vec<_> = action.names.iter().map(String::as_str).collect();
-        plots.push(panels.plot("action", ACTION_TOPIC, &names));
+        plots.push(panels.plot("action", values(ACTION_TOPIC, names.into_iter())));
     }
     let tabs = [("Live", OBSERVATION_TOPIC), ("Recorded", FRAME_TOPIC)]
         .map(|(title, topic)| json!({ "title": title, "layout": panels.presence(registry, title, topic) }));
@@ -68,19 +69,41 @@ impl Panels {
         self.add("Image", &device.name, settings)
     }
 
-    fn numbers(&mut self, device: &DeviceSpec) -> Value {
-        let count = device.modality().shape.first().copied().unwrap_or_default().min(MOST_PLOTTED);
-        let names: Vec<_> = (0..count).map(|index| index.to_string()).collect();
-        self.plot(&device.name, &device.topic, &names.iter().map(String::as_str).collect::<Vec<_>>())
+    /// The poses, if there are any.
+    fn scene(&mut self, registry: &Registry) -> Option<Value> {
+        let poses: Vec<_> = registry
+            .devices
+            .iter()
+            .filter_map(|device| match &device.form {
+                Some(form @ Form::Pose(pose)) => Some((format!("{}{}", device.topic, form.ending()), &pose.parent)),
+                _ => None,
+            })
+            .collect();
+        let (_, frame) = poses.first()?;
+        let topics: Map<_, _> = poses.iter().map(|(topic, _)| (topic.clone(), json!({ "visible": true }))).collect();
+        let settings = json!({ "foxglovePanelTitle": "poses", "followTf": frame, "topics": topics });
+        Some(self.add("3D", "poses", settings))
     }
 
-    /// `names`: of the numbers in a message of `topic`.
-    fn plot(&mut self, name: &str, topic: &str, names: &[&str]) -> Value {
-        let series = |(index, label): (usize, &&str)| {
-            let value = format!("{topic}.values[{index}]");
-            json!({ "value": value, "label": label, "enabled": true, "timestampMethod": "receiveTime" })
-        };
-        let paths: Vec<_> = names.iter().enumerate().map(series).collect();
+    fn numbers(&mut self, device: &DeviceSpec) -> Value {
+        if let Some(form @ Form::Joints(joints)) = &device.form {
+            let topic = format!("{}{}", device.topic, form.ending());
+            let quantity = joints.quantities.iter().find(|quantity| **quantity != Quantity::Other);
+            let quantity = quantity.copied().unwrap_or(Quantity::Position);
+            let most = usize::try_from(MOST_PLOTTED).unwrap_or(usize::MAX);
+            let paths = joints.names.iter().enumerate().take(most);
+            let paths = paths.map(|(index, name)| (format!("{topic}.joints[{index}].{quantity}"), name.as_str()));
+            return self.plot(&device.name, paths);
+        }
+        let count = device.modality().shape.first().copied().unwrap_or_default().min(MOST_PLOTTED);
+        let names: Vec<_> = (0..count).map(|index| index.to_string()).collect();
+        self.plot(&device.name, values(&device.topic, names.iter().map(String::as_str)))
+    }
+
+    /// `series`: the path of each, and its name.
+    fn plot<'a>(&mut self, name: &str, series: impl Iterator<Item = (String, &'a str)>) -> Value {
+        let one = |(value, label): (String, &str)| json!({ "value": value, "label": label, "enabled": true, "timestampMethod": "receiveTime" });
+        let paths: Vec<_> = series.map(one).collect();
         let settings = json!({
             "foxglovePanelTitle": name,
             "paths": paths,
@@ -104,6 +127,11 @@ impl Panels {
         let paths: Vec<_> = [mask].into_iter().chain(sensors).collect();
         self.add("StateTransitions", title, json!({ "paths": paths, "isSynced": true, "showPoints": false }))
     }
+}
+
+/// The numbers in a message of `topic`, with their names.
+fn values<'a>(topic: &'a str, names: impl Iterator<Item = &'a str>) -> impl Iterator<Item = (String, &'a str)> {
+    names.enumerate().map(move |(index, name)| (format!("{topic}.values[{index}]"), name))
 }
 
 /// Panels of equal size, split in `direction` and then in the other; `None` without any.

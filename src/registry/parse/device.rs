@@ -9,13 +9,14 @@ use std::time::Duration;
 use super::identity::name_problem;
 use super::program::{self, For, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{identity, lan, motors, node, verdict};
+use super::{form, identity, lan, motors, node, verdict};
 use crate::action::MAX_ACTION;
 use crate::modality::{ModalityId, ModalityKind};
 use crate::registry::section::Section;
 use crate::registry::spec::VerdictSpec;
 use crate::registry::spec::{
-    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens, WhenStale,
+    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens,
+    WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -26,7 +27,7 @@ const PROCESS: &str = "process";
 /// Keys that state which device an entry identifies.
 pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
 const KEYS: [&str; 9] = ["node", "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
-const TABLES: [&str; 7] = ["camera", "tty", "can", "lan", "process", "verdict", "action"];
+const TABLES: [&str; 9] = ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints"];
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -64,6 +65,7 @@ pub(super) struct Draft<'a> {
     when_stale: WhenStale,
     latency: Duration,
     verdict: VerdictTable,
+    pub(super) form: Option<Form>,
     pub(super) action: Option<ActionSpec>,
     hooks: Hooks,
 }
@@ -91,6 +93,7 @@ impl<'d> Draft<'d> {
             depth: usize::try_from(self.depth).ok()?,
             when_stale: self.when_stale,
             latency: self.latency,
+            form: self.form,
             action: self.action,
             hooks: self.hooks,
         };
@@ -99,12 +102,7 @@ impl<'d> Draft<'d> {
 
     /// How many numbers a sample holds, 0 if it holds none; `None` if a problem with the node was reported.
     pub(super) fn numbers(&self) -> Option<usize> {
-        let node = self.node.as_ref()?;
-        let count = match node.modality_kind() {
-            ModalityKind::Scalars => node.shape().first().copied().unwrap_or(0),
-            ModalityKind::Image | ModalityKind::Bytes => 0,
-        };
-        usize::try_from(count).ok()
+        numbers_of(self.node.as_ref()?)
     }
 
     /// Which node of the unit the entry opens.
@@ -129,6 +127,15 @@ impl<'d> Draft<'d> {
             _ => None,
         }
     }
+}
+
+/// How many numbers a sample holds, 0 if it holds none.
+fn numbers_of(node: &NodeSpec) -> Option<usize> {
+    let count = match node.modality_kind() {
+        ModalityKind::Scalars => node.shape().first().copied().unwrap_or(0),
+        ModalityKind::Image | ModalityKind::Bytes => 0,
+    };
+    usize::try_from(count).ok()
 }
 
 /// Reads one entry.
@@ -194,6 +201,7 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>)
         when_stale,
         latency,
         verdict: verdict::read(&section, Whose::Device),
+        form: form::form(&section, settings.as_ref(), settings.as_ref().and_then(numbers_of)),
         action,
         hooks: program::hooks(&section, attach_is_node(&section), programs),
         node: settings,

@@ -42,6 +42,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         depth: 16,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        form: None,
         action: None,
         hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(

@@ -1,0 +1,122 @@
+//! Messages derived from the numbers of a device whose [`Form`] is known, which viewers draw: poses, transforms and the
+//! states of joints. They are recorded beside the numbers, and carry their capture time and sequence number.
+//!
+//! Invariant: nothing here is read again by `rapid`: the numbers are what was measured.
+//! Invariant: numbers that are no pose (not finite, or without a rotation) give no message.
+
+use super::encode::{self, Joint, Pose};
+use super::schema::{self, Schema};
+use crate::registry::{DeviceSpec, Form, JointsSpec, PoseLayout, PoseSpec, Quantity};
+
+/// The topic of all transforms.
+pub const TRANSFORM_TOPIC: &str = "/tf";
+
+/// A kind of derived message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Derived {
+    /// `foxglove.PoseInFrame`.
+    Pose,
+    /// `foxglove.FrameTransform`.
+    Transform,
+    /// `foxglove.JointStates`.
+    Joints,
+}
+
+impl Derived {
+    /// Those of a device.
+    pub const fn of(device: &DeviceSpec) -> &'static [Self] {
+        match device.form {
+            Some(Form::Pose(_)) => &[Self::Pose, Self::Transform],
+            Some(Form::Joints(_)) => &[Self::Joints],
+            None => &[],
+        }
+    }
+
+    /// Its topic.
+    pub fn topic(self, device: &DeviceSpec) -> String {
+        let ending = device.form.as_ref().map_or("", Form::ending);
+        match self {
+            Self::Transform => TRANSFORM_TOPIC.to_owned(),
+            Self::Pose | Self::Joints => format!("{}{ending}", device.topic),
+        }
+    }
+
+    /// Its schema.
+    pub const fn schema(self) -> Schema {
+        match self {
+            Self::Pose => schema::POSE,
+            Self::Transform => schema::TRANSFORM,
+            Self::Joints => schema::JOINTS,
+        }
+    }
+
+    /// Writes the message of the sample with these numbers (little-endian 64-bit floats), captured at `wall_ns`. False if
+    /// they give none.
+    pub fn encode(self, out: &mut Vec<u8>, wall_ns: u64, name: &str, form: &Form, payload: &[u8]) -> bool {
+        if payload.len() != 8 * form.numbers() {
+            return false;
+        }
+        match form {
+            Form::Pose(spec) => {
+                let Some(pose) = pose(spec, payload) else { return false };
+                match self {
+                    Self::Pose => encode::pose(out, wall_ns, &spec.parent, &pose),
+                    Self::Transform => encode::transform(out, wall_ns, [&spec.parent, name], &pose),
+                    Self::Joints => return false,
+                }
+            }
+            Form::Joints(spec) => encode::joints(out, wall_ns, joints(spec, payload)),
+        }
+        true
+    }
+}
+
+fn number(payload: &[u8], index: usize) -> Option<f64> {
+    let bytes = payload.get(index * 8..index * 8 + 8)?;
+    Some(f64::from_le_bytes(bytes.try_into().ok()?))
+}
+
+fn pose(spec: &PoseSpec, payload: &[u8]) -> Option<Pose> {
+    let at = |index| number(payload, index).filter(|number| number.is_finite());
+    let (position, rotation) = match spec.layout {
+        PoseLayout::Quaternion => ([at(0)?, at(1)?, at(2)?], [at(3)?, at(4)?, at(5)?, at(6)?]),
+        PoseLayout::Columns => matrix(|row, column| at(column * 4 + row))?,
+        PoseLayout::Rows => matrix(|row, column| at(row * 4 + column))?,
+    };
+    let length = rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
+    let is_rotation = length.is_finite() && length > 0.0;
+    is_rotation.then(|| Pose { position, rotation: rotation.map(|part| part / length) })
+}
+
+/// Position and quaternion `x y z w` of a homogeneous matrix. The largest of the four parts is found first, because the
+/// others are divided by it (Shepperd, 1978).
+fn matrix(at: impl Fn(usize, usize) -> Option<f64>) -> Option<([f64; 3], [f64; 4])> {
+    let [xx, yy, zz] = [at(0, 0)?, at(1, 1)?, at(2, 2)?];
+    let [xy, yx] = [at(0, 1)?, at(1, 0)?];
+    let [xz, zx] = [at(0, 2)?, at(2, 0)?];
+    let [yz, zy] = [at(1, 2)?, at(2, 1)?];
+    let trace = xx + yy + zz;
+    let rotation = if trace >= xx && trace >= yy && trace >= zz {
+        [zy - yz, xz - zx, yx - xy, 1.0 + trace]
+    } else if xx >= yy && xx >= zz {
+        [1.0 + xx - yy - zz, yx + xy, xz + zx, zy - yz]
+    } else if yy >= zz {
+        [yx + xy, 1.0 - xx + yy - zz, zy + yz, xz - zx]
+    } else {
+        [xz + zx, zy + yz, 1.0 - xx - yy + zz, yx - xy]
+    };
+    Some(([at(0, 3)?, at(1, 3)?, at(2, 3)?], rotation))
+}
+
+fn joints<'a>(spec: &'a JointsSpec, payload: &'a [u8]) -> impl Iterator<Item = Joint<'a>> {
+    spec.names.iter().enumerate().map(move |(joint, name)| {
+        let of = |wanted: Quantity| {
+            let place = spec.quantities.iter().position(|quantity| *quantity == wanted)?;
+            number(payload, joint * spec.quantities.len() + place)
+        };
+        Joint { name, position: of(Quantity::Position), velocity: of(Quantity::Velocity), effort: of(Quantity::Effort) }
+    })
+}
+
+#[cfg(test)]
+mod tests;

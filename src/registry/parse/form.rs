@@ -1,0 +1,128 @@
+//! `[device.NAME.pose]` and `[device.NAME.joints]`, and the forms that follow from the device itself.
+
+use crate::registry::section::Section;
+use crate::registry::spec::{
+    CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PoseLayout, PoseSpec, Quantity,
+};
+
+const POSE: &str = "pose";
+const JOINTS: &str = "joints";
+const WORLD: &str = "world";
+/// Of a motor: `control::motors::SAMPLE_VALUES`.
+const OF_A_MOTOR: [Quantity; 6] =
+    [Quantity::Position, Quantity::Velocity, Quantity::Effort, Quantity::Other, Quantity::Other, Quantity::Other];
+
+/// The form of the numbers of `node`, of which a sample has `count`; `None` if they have none, or if a problem was
+/// reported.
+pub(super) fn form(section: &Section<'_>, node: Option<&NodeSpec>, count: Option<usize>) -> Option<Form> {
+    if let Some(node) = node
+        && let Some(own) = of_node(node)
+    {
+        refuse_tables(section, &own);
+        return Some(match (own, section.table(POSE)) {
+            (Form::Pose(own), Some(table)) => Form::Pose(PoseSpec { parent: parent(&table, &["parent"]), ..own }),
+            (own, _) => own,
+        });
+    }
+    let (form, key) = match (section.table(POSE), section.table(JOINTS)) {
+        (Some(_), Some(_)) => {
+            let message = "its numbers are a pose or the states of joints, not both".to_owned();
+            return section.refuse(JOINTS, message, "remove one of the two tables");
+        }
+        (Some(table), None) => (Form::Pose(pose(&table)?), POSE),
+        (None, Some(table)) => (Form::Joints(joints(&table)?), JOINTS),
+        (None, None) => return None,
+    };
+    // The number of numbers is wrong too, if the node is.
+    let count = count?;
+    if count == form.numbers() {
+        return Some(form);
+    }
+    if count == 0 {
+        return section.refuse(key, "its samples are no numbers".to_owned(), "remove the table");
+    }
+    let message = format!("{} numbers for a sample of {count}", form.numbers());
+    let fix = match &form {
+        Form::Pose(_) => "columns and rows have 16 numbers, a quaternion with its position 7: write as many `channels`",
+        Form::Joints(_) => "a sample has each of `quantities` for each of `names`: write as many `channels`",
+    };
+    section.refuse(key, message, fix)
+}
+
+/// What a device of known contents sends.
+fn of_node(node: &NodeSpec) -> Option<Form> {
+    match node {
+        NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. }) => Some(Form::Joints(JointsSpec {
+            names: damiao.motors.iter().map(|motor| motor.name.clone()).collect(),
+            quantities: OF_A_MOTOR.to_vec(),
+        })),
+        NodeSpec::Lan(LanSpec { protocol: LanProtocol::Iphone { stream: PhoneStream::Pose, .. }, .. }) => {
+            Some(Form::Pose(PoseSpec { layout: PoseLayout::Columns, parent: WORLD.to_owned() }))
+        }
+        _ => None,
+    }
+}
+
+/// Reports the tables that a device of known contents does not take.
+fn refuse_tables(section: &Section<'_>, own: &Form) {
+    let (tables, what): (&[&str], _) = match own {
+        Form::Pose(_) => (&[JOINTS], "sends the pose of its camera"),
+        Form::Joints(_) => (&[POSE, JOINTS], "sends the states of its motors, with their names"),
+    };
+    for table in tables.iter().filter(|table| section.has(table)) {
+        section.report(table, format!("the device {what}"), "remove the table");
+    }
+}
+
+fn parent(table: &Section<'_>, keys: &[&str]) -> String {
+    table.allow(keys);
+    match table.text("parent") {
+        Some("") => {
+            table.report("parent", "the frame has no name", "write parent = \"world\", or remove the key");
+            String::new()
+        }
+        parent => parent.unwrap_or(WORLD).to_owned(),
+    }
+}
+
+fn pose(table: &Section<'_>) -> Option<PoseSpec> {
+    let parent = parent(table, &["layout", "parent"]);
+    table.need("layout", "write layout = \"quaternion\", \"columns\" or \"rows\"");
+    Some(PoseSpec { layout: table.choice("layout", &PoseLayout::WORDS)?, parent })
+}
+
+fn joints(table: &Section<'_>) -> Option<JointsSpec> {
+    table.allow(&["names", "quantities"]);
+    table.need("names", "write names = [\"shoulder\", \"elbow\"], as in the robot's description");
+    let names = table.texts("names");
+    let quantities = if table.has("quantities") { quantities(table) } else { Some(vec![Quantity::Position]) };
+    let (names, quantities) = (names?, quantities?);
+    let twice = names.iter().enumerate().find(|(at, name)| names.iter().take(*at).any(|earlier| earlier == *name));
+    if names.is_empty() || names.iter().any(String::is_empty) {
+        return table.refuse("names", "a joint without a name".to_owned(), "name every joint");
+    }
+    if let Some((_, name)) = twice {
+        return table.refuse("names", format!("joint {name:?} is in the list twice"), "name it once");
+    }
+    Some(JointsSpec { names, quantities })
+}
+
+fn quantities(table: &Section<'_>) -> Option<Vec<Quantity>> {
+    const KEY: &str = "quantities";
+    const FIX: &str =
+        "write each of \"position\", \"velocity\" and \"effort\" at most once, and \"other\" for the rest";
+    let mut found = Vec::new();
+    for word in table.texts(KEY)? {
+        let Some((_, quantity)) = Quantity::WORDS.iter().find(|(known, _)| *known == word) else {
+            return table.refuse(KEY, format!("unknown quantity {word:?}"), FIX);
+        };
+        if *quantity != Quantity::Other && found.contains(quantity) {
+            return table.refuse(KEY, format!("{word:?} is in the list twice"), FIX);
+        }
+        found.push(*quantity);
+    }
+    if found.iter().all(|quantity| *quantity == Quantity::Other) {
+        return table.refuse(KEY, "none of them is a state of a joint".to_owned(), FIX);
+    }
+    Some(found)
+}

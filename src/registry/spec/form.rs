@@ -1,0 +1,82 @@
+//! What the numbers of a device mean, where viewers know messages for that: `[device.NAME.pose]` and `[device.NAME.joints]`.
+//!
+//! The numbers are recorded as they are; messages of these forms are derived from them (`episode::form`).
+
+/// See the module's comment.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Form {
+    /// The pose of a frame that has the name of the entry.
+    Pose(PoseSpec),
+    /// The states of joints.
+    Joints(JointsSpec),
+}
+
+/// How a pose is given.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PoseSpec {
+    /// The order of its numbers.
+    pub layout: PoseLayout,
+    /// The frame in which it is given, default `world`.
+    pub parent: String,
+}
+
+/// The numbers of a pose. Positions are in m.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PoseLayout {
+    /// A homogeneous matrix of 4 by 4, column by column.
+    Columns,
+    /// The same, row by row.
+    Rows,
+    /// Position, then the quaternion `x y z w`.
+    Quaternion,
+}
+
+impl PoseLayout {
+    /// How many numbers it has.
+    pub const fn numbers(self) -> usize {
+        match self {
+            Self::Columns | Self::Rows => 16,
+            Self::Quaternion => 7,
+        }
+    }
+}
+
+/// The numbers of joints: those of the first, those of the second and so on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct JointsSpec {
+    /// Their names, as in the robot's description; at least one, none twice.
+    pub names: Vec<String>,
+    /// What the numbers of each are, in order; none but [`Quantity::Other`] twice.
+    pub quantities: Vec<Quantity>,
+}
+
+/// What a number of a joint is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quantity {
+    /// rad, or m.
+    Position,
+    /// rad/s, or m/s.
+    Velocity,
+    /// Nm, or N.
+    Effort,
+    /// Something that the message does not have.
+    Other,
+}
+
+impl Form {
+    /// How many numbers a sample has.
+    pub fn numbers(&self) -> usize {
+        match self {
+            Self::Pose(pose) => pose.layout.numbers(),
+            Self::Joints(joints) => joints.names.len().saturating_mul(joints.quantities.len()),
+        }
+    }
+
+    /// The end of the topic with its messages, after the topic of the device.
+    pub const fn ending(&self) -> &'static str {
+        match self {
+            Self::Pose(_) => "/pose",
+            Self::Joints(_) => "/joints",
+        }
+    }
+}
