@@ -609,6 +609,7 @@ failures! {
     commands::plot::PlotError: |error| match error {
         commands::plot::PlotError::Episode(error) => read_code(error),
         commands::plot::PlotError::Foreign(_)
+        | commands::plot::PlotError::NoFolder(_)
         | commands::plot::PlotError::Several { .. }
         | commands::plot::PlotError::Twice { .. } => 2,
         _ => 1,

@@ -17,7 +17,7 @@ use super::requests::Reply;
 use super::stage::join;
 use crate::record::inspect::{self, Judgement, Listed};
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
-use crate::session::journal::{Journal, Plan};
+use crate::session::journal::{self, Journal, Plan, SessionFile};
 use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
 use crate::session::{Answer, Effect, Session};
 use crate::status::session::{Answered, Phase, SessionRequest, SessionStatus};
@@ -78,6 +78,10 @@ pub(super) struct Collection {
     /// When the session began whose file is there but which is not continued. It is archived before this session's is
     /// written: a run that records nothing changes nothing.
     superseded: Option<String>,
+    /// Names of the episodes of earlier sessions: none is given again.
+    taken: Vec<String>,
+    /// The plan of this run has a goal.
+    has_goal: bool,
     /// The end that was handled last: a reader that missed events may see it again.
     handled: Option<EpisodeEnd>,
 }
@@ -99,6 +103,8 @@ impl Collection {
             tracing::warn!(%error, "an earlier session is not continued");
         }
         let earlier = before.as_ref().map(|before| before.begun.clone());
+        let has_goal = plan.goal.is_some();
+        let taken = journal::sessions(&episode.out).0.into_iter().flat_map(SessionFile::into_names).collect();
         let (session, is_new) = Session::new(&episode.out, plan, before, rfc3339(realtime_ns()));
         let (keeper, outcomes) = Keeper::start(&episode.out, journal)?;
         let collection = Self {
@@ -114,10 +120,17 @@ impl Collection {
             answer: None,
             is_kept,
             superseded: earlier.filter(|_| is_new),
+            taken,
+            has_goal,
             handled: None,
         };
         collection.show();
         Ok(collection)
+    }
+
+    /// What this run was to collect was collected before.
+    pub(super) fn was_complete(&self) -> bool {
+        self.has_goal && self.is_complete()
     }
 
     /// What is collected is complete.
@@ -167,9 +180,7 @@ impl Collection {
             Ok((answer, effects)) => {
                 let pending = match answer {
                     Answer::Now(text) => {
-                        // The episode has a mark, whatever becomes of the session's file.
-                        let is_done = matches!(request, SessionRequest::Mark { .. });
-                        Some(Pending { text, is_done, is_shown, to: reply.into_iter().collect() })
+                        Some(Pending { text, is_done: false, is_shown, to: reply.into_iter().collect() })
                     }
                     Answer::AtBegin => {
                         self.at_begin.extend(reply);
@@ -254,11 +265,15 @@ impl Collection {
                 self.submit(None);
                 let why = format!("{file} was not moved: {why}");
                 // A redo that still counts down.
-                reply_all(std::mem::take(&mut self.at_begin), &Err(why.clone()));
+                let answer = Err(format!("{why}; the next episode begins nevertheless"));
+                reply_all(std::mem::take(&mut self.at_begin), &answer);
                 self.fail(why);
             }
             Outcome::Failed(why) => self.fail(why),
             Outcome::Closed(closed) => {
+                if closed.is_ok() {
+                    self.taken.extend(self.session.names().cloned());
+                }
                 self.session.closed(closed.is_ok(), rfc3339(realtime_ns()));
                 if let Err(why) = closed {
                     self.fail(why);
@@ -346,7 +361,7 @@ impl Collection {
         let request = EpisodeRequest {
             task: plan.task.clone(),
             tags: plan.tags.iter().map(|(key, value)| (key.clone(), value.clone())).collect(),
-            taken: self.session.file().episodes.iter().map(|entry| entry.file.clone()).collect(),
+            taken: self.taken.iter().chain(self.session.names()).cloned().collect(),
             ..self.episode.clone()
         };
         let started = self.recorder.start(request).await;
@@ -359,9 +374,7 @@ impl Collection {
         match &started {
             Ok(file) => {
                 let text = format!("recording {}", file.display());
-                // A redo is not done while the episode that it replaces is still among the kept ones.
-                let is_done = !self.operations.iter().any(|operation| matches!(operation, Operation::Discard(_)));
-                self.submit(Some(Pending { text, is_done, is_shown: false, to }));
+                self.submit(Some(Pending { text, is_done: true, is_shown: false, to }));
             }
             Err(error) => {
                 reply_all(to, &Err(error.to_string()));

@@ -111,7 +111,9 @@ impl Conductor {
                 _ = look.tick(), if self.begin_episode => {
                     if self.has_settled(begun) {
                         self.begin_episode = false;
-                        self.collection.start().await?;
+                        if self.begin_first(running.kind).await? {
+                            return output;
+                        }
                     }
                 }
                 outcome = self.collection.outcome() => self.collection.take(outcome),
@@ -128,6 +130,18 @@ impl Conductor {
                 }
             }
         }
+    }
+
+    /// Begins the episode that the command line asked for. True if there is nothing to record: the session has what `--goal`
+    /// wants, and no one is there to change it.
+    async fn begin_first(&mut self, screen: Screen) -> Result<bool, AppError> {
+        if !self.collection.was_complete() {
+            self.collection.start().await?;
+            return Ok(false);
+        }
+        let text = "the session in this folder has as many episodes as --goal wants: none begins by itself".to_owned();
+        self.board.announce(What::Log { level: Level::Warn, text });
+        Ok(screen != Screen::Monitor)
     }
 
     async fn carry_out(&mut self, request: Request, screen: Screen) -> Result<ControlFlow<()>, AppError> {

@@ -99,7 +99,7 @@ fn name(bit: u8, layout: Option<&Layout>) -> String {
 fn freshness(record: &MaskRecord, now_ns: u64, palette: Palette) -> String {
     let age = age(record, now_ns);
     if age > STALE_AFTER {
-        return palette.bad(&format!("stale: published {} ago, the publisher is gone", text::age(age)));
+        return palette.bad(&format!("stale: published {} ago, the publisher is stopped or gone", text::age(age)));
     }
     palette.faint(&format!("{} old", text::age(age)))
 }

@@ -46,6 +46,11 @@ pub enum MonitorError {
         /// What is wrong.
         error: LinkError,
     },
+    /// The run is stopped.
+    #[error(
+        "process {0} is stopped (by ctrl-z, or `kill -STOP`): `kill -CONT {0}`, or `fg` in its terminal, continues it"
+    )]
+    Stopped(u32),
     /// No terminal, or it is gone.
     #[error(transparent)]
     Screen(#[from] TuiError),
@@ -116,7 +121,10 @@ impl Connection {
         let limits = stream.set_read_timeout(Some(SILENT)).and_then(|()| stream.set_write_timeout(Some(WRITE_LIMIT)));
         let reader = limits.and_then(|()| stream.try_clone()).map_err(|error| of(error.into()))?;
         let mut connection = Self { process, stream, decoder: Decoder::default(), reader: BufReader::new(reader) };
-        let first = connection.read().map_err(of)?;
+        let first = connection.read().map_err(|error| match ProcessState::of(process) {
+            ProcessState::Stopped => MonitorError::Stopped(process),
+            ProcessState::Alive | ProcessState::Ended => of(error),
+        })?;
         Ok((connection, first))
     }
 

@@ -37,6 +37,9 @@ pub enum PlotError {
         /// The name.
         to: PathBuf,
     },
+    /// The name of a folder that does not exist.
+    #[error("{}: no such folder: make it, or leave the `/` out to name a picture", .0.display())]
+    NoFolder(PathBuf),
     /// Episodes of one name, and one folder for their pictures.
     #[error(
         "{} and {} would both be drawn to {}: name a folder for each of their folders, or leave the name out",
@@ -105,6 +108,9 @@ pub fn plot(
         None => Place::Beside,
         Some(to) if to.as_os_str() == "-" => Place::Stdout,
         Some(to) if to.is_dir() => Place::In(to),
+        Some(to) if to.as_os_str().as_encoded_bytes().ends_with(b"/") => {
+            return Err(PlotError::NoFolder(to.to_owned()));
+        }
         Some(to) => Place::Named(to),
     };
     if let (Place::Named(_) | Place::Stdout, Some(to), 2..) = (&place, to, files.len()) {

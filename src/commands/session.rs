@@ -72,7 +72,7 @@ fn show(session: &SessionStatus, out: &mut dyn Write) -> io::Result<()> {
     let folder = session.folder.display().to_string();
     writeln!(
         out,
-        "{} in {}: {good} GOOD, {suspect} SUSPECT, {bad} BAD{trash}; {phase}",
+        "counted {}, in {}: {good} GOOD, {suspect} SUSPECT, {bad} BAD{trash}; {phase}",
         session.progress(),
         text::plain(&folder)
     )?;

@@ -53,8 +53,8 @@ pub enum GiveError {
     },
     /// The run does not answer.
     #[error(
-        "process {process} does not answer ({}): its motors may still move, so cut their power, or end it with `kill \
-         -9 {process}`, after which its guard stops them", unanswered(.error)
+        "process {process} {}: if it has motors they may still move, so cut their power, or end it with `kill -9 \
+         {process}`, after which its guard stops them", standstill(*.process, .error)
     )]
     NoAnswer {
         /// Its process.
@@ -79,6 +79,14 @@ pub enum GiveError {
     /// The running instances cannot be determined.
     #[error("{SOCKETS}: {0}")]
     Sockets(#[from] io::Error),
+}
+
+fn standstill(process: u32, error: &io::Error) -> String {
+    if ProcessState::of(process) == ProcessState::Stopped {
+        format!("is stopped (`kill -CONT {process}` continues it) and does not answer")
+    } else {
+        format!("does not answer ({})", unanswered(error))
+    }
 }
 
 fn no_run(instance: Option<&str>, others: &[Other]) -> String {
@@ -217,7 +225,13 @@ impl Run {
         let failed = |error| GiveError::Unanswered { process, error };
         let line = format!("{}\n", serde_json::to_string(request).map_err(|error| failed(error.into()))?);
         if line.len() > LONGEST {
-            return Ok(Answer { ok: false, text: format!("a request of {} bytes, of at most {LONGEST}", line.len()) });
+            return Ok(Answer {
+                ok: false,
+                text: format!(
+                    "the text is too long: {} bytes with the rest of the request, of at most {LONGEST}",
+                    line.len()
+                ),
+            });
         }
         self.stream.write_all(line.as_bytes()).map_err(failed)?;
         let mut from = BufReader::new(self.stream.take(LONGEST_ANSWER));

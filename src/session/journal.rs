@@ -61,9 +61,19 @@ pub struct SessionFile {
     /// What was to be collected.
     #[serde(default)]
     pub plan: Plan,
+    /// Names of the episodes that were deleted at its end: they are not given again.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub deleted: Vec<String>,
     /// The episodes, in the order in which they were recorded.
     #[serde(default, rename = "episode")]
     pub episodes: Vec<EpisodeEntry>,
+}
+
+impl SessionFile {
+    /// The names of all its episodes.
+    pub fn into_names(self) -> impl Iterator<Item = String> {
+        self.episodes.into_iter().map(|entry| entry.file).chain(self.deleted)
+    }
 }
 
 /// Why a session cannot be read or written.
@@ -328,7 +338,7 @@ mod tests {
             countdown: Some(Duration::from_millis(2500)),
             tags: [("finger".to_owned(), "soft".to_owned())].into(),
         };
-        SessionFile { begun: "2026-11-24T14:02:00.000Z".to_owned(), ended: None, plan, episodes }
+        SessionFile { begun: "2026-11-24T14:02:00.000Z".to_owned(), plan, episodes, ..SessionFile::default() }
     }
 
     fn names(folder: &Path) -> Vec<String> {

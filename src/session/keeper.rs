@@ -38,7 +38,7 @@ pub enum Operation {
 pub struct Pending {
     /// What was done.
     pub text: String,
-    /// It was done, whatever becomes of the operations: an episode has begun, say.
+    /// It was done, also if an episode cannot be moved: another has begun, say.
     pub is_done: bool,
     /// It is shown on screens too.
     pub is_shown: bool,
@@ -117,16 +117,20 @@ struct Desk {
 impl Desk {
     fn run(mut self, inbox: &mpsc::Receiver<Work>) {
         while let Ok(Work { operations, answer }) = inbox.recv() {
-            let mut failed = None;
+            let (mut failed, mut unsaved) = (None, None);
             for operation in operations {
-                let outcome = self.carry_out(operation);
-                failed = failed.or(outcome.err());
+                let is_note = matches!(operation, Operation::Save(_) | Operation::Archive(_));
+                let outcome = self.carry_out(operation).err();
+                let place = if is_note { &mut unsaved } else { &mut failed };
+                *place = place.take().or(outcome);
             }
             let Some(Pending { text, is_done, is_shown, to }) = answer else { continue };
-            let answer = match failed {
-                None => Ok(text),
-                Some(why) if is_done => Ok(format!("{text}; {why}")),
-                Some(why) => Err(why),
+            let answer = match (failed, unsaved) {
+                (None, None) => Ok(text),
+                // It is in effect, and noted as soon as the journal can be written: who repeats it does it twice.
+                (None, Some(why)) => Ok(format!("{text}; {why}")),
+                (Some(why), _) if is_done => Err(format!("{why}; {text}")),
+                (Some(why), _) => Err(why),
             };
             for program in to {
                 // It may have ended.
@@ -171,7 +175,7 @@ impl Desk {
     }
 
     fn moved(&self, file: String, moved: io::Result<()>, done: fn(String) -> Outcome) -> Result<(), String> {
-        let why = moved.map_err(|error| error.to_string());
+        let why = moved.map_err(|error| reason(&error));
         let failed = why.clone().map_err(|why| format!("{file} was not moved: {why}"));
         self.report(match why {
             Ok(()) => done(file),
@@ -187,12 +191,26 @@ impl Desk {
         closed?;
         let emptied = trash::empty(&self.folder, gone.iter().map(String::as_str));
         let why = |error| {
-            format!(
-                "the session is ended, but its trash is not deleted: {}: {error}",
-                self.folder.join(TRASH).display()
-            )
+            let trash = self.folder.join(TRASH);
+            format!("the session is ended, but its trash is not deleted: {}; remove it by hand", at(&trash, &error))
         };
         emptied.map_err(why).inspect_err(|why| self.report(Outcome::Failed(why.clone())))
+    }
+}
+
+/// The error with its path, which some have already.
+fn at(path: &Path, error: &io::Error) -> String {
+    let (path, text) = (path.display().to_string(), error.to_string());
+    if text.starts_with(&path) { text } else { format!("{path}: {text}") }
+}
+
+/// Why an episode was not moved, in the words of what is moved.
+fn reason(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::NotFound => "it is not there any more".to_owned(),
+        io::ErrorKind::AlreadyExists => "another file of its name is there".to_owned(),
+        io::ErrorKind::CrossesDevices => format!("{TRASH} is on another disk"),
+        _ => error.to_string(),
     }
 }
 
@@ -273,14 +291,18 @@ mod tests {
         // The disk does not accept anything any more.
         std::fs::remove_dir_all(&folder).unwrap();
         std::fs::write(&folder, "").unwrap();
+        // What is only not noted is in effect.
+        for is_done in [false, true] {
+            let answered = answer(&keeper, saved("two"), is_done).unwrap();
+            assert!(answered.starts_with("done; the session is not saved: "), "{answered}");
+        }
         for operations in [
-            saved("two"),
             vec![Operation::Discard("a.mcap".to_owned()), Operation::Archive("t".to_owned())],
             vec![Operation::Close(session("two"), Vec::new())],
         ] {
             let why = answer(&keeper, operations.clone(), false).unwrap_err();
             assert!(why.contains("not"), "{why}");
-            assert_eq!(answer(&keeper, operations, true), Ok(format!("done; {why}")));
+            assert_eq!(answer(&keeper, operations, true), Err(format!("{why}; done")));
         }
         drop(keeper);
         let mut all = Vec::new();

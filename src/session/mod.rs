@@ -137,7 +137,7 @@ impl Session {
         let begun = continued.as_ref().map_or(begun, |before| before.begun.clone());
         let goal = plan.goal.or_else(|| continued?.plan.goal);
         let discarded = (0..episodes.len()).filter(|index| episodes.get(*index).is_some_and(|e| e.discarded)).collect();
-        let file = SessionFile { begun, ended: None, plan: Plan { goal, ..plan }, episodes };
+        let file = SessionFile { begun, plan: Plan { goal, ..plan }, episodes, ..SessionFile::default() };
         let session = Self {
             folder: folder.to_owned(),
             file,
@@ -153,6 +153,11 @@ impl Session {
     /// What is to be saved.
     pub fn file(&self) -> &SessionFile {
         &self.file
+    }
+
+    /// The names of all its episodes, discarded or not.
+    pub fn names(&self) -> impl Iterator<Item = &String> {
+        self.file.episodes.iter().map(|entry| &entry.file)
     }
 
     /// What the next episode is of.
@@ -298,7 +303,7 @@ impl Session {
     pub fn closed(&mut self, is_closed: bool, now: String) {
         self.closing = false;
         if is_closed {
-            self.file = SessionFile { begun: now, ended: None, plan: self.file.plan.clone(), episodes: Vec::new() };
+            self.file = SessionFile { begun: now, plan: self.file.plan.clone(), ..SessionFile::default() };
             self.discarded.clear();
         }
     }
@@ -535,8 +540,9 @@ impl Session {
 
     /// What is saved of a session that ends at `ended`: without what is deleted.
     pub fn at_end(&self, ended: String) -> SessionFile {
-        let episodes = self.file.episodes.iter().filter(|entry| !entry.discarded).cloned().collect();
-        SessionFile { ended: Some(ended), episodes, ..self.file.clone() }
+        let (gone, episodes): (Vec<_>, Vec<_>) = self.file.episodes.iter().cloned().partition(|entry| entry.discarded);
+        let deleted = gone.into_iter().map(|entry| entry.file).collect();
+        SessionFile { ended: Some(ended), episodes, deleted, ..self.file.clone() }
     }
 }
 

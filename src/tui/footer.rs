@@ -7,7 +7,6 @@ use ratatui::text::{Line, Span};
 use super::keys;
 use super::model::{Model, Quit};
 use super::theme::Theme;
-use super::tour::Tour;
 use crate::text;
 
 /// Columns that a question leaves for its answer.
@@ -31,9 +30,13 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
             let message = text::cut(&message, usize::from(area.width).saturating_sub(2), theme.ellipsis()).into_owned();
             Line::styled(format!(" {message}"), theme.warning())
         }
-        None => match model.tour.and_then(Tour::text) {
+        None => match model
+            .tour
+            .and_then(|tour| tour.text(model.latest(), model.selected_device().map(|device| &*device.name)))
+        {
             Some(step) => {
-                let step = text::cut(step, usize::from(area.width).saturating_sub(2), theme.ellipsis()).into_owned();
+                let step = text::cut(&theme.safe(&step), usize::from(area.width).saturating_sub(2), theme.ellipsis())
+                    .into_owned();
                 Line::styled(format!(" {step}"), theme.title())
             }
             None => keys(usize::from(area.width), model, theme),

@@ -97,7 +97,7 @@ pub(super) enum Act {
 
 impl Act {
     /// Whether it does something about episodes, devices or motion, and not only about the screen.
-    const fn is_about_the_rig(self) -> bool {
+    pub(super) const fn is_about_the_rig(self) -> bool {
         matches!(
             self,
             Self::Toggle

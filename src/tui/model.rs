@@ -61,6 +61,9 @@ pub enum Msg {
     Failed(String),
 }
 
+/// Shown instead of a request by a screen that makes none.
+const READ_ONLY: &str = "read-only: `rapid monitor` without --read-only controls the run";
+
 /// A request of the model to the rest of the program.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Effect {
@@ -402,7 +405,7 @@ impl Model {
             LinkState::Attached { read_only: true, .. } if is_request => {
                 // Esc also closes dialogs.
                 if effect != Effect::Order(Order::Disarm) {
-                    self.notify("read-only: `rapid monitor` without --read-only controls the run");
+                    self.notify(READ_ONLY);
                 }
                 Effect::None
             }
@@ -420,6 +423,11 @@ impl Model {
 
     fn act(&mut self, act: Act) -> Effect {
         let session = |request| Effect::Send(Command::Session(request));
+        if self.is_read_only() && act.is_about_the_rig() {
+            // Before anything is asked.
+            self.notify(READ_ONLY);
+            return Effect::None;
+        }
         match act {
             Act::Toggle => return self.toggle_recording(),
             Act::Next => return self.once(SessionRequest::Next),
@@ -465,13 +473,13 @@ impl Model {
         Effect::None
     }
 
-    /// Opens a page, or returns from it to the rig.
     /// The episode that is marked on the page of episodes; `None` on any other page, where keys are about the newest.
     pub(super) fn marked_episode(&self) -> Option<String> {
         let session = self.latest.session.as_ref().filter(|_| self.page == Page::Episodes)?;
         session.episodes.iter().rev().nth(self.episode).map(|entry| entry.file.clone())
     }
 
+    /// Opens a page, or returns from it to the rig.
     fn turn_to(&mut self, page: Page) {
         self.page = if self.page == page { Page::Rig } else { page };
         self.looked = None;
@@ -806,14 +814,20 @@ impl Model {
 
     /// Disarms, and closes any open dialog, as Esc usually does.
     fn disarm(&mut self, is_escape: bool) -> Effect {
-        (self.help, self.prompt) = (None, None);
+        let (help, prompt) = (self.help.take(), self.prompt.take());
+        let mut is_open = help.is_some() || prompt.is_some();
         if self.quit == Quit::Asked {
-            self.quit = Quit::No;
+            (self.quit, is_open) = (Quit::No, true);
         }
         if is_escape {
-            self.log.follow();
-            self.log.search.clear();
-            self.page = Page::Rig;
+            if prompt.is_some_and(|prompt| prompt.is_search()) || !is_open {
+                self.log.search.clear();
+            }
+            // A dialog is closed before its page is left.
+            if !is_open {
+                self.log.follow();
+                self.page = Page::Rig;
+            }
         } else {
             self.notify("disarming the actuator");
         }

@@ -1,6 +1,6 @@
 //! The recording panel: the episode being written, or the last one and its verdict.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ratatui::Frame;
@@ -106,7 +106,13 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
         let text = format!("{} not started: {}", theme.symbol("▲", "!"), theme.safe(why));
         return not_started(first, &text, area, theme);
     }
-    let Some((last, verdict)) = shown.last_episode.as_ref().zip(shown.last_verdict.as_ref()) else {
+    let is_kept = |file: &&PathBuf| {
+        let entries = shown.session.iter().flat_map(|session| &session.episodes);
+        let name = file.file_name().unwrap_or_default();
+        !entries.rev().find(|entry| name == &*entry.file).is_some_and(|entry| entry.discarded)
+    };
+    let last = shown.last_episode.as_ref().filter(is_kept);
+    let Some((last, verdict)) = last.zip(shown.last_verdict.as_ref()) else {
         return vec![first];
     };
     let Verdict { grade, reasons, .. } = verdict;

@@ -79,7 +79,7 @@ impl Screen {
     /// Takes the terminal again after the process was stopped: the shell has used it meanwhile. One in the background is left
     /// alone, because setting its modes from there stops the process; the shell continues it again in the foreground.
     pub(super) fn resume(&mut self) -> io::Result<()> {
-        if rustix::termios::tcgetpgrp(io::stdout()).ok() != Some(rustix::process::getpgrp()) {
+        if !in_foreground() {
             return Ok(());
         }
         disable_raw_mode()?;
@@ -105,6 +105,10 @@ impl Screen {
     pub(super) fn draw(&mut self, model: &Model, theme: Theme) -> io::Result<bool> {
         if !self.outlet.as_ref().is_some_and(Outlet::is_idle) {
             return Ok(false);
+        }
+        // In the background the terminal is the shell's.
+        if !in_foreground() {
+            return Ok(true);
         }
         self.canvas.begin_frame();
         self.terminal.draw(|frame| view::draw(frame, model, theme, &mut self.canvas))?;
@@ -143,6 +147,11 @@ impl Drop for Screen {
         }
         restore();
     }
+}
+
+/// Whether the terminal is this job's. True where there are no jobs.
+fn in_foreground() -> bool {
+    rustix::termios::tcgetpgrp(io::stdout()).map_or(true, |group| group == rustix::process::getpgrp())
 }
 
 /// Pixels of a cell, if the terminal reports them.

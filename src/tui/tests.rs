@@ -160,13 +160,16 @@ fn a_session_is_shown_with_its_goal_its_episodes_and_the_time_on_the_disk() {
 
 #[test]
 fn a_text_that_is_typed_is_shown_with_its_end() {
-    let mut model = measured(&three_streaming());
+    let mut now = three_streaming();
+    let episodes = vec![EpisodeEntry::begin("a.mcap".to_owned(), String::new())];
+    now.session = Some(SessionStatus { episodes, ..SessionStatus::default() });
+    let mut model = measured(&now);
     model.update(press(KeyCode::Char('n')));
     for c in "a note that is longer than the sixty columns of the line, öä".chars() {
         model.update(press(KeyCode::Char(c)));
     }
     let screen = draw(&model, (60, 12), THEME).to_string();
-    assert!(screen.contains(" note: ") && screen.contains("columns of the line, öä█"), "{screen}");
+    assert!(screen.contains(" a.mcap, note: ") && screen.contains("columns of the line, öä█"), "{screen}");
 }
 
 /// A minute in which one camera slows down and recovers, one is unplugged for 8 s, and a device has no nominal rate.

@@ -591,9 +591,9 @@ fn the_tour_leads_through_a_first_episode() {
     // Without the tour a camera would be out by now: here only the user unplugs.
     pane.shows(&["REC 00:05", "2/4 U: the selected sensor is unplugged", "0x07"]);
     pane.type_in("U");
-    pane.shows(&["3/4 the bit is clear", "0x06"]);
+    pane.shows(&["3/4 U: plug it in again; its bit is clear", "0x06"]);
     pane.type_in("U");
-    pane.shows(&["4/4 the bit is set again", "0x07"]);
+    pane.shows(&["4/4 space: the episode ends", "0x07"]);
     end(&pane);
     pane.shows(&["? help", "q quit"]);
     quit(&pane);
@@ -604,13 +604,21 @@ fn the_tour_of_a_policy_leads_through_the_loss_of_a_sensor() {
     let place = place();
     let tmux = Tmux::new(&place);
     let pane = streaming(&tmux, "policy", (80, 24), "rapid --infer --sim task --monitor --tour --out out");
-    pane.shows(&["1/2 a policy moves the arm", "acting", "0x07"]);
+    pane.shows(&["1/2 select tactile_tip (up, down), U: unplug it", "acting", "0x07"]);
+    // Without what the policy requires it holds, and the tour says so.
     pane.press("Down");
+    pane.press("Down");
+    pane.until("arm is selected", |screen| screen.lines().any(|line| line.contains('▸') && line.contains("arm")));
+    pane.type_in("U");
+    pane.shows(&["1/2 U: plug arm in again, which the policy requires", "holds"]);
+    pane.type_in("U");
+    pane.shows(&["1/2 select tactile_tip", "acting", "0x07"]);
+    pane.press("Up");
     pane.until("tactile_tip is selected", |screen| {
         screen.lines().any(|line| line.contains('▸') && line.contains("tactile_tip"))
     });
     pane.type_in("U");
-    pane.shows(&["2/2 its bit is clear, and the policy acts without it", "acting", "saw mask 0x05"]);
+    pane.shows(&["2/2 U: plug tactile_tip in again; its bit is clear", "acting", "saw mask 0x05"]);
     pane.type_in("U");
     pane.shows(&["? help", "acting", "saw mask 0x07"]);
     quit(&pane);

@@ -25,7 +25,7 @@ fn the_mask_is_shown_with_names_and_age() {
     // Without names, by number; a bit beyond the count is not hidden.
     let text = render(&record(0b1000, 42, NOW - 3_200_000_000), None, NOW, Palette::Plain);
     insta::assert_snapshot!(text, @r#"
-    mask 0x08  00001000  1 of 3 present  sequence 42  stale: published 3.2 s ago, the publisher is gone
+    mask 0x08  00001000  1 of 3 present  sequence 42  stale: published 3.2 s ago, the publisher is stopped or gone
       bit  0  ?                     absent
       bit  1  ?                     absent
       bit  2  ?                     absent

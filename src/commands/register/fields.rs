@@ -89,7 +89,11 @@ pub(super) fn choose(
             if format == Format::Json && args.name.is_none() {
                 return Ok(Selection::Nothing);
             }
-            Err(RegisterError::Missing(vec!["--vid", "--pid", "--name"]))
+            if units.is_empty() && !is_described {
+                return Err(RegisterError::NothingNew);
+            }
+            let given = [("--vid", args.vid.is_some()), ("--pid", args.pid.is_some()), ("--name", args.name.is_some())];
+            Err(RegisterError::Missing(given.iter().filter(|(_, given)| !given).map(|(option, _)| *option).collect()))
         }
     }
 }

@@ -44,6 +44,9 @@ pub enum RegisterError {
     /// A value is missing and there is no terminal to ask on.
     #[error("{} must be given: there is no terminal to ask on", .0.join(", "))]
     Missing(Vec<&'static str>),
+    /// Every connected device has an entry.
+    #[error("no device without an entry is plugged in: plug it in, or describe it with --vid, --pid and --name")]
+    NothingNew,
     /// Several units match.
     #[error("several connected units match: name one with --serial or --port{}", .0.iter().flat_map(|unit| ["\n  ", unit]).collect::<String>())]
     Several(Vec<String>),

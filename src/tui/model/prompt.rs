@@ -50,7 +50,7 @@ impl Question {
             Self::Control => "control of the camera, such as exposure=120: ",
             Self::Search => "lines of the log with: ",
             Self::Name => "name of the new device (empty: none): ",
-            Self::EndSession => "type end to end the session and delete what was discarded: ",
+            Self::EndSession => "type \"end\": ends the session, deletes its trash: ",
         }
     }
 }
@@ -62,8 +62,15 @@ pub(super) struct Prompt {
     text: String,
     /// The text is a suggestion: what is typed first replaces it.
     is_suggested: bool,
-    /// The episode that it is about, if not the newest.
+    /// The episode that it is about: another may begin while it is typed.
     episode: Option<String>,
+}
+
+impl Prompt {
+    /// Whether it narrows the log while it is typed.
+    pub(super) const fn is_search(&self) -> bool {
+        matches!(self.question, Question::Search)
+    }
 }
 
 impl Model {
@@ -123,9 +130,15 @@ impl Model {
     pub(super) fn ask(&mut self, question: Question) {
         let session = self.latest.session.as_ref();
         let is_about = matches!(question, Question::Note | Question::WhyFailed);
-        let episode = if is_about { self.marked_episode() } else { None };
+        let newest = |session: &SessionStatus| {
+            session.episodes.iter().rev().find(|entry| !entry.discarded).map(|entry| entry.file.clone())
+        };
+        let episode = if is_about { self.marked_episode().or_else(|| newest(session?)) } else { None };
+        if is_about && episode.is_none() {
+            return self.notify("this session has no episode");
+        }
         let noted = |session: &SessionStatus| {
-            let is_it = |entry: &&EpisodeEntry| episode.as_ref().map_or(!entry.discarded, |file| entry.file == *file);
+            let is_it = |entry: &&EpisodeEntry| episode.as_ref() == Some(&entry.file);
             session.episodes.iter().rev().find(is_it).map(|entry| entry.note.clone())
         };
         let text = match question {
@@ -139,9 +152,10 @@ impl Model {
         self.prompt = Some(Prompt { question, text, is_suggested, episode });
     }
 
-    /// Adds pasted text to the answer, without line ends and other control characters.
+    /// Adds pasted text to the answer, in one line and without other control characters.
     pub(super) fn paste(&mut self, text: &str) {
-        for c in text.chars().filter(|c| !c.is_control()) {
+        let spaced = text.trim_end().chars().map(|c| if c.is_whitespace() { ' ' } else { c });
+        for c in spaced.filter(|c| !c.is_control()) {
             let Some(prompt) = self.prompt.take() else { return };
             let _only_text = self.type_into(prompt, KeyEvent::new(KeyCode::Char(c), KeyModifiers::NONE));
         }

@@ -338,14 +338,30 @@ fn typed(model: &mut Model, text: &str) {
 
 #[test]
 fn a_text_is_typed_and_sent_by_enter_and_escape_disarms_and_closes_it() {
+    let episode = || Some("a.mcap".to_owned());
     let note =
-        |text: &str| Effect::Send(Command::Session(SessionRequest::Note { episode: None, text: text.to_owned() }));
-    let mut model = Model::new(three_streaming());
+        |text: &str| Effect::Send(Command::Session(SessionRequest::Note { episode: episode(), text: text.to_owned() }));
+    let mut now = three_streaming();
+    let mut model = Model::new(now.clone());
+    typed(&mut model, "n");
+    assert_eq!((model.prompt(), model.notice()), (None, Some("this session has no episode")));
+    let mut session = SessionStatus::default();
+    session.episodes.push(EpisodeEntry::begin("a.mcap".to_owned(), String::new()));
+    now.session = Some(session.clone());
+    model.update(after(&now, 100));
     typed(&mut model, "nquick dxE");
-    assert_eq!(model.prompt(), Some(("note: ".to_owned(), "quick dxE")));
+    assert_eq!(model.prompt(), Some(("a.mcap, note: ".to_owned(), "quick dxE")));
+    // Another episode begins: the note is about the one that it was begun for.
+    session.episodes.push(EpisodeEntry::begin("b.mcap".to_owned(), String::new()));
+    now.session = Some(session.clone());
+    model.update(after(&now, 200));
     model.update(press(KeyCode::Backspace));
     assert_eq!(model.update(press(KeyCode::Enter)), note("quick dx"));
     assert_eq!(model.prompt(), None);
+    // One that is discarded is no longer the newest.
+    session.episodes[1].discarded = true;
+    now.session = Some(session);
+    model.update(after(&now, 300));
     // It is empty again, and an empty one removes the note.
     typed(&mut model, "n");
     assert_eq!(model.update(press(KeyCode::Enter)), note(""));
@@ -353,10 +369,10 @@ fn a_text_is_typed_and_sent_by_enter_and_escape_disarms_and_closes_it() {
     assert_eq!(model.update(Msg::Paste("nq".to_owned())), Effect::None);
     assert_eq!(model.prompt(), None);
     typed(&mut model, "n");
-    model.update(Msg::Paste("two\nlines\x1b".to_owned()));
-    assert_eq!(model.update(press(KeyCode::Enter)), note("twolines"));
+    model.update(Msg::Paste("two\nlines\x1b\n".to_owned()));
+    assert_eq!(model.update(press(KeyCode::Enter)), note("two lines"));
     typed(&mut model, "-slipped");
-    let label = SessionRequest::Label { episode: None, label: Label::Failure, reason: "slipped".to_owned() };
+    let label = SessionRequest::Label { episode: episode(), label: Label::Failure, reason: "slipped".to_owned() };
     assert_eq!(model.update(press(KeyCode::Enter)), Effect::Send(Command::Session(label)));
     typed(&mut model, "nhalf");
     assert_eq!(model.update(press(KeyCode::Esc)), Effect::Order(Order::Disarm));
@@ -607,6 +623,16 @@ fn on_the_page_of_episodes_keys_are_about_the_marked_one() {
     model.update(press(KeyCode::Char('a')));
     let note = sent(SessionRequest::Note { episode: Some(file(2)), text: "a".to_owned() });
     assert_eq!(model.update(press(KeyCode::Enter)), note);
+    // Esc closes what is open before it leaves the page, whose mark the next key is about.
+    for opens in ["n", "-", "?"] {
+        typed(&mut model, opens);
+        assert_eq!(model.update(press(KeyCode::Esc)), Effect::Order(Order::Disarm));
+        assert_eq!((model.prompt(), model.help, model.page), (None, None, Page::Episodes), "{opens}");
+        let undo = sent(SessionRequest::Label { episode: Some(file(2)), label: Label::Success, reason: String::new() });
+        assert_eq!(model.update(press(KeyCode::Char('+'))), undo);
+    }
+    model.update(press(KeyCode::Esc));
+    assert_eq!(model.page, Page::Rig);
 }
 
 #[test]
