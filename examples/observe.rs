@@ -83,6 +83,8 @@ fn line(observation: &Observation, samples: &BTreeMap<u32, VecDeque<(u64, Vec<u8
             "valid"
         } else if slot.present {
             "stale"
+        } else if slot.plugged {
+            "plugged in, not running"
         } else {
             "absent"
         };

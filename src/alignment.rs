@@ -16,7 +16,7 @@ use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
 
 use crate::bus::{BusError, Queues, Subscription, TopicId, Writer};
-use crate::mask::PhysicalMask;
+use crate::mask::Bits;
 use crate::modality::ModalityId;
 use crate::observation::{HEAD_BYTES, SLOT_BYTES};
 use crate::registry::{DeviceSpec, Registry};
@@ -120,7 +120,7 @@ fn modality(device: &DeviceSpec) -> SyncModality {
 struct Aligner {
     sync: Synchronizer<()>,
     /// Changes of the mask and when they were published, the oldest first.
-    masks: VecDeque<(Stamp, PhysicalMask)>,
+    masks: VecDeque<(Stamp, Bits)>,
     payload: Vec<u8>,
 }
 
@@ -142,8 +142,8 @@ impl Aligner {
         match topic {
             TopicId::Modality(id) => self.sample(id, header),
             TopicId::Mask => {
-                if let Some((mask, _)) = PhysicalMask::of_payload(payload) {
-                    self.mask(Stamp(header.capture_ns), mask);
+                if let Some((bits, _)) = Bits::of_payload(payload) {
+                    self.mask(Stamp(header.capture_ns), bits);
                 }
             }
             TopicId::Action | TopicId::Observation => {}
@@ -158,14 +158,14 @@ impl Aligner {
         }
     }
 
-    fn mask(&mut self, published: Stamp, mask: PhysicalMask) {
-        if self.masks.back().is_some_and(|(_, last)| *last == mask) {
+    fn mask(&mut self, published: Stamp, bits: Bits) {
+        if self.masks.back().is_some_and(|(_, last)| *last == bits) {
             return;
         }
         if self.masks.len() == MASKS {
             self.masks.pop_front();
         }
-        self.masks.push_back((published, mask));
+        self.masks.push_back((published, bits));
     }
 
     /// The observation of this tick, as it is published: from what was received by then, under the mask last published
@@ -175,8 +175,8 @@ impl Aligner {
             self.masks.pop_front();
         }
         let in_force = self.masks.front().filter(|(published, _)| *published <= tick);
-        let mask = in_force.map_or(PhysicalMask::EMPTY, |(_, mask)| *mask);
-        self.sync.observe(tick, tick, mask).encode(&mut self.payload);
+        let bits = in_force.map_or(Bits::default(), |(_, bits)| *bits);
+        self.sync.observe(tick, tick, bits).encode(&mut self.payload);
         &self.payload
     }
 }
@@ -184,6 +184,7 @@ impl Aligner {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mask::PhysicalMask;
 
     const REGISTRY: &str = "[device.cam]\nvid = \"1209\"\npid = \"0001\"\nnode = \"camera\"\nbit = 0\n\
         [device.tof]\nvid = \"1209\"\npid = \"0002\"\nnode = \"serial\"\nbit = 3\ntty = { channels = 1 }\n";
@@ -214,28 +215,31 @@ mod tests {
             ..SampleHeader::default()
         };
         let mask = |at: u64| SampleHeader { capture_ns: at * MS, ..SampleHeader::default() };
+        let crashed = Bits { mask: PhysicalMask(0b1000), plugged: PhysicalMask(0b1001) };
         assert_eq!(read(aligner.observe(Stamp(50 * MS))), (0, vec![(0, 0, 0, 0), (3, 0, 0, 0)]), "before any mask");
 
-        aligner.take(TopicId::Mask, &mask(60), &PhysicalMask(0b1001).payload(1));
-        aligner.take(TopicId::Mask, &mask(62), &PhysicalMask(0b1001).payload(2));
-        aligner.take(TopicId::Mask, &mask(110), &PhysicalMask(0b1000).payload(3));
+        aligner.take(TopicId::Mask, &mask(60), &Bits::from(PhysicalMask(0b1001)).payload(1));
+        aligner.take(TopicId::Mask, &mask(62), &Bits::from(PhysicalMask(0b1001)).payload(2));
+        aligner.take(TopicId::Mask, &mask(110), &crashed.payload(3));
+        aligner.take(TopicId::Mask, &mask(115), &Bits::from(PhysicalMask(0b1000)).payload(4));
         aligner.take(TopicId::Mask, &mask(112), b"short");
         aligner.take(TopicId::Modality(cam), &sample(7, 90, 95, 0), b"");
         // In transit at the tick; damaged.
         aligner.take(TopicId::Modality(cam), &sample(8, 99, 101, 0), b"");
         aligner.take(TopicId::Modality(cam), &sample(9, 100, 100, FLAG_ERROR), b"");
         aligner.take(TopicId::Modality(tof), &sample(1, 40, 41, 0), b"");
-        let (chosen, stale) = (1 | 2 | 8, 1 | 4 | 8);
+        let (chosen, stale) = (1 | 2 | 8 | 16, 1 | 4 | 8 | 16);
         assert_eq!(read(aligner.observe(Stamp(100 * MS))), (0b1001, vec![(0, chosen, 7, 10), (3, stale, 1, 60)]));
-        // Unplugged: nothing of it, however fresh; the other is known by now.
-        assert_eq!(read(aligner.observe(Stamp(110 * MS))), (0b1000, vec![(0, 0, 0, 0), (3, stale, 1, 70)]));
+        // Its driver failed, and it is unplugged: nothing of it, however fresh.
+        assert_eq!(read(aligner.observe(Stamp(110 * MS))), (0b1000, vec![(0, 16, 0, 0), (3, stale, 1, 70)]));
+        assert_eq!(read(aligner.observe(Stamp(115 * MS))), (0b1000, vec![(0, 0, 0, 0), (3, stale, 1, 75)]));
     }
 
     #[test]
     fn an_added_modality_is_in_the_next_observation() {
         let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
         let mut aligner = Aligner::new(&registry);
-        aligner.take(TopicId::Mask, &SampleHeader::default(), &PhysicalMask(0b110).payload(1));
+        aligner.take(TopicId::Mask, &SampleHeader::default(), &Bits::from(PhysicalMask(0b110)).payload(1));
         assert_eq!(read(aligner.observe(Stamp(50 * MS))).1.len(), 2);
         let text = REGISTRY.replace("tof", "new").replace("bit = 3", "bit = 2");
         let added = Registry::parse(&text, None).expect("a registry").registry;
@@ -244,7 +248,7 @@ mod tests {
             SampleHeader { seq: 4, capture_ns: 90 * MS, recv_ns: 90 * MS, epoch: 1, ..SampleHeader::default() };
         aligner.take(TopicId::Modality(added.devices[1].id), &header, b"");
         let seen = read(aligner.observe(Stamp(100 * MS)));
-        assert_eq!(seen, (0b110, vec![(0, 0, 0, 0), (2, 1 | 2 | 8, 4, 10), (3, 0, 0, 0)]));
+        assert_eq!(seen, (0b110, vec![(0, 0, 0, 0), (2, 1 | 2 | 8 | 16, 4, 10), (3, 0, 0, 0)]));
     }
 
     #[test]
@@ -252,7 +256,7 @@ mod tests {
         let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
         let mut aligner = Aligner::new(&registry);
         for at in 0..1000 {
-            aligner.mask(Stamp(at), PhysicalMask(at % 2));
+            aligner.mask(Stamp(at), PhysicalMask(at % 2).into());
         }
         assert_eq!(aligner.masks.capacity(), MASKS);
         assert_eq!(read(aligner.observe(Stamp(1000))).0, 1);

@@ -20,7 +20,7 @@ const MAGIC: [u8; 4] = *b"RAPD";
 const VERSION: u8 = 1;
 
 /// Size of the payload on the topic in bytes.
-pub const PAYLOAD_LEN: usize = 16;
+pub const PAYLOAD_LEN: usize = 24;
 
 /// One bit per modality: set exactly while its device is attached and its samples have begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
@@ -30,21 +30,6 @@ pub struct PhysicalMask(pub u64);
 impl PhysicalMask {
     /// No modality present.
     pub const EMPTY: Self = Self(0);
-
-    /// The payload of its topic: mask and number of the publication, little endian.
-    pub fn payload(self, sequence: u64) -> [u8; PAYLOAD_LEN] {
-        let mut payload = [0; PAYLOAD_LEN];
-        payload[..8].copy_from_slice(&self.0.to_le_bytes());
-        payload[8..].copy_from_slice(&sequence.to_le_bytes());
-        payload
-    }
-
-    /// What such a payload holds; `None` if it is too short.
-    pub fn of_payload(payload: &[u8]) -> Option<(Self, u64)> {
-        let (mask, rest) = payload.split_first_chunk()?;
-        let (sequence, _) = rest.split_first_chunk()?;
-        Some((Self(u64::from_le_bytes(*mask)), u64::from_le_bytes(*sequence)))
-    }
 
     /// Whether the modality is present.
     pub const fn contains(self, id: ModalityId) -> bool {
@@ -74,6 +59,42 @@ impl PhysicalMask {
     pub fn hex(self, device_count: usize) -> String {
         let width = digits(self, device_count) / 4;
         format!("0x{:0width$x}", self.0)
+    }
+}
+
+/// The mask, and which devices are plugged in. What runs is plugged in: each bit of the mask is one of the others too. A
+/// device that is plugged in without a bit in the mask is being opened, or its driver failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Bits {
+    /// The mask.
+    pub mask: PhysicalMask,
+    /// One bit per modality: set exactly while its device is attached.
+    pub plugged: PhysicalMask,
+}
+
+impl From<PhysicalMask> for Bits {
+    /// Nothing is plugged in that does not run, as far as is known.
+    fn from(mask: PhysicalMask) -> Self {
+        Self { mask, plugged: mask }
+    }
+}
+
+impl Bits {
+    /// The payload of the mask's topic: mask, number of the publication, and what is plugged in, little endian.
+    pub fn payload(self, sequence: u64) -> [u8; PAYLOAD_LEN] {
+        let mut payload = [0; PAYLOAD_LEN];
+        for (place, value) in payload.as_chunks_mut::<8>().0.iter_mut().zip([self.mask.0, sequence, self.plugged.0]) {
+            *place = value.to_le_bytes();
+        }
+        payload
+    }
+
+    /// What such a payload holds; `None` if it is too short. One without the last number is of an earlier version.
+    pub fn of_payload(payload: &[u8]) -> Option<(Self, u64)> {
+        let mut numbers = payload.as_chunks().0.iter().map(|number| u64::from_le_bytes(*number));
+        let (mask, sequence) = (PhysicalMask(numbers.next()?), numbers.next()?);
+        let plugged = numbers.next().map_or(mask, |plugged| PhysicalMask(plugged | mask.0));
+        Some((Self { mask, plugged }, sequence))
     }
 }
 

@@ -23,12 +23,17 @@ const VALID: u32 = 2;
 const STALE: u32 = 4;
 /// [`ObservationSlot::seq`] is known.
 const CHOSEN: u32 = 8;
+/// [`ObservationSlot::plugged`].
+const PLUGGED: u32 = 16;
 
 /// One modality of an observation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a flag of the published slot")]
 pub struct ObservationSlot {
     /// The modality.
     pub id: ModalityId,
+    /// Its device is plugged in at the tick, whether it runs or not.
+    pub plugged: bool,
     /// Its bit in the mask at the tick.
     pub present: bool,
     /// A sample lies in the window of the tick.
@@ -45,8 +50,8 @@ pub struct ObservationSlot {
 }
 
 impl ObservationSlot {
-    pub(crate) fn clear(&mut self, present: bool) {
-        *self = Self { present, ..Self::empty(self.id) };
+    pub(crate) fn clear(&mut self, present: bool, plugged: bool) {
+        *self = Self { plugged, present, ..Self::empty(self.id) };
     }
 
     /// Names the sample `seq`, which stands for the moment `shown`.
@@ -63,6 +68,7 @@ impl ObservationSlot {
         let (bit, flags) = (u32::from_le_bytes(*bit), u32::from_le_bytes(*flags));
         Some(Self {
             id: ModalityId::new(u8::try_from(bit).ok()?)?,
+            plugged: flags & PLUGGED != 0,
             present: flags & PRESENT != 0,
             valid: flags & VALID != 0,
             stale: flags & STALE != 0,
@@ -73,7 +79,7 @@ impl ObservationSlot {
     }
 
     pub(crate) fn empty(id: ModalityId) -> Self {
-        Self { id, present: false, valid: false, stale: false, age_ns: 0, seq: None, handle: None }
+        Self { id, plugged: false, present: false, valid: false, stale: false, age_ns: 0, seq: None, handle: None }
     }
 }
 
@@ -99,7 +105,7 @@ impl Observation {
 
     /// Its published form: the mask (u64), and of each slot bit (u32), flags (u32), sequence number (u64) and age in ns
     /// (i64), little endian. Flags: 1 present, 2 valid, 4 stale, 8 a sample is chosen, without which the last two
-    /// numbers are 0. Replaces what `out` holds; does not allocate if it has the capacity.
+    /// numbers are 0, 16 plugged in. Replaces what `out` holds; does not allocate if it has the capacity.
     pub fn encode(&self, out: &mut Vec<u8>) {
         out.clear();
         out.extend_from_slice(&self.mask.0.to_le_bytes());
@@ -108,7 +114,8 @@ impl Observation {
             let flags = flag(slot.present, PRESENT)
                 | flag(slot.valid, VALID)
                 | flag(slot.stale, STALE)
-                | flag(slot.seq.is_some(), CHOSEN);
+                | flag(slot.seq.is_some(), CHOSEN)
+                | flag(slot.plugged, PLUGGED);
             out.extend_from_slice(&u32::from(slot.id.bit()).to_le_bytes());
             out.extend_from_slice(&flags.to_le_bytes());
             out.extend_from_slice(&slot.seq.unwrap_or(0).to_le_bytes());
@@ -139,17 +146,17 @@ mod tests {
         let ids: Vec<_> = [0, 5].into_iter().filter_map(ModalityId::new).collect();
         let mut observation = Observation::new(&ids);
         observation.mask = PhysicalMask(0x21);
-        observation.slots[0].clear(true);
+        observation.slots[0].clear(true, false);
         observation.slots[0].valid = true;
         observation.slots[0].hold(3, 7, Stamp(100), Stamp(102));
-        observation.slots[1].clear(true);
+        observation.slots[1].clear(true, true);
         observation.slots[1].stale = true;
         let mut bytes = vec![9];
         observation.encode(&mut bytes);
         let slot = |bit: u32, flags: u32, seq: u64, age: i64| {
             [&bit.to_le_bytes()[..], &flags.to_le_bytes(), &seq.to_le_bytes(), &age.to_le_bytes()].concat()
         };
-        let expected = [&0x21_u64.to_le_bytes()[..], &slot(0, 1 | 2 | 8, 7, -2), &slot(5, 1 | 4, 0, 0)].concat();
+        let expected = [&0x21_u64.to_le_bytes()[..], &slot(0, 1 | 2 | 8, 7, -2), &slot(5, 1 | 4 | 16, 0, 0)].concat();
         assert_eq!(bytes, expected);
         assert_eq!(bytes.len(), HEAD_BYTES + 2 * SLOT_BYTES);
 

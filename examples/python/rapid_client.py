@@ -22,7 +22,7 @@ OBSERVATIONS = "/rapid/observation"
 # An observation: the mask, and of each modality its bit, flags, number of the chosen sample, its age in ns.
 MASK = struct.Struct("<Q")
 SLOT = struct.Struct("<IIQq")
-PRESENT, VALID, STALE, CHOSEN = 1, 2, 4, 8
+PRESENT, VALID, STALE, CHOSEN, PLUGGED = 1, 2, 4, 8, 16
 DAMAGED = 1
 # Samples of a modality that are kept until an observation names one of them.
 KEPT = 64
@@ -42,6 +42,8 @@ class Observation:
     """uint8 (height, width, channels) of a picture, float64 (n,) of numbers; zeros where there is no usable sample."""
     present: dict
     """The modality's bit of the mask; False before the first sample of its topic, which names its bit."""
+    plugged: dict
+    """Its device is plugged in, though it may not run: plugged and not present is a driver that starts or has failed."""
     valid: dict
     """A usable sample lies within the window of the tick."""
     age: dict
@@ -114,14 +116,15 @@ class Client:
     def _observation(self, header, payload):
         (mask,) = MASK.unpack_from(payload)
         slots = {bit: slot for bit, *slot in SLOT.iter_unpack(payload[MASK.size :])}
-        arrays, present, valid, age = {}, {}, {}, {}
+        arrays, present, plugged, valid, age = {}, {}, {}, {}, {}
         for topic, shape in self._shapes.items():
             flags, seq, age_ns = slots.get(self._bits.get(topic), (0, 0, 0))
             sample = self._samples[topic].get(seq) if flags & CHOSEN else None
             array = None if sample is None else array_of(*sample, shape, self._decode)
             present[topic] = bool(flags & PRESENT)
+            plugged[topic] = bool(flags & PLUGGED)
             valid[topic] = bool(flags & VALID) and array is not None
             age[topic] = age_ns / 1e9 if array is not None else float("nan")
             kind = np.uint8 if len(shape) == 3 else np.float64
             arrays[topic] = np.zeros(shape, kind) if array is None else array
-        return Observation(header.seq, header.capture_ns, mask, arrays, present, valid, age)
+        return Observation(header.seq, header.capture_ns, mask, arrays, present, plugged, valid, age)

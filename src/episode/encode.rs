@@ -8,7 +8,7 @@
 use std::ops::Range;
 
 use super::schema::SampleSchema;
-use crate::mask::PhysicalMask;
+use crate::mask::Bits;
 use crate::observation::Observation;
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Event, Level, What};
@@ -59,11 +59,13 @@ pub fn sample(
 }
 
 /// Writes a `rapid.Mask`.
-pub fn mask(out: &mut Vec<u8>, wall_ns: u64, mask: PhysicalMask, sequence: u64) {
+pub fn mask(out: &mut Vec<u8>, wall_ns: u64, bits: impl Into<Bits>, sequence: u64) {
+    let Bits { mask, plugged } = bits.into();
     out.clear();
     timestamp(out, wall_ns);
     fixed64(out, 2, mask.0);
     varint_field(out, 3, sequence);
+    fixed64(out, 4, plugged.0);
 }
 
 /// Writes a `rapid.Frame`.
@@ -85,6 +87,7 @@ pub fn frame(out: &mut Vec<u8>, wall_ns: u64, index: u64, observation: &Observat
                 varint(out, seq);
             }
             varint_field(out, 6, u64::from(slot.present));
+            varint_field(out, 7, u64::from(slot.plugged));
         });
     }
 }
@@ -316,6 +319,7 @@ mod tests {
 
     use super::*;
     use crate::episode::schema::{EVENT, FRAME, LOG, MASK, Schema};
+    use crate::mask::PhysicalMask;
     use crate::modality::ModalityId;
     use crate::registry::WhenStale;
     use crate::sample::Epoch;
@@ -402,9 +406,11 @@ mod tests {
     #[test]
     fn masks_events_and_log_lines_decode() {
         let mut out = Vec::new();
-        mask(&mut out, WALL, PhysicalMask(0x8000_0000_0000_0001), u64::MAX);
+        let bits = Bits { mask: PhysicalMask(0x8000_0000_0000_0001), plugged: PhysicalMask(0x8000_0000_0000_0011) };
+        mask(&mut out, WALL, bits, u64::MAX);
         let message = decode(MASK, &out);
         assert_eq!(number(&message, "mask"), 0x8000_0000_0000_0001);
+        assert_eq!(number(&message, "plugged"), 0x8000_0000_0000_0011);
         assert_eq!((number(&message, "sequence"), wall(&message)), (u64::MAX.into(), WALL));
 
         let report = EventText { kind: "attach", device: "cam", text: "cam attached", json: "{}" };

@@ -15,7 +15,7 @@ use crate::episode::encode::{self, Announced, logged};
 use crate::episode::form::Derived;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{EVENT_TOPIC, LOG_TOPIC, channel};
-use crate::mask::{MASK_TOPIC, PhysicalMask};
+use crate::mask::{Bits, MASK_TOPIC};
 use crate::modality::MAX_MODALITIES;
 use crate::observation::{OBSERVATION_TOPIC, Observation};
 use crate::registry::{DeviceSpec, Form, Registry};
@@ -130,8 +130,8 @@ impl Topics {
             }
             TopicId::Mask => {
                 let Some(channel) = wanted(self.mask.as_ref()) else { return };
-                if let Some((mask, sequence)) = PhysicalMask::of_payload(payload) {
-                    encode::mask(message, log_time, mask, sequence);
+                if let Some((bits, sequence)) = Bits::of_payload(payload) {
+                    encode::mask(message, log_time, bits, sequence);
                     send(channel, message, log_time);
                 }
             }

@@ -277,7 +277,7 @@ impl Lockstep {
 
     fn publish(&mut self, taker: &mut dyn Taker) {
         self.mask_sequence += 1;
-        let payload = self.core.mask().payload(self.mask_sequence);
+        let payload = self.core.bits().payload(self.mask_sequence);
         let header = SampleHeader {
             seq: self.mask_sequence,
             capture_ns: self.now.0,

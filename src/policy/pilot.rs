@@ -12,7 +12,7 @@ use super::horizon::{ActionQueue, Situation, Step, WithoutMask};
 use super::observer::Observer;
 use super::request::Request;
 use crate::bus::TopicId;
-use crate::mask::PhysicalMask;
+use crate::mask::{Bits, PhysicalMask};
 use crate::registry::Registry;
 use crate::sample::SampleHeader;
 use crate::time::Stamp;
@@ -52,7 +52,7 @@ impl Pilot {
         match topic {
             TopicId::Modality(id) => self.observer.push(id, header, payload),
             TopicId::Mask => {
-                if let Some((mask, _)) = PhysicalMask::of_payload(payload) {
+                if let Some((Bits { mask, .. }, _)) = Bits::of_payload(payload) {
                     self.mask = mask;
                 }
             }

@@ -24,7 +24,7 @@ use crate::episode::form::Derived;
 use crate::episode::own::EpisodeId;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
-use crate::mask::{MASK_TOPIC, PhysicalMask};
+use crate::mask::{Bits, MASK_TOPIC};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::observation::Observation;
 use crate::registry::{Form, Registry};
@@ -228,9 +228,9 @@ impl EpisodeFile {
     }
 
     /// Writes a publication of the mask.
-    pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64) -> io::Result<()> {
+    pub(super) fn mask(&mut self, header: &SampleHeader, bits: Bits, sequence: u64) -> io::Result<()> {
         let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
-        encode::mask(&mut self.message, log_time, mask, sequence);
+        encode::mask(&mut self.message, log_time, bits, sequence);
         self.write(self.mask, sequence, log_time, Stamp(header.recv_ns))
     }
 

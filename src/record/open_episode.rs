@@ -35,7 +35,7 @@ use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge}
 use super::writeback::Writeback;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::encode::{Announced as Report, logged};
-use crate::mask::PhysicalMask;
+use crate::mask::{Bits, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
@@ -111,7 +111,7 @@ impl OpenEpisode {
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
         let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
         let units = Units::new(attached);
-        let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, mask, _)| *mask);
+        let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, bits, _)| bits.mask);
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, Guard::begin(&path))?;
@@ -120,9 +120,9 @@ impl OpenEpisode {
         for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {
             measures.plugged(device.id, begin.0, true);
         }
-        if let Some((header, mask, sequence)) = masks.at(begin) {
-            file.mask(header, *mask, *sequence)?;
-            measures.mask(header.capture_ns, *mask);
+        if let Some((header, bits, sequence)) = masks.at(begin) {
+            file.mask(header, *bits, *sequence)?;
+            measures.mask(header.capture_ns, bits.mask);
         }
         // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
@@ -196,7 +196,7 @@ impl OpenEpisode {
     }
 
     /// Takes a publication of the mask, and the gap before it.
-    pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, hole: Option<Hole>) {
+    pub(super) fn mask(&mut self, header: &SampleHeader, bits: Bits, sequence: u64, hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
             self.missing.masks = self.missing.masks.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
         }
@@ -205,8 +205,8 @@ impl OpenEpisode {
         if !(captured < self.begin || self.holds(captured, Duration::ZERO)) || self.failed.is_some() {
             return;
         }
-        self.failed = self.file.mask(header, mask, sequence).err();
-        self.measures.mask(header.capture_ns, mask);
+        self.failed = self.file.mask(header, bits, sequence).err();
+        self.measures.mask(header.capture_ns, bits.mask);
     }
 
     /// Takes an action, and the gap before it.
@@ -413,8 +413,8 @@ impl OpenEpisode {
         let (index, deadline) = (self.next_tick, self.deadline(self.next_tick));
         let tick = self.grid.tick(index);
         // Before the first publication nothing is known to be present.
-        let mask = masks.at(tick).map_or(PhysicalMask::EMPTY, |(_, mask, _)| *mask);
-        let observation = self.sync.observe(tick, deadline, mask);
+        let bits = masks.at(tick).map_or(Bits::default(), |(_, bits, _)| *bits);
+        let observation = self.sync.observe(tick, deadline, bits);
         let slots = observation.slots.iter();
         self.measures.frame(slots.map(|slot| (slot.id, slot.present, slot.valid.then_some(slot.age_ns))));
         self.failed = self.file.frame(index, observation, deadline).err();

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use super::open_episode::OpenEpisode;
 use crate::bus::TopicId;
-use crate::mask::PhysicalMask;
+use crate::mask::Bits;
 use crate::modality::MAX_MODALITIES;
 use crate::sample::SampleHeader;
 use crate::time::Stamp;
@@ -50,12 +50,12 @@ impl Streams {
                 }
             }
             TopicId::Mask => {
-                let Some((mask, sequence)) = PhysicalMask::of_payload(payload) else { return };
+                let Some((bits, sequence)) = Bits::of_payload(payload) else { return };
                 let now = Last { seq: sequence, lost: 0, captured: Stamp(header.capture_ns) };
                 let hole = self.last_mask.replace(now).and_then(|last| last.hole(now));
-                self.masks.push(header, mask, sequence);
+                self.masks.push(header, bits, sequence);
                 if let Some(open) = open {
-                    open.mask(header, mask, sequence, hole);
+                    open.mask(header, bits, sequence, hole);
                 }
             }
         }
@@ -67,22 +67,22 @@ const MASKS: usize = 8192;
 
 /// The last publications of the mask, in the order of publication.
 #[derive(Debug)]
-pub(super) struct MaskHistory(VecDeque<(SampleHeader, PhysicalMask, u64)>);
+pub(super) struct MaskHistory(VecDeque<(SampleHeader, Bits, u64)>);
 
 impl MaskHistory {
     pub(super) fn new() -> Self {
         Self(VecDeque::with_capacity(MASKS))
     }
 
-    pub(super) fn push(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64) {
+    pub(super) fn push(&mut self, header: &SampleHeader, bits: impl Into<Bits>, sequence: u64) {
         if self.0.len() == MASKS {
             self.0.pop_front();
         }
-        self.0.push_back((*header, mask, sequence));
+        self.0.push_back((*header, bits.into(), sequence));
     }
 
     /// The publication in force at `stamp`: the last one at or before it.
-    pub(super) fn at(&self, stamp: Stamp) -> Option<&(SampleHeader, PhysicalMask, u64)> {
+    pub(super) fn at(&self, stamp: Stamp) -> Option<&(SampleHeader, Bits, u64)> {
         self.0.iter().rev().find(|(header, ..)| header.capture_ns <= stamp.0)
     }
 }

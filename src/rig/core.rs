@@ -4,7 +4,7 @@
 //! rig (`owner`) with tasks and shared memory, the lockstep rig with a virtual clock.
 //!
 //! Invariant: no clock, no I/O, no lock: the same inputs give the same effects.
-//! Invariant: a step that changes the mask has [`Effect::Publish`] as its first effect, once, with the mask after the
+//! Invariant: a step that changes the mask, or what is plugged in, has [`Effect::Publish`] as its first effect, once, with the mask after the
 //! whole step: no effect that allocates or locks precedes it.
 //! Invariant: a bit is set only while its device is attached and a stream of its newest epoch runs.
 //! Invariant: the device attached to a slot is the one that the assigner gave to its entry.
@@ -16,7 +16,7 @@ use std::time::Duration;
 use super::slot::{self, End, Slot};
 use crate::device::{Attachment, Unit};
 use crate::hotplug::HotplugEvent;
-use crate::mask::PhysicalMask;
+use crate::mask::{Bits, PhysicalMask};
 use crate::modality::ModalityId;
 use crate::provenance::UnplugSource;
 use crate::registry::{Assigner, Assignment, DeviceSpec, Registry};
@@ -66,8 +66,8 @@ pub enum StreamEvent {
 /// An action for the caller.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Effect {
-    /// Publish this mask. Always the first effect of a step.
-    Publish(PhysicalMask),
+    /// Publish these. Always the first effect of a step.
+    Publish(Bits),
     /// Report that no entry uses this device.
     Unused {
         /// The device.
@@ -158,7 +158,7 @@ impl Core {
 
     /// Takes one input at `now` and appends the effects, in order, to `effects`, which is empty.
     pub fn step(&mut self, input: Input, now: Stamp, effects: &mut Vec<Effect>) {
-        let before = self.mask;
+        let before = self.bits();
         match input {
             Input::Hotplug(HotplugEvent::Added(attachment)) => self.added(attachment, now, effects),
             Input::Hotplug(HotplugEvent::Removed { syspath, source, .. }) => {
@@ -179,14 +179,22 @@ impl Core {
                 }
             }
         }
-        if self.mask != before {
-            effects.insert(0, Effect::Publish(self.mask));
+        let bits = self.bits();
+        if bits != before {
+            effects.insert(0, Effect::Publish(bits));
         }
     }
 
     /// The mask in force.
     pub const fn mask(&self) -> PhysicalMask {
         self.mask
+    }
+
+    /// The mask in force, and what is plugged in.
+    pub fn bits(&self) -> Bits {
+        let is_plugged = |lane: &&Lane| lane.slot.attached().is_some() && !lane.is_announced_gone;
+        let plugged = self.lanes.iter().filter(is_plugged).fold(self.mask, |all, lane| all.with(lane.id, true));
+        Bits { mask: self.mask, plugged }
     }
 
     /// When [`Input::Timer`] is due, if no other input comes before.

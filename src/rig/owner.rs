@@ -238,7 +238,7 @@ impl Rig {
         self.core.step(input, Stamp::now(), &mut effects);
         for effect in effects.drain(..) {
             match effect {
-                Effect::Publish(mask) => self.presence.publish(mask),
+                Effect::Publish(bits) => self.presence.publish(bits),
                 Effect::Unused { unit, reason } => {
                     let serial = unit.serial().unwrap_or("no serial");
                     let device = format!("{} ({serial}) at {}", unit.model(), unit.place());

@@ -15,7 +15,7 @@ mod tests;
 
 use std::time::Duration;
 
-use crate::mask::PhysicalMask;
+use crate::mask::Bits;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::observation::{Observation, ObservationSlot};
 use crate::registry::{DeviceSpec, WhenStale};
@@ -119,14 +119,15 @@ impl<T> Synchronizer<T> {
         }
     }
 
-    /// Chooses the samples of `tick` by what was known at `now`, under the `mask` in force at the
+    /// Chooses the samples of `tick` by what was known at `now`, under the mask in force at the
     /// tick.
-    pub fn observe(&mut self, tick: Stamp, now: Stamp, mask: PhysicalMask) -> &Observation {
+    pub fn observe(&mut self, tick: Stamp, now: Stamp, bits: impl Into<Bits>) -> &Observation {
+        let Bits { mask, plugged } = bits.into();
         self.observation.tick = tick;
         self.observation.mask = mask;
         for (lane, slot) in self.lanes.iter().zip(&mut self.observation.slots) {
             let present = mask.contains(slot.id);
-            slot.clear(present);
+            slot.clear(present, plugged.contains(slot.id));
             if present {
                 lane.choose(tick, now, self.window_ns, slot);
             }

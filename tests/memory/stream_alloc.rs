@@ -24,7 +24,7 @@ use rapid::bus::{Bus, Inbox, TopicId};
 use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
-use rapid::mask::PhysicalMask;
+use rapid::mask::{Bits, PhysicalMask};
 use rapid::registry::Registry;
 use rapid::registry::scenario::Scenario;
 use rapid::rig::Rig;
@@ -208,7 +208,7 @@ fn an_observation_does_not_allocate() {
             let now = Stamp::now().0;
             let header = SampleHeader { seq, capture_ns: now, recv_ns: now, epoch: 1, ..SampleHeader::default() };
             state.publish(header, &[1; 64]).unwrap();
-            mask.publish(header, &PhysicalMask(2 + seq % 2).payload(seq)).unwrap();
+            mask.publish(header, &Bits::from(PhysicalMask(2 + seq % 2)).payload(seq)).unwrap();
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
         let allocated = own_allocations() - before;

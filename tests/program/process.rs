@@ -6,7 +6,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use crate::support::{self, Episode, EventMessage, Place, Running, events, logged, until};
+use crate::support::{self, Episode, EventMessage, MaskMessage, Place, Running, events, logged, until};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -186,6 +186,40 @@ fn a_program_that_crashes_repeatedly_fails() {
     for words in ["started as process", "crashes after 3 samples", "its process ended with code 1"] {
         assert_eq!(kept.matches(words).count(), 6, "{words:?} in {kept}");
     }
+}
+
+#[test]
+fn every_frame_tells_a_crash_from_an_unplug() {
+    let place = Place::new();
+    registry(&place, ", \"--crash-after\", \"20\"", "");
+    let scenario = "[[device]]\nname = \"counter\"\n[[event]]\nat = \"3s\"\nunplug = \"counter\"\n";
+    let output = place.run(&[&sim(&place, scenario)[..], &["--record", "--out", "out", "--duration", "4s"]].concat());
+    let text = String::from_utf8_lossy(&output.stdout);
+    let episode = Episode::read(&place.path("out").join(&place.episodes("out")[0]));
+    // Runs of frames that show the same.
+    let frames = episode.frames();
+    let shown = frames.iter().map(|(_, frame)| (frame.modalities[0].present, frame.modalities[0].plugged));
+    let mut phases: Vec<(bool, bool)> = shown.collect();
+    phases.dedup();
+    assert!(
+        phases.contains(&(true, true)) && phases.contains(&(false, true)),
+        "it ran, and crashed: {phases:?} {text}"
+    );
+    assert_eq!(phases.last(), Some(&(false, false)), "it is unplugged: {phases:?}");
+    assert_eq!(phases.iter().filter(|phase| **phase == (false, false)).count(), 1, "a crash is no unplug: {phases:?}");
+    assert!(!phases.contains(&(true, false)), "what runs is plugged in: {phases:?}");
+    // The topic of the mask carries the same.
+    let bits = |message: &support::Message| {
+        let message: MaskMessage = message.decode();
+        (message.mask, message.plugged)
+    };
+    let mut published: Vec<(u64, u64)> = episode.topic("/rapid/mask").map(bits).collect();
+    published.dedup();
+    assert_eq!(published.last(), Some(&(0, 0)), "{published:?}");
+    assert!(
+        published.contains(&(0, 1)) && published.contains(&(1, 1)) && !published.contains(&(1, 0)),
+        "{published:?}"
+    );
 }
 
 #[test]

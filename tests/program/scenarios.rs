@@ -384,6 +384,7 @@ fn frames(run: &Run) {
             let what = format!("frame {index}, {}: {slot:?}", device.name);
             assert_eq!(slot.bit, u32::from(device.id.bit()), "{what}");
             assert_eq!(slot.present, in_force >> slot.bit & 1 == 1, "{what}");
+            assert!(slot.plugged || !slot.present, "{what}: it runs, and is not plugged in");
             assert!(slot.present || !(slot.valid || slot.stale || slot.seq.is_some()), "{what}");
             assert_eq!(slot.stale, slot.present && !slot.valid, "{what}");
             if slot.valid {

@@ -337,6 +337,8 @@ pub(crate) struct MaskMessage {
     pub(crate) mask: u64,
     #[prost(uint64, tag = "3")]
     pub(crate) sequence: u64,
+    #[prost(fixed64, tag = "4")]
+    pub(crate) plugged: u64,
 }
 
 /// `rapid.Frame`.
@@ -352,6 +354,7 @@ pub(crate) struct FrameMessage {
 
 /// `rapid.Frame.Modality`.
 #[derive(Clone, PartialEq, prost::Message)]
+#[expect(clippy::struct_excessive_bools, reason = "they are the message's")]
 pub(crate) struct FrameModality {
     #[prost(uint32, tag = "1")]
     pub(crate) bit: u32,
@@ -365,6 +368,8 @@ pub(crate) struct FrameModality {
     pub(crate) seq: Option<u64>,
     #[prost(bool, tag = "6")]
     pub(crate) present: bool,
+    #[prost(bool, tag = "7")]
+    pub(crate) plugged: bool,
 }
 
 /// `rapid.Event`.

@@ -52,7 +52,7 @@ fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
     masks.push(&scalars(5, 996, 996), PhysicalMask(0b10), 5);
     let mut open = open(folder.path(), &board, &masks);
     for (sequence, capture) in [(6, 998), (7, 1000), (8, 1002)] {
-        open.mask(&scalars(sequence, capture, capture), PhysicalMask(0b10), sequence, None);
+        open.mask(&scalars(sequence, capture, capture), PhysicalMask(0b10).into(), sequence, None);
     }
     open.end_at(Stamp(1002 * MS));
     let report = open.finish(Stamp(1200 * MS), &masks, None, &[]);

@@ -48,10 +48,15 @@ fn an_added_entry_starts_the_device_that_is_plugged_in_and_touches_no_other() {
     let added = Arc::new(registry(&[("S", 3)]).devices.remove(0));
     let effects = step(&mut core, Input::Register(Arc::clone(&added)));
     let started = |effect: &Effect| matches!(effect, Effect::Device(_, DeviceEffect::Start(Epoch(1), _)));
-    assert!(effects.iter().all(|effect| matches!(effect, Effect::Device(of, _) if *of == id(3))), "{effects:?}");
+    let bits = Bits { mask: PhysicalMask(0b10_0001), plugged: PhysicalMask(0b10_1001) };
+    assert_eq!(effects.first(), Some(&Effect::Publish(bits)), "plugged in, and not running yet");
+    assert!(
+        effects.iter().skip(1).all(|effect| matches!(effect, Effect::Device(of, _) if *of == id(3))),
+        "{effects:?}"
+    );
     assert_eq!(effects.iter().filter(|effect| started(effect)).count(), 1, "{effects:?}");
     let effects = step(&mut core, Input::Stream { id: id(3), epoch: Epoch(1), event: StreamEvent::Started });
-    assert_eq!(effects.first(), Some(&Effect::Publish(PhysicalMask(0b10_1001))));
+    assert_eq!(effects.first(), Some(&Effect::Publish(PhysicalMask(0b10_1001).into())));
     assert_eq!(core.state(id(5)), (SlotState::Streaming, Epoch(1)));
     assert_eq!(step(&mut core, Input::Register(added)), [], "it is there");
 }

@@ -20,7 +20,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::bus::Writer;
 use crate::fault;
-use crate::mask::PhysicalMask;
+use crate::mask::{Bits, PhysicalMask};
 use crate::realtime::{MASK_PRIORITY, use_fifo};
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::Board;
@@ -52,9 +52,19 @@ pub struct Presence {
 #[derive(Debug)]
 struct Shared {
     mask: AtomicU64,
+    plugged: AtomicU64,
     /// Number of registered modalities.
     devices: AtomicU8,
     stop: AtomicBool,
+}
+
+impl Shared {
+    /// What runs is plugged in, also between the two stores of [`Presence::publish`].
+    fn bits(&self) -> Bits {
+        let mask = self.mask.load(Ordering::Acquire);
+        let plugged = self.plugged.load(Ordering::Acquire) | mask;
+        Bits { mask: PhysicalMask(mask), plugged: PhysicalMask(plugged) }
+    }
 }
 
 /// The right to publish the mask of this rig, and so to be its only `rapid`.
@@ -82,7 +92,12 @@ impl Presence {
     pub fn start(claim: Claim, writer: Arc<Writer>, board: Arc<Board>) -> Result<Self, PresenceError> {
         let Claim { path, file } = claim;
         let devices = AtomicU8::new(file.device_count());
-        let shared = Arc::new(Shared { mask: AtomicU64::new(0), devices, stop: AtomicBool::new(false) });
+        let shared = Arc::new(Shared {
+            mask: AtomicU64::new(0),
+            plugged: AtomicU64::new(0),
+            devices,
+            stop: AtomicBool::new(false),
+        });
         let ended = CancellationToken::new();
         let heartbeat =
             Heartbeat { _ended: ended.clone().drop_guard(), shared: Arc::clone(&shared), file, writer, board };
@@ -106,8 +121,11 @@ impl Presence {
         move || PhysicalMask(shared.mask.load(Ordering::Acquire))
     }
 
-    /// Publishes `mask` at once, and then at every period. Does not wait.
-    pub fn publish(&self, mask: PhysicalMask) {
+    /// Publishes these at once, and then at every period. Does not wait.
+    pub fn publish(&self, bits: impl Into<Bits>) {
+        let Bits { mask, plugged } = bits.into();
+        // In this order: whoever reads the new mask reads what is plugged in with it.
+        self.shared.plugged.store(plugged.0, Ordering::Release);
         self.shared.mask.store(mask.0, Ordering::Release);
         if let Some(thread) = &self.thread {
             thread.thread().unpark();
@@ -142,7 +160,7 @@ impl Presence {
 
 impl Drop for Presence {
     fn drop(&mut self) {
-        self.shared.mask.store(0, Ordering::Release);
+        self.publish(PhysicalMask::EMPTY);
         self.shared.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
             thread.thread().unpark();
@@ -178,9 +196,9 @@ impl Heartbeat {
         loop {
             fault::point("mask");
             let stop = self.shared.stop.load(Ordering::Acquire);
-            let mask = PhysicalMask(self.shared.mask.load(Ordering::Acquire));
+            let bits = self.shared.bits();
             let now = Stamp::now();
-            if now < due && published == Some(mask) && !stop {
+            if now < due && published == Some(bits) && !stop {
                 std::thread::park_timeout(due.since(now));
                 continue;
             }
@@ -188,7 +206,7 @@ impl Heartbeat {
             if beats == 0 {
                 lost = self.look(lost);
             }
-            match self.publish(mask, now) {
+            match self.publish(bits, now) {
                 Ok(()) => failed = false,
                 Err(error) if !failed => {
                     // Once, not 500 times a second.
@@ -197,7 +215,7 @@ impl Heartbeat {
                 }
                 Err(_) => {}
             }
-            published = Some(mask);
+            published = Some(bits);
             if stop {
                 return;
             }
@@ -230,7 +248,8 @@ impl Heartbeat {
         }
     }
 
-    fn publish(&mut self, mask: PhysicalMask, now: Stamp) -> Result<(), String> {
+    fn publish(&mut self, bits: Bits, now: Stamp) -> Result<(), String> {
+        let mask = bits.mask;
         self.file.set_device_count(self.shared.devices.load(Ordering::Acquire));
         let sequence = self.file.publish(mask, realtime_ns()).map_err(|error| error.to_string())?;
         self.board.set_mask(mask, sequence);
@@ -242,7 +261,7 @@ impl Heartbeat {
             encoding: Encoding::Mask as u32,
             ..SampleHeader::default()
         };
-        self.writer.publish(header, &mask.payload(sequence)).map_err(|error| error.to_string())
+        self.writer.publish(header, &bits.payload(sequence)).map_err(|error| error.to_string())
     }
 }
 

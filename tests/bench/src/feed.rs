@@ -85,7 +85,7 @@ impl Feed {
             name: "/rapid/mask".to_owned(),
             schema: SampleSchema::Bytes,
             header: mask,
-            payloads: vec![[0x1f_u64.to_le_bytes(), 1_u64.to_le_bytes()].concat()],
+            payloads: vec![[0x1f_u64, 1, 0x1f].map(u64::to_le_bytes).concat()],
             messages: vec![message],
             hz: MASK_HZ,
         });

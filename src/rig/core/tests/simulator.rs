@@ -292,13 +292,13 @@ impl Storm {
     }
 
     fn step(&mut self, input: &Input) -> Result<(), String> {
-        let before = self.core.mask();
+        let before = self.core.bits();
         self.effects.clear();
         self.core.step(input.clone(), self.now, &mut self.effects);
         if self.is_shown {
             println!("{:?} {input:?}\n    {:?}", self.now, self.effects);
         }
-        self.check_input(input, before)?;
+        self.check_input(input, before.mask)?;
         self.check_effects(before)?;
         self.check_state(input)
     }
@@ -322,10 +322,11 @@ impl Storm {
     }
 
     /// Checks the effects in order.
-    fn check_effects(&mut self, before: PhysicalMask) -> Result<(), String> {
-        let mask = self.core.mask();
-        let publishes = matches!(self.effects.first(), Some(Effect::Publish(published)) if *published == mask);
-        ensure(publishes == (mask != before), || format!("{before:?} to {mask:?}, first {:?}", self.effects.first()))?;
+    fn check_effects(&mut self, before: Bits) -> Result<(), String> {
+        let bits = self.core.bits();
+        let publishes = matches!(self.effects.first(), Some(Effect::Publish(published)) if *published == bits);
+        ensure(publishes == (bits != before), || format!("{before:?} to {bits:?}, first {:?}", self.effects.first()))?;
+        let (mask, before) = (bits.mask, before.mask);
         self.reached.bits_set += u64::from((mask.0 & !before.0).count_ones());
         self.reached.bits_cleared += u64::from((before.0 & !mask.0).count_ones());
         for (index, effect) in self.effects.iter().enumerate() {
@@ -371,6 +372,10 @@ impl Storm {
             ensure(attached.is_some() || state == SlotState::Absent, || format!("{id} is {state:?}, not attached"))?;
             ensure(attached.is_some() == model.is_plugged, || format!("hooks of {id}: {model:?}"))?;
             ensure(attached.is_some() || !model.is_announced, || format!("{id} was not announced as detached"))?;
+            let is_plugged = is_present || model.is_announced;
+            ensure(self.core.bits().plugged.contains(id) == is_plugged, || {
+                format!("{id} is plugged in or not: {model:?}")
+            })?;
             // Every waiting state has a deadline.
             let waits = state == SlotState::Backoff || state == SlotState::Absent && attached.is_some();
             let deadline = lane.slot.deadline();
