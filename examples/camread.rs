@@ -84,6 +84,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         depth: 4,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        form: None,
         action: None,
         hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(

@@ -84,6 +84,7 @@ fn registry(count: u8) -> Registry {
                 None,
             ),
             latency: Duration::ZERO,
+            form: None,
             action: None,
             hooks: rapid::registry::Hooks::default(),
         })

@@ -12,7 +12,7 @@ if [[ -t 0 && -t 1 ]]; then
   "$rapid" --sim --tour --out "$folder" --task demo
   echo
   echo 'Next: a policy moves a simulated arm and loses a sensor. Enter: start, ctrl-c: end.'
-  read -r
+  read -r || exit 0
   exec "$rapid" --infer --sim task --monitor --tour --out "$folder" --task demo
 fi
 began=$(mktemp "$folder/.began.XXXXXX")

@@ -5,10 +5,13 @@
 #[cfg(feature = "export")]
 mod export;
 mod list;
+mod measure;
+mod policy;
+mod registry;
+mod run;
 mod session;
 
 use std::ffi::OsString;
-use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeBounds;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -17,11 +20,15 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum, ValueHint};
 
-#[cfg(feature = "policy")]
-use crate::lockstep::evaluate::Condition;
 #[cfg(feature = "export")]
 pub use export::{ExportArgs, Layout};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
+pub use measure::{AblationArgs, Calibration, Count, LatencyArgs};
+#[cfg(feature = "policy")]
+pub use policy::EvalArgs;
+pub use policy::{InferenceArgs, PolicyArgs, ReplayArgs};
+pub use registry::{RegisterArgs, UnregisterArgs};
+pub use run::{LiveArgs, RunArgs, ShownArgs, TaskArgs};
 pub use session::{EpisodeCommand, SessionCommand};
 
 /// Record robot demonstrations with hot-plugged sensors
@@ -125,7 +132,6 @@ Examples:
   rapid register && rapid reload
   rapid reload --instance left --json";
 
-const RUN: &str = "Run options";
 const GENERAL: &str = "General options";
 
 /// Options of several commands, accepted before or after the command.
@@ -167,113 +173,6 @@ fn general_options(command: &str) -> &'static [&'static str] {
     }
 }
 
-/// Options of a run.
-#[derive(Debug, Clone, Args)]
-#[command(next_help_heading = RUN)]
-#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
-pub struct RunArgs {
-    /// Print events as plain text (no monitor)
-    #[arg(long)]
-    pub headless: bool,
-    /// Record an episode from the start
-    #[arg(long)]
-    pub record: bool,
-    /// End after recording (or running) this long: 30s, 5m
-    #[arg(long, value_name = "TIME", value_parser = duration, hide_short_help = true)]
-    pub duration: Option<Duration>,
-    /// Folder for episodes
-    #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
-    pub out: PathBuf,
-    /// Task, part of the file's name
-    #[arg(long, value_name = "TEXT", default_value = "episode", value_parser = task, hide_short_help = true)]
-    pub task: String,
-    /// Property of the episode, such as finger=soft; repeatable
-    #[arg(long, value_name = "KEY=VALUE", value_parser = tag, hide_short_help = true)]
-    pub tag: Vec<(String, String)>,
-    /// Module that is mounted and has no sensor of its own; repeatable
-    #[arg(long, value_name = "NAME", hide_short_help = true)]
-    pub module: Vec<String>,
-    /// Episodes wanted; the session is complete once so many are kept and not BAD
-    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..), conflicts_with = "duration", hide_short_help = true)]
-    pub goal: Option<u32>,
-    /// End each episode after this time
-    #[arg(long, value_name = "TIME", value_parser = duration, conflicts_with = "duration", hide_short_help = true)]
-    pub episode_time: Option<Duration>,
-    /// Begin the next episode this long after the end of the last, for which the scene is reset
-    #[arg(long, value_name = "TIME", value_parser = duration, conflicts_with = "duration", hide_short_help = true)]
-    pub reset_time: Option<Duration>,
-    /// Count down this long before each episode
-    #[arg(long, value_name = "TIME", value_parser = duration, hide_short_help = true)]
-    pub countdown: Option<Duration>,
-    /// Observations per second [default: from the registry]
-    #[arg(long, value_name = "HZ", value_parser = rate, hide_short_help = true)]
-    pub rate: Option<f64>,
-    /// Let members of this process's group attach and control, as its user may
-    ///
-    /// They may attach monitors, make requests to the session, and arm and disarm. The service that `rapid artifacts`
-    /// writes has it: members of group rapid use it.
-    #[arg(long, hide_short_help = true)]
-    pub group_control: bool,
-    /// Enable the actuator as soon as it is connected, instead of by `rapid arm` or the monitor
-    #[arg(long, hide_short_help = true)]
-    pub arm: bool,
-    /// Let the monitor lead through a first episode of the simulated rig, or with --infer through a policy's loss of a sensor
-    #[arg(long, requires = "sim", hide_short_help = true)]
-    pub tour: bool,
-    /// Half width of the synchronisation window of an observation [default: from the registry]
-    #[arg(long, value_name = "TIME", value_parser = window, hide_short_help = true)]
-    pub window: Option<Duration>,
-    /// What other programs see live.
-    #[command(flatten)]
-    pub live: LiveArgs,
-    /// How the monitor is shown.
-    #[command(flatten)]
-    pub shown: ShownArgs,
-}
-
-/// What other programs see live.
-#[derive(Debug, Clone, Copy, Args)]
-pub struct LiveArgs {
-    /// Show all topics live in Foxglove, as they are recorded [default address: 127.0.0.1:8765]
-    ///
-    /// In Foxglove: open connection, `ws://localhost:8765`. From another machine: `ssh -L 8765:localhost:8765 RIG`. With an
-    /// address that is not of this machine alone, such as 0.0.0.0:8765, whoever reaches the port sees what the sensors see.
-    #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = live_address, default_missing_value = "127.0.0.1:8765", hide_short_help = true)]
-    pub foxglove: Option<SocketAddr>,
-    /// Let Foxglove begin and end episodes, arm and disarm
-    ///
-    /// There is no password: every program and every user that reaches the port may do so, and so may web pages that are
-    /// open in a browser on this machine.
-    #[arg(long, requires = "foxglove", hide_short_help = true)]
-    pub foxglove_control: bool,
-}
-
-/// How the monitor is shown.
-#[derive(Debug, Clone, Copy, Args)]
-pub struct ShownArgs {
-    /// Show times in UTC in the monitor, not in the zone of this machine
-    #[arg(long, hide_short_help = true)]
-    pub utc: bool,
-    /// Select and scroll with the mouse in the monitor (text is then selected with shift)
-    #[arg(long, hide_short_help = true)]
-    pub mouse: bool,
-}
-
-/// Options of the simulated task.
-#[derive(Debug, Clone, Args)]
-#[command(next_help_heading = "Options of the simulated task")]
-pub struct TaskArgs {
-    /// Seed of the first trial of `--sim task`, and of the noise of a policy
-    #[arg(long, value_name = "N", default_value_t = 0, hide_short_help = true)]
-    pub seed: u64,
-    /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
-    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm", "foxglove"], hide_short_help = true)]
-    pub expert: bool,
-    /// Demonstrations to record, one trial each
-    #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert", hide_short_help = true)]
-    pub episodes: usize,
-}
-
 /// What to do instead of running the rig.
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -286,7 +185,7 @@ pub enum Command {
         formats: bool,
     },
     /// Add an entry to the registry for a connected device
-    #[command(after_long_help = REGISTER)]
+    #[command(after_long_help = registry::REGISTER)]
     Register(Box<RegisterArgs>),
     /// Remove an entry from the registry; the rest is kept unchanged
     #[command(after_long_help = "Examples:\n  rapid unregister cam_left --dry-run\n  rapid unregister cam_left --yes")]
@@ -424,14 +323,14 @@ pub enum Command {
         paths: Vec<PathBuf>,
     },
     /// Replay an episode as if its devices were plugged in
-    #[command(after_long_help = REPLAY)]
+    #[command(after_long_help = policy::REPLAY)]
     Replay(ReplayArgs),
     /// Evaluate a policy on the simulated task with sensors unplugged
     #[cfg(feature = "policy")]
-    #[command(after_long_help = EVAL)]
+    #[command(after_long_help = policy::EVAL)]
     Eval(EvalArgs),
     /// List the configurations of a comparison and what to record next
-    #[command(after_long_help = ABLATION)]
+    #[command(after_long_help = measure::ABLATION)]
     Ablation(AblationArgs),
     /// Print a shell completion script
     #[command(after_long_help = "Examples:\n  source <(rapid completions bash)\n  \
@@ -529,14 +428,15 @@ impl Cli {
             of_run.try_contains_id(id).unwrap_or(false) && of_run.value_source(id) == Some(ValueSource::CommandLine)
         };
         if run.headless || self.policy.infer.is_some() && !self.policy.monitor {
-            let shown = ["tour", "mouse", "utc"].into_iter().find(|id| given(id))?;
-            let why = if run.headless { "--headless opens none" } else { "--infer opens none without --monitor" };
-            return Some(format!("--{shown} is of the monitor, and {why}: leave one of them out"));
+            let why = if run.headless { "--headless does not open" } else { "--infer opens only with --monitor" };
+            if let Some(shown) = ["tour", "mouse", "utc"].into_iter().find(|id| given(id)) {
+                return Some(format!("--{shown} needs the monitor, which {why}: leave one of them out"));
+            }
         }
         let is_task = self.global.sim.as_ref().and_then(Option::as_deref).is_some_and(|sim| sim == Path::new("task"));
         let is_used = is_task || self.policy.infer.is_some();
         (given("seed") && !is_used).then(|| {
-            "--seed is of `--sim task` and of a policy (--infer), and there is neither: leave it out".to_owned()
+            "--seed only affects `--sim task` and a policy (--infer), and there is neither: leave it out".to_owned()
         })
     }
 
@@ -571,24 +471,6 @@ impl Cli {
             _ => "leave --sim out, or name a scenario file".to_owned(),
         };
         Some(format!("--sim takes {name:?} for the name of a scenario file: {fix}"))
-    }
-}
-
-/// An address to listen on: an IP address and a port, or one of them.
-fn live_address(text: &str) -> Result<SocketAddr, String> {
-    const PORT: u16 = 8765;
-    let address = text.parse().ok();
-    let address = address.or_else(|| Some(SocketAddr::new(text.parse::<IpAddr>().ok()?, PORT)));
-    let address = address.or_else(|| Some(SocketAddr::from(([127, 0, 0, 1], text.parse().ok()?))));
-    address.ok_or_else(|| "write an IP address and a port, such as 127.0.0.1:8765, or one of them".to_owned())
-}
-
-/// The name of a task.
-fn task(text: &str) -> Result<String, String> {
-    if text.trim().is_empty() {
-        Err("write a name, for example \"place block\"".to_owned())
-    } else {
-        Ok(text.to_owned())
     }
 }
 
@@ -660,15 +542,6 @@ fn duration(text: &str) -> Result<Duration, String> {
     time(text, Duration::from_nanos(1).., "must be longer than 0s", "30s, 500ms or 2m")
 }
 
-fn window(text: &str) -> Result<Duration, String> {
-    time(text, Duration::from_millis(1)..=Duration::from_secs(10), "must be between 1ms and 10s", "25ms")
-}
-
-fn rate(text: &str) -> Result<f64, String> {
-    let hertz: f64 = text.parse().map_err(|_| "write a number, for example 30".to_owned())?;
-    if (0.1..=1000.0).contains(&hertz) { Ok(hertz) } else { Err("must be between 0.1 and 1000 Hz".to_owned()) }
-}
-
 fn tag(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
         Some((key, value)) if !key.is_empty() => Ok((key.to_owned(), value.to_owned())),
@@ -679,319 +552,6 @@ fn tag(text: &str) -> Result<(String, String), String> {
 fn instance(text: &str) -> Result<String, String> {
     let plain = !text.is_empty() && text.len() <= 32 && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
     if plain { Ok(text.to_owned()) } else { Err("1 to 32 letters, digits and dashes".to_owned()) }
-}
-
-const ABLATION: &str = "\
-An episode belongs to a configuration by its tag finger=... (or that of a module) and by the sensors that \
-were present when it started. A word of --modality is an entry, a module with sensors, a part of the names \
-of entries (tactile for tactile_tip), or vision: cameras that are not in a fingertip.
-
-Examples:
-  rapid ablation --finger rigid,soft --modality vision,vision+tactile --episodes 20
-  rapid ablation plan.toml --in /data/episodes --json
-
-Keys of a plan: episodes = 20, fingers = [\"rigid\"], modalities = [\"vision\"], and optionally task = \"...\", \
-tag = \"finger\" and [words] vision = [\"cam_wrist\"].";
-
-/// Which configurations, and where their episodes are.
-#[derive(Debug, Clone, Args)]
-pub struct AblationArgs {
-    /// Plan [default: ablation.toml, if there is one]
-    #[arg(value_hint = ValueHint::FilePath)]
-    pub plan: Option<PathBuf>,
-    /// Fingers: values of their tag
-    #[arg(long, value_name = "A,B", value_delimiter = ',')]
-    pub finger: Vec<String>,
-    /// Sets of modalities
-    #[arg(long, value_name = "X,X+Y", value_delimiter = ',')]
-    pub modality: Vec<String>,
-    /// Episodes per configuration [default: from the plan, or 10]
-    #[arg(long, value_name = "COUNT", value_parser = at_least_one)]
-    pub episodes: Option<usize>,
-    /// Only episodes of this task
-    #[arg(long, value_name = "TEXT")]
-    pub task: Option<String>,
-    /// Folder of the episodes
-    #[arg(long = "in", value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
-    pub folder: PathBuf,
-    /// Worst verdict that counts: good, suspect or any
-    #[arg(long, value_name = "VERDICT", default_value = "suspect", hide_possible_values = true)]
-    pub count: Count,
-}
-
-/// The worst verdict with which an episode counts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Count {
-    /// GOOD.
-    Good,
-    /// GOOD or SUSPECT.
-    Suspect,
-    /// All of them.
-    Any,
-}
-
-fn at_least_one(text: &str) -> Result<usize, String> {
-    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "write a number from 1 on".to_owned())
-}
-
-const LATENCY: &str = "\
-How: stop a running rapid (the camera must be free), darken the room, and point the camera at this \
-terminal from nearby, so that the terminal fills most of the picture; use full screen and full brightness. \
-Then start this: the terminal flashes white and black in a pattern that matches at one delay only, up to \
-three times a second. The result is the line for the camera's entry. Switch automatic exposure off \
-(`controls` of the entry) if the pictures do not follow.
-
-The result includes the latency of the terminal and its screen, often 10 to 40 ms. That of an LED is \
-negligible: --led takes one of /sys/class/leds (needs permission to write there).
-
-Examples:
-  rapid calibrate latency --device cam_wrist
-  rapid calibrate latency --device cam_wrist --light-delay 15ms
-  sudo rapid calibrate latency --device cam_wrist --led ACT --duration 1m
-  rapid calibrate latency --sim --device cam_wrist          without a camera";
-
-/// What can be measured.
-#[derive(Debug, Subcommand)]
-pub enum Calibration {
-    /// Measure the latency of a camera by flashing a light in front of it
-    #[command(after_long_help = LATENCY)]
-    Latency(LatencyArgs),
-}
-
-/// How the latency of a camera is measured.
-#[derive(Debug, Clone, Args)]
-pub struct LatencyArgs {
-    /// Entry of the camera [default: the only one that is plugged in]
-    #[arg(long, value_name = "NAME")]
-    pub device: Option<String>,
-    /// How long to flash: 5s to 10m
-    #[arg(long, value_name = "TIME", default_value = "20s", value_parser = flashing)]
-    pub duration: Duration,
-    /// Flash an LED instead of this terminal: its name, or its folder
-    #[arg(long, value_name = "NAME|DIR", value_hint = ValueHint::DirPath)]
-    pub led: Option<PathBuf>,
-    /// Latency of the light itself, if known; subtracted from the result
-    #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = light_delay)]
-    pub light_delay: Duration,
-}
-
-fn flashing(text: &str) -> Result<Duration, String> {
-    match duration(text)? {
-        length if (Duration::from_secs(5)..=Duration::from_mins(10)).contains(&length) => Ok(length),
-        _ => Err("must be between 5s and 10m".to_owned()),
-    }
-}
-
-fn light_delay(text: &str) -> Result<Duration, String> {
-    time(text, ..=Duration::from_secs(1), "must be 1s at most", "15ms")
-}
-
-const POLICY: &str = "Policy options";
-
-#[cfg(feature = "policy")]
-const EVAL: &str = "\
-Conditions: full (all sensors), no-tactile (without the tactile sensor), hot-unplug (it is unplugged while \
-the block is carried), hot-replug (it is unplugged on the way to the block, and plugged in again), no-wrist \
-(without the camera that shows where the block lies).
-
-The seed of a trial determines when each sensor captures (anywhere in its period of 100 ms) and how long \
-after that its sample is delivered (5 to 50 ms); the policy starts when the last of them was delivered. \
-Trials run faster than real time; the same seed gives the same trial.
-
-Examples:
-  rapid eval
-  rapid eval --trials 100 --json > result.jsonl
-  rapid eval --static-config --condition hot-unplug models/tactile-id";
-
-/// Options of a policy.
-#[derive(Debug, Clone, Args)]
-#[command(next_help_heading = POLICY)]
-#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
-pub struct PolicyArgs {
-    /// Run a policy, headless [default: the built-in one]
-    ///
-    /// The built-in policy is for `--sim task`.
-    #[arg(long, value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath, help_heading = RUN)]
-    pub infer: Option<Option<PathBuf>>,
-    /// Show and record its actions without moving anything
-    #[arg(long, requires = "infer", hide_short_help = true)]
-    pub dry_run: bool,
-    /// Wait until all sensors it requires are plugged in, instead of failing
-    #[arg(long, requires = "infer", hide_short_help = true)]
-    pub wait: bool,
-    /// Open the monitor
-    #[arg(long, requires = "infer", conflicts_with = "headless", hide_short_help = true)]
-    pub monitor: bool,
-    /// Continue when a sensor is missing that the policy was not trained to miss
-    #[arg(long, alias = "go-on", requires = "infer", hide_short_help = true)]
-    pub ignore_missing: bool,
-    /// How inference runs.
-    #[command(flatten, next_help_heading = POLICY)]
-    pub inference: InferenceArgs,
-}
-
-/// How inference runs.
-#[derive(Debug, Clone, Args)]
-pub struct InferenceArgs {
-    /// Denoising steps [default: from the policy]
-    #[arg(long, value_name = "COUNT")]
-    pub denoising_steps: Option<usize>,
-    /// onnxruntime library to use instead of the built-in one
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
-    pub ort_lib: Option<PathBuf>,
-}
-
-/// What `rapid eval` runs.
-#[cfg(feature = "policy")]
-#[derive(Debug, Clone, Args)]
-pub struct EvalArgs {
-    /// Folder of the policy [default: the one built into rapid]
-    #[arg(value_hint = ValueHint::DirPath)]
-    pub bundle: Option<PathBuf>,
-    /// Trials per condition
-    #[arg(long, value_name = "COUNT", default_value_t = 25, value_parser = trials)]
-    pub trials: usize,
-    /// Seed of the first trial; demonstrations start at 0 unless recorded with another --seed
-    #[arg(long, value_name = "N", default_value_t = 50_000)]
-    pub seed: u64,
-    /// Condition, all of which --help explains; repeatable [default: all]
-    #[arg(long, value_name = "NAME", value_parser = condition)]
-    pub condition: Vec<Condition>,
-    /// Baseline with a fixed set of sensors: losing one ends the run
-    #[arg(long)]
-    pub static_config: bool,
-    /// How inference runs.
-    #[command(flatten)]
-    pub inference: InferenceArgs,
-}
-
-#[cfg(feature = "policy")]
-fn trials(text: &str) -> Result<usize, String> {
-    let count = text.parse().map_err(|_| "write a number, for example 25".to_owned())?;
-    if count > 0 { Ok(count) } else { Err("must be at least 1".to_owned()) }
-}
-
-#[cfg(feature = "policy")]
-fn condition(text: &str) -> Result<Condition, String> {
-    let known = Condition::ALL.into_iter().find(|condition| condition.word() == text);
-    known.ok_or_else(|| format!("one of {}", Condition::ALL.map(Condition::word).join(", ")))
-}
-
-const REGISTER: &str = "\
-On a terminal it asks for missing values. Without --serial and --port the entry matches the connected unit \
-by its serial number, or by its port if it has no unique one and is not the only unit. The udev rules and descriptors \
-that `rapid artifacts` writes are written too, to udev/ beside the registry.
-
-Examples:
-  rapid register
-  rapid register --vid 046d --pid 0825 --name cam_left --node camera --set camera.width=1280
-  rapid register --import ~/.config/rapid_driver/registry.toml --dry-run
-  rapid register --sim scenario.toml          without a device";
-
-/// What to register.
-#[derive(Debug, Clone, Args)]
-pub struct RegisterArgs {
-    /// USB vendor id
-    #[arg(long, value_name = "HEX", value_parser = usb_id)]
-    pub vid: Option<u16>,
-    /// USB product id
-    #[arg(long, value_name = "HEX", value_parser = usb_id)]
-    pub pid: Option<u16>,
-    /// Serial number of the unit
-    #[arg(long, value_name = "TEXT")]
-    pub serial: Option<String>,
-    /// USB port instead of a serial number, such as 1-2.3
-    #[arg(long, value_name = "PORT")]
-    pub port: Option<String>,
-    /// Name of the entry, such as gripper
-    #[arg(long)]
-    pub name: Option<String>,
-    /// camera, serial, can, lan or a node program [default: from the device's interfaces]
-    #[arg(long)]
-    pub node: Option<String>,
-    /// Bit in the mask [default: the lowest free one]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..64))]
-    pub bit: Option<u8>,
-    /// Position of its module: front, tip, top or bottom
-    #[arg(long)]
-    pub slot: Option<String>,
-    /// Any other key of the entry, such as camera.width=1280; repeatable
-    #[arg(long, value_name = "KEY=VALUE", value_parser = tag)]
-    pub set: Vec<(String, String)>,
-    /// First read the device for up to 2 s and show its data
-    #[arg(long)]
-    pub test: bool,
-    /// Write without asking
-    #[arg(long, short)]
-    pub yes: bool,
-    /// Print the entry without writing it
-    #[arg(long)]
-    pub dry_run: bool,
-    /// Import the devices of a registry.toml of `rapid_driver`
-    #[arg(long, help = "Import the devices of a registry.toml of rapid_driver", value_name = "FILE", value_hint = ValueHint::FilePath, conflicts_with_all = ["vid", "pid", "serial", "port", "name", "bit", "slot", "set"])]
-    pub import: Option<PathBuf>,
-    /// Its `mask_layout.toml`, for the bits
-    #[arg(long, help = "Its mask_layout.toml, for the bits", value_name = "FILE", value_hint = ValueHint::FilePath, requires = "import")]
-    pub layout: Option<PathBuf>,
-}
-
-/// What to remove.
-#[derive(Debug, Clone, Args)]
-pub struct UnregisterArgs {
-    /// Name of the entry
-    pub name: String,
-    /// Write without asking
-    #[arg(long, short)]
-    pub yes: bool,
-    /// Print the new registry without writing it
-    #[arg(long)]
-    pub dry_run: bool,
-}
-
-fn usb_id(text: &str) -> Result<u16, String> {
-    let digits = text.strip_prefix("0x").unwrap_or(text);
-    let hex = (1..=4).contains(&digits.len()) && digits.bytes().all(|byte| byte.is_ascii_hexdigit());
-    let id = hex.then(|| u16::from_str_radix(digits, 16).ok()).flatten();
-    id.ok_or_else(|| "write the four hexadecimal digits that lsusb shows, for example 046d".to_owned())
-}
-
-const REPLAY: &str = "\
-The registry is the one recorded in the episode. With --infer nothing is run: the action chunks of an \
-episode recorded with the policy are computed again; with any other episode, the policy's actions are \
-compared with the recorded ones.
-
-Examples:
-  rapid replay episodes/20260101_place-block_001.mcap
-  rapid replay episodes/20260101_place-block_001.mcap --headless --record --out again
-  rapid replay episodes/20260101_place-block_001.mcap --infer models/tactile-id --tolerance 1e-4";
-
-/// Which episode, and how it is replayed.
-#[derive(Debug, Clone, Args)]
-pub struct ReplayArgs {
-    /// Episode
-    #[arg(value_hint = ValueHint::FilePath)]
-    pub file: PathBuf,
-    /// Options of the run.
-    #[command(flatten)]
-    pub run: RunArgs,
-    /// Compare a policy with the episode [default: the one built into rapid]
-    #[arg(long, value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath, help_heading = COMPARISON)]
-    pub infer: Option<Option<PathBuf>>,
-    /// Largest accepted difference of actions computed again
-    #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance, requires = "infer", help_heading = COMPARISON)]
-    pub tolerance: Option<f64>,
-    /// How inference runs.
-    #[command(flatten, next_help_heading = COMPARISON)]
-    pub inference: InferenceArgs,
-}
-
-const COMPARISON: &str = "Comparison options";
-
-fn tolerance(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(difference) if (0.0..f64::INFINITY).contains(&difference) => Ok(difference),
-        _ => Err("write a number from 0 on, for example 1e-4".to_owned()),
-    }
 }
 
 #[cfg(test)]

@@ -68,7 +68,7 @@ impl PhysicalMask {
 pub struct Bits {
     /// The mask.
     pub mask: PhysicalMask,
-    /// One bit per modality: set exactly while its device is attached.
+    /// One bit per modality: set exactly while its device is attached and no source has reported it gone.
     pub plugged: PhysicalMask,
 }
 

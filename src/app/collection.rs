@@ -26,6 +26,8 @@ use crate::time::{Stamp, realtime_ns, rfc3339};
 
 /// Answers that wait for an episode to begin, or to end.
 type Waiting = Vec<oneshot::Sender<Result<String, String>>>;
+/// Those that wait for a beginning, each with the episode that its request replaces, if it does.
+type Beginning = Vec<(oneshot::Sender<Result<String, String>>, Option<String>)>;
 
 fn reply_all(to: Waiting, answer: &Result<String, String>) {
     for reply in to {
@@ -69,7 +71,7 @@ pub(super) struct Collection {
     /// What the keeper is to do for the request that is being carried out.
     operations: Vec<Operation>,
     outcomes: UnboundedReceiver<Outcome>,
-    at_begin: Waiting,
+    at_begin: Beginning,
     at_end: Waiting,
     answer: Option<Answered>,
     /// The session has a file. A run that records one episode by itself leaves that episode and nothing beside it, unless
@@ -175,15 +177,17 @@ impl Collection {
         reply: Reply,
     ) -> Result<(), RecordError> {
         let is_shown = *request != SessionRequest::Show;
+        let replaces = self.session.newest().filter(|_| *request == SessionRequest::Redo).map(str::to_owned);
         self.is_kept |= is_shown;
         match self.session.request(request, at) {
             Ok((answer, effects)) => {
                 let pending = match answer {
                     Answer::Now(text) => {
-                        Some(Pending { text, is_done: false, is_shown, to: reply.into_iter().collect() })
+                        let to = reply.into_iter().collect();
+                        Some(Pending { text, is_done: false, replaces: None, is_shown, to })
                     }
                     Answer::AtBegin => {
-                        self.at_begin.extend(reply);
+                        self.at_begin.extend(reply.map(|reply| (reply, replaces)));
                         None
                     }
                     Answer::AtEnd => {
@@ -224,7 +228,7 @@ impl Collection {
             let is_discarded = self.session.discards();
             let length = format!("{}, {:.1} s", end.verdict.grade.word(), end.seconds);
             let text = if is_discarded { format!("{file}: in the trash") } else { format!("{file}: {length}") };
-            Some(Pending { text, is_done: !is_discarded, is_shown: false, to })
+            Some(Pending { text, is_done: !is_discarded, replaces: None, is_shown: false, to })
         };
         (self.session.ended(&end.file, end.seconds, &end.verdict, Stamp::now()), answer)
     }
@@ -263,11 +267,7 @@ impl Collection {
                     self.change(effect);
                 }
                 self.submit(None);
-                let why = format!("{file} was not moved: {why}");
-                // A redo that still counts down.
-                let answer = Err(format!("{why}; the next episode begins nevertheless"));
-                reply_all(std::mem::take(&mut self.at_begin), &answer);
-                self.fail(why);
+                self.fail(format!("{file} was not moved: {why}"));
             }
             Outcome::Failed(why) => self.fail(why),
             Outcome::Closed(closed) => {
@@ -295,10 +295,7 @@ impl Collection {
         for effect in effects {
             match effect {
                 Effect::Begin => {
-                    // What no program waits for is carried out with what the beginning changes, and answered with it.
-                    if let Some(answer) = answer.take_if(|answer| !answer.to.is_empty()) {
-                        self.submit(Some(answer));
-                    }
+                    self.submit(answer.take());
                     outcome = self.begin().await;
                 }
                 effect => self.change(effect),
@@ -307,7 +304,8 @@ impl Collection {
         self.submit(answer);
         if self.session.phase() == Phase::Idle {
             // Whatever they waited for was called off.
-            reply_all(std::mem::take(&mut self.at_begin), &Err("no episode begins".to_owned()));
+            let waiting = std::mem::take(&mut self.at_begin).into_iter().map(|(to, _)| to).collect();
+            reply_all(waiting, &Err("no episode begins".to_owned()));
         }
         self.show();
         outcome
@@ -338,7 +336,7 @@ impl Collection {
         let operations = std::mem::take(&mut self.operations);
         match answer {
             // What changes nothing on the disk does not wait for it.
-            Some(Pending { text, is_shown, to, .. }) if operations.is_empty() => {
+            Some(Pending { text, is_shown, to, replaces: None, .. }) if operations.is_empty() => {
                 reply_all(to, &Ok(text.clone()));
                 if is_shown {
                     self.answer(Ok(text), None);
@@ -370,14 +368,18 @@ impl Collection {
         for effect in self.session.began(started.as_deref().ok(), begun, Stamp::now()) {
             self.change(effect);
         }
-        let to: Waiting = std::mem::take(&mut self.at_begin);
+        let waiting = std::mem::take(&mut self.at_begin);
         match &started {
             Ok(file) => {
                 let text = format!("recording {}", file.display());
-                self.submit(Some(Pending { text, is_done: true, is_shown: false, to }));
+                for (to, replaces) in waiting {
+                    let (text, to) = (text.clone(), vec![to]);
+                    self.submit(Some(Pending { text, is_done: true, replaces, is_shown: false, to }));
+                }
+                self.submit(None);
             }
             Err(error) => {
-                reply_all(to, &Err(error.to_string()));
+                reply_all(waiting.into_iter().map(|(to, _)| to).collect(), &Err(error.to_string()));
                 self.submit(None);
             }
         }

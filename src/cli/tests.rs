@@ -115,10 +115,11 @@ fn options_before_or_after_a_command_parse_or_the_error_names_the_position() {
         ("--sim --headless play.toml", "right after --sim (rapid --sim play.toml)"),
         ("a.mcap", "rapid inspect a.mcap"),
         ("devces", "'devices'"),
-        ("--sim --tour --headless", "--tour is of the monitor, and --headless opens none"),
-        ("replay a.mcap --utc --headless", "--utc is of the monitor, and --headless opens none"),
-        ("--infer --sim task --mouse", "--mouse is of the monitor, and --infer opens none without --monitor"),
-        ("--sim --seed 3", "--seed is of `--sim task` and of a policy"),
+        ("--sim --tour --headless", "--tour needs the monitor, which --headless does not open"),
+        ("replay a.mcap --utc --headless", "--utc needs the monitor, which --headless does not open"),
+        ("--infer --sim task --mouse", "--mouse needs the monitor, which --infer opens only with --monitor"),
+        ("--sim --seed 3", "--seed only affects `--sim task` and a policy"),
+        ("--sim --headless --seed 3", "--seed only affects `--sim task` and a policy"),
     ] {
         let message = printed(words);
         assert!(message.contains(expected), "{words}: {message}");

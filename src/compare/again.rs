@@ -358,7 +358,7 @@ impl Reference {
             }
             // If the very first sample of the run is in the file, none can have been used before.
             let device = registry.named(&observation.modality);
-            let first = || device.is_some_and(|device| survey.holds(&device.topic, 0));
+            let first = || !survey.is_begun_in_damage && device.is_some_and(|device| survey.holds(&device.topic, 0));
             if whole || first() { Self::Next } else { Self::Lost }
         };
         bundle.observations.iter().map(of).collect()
@@ -368,8 +368,14 @@ impl Reference {
 /// Whether the recording began before the policy's first chunk.
 fn holds_every_chunk(survey: &Survey, bundle: &Bundle) -> bool {
     let Some(chunk) = survey.chunks.first() else { return true };
+    if chunk.tick == 0 {
+        return true;
+    }
+    if survey.is_begun_in_damage {
+        return false;
+    }
     // Reported when the policy is loaded.
-    if survey.policy.is_some() || chunk.tick == 0 {
+    if survey.policy.is_some() {
         return true;
     }
     let begun = chunk.observed_ns as f64 - chunk.tick as f64 * 1e9 / bundle.control_hz;

@@ -42,6 +42,8 @@ pub(super) struct Survey {
     pub(super) samples: BTreeMap<String, Vec<u32>>,
     /// Which part of the file could not be read.
     pub(super) damage: Option<String>,
+    /// Something before the first chunk could not be read: it may not be the first of the run.
+    pub(super) is_begun_in_damage: bool,
 }
 
 /// A chunk as its event states it.
@@ -115,7 +117,10 @@ impl Survey {
                     }
                 }
                 Content::Event(EventText { kind: "chunk", json, .. }) => match serde_json::from_str(json) {
-                    Ok(chunk) => survey.chunks.push(chunk),
+                    Ok(chunk) => {
+                        survey.is_begun_in_damage |= survey.chunks.is_empty() && reader.integrity().damage().is_some();
+                        survey.chunks.push(chunk);
+                    }
                     Err(_) => survey.unreadable += 1,
                 },
                 Content::Event(EventText { kind: "policy", json, .. }) => {

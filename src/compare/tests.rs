@@ -306,8 +306,8 @@ fn a_damaged_file_is_compared_up_to_the_damage_and_a_foreign_one_rejected_by_nam
     for at in (0..recorded.bytes.len()).step_by(recorded.bytes.len() / 12) {
         let mut bytes = recorded.bytes.clone();
         bytes[at] ^= 0x55;
-        if let Ok(Compared { comparison: Comparison::Again(again), .. }) = recorded.compared(&bytes) {
-            assert!(again.difference.all.largest < 1e-6, "at {at}: {again:?}");
+        if let Ok(Compared { comparison: Comparison::Again(again), damage, .. }) = recorded.compared(&bytes) {
+            assert!(again.difference.all.largest < 1e-6, "at {at}, {damage:?}: {again:?}");
         }
     }
 

@@ -10,6 +10,7 @@ use std::ops::Range;
 use super::schema::SampleSchema;
 use crate::mask::Bits;
 use crate::observation::Observation;
+use crate::registry::CalibrationSpec;
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Event, Level, What};
 
@@ -225,6 +226,32 @@ pub fn joints<'a>(out: &mut Vec<u8>, wall_ns: u64, joints: impl Iterator<Item = 
                 out.extend_from_slice(&number.to_le_bytes());
             }
         }
+    }
+}
+
+/// Writes a `foxglove.CameraCalibration`: without rectification, and projected by the intrinsics.
+pub fn calibration(out: &mut Vec<u8>, wall_ns: u64, frame_id: &str, camera: &CalibrationSpec) {
+    let CalibrationSpec { width, height, model, distortion, intrinsics } = camera;
+    out.clear();
+    timestamp(out, wall_ns);
+    fixed32(out, 2, *width);
+    fixed32(out, 3, *height);
+    bytes(out, 4, model.as_bytes());
+    packed(out, 5, distortion.iter().copied());
+    packed(out, 6, intrinsics.iter().copied());
+    packed(out, 7, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0].into_iter());
+    let rows = intrinsics.as_chunks::<3>().0.iter();
+    packed(out, 8, rows.flat_map(|[first, second, third]| [*first, *second, *third, 0.0]));
+    bytes(out, 9, frame_id.as_bytes());
+}
+
+/// A repeated double; nothing of none.
+fn packed(out: &mut Vec<u8>, field: u8, values: impl Iterator<Item = f64> + Clone) {
+    let count = values.clone().count() as u64;
+    if count > 0 {
+        key(out, field, BYTES);
+        varint(out, 8 * count);
+        values.for_each(|value| out.extend_from_slice(&value.to_le_bytes()));
     }
 }
 

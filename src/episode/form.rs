@@ -1,11 +1,12 @@
-//! Messages derived from the numbers of a device whose [`Form`] is known, which viewers draw: poses, transforms and the
-//! states of joints. They are recorded beside the numbers, and carry their capture time and sequence number.
+//! Messages derived from the samples of a device whose [`Form`] is known, which viewers draw: poses, transforms, the states
+//! of joints, and the calibration of a camera. They are recorded beside the samples, and carry their capture time and
+//! sequence number.
 //!
-//! Invariant: nothing here is read again by `rapid`: the numbers are what was measured.
-//! Invariant: numbers that are no pose (not finite, or without a rotation) give no message.
+//! Invariant: nothing here is read again by `rapid`: the samples are what was measured.
+//! Invariant: numbers that do not form a pose (not finite, or without a rotation) give no message.
 
 use super::encode::{self, Joint, Pose};
-use super::schema::{self, Schema};
+use super::schema::{self, SampleSchema, Schema};
 use crate::registry::{DeviceSpec, Form, JointsSpec, PoseLayout, PoseSpec, Quantity};
 
 /// The topic of all transforms.
@@ -20,6 +21,8 @@ pub enum Derived {
     Transform,
     /// `foxglove.JointStates`.
     Joints,
+    /// `foxglove.CameraCalibration`.
+    Calibration,
 }
 
 impl Derived {
@@ -28,6 +31,7 @@ impl Derived {
         match device.form {
             Some(Form::Pose(_)) => &[Self::Pose, Self::Transform],
             Some(Form::Joints(_)) => &[Self::Joints],
+            Some(Form::Calibration(_)) => &[Self::Calibration],
             None => &[],
         }
     }
@@ -37,7 +41,7 @@ impl Derived {
         let ending = device.form.as_ref().map_or("", Form::ending);
         match self {
             Self::Transform => TRANSFORM_TOPIC.to_owned(),
-            Self::Pose | Self::Joints => format!("{}{ending}", device.topic),
+            Self::Pose | Self::Joints | Self::Calibration => format!("{}{ending}", device.topic),
         }
     }
 
@@ -47,22 +51,35 @@ impl Derived {
             Self::Pose => schema::POSE,
             Self::Transform => schema::TRANSFORM,
             Self::Joints => schema::JOINTS,
+            Self::Calibration => schema::CALIBRATION,
         }
     }
 
-    /// Writes the message of the sample with these numbers (little-endian 64-bit floats), captured at `wall_ns`. False if
-    /// they give none.
-    pub fn encode(self, out: &mut Vec<u8>, wall_ns: u64, name: &str, form: &Form, payload: &[u8]) -> bool {
-        if payload.len() != 8 * form.numbers() {
-            return false;
-        }
+    /// Writes the message of a sample of `schema` (numbers are little-endian 64-bit floats), captured at `wall_ns` by the
+    /// device `name`. False if it gives none.
+    pub fn encode(
+        self,
+        out: &mut Vec<u8>,
+        wall_ns: u64,
+        name: &str,
+        form: &Form,
+        (schema, payload): (SampleSchema, &[u8]),
+    ) -> bool {
+        let has_numbers = || schema == SampleSchema::Scalars && payload.len() == 8 * form.numbers();
         match form {
+            Form::Calibration(camera) => {
+                if !matches!(schema, SampleSchema::CompressedImage | SampleSchema::RawImage) {
+                    return false;
+                }
+                encode::calibration(out, wall_ns, name, camera);
+            }
+            _ if !has_numbers() => return false,
             Form::Pose(spec) => {
                 let Some(pose) = pose(spec, payload) else { return false };
                 match self {
                     Self::Pose => encode::pose(out, wall_ns, &spec.parent, &pose),
                     Self::Transform => encode::transform(out, wall_ns, [&spec.parent, name], &pose),
-                    Self::Joints => return false,
+                    Self::Joints | Self::Calibration => return false,
                 }
             }
             Form::Joints(spec) => encode::joints(out, wall_ns, joints(spec, payload)),

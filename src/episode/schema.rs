@@ -36,6 +36,8 @@ pub const FRAME: Schema = schema!("rapid.Frame");
 pub const POSE: Schema = schema!("foxglove.PoseInFrame");
 /// `foxglove.FrameTransform`.
 pub const TRANSFORM: Schema = schema!("foxglove.FrameTransform");
+/// `foxglove.CameraCalibration`.
+pub const CALIBRATION: Schema = schema!("foxglove.CameraCalibration");
 /// `foxglove.JointStates`.
 pub const JOINTS: Schema = schema!("foxglove.JointStates");
 /// `rapid.Mask`.

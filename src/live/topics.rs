@@ -107,7 +107,7 @@ impl Topics {
             };
             let channel = match derived {
                 Derived::Transform => self.transforms.clone().or_else(made),
-                Derived::Pose | Derived::Joints => made(),
+                Derived::Pose | Derived::Joints | Derived::Calibration => made(),
             };
             if *derived == Derived::Transform {
                 self.transforms.clone_from(&channel);
@@ -213,9 +213,9 @@ impl Track {
         log_time: u64,
     ) -> u64 {
         let schema = SampleSchema::of(header, payload);
-        if let Some(form) = self.form.as_ref().filter(|_| schema == SampleSchema::Scalars) {
+        if let Some(form) = &self.form {
             for (derived, channel) in self.derived.iter().filter(|(_, channel)| channel.has_sinks()) {
-                if derived.encode(message, log_time, &self.name, form, payload) {
+                if derived.encode(message, log_time, &self.name, form, (schema, payload)) {
                     send(channel, message, log_time);
                 }
             }

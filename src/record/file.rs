@@ -213,12 +213,9 @@ impl EpisodeFile {
         let message = message_header(channel, header.seq, log_time, self.clock.wall_ns(Stamp(header.recv_ns)));
         self.writer.message(&message, &track.message).map_err(io_error)?;
         self.messages += 1;
-        if schema != SampleSchema::Scalars {
-            return Ok(());
-        }
         let Track { name, form: Some(form), derived, .. } = track else { return Ok(()) };
         for (derived, channel_id) in derived {
-            if derived.encode(&mut self.message, log_time, name, form, payload) {
+            if derived.encode(&mut self.message, log_time, name, form, (schema, payload)) {
                 let message = MessageHeader { channel_id: *channel_id, ..message };
                 self.writer.message(&message, &self.message).map_err(io_error)?;
                 self.messages += 1;

@@ -28,10 +28,10 @@ pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use parse::{BUILTIN, Loaded, like_a_name, name_problem};
 pub use section::read_file;
 pub use spec::{
-    ActionSpec, Bound, BrakeSpec, ButtonAction, ButtonSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec,
-    CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, FieldInput, Form, Framing, GpioInput, Hook, Hooks,
-    IdentitySpec, InputSpec, InterlockSpec, JointsSpec, KeyInput, LanFind, LanPicture, LanProtocol, LanSpec, Limits,
-    LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError,
+    ActionSpec, Bound, BrakeSpec, ButtonAction, ButtonSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CalibrationSpec,
+    CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, FieldInput, Form, Framing, GpioInput, Hook,
+    Hooks, IdentitySpec, InputSpec, InterlockSpec, JointsSpec, KeyInput, LanFind, LanPicture, LanProtocol, LanSpec,
+    Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError,
     ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
     PixelFormat, PoseLayout, PoseSpec, Probe, ProcessSpec, Quantity, Registry, RigSpec, SLCAN_BITRATES, SerialSpec,
     Stop, StopSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale, mounted, own_side,

@@ -21,7 +21,7 @@ use serde::Serialize;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use form::{Form, JointsSpec, PoseLayout, PoseSpec, Quantity};
+pub use form::{CalibrationSpec, Form, JointsSpec, PoseLayout, PoseSpec, Quantity};
 pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,

@@ -3,7 +3,7 @@
 //! Invariant: only this thread, and whoever closes the keeper, waits for the disk of the journal.
 //! Invariant: what is answered is on the disk, or the answer names why it is not.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
@@ -40,6 +40,8 @@ pub struct Pending {
     pub text: String,
     /// It was done, also if an episode cannot be moved: another has begun, say.
     pub is_done: bool,
+    /// The episode that the request replaces: it is not done while that one is not in the trash.
+    pub replaces: Option<String>,
     /// It is shown on screens too.
     pub is_shown: bool,
     /// Programs that wait for it.
@@ -85,7 +87,8 @@ impl Keeper {
     pub fn start(folder: &Path, journal: Journal) -> io::Result<(Self, UnboundedReceiver<Outcome>)> {
         let (operations, inbox) = mpsc::channel();
         let (outcomes, to_owner) = unbounded_channel();
-        let desk = Desk { folder: folder.to_owned(), journal, failing: BTreeSet::new(), outcomes };
+        let desk =
+            Desk { folder: folder.to_owned(), journal, failing: BTreeSet::new(), unmoved: BTreeMap::new(), outcomes };
         let thread = Builder::new().name("session".to_owned()).spawn(move || desk.run(&inbox))?;
         Ok((Self { operations: Some(operations), thread: Some(thread) }, to_owner))
     }
@@ -111,6 +114,8 @@ struct Desk {
     journal: Journal,
     /// Errors that were reported: a full disk is reported once, and not at each change.
     failing: BTreeSet<String>,
+    /// Episodes that could not be moved the last time, and why.
+    unmoved: BTreeMap<String, String>,
     outcomes: UnboundedSender<Outcome>,
 }
 
@@ -124,7 +129,8 @@ impl Desk {
                 let place = if is_note { &mut unsaved } else { &mut failed };
                 *place = place.take().or(outcome);
             }
-            let Some(Pending { text, is_done, is_shown, to }) = answer else { continue };
+            let Some(Pending { text, is_done, replaces, is_shown, to }) = answer else { continue };
+            let failed = failed.or_else(|| self.unmoved.get(&replaces?).cloned());
             let answer = match (failed, unsaved) {
                 (None, None) => Ok(text),
                 // It is in effect, and noted as soon as the journal can be written: who repeats it does it twice.
@@ -174,9 +180,13 @@ impl Desk {
         Err(why)
     }
 
-    fn moved(&self, file: String, moved: io::Result<()>, done: fn(String) -> Outcome) -> Result<(), String> {
+    fn moved(&mut self, file: String, moved: io::Result<()>, done: fn(String) -> Outcome) -> Result<(), String> {
         let why = moved.map_err(|error| reason(&error));
         let failed = why.clone().map_err(|why| format!("{file} was not moved: {why}"));
+        match &failed {
+            Ok(()) => self.unmoved.remove(&file),
+            Err(why) => self.unmoved.insert(file.clone(), why.clone()),
+        };
         self.report(match why {
             Ok(()) => done(file),
             Err(why) => Outcome::NotMoved(file, why),
@@ -273,7 +283,7 @@ mod tests {
     /// What a request with these operations is answered.
     fn answer(keeper: &Keeper, operations: Vec<Operation>, is_done: bool) -> Result<String, String> {
         let (to, answered) = oneshot::channel();
-        let pending = Pending { text: "done".to_owned(), is_done, is_shown: false, to: vec![to] };
+        let pending = Pending { text: "done".to_owned(), is_done, replaces: None, is_shown: false, to: vec![to] };
         keeper.request(operations, Some(pending));
         answered.blocking_recv().unwrap()
     }

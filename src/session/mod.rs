@@ -160,6 +160,12 @@ impl Session {
         self.file.episodes.iter().map(|entry| &entry.file)
     }
 
+    /// The episode that a request without a name is about: the one in progress, or the last that is kept.
+    pub fn newest(&self) -> Option<&str> {
+        let index = self.current.map(|(index, _)| index).or_else(|| self.last())?;
+        self.file.episodes.get(index).map(|entry| &*entry.file)
+    }
+
     /// What the next episode is of.
     pub fn plan(&self) -> &Plan {
         &self.file.plan

@@ -127,7 +127,7 @@ pub async fn show(mut link: impl Link, options: ScreenOptions, shutdown: Cancell
     let size = crossterm::terminal::size().ok();
     // The size comes with later changes of it.
     let size = futures::stream::iter(size.map(|(columns, rows)| Ok(Event::Resize(columns, rows))));
-    let events = size.chain(EventStream::new());
+    let events = terminal::without_answers(size.chain(EventStream::new()));
     let mut continued = signal(SignalKind::from_raw(Signal::CONT.as_raw())).map_err(TuiError::NoTerminal)?;
     let room = screen.room();
     let draw = |model: &Model| {

@@ -829,7 +829,7 @@ impl Model {
                 self.page = Page::Rig;
             }
         } else {
-            self.notify("disarming the actuator");
+            self.notify(if self.is_read_only() { READ_ONLY } else { "disarming the actuator" });
         }
         Effect::Order(Order::Disarm)
     }

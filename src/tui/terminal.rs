@@ -11,11 +11,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 
 use crossterm::cursor::{Hide, Show};
-use crossterm::event::{DisableBracketedPaste, DisableMouseCapture, EnableBracketedPaste, EnableMouseCapture};
+use crossterm::event::{
+    DisableBracketedPaste, DisableMouseCapture, EnableBracketedPaste, EnableMouseCapture, Event, KeyCode, KeyModifiers,
+};
 use crossterm::terminal::{
     Clear, ClearType, DisableLineWrap, EnableLineWrap, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode,
     enable_raw_mode,
 };
+use futures::{Stream, StreamExt as _};
 use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
 use rustix::event::{PollFd, PollFlags, Timespec};
@@ -161,8 +164,8 @@ fn cell() -> Option<(u16, u16)> {
     Some((of_cell(size.width, size.columns)?, of_cell(size.height, size.rows)?))
 }
 
-/// How long the terminal may take to answer: no longer than a far one over SSH.
-const ANSWER: Duration = Duration::from_millis(500);
+/// How long the first frame waits for the answer. One that comes later is left out of the keys, see [`without_answers`].
+const ANSWER: Duration = Duration::from_millis(300);
 /// Its name and version (XTVERSION), and its attributes (DA1), which every terminal answers: the end of the answers.
 const NAME_AND_ATTRIBUTES: &[u8] = b"\x1b[>q\x1b[c";
 
@@ -189,6 +192,32 @@ fn places_pictures_in_text() -> bool {
         }
     }
     has_placeholders(&String::from_utf8_lossy(&answer))
+}
+
+/// Leaves the answer to [`NAME_AND_ATTRIBUTES`] out, if it comes when nothing waits for it any more: crossterm reads
+/// `ESC P > | ... ESC \` as Alt+P, letters and Alt+\. (It takes the attributes for what they are.)
+pub(super) fn without_answers(events: impl Stream<Item = io::Result<Event>>) -> impl Stream<Item = io::Result<Event>> {
+    /// More letters than a name and a version have: what follows is typed.
+    const LONGEST: u8 = 64;
+    let mut left = 0_u8;
+    events.filter(move |event| {
+        let key = match event {
+            Ok(Event::Key(key)) => Some(key),
+            _ => None,
+        };
+        let is_alt = |letter| {
+            key.is_some_and(|key| key.code == KeyCode::Char(letter) && key.modifiers.contains(KeyModifiers::ALT))
+        };
+        let is_answer = key.is_some() && left > 0;
+        left = if is_alt('P') {
+            LONGEST
+        } else if is_alt('\\') {
+            0
+        } else {
+            left.saturating_sub(u8::from(is_answer))
+        };
+        std::future::ready(!is_answer && left == 0 || key.is_none())
+    })
 }
 
 /// Whether the attributes have arrived: `ESC [ ? 62 ; 22 c`.
@@ -282,7 +311,34 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 #[cfg(test)]
 mod tests {
+    use crossterm::event::KeyEvent;
+
     use super::*;
+
+    #[tokio::test]
+    async fn a_late_answer_is_not_typed() {
+        let key = |letter: char, modifiers| Ok(Event::Key(KeyEvent::new(KeyCode::Char(letter), modifiers)));
+        let plain = |text: &str| text.chars().map(|letter| key(letter, KeyModifiers::NONE)).collect::<Vec<_>>();
+        let alt = |letter| [key(letter, KeyModifiers::ALT)];
+        let typed = |events: Vec<io::Result<Event>>| async {
+            let letter = |event: io::Result<Event>| match event.unwrap() {
+                Event::Key(key) => key.code.as_char().unwrap(),
+                _ => '*',
+            };
+            without_answers(futures::stream::iter(events)).map(letter).collect::<String>().await
+        };
+        let mut answered = plain("ab");
+        answered.extend(alt('P'));
+        answered.extend(plain(">|kitty(0.35"));
+        answered.push(Ok(Event::FocusGained));
+        answered.extend(plain(".2)"));
+        answered.extend(alt('\\'));
+        answered.extend(plain("itq"));
+        assert_eq!(typed(answered).await, "ab*itq");
+        // Who presses Alt+P is not locked out.
+        let pressed = alt('P').into_iter().chain(plain(&"x".repeat(70))).collect();
+        assert_eq!(typed(pressed).await.len(), 6);
+    }
 
     #[test]
     fn an_old_kitty_shows_no_pictures_among_text() {

@@ -63,6 +63,9 @@ impl Tour {
             (Self::Lose(_), Some(plug), Some(name)) if holds => {
                 format!("1/2 {plug}: plug {name} in again, which the policy requires: it holds")
             }
+            (Self::Lose(_), ..) if !now.devices.iter().any(|device| device.name == MAY_GO) => {
+                "1/2 select a sensor that the policy may lose, U: unplug it".to_owned()
+            }
             (Self::Lose(_), ..) if selected == Some(MAY_GO) => {
                 format!("1/2 U: unplug {MAY_GO}, while a policy moves the arm")
             }
@@ -140,6 +143,7 @@ mod tests {
     #[test]
     fn the_device_that_is_missing_is_named() {
         let mut now = three_streaming();
+        now.devices[1].name = "tactile_tip".into();
         let text = |tour: Tour, now: &Snapshot, selected| tour.text(now, selected).unwrap();
         assert_eq!(
             text(Tour::Lose(0), &now, Some("cam_wrist")).split(':').next(),

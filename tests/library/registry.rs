@@ -211,6 +211,9 @@ fn what_numbers_mean_is_written_or_follows_from_the_device() {
     };
     assert_eq!(form("fingers"), joints(&["left", "right"], &[Position, Other, Effort]));
     assert_eq!(form("encoder"), joints(&["gripper"], &[Position]));
+    let Form::Calibration(camera) = form("cam") else { panic!("a calibration") };
+    assert_eq!((camera.width, camera.height, camera.model.as_str()), (640, 480, "rational_polynomial"));
+    assert_eq!((camera.distortion.len(), camera.intrinsics[0], camera.intrinsics[5]), (8, 600.5, 240.0));
     let Loaded { registry, .. } = valid("can");
     let motors = registry.devices.iter().find_map(|device| device.form.clone());
     let Some(Form::Joints(JointsSpec { names, quantities })) = motors else { panic!("motors are joints: {motors:?}") };

@@ -5,7 +5,8 @@ use std::path::Path;
 /// Set, the compiled schemas are written.
 const WRITE: &str = "RAPID_WRITE_SCHEMAS";
 
-const SCHEMAS: [&str; 11] = [
+const SCHEMAS: [&str; 12] = [
+    "foxglove/CameraCalibration",
     "foxglove/CompressedImage",
     "foxglove/FrameTransform",
     "foxglove/JointStates",

@@ -281,7 +281,8 @@ fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
         [device.tracker.tty]\nbaud = 115200\nparse = \"csv\"\nchannels = 7\n[device.tracker.pose]\nlayout = \"quaternion\"\n";
     let joints =
         "[device.motor_state.joints]\nnames = [\"gripper\"]\nquantities = [\"effort\", \"other\", \"position\"]\n";
-    place.write("devices.toml", &[include_str!("../../devices.toml"), joints, tracker, LENIENT].concat());
+    let camera = "[device.cam_wrist.calibration]\nintrinsics = [600, 0, 320, 0, 600, 240, 0, 0, 1]\n";
+    place.write("devices.toml", &[include_str!("../../devices.toml"), joints, camera, tracker, LENIENT].concat());
     let running = start(&place, &[]);
     let mut client = Client::connect(&address(&running));
     let topics = ["/rapid/serial/motor/joints", "/rapid/serial/tracker/pose", "/tf"];
@@ -313,6 +314,8 @@ fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
     }
     assert_eq!(of("/rapid/serial/tracker").len(), of(topics[1]).len());
     assert_eq!(of(topics[1]).len(), of(topics[2]).len());
+    assert_eq!(of("/rapid/camera/wrist").len(), of("/rapid/camera/wrist/calibration").len());
+    assert!(counts["/rapid/camera/wrist/calibration"] > 10, "{counts:?}");
     // They are no devices of their own.
     let report = place.run(&["inspect", "--json", &file]).stdout;
     let report: Value = serde_json::from_slice(&report).expect("JSON");

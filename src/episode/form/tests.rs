@@ -4,6 +4,7 @@ use proptest::prelude::*;
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage as _};
 
 use super::*;
+use crate::registry::CalibrationSpec;
 
 const WALL: u64 = 1_700_000_000_123_456_789;
 
@@ -35,7 +36,9 @@ fn pose_of(layout: PoseLayout) -> Form {
 /// The message of these numbers, if they give one.
 fn message(derived: Derived, form: &Form, numbers: &[f64]) -> Option<DynamicMessage> {
     let mut out = b"what was there".to_vec();
-    derived.encode(&mut out, WALL, "phone", form, &payload(numbers)).then(|| decode(derived, &out))
+    derived
+        .encode(&mut out, WALL, "phone", form, (SampleSchema::Scalars, &payload(numbers)))
+        .then(|| decode(derived, &out))
 }
 
 /// The quaternion of a pose of these numbers.
@@ -94,7 +97,10 @@ fn numbers_that_are_no_pose_give_no_message() {
         }
     }
     let mut out = Vec::new();
-    assert!(!Derived::Pose.encode(&mut out, WALL, "phone", &quaternion, &[0; 55]), "half a number");
+    assert!(
+        !Derived::Pose.encode(&mut out, WALL, "phone", &quaternion, (SampleSchema::Scalars, &[0; 55])),
+        "half a number"
+    );
     assert!(message(Derived::Pose, &columns, &singular).is_some(), "it is scaled to the nearest length");
 }
 
@@ -121,6 +127,38 @@ fn joints_have_the_quantities_that_are_known() {
     assert!(number(1, "effort").unwrap().is_nan() && number(1, "position") == Some(-2.0));
     assert_eq!((number(2, "position"), number(2, "effort")), (Some(4.0), Some(3.0)));
     assert!(message(Derived::Joints, &form, &numbers[1..]).is_none());
+}
+
+#[test]
+fn a_calibrated_camera_gives_its_intrinsics_with_each_picture() {
+    let intrinsics = [600.5, 0.0, 320.0, 0.0, 601.0, 240.0, 0.0, 0.0, 1.0];
+    let camera = CalibrationSpec {
+        width: 640,
+        height: 480,
+        model: "plumb_bob".to_owned(),
+        distortion: vec![0.1, -0.2, 0.0, 0.0, 0.3],
+        intrinsics,
+    };
+    let form = Form::Calibration(camera);
+    let mut out = Vec::new();
+    for schema in [SampleSchema::CompressedImage, SampleSchema::RawImage] {
+        assert!(Derived::Calibration.encode(&mut out, WALL, "cam", &form, (schema, b"a picture")));
+        let message = decode(Derived::Calibration, &out);
+        let list = |field: &str| {
+            let list = message.get_field_by_name(field).unwrap().as_list().unwrap().to_vec();
+            list.iter().map(|number| number.as_f64().unwrap()).collect::<Vec<_>>()
+        };
+        assert_eq!((list("D"), list("K")), (vec![0.1, -0.2, 0.0, 0.0, 0.3], intrinsics.to_vec()));
+        assert_eq!(list("R"), [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+        assert_eq!(list("P"), [600.5, 0.0, 320.0, 0.0, 0.0, 601.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
+        let text = |field: &str| message.get_field_by_name(field).unwrap().as_str().unwrap().to_owned();
+        assert_eq!([text("frame_id"), text("distortion_model")], ["cam", "plumb_bob"]);
+        let pixels = |field: &str| message.get_field_by_name(field).unwrap().as_u32();
+        assert_eq!((pixels("width"), pixels("height")), (Some(640), Some(480)));
+    }
+    for schema in [SampleSchema::Bytes, SampleSchema::Scalars] {
+        assert!(!Derived::Calibration.encode(&mut out, WALL, "cam", &form, (schema, b"no picture")));
+    }
 }
 
 proptest! {

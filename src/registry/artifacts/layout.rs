@@ -65,7 +65,11 @@ impl Panels {
     }
 
     fn picture(&mut self, device: &DeviceSpec) -> Value {
-        let settings = json!({ "foxglovePanelTitle": device.name, "imageMode": { "imageTopic": device.topic } });
+        let mut mode = json!({ "imageTopic": device.topic });
+        if let Some(form @ Form::Calibration(_)) = &device.form {
+            mode["calibrationTopic"] = json!(format!("{}{}", device.topic, form.ending()));
+        }
+        let settings = json!({ "foxglovePanelTitle": device.name, "imageMode": mode });
         self.add("Image", &device.name, settings)
     }
 

@@ -27,7 +27,8 @@ const PROCESS: &str = "process";
 /// Keys that state which device an entry identifies.
 pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
 const KEYS: [&str; 9] = ["node", "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
-const TABLES: [&str; 9] = ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints"];
+const TABLES: [&str; 10] =
+    ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints", "calibration"];
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -201,7 +202,7 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>)
         when_stale,
         latency,
         verdict: verdict::read(&section, Whose::Device),
-        form: form::form(&section, settings.as_ref(), settings.as_ref().and_then(numbers_of)),
+        form: form::form(name, &section, settings.as_ref(), settings.as_ref().and_then(numbers_of)),
         action,
         hooks: program::hooks(&section, attach_is_node(&section), programs),
         node: settings,

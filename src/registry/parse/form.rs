@@ -1,35 +1,48 @@
-//! `[device.NAME.pose]` and `[device.NAME.joints]`, and the forms that follow from the device itself.
+//! `[device.NAME.pose]`, `[device.NAME.joints]` and `[device.NAME.calibration]`, and the forms that follow from the device
+//! itself.
 
+use crate::modality::ModalityKind;
 use crate::registry::section::Section;
 use crate::registry::spec::{
-    CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PoseLayout, PoseSpec, Quantity,
+    CalibrationSpec, CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PoseLayout,
+    PoseSpec, Quantity,
 };
 
 const POSE: &str = "pose";
 const JOINTS: &str = "joints";
+const CALIBRATION: &str = "calibration";
 const WORLD: &str = "world";
+/// Models of a lens that viewers know, each with its name and how many parameters it has.
+const MODELS: [(&str, (&str, usize)); 3] = [
+    ("plumb_bob", ("plumb_bob", 5)),
+    ("rational_polynomial", ("rational_polynomial", 8)),
+    ("kannala_brandt", ("kannala_brandt", 4)),
+];
 /// Of a motor: `control::motors::SAMPLE_VALUES`.
 const OF_A_MOTOR: [Quantity; 6] =
     [Quantity::Position, Quantity::Velocity, Quantity::Effort, Quantity::Other, Quantity::Other, Quantity::Other];
 
-/// The form of the numbers of `node`, of which a sample has `count`; `None` if they have none, or if a problem was
+/// The form of the samples of the entry `name`, of which each has `count` numbers; `None` if they have none, or if a problem was
 /// reported.
-pub(super) fn form(section: &Section<'_>, node: Option<&NodeSpec>, count: Option<usize>) -> Option<Form> {
+pub(super) fn form(name: &str, section: &Section<'_>, node: Option<&NodeSpec>, count: Option<usize>) -> Option<Form> {
     if let Some(node) = node
         && let Some(own) = of_node(node)
     {
         refuse_tables(section, &own);
         return Some(match (own, section.table(POSE)) {
-            (Form::Pose(own), Some(table)) => Form::Pose(PoseSpec { parent: parent(&table, &["parent"]), ..own }),
+            (Form::Pose(own), Some(table)) => Form::Pose(PoseSpec { parent: parent(&table, name, &["parent"]), ..own }),
             (own, _) => own,
         });
+    }
+    if let Some(table) = section.table(CALIBRATION) {
+        return calibration(section, &table, node?).map(Form::Calibration);
     }
     let (form, key) = match (section.table(POSE), section.table(JOINTS)) {
         (Some(_), Some(_)) => {
             let message = "its numbers are a pose or the states of joints, not both".to_owned();
             return section.refuse(JOINTS, message, "remove one of the two tables");
         }
-        (Some(table), None) => (Form::Pose(pose(&table)?), POSE),
+        (Some(table), None) => (Form::Pose(pose(name, &table)?), POSE),
         (None, Some(table)) => (Form::Joints(joints(&table)?), JOINTS),
         (None, None) => return None,
     };
@@ -39,12 +52,14 @@ pub(super) fn form(section: &Section<'_>, node: Option<&NodeSpec>, count: Option
         return Some(form);
     }
     if count == 0 {
-        return section.refuse(key, "its samples are no numbers".to_owned(), "remove the table");
+        return section.refuse(key, "its samples are not numbers".to_owned(), "remove the table");
     }
     let message = format!("{} numbers for a sample of {count}", form.numbers());
     let fix = match &form {
         Form::Pose(_) => "columns and rows have 16 numbers, a quaternion with its position 7: write as many `channels`",
-        Form::Joints(_) => "a sample has each of `quantities` for each of `names`: write as many `channels`",
+        Form::Joints(_) | Form::Calibration(_) => {
+            "a sample has each of `quantities` for each of `names`: write as many `channels`"
+        }
     };
     section.refuse(key, message, fix)
 }
@@ -66,27 +81,65 @@ fn of_node(node: &NodeSpec) -> Option<Form> {
 /// Reports the tables that a device of known contents does not take.
 fn refuse_tables(section: &Section<'_>, own: &Form) {
     let (tables, what): (&[&str], _) = match own {
-        Form::Pose(_) => (&[JOINTS], "sends the pose of its camera"),
-        Form::Joints(_) => (&[POSE, JOINTS], "sends the states of its motors, with their names"),
+        Form::Pose(_) => (&[JOINTS, CALIBRATION], "sends the pose of its camera"),
+        Form::Joints(_) | Form::Calibration(_) => {
+            (&[POSE, JOINTS, CALIBRATION], "sends the states of its motors, with their names")
+        }
     };
     for table in tables.iter().filter(|table| section.has(table)) {
         section.report(table, format!("the device {what}"), "remove the table");
     }
 }
 
-fn parent(table: &Section<'_>, keys: &[&str]) -> String {
+fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> Option<CalibrationSpec> {
+    table.allow(&["model", "distortion", "intrinsics"]);
+    table.need("intrinsics", "write intrinsics = [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels");
+    let size = node.shape();
+    let (ModalityKind::Image, [height, width]) = (node.modality_kind(), &size[..]) else {
+        return section.refuse(CALIBRATION, "its samples are not pictures".to_owned(), "remove the table");
+    };
+    for other in [POSE, JOINTS].iter().filter(|other| section.has(other)) {
+        section.report(other, "its samples are pictures", "remove the table");
+    }
+    let distortion = if table.has("distortion") { table.numbers("distortion")? } else { Vec::new() };
+    let intrinsics = table.numbers("intrinsics")?;
+    let Ok(intrinsics) = <[f64; 9]>::try_from(intrinsics.as_slice()) else {
+        let message = format!("{} numbers, and the matrix has 9", intrinsics.len());
+        return table.refuse("intrinsics", message, "write [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels");
+    };
+    let is_matrix = intrinsics.iter().all(|number| number.is_finite()) && intrinsics[0] > 0.0 && intrinsics[4] > 0.0;
+    if !is_matrix || intrinsics[6..] != [0.0, 0.0, 1.0] {
+        let fix = "write [fx, 0, cx, 0, fy, cy, 0, 0, 1], row by row, in pixels of the pictures as they are recorded";
+        return table.refuse("intrinsics", "not the matrix of a camera".to_owned(), fix);
+    }
+    let (model, parameters) = if table.has("model") { table.choice("model", &MODELS)? } else { ("plumb_bob", 5) };
+    if !distortion.is_empty() && distortion.len() != parameters {
+        let message = format!("{} numbers, and {model} has {parameters}", distortion.len());
+        return table.refuse("distortion", message, "write those of the calibration, or name its `model`");
+    }
+    if distortion.iter().any(|number| !number.is_finite()) {
+        return table.refuse("distortion", "a number that is not finite".to_owned(), "write those of the calibration");
+    }
+    Some(CalibrationSpec { width: *width, height: *height, model: model.to_owned(), distortion, intrinsics })
+}
+
+fn parent(table: &Section<'_>, name: &str, keys: &[&str]) -> String {
     table.allow(keys);
     match table.text("parent") {
         Some("") => {
             table.report("parent", "the frame has no name", "write parent = \"world\", or remove the key");
             String::new()
         }
+        Some(parent) if parent == name => {
+            table.report("parent", "the frame of the entry itself", "name another frame, such as \"world\"");
+            String::new()
+        }
         parent => parent.unwrap_or(WORLD).to_owned(),
     }
 }
 
-fn pose(table: &Section<'_>) -> Option<PoseSpec> {
-    let parent = parent(table, &["layout", "parent"]);
+fn pose(name: &str, table: &Section<'_>) -> Option<PoseSpec> {
+    let parent = parent(table, name, &["layout", "parent"]);
     table.need("layout", "write layout = \"quaternion\", \"columns\" or \"rows\"");
     Some(PoseSpec { layout: table.choice("layout", &PoseLayout::WORDS)?, parent })
 }
@@ -98,7 +151,10 @@ fn joints(table: &Section<'_>) -> Option<JointsSpec> {
     let quantities = if table.has("quantities") { quantities(table) } else { Some(vec![Quantity::Position]) };
     let (names, quantities) = (names?, quantities?);
     let twice = names.iter().enumerate().find(|(at, name)| names.iter().take(*at).any(|earlier| earlier == *name));
-    if names.is_empty() || names.iter().any(String::is_empty) {
+    if names.is_empty() {
+        return table.refuse("names", "no joints are named".to_owned(), "name every joint, or remove the table");
+    }
+    if names.iter().any(String::is_empty) {
         return table.refuse("names", "a joint without a name".to_owned(), "name every joint");
     }
     if let Some((_, name)) = twice {

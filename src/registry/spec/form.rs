@@ -1,14 +1,17 @@
-//! What the numbers of a device mean, where viewers know messages for that: `[device.NAME.pose]` and `[device.NAME.joints]`.
+//! What the samples of a device mean, where viewers know messages for that: `[device.NAME.pose]`, `[device.NAME.joints]` and
+//! `[device.NAME.calibration]`.
 //!
-//! The numbers are recorded as they are; messages of these forms are derived from them (`episode::form`).
+//! Samples are recorded as they are; messages of these forms are derived from them (`episode::form`).
 
 /// See the module's comment.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Form {
     /// The pose of a frame that has the name of the entry.
     Pose(PoseSpec),
     /// The states of joints.
     Joints(JointsSpec),
+    /// Pictures of a calibrated camera.
+    Calibration(CalibrationSpec),
 }
 
 /// How a pose is given.
@@ -63,12 +66,28 @@ pub enum Quantity {
     Other,
 }
 
+/// The intrinsics of a camera, for the size of its pictures.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CalibrationSpec {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// The model of its lens: `plumb_bob`, the default, `rational_polynomial` or `kannala_brandt`.
+    pub model: String,
+    /// Its parameters: 5, 8 or 4, or none.
+    pub distortion: Vec<f64>,
+    /// The matrix of 3 by 3, row by row: `fx 0 cx, 0 fy cy, 0 0 1`, in pixels; finite, the focal lengths above 0.
+    pub intrinsics: [f64; 9],
+}
+
 impl Form {
-    /// How many numbers a sample has.
+    /// How many numbers a sample has; 0 of pictures.
     pub fn numbers(&self) -> usize {
         match self {
             Self::Pose(pose) => pose.layout.numbers(),
             Self::Joints(joints) => joints.names.len().saturating_mul(joints.quantities.len()),
+            Self::Calibration(_) => 0,
         }
     }
 
@@ -77,6 +96,7 @@ impl Form {
         match self {
             Self::Pose(_) => "/pose",
             Self::Joints(_) => "/joints",
+            Self::Calibration(_) => "/calibration",
         }
     }
 }

@@ -154,8 +154,8 @@ impl Model {
 
     /// Adds pasted text to the answer, in one line and without other control characters.
     pub(super) fn paste(&mut self, text: &str) {
-        let spaced = text.trim_end().chars().map(|c| if c.is_whitespace() { ' ' } else { c });
-        for c in spaced.filter(|c| !c.is_control()) {
+        let line = text.split_whitespace().collect::<Vec<_>>().join(" ");
+        for c in line.chars().filter(|c| !c.is_control()) {
             let Some(prompt) = self.prompt.take() else { return };
             let _only_text = self.type_into(prompt, KeyEvent::new(KeyCode::Char(c), KeyModifiers::NONE));
         }

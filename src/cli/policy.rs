@@ -1,0 +1,139 @@
+//! The options of a policy, and the grammar of `rapid eval` and `rapid replay`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueHint};
+
+use super::run::{RUN, RunArgs};
+#[cfg(feature = "policy")]
+use crate::lockstep::evaluate::Condition;
+
+const POLICY: &str = "Policy options";
+
+#[cfg(feature = "policy")]
+pub(super) const EVAL: &str = "\
+Conditions: full (all sensors), no-tactile (without the tactile sensor), hot-unplug (it is unplugged while \
+the block is carried), hot-replug (it is unplugged on the way to the block, and plugged in again), no-wrist \
+(without the camera that shows where the block lies).
+
+The seed of a trial determines when each sensor captures (anywhere in its period of 100 ms) and how long \
+after that its sample is delivered (5 to 50 ms); the policy starts when the last of them was delivered. \
+Trials run faster than real time; the same seed gives the same trial.
+
+Examples:
+  rapid eval
+  rapid eval --trials 100 --json > result.jsonl
+  rapid eval --static-config --condition hot-unplug models/tactile-id";
+
+/// Options of a policy.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = POLICY)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
+pub struct PolicyArgs {
+    /// Run a policy, headless [default: the built-in one]
+    ///
+    /// The built-in policy is for `--sim task`.
+    #[arg(long, value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath, help_heading = RUN)]
+    pub infer: Option<Option<PathBuf>>,
+    /// Show and record its actions without moving anything
+    #[arg(long, requires = "infer", hide_short_help = true)]
+    pub dry_run: bool,
+    /// Wait until all sensors it requires are plugged in, instead of failing
+    #[arg(long, requires = "infer", hide_short_help = true)]
+    pub wait: bool,
+    /// Open the monitor
+    #[arg(long, requires = "infer", conflicts_with = "headless", hide_short_help = true)]
+    pub monitor: bool,
+    /// Continue when a sensor is missing that the policy was not trained to miss
+    #[arg(long, alias = "go-on", requires = "infer", hide_short_help = true)]
+    pub ignore_missing: bool,
+    /// How inference runs.
+    #[command(flatten, next_help_heading = POLICY)]
+    pub inference: InferenceArgs,
+}
+
+/// How inference runs.
+#[derive(Debug, Clone, Args)]
+pub struct InferenceArgs {
+    /// Denoising steps [default: from the policy]
+    #[arg(long, value_name = "COUNT")]
+    pub denoising_steps: Option<usize>,
+    /// onnxruntime library to use instead of the built-in one
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub ort_lib: Option<PathBuf>,
+}
+
+/// What `rapid eval` runs.
+#[cfg(feature = "policy")]
+#[derive(Debug, Clone, Args)]
+pub struct EvalArgs {
+    /// Folder of the policy [default: the one built into rapid]
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub bundle: Option<PathBuf>,
+    /// Trials per condition
+    #[arg(long, value_name = "COUNT", default_value_t = 25, value_parser = trials)]
+    pub trials: usize,
+    /// Seed of the first trial; demonstrations start at 0 unless recorded with another --seed
+    #[arg(long, value_name = "N", default_value_t = 50_000)]
+    pub seed: u64,
+    /// Condition, all of which --help explains; repeatable [default: all]
+    #[arg(long, value_name = "NAME", value_parser = condition)]
+    pub condition: Vec<Condition>,
+    /// Baseline with a fixed set of sensors: losing one ends the run
+    #[arg(long)]
+    pub static_config: bool,
+    /// How inference runs.
+    #[command(flatten)]
+    pub inference: InferenceArgs,
+}
+
+#[cfg(feature = "policy")]
+fn trials(text: &str) -> Result<usize, String> {
+    let count = text.parse().map_err(|_| "write a number, for example 25".to_owned())?;
+    if count > 0 { Ok(count) } else { Err("must be at least 1".to_owned()) }
+}
+
+#[cfg(feature = "policy")]
+fn condition(text: &str) -> Result<Condition, String> {
+    let known = Condition::ALL.into_iter().find(|condition| condition.word() == text);
+    known.ok_or_else(|| format!("one of {}", Condition::ALL.map(Condition::word).join(", ")))
+}
+
+pub(super) const REPLAY: &str = "\
+The registry is the one recorded in the episode. With --infer nothing is run: the action chunks of an \
+episode recorded with the policy are computed again; with any other episode, the policy's actions are \
+compared with the recorded ones.
+
+Examples:
+  rapid replay episodes/20260101_place-block_001.mcap
+  rapid replay episodes/20260101_place-block_001.mcap --headless --record --out again
+  rapid replay episodes/20260101_place-block_001.mcap --infer models/tactile-id --tolerance 1e-4";
+
+/// Which episode, and how it is replayed.
+#[derive(Debug, Clone, Args)]
+pub struct ReplayArgs {
+    /// Episode
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// Options of the run.
+    #[command(flatten)]
+    pub run: RunArgs,
+    /// Compare a policy with the episode [default: the one built into rapid]
+    #[arg(long, value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath, help_heading = COMPARISON)]
+    pub infer: Option<Option<PathBuf>>,
+    /// Largest accepted difference of actions computed again
+    #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance, requires = "infer", help_heading = COMPARISON)]
+    pub tolerance: Option<f64>,
+    /// How inference runs.
+    #[command(flatten, next_help_heading = COMPARISON)]
+    pub inference: InferenceArgs,
+}
+
+const COMPARISON: &str = "Comparison options";
+
+fn tolerance(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(difference) if (0.0..f64::INFINITY).contains(&difference) => Ok(difference),
+        _ => Err("write a number from 0 on, for example 1e-4".to_owned()),
+    }
+}
