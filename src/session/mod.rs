@@ -537,7 +537,9 @@ impl Session {
         }
         let (is_gone, kept): (Vec<_>, Vec<_>) = self.file.episodes.iter().partition(|entry| entry.discarded);
         let gone: Vec<String> = is_gone.into_iter().map(|entry| entry.file.clone()).collect();
-        let kept = text::counted(kept.len() as u64, "episode");
+        // Of a run that was killed at once there may be nothing.
+        let recorded = kept.iter().filter(|entry| entry.verdict.is_some()).count();
+        let kept = text::counted(recorded as u64, "episode");
         let text = format!("session ended: {kept} kept, {} deleted", gone.len());
         self.phase = Phase::Idle;
         self.closing = true;
