@@ -133,7 +133,7 @@ impl Conductor {
     }
 
     /// Begins the episode that the command line asked for. True if there is nothing to record: the session has what `--goal`
-    /// wants, and no one is there to change it.
+    /// wants, and without a monitor it stays so.
     async fn begin_first(&mut self, screen: Screen) -> Result<bool, AppError> {
         if !self.collection.was_complete() {
             self.collection.start().await?;

@@ -4,8 +4,8 @@
 //! rig (`owner`) with tasks and shared memory, the lockstep rig with a virtual clock.
 //!
 //! Invariant: no clock, no I/O, no lock: the same inputs give the same effects.
-//! Invariant: a step that changes the mask, or what is plugged in, has [`Effect::Publish`] as its first effect, once, with the mask after the
-//! whole step: no effect that allocates or locks precedes it.
+//! Invariant: a step that changes the mask, or what is plugged in, has [`Effect::Publish`] as its first effect, once, with
+//! both after the whole step: no effect that allocates or locks precedes it.
 //! Invariant: a bit is set only while its device is attached and a stream of its newest epoch runs.
 //! Invariant: the device attached to a slot is the one that the assigner gave to its entry.
 

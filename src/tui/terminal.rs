@@ -178,7 +178,7 @@ fn places_pictures_in_text() -> bool {
     }
     while !is_answered(&answer) {
         let left = end.saturating_duration_since(Instant::now());
-        // Half a second fits.
+        // So short a time has this form.
         let limit = Timespec::try_from(left).unwrap_or_default();
         let input = rustix::stdio::stdin();
         let mut bytes = [0; 256];

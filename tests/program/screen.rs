@@ -605,7 +605,7 @@ fn the_tour_of_a_policy_leads_through_the_loss_of_a_sensor() {
     let tmux = Tmux::new(&place);
     let pane = streaming(&tmux, "policy", (80, 24), "rapid --infer --sim task --monitor --tour --out out");
     pane.shows(&["1/2 select tactile_tip (up, down), U: unplug it", "acting", "0x07"]);
-    // Without what the policy requires it holds, and the tour says so.
+    // Without what the policy requires it holds, and the tour names it.
     pane.press("Down");
     pane.press("Down");
     pane.until("arm is selected", |screen| screen.lines().any(|line| line.contains('▸') && line.contains("arm")));
