@@ -177,7 +177,10 @@ async fn drive(
                 None => return Err(TuiError::Gone(io::ErrorKind::UnexpectedEof.into())),
             },
             () = room.notified(), if !is_drawn => model::Effect::None,
-            _ = frames.tick() => model.update(Msg::Snapshot(Box::new(link.snapshot()))),
+            _ = frames.tick() => {
+                model.pace(is_drawn);
+                model.update(Msg::Snapshot(Box::new(link.snapshot())))
+            }
         };
         match link.carry_out(effect) {
             Ok(Some(answer)) => drop(model.update(answer)),

@@ -61,6 +61,9 @@ pub enum Msg {
     Failed(String),
 }
 
+/// Late frames after which a line counts as slow: more than two seconds of them.
+const TOO_LATE: u8 = 20;
+
 /// Shown instead of a request by a screen that makes none.
 const READ_ONLY: &str = "read-only: `rapid monitor` without --read-only controls the run";
 
@@ -157,6 +160,8 @@ pub struct Model {
     pub(super) size: (u16, u16),
     /// Pictures are shown.
     pub(super) pictures: bool,
+    /// Frames that the terminal had not taken when the next was due, less those that it had, while a picture is shown.
+    late: u8,
     /// When previews of the selected device were last requested.
     looked: Option<Stamp>,
     /// What the previews showed so far.
@@ -223,6 +228,7 @@ impl Model {
             log: LogView::default(),
             size: (80, 24),
             pictures: true,
+            late: 0,
             looked: None,
             seen: Seen::default(),
             naming: Naming::default(),
@@ -541,9 +547,27 @@ impl Model {
         self.log.device = if self.log.device.is_some() { None } else { name };
     }
 
+    fn shows_a_device(&self) -> bool {
+        self.page == Page::Device || (self.page == Page::Rig && self.has_column())
+    }
+
+    /// A frame is due, and the terminal has taken the one before or not. A line that is too slow for pictures shows none.
+    pub(super) fn pace(&mut self, is_taken: bool) {
+        let picture = self.selected_device().and_then(|device| self.picture(device.id));
+        if is_taken || picture.is_none() || !self.pictures || !self.shows_a_device() {
+            self.late = self.late.saturating_sub(1);
+            return;
+        }
+        self.late += 1;
+        if self.late == TOO_LATE {
+            (self.late, self.pictures) = (0, false);
+            self.notify("pictures are off: this line is too slow for them (c shows them)");
+        }
+    }
+
     /// Requests previews of the selected device while they are shown.
     fn look(&mut self) -> Effect {
-        let is_shown = self.page == Page::Device || (self.page == Page::Rig && self.has_column());
+        let is_shown = self.shows_a_device();
         let is_due = self.looked.is_none_or(|looked| self.latest.taken.since(looked) >= LOOK_AGAIN);
         let is_linked = !matches!(self.link, LinkState::Lost { .. });
         let wanted = self.selected_device().filter(|_| is_shown && is_due && is_linked && self.frozen.is_none());

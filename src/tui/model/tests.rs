@@ -663,3 +663,37 @@ fn what_other_screens_look_at_takes_nothing_from_the_plot_of_this_one() {
     assert_eq!(model.numbers(id(0)).count(), 5);
     assert_eq!(model.numbers(id(1)).count(), 0);
 }
+
+#[test]
+fn a_line_that_is_too_slow_for_pictures_shows_none() {
+    let mut now = three_streaming();
+    let payload: Vec<u8> = vec![7; 16];
+    now.previews = vec![std::sync::Arc::new(Preview {
+        device: id(0),
+        encoding: crate::sample::Encoding::Grey,
+        width: 4,
+        height: 4,
+        bytes: payload.len(),
+        payload: payload.into(),
+        ..Preview::default()
+    })];
+    let mut model = Model::new(now.clone());
+    // The rig alone is small: whatever the line does, there is nothing to leave out.
+    (0..100).for_each(|_| model.pace(false));
+    assert!(model.pictures);
+    model.update(press(KeyCode::Enter));
+    model.update(after(&now, 100));
+    assert!(model.picture(id(0)).is_some());
+    // Now and then a frame is late on any line.
+    for _ in 0..100 {
+        model.pace(false);
+        model.pace(true);
+    }
+    assert!(model.pictures);
+    (1..TOO_LATE).for_each(|_| model.pace(false));
+    assert!(model.pictures);
+    model.pace(false);
+    assert!(!model.pictures && model.notice().is_some_and(|notice| notice.contains("too slow")));
+    model.update(press(KeyCode::Char('c')));
+    assert!(model.pictures, "who wants them has them");
+}
