@@ -51,6 +51,7 @@ pub mod peer;
 pub mod permission;
 pub mod pixels;
 pub mod plot;
+pub mod points;
 #[cfg(feature = "policy")]
 pub mod policy;
 pub mod provenance;

@@ -34,6 +34,7 @@ const LAYERS: &[&[&str]] = &[
         "random",
         "provenance",
         "flash",
+        "points",
     ],
     &[
         "registry",

@@ -17,7 +17,9 @@ pub(crate) fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {
 pub(crate) fn of_derived(device: &DeviceSpec, derived: Derived) -> BTreeMap<String, String> {
     match derived {
         Derived::Transform => BTreeMap::new(),
-        Derived::Pose | Derived::Joints | Derived::Calibration => text_map([("derived_from", device.topic.clone())]),
+        Derived::Pose | Derived::Joints | Derived::Calibration | Derived::Points => {
+            text_map([("derived_from", device.topic.clone())])
+        }
     }
 }
 

@@ -10,7 +10,8 @@ use std::ops::Range;
 use super::schema::SampleSchema;
 use crate::mask::Bits;
 use crate::observation::Observation;
-use crate::registry::CalibrationSpec;
+use crate::points;
+use crate::registry::{CalibrationSpec, PointsSpec};
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Event, Level, What};
 
@@ -243,6 +244,38 @@ pub fn calibration(out: &mut Vec<u8>, wall_ns: u64, frame_id: &str, camera: &Cal
     let rows = intrinsics.as_chunks::<3>().0.iter();
     packed(out, 8, rows.flat_map(|[first, second, third]| [*first, *second, *third, 0.0]));
     bytes(out, 9, frame_id.as_bytes());
+}
+
+/// Bytes of a point: x, y, z (f32) and the reflectivity.
+const POINT: u8 = 13;
+/// Its fields: name, place, and type (`foxglove.PackedElementField.NumericType`: 1 UINT8, 7 FLOAT32).
+const POINT_FIELDS: [(&str, u32, u64); 4] = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 1)];
+
+/// Writes a `foxglove.PointCloud` of a packet; false if it is none.
+pub fn points(out: &mut Vec<u8>, wall_ns: u64, spec: &PointsSpec, packet: &[u8]) -> bool {
+    let mut count = 0;
+    if !points::read(spec.format, packet, |_| count += 1) {
+        return false;
+    }
+    out.clear();
+    timestamp(out, wall_ns);
+    bytes(out, 2, spec.frame.as_bytes());
+    // At the origin of its frame, and not turned.
+    nested(out, 3, |out| nested(out, 2, |out| doubles(out, &[0.0, 0.0, 0.0, 1.0])));
+    fixed32(out, 4, POINT.into());
+    for (name, at, kind) in POINT_FIELDS {
+        nested(out, 5, |out| {
+            bytes(out, 1, name.as_bytes());
+            fixed32(out, 2, at);
+            varint_field(out, 3, kind);
+        });
+    }
+    key(out, 6, BYTES);
+    varint(out, u64::from(POINT) * count);
+    points::read(spec.format, packet, |point| {
+        point.position.iter().for_each(|part| out.extend_from_slice(&part.to_le_bytes()));
+        out.push(point.reflectivity);
+    })
 }
 
 /// A repeated double; nothing of none.

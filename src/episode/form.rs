@@ -1,5 +1,5 @@
 //! Messages derived from the samples of a device whose [`Form`] is known, which viewers draw: poses, transforms, the states
-//! of joints, and the calibration of a camera. They are recorded beside the samples, and carry their capture time and
+//! of joints, the calibration of a camera, and the points of a LiDAR. They are recorded beside the samples, and carry their capture time and
 //! sequence number.
 //!
 //! Invariant: nothing here is read again by `rapid`: the samples are what was measured.
@@ -23,6 +23,8 @@ pub enum Derived {
     Joints,
     /// `foxglove.CameraCalibration`.
     Calibration,
+    /// `foxglove.PointCloud`.
+    Points,
 }
 
 impl Derived {
@@ -32,6 +34,7 @@ impl Derived {
             Some(Form::Pose(_)) => &[Self::Pose, Self::Transform],
             Some(Form::Joints(_)) => &[Self::Joints],
             Some(Form::Calibration(_)) => &[Self::Calibration],
+            Some(Form::Points(_)) => &[Self::Points],
             None => &[],
         }
     }
@@ -41,7 +44,7 @@ impl Derived {
         let ending = device.form.as_ref().map_or("", Form::ending);
         match self {
             Self::Transform => TRANSFORM_TOPIC.to_owned(),
-            Self::Pose | Self::Joints | Self::Calibration => format!("{}{ending}", device.topic),
+            Self::Pose | Self::Joints | Self::Calibration | Self::Points => format!("{}{ending}", device.topic),
         }
     }
 
@@ -52,6 +55,7 @@ impl Derived {
             Self::Transform => schema::TRANSFORM,
             Self::Joints => schema::JOINTS,
             Self::Calibration => schema::CALIBRATION,
+            Self::Points => schema::POINTS,
         }
     }
 
@@ -73,13 +77,14 @@ impl Derived {
                 }
                 encode::calibration(out, wall_ns, name, camera);
             }
+            Form::Points(spec) => return schema == SampleSchema::Bytes && encode::points(out, wall_ns, spec, payload),
             _ if !has_numbers() => return false,
             Form::Pose(spec) => {
                 let Some(pose) = pose(spec, payload) else { return false };
                 match self {
                     Self::Pose => encode::pose(out, wall_ns, &spec.parent, &pose),
                     Self::Transform => encode::transform(out, wall_ns, [&spec.parent, name], &pose),
-                    Self::Joints | Self::Calibration => return false,
+                    Self::Joints | Self::Calibration | Self::Points => return false,
                 }
             }
             Form::Joints(spec) => encode::joints(out, wall_ns, joints(spec, payload)),

@@ -40,6 +40,8 @@ pub const TRANSFORM: Schema = schema!("foxglove.FrameTransform");
 pub const CALIBRATION: Schema = schema!("foxglove.CameraCalibration");
 /// `foxglove.JointStates`.
 pub const JOINTS: Schema = schema!("foxglove.JointStates");
+/// `foxglove.PointCloud`.
+pub const POINTS: Schema = schema!("foxglove.PointCloud");
 /// `rapid.Mask`.
 pub const MASK: Schema = schema!("rapid.Mask");
 

@@ -107,7 +107,7 @@ impl Topics {
             };
             let channel = match derived {
                 Derived::Transform => self.transforms.clone().or_else(made),
-                Derived::Pose | Derived::Joints | Derived::Calibration => made(),
+                Derived::Pose | Derived::Joints | Derived::Calibration | Derived::Points => made(),
             };
             if *derived == Derived::Transform {
                 self.transforms.clone_from(&channel);

@@ -19,9 +19,10 @@ use std::time::Duration;
 use serde::Serialize;
 
 use crate::modality::{Modality, ModalityId, ModalityKind};
+use crate::points::PacketFormat;
 use crate::sample::SampleHeader;
 
-pub use form::{CalibrationSpec, Form, JointsSpec, PoseLayout, PoseSpec, Quantity};
+pub use form::{CalibrationSpec, Form, JointsSpec, PointsSpec, PoseLayout, PoseSpec, Quantity};
 pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
@@ -579,6 +580,8 @@ words! {
     PoseLayout, 3: "columns" = Columns, "rows" = Rows, "quaternion" = Quaternion;
     /// Everything that a joint's number may be, and its name.
     Quantity, 4: "position" = Position, "velocity" = Velocity, "effort" = Effort, "other" = Other;
+    /// Every format of a LiDAR's packets and its name.
+    PacketFormat, 2: "velodyne" = Velodyne, "livox" = Livox;
     /// Every policy and its name.
     WhenStale, 2: "hold" = Hold, "zero" = Zero;
 }

@@ -10,11 +10,13 @@ use crate::support::mistakes;
 use proptest::prelude::*;
 use rapid::interlock::StopKind;
 use rapid::modality::ModalityKind;
+use rapid::points::PacketFormat;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
     BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Form, Framing, Hook, InputSpec, JointsSpec,
     LanFind, LanPicture, LanProtocol, LineOff, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE,
-    Parse, PhoneStream, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
+    Parse, PhoneStream, PointsSpec, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop, StopSpec, VerdictSpec,
+    WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -211,6 +213,9 @@ fn what_numbers_mean_is_written_or_follows_from_the_device() {
     };
     assert_eq!(form("fingers"), joints(&["left", "right"], &[Position, Other, Effort]));
     assert_eq!(form("encoder"), joints(&["gripper"], &[Position]));
+    let points = |format, frame: &str| Form::Points(PointsSpec { format, frame: frame.to_owned() });
+    assert_eq!(form("lidar"), points(PacketFormat::Velodyne, "lidar"));
+    assert_eq!(form("scanner"), points(PacketFormat::Livox, "base"));
     let Form::Calibration(camera) = form("cam") else { panic!("a calibration") };
     assert_eq!((camera.width, camera.height, camera.model.as_str()), (640, 480, "rational_polynomial"));
     assert_eq!((camera.distortion.len(), camera.intrinsics[0], camera.intrinsics[5]), (8, 600.5, 240.0));

@@ -5,12 +5,13 @@ use std::path::Path;
 /// Set, the compiled schemas are written.
 const WRITE: &str = "RAPID_WRITE_SCHEMAS";
 
-const SCHEMAS: [&str; 12] = [
+const SCHEMAS: [&str; 13] = [
     "foxglove/CameraCalibration",
     "foxglove/CompressedImage",
     "foxglove/FrameTransform",
     "foxglove/JointStates",
     "foxglove/Log",
+    "foxglove/PointCloud",
     "foxglove/PoseInFrame",
     "foxglove/RawImage",
     "rapid/Bytes",

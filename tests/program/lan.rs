@@ -14,6 +14,7 @@ use crate::support::lan::{
 };
 use crate::support::{self, Episode, Place, until};
 use serde_json::Value;
+use vbench::emu::lan::lidar;
 
 #[test]
 fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
@@ -86,6 +87,65 @@ fn packets_become_samples_unchanged() {
         samples.iter().map(|packet| u32::from_le_bytes([packet[0], packet[1], packet[2], packet[3]])).collect();
     assert!(numbers.windows(2).all(|pair| pair[0] < pair[1] && pair[1] % 10 != 9), "{numbers:?}");
     assert!(lost["gaps"].as_u64().is_some_and(|gaps| gaps > 0), "what was too large is lost: {lost}");
+}
+
+/// `foxglove.PointCloud`.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Cloud {
+    #[prost(fixed32, tag = "4")]
+    stride: u32,
+    #[prost(bytes = "vec", tag = "6")]
+    data: Vec<u8>,
+}
+
+#[test]
+fn packets_of_a_lidar_are_recorded_with_their_points() {
+    let (place, [port]) = (Place::new(), free_ports());
+    let entry = format!(
+        "{RIG}[device.lidar]\nnode = \"lan\"\nbit = 0\n[device.lidar.lan]\nprotocol = \"udp\"\nhost = \"127.0.0.1\"\n\
+         port = {port}\nlease = \"1s\"\n[device.lidar.points]\nformat = \"velodyne\"\n"
+    );
+    place.write("devices.toml", &entry);
+    let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+    let (sends, sent) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU32::new(0)));
+    let sender = std::thread::spawn({
+        let (sends, sent) = (Arc::clone(&sends), Arc::clone(&sent));
+        move || {
+            let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
+            for number in (0..).take_while(|_| sends.load(Ordering::Relaxed)) {
+                // Each tenth is none: it is recorded all the same.
+                let packet = lidar::packet(number, 0);
+                let length = if number % 10 == 9 { 1205 } else { packet.len() };
+                let _ = socket.send_to(&packet[..length], ("127.0.0.1", port));
+                sent.store(number + 1, Ordering::Relaxed);
+                std::thread::sleep(Duration::from_millis(2));
+            }
+        }
+    });
+    wait_for(&running, "lidar", "streaming", 1);
+    let before = sent.load(Ordering::Relaxed);
+    until("a hundred packets", || sent.load(Ordering::Relaxed) > before + 100);
+    sends.store(false, Ordering::Relaxed);
+    sender.join().expect("no panic");
+    stop(running);
+    let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
+    let packets: Vec<_> = episode.topic("/rapid/lan/lidar").collect();
+    let clouds: Vec<_> = episode.topic("/rapid/lan/lidar/points").collect();
+    let whole: Vec<_> = packets.iter().filter(|packet| packet.payload().len() == lidar::PACKET).collect();
+    assert!(packets.len() > whole.len() && whole.len() > 20, "{} packets, {} whole", packets.len(), whole.len());
+    assert_eq!(clouds.len(), whole.len());
+    for (packet, cloud) in whole.iter().zip(clouds) {
+        assert_eq!((packet.log_time, packet.sequence), (cloud.log_time, cloud.sequence));
+        let cloud: Cloud = cloud.decode();
+        let points: Vec<_> = cloud.data.chunks_exact(usize::try_from(cloud.stride).expect("small")).collect();
+        // The packet's number takes the place of its first four returns, of which some are 0: none.
+        assert!((380..=384).contains(&points.len()), "{}", points.len());
+        // The last return is that of the highest laser, at 1310 x 2 mm.
+        let part = |at: usize| f32::from_le_bytes(points[points.len() - 1][at..at + 4].try_into().expect("four bytes"));
+        let (level, up) = (part(0).hypot(part(4)), part(8) + 0.0112);
+        assert!((level.hypot(up) - 2.62).abs() < 1e-3 && (up.atan2(level).to_degrees() - 15.0).abs() < 1e-2);
+        assert_eq!(points[points.len() - 1][12], 100, "its reflectivity");
+    }
 }
 
 /// A phone: connects, names its session, sends frames; connects again when that ends.

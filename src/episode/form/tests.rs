@@ -4,7 +4,8 @@ use proptest::prelude::*;
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage as _};
 
 use super::*;
-use crate::registry::CalibrationSpec;
+use crate::points::PacketFormat;
+use crate::registry::{CalibrationSpec, PointsSpec};
 
 const WALL: u64 = 1_700_000_000_123_456_789;
 
@@ -159,6 +160,41 @@ fn a_calibrated_camera_gives_its_intrinsics_with_each_picture() {
     for schema in [SampleSchema::Bytes, SampleSchema::Scalars] {
         assert!(!Derived::Calibration.encode(&mut out, WALL, "cam", &form, (schema, b"no picture")));
     }
+}
+
+#[test]
+fn a_packet_of_a_lidar_is_a_cloud_of_its_points() {
+    let mut packet = vec![0; 36 + 2 * 14];
+    let length = u16::try_from(packet.len()).unwrap();
+    packet[1..3].copy_from_slice(&length.to_le_bytes());
+    (packet[5], packet[10]) = (2, 1);
+    for (at, number) in [2500_i32, -1500, 40].into_iter().enumerate() {
+        packet[50 + 4 * at..54 + 4 * at].copy_from_slice(&number.to_le_bytes());
+    }
+    packet[62] = 200;
+    let form = Form::Points(PointsSpec { format: PacketFormat::Livox, frame: "base".to_owned() });
+    let mut out = Vec::new();
+    assert!(Derived::Points.encode(&mut out, WALL, "lidar", &form, (SampleSchema::Bytes, &packet)));
+    let cloud = decode(Derived::Points, &out);
+    assert_eq!(cloud.get_field_by_name("frame_id").unwrap().as_str(), Some("base"));
+    assert_eq!(cloud.get_field_by_name("point_stride").unwrap().as_u32(), Some(13));
+    assert_eq!(doubles(&inner(&inner(&cloud, "pose"), "orientation")), [0.0, 0.0, 0.0, 1.0]);
+    let fields = cloud.get_field_by_name("fields").unwrap();
+    let fields = fields.as_list().unwrap().iter().map(|field| {
+        let of = |name: &str| field.as_message().unwrap().get_field_by_name(name).unwrap().into_owned();
+        (of("name").as_str().unwrap().to_owned(), of("offset").as_u32(), of("type").as_enum_number())
+    });
+    let wanted = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 1)];
+    assert!(fields.eq(wanted.map(|(name, at, kind)| (name.to_owned(), Some(at), Some(kind)))));
+    let data = cloud.get_field_by_name("data").unwrap().as_bytes().unwrap().clone();
+    let coordinates = [2.5_f32, -1.5, 0.04].map(f32::to_le_bytes).concat();
+    assert_eq!(data.as_ref(), [&coordinates[..], &[200]].concat(), "the first has no distance");
+    // Another kind of packet, and bytes that are none.
+    packet[10] = 0;
+    for other in [&packet[..], b"", b"packet"] {
+        assert!(!Derived::Points.encode(&mut out, WALL, "lidar", &form, (SampleSchema::Bytes, other)));
+    }
+    assert!(!Derived::Points.encode(&mut out, WALL, "lidar", &form, (SampleSchema::Scalars, &packet)));
 }
 
 proptest! {

@@ -22,6 +22,9 @@ pub(super) const LOG_TOPIC: &str = "/rapid/log";
 /// Numbers of a device that are plotted.
 const MOST_PLOTTED: u32 = 16;
 
+/// A turn of a LiDAR, seconds: they turn 5 to 20 times a second.
+const TURN_S: f64 = 0.2;
+
 /// The text of the file.
 pub(super) fn layout(registry: &Registry) -> String {
     let mut panels = Panels::default();
@@ -73,20 +76,25 @@ impl Panels {
         self.add("Image", &device.name, settings)
     }
 
-    /// The poses, if there are any.
+    /// Poses and points, if there are any.
     fn scene(&mut self, registry: &Registry) -> Option<Value> {
-        let poses: Vec<_> = registry
-            .devices
-            .iter()
-            .filter_map(|device| match &device.form {
-                Some(form @ Form::Pose(pose)) => Some((format!("{}{}", device.topic, form.ending()), &pose.parent)),
-                _ => None,
-            })
-            .collect();
-        let (_, frame) = poses.first()?;
-        let topics: Map<_, _> = poses.iter().map(|(topic, _)| (topic.clone(), json!({ "visible": true }))).collect();
-        let settings = json!({ "foxglovePanelTitle": "poses", "followTf": frame, "topics": topics });
-        Some(self.add("3D", "poses", settings))
+        let shown = |device: &DeviceSpec| {
+            let form = device.form.as_ref()?;
+            let (frame, settings) = match form {
+                Form::Pose(pose) => (pose.parent.clone(), json!({ "visible": true })),
+                // A packet is a part of a turn: what the last ones had is shown together.
+                Form::Points(points) => {
+                    (points.frame.clone(), json!({ "visible": true, "decayTime": TURN_S, "colorField": "intensity" }))
+                }
+                Form::Joints(_) | Form::Calibration(_) => return None,
+            };
+            Some((format!("{}{}", device.topic, form.ending()), frame, settings))
+        };
+        let shown: Vec<_> = registry.devices.iter().filter_map(shown).collect();
+        let (_, frame, _) = shown.first()?;
+        let topics: Map<_, _> = shown.iter().map(|(topic, _, settings)| (topic.clone(), settings.clone())).collect();
+        let settings = json!({ "foxglovePanelTitle": "space", "followTf": frame, "topics": topics });
+        Some(self.add("3D", "space", settings))
     }
 
     fn numbers(&mut self, device: &DeviceSpec) -> Value {

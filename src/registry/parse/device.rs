@@ -27,8 +27,8 @@ const PROCESS: &str = "process";
 /// Keys that state which device an entry identifies.
 pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
 const KEYS: [&str; 9] = ["node", "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
-const TABLES: [&str; 10] =
-    ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints", "calibration"];
+const TABLES: [&str; 11] =
+    ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints", "calibration", "points"];
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;

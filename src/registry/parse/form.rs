@@ -1,16 +1,18 @@
-//! `[device.NAME.pose]`, `[device.NAME.joints]` and `[device.NAME.calibration]`, and the forms that follow from the device
-//! itself.
+//! `[device.NAME.pose]`, `[device.NAME.joints]`, `[device.NAME.calibration]` and `[device.NAME.points]`, and the forms that
+//! follow from the device itself.
 
 use crate::modality::ModalityKind;
+use crate::points::PacketFormat;
 use crate::registry::section::Section;
 use crate::registry::spec::{
-    CalibrationSpec, CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PoseLayout,
-    PoseSpec, Quantity,
+    CalibrationSpec, CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PointsSpec,
+    PoseLayout, PoseSpec, Quantity,
 };
 
 const POSE: &str = "pose";
 const JOINTS: &str = "joints";
 const CALIBRATION: &str = "calibration";
+const POINTS: &str = "points";
 const WORLD: &str = "world";
 /// Models of a lens that viewers know, each with its name and how many parameters it has.
 const MODELS: [(&str, (&str, usize)); 3] = [
@@ -37,6 +39,9 @@ pub(super) fn form(name: &str, section: &Section<'_>, node: Option<&NodeSpec>, c
     if let Some(table) = section.table(CALIBRATION) {
         return calibration(section, &table, node?).map(Form::Calibration);
     }
+    if let Some(table) = section.table(POINTS) {
+        return points(name, section, &table, node?).map(Form::Points);
+    }
     let (form, key) = match (section.table(POSE), section.table(JOINTS)) {
         (Some(_), Some(_)) => {
             let message = "its numbers are a pose or the states of joints, not both".to_owned();
@@ -57,7 +62,7 @@ pub(super) fn form(name: &str, section: &Section<'_>, node: Option<&NodeSpec>, c
     let message = format!("{} numbers for a sample of {count}", form.numbers());
     let fix = match &form {
         Form::Pose(_) => "columns and rows have 16 numbers, a quaternion with its position 7: write as many `channels`",
-        Form::Joints(_) | Form::Calibration(_) => {
+        Form::Joints(_) | Form::Calibration(_) | Form::Points(_) => {
             "a sample has each of `quantities` for each of `names`: write as many `channels`"
         }
     };
@@ -81,9 +86,9 @@ fn of_node(node: &NodeSpec) -> Option<Form> {
 /// Reports the tables that a device of known contents does not take.
 fn refuse_tables(section: &Section<'_>, own: &Form) {
     let (tables, what): (&[&str], _) = match own {
-        Form::Pose(_) => (&[JOINTS, CALIBRATION], "sends the pose of its camera"),
-        Form::Joints(_) | Form::Calibration(_) => {
-            (&[POSE, JOINTS, CALIBRATION], "sends the states of its motors, with their names")
+        Form::Pose(_) => (&[JOINTS, CALIBRATION, POINTS], "sends the pose of its camera"),
+        Form::Joints(_) | Form::Calibration(_) | Form::Points(_) => {
+            (&[POSE, JOINTS, CALIBRATION, POINTS], "sends the states of its motors, with their names")
         }
     };
     for table in tables.iter().filter(|table| section.has(table)) {
@@ -98,9 +103,7 @@ fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> O
     let (ModalityKind::Image, [height, width]) = (node.modality_kind(), &size[..]) else {
         return section.refuse(CALIBRATION, "its samples are not pictures".to_owned(), "remove the table");
     };
-    for other in [POSE, JOINTS].iter().filter(|other| section.has(other)) {
-        section.report(other, "its samples are pictures", "remove the table");
-    }
+    refuse_others(section, &[POSE, JOINTS, POINTS], "its samples are pictures");
     let distortion = if table.has("distortion") { table.numbers("distortion")? } else { Vec::new() };
     let intrinsics = table.numbers("intrinsics")?;
     let Ok(intrinsics) = <[f64; 9]>::try_from(intrinsics.as_slice()) else {
@@ -121,6 +124,29 @@ fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> O
         return table.refuse("distortion", "a number that is not finite".to_owned(), "write those of the calibration");
     }
     Some(CalibrationSpec { width: *width, height: *height, model: model.to_owned(), distortion, intrinsics })
+}
+
+fn points(name: &str, section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> Option<PointsSpec> {
+    table.allow(&["format", "frame"]);
+    table.need("format", "write format = \"velodyne\" or \"livox\"");
+    if node.modality_kind() != ModalityKind::Bytes {
+        return section.refuse(POINTS, "its samples are not packets".to_owned(), "remove the table");
+    }
+    refuse_others(section, &[POSE, JOINTS], "its samples are packets");
+    let frame = match table.text("frame") {
+        Some("") => {
+            let fix = "write frame = \"base\", or remove the key: the frame has the name of the entry then";
+            return table.refuse("frame", "the frame has no name".to_owned(), fix);
+        }
+        frame => frame.unwrap_or(name).to_owned(),
+    };
+    Some(PointsSpec { format: table.choice("format", &PacketFormat::WORDS)?, frame })
+}
+
+fn refuse_others(section: &Section<'_>, others: &[&str], why: &str) {
+    for other in others.iter().filter(|other| section.has(other)) {
+        section.report(other, why, "remove the table");
+    }
 }
 
 fn parent(table: &Section<'_>, name: &str, keys: &[&str]) -> String {

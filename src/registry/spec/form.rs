@@ -1,7 +1,9 @@
-//! What the samples of a device mean, where viewers know messages for that: `[device.NAME.pose]`, `[device.NAME.joints]` and
-//! `[device.NAME.calibration]`.
+//! What the samples of a device mean, where viewers know messages for that: `[device.NAME.pose]`, `[device.NAME.joints]`,
+//! `[device.NAME.calibration]` and `[device.NAME.points]`.
 //!
 //! Samples are recorded as they are; messages of these forms are derived from them (`episode::form`).
+
+use crate::points::PacketFormat;
 
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
@@ -12,6 +14,17 @@ pub enum Form {
     Joints(JointsSpec),
     /// Pictures of a calibrated camera.
     Calibration(CalibrationSpec),
+    /// Packets of a LiDAR.
+    Points(PointsSpec),
+}
+
+/// How points are given.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PointsSpec {
+    /// The format of its packets.
+    pub format: PacketFormat,
+    /// The frame in which they are given, default the name of the entry.
+    pub frame: String,
 }
 
 /// How a pose is given.
@@ -82,12 +95,12 @@ pub struct CalibrationSpec {
 }
 
 impl Form {
-    /// How many numbers a sample has; 0 of pictures.
+    /// How many numbers a sample has; 0 of pictures and packets.
     pub fn numbers(&self) -> usize {
         match self {
             Self::Pose(pose) => pose.layout.numbers(),
             Self::Joints(joints) => joints.names.len().saturating_mul(joints.quantities.len()),
-            Self::Calibration(_) => 0,
+            Self::Calibration(_) | Self::Points(_) => 0,
         }
     }
 
@@ -97,6 +110,7 @@ impl Form {
             Self::Pose(_) => "/pose",
             Self::Joints(_) => "/joints",
             Self::Calibration(_) => "/calibration",
+            Self::Points(_) => "/points",
         }
     }
 }

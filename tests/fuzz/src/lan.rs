@@ -2,6 +2,7 @@
 
 use rapid::driver::lan::fuzzing;
 use rapid::hotplug::lan::fuzz_label;
+use rapid::points::{self, PacketFormat};
 
 /// Of the smallest entry.
 const LARGEST: usize = 1024;
@@ -46,6 +47,32 @@ pub fn label(bytes: &[u8]) {
     if let Ok(label) = std::str::from_utf8(bytes) {
         fuzz_label(label);
     }
+}
+
+/// Packets of LiDARs: what is no packet gives no point, and every point lies where its numbers can be.
+pub fn points(bytes: &[u8]) {
+    for (_, format) in PacketFormat::WORDS {
+        let mut count = 0;
+        let is_packet = points::read(format, bytes, |point| {
+            count += 1;
+            assert!(point.position.iter().all(|part| part.abs() <= 5.0e6), "{point:?}");
+        });
+        assert!(is_packet || count == 0);
+        assert!(count <= bytes.len() / 3);
+    }
+}
+
+/// Packets as they are.
+pub fn packets() -> Vec<Vec<u8>> {
+    let mut velodyne = [&[0xff, 0xee, 0, 0][..], &[0x88, 0x13, 9].repeat(32)].concat().repeat(12);
+    velodyne.extend([1, 2, 3, 4, 0x37, 0x22]);
+    let livox = |kind: u8, size: u8, count: u8| {
+        let mut packet = vec![0; 36];
+        (packet[1], packet[5], packet[10]) = (36 + size * count, count, kind);
+        packet.extend((0..size * count).map(|byte| byte.wrapping_mul(37)));
+        packet
+    };
+    vec![velodyne, livox(1, 14, 10), livox(2, 8, 20), livox(3, 10, 12), livox(0, 24, 1)]
 }
 
 /// Streams of cameras as they are.

@@ -36,6 +36,7 @@ pub const TARGETS: &[Target] = &[
     Target { name: "slcan", run: can::slcan, seeds: seeds::slcan },
     Target { name: "damiao_serial", run: can::damiao_serial, seeds: seeds::damiao_serial },
     Target { name: "multipart", run: lan::multipart, seeds: lan::multiparts },
+    Target { name: "points", run: lan::points, seeds: lan::packets },
     Target { name: "phone", run: lan::phone, seeds: lan::phones },
     Target { name: "http_answer", run: lan::answer, seeds: lan::answers },
     Target { name: "mdns_name", run: lan::label, seeds: lan::labels },
