@@ -63,13 +63,15 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         "MJPG" => PixelFormat::Mjpg,
         "YUYV" => PixelFormat::Yuyv,
         "GREY" => PixelFormat::Grey,
-        other => return Err(format!("{other}: the format is MJPG, YUYV or GREY").into()),
+        "Z16" => PixelFormat::Z16,
+        other => return Err(format!("{other}: the format is MJPG, YUYV, GREY or Z16").into()),
     };
     let camera = CameraSpec {
         width: number(1, 640)?,
         height: number(2, 480)?,
         fps: number(3, 30)?,
         format,
+        depth_unit_um: 1000,
         controls: Vec::new(),
     };
     Ok(DeviceSpec {

@@ -71,6 +71,7 @@ fn registry(count: u8) -> Registry {
                 height: 480,
                 fps: 30,
                 format: PixelFormat::Mjpg,
+                depth_unit_um: 1000,
                 controls: Vec::new(),
             }),
             mount: None,

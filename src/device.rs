@@ -168,6 +168,8 @@ pub struct Attachment {
     pub unit: Unit,
     /// The kernel's driver of it.
     pub driver: Option<Box<KernelDriver>>,
+    /// Pixel formats of a capture node, by their V4L2 names; empty if it was not asked (`hotplug::Ask`).
+    pub formats: Vec<String>,
 }
 
 impl Attachment {

@@ -29,7 +29,8 @@ use crate::commands::mask::MaskOptions;
 use crate::commands::register::{self, Dialogue};
 use crate::commands::{self, CommandStatus, Format};
 use crate::device::Attachment;
-use crate::driver::replay;
+use crate::driver::{camera, replay};
+use crate::hotplug::udev::Ask;
 use crate::hotplug::{HotplugError, udev};
 use crate::palette::Palette;
 use crate::record::inspect::ReadError;
@@ -266,10 +267,15 @@ fn is_task(global: &Global) -> bool {
 fn connected(global: &Global) -> Result<(Registry, Vec<Attachment>), Failure> {
     let (registry, devices) = rig(global, 0)?;
     let attached = match devices {
-        Devices::Machine => udev::enumerate()?,
+        Devices::Machine => udev::enumerate(&asked(Some(&registry)))?,
         Devices::Simulated(scenario) => crate::hotplug::script::attached(&scenario),
     };
     Ok((registry, attached))
+}
+
+/// What capture nodes are asked in order to assign them.
+fn asked(registry: Option<&Registry>) -> Ask {
+    registry.map_or(Ask::NOTHING, |registry| Ask::of(registry, camera::formats))
 }
 
 /// Lists connected devices first, even if the registry is invalid.
@@ -285,7 +291,8 @@ fn devices(global: &Global, formats: Formats, format: Format, out: &mut dyn Writ
         Ok(None) => Entries::NoFile,
         Err(_) => Entries::Wrong,
     };
-    let mut listed = commands::devices::list(known, &udev::enumerate()?, formats);
+    let ask = asked(registry.as_ref().ok().and_then(Option::as_ref));
+    let mut listed = commands::devices::list(known, &udev::enumerate(&ask)?, formats);
     listed.extend(commands::devices::other_cameras(formats));
     commands::devices::print(&listed, registry.as_ref().ok().and_then(Option::as_ref), format, out)?;
     registry.map(drop)
@@ -488,7 +495,7 @@ fn usual_places() -> Vec<PathBuf> {
 /// Adds an entry.
 fn register(global: &Global, args: &RegisterArgs, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
     let target = Target::read(find_registry(global).unwrap_or_else(|| PathBuf::from("devices.toml")))?;
-    let attached = match udev::enumerate() {
+    let attached = match udev::enumerate(&Ask::NOTHING) {
         _ if global.sim.is_some() => connected(global)?.1,
         // An entry for a device that is not plugged in can be created on any machine.
         Err(_) if args.vid.is_some() => Vec::new(),

@@ -65,6 +65,8 @@ impl std::fmt::Display for ModalityId {
 pub enum ModalityKind {
     /// Pictures, as the camera encodes them.
     Image,
+    /// Pictures of 16-bit distances.
+    Depth,
     /// A vector of numbers per sample.
     Scalars,
     /// Bytes that `rapid` forwards and records without interpreting them.
@@ -78,6 +80,6 @@ pub struct Modality {
     pub name: String,
     /// What the samples hold.
     pub kind: ModalityKind,
-    /// Image: `[height, width]` in pixels. Scalars: `[channels]`. Bytes: empty.
+    /// Image and depth: `[height, width]` in pixels. Scalars: `[channels]`. Bytes: empty.
     pub shape: Vec<u32>,
 }

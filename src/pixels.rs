@@ -1,5 +1,7 @@
 //! Pictures of a camera as pixels: 8-bit red, green, blue, row by row.
 //!
+//! Distances become shades for people: from white at 0 to black at 16 x 255 counts (4 m in mm) and where there is none.
+//!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
 
 use zune_jpeg::JpegDecoder;
@@ -88,6 +90,11 @@ impl Pixels {
                     return Err(PixelError::Damaged("an odd number of pixels in YUYV".to_owned()));
                 }
             }
+            Encoding::Depth => {
+                whole(2)?;
+                self.values.clear();
+                self.values.extend(picture.bytes.as_chunks::<2>().0.iter().flat_map(|count| [shade(*count); CHANNELS]));
+            }
             Encoding::Mjpeg => self.decode_jpeg(picture.bytes, width, height)?,
             other => return Err(PixelError::NoPicture(other)),
         }
@@ -130,6 +137,13 @@ pub(crate) fn with_mark(jpeg: &[u8], marked: &mut Vec<u8>) {
     }
 }
 
+fn shade(count: [u8; 2]) -> u8 {
+    match u16::from_le_bytes(count) {
+        0 => 0,
+        count => u8::MAX - u8::try_from(count / 16).unwrap_or(u8::MAX),
+    }
+}
+
 /// Two pixels of YUYV in red, green and blue: ITU-R BT.601 of limited range, what V4L2 means by YUYV
 /// unless it states otherwise; coefficients in 1/65536.
 fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
@@ -146,6 +160,17 @@ fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn distances_are_shades_and_their_length_is_checked() {
+        let bytes = [0_u16, 1, 16, 4080, u16::MAX, 160].map(u16::to_le_bytes).concat();
+        let mut pixels = Pixels::default();
+        let picture = |bytes| Picture { encoding: Encoding::Depth, width: 3, height: 2, bytes };
+        assert_eq!(pixels.decode(&picture(&bytes)), Ok([2, 3]));
+        let shades: Vec<u8> = pixels.values().iter().step_by(CHANNELS).copied().collect();
+        assert_eq!(shades, [0, 255, 254, 0, 0, 245]);
+        assert!(pixels.decode(&picture(&bytes[1..])).is_err());
+    }
 
     #[test]
     fn yuyv_is_bt_601_of_limited_range() {

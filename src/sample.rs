@@ -36,6 +36,8 @@ pub enum Encoding {
     F64 = 4,
     /// A mask value: u64 mask, u64 sequence, little endian.
     Mask = 5,
+    /// 16-bit distances, little-endian, row by row; 0 is none. V4L2 calls it `Z16 `.
+    Depth = 6,
 }
 
 impl Encoding {
@@ -48,8 +50,23 @@ impl Encoding {
             3 => Self::Grey,
             4 => Self::F64,
             5 => Self::Mask,
+            6 => Self::Depth,
             _ => return None,
         })
+    }
+
+    /// Bytes of a pixel, if these are pixels that are not compressed.
+    pub const fn pixel_bytes(self) -> Option<usize> {
+        match self {
+            Self::Grey => Some(1),
+            Self::Yuyv | Self::Depth => Some(2),
+            Self::Bytes | Self::Mjpeg | Self::F64 | Self::Mask => None,
+        }
+    }
+
+    /// Whether these are pixels, compressed or not.
+    pub const fn is_picture(self) -> bool {
+        matches!(self, Self::Mjpeg) || self.pixel_bytes().is_some()
     }
 }
 
@@ -100,9 +117,9 @@ mod tests {
 
     #[test]
     fn encodings_survive_the_header() {
-        for raw in 0..6 {
+        for raw in 0..7 {
             assert_eq!(Encoding::from_raw(raw).map(|e| e as u32), Some(raw));
         }
-        assert_eq!(Encoding::from_raw(6), None);
+        assert_eq!(Encoding::from_raw(7), None);
     }
 }

@@ -15,7 +15,7 @@ extern "C" {
 #endif
 
 /* What a payload holds. RAPID_F64 is little-endian 64-bit floats, which is what kind = "scalars" means. */
-enum rapid_encoding { RAPID_BYTES = 0, RAPID_MJPEG = 1, RAPID_YUYV = 2, RAPID_GREY = 3, RAPID_F64 = 4 };
+enum rapid_encoding { RAPID_BYTES = 0, RAPID_MJPEG = 1, RAPID_YUYV = 2, RAPID_GREY = 3, RAPID_F64 = 4, RAPID_DEPTH = 6 };
 
 struct rapid_sample {
     const void *bytes;

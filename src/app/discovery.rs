@@ -7,11 +7,12 @@ use tokio::sync::mpsc;
 
 use super::stage::Stage;
 use super::{AppError, Devices};
+use crate::driver::camera;
 use crate::hotplug::HotplugStream;
 #[cfg(feature = "lan")]
 use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
-use crate::hotplug::udev::UdevMonitor;
+use crate::hotplug::udev::{Ask, UdevMonitor};
 use crate::registry::Registry;
 
 /// Created by udev's daemon when it starts.
@@ -62,7 +63,7 @@ fn open(
     if !Path::new(UDEV).exists() {
         tracing::warn!("no udev runs here ({UDEV} is missing): USB devices are not detected; start systemd-udevd");
     }
-    let machine = UdevMonitor::open()?;
+    let machine = UdevMonitor::open(Ask::of(registry, camera::formats))?;
     #[cfg(feature = "lan")]
     if let Some(lan) = LanMonitor::open(registry) {
         return Ok(Box::pin(futures::stream::select(machine, lan)));

@@ -42,7 +42,7 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
             let pixels = decoder.decode().map_err(|error| BrightnessError::Damaged(error.to_string()))?;
             mean(pixels.iter())
         }
-        Encoding::Bytes | Encoding::F64 | Encoding::Mask => Err(BrightnessError::NoPicture),
+        Encoding::Bytes | Encoding::F64 | Encoding::Mask | Encoding::Depth => Err(BrightnessError::NoPicture),
     }
 }
 

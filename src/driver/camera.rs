@@ -348,6 +348,13 @@ fn merge(found: Vec<Mode>, exact: Vec<Mode>) -> Vec<Mode> {
     modes
 }
 
+/// The V4L2 names of the pixel formats that the node at `path` offers; none if it does not answer.
+pub fn formats(path: &Path) -> Vec<String> {
+    let mut formats: Vec<_> = enumerate(path).unwrap_or_default().into_iter().map(|mode| mode.fourcc).collect();
+    formats.dedup();
+    formats
+}
+
 fn enumerate(path: &Path) -> Result<Vec<Mode>, DriverError> {
     let device = v4l::Device::with_path(path).map_err(|error| open_error(path, &error))?;
     let handle = device.handle();

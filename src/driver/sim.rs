@@ -18,7 +18,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use self::joints::Joints;
-use self::pictures::{PICTURES, Pictures, encode, fill, write_picture};
+use self::pictures::{PICTURES, Pictures, encode, fill, write_depth, write_picture};
 use super::{Agreed, DriverError, Reading, unblock};
 #[cfg(feature = "motors")]
 use crate::control::can::CanFrame;
@@ -68,6 +68,7 @@ pub struct Sim {
 #[derive(Debug)]
 enum Content {
     Pictures(Pictures),
+    Depth { width: u32, height: u32, seed: u64 },
     Values { channels: usize, seed: u64 },
     Records { records: Records, seed: u64 },
     Task { part: TaskPart, trial: SharedTrial },
@@ -91,6 +92,9 @@ impl Sim {
                 let pictures = unblock(move || Pictures::new(width, height, seed, bytes, has_light)).await?;
                 (Content::Pictures(pictures), fps, CAMERA_BACKLOG)
             }
+            SimSource::Depth { width, height, fps, seed } => {
+                (Content::Depth { width, height, seed }, fps, CAMERA_BACKLOG)
+            }
             SimSource::Serial { channels, hz, seed } => {
                 (Content::Values { channels, seed }, hz, SERIAL_BACKLOG.as_secs() * u64::from(hz.max(1)))
             }
@@ -104,6 +108,7 @@ impl Sim {
         };
         let capacity = match &content {
             Content::Pictures(pictures) => pictures.largest(),
+            Content::Depth { width, height, .. } => 2 * (width * height) as usize,
             Content::Values { channels, .. } => channels * 8,
             Content::Records { .. } => CAN_RECORD,
             Content::Task { .. } => task::SIDE * task::SIDE * 3,
@@ -209,6 +214,9 @@ impl Sim {
                     let lit = pictures.shows_light() && self.device.light.was_lit(captured.before(faults.latency));
                     pictures.write(sequence, lit, &mut self.payload);
                 }
+                Content::Depth { width, height, seed } => {
+                    write_depth((*width, *height), *seed, sequence, &mut self.payload);
+                }
                 Content::Values { channels, seed } => {
                     write_values(*channels, *seed, sequence, &mut self.payload);
                     self.joints.write(&mut self.payload);
@@ -234,6 +242,7 @@ impl Sim {
     fn reading(&self, captured: Stamp, lost: u64) -> Reading<'_> {
         let (encoding, width, height) = match &self.content {
             Content::Pictures(pictures) => (Encoding::Mjpeg, pictures.width, pictures.height),
+            Content::Depth { width, height, .. } => (Encoding::Depth, *width, *height),
             Content::Values { channels, .. } => (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0),
             Content::Records { .. } => (Encoding::Bytes, 0, 0),
             Content::Task { part, .. } => task::layout(*part),
@@ -275,6 +284,9 @@ impl Sim {
             SimSource::Camera { width, height, fps, .. } => {
                 format!("simulated camera, MJPG {width}x{height} at {fps} fps")
             }
+            SimSource::Depth { width, height, fps, .. } => {
+                format!("simulated camera, Z16 {width}x{height} at {fps} fps")
+            }
             SimSource::Serial { channels, hz, .. } => match self.content {
                 Content::Records { records, .. } => format!("{} at {hz} Hz", records.describe()),
                 _ if self.joints.count() > 0 => format!("simulated motors, {} at {hz} Hz", self.joints.count()),
@@ -293,6 +305,9 @@ impl Sim {
         let format = match self.device.source {
             SimSource::Camera { width, height, fps, .. } => {
                 Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: Some(fps.into()) })
+            }
+            SimSource::Depth { width, height, fps, .. } => {
+                Some(Format::Pictures { fourcc: "Z16".to_owned(), width, height, fps: Some(fps.into()) })
             }
             SimSource::Serial { channels, hz, .. } => {
                 let channels = if matches!(self.content, Content::Records { .. }) { 0 } else { channels };
@@ -375,7 +390,10 @@ fn first_after(grid: Grid, now: Stamp) -> u64 {
 /// When kind, picture size or number of channels differ: later stages rely on the registry's layout.
 pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverError> {
     let (sends, requested) = match (&device.source, &spec.node) {
-        (SimSource::Camera { width, height, .. }, NodeSpec::Camera(camera)) => {
+        (
+            SimSource::Camera { width, height, .. } | SimSource::Depth { width, height, .. },
+            NodeSpec::Camera(camera),
+        ) => {
             if (*width, *height) == (camera.width, camera.height) {
                 return Ok(());
             }
@@ -395,14 +413,16 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             }
             (format!("{channels} numbers"), can.channels().to_string())
         }
-        // A simulated replacement may send any amount.
-        (SimSource::Camera { .. } | SimSource::Serial { .. }, NodeSpec::Lan(_)) => return Ok(()),
-        (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
-        (SimSource::Camera { .. }, NodeSpec::Can(_)) => (String::from("pictures"), String::from("a CAN adapter")),
-        (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
-        (SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => {
-            return Ok(());
+        (SimSource::Camera { .. } | SimSource::Depth { .. }, NodeSpec::Serial(_)) => {
+            (String::from("pictures"), String::from("a serial line"))
         }
+        (SimSource::Camera { .. } | SimSource::Depth { .. }, NodeSpec::Can(_)) => {
+            (String::from("pictures"), String::from("a CAN adapter"))
+        }
+        (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
+        // A simulated replacement of a device on the network may send any amount.
+        (SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. }, _)
+        | (_, NodeSpec::Process(_) | NodeSpec::Lan(_)) => return Ok(()),
     };
     Err(DriverError::Fatal(format!(
         "the scenario's device {} sends {sends}, [device.{}] declares {requested}: make them equal",
@@ -420,6 +440,7 @@ pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
                 fill(encode(width, height, seed, sequence % PICTURES).ok()?, bytes, seed, sequence % PICTURES);
             write_picture(&picture, seed, sequence, &mut payload);
         }
+        SimSource::Depth { width, height, seed, .. } => write_depth((width, height), seed, sequence, &mut payload),
         SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
         SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. } => return None,
     }

@@ -4,13 +4,18 @@ use std::collections::BTreeMap;
 
 use super::form::Derived;
 use super::text_map;
-use crate::registry::{ActionSpec, DeviceSpec};
+use crate::modality::ModalityKind;
+use crate::registry::{ActionSpec, DeviceSpec, NodeSpec};
 
 /// Of the topic of a device.
 pub(crate) fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {
     let kind = serde_json::to_value(device.modality().kind).ok();
     let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
-    text_map([("modality", device.name.clone()), ("bit", device.id.to_string()), ("kind", kind)])
+    let mut metadata = text_map([("modality", device.name.clone()), ("bit", device.id.to_string()), ("kind", kind)]);
+    if let (NodeSpec::Camera(camera), ModalityKind::Depth) = (&device.node, device.modality().kind) {
+        metadata.insert("depth_unit_um".to_owned(), camera.depth_unit_um.to_string());
+    }
+    metadata
 }
 
 /// Of a topic derived from that of a device; that of transforms is derived from several.

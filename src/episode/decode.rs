@@ -183,6 +183,7 @@ fn raw<'a>(message: &'a [u8], scratch: &'a mut Vec<u8>) -> Option<Sample<'a>> {
     let (encoding, row) = match encoding {
         b"yuyv" | b"yuv422_yuy2" => (Encoding::Yuyv, (width as usize).checked_mul(2)?),
         b"mono8" | b"8UC1" => (Encoding::Grey, width as usize),
+        b"16UC1" | b"mono16" => (Encoding::Depth, (width as usize).checked_mul(2)?),
         _ => return None,
     };
     let payload = if step as usize > row { without_padding(data, step as usize, row, height, scratch) } else { data };

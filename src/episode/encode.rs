@@ -43,6 +43,7 @@ pub fn sample(
         SampleSchema::RawImage => {
             let (encoding, bytes_a_pixel) = match Encoding::from_raw(header.encoding) {
                 Some(Encoding::Grey) => ("mono8", 1),
+                Some(Encoding::Depth) => ("16UC1", 2),
                 // The name that older and newer Foxglove both know.
                 _ => ("yuv422_yuy2", 2),
             };
@@ -431,7 +432,7 @@ mod tests {
         assert_eq!(message.get_field_by_name("data").unwrap().as_bytes().unwrap().as_ref(), payload);
         assert_eq!((text(&message, "format"), text(&message, "frame_id")), ("jpeg".into(), "cam_wrist".into()));
 
-        for (encoding, name, step) in [(2, "yuv422_yuy2", 8), (3, "mono8", 4)] {
+        for (encoding, name, step) in [(2, "yuv422_yuy2", 8), (3, "mono8", 4), (6, "16UC1", 8)] {
             sample(&mut out, SampleSchema::RawImage, WALL, "cam", &header(encoding, 4, 2), &payload[..8]);
             let message = decode(SampleSchema::RawImage.schema(), &out);
             assert_eq!((number(&message, "width"), number(&message, "height")), (4, 2));

@@ -89,13 +89,14 @@ impl SampleSchema {
         match &device.node {
             NodeSpec::Camera(camera) => match camera.format {
                 PixelFormat::Mjpg => Self::CompressedImage,
-                PixelFormat::Yuyv | PixelFormat::Grey => Self::RawImage,
+                PixelFormat::Yuyv | PixelFormat::Grey | PixelFormat::Z16 => Self::RawImage,
             },
             NodeSpec::Serial(_) | NodeSpec::Process(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => {
                 match device.modality().kind {
                     ModalityKind::Scalars => Self::Scalars,
                     // Raw pictures of a program get their own channel when the first one arrives.
                     ModalityKind::Image => Self::CompressedImage,
+                    ModalityKind::Depth => Self::RawImage,
                     ModalityKind::Bytes => Self::Bytes,
                 }
             }
@@ -107,7 +108,7 @@ impl SampleSchema {
     pub fn of(header: &SampleHeader, payload: &[u8]) -> Self {
         match Encoding::from_raw(header.encoding) {
             Some(Encoding::Mjpeg) => Self::CompressedImage,
-            Some(Encoding::Yuyv | Encoding::Grey) => Self::RawImage,
+            Some(Encoding::Yuyv | Encoding::Grey | Encoding::Depth) => Self::RawImage,
             Some(Encoding::F64) if payload.len().is_multiple_of(8) => Self::Scalars,
             Some(Encoding::F64 | Encoding::Bytes | Encoding::Mask) | None => Self::Bytes,
         }

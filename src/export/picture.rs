@@ -47,7 +47,7 @@ pub(super) fn shape(payload: &Payload) -> Option<Shape> {
         Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components).filter(|_| is_whole_jpeg(bytes)),
         Encoding::Grey => (bytes.len() == pixels).then_some(3),
         Encoding::Yuyv => (Some(bytes.len()) == pixels.checked_mul(2) && pixels.is_multiple_of(2)).then_some(3),
-        Encoding::Bytes | Encoding::F64 | Encoding::Mask => None,
+        Encoding::Bytes | Encoding::F64 | Encoding::Mask | Encoding::Depth => None,
     };
     Shape::new(height, width, channels?)
 }

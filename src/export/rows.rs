@@ -160,7 +160,8 @@ impl Payload {
                 Some(Self::Picture { encoding, width, height, bytes: sample.payload.to_owned() })
             }
             Encoding::F64 => Some(Self::Numbers(numbers(sample.payload))),
-            Encoding::Bytes | Encoding::Mask => None,
+            // Distances are no picture for LeRobot.
+            Encoding::Bytes | Encoding::Mask | Encoding::Depth => None,
         }
     }
 

@@ -79,7 +79,7 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
     let inspection = inspect::inspect(path)?;
     let grade = judged(&inspection, include_bad)?;
     let index = Index::read(path, stop)?;
-    if index.modalities.iter().all(|modality| modality.kind == ModalityKind::Bytes) {
+    if index.modalities.iter().all(|modality| matches!(modality.kind, ModalityKind::Bytes | ModalityKind::Depth)) {
         return Err(Refusal::Nothing);
     }
     let mut found = Found::new(&index);
@@ -179,7 +179,7 @@ pub(super) fn is_usable(kind: ModalityKind, payload: &Payload) -> bool {
             !numbers.is_empty() && numbers.iter().all(|number| narrow(*number).is_finite())
         }
         (ModalityKind::Scalars, Payload::Picture { .. }) => false,
-        (ModalityKind::Bytes, _) => true,
+        (ModalityKind::Bytes | ModalityKind::Depth, _) => true,
     }
 }
 
@@ -223,7 +223,7 @@ impl Gatherer {
                 let declared = shape.first().and_then(|length| usize::try_from(*length).ok());
                 Content::Vector { found: None, declared: declared.filter(|length| (1..=LONGEST).contains(length)) }
             }
-            ModalityKind::Bytes => Content::Bytes,
+            ModalityKind::Bytes | ModalityKind::Depth => Content::Bytes,
         };
         Self {
             name: modality.name.clone(),

@@ -171,10 +171,11 @@ pub fn attached(scenario: &Scenario) -> Vec<Attachment> {
 /// The attachment of a device plugged in now, and its cable.
 fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevice>) {
     let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun).with_faults(device.faults));
-    let syspath = PathBuf::from("/sim").join(&device.usb.port);
+    // The streams of a camera are at one port.
+    let syspath = PathBuf::from("/sim").join(&device.usb.port).join(&device.name);
     let unit = device.lan.clone().map_or_else(|| Unit::Usb(device.usb.clone()), Unit::Lan);
     let node = DeviceNode::Sim(Arc::clone(&sim));
-    (Attachment { syspath, node, unit, driver: Some(Box::new(simulation::driver())) }, sim)
+    (Attachment { syspath, node, unit, driver: Some(Box::new(simulation::driver())), formats: Vec::new() }, sim)
 }
 
 impl Stream for Script {
@@ -235,13 +236,17 @@ mod tests {
         let events = vec![event(100, "a", ScenarioAction::Unplug)];
         let mut script = Script::with_requests(Scenario { devices, events, repeat: None }, requested);
         assert_eq!(word(&script.next().await.expect("open").expect("an event")), "+1-1");
-        for (name, expected) in [("b", "+1-2"), ("b", "-/sim/1-2"), ("a", "-/sim/1-1"), ("a", "+1-1")] {
+        for (name, expected) in [("b", "+1-2"), ("b", "-/sim/1-2/b"), ("a", "-/sim/1-1/a"), ("a", "+1-1")] {
             sender.send(name.to_owned()).expect("it listens");
             assert_eq!(word(&script.next().await.expect("open").expect("an event")), expected);
         }
         sender.send("nosuch".to_owned()).expect("it listens");
         drop(sender);
-        assert_eq!(word(&script.next().await.expect("open").expect("an event")), "-/sim/1-1", "the scenario continues");
+        assert_eq!(
+            word(&script.next().await.expect("open").expect("an event")),
+            "-/sim/1-1/a",
+            "the scenario continues"
+        );
     }
 
     #[tokio::test(start_paused = true)]
@@ -264,7 +269,7 @@ mod tests {
         }
         assert_eq!(
             got,
-            ["+1-1@0", "-/sim/1-1@100", "+1-2@100", "+1-3@300", "-/sim/1-2@350", "-/sim/1-3@1100", "+1-2@1100"]
+            ["+1-1@0", "-/sim/1-1/a@100", "+1-2@100", "+1-3@300", "-/sim/1-2/b@350", "-/sim/1-3/a@1100", "+1-2@1100"]
         );
     }
 

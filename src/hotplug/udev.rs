@@ -11,7 +11,7 @@
 //! Invariant: lost events are never silent: when a socket overflows, devices are enumerated again
 //! and the difference is reported.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -24,10 +24,35 @@ use udev::{Device, Enumerator, EventType, MonitorBuilder, MonitorSocket};
 use super::{HotplugError, HotplugEvent, UnplugSource};
 use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::provenance::KernelDriver;
+use crate::registry::Registry;
 use crate::time::Stamp;
 
 /// Subsystems whose nodes are opened, in addition to USB devices themselves.
 const NODE_SUBSYSTEMS: [&str; 3] = ["video4linux", "tty", "net"];
+
+/// Which capture nodes are asked for the pixel formats that they offer, and how: those of cameras with several streams, which
+/// are told apart by them. No others: asking opens the node.
+#[derive(Debug, Clone)]
+pub struct Ask {
+    /// Vendor and product ids.
+    pub models: BTreeSet<(u16, u16)>,
+    /// The V4L2 names of a node's formats; none if it does not answer.
+    pub formats: fn(&Path) -> Vec<String>,
+}
+
+impl Ask {
+    /// Nothing is asked.
+    pub const NOTHING: Self = Self { models: BTreeSet::new(), formats: |_| Vec::new() };
+
+    /// What a run with these entries asks.
+    pub fn of(registry: &Registry, formats: fn(&Path) -> Vec<String>) -> Self {
+        let streams = registry.devices.iter().filter(|device| registry.shares_unit(device));
+        Self {
+            models: streams.filter_map(|device| device.identity.usb()).map(|usb| (usb.vid, usb.pid)).collect(),
+            formats,
+        }
+    }
+}
 
 /// See the module's comment.
 pub struct UdevMonitor {
@@ -35,6 +60,7 @@ pub struct UdevMonitor {
     udev: AsyncFd<MonitorSocket>,
     known: Known,
     queue: VecDeque<HotplugEvent>,
+    ask: Ask,
 }
 
 impl UdevMonitor {
@@ -42,12 +68,13 @@ impl UdevMonitor {
     ///
     /// # Errors
     /// When the netlink sockets are not available or sysfs cannot be read.
-    pub fn open() -> Result<Self, HotplugError> {
+    pub fn open(ask: Ask) -> Result<Self, HotplugError> {
         let mut monitor = Self {
             kernel: listen(MonitorBuilder::new_kernel())?,
             udev: listen(MonitorBuilder::new())?,
             known: Known::default(),
             queue: VecDeque::new(),
+            ask,
         };
         monitor.enumerate()?;
         Ok(monitor)
@@ -57,7 +84,7 @@ impl UdevMonitor {
     fn enumerate(&mut self) -> Result<(), HotplugError> {
         // Read before the devices: an event up to this one may concern a device that is gone by now.
         let sequence = newest_event();
-        self.queue.extend(self.known.enumerated(attached()?, sequence, Stamp::now()));
+        self.queue.extend(self.known.enumerated(attached(&self.ask)?, sequence, Stamp::now()));
         Ok(())
     }
 
@@ -72,7 +99,7 @@ impl UdevMonitor {
                 }
             }
             EventType::Add | EventType::Change if source == UnplugSource::Udev => {
-                if let Some(present) = present(event) {
+                if let Some(present) = present(event, &self.ask) {
                     self.queue.extend(self.known.added(present, sequence, now));
                 }
             }
@@ -126,8 +153,8 @@ impl Stream for UdevMonitor {
 ///
 /// # Errors
 /// When sysfs cannot be read.
-pub fn enumerate() -> Result<Vec<Attachment>, HotplugError> {
-    Ok(attached()?.into_iter().map(|present| present.attachment).collect())
+pub fn enumerate(ask: &Ask) -> Result<Vec<Attachment>, HotplugError> {
+    Ok(attached(ask)?.into_iter().map(|present| present.attachment).collect())
 }
 
 fn listen(builder: std::io::Result<MonitorBuilder>) -> Result<AsyncFd<MonitorSocket>, HotplugError> {
@@ -145,14 +172,14 @@ fn newest_event() -> u64 {
     number.and_then(|number| number.trim().parse().ok()).unwrap_or(0)
 }
 
-fn attached() -> Result<Vec<Present>, HotplugError> {
+fn attached(ask: &Ask) -> Result<Vec<Present>, HotplugError> {
     let mut enumerator = Enumerator::new()?;
     for subsystem in NODE_SUBSYSTEMS {
         enumerator.match_subsystem(subsystem)?;
     }
     enumerator.match_subsystem("usb")?;
     enumerator.match_is_initialized()?;
-    let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| present(&device)).collect();
+    let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| present(&device, ask)).collect();
     // Sorted by port, so that identical units are assigned the same way at each start.
     found.sort_by(|a, b| {
         let (a, b) = (&a.attachment, &b.attachment);
@@ -162,7 +189,7 @@ fn attached() -> Result<Vec<Present>, HotplugError> {
 }
 
 /// The attachment of a node that can be opened; `None` for any other device.
-fn present(device: &Device) -> Option<Present> {
+fn present(device: &Device, ask: &Ask) -> Option<Present> {
     let path = || Some(device.devnode()?.to_owned());
     let node = match device.subsystem()?.to_str()? {
         "video4linux" if captures(device) => DeviceNode::Video(path()?),
@@ -192,11 +219,16 @@ fn present(device: &Device) -> Option<Present> {
         manufacturer: text("manufacturer"),
         firmware: text("bcdDevice").map(|release| release_number(&release)),
     };
+    let formats = match &node {
+        DeviceNode::Video(path) if ask.models.contains(&(usb.vid, usb.pid)) => (ask.formats)(path),
+        _ => Vec::new(),
+    };
     let attachment = Attachment {
         syspath: device.syspath().to_owned(),
         node,
         unit: usb.into(),
         driver: kernel_driver(device).map(Box::new),
+        formats,
     };
     Some(Present { attachment, device_number: text("devnum") })
 }
@@ -351,8 +383,13 @@ mod known_tests {
     fn node(path: &str, number: u32) -> Present {
         let port = path.split('/').next().unwrap_or_default();
         let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), ..UsbIdentity::default() };
-        let attachment =
-            Attachment { syspath: path.into(), node: DeviceNode::Tty(path.into()), unit: usb.into(), driver: None };
+        let attachment = Attachment {
+            syspath: path.into(),
+            node: DeviceNode::Tty(path.into()),
+            unit: usb.into(),
+            driver: None,
+            formats: Vec::new(),
+        };
         Present { attachment, device_number: Some(number.to_string()) }
     }
 

@@ -13,7 +13,6 @@ use crate::episode::schema::SampleSchema;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::pixels::Picture;
 use crate::record::inspect::{Inspection, Numbers};
-use crate::sample::Encoding;
 
 /// Bins of the time of an episode.
 pub(super) const BINS: usize = 480;
@@ -193,7 +192,7 @@ impl Timeline {
         if let Some(Content::Sample(sample)) = message.content(&mut self.scratch) {
             let (width, height) = (sample.width, sample.height);
             let taken = Picture { encoding: sample.encoding, width, height, bytes: sample.payload };
-            if matches!(taken.encoding, Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey) {
+            if taken.encoding.is_picture() {
                 *picture = self.thumbnails.of(&taken, share);
             }
         }

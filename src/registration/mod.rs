@@ -245,7 +245,8 @@ mod tests {
             product,
             ..UsbIdentity::default()
         };
-        let attached = [Attachment { syspath: "/sim/1-4".into(), node, unit: Unit::Usb(usb), driver: None }];
+        let attached =
+            [Attachment { syspath: "/sim/1-4".into(), node, unit: Unit::Usb(usb), driver: None, formats: Vec::new() }];
         let units = unregistered(Some(&Registry::builtin()), &attached);
         // As the board shows it.
         let device = text::plain(&units[0].describe()).into_owned();

@@ -11,6 +11,7 @@ pub fn suggested(node: &DeviceNode, camera: Option<&CameraInfo>) -> Vec<(String,
     match (node, camera) {
         (DeviceNode::Sim(device), _) => match device.source {
             SimSource::Camera { width, height, fps, .. } => camera_settings(width, height, fps, "MJPG"),
+            SimSource::Depth { width, height, fps, .. } => camera_settings(width, height, fps, "Z16"),
             SimSource::Serial { channels, .. } => serial_settings("csv", channels),
             _ => Vec::new(),
         },

@@ -124,7 +124,9 @@ fn sensor(node: &NodeSpec) -> String {
         NodeSpec::Process(process) => {
             let program = process.program.file_name().unwrap_or_default().to_string_lossy();
             let shape = match (process.kind, process.shape.as_slice()) {
-                (ModalityKind::Image, [height, width]) => format!("    width: {width}\n    height: {height}\n"),
+                (ModalityKind::Image | ModalityKind::Depth, [height, width]) => {
+                    format!("    width: {width}\n    height: {height}\n")
+                }
                 (ModalityKind::Scalars, [channels]) => format!("    channels: {channels}\n"),
                 _ => String::new(),
             };

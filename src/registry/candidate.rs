@@ -95,9 +95,9 @@ pub fn kind(attachment: &Attachment) -> Option<&'static str> {
         }
         DeviceNode::Usb(_) | DeviceNode::Lan { .. } => None,
         DeviceNode::Sim(device) => match device.source {
-            SimSource::Camera { .. } | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => {
-                Some("camera")
-            }
+            SimSource::Camera { .. }
+            | SimSource::Depth { .. }
+            | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => Some("camera"),
             SimSource::Serial { .. } | SimSource::Task { part: TaskPart::Arm, .. } => Some("serial"),
             SimSource::Process | SimSource::Replay { .. } => None,
         },

@@ -35,7 +35,7 @@ impl Difference {
             }
         }
         for device in new.devices.iter().filter(|device| running.named(&device.name).is_none()) {
-            match obstacle(device, running) {
+            match obstacle(device, running, new) {
                 Some(why) => found.restart(&device.name, why),
                 None => found.added.push(device.clone()),
             }
@@ -149,7 +149,7 @@ fn renamed(was: &DeviceSpec, running: &Registry, new: &Registry) -> String {
 }
 
 /// Why a run cannot take this entry over, if it cannot.
-fn obstacle(device: &DeviceSpec, running: &Registry) -> Option<String> {
+fn obstacle(device: &DeviceSpec, running: &Registry, new: &Registry) -> Option<String> {
     if let Some(holder) = running.device(device.id) {
         return Some(format!("its bit {} is that of [device.{}] in this run", device.id, holder.name));
     }
@@ -158,6 +158,9 @@ fn obstacle(device: &DeviceSpec, running: &Registry) -> Option<String> {
     }
     if device.action.is_some() {
         return Some("an actuator is set up at the start, before anything may move".to_owned());
+    }
+    if new.shares_unit(device) {
+        return Some("the streams of a camera are told apart by what discovery asks of it from the start".to_owned());
     }
     if !device.hooks.is_empty() {
         return Some("its hooks need what a run sets up for programs at its start".to_owned());

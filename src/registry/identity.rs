@@ -9,17 +9,20 @@
 //!    entry it had last, if that is free (recognised by its serial number if it has one, otherwise
 //!    by its port), or the free entry with the lowest bit, and keeps it while plugged.
 //!
+//! A camera may have several entries with its identity, one for each of its streams: each takes the capture node that offers
+//! its pixel format.
+//!
 //! A unit whose entry is taken waits: a device may appear in its new port before it disappears from its
 //! old one. It begins when the entry is freed.
 //!
 //! Invariant: an entry has at most one node, a node at most one entry.
-//! Invariant: two units are never assigned to one entry, and one unit (one port) never takes two
-//! entries of one kind.
+//! Invariant: two units are never assigned to one entry, and one unit (one port) never takes two entries of one kind,
+//! but for those of the streams of a camera.
 
 use std::collections::VecDeque;
 use std::path::Path;
 
-use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, Registry};
+use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, PixelFormat, Registry};
 use crate::device::{Attachment, DeviceNode, Unit, UsbIdentity};
 use crate::modality::ModalityId;
 use crate::simulation::{SimSource, TaskPart};
@@ -87,7 +90,8 @@ const MOST_REMEMBERED: usize = 256;
 impl Assigner {
     /// Without attached nodes.
     pub fn new(registry: &Registry) -> Self {
-        let mut entries: Vec<_> = registry.devices.iter().map(Entry::new).collect();
+        let entry = |device| Entry { is_stream: registry.shares_unit(device), ..Entry::new(device) };
+        let mut entries: Vec<_> = registry.devices.iter().map(entry).collect();
         entries.sort_by_key(|entry| entry.id);
         Self { entries, attached: Vec::new(), remembered: VecDeque::new() }
     }
@@ -173,7 +177,9 @@ impl Assigner {
     fn choose(&self, attachment: &Attachment) -> Assignment {
         let fitting = self.fitting(attachment);
         let Some((rule, best)) = fitting.first() else { return self.refuse(attachment) };
-        if let Some(other) = self.other_node(attachment) {
+        if !best.is_stream
+            && let Some(other) = self.other_node(attachment)
+        {
             let name =
                 self.entries.iter().find(|entry| Some(entry.id) == other.assigned).map_or("", |entry| &entry.name);
             let reason = format!("[device.{name}] already reads another node of this device");
@@ -181,7 +187,7 @@ impl Assigner {
         }
         let free = |id: ModalityId| self.attached_as(id).is_none();
         let chosen = match rule {
-            Rule::Serial | Rule::Port | Rule::Lan => Some(best.id).filter(|id| free(*id)),
+            Rule::Serial | Rule::Port | Rule::Lan => fitting.iter().map(|(_, entry)| entry.id).find(|id| free(*id)),
             Rule::Model => {
                 let mut pool = fitting.iter().map(|(_, entry)| entry.id).filter(|id| free(*id));
                 let last = attachment
@@ -212,7 +218,7 @@ impl Assigner {
         let fits: Vec<_> = self
             .entries
             .iter()
-            .filter(|entry| entry.reads(&attachment.node))
+            .filter(|entry| entry.reads(&attachment.node) && entry.shows(&attachment.formats))
             .filter_map(|entry| Some((rule(entry, &attachment.unit)?, entry)))
             .collect();
         let best = fits.iter().map(|(rule, _)| *rule).min();
@@ -329,6 +335,10 @@ struct Entry {
     opens: Option<Opens>,
     /// A program reads it.
     is_process: bool,
+    /// The pixel format of a camera.
+    format: Option<PixelFormat>,
+    /// One of several streams of its unit.
+    is_stream: bool,
 }
 
 /// The rule of the module's comment by which a unit fits an entry.
@@ -347,7 +357,12 @@ impl Entry {
             node => Some(node.opens()),
         };
         let is_process = matches!(device.node, NodeSpec::Process(_));
-        Self { id: device.id, name: device.name.clone(), identity: device.identity.clone(), opens, is_process }
+        let format = match &device.node {
+            NodeSpec::Camera(camera) => Some(camera.format),
+            _ => None,
+        };
+        let (name, identity) = (device.name.clone(), device.identity.clone());
+        Self { id: device.id, name, identity, opens, is_process, format, is_stream: false }
     }
 
     const fn label(&self) -> &'static str {
@@ -366,6 +381,12 @@ impl Entry {
         (expected.vid, expected.pid) == (usb.vid, usb.pid)
     }
 
+    /// Whether a node that offers these pixel formats can be its stream.
+    fn shows(&self, formats: &[String]) -> bool {
+        let is_offered = |format: PixelFormat| formats.iter().any(|offered| offered == format.word());
+        !self.is_stream || formats.is_empty() || self.format.is_none_or(is_offered)
+    }
+
     fn reads(&self, node: &DeviceNode) -> bool {
         match node {
             DeviceNode::Video(_) => self.opens == Some(Opens::Video),
@@ -375,14 +396,15 @@ impl Entry {
             DeviceNode::Lan { .. } => self.opens.is_none(),
             DeviceNode::Sim(device) => match device.source {
                 // A simulated device without a picture node or a line sends as if it had one.
-                SimSource::Camera { .. } | SimSource::Serial { .. }
+                SimSource::Camera { .. } | SimSource::Depth { .. } | SimSource::Serial { .. }
                     if matches!(self.opens, None | Some(Opens::Net)) =>
                 {
                     !self.is_process
                 }
                 SimSource::Camera { .. } | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => {
-                    self.opens == Some(Opens::Video) && !self.is_process
+                    self.opens == Some(Opens::Video) && !self.is_process && self.format != Some(PixelFormat::Z16)
                 }
+                SimSource::Depth { .. } => self.format == Some(PixelFormat::Z16),
                 SimSource::Serial { .. } | SimSource::Task { part: TaskPart::Arm, .. } => {
                     self.opens == Some(Opens::Tty) && !self.is_process
                 }

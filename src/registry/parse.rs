@@ -114,6 +114,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
         return Err(RegistryErrors::whole_file(file.to_owned(), "no device is registered", fix));
     }
     check_identities(&drafts);
+    check_streams(&drafts);
     check_topics(&drafts);
     rig.expect = section.map(|section| expected(&section, &drafts)).unwrap_or_default();
     check_actuators(&drafts);
@@ -188,14 +189,18 @@ fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>) -> Vec<Draft<'a>> {
     let Some(devices) = root.table("device") else { return Vec::new() };
     let mut drafts = Vec::new();
     for (at, name, value) in devices.fields() {
-        if drafts.len() == MAX_MODALITIES {
-            let message =
-                format!("more than {MAX_MODALITIES} devices: the mask has one bit for each and is 64 bits wide");
-            devices.report_child(at, name, message, "remove entries that are not used, or run two rigs");
-            break;
-        }
         if let Some(table) = value.get_ref().as_table() {
-            drafts.push(device::read(name, devices.part(table, at, devices.child(name)), programs));
+            let draft = device::read(name, devices.part(table, at, devices.child(name)), programs);
+            let streams = device::streams(&draft, programs);
+            drafts.push(draft);
+            drafts.extend(streams);
+            if drafts.len() > MAX_MODALITIES {
+                let message =
+                    format!("more than {MAX_MODALITIES} devices: the mask has one bit for each and is 64 bits wide");
+                devices.report_child(at, name, message, "remove entries that are not used, or run two rigs");
+                drafts.truncate(MAX_MODALITIES);
+                break;
+            }
         } else {
             devices.report_child(at, name, format!("{name:?} is not a table"), "write it as a table [device.NAME]");
         }
@@ -217,7 +222,10 @@ fn check_identities(drafts: &[Draft<'_>]) {
                 (None, None) => identity.port.is_some() && identity.port == earlier.port,
                 _ => false,
             };
-            same_model && same_place
+            let is_stream = |one: &Draft<'_>, of: &Draft<'_>| one.stream_of.as_ref() == Some(&of.name);
+            let is_other_stream =
+                is_stream(draft, other) || (draft.stream_of.is_some() && draft.stream_of == other.stream_of);
+            same_model && same_place && !is_other_stream
         };
         let Some(earlier) = drafts.iter().take(index).find(same_unit) else { continue };
         let (key, what) = match identity.serial {
@@ -229,6 +237,28 @@ fn check_identities(drafts: &[Draft<'_>]) {
             format!("same vid, pid and {what} as [{}] on line {}", earlier.section.entry, earlier.section.line());
         let fix = format!("give each entry the {what} of its own unit; one physical device is one entry");
         draft.section.report(key, message, fix);
+    }
+}
+
+/// The streams of a camera are told apart by their pixel formats, and their entries by their names.
+fn check_streams(drafts: &[Draft<'_>]) {
+    for (index, draft) in drafts.iter().enumerate() {
+        let Some(owner) = &draft.stream_of else { continue };
+        if let Some(other) = drafts.iter().enumerate().find(|(at, other)| *at != index && other.name == draft.name) {
+            let message = format!("it is called {:?}, as is [{}]", draft.name, other.1.section.entry);
+            draft.section.report_at(draft.section.at, message, "give one of them another name");
+        }
+        let is_of_it = |other: &&Draft<'_>| other.name == *owner || other.stream_of.as_ref() == Some(owner);
+        let same = |other: &&Draft<'_>| other.format().is_some() && other.format() == draft.format();
+        let Some(earlier) = drafts.iter().take(index).filter(is_of_it).find(same) else { continue };
+        let format = draft.format().map(|format| format.to_string()).unwrap_or_default();
+        let message =
+            format!("pictures in {format}, as of [{}]: nothing else tells the streams apart", earlier.section.entry);
+        draft.section.report(
+            "camera",
+            message,
+            "write the format of the other capture node: `rapid devices --formats` lists it",
+        );
     }
 }
 

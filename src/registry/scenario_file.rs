@@ -18,6 +18,7 @@ use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
 use super::section::{Section, file_label, read, read_file};
 use super::spec::{DeviceSpec, LanPicture, NodeSpec, Registry};
 use crate::device::{LanIdentity, UsbIdentity};
+use crate::modality::ModalityKind;
 use crate::simulation::{SimFaults, SimSource};
 
 const DEVICE_KEYS: [&str; 14] = [
@@ -144,7 +145,9 @@ fn device(section: &Section<'_>, registry: &Registry) -> Option<ScenarioDevice> 
         section.report("bytes", message, "leave bytes out");
     }
     match &mut device.source {
-        SimSource::Camera { fps: rate, seed: chosen, .. } | SimSource::Serial { hz: rate, seed: chosen, .. } => {
+        SimSource::Camera { fps: rate, seed: chosen, .. }
+        | SimSource::Depth { fps: rate, seed: chosen, .. }
+        | SimSource::Serial { hz: rate, seed: chosen, .. } => {
             *rate = hz.unwrap_or(*rate);
             *chosen = seed.unwrap_or(*chosen);
         }
@@ -301,6 +304,9 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
     let seed = u64::from(spec.id.bit());
     let source = match (&spec.node, spec.node.picture(), spec.node.shape().as_slice()) {
         (NodeSpec::Process(_), ..) => SimSource::Process,
+        (_, Some(LanPicture { width, height, fps }), [_, _]) if spec.node.modality_kind() == ModalityKind::Depth => {
+            SimSource::Depth { width, height, fps, seed }
+        }
         (_, Some(LanPicture { width, height, fps }), [_, _]) => {
             SimSource::Camera { width, height, fps, seed, bytes: 0 }
         }

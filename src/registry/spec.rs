@@ -20,7 +20,7 @@ use serde::Serialize;
 
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::points::PacketFormat;
-use crate::sample::SampleHeader;
+use crate::sample::{Encoding, SampleHeader};
 
 pub use form::{CalibrationSpec, Form, JointsSpec, PointsSpec, PoseLayout, PoseSpec, Quantity};
 pub use input::{
@@ -203,6 +203,8 @@ pub struct CameraSpec {
     pub fps: u32,
     /// Pixel format, default MJPG.
     pub format: PixelFormat,
+    /// Depth: the distance of one count, um, `1..=100_000`, default 1000.
+    pub depth_unit_um: u32,
     /// Controls set at start: V4L2 control name as listed by `rapid devices`, value.
     pub controls: Vec<(String, i64)>,
 }
@@ -217,6 +219,20 @@ pub enum PixelFormat {
     Yuyv,
     /// 8-bit luminance.
     Grey,
+    /// 16-bit distances.
+    Z16,
+}
+
+impl PixelFormat {
+    /// How its pictures are encoded.
+    pub const fn encoding(self) -> Encoding {
+        match self {
+            Self::Mjpg => Encoding::Mjpeg,
+            Self::Yuyv => Encoding::Yuyv,
+            Self::Grey => Encoding::Grey,
+            Self::Z16 => Encoding::Depth,
+        }
+    }
 }
 
 /// `[device.NAME.tty]`.
@@ -356,6 +372,7 @@ impl NodeSpec {
     /// Content of the samples of a device that is read like this.
     pub fn modality_kind(&self) -> ModalityKind {
         match self {
+            Self::Camera(CameraSpec { format: PixelFormat::Z16, .. }) => ModalityKind::Depth,
             Self::Camera(_) => ModalityKind::Image,
             Self::Serial(serial) if serial.parse == Parse::Raw => ModalityKind::Bytes,
             Self::Can(can) if can.protocol == CanProtocol::Raw => ModalityKind::Bytes,
@@ -375,6 +392,18 @@ impl Registry {
     /// The actuator, if there is one.
     pub fn actuator(&self) -> Option<(&DeviceSpec, &ActionSpec)> {
         self.devices.iter().find_map(|device| Some((device, device.action.as_ref()?)))
+    }
+
+    /// Whether another entry reads another capture node of the same unit: one camera with several streams.
+    pub fn shares_unit(&self, device: &DeviceSpec) -> bool {
+        let is_video = |other: &DeviceSpec| other.node.opens() == Opens::Video && other.identity.usb().is_some();
+        let is_alone = |usb: &UsbSpec| usb.serial.is_none() && usb.port.is_none();
+        is_video(device)
+            && !device.identity.usb().is_some_and(is_alone)
+            && self
+                .devices
+                .iter()
+                .any(|other| other.id != device.id && is_video(other) && other.identity == device.identity)
     }
 
     /// The entry of this name.
@@ -565,7 +594,7 @@ macro_rules! words {
 
 words! {
     /// Every format and its V4L2 name.
-    PixelFormat, 3: "MJPG" = Mjpg, "YUYV" = Yuyv, "GREY" = Grey;
+    PixelFormat, 4: "MJPG" = Mjpg, "YUYV" = Yuyv, "GREY" = Grey, "Z16" = Z16;
     /// Every kind of content and its name.
     Parse, 4: "csv" = Csv, "json" = Json, "f32le" = F32le, "raw" = Raw;
     /// Every slot and its name.
@@ -587,8 +616,12 @@ words! {
 }
 
 /// What the samples of a program may hold.
-pub(super) const KINDS: [(&str, ModalityKind); 3] =
-    [("scalars", ModalityKind::Scalars), ("image", ModalityKind::Image), ("bytes", ModalityKind::Bytes)];
+pub(super) const KINDS: [(&str, ModalityKind); 4] = [
+    ("scalars", ModalityKind::Scalars),
+    ("image", ModalityKind::Image),
+    ("depth", ModalityKind::Depth),
+    ("bytes", ModalityKind::Bytes),
+];
 
 impl fmt::Display for Framing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -710,7 +743,7 @@ impl VerdictSpec {
     ///   an old one or none. A device slower than twice `sync_window` misses ticks by its phase alone.
     /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
     pub fn of(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
-        let image = kind == ModalityKind::Image;
+        let image = matches!(kind, ModalityKind::Image | ModalityKind::Depth);
         let suspect = Limits {
             lost: Some(0.01),
             dropped: Some(0.0),
@@ -754,8 +787,8 @@ mod tests {
 
     #[test]
     fn every_value_has_a_word() {
-        let formats = [PixelFormat::Mjpg, PixelFormat::Yuyv, PixelFormat::Grey].map(|format| format.to_string());
-        assert_eq!(formats, ["MJPG", "YUYV", "GREY"]);
+        let formats = PixelFormat::WORDS.map(|(_, format)| format.to_string());
+        assert_eq!(formats, ["MJPG", "YUYV", "GREY", "Z16"]);
         let parses = [Parse::Csv, Parse::Json, Parse::F32le, Parse::Raw].map(|parse| parse.to_string());
         assert_eq!(parses, ["csv", "json", "f32le", "raw"]);
         let mounts = [Mount::Front, Mount::Tip, Mount::Top, Mount::Bottom].map(|mount| mount.to_string());

@@ -26,6 +26,7 @@ use crate::time::Stamp;
 
 /// What happens to a rig.
 #[derive(Debug, Clone, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "plugs are rare")]
 pub enum Input {
     /// A device was plugged in or removed.
     Hotplug(HotplugEvent),
@@ -86,6 +87,7 @@ pub enum Effect {
 
 /// An action for one modality.
 #[derive(Debug, Clone, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "plugs are rare")]
 pub enum DeviceEffect {
     /// Ask the running stream to end; do not wait for it.
     Stop,

@@ -53,6 +53,17 @@ pub enum SimSource {
         /// Least size of a picture, which is padded to it. 0: as the encoder produces it.
         bytes: usize,
     },
+    /// Pictures of distances of these dimensions in pixels; bytes are a function of seed and sequence.
+    Depth {
+        /// Pixels.
+        width: u32,
+        /// Pixels.
+        height: u32,
+        /// Frames per second.
+        fps: u32,
+        /// Determines the pictures.
+        seed: u64,
+    },
     /// Vectors of numbers; values are a function of seed and sequence.
     Serial {
         /// Numbers in a sample.

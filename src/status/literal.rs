@@ -153,6 +153,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
             height: 480,
             fps: 30,
             format: PixelFormat::Mjpg,
+            depth_unit_um: 1000,
             controls: Vec::new(),
         }),
         topic: format!("/rapid/{name}"),

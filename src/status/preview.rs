@@ -71,7 +71,7 @@ impl Preview {
 
     /// Whether it is a picture, if perhaps a damaged one. The header of numbers has a width too: how many there are.
     pub fn is_picture(&self) -> bool {
-        self.width > 0 && matches!(self.encoding, Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey)
+        self.width > 0 && self.encoding.is_picture()
     }
 
     /// The numbers of a sample of numbers; empty for any other.

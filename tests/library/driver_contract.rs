@@ -55,7 +55,14 @@ fn spec(node: NodeSpec) -> DeviceSpec {
 
 fn camera_spec() -> DeviceSpec {
     let format = PixelFormat::Mjpg;
-    spec(NodeSpec::Camera(CameraSpec { width: 64, height: 48, fps: 200, format, controls: Vec::new() }))
+    spec(NodeSpec::Camera(CameraSpec {
+        width: 64,
+        height: 48,
+        fps: 200,
+        format,
+        depth_unit_um: 1000,
+        controls: Vec::new(),
+    }))
 }
 
 fn serial_spec(framing: Framing, parse: Parse, channels: usize) -> DeviceSpec {
@@ -68,7 +75,7 @@ fn sim_device(source: SimSource) -> Arc<SimDevice> {
 
 async fn open_sim(source: SimSource) -> (Driver, Arc<SimDevice>) {
     let spec = match source {
-        SimSource::Camera { .. } => camera_spec(),
+        SimSource::Camera { .. } | SimSource::Depth { .. } => camera_spec(),
         SimSource::Serial { channels, .. } => serial_spec(Framing::Line, Parse::Csv, channels),
         SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. } => {
             serial_spec(Framing::Line, Parse::Csv, 1)

@@ -105,6 +105,7 @@ async fn only_chunks_allocate() {
             height: 480,
             fps: 30,
             format: PixelFormat::Mjpg,
+            depth_unit_um: 1000,
             controls: Vec::new(),
         }),
         topic: "/cam".to_owned(),

@@ -164,7 +164,10 @@ fn devices_on_the_network_are_parsed() {
     assert_eq!(lan("lidar").find, fixed("192.168.1.201", Probe::Udp, 2368));
     assert_eq!((lan("lidar").lease.as_secs(), lan("gopro").lease.as_secs()), (1, 3));
     assert_eq!(lan("lidar_asked").find, fixed("fd00::7", Probe::Http, 80));
-    assert_eq!(lan("gopro").protocol, LanProtocol::Gopro { port: 8080, download: true, reserve: Some(3 << 30) });
+    assert_eq!(
+        lan("gopro").protocol,
+        LanProtocol::Gopro { port: 8080, download: true, reserve: Some(3 << 30), preview: None }
+    );
     assert_eq!(lan("gopro").find, LanFind::Adapter { host: None });
     assert_eq!(lan("cam_behind_adapter").find, LanFind::Adapter { host: Some(host("10.0.0.2")) });
     let instance = Some("iPhone 15-iPhoneVIO".to_owned());
@@ -226,6 +229,25 @@ fn what_numbers_mean_is_written_or_follows_from_the_device() {
     let Loaded { registry, .. } = valid("lan");
     assert_eq!(registry.named("phone_pose").unwrap().form, Some(pose(PoseLayout::Columns, "world")));
     assert_eq!(registry.named("phone").unwrap().form, None, "pictures");
+}
+
+#[test]
+fn the_streams_of_a_camera_are_entries_of_their_own() {
+    let Loaded { registry, warnings } = valid("streams");
+    assert_eq!(warnings, []);
+    let entry = |name: &str| registry.named(name).unwrap();
+    let (colour, depth, infrared) = (entry("d435"), entry("d435_depth"), entry("d435_infrared"));
+    assert_eq!([colour, depth, infrared].map(|device| device.id.bit()), [0, 1, 2]);
+    assert_eq!(depth.topic, "/rapid/camera/d435/depth");
+    assert_eq!(infrared.topic, "/infrared");
+    assert_eq!((depth.modality().kind, depth.modality().shape), (ModalityKind::Depth, vec![480, 848]));
+    assert_eq!(infrared.modality().kind, ModalityKind::Image);
+    assert_eq!(depth.max_bytes, 2 * 848 * 480);
+    let NodeSpec::Camera(camera) = &depth.node else { panic!("a camera") };
+    assert_eq!(camera.depth_unit_um, 100);
+    assert!([colour, depth, infrared].iter().all(|device| registry.shares_unit(device)));
+    assert!(depth.identity == colour.identity && entry("other_depth").identity == entry("other").identity);
+    assert!(depth.identity != entry("other_depth").identity);
 }
 
 #[test]

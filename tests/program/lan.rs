@@ -134,15 +134,16 @@ fn packets_of_a_lidar_are_recorded_with_their_points() {
     let whole: Vec<_> = packets.iter().filter(|packet| packet.payload().len() == lidar::PACKET).collect();
     assert!(packets.len() > whole.len() && whole.len() > 20, "{} packets, {} whole", packets.len(), whole.len());
     assert_eq!(clouds.len(), whole.len());
-    for (packet, cloud) in whole.iter().zip(clouds) {
-        assert_eq!((packet.log_time, packet.sequence), (cloud.log_time, cloud.sequence));
+    for (recorded, cloud) in whole.iter().zip(clouds) {
+        assert_eq!((recorded.log_time, recorded.sequence), (cloud.log_time, cloud.sequence));
         let cloud: Cloud = cloud.decode();
         let points: Vec<_> = cloud.data.chunks_exact(usize::try_from(cloud.stride).expect("small")).collect();
         // The packet's number takes the place of its first four returns, of which some are 0: none.
         assert!((380..=384).contains(&points.len()), "{}", points.len());
         // The last return is that of the highest laser, at 1310 x 2 mm.
-        let part = |at: usize| f32::from_le_bytes(points[points.len() - 1][at..at + 4].try_into().expect("four bytes"));
-        let (level, up) = (part(0).hypot(part(4)), part(8) + 0.0112);
+        let number =
+            |at: usize| f32::from_le_bytes(points[points.len() - 1][at..at + 4].try_into().expect("four bytes"));
+        let (level, up) = (number(0).hypot(number(4)), number(8) + 0.0112);
         assert!((level.hypot(up) - 2.62).abs() < 1e-3 && (up.atan2(level).to_degrees() - 15.0).abs() < 1e-2);
         assert_eq!(points[points.len() - 1][12], 100, "its reflectivity");
     }

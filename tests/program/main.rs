@@ -44,5 +44,6 @@ mod second_run;
 mod session;
 mod shared_memory;
 mod stops;
+mod streams;
 mod task;
 mod verdict;

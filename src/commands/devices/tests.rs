@@ -55,7 +55,7 @@ fn usb(ids: (u16, u16), serial: Option<&str>, port: &str, product: Option<&str>)
 
 fn attachment(node: DeviceNode, usb: UsbIdentity) -> Attachment {
     let syspath = format!("/sys/{}/{}", usb.port, node.label().replace('/', "_"));
-    Attachment { syspath: syspath.into(), node, unit: usb.into(), driver: None }
+    Attachment { syspath: syspath.into(), node, unit: usb.into(), driver: None, formats: Vec::new() }
 }
 
 fn video(number: u8, ids: (u16, u16), serial: Option<&str>, port: &str) -> Attachment {

@@ -7,6 +7,8 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use super::preview;
+
 #[cfg(feature = "motors")]
 use crate::driver::can::netlink;
 
@@ -37,6 +39,8 @@ pub(super) struct Facts {
     pub(super) can: Vec<Interface>,
     /// Memory that all programs together may use for transfers through usbfs, MB.
     pub(super) usbfs_mb: Option<u64>,
+    /// There is a program that decodes the preview of a GoPro.
+    pub(super) has_decoder: bool,
 }
 
 /// A node of a USB device.
@@ -115,6 +119,7 @@ pub(super) fn collect(root: &Path) -> Facts {
         shared_memory: space(&root.join("dev/shm")),
         disk: None,
         clock: word(&root.join("sys/devices/system/clocksource/clocksource0/current_clocksource")),
+        has_decoder: preview::is_on(std::env::var_os("PATH").as_deref()),
         usbfs_mb: word(&root.join("sys/module/usbcore/parameters/usbfs_memory_mb")).and_then(|mb| mb.parse().ok()),
     }
 }

@@ -13,6 +13,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::facts::{Facts, Node, UsbDevice};
+use super::preview;
 use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::registry::{Assigner, CameraSpec, DeviceSpec, InputSpec, NodeSpec, Opens, PixelFormat, Registry};
 use crate::text;
@@ -75,6 +76,7 @@ pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&s
     found.extend(can(facts, entries, &plugged));
     found.extend(limits(facts, registry));
     found.extend(disk(facts, registry));
+    found.extend(preview::decoder(facts.has_decoder, entries));
     found
 }
 
@@ -112,7 +114,7 @@ fn nodes_of(unit: &UsbDevice) -> [Attachment; 4] {
     let folder = PathBuf::from("/usb").join(&unit.port);
     let node = |kind: &str, node: fn(PathBuf) -> DeviceNode| {
         let syspath = folder.join(kind);
-        Attachment { node: node(syspath.clone()), syspath, unit: usb.clone().into(), driver: None }
+        Attachment { node: node(syspath.clone()), syspath, unit: usb.clone().into(), driver: None, formats: Vec::new() }
     };
     [
         node("video", DeviceNode::Video),
@@ -549,11 +551,8 @@ impl CameraLoad {
     pub(super) fn bytes_per_second(&self) -> f64 {
         let camera = &self.camera;
         let pixels = f64::from(camera.width) * f64::from(camera.height);
-        let picture = match camera.format {
-            PixelFormat::Yuyv => 2.0 * pixels,
-            PixelFormat::Grey => pixels,
-            PixelFormat::Mjpg => self.max_bytes as f64,
-        };
+        let picture =
+            camera.format.encoding().pixel_bytes().map_or(self.max_bytes as f64, |bytes| bytes as f64 * pixels);
         picture * f64::from(camera.fps)
     }
 
@@ -642,7 +641,7 @@ mod tests {
     use super::*;
 
     fn load(width: u32, height: u32, fps: u32, format: PixelFormat) -> CameraLoad {
-        let camera = CameraSpec { width, height, fps, format, controls: Vec::new() };
+        let camera = CameraSpec { width, height, fps, format, depth_unit_um: 1000, controls: Vec::new() };
         CameraLoad { name: "cam".into(), camera, max_bytes: 2 * (width * height) as usize }
     }
 

@@ -4,6 +4,7 @@
 
 mod facts;
 mod judge;
+mod preview;
 
 use std::io::{self, Write};
 use std::path::Path;

@@ -195,6 +195,7 @@ fn well() -> (Registry, Facts) {
         clock: Some("tsc".into()),
         can: Vec::new(),
         usbfs_mb: Some(16),
+        has_decoder: true,
     };
     (registry, facts)
 }
@@ -304,6 +305,36 @@ fn one_problem_is_one_finding() {
     assert!(!found.iter().any(|found| found.contains("button go")), "{found:?}");
     let root = User { is_root: true, groups: Vec::new() };
     assert_eq!(wrong(&Facts { user: root, realtime: Some(0), ..facts }, &registry), Vec::<String>::new());
+}
+
+#[test]
+fn a_preview_without_its_decoder_is_reported() {
+    let (_, facts) = well();
+    let entry =
+        "[device.gopro]\nnode = \"lan\"\nbit = 5\n[device.gopro.lan]\nprotocol = \"gopro\"\nhost = \"127.0.0.1\"\n";
+    let without = Registry::parse(&[BUILTIN, entry].concat(), None).unwrap().registry;
+    let with = Registry::parse(&[BUILTIN, entry, "stream = \"preview\"\n"].concat(), None).unwrap().registry;
+    let lacking = Facts { has_decoder: false, ..facts.clone() };
+    let about = |facts: &Facts, registry: &Registry| {
+        let rules = artifacts(registry).swap_remove(0).contents;
+        let facts = Facts { rules: Some(rules), ..facts.clone() };
+        wrong(&facts, registry)
+    };
+    assert_eq!(about(&lacking, &without), about(&facts, &without));
+    assert_eq!(about(&facts, &with), about(&facts, &without));
+    let found = about(&lacking, &with);
+    let wanted =
+        "Warn preview: the preview of [device.gopro] needs ffmpeg, which is not on PATH: only clips are recorded";
+    assert!(found.iter().any(|finding| finding == wanted), "{found:?}");
+    // In any folder of the path, and only as a file.
+    let folder = tempfile::tempdir().unwrap();
+    let path = std::env::join_paths([std::path::Path::new("/nowhere"), folder.path()]).unwrap();
+    assert!(!preview::is_on(Some(&path)) && !preview::is_on(None));
+    std::fs::create_dir(folder.path().join("ffmpeg")).unwrap();
+    assert!(!preview::is_on(Some(&path)));
+    std::fs::remove_dir(folder.path().join("ffmpeg")).unwrap();
+    std::fs::write(folder.path().join("ffmpeg"), "").unwrap();
+    assert!(preview::is_on(Some(&path)));
 }
 
 #[test]

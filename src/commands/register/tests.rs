@@ -24,7 +24,13 @@ fn serial_line(serial: Option<&str>, port: &str) -> Attachment {
         product,
         ..UsbIdentity::default()
     };
-    Attachment { syspath: PathBuf::from("/sim").join(port), node, unit: Unit::Usb(usb), driver: None }
+    Attachment {
+        syspath: PathBuf::from("/sim").join(port),
+        node,
+        unit: Unit::Usb(usb),
+        driver: None,
+        formats: Vec::new(),
+    }
 }
 
 fn arguments(words: &str) -> RegisterArgs {

@@ -198,12 +198,13 @@ pub(super) const fn fourcc(format: PixelFormat) -> [u8; 4] {
         PixelFormat::Mjpg => *b"MJPG",
         PixelFormat::Yuyv => *b"YUYV",
         PixelFormat::Grey => *b"GREY",
+        PixelFormat::Z16 => *b"Z16 ",
     }
 }
 
 /// A pixel format's name for people.
 pub(super) fn fourcc_text(fourcc: [u8; 4]) -> String {
-    fourcc.iter().map(|&byte| if byte.is_ascii_graphic() { char::from(byte) } else { '?' }).collect()
+    fourcc.trim_ascii_end().iter().map(|&byte| if byte.is_ascii_graphic() { char::from(byte) } else { '?' }).collect()
 }
 
 /// The format that the driver agreed to.
@@ -305,22 +306,14 @@ pub(super) struct Layout {
 
 impl Layout {
     pub(super) const fn encoding(self) -> Encoding {
-        match self.format {
-            PixelFormat::Mjpg => Encoding::Mjpeg,
-            PixelFormat::Yuyv => Encoding::Yuyv,
-            PixelFormat::Grey => Encoding::Grey,
-        }
+        self.format.encoding()
     }
 
     /// Bytes of a row's pixels; 0 for compressed pictures.
     fn row_bytes(self) -> usize {
-        let width = self.width as usize;
-        match self.format {
-            PixelFormat::Mjpg => 0,
-            // Two pixels share their colour: an odd width is rounded up.
-            PixelFormat::Yuyv => width.div_ceil(2) * 4,
-            PixelFormat::Grey => width,
-        }
+        // Two pixels of YUYV share their colour: an odd width is rounded up.
+        let width = if self.format == PixelFormat::Yuyv { self.width.next_multiple_of(2) } else { self.width };
+        self.encoding().pixel_bytes().unwrap_or(0) * width as usize
     }
 
     /// Bytes of a picture's pixels; 0 for compressed pictures.
@@ -344,7 +337,7 @@ impl Layout {
                 let least = most - (self.stride - self.row_bytes());
                 (least..=most).contains(&bytes.len())
             }
-            PixelFormat::Yuyv | PixelFormat::Grey => bytes.len() == self.picture_bytes(),
+            PixelFormat::Yuyv | PixelFormat::Grey | PixelFormat::Z16 => bytes.len() == self.picture_bytes(),
         }
     }
 

@@ -21,6 +21,7 @@
 mod answer;
 mod camera;
 mod clip;
+pub(super) mod preview;
 
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
@@ -34,10 +35,12 @@ use tokio_util::task::AbortOnDropHandle;
 use self::answer::{Name, State};
 use self::camera::{Camera, Pace, ReportedEpisode};
 use self::clip::Clip;
+use self::preview::Preview;
 use super::http;
 use super::place::{Place, Server};
 use crate::driver::{DriverError, Reading};
 use crate::folder::{Folder, Links, Missing, Sync, read_text, state_directory};
+use crate::registry::LanPicture;
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
@@ -68,15 +71,29 @@ pub(super) struct Gopro {
     task: AbortOnDropHandle<()>,
     model: Option<String>,
     payload: Vec<u8>,
+    /// Its pictures are the samples, not its states.
+    preview: Option<Preview>,
 }
 
 impl Gopro {
-    pub(super) async fn open(name: &str, place: &Place, port: u16, clips: Clips) -> Result<Self, DriverError> {
+    /// `preview`: the samples are pictures of this size, of at most so many bytes.
+    pub(super) async fn open(
+        name: &str,
+        place: &Place,
+        port: u16,
+        clips: Clips,
+        preview: Option<(LanPicture, usize)>,
+    ) -> Result<Self, DriverError> {
         let place = match place.peer() {
             Some(_) => place.clone(),
             None => place.at(address(place).await?.into()),
         };
-        Self::begin(name, place.server(port)?, clips, state_directory(), Pace::USUAL).await
+        let server = place.server(port)?;
+        let mut camera = Self::begin(name, server.clone(), clips, state_directory(), Pace::USUAL).await?;
+        if let Some((picture, largest)) = preview {
+            camera.preview = Some(Preview::begin(name, &server, picture, largest).await?);
+        }
+        Ok(camera)
     }
 
     /// `state` is the folder of the books.
@@ -98,12 +115,29 @@ impl Gopro {
         let (reported, tasks) = watch::channel(None);
         let camera = Camera::new(name, server, clips, books, notify, pace).await;
         let task = AbortOnDropHandle::new(tokio::spawn(camera.run(tasks)));
-        Ok(Self { states, reported, task, model: answer::model(&info), payload: Vec::new() })
+        Ok(Self { states, reported, task, model: answer::model(&info), payload: Vec::new(), preview: None })
     }
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         let ended = || Err(DriverError::Retry("the camera's task ended".to_owned()));
-        let state = self.states.recv().await.unwrap_or_else(ended)?;
+        let state = match &mut self.preview {
+            None => self.states.recv().await.unwrap_or_else(ended)?,
+            Some(preview) => {
+                // A state is no sample then, but that it cannot be had ends the stream.
+                let failed = async {
+                    loop {
+                        if let Err(error) = self.states.recv().await.unwrap_or_else(ended) {
+                            break error;
+                        }
+                    }
+                };
+                return tokio::select! {
+                    biased;
+                    error = failed => Err(error),
+                    picture = preview.read() => picture,
+                };
+            }
+        };
         self.payload.clear();
         // Writing to a Vec cannot fail.
         let _ = serde_json::to_writer(&mut self.payload, &state);
@@ -125,7 +159,8 @@ impl Gopro {
 
     /// Stops the shutter, if this program started it, and notes the clip.
     pub(super) async fn close(self) {
-        let Self { reported, task, states, .. } = self;
+        let Self { reported, task, states, preview, .. } = self;
+        drop(preview);
         reported.send_replace(Some(None));
         drop((reported, states));
         // If the caller abandons this, the task still runs: the camera must not keep recording.

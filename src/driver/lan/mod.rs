@@ -72,9 +72,10 @@ impl Lan {
                 Protocol::Mjpeg(mjpeg::Camera::open(&spec.name, server, path, *picture, spec.max_bytes).await?)
             }
             LanProtocol::Udp { port } => Protocol::Udp(udp::Packets::open(place, *port, spec.max_bytes)?),
-            LanProtocol::Gopro { port, download, reserve } => {
+            LanProtocol::Gopro { port, download, reserve, preview } => {
                 let clips = gopro::Clips { download: *download, reserve: *reserve };
-                Protocol::Gopro(gopro::Gopro::open(&spec.name, &place, *port, clips).await?)
+                let preview = preview.map(|picture| (picture, spec.max_bytes));
+                Protocol::Gopro(gopro::Gopro::open(&spec.name, &place, *port, clips, preview).await?)
             }
             LanProtocol::Iphone { port, stream, picture } => {
                 Protocol::Iphone(iphone::Phone::open(&spec.name, place, *port, *stream, *picture, spec.max_bytes)?)
@@ -145,7 +146,10 @@ fn describe(lan: &LanSpec, at: &str) -> (String, Option<Format>) {
             (format!("camera at {at}, MJPG {}x{} from {path}", picture.width, picture.height), pictures(*picture))
         }
         LanProtocol::Udp { port } => (format!("packets from {at} to port {port}"), None),
-        LanProtocol::Gopro { .. } => (format!("GoPro at {at}"), None),
+        LanProtocol::Gopro { preview: None, .. } => (format!("GoPro at {at}"), None),
+        LanProtocol::Gopro { preview: Some(picture), .. } => {
+            (format!("GoPro at {at}, preview {}x{}", picture.width, picture.height), pictures(*picture))
+        }
         LanProtocol::Iphone { port, picture, .. } => {
             let shape = lan.shape();
             let format = if shape.len() == 2 { pictures(*picture) } else { None };

@@ -77,7 +77,8 @@ impl Watch {
             instance: instance.map(str::to_owned),
         };
         let node = DeviceNode::Lan { address, last_received: self.last_received.clone() };
-        let attachment = Attachment { syspath: self.syspath(), node, unit: Unit::Lan(unit), driver: None };
+        let attachment =
+            Attachment { syspath: self.syspath(), node, unit: Unit::Lan(unit), driver: None, formats: Vec::new() };
         self.notify(HotplugEvent::Added(attachment)).await;
     }
 

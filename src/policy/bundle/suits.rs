@@ -116,6 +116,7 @@ impl Bundle {
                     };
                     let given = match kind {
                         ModalityKind::Image => "pictures",
+                        ModalityKind::Depth => "pictures of distances",
                         ModalityKind::Scalars => "numbers",
                         ModalityKind::Bytes => "bytes without a known structure",
                     };

@@ -29,7 +29,8 @@ const TURN_S: f64 = 0.2;
 pub(super) fn layout(registry: &Registry) -> String {
     let mut panels = Panels::default();
     let of = |kind| registry.devices.iter().filter(move |device| device.modality().kind == kind);
-    let mut pictures: Vec<_> = of(ModalityKind::Image).map(|device| panels.picture(device)).collect();
+    let cameras = of(ModalityKind::Image).chain(of(ModalityKind::Depth));
+    let mut pictures: Vec<_> = cameras.map(|device| panels.picture(device)).collect();
     pictures.extend(panels.scene(registry));
     let mut plots: Vec<_> = of(ModalityKind::Scalars).map(|device| panels.numbers(device)).collect();
     if let Some((_, action)) = registry.actuator() {

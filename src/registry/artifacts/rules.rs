@@ -41,7 +41,10 @@ pub(super) fn rules(registry: &Registry) -> String {
                 Err(reason) => writeln!(text, "# Not brought up: {reason}."),
             },
             _ => match identify(registry, device) {
-                Ok(identity) => writeln!(text, "{}", rule(device, usb, &identity)),
+                Ok(identity) if registry.shares_unit(device) => {
+                    writeln!(text, "{}\n{}", STREAM, rule(device, usb, &identity, false))
+                }
+                Ok(identity) => writeln!(text, "{}", rule(device, usb, &identity, true)),
                 Err(reason) => writeln!(text, "# No stable name: {reason}."),
             },
         };
@@ -112,21 +115,25 @@ fn single_out(registry: &Registry, device: &DeviceSpec, usb: &UsbSpec) -> Result
     Err("several entries are of this model and this one has neither serial number nor port".to_owned())
 }
 
-fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
+/// Their capture nodes have the same identity.
+const STREAM: &str = "# No stable name: one of several streams of a camera.";
+
+fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str, is_named: bool) -> String {
     // A camera has several nodes; index 0 is the one that captures pictures.
     let (index, group) = match device.node.opens() {
-        Opens::Video => (", ATTR{index}==\"0\"", "video"),
+        Opens::Video if is_named => (", ATTR{index}==\"0\"", "video"),
+        Opens::Video => ("", "video"),
         Opens::Tty => ("", "dialout"),
         Opens::Usb | Opens::Net => (", ENV{DEVTYPE}==\"usb_device\"", "plugdev"),
     };
     let attr = keys(device).0;
+    let link = if is_named { format!("SYMLINK+=\"rapid/{}\", ", device.name) } else { String::new() };
     format!(
         "SUBSYSTEM==\"{}\"{index}, {attr}{{idVendor}}==\"{:04x}\", {attr}{{idProduct}}==\"{:04x}\"{identity}, \
-         SYMLINK+=\"rapid/{}\", GROUP=\"{group}\", MODE=\"0660\", TAG+=\"uaccess\", RUN{{builtin}}+=\"uaccess\"",
+         {link}GROUP=\"{group}\", MODE=\"0660\", TAG+=\"uaccess\", RUN{{builtin}}+=\"uaccess\"",
         subsystem(device),
         usb.vid,
         usb.pid,
-        device.name,
     )
 }
 

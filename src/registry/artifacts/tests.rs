@@ -71,7 +71,7 @@ fn the_layout_shows_every_device_and_places_every_panel_once() {
             let present = format!("/rapid/observation.modalities[:]{{bit=={}}}.present", device.id.bit());
             assert!(text.contains(&present), "{}", device.name);
             match device.modality().kind {
-                ModalityKind::Image => {
+                ModalityKind::Image | ModalityKind::Depth => {
                     assert_eq!(panels[&format!("Image!{}", device.name)]["imageMode"]["imageTopic"], device.topic);
                 }
                 ModalityKind::Scalars => {

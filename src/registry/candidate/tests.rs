@@ -18,7 +18,7 @@ fn usb(ids: (u16, u16), serial: Option<&str>, port: &str) -> UsbIdentity {
 
 fn node(usb: &UsbIdentity, node: DeviceNode) -> Attachment {
     let syspath = PathBuf::from("/sys/none").join(&usb.port).join(node.label().replace('/', "_"));
-    Attachment { syspath, node, unit: Unit::Usb(usb.clone()), driver: None }
+    Attachment { syspath, node, unit: Unit::Usb(usb.clone()), driver: None, formats: Vec::new() }
 }
 
 fn video(usb: &UsbIdentity, path: &str) -> Attachment {

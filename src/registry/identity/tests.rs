@@ -73,12 +73,19 @@ fn video(number: u32, usb: UsbIdentity) -> Attachment {
         node: DeviceNode::Video(format!("/dev/video{number}").into()),
         unit: usb.into(),
         driver: None,
+        formats: Vec::new(),
     }
 }
 
 fn tty(usb: UsbIdentity) -> Attachment {
     let syspath = PathBuf::from(format!("/sys/devices/usb1/{}/tty/ttyACM0", usb.port));
-    Attachment { syspath, node: DeviceNode::Tty("/dev/ttyACM0".into()), unit: usb.into(), driver: None }
+    Attachment {
+        syspath,
+        node: DeviceNode::Tty("/dev/ttyACM0".into()),
+        unit: usb.into(),
+        driver: None,
+        formats: Vec::new(),
+    }
 }
 
 fn device_path(port: &str) -> PathBuf {
@@ -87,6 +94,49 @@ fn device_path(port: &str) -> PathBuf {
 
 fn waits(assignment: &Assignment) -> bool {
     matches!(assignment, Assignment::Waiting { .. })
+}
+
+/// Two cameras of one model, each with a stream of colours and one of distances.
+fn with_streams() -> Registry {
+    let camera = |name: &str, serial: &str, bits: [u8; 2]| {
+        format!(
+            "[device.{name}]\nvid = \"8086\"\npid = \"0b07\"\nserial = \"{serial}\"\nnode = \"camera\"\nbit = {}\n\
+             [device.{name}.camera]\nformat = \"YUYV\"\n[device.{name}.stream.depth]\nbit = {}\n\
+             [device.{name}.stream.depth.camera]\nformat = \"Z16\"\n",
+            bits[0], bits[1]
+        )
+    };
+    let text = camera("left", "L", [3, 0]) + &camera("right", "R", [1, 2]);
+    Registry::parse(&text, None).unwrap().registry
+}
+
+#[test]
+fn the_streams_of_a_camera_are_told_apart_by_their_formats() {
+    let registry = with_streams();
+    assert!(registry.devices.iter().all(|device| registry.shares_unit(device)));
+    let node = |number, serial: &str, port: &str, formats: &[&str]| {
+        let formats = formats.iter().map(|format| (*format).to_owned()).collect();
+        let usb = UsbIdentity { vid: 0x8086, pid: 0x0b07, ..unit(0, Some(serial), port) };
+        let syspath = device_path(port).join(format!("video4linux/video{number}"));
+        Attachment { syspath, formats, ..video(number, usb) }
+    };
+    let (depth, colour) = (["Z16"], ["YUYV", "MJPG"]);
+    // In either order, and a node that offers neither is left alone.
+    let mut assigner = Assigner::new(&registry);
+    assert_eq!(assigner.attach(&node(4, "L", "1-1", &colour)), entry(3));
+    assert!(matches!(assigner.attach(&node(2, "L", "1-1", &["GREY"])), Assignment::WrongNode { .. }));
+    assert_eq!(assigner.attach(&node(0, "L", "1-1", &depth)), entry(0));
+    assert_eq!(assigner.attach(&node(6, "R", "1-2", &depth)), entry(2));
+    assert_eq!(assigner.attach(&node(8, "R", "1-2", &colour)), entry(1));
+    // One cable: both are gone, and come back, in another port too.
+    assert_eq!(assigner.detach(&device_path("1-1")).freed, [id(0), id(3)]);
+    assert_eq!(assigner.attach(&node(0, "L", "1-4", &depth)), entry(0));
+    assert!(waits(&assigner.attach(&node(9, "L", "1-4", &depth))), "a second node of a taken stream");
+    assert_eq!(assigner.attach(&node(4, "L", "1-4", &colour)), entry(3));
+    // A camera that does not answer: by the order of its nodes.
+    let mut assigner = Assigner::new(&registry);
+    assert_eq!(assigner.attach(&node(0, "R", "1-2", &[])), entry(1));
+    assert_eq!(assigner.attach(&node(2, "R", "1-2", &[])), entry(2));
 }
 
 #[test]

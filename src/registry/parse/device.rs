@@ -16,7 +16,7 @@ use crate::registry::section::Section;
 use crate::registry::spec::VerdictSpec;
 use crate::registry::spec::{
     ActionSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens,
-    WhenStale,
+    PixelFormat, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -26,9 +26,12 @@ pub(super) const BUILT_IN: [(&str, Kind); 4] =
 const PROCESS: &str = "process";
 /// Keys that state which device an entry identifies.
 pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
-const KEYS: [&str; 9] = ["node", "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
-const TABLES: [&str; 11] =
-    ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints", "calibration", "points"];
+const KEYS: [&str; 9] = [NODE, "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
+const TABLES: [&str; 12] =
+    ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints", "calibration", "points", STREAM];
+/// The further streams of a camera.
+const STREAM: &str = "stream";
+const NODE: &str = "node";
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -52,6 +55,8 @@ pub(super) struct Draft<'a> {
     pub(super) name: String,
     pub(super) section: Section<'a>,
     pub(super) identity: Option<IdentitySpec>,
+    /// The entry of whose unit it is a further stream.
+    pub(super) stream_of: Option<String>,
     pub(super) kind: Option<Kind>,
     node: Option<NodeSpec>,
     pub(super) topic: String,
@@ -121,6 +126,14 @@ impl<'d> Draft<'d> {
         node.into_iter().chain(self.hooks.all().map(|(key, hook)| (key, hook.program.as_path())))
     }
 
+    /// The pixel format of a camera.
+    pub(super) const fn format(&self) -> Option<PixelFormat> {
+        match &self.node {
+            Some(NodeSpec::Camera(camera)) => Some(camera.format),
+            _ => None,
+        }
+    }
+
     /// Its settings, if it is on the network.
     pub(super) fn lan(&self) -> Option<&LanSpec> {
         match self.node.as_ref()? {
@@ -134,7 +147,7 @@ impl<'d> Draft<'d> {
 fn numbers_of(node: &NodeSpec) -> Option<usize> {
     let count = match node.modality_kind() {
         ModalityKind::Scalars => node.shape().first().copied().unwrap_or(0),
-        ModalityKind::Image | ModalityKind::Bytes => 0,
+        ModalityKind::Image | ModalityKind::Depth | ModalityKind::Bytes => 0,
     };
     usize::try_from(count).ok()
 }
@@ -147,6 +160,52 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>)
     section.allow(&[&IDENTITY_KEYS[..], &KEYS, &TABLES, &Hooks::KEYS].concat());
     let kind = kind(&section);
     let identity = identity::identity(kind, &section);
+    if kind != Some(Kind::Camera) && section.has(STREAM) {
+        section.report(STREAM, "only a camera has several streams", "remove the table, or write node = \"camera\"");
+    }
+    draft(name, section, (kind, identity), programs)
+}
+
+/// Reads the further streams of an entry, each an entry of its own with the same identity: `NAME_STREAM`.
+pub(super) fn streams<'a>(owner: &Draft<'a>, programs: Programs<'_>) -> Vec<Draft<'a>> {
+    let Some(streams) = owner.section.table(STREAM).filter(|_| owner.kind == Some(Kind::Camera)) else {
+        return Vec::new();
+    };
+    let usb = owner.identity.as_ref().and_then(IdentitySpec::usb);
+    if usb.is_some_and(|usb| usb.serial.is_none() && usb.port.is_none()) {
+        let fix = "write its serial = \"...\" or its port = \"...\"";
+        owner.section.report(STREAM, "any unit of the model fits: of which one the stream is, is not known", fix);
+    }
+    let mut drafts = Vec::new();
+    for (at, stream, value) in streams.fields() {
+        let Some(table) = value.get_ref().as_table() else {
+            let fix = "write it as a table, [device.NAME.stream.depth]";
+            streams.report_child(at, stream, format!("{stream:?} is not a table"), fix);
+            continue;
+        };
+        let (name, section) = (format!("{}_{stream}", owner.name), streams.part(table, at, streams.child(stream)));
+        if let Some((message, fix)) = name_problem(&name) {
+            section.report_at(section.at, message, fix);
+        }
+        let keys = KEYS.iter().filter(|key| **key != NODE);
+        section.allow(&keys.copied().chain(["camera", "verdict", "calibration"]).collect::<Vec<_>>());
+        let mut draft = draft(&name, section, (owner.kind, owner.identity.clone()), programs);
+        if !draft.section.has("topic") {
+            draft.topic = format!("{}/{stream}", owner.topic);
+        }
+        draft.stream_of = Some(owner.name.clone());
+        drafts.push(draft);
+    }
+    drafts
+}
+
+/// Reads the rest of one entry.
+fn draft<'a>(
+    name: &str,
+    section: Section<'a>,
+    (kind, identity): (Option<Kind>, Option<IdentitySpec>),
+    programs: Programs<'_>,
+) -> Draft<'a> {
     let mut heartbeat = None;
     let settings = match kind {
         Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section))),
@@ -190,6 +249,7 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>)
     Draft {
         name: name.to_owned(),
         identity,
+        stream_of: None,
         kind,
         topic,
         bit,

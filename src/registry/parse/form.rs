@@ -100,7 +100,7 @@ fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> O
     table.allow(&["model", "distortion", "intrinsics"]);
     table.need("intrinsics", "write intrinsics = [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels");
     let size = node.shape();
-    let (ModalityKind::Image, [height, width]) = (node.modality_kind(), &size[..]) else {
+    let (ModalityKind::Image | ModalityKind::Depth, [height, width]) = (node.modality_kind(), &size[..]) else {
         return section.refuse(CALIBRATION, "its samples are not pictures".to_owned(), "remove the table");
     };
     refuse_others(section, &[POSE, JOINTS, POINTS], "its samples are pictures");

@@ -12,7 +12,7 @@ const KEYS: [&str; 8] = ["protocol", "mdns", "instance", "host", "port", "probe"
 const OWN: [(Word, &[&str]); 4] = [
     (Word::Mjpeg, &["path", "width", "height", "fps"]),
     (Word::Udp, &[]),
-    (Word::Gopro, &["download"]),
+    (Word::Gopro, &["download", "stream", "width", "height", "fps"]),
     (Word::Iphone, &["stream", "width", "height", "fps"]),
 ];
 const OPTIONAL: [&str; 6] = ["path", "width", "height", "fps", "download", "stream"];
@@ -82,12 +82,11 @@ fn protocol(table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanPro
             table.need("port", "write port = the port of this computer that the device sends to");
             LanProtocol::Udp { port: port? }
         }
-        Word::Gopro => LanProtocol::Gopro {
-            port: port.unwrap_or(GOPRO_PORT),
-            download: table.flag("download").unwrap_or(false),
-            // Set once the whole registry is read.
-            reserve: None,
-        },
+        Word::Gopro => {
+            let (port, download) = (port.unwrap_or(GOPRO_PORT), table.flag("download").unwrap_or(false));
+            // `reserve` is set once the whole registry is read.
+            LanProtocol::Gopro { port, download, reserve: None, preview: preview(table) }
+        }
         Word::Iphone => {
             const STREAMS: [(&str, PhoneStream); 2] = [("image", PhoneStream::Image), ("pose", PhoneStream::Pose)];
             let stream = table.choice("stream", &STREAMS).unwrap_or(PhoneStream::Image);
@@ -95,6 +94,19 @@ fn protocol(table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanPro
             LanProtocol::Iphone { port: port.unwrap_or(PHONE_PORT), stream, picture }
         }
     })
+}
+
+/// The pictures of a GoPro, if they are its samples.
+fn preview(table: &Section<'_>) -> Option<LanPicture> {
+    const STREAMS: [(&str, bool); 2] = [("state", false), ("preview", true)];
+    if table.choice("stream", &STREAMS).unwrap_or(false) {
+        return Some(picture(table, LanPicture::OF_A_CAMERA));
+    }
+    for key in ["width", "height", "fps"].into_iter().filter(|key| table.has(key)) {
+        let message = format!("the state of a GoPro has no {key}");
+        table.report(key, message, format!("remove {key}, or write stream = \"preview\""));
+    }
+    None
 }
 
 fn path(table: &Section<'_>) -> String {

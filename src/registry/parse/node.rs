@@ -24,14 +24,24 @@ pub(super) fn camera(section: &Section<'_>) -> CameraSpec {
         let fix = "remove the table, or write node = \"serial\"";
         section.report(key, format!("a camera has no table [{}]", section.child(key)), fix);
     }
-    let mut camera = CameraSpec { width: 640, height: 480, fps: 30, format: PixelFormat::Mjpg, controls: Vec::new() };
+    let mut camera = CameraSpec {
+        width: 640,
+        height: 480,
+        fps: 30,
+        format: PixelFormat::Mjpg,
+        depth_unit_um: MILLIMETRE,
+        controls: Vec::new(),
+    };
     let Some(table) = section.table("camera") else { return camera };
-    table.allow(&["width", "height", "fps", "format", "controls"]);
+    table.allow(&["width", "height", "fps", "format", "depth_unit", "controls"]);
     let integer = |key, most, default| table.integer(key, 1..=most).unwrap_or(default);
     camera.width = integer("width", 8192, camera.width);
     camera.height = integer("height", 8192, camera.height);
     camera.fps = integer("fps", 1000, camera.fps);
     camera.format = table.choice("format", &PixelFormat::WORDS).unwrap_or(camera.format);
+    if let Some(unit) = depth_unit(&table, camera.format) {
+        camera.depth_unit_um = unit;
+    }
     if let Some(controls) = table.table("controls") {
         for (_, name, _) in controls.fields() {
             if let Some(value) = controls.integer(name, i64::MIN..=i64::MAX) {
@@ -40,6 +50,27 @@ pub(super) fn camera(section: &Section<'_>) -> CameraSpec {
         }
     }
     camera
+}
+
+/// In um.
+const MILLIMETRE: u32 = 1000;
+
+/// The distance of one count of a picture of distances, in um.
+fn depth_unit(table: &Section<'_>, format: PixelFormat) -> Option<u32> {
+    const KEY: &str = "depth_unit";
+    let text = table.text(KEY)?;
+    if format != PixelFormat::Z16 {
+        return table.refuse(KEY, format!("pictures in {format} have no distances"), "remove the key");
+    }
+    let number = |unit: &str| text.strip_suffix(unit)?.trim_end().parse::<u32>().ok();
+    let um = number("um").or_else(|| number("mm")?.checked_mul(MILLIMETRE));
+    um.filter(|um| (1..=100 * MILLIMETRE).contains(um)).or_else(|| {
+        table.refuse(
+            KEY,
+            format!("{text:?} is no distance"),
+            "write a whole number of mm or um, such as \"1mm\" or \"100um\"",
+        )
+    })
 }
 
 pub(super) fn serial(section: &Section<'_>) -> Option<SerialSpec> {
@@ -142,10 +173,9 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>) -> u64 {
     let (default, least) = match node {
         Some(NodeSpec::Camera(camera)) => {
             let pixels = u64::from(camera.width) * u64::from(camera.height);
-            match camera.format {
-                PixelFormat::Mjpg => ((2 * pixels).max(SMALLEST_JPEG), 1024),
-                PixelFormat::Yuyv => (2 * pixels, 2 * pixels),
-                PixelFormat::Grey => (pixels, pixels),
+            match camera.format.encoding().pixel_bytes() {
+                Some(bytes) => (bytes as u64 * pixels, bytes as u64 * pixels),
+                None => ((2 * pixels).max(SMALLEST_JPEG), 1024),
             }
         }
         Some(NodeSpec::Serial(serial)) => match (serial.parse, serial.framing) {
@@ -160,7 +190,7 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>) -> u64 {
         },
         Some(NodeSpec::Lan(lan)) => lan.max_bytes(),
         Some(NodeSpec::Process(process)) => match (process.kind, process.shape.as_slice()) {
-            (ModalityKind::Image, [height, width]) => {
+            (ModalityKind::Image | ModalityKind::Depth, [height, width]) => {
                 ((2 * u64::from(*width) * u64::from(*height)).max(SMALLEST_JPEG), 1024)
             }
             (ModalityKind::Scalars, [channels]) => (8 * u64::from(*channels), 8 * u64::from(*channels)),
@@ -181,8 +211,9 @@ pub(super) fn default_depth(node: Option<&NodeSpec>) -> u64 {
     }
 }
 
+/// Whether its samples are the states of a GoPro.
 pub(super) fn is_gopro(node: &NodeSpec) -> bool {
-    matches!(node, NodeSpec::Lan(LanSpec { protocol: LanProtocol::Gopro { .. }, .. }))
+    matches!(node, NodeSpec::Lan(LanSpec { protocol: LanProtocol::Gopro { preview: None, .. }, .. }))
 }
 
 const PROCESS_KEYS: [&str; 7] = ["args", "opens", "kind", "channels", "width", "height", "heartbeat"];
@@ -246,6 +277,7 @@ fn shape(table: &Section<'_>, kind: ModalityKind) -> Vec<u32> {
     let (word, keys): (&str, &[(&str, i64)]) = match kind {
         ModalityKind::Scalars => ("scalars", &[("channels", 1024)]),
         ModalityKind::Image => ("image", &[("height", 8192), ("width", 8192)]),
+        ModalityKind::Depth => ("depth", &[("height", 8192), ("width", 8192)]),
         ModalityKind::Bytes => ("bytes", &[]),
     };
     for key in ["channels", "width", "height"] {

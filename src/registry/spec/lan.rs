@@ -41,6 +41,8 @@ pub enum LanProtocol {
         download: bool,
         /// `disk_reserve` of the rig, bytes: downloads leave this space free, plus room for an episode.
         reserve: Option<u64>,
+        /// The format of the pictures of its preview stream, if they are its samples. Default: its state is.
+        preview: Option<LanPicture>,
     },
     /// A phone that connects to this computer and sends pictures with the camera's pose.
     Iphone {
@@ -161,9 +163,11 @@ impl LanSpec {
     /// Content of its samples.
     pub const fn modality_kind(&self) -> ModalityKind {
         match &self.protocol {
-            LanProtocol::Mjpeg { .. } | LanProtocol::Iphone { stream: PhoneStream::Image, .. } => ModalityKind::Image,
+            LanProtocol::Mjpeg { .. }
+            | LanProtocol::Iphone { stream: PhoneStream::Image, .. }
+            | LanProtocol::Gopro { preview: Some(_), .. } => ModalityKind::Image,
             LanProtocol::Iphone { stream: PhoneStream::Pose, .. } => ModalityKind::Scalars,
-            LanProtocol::Udp { .. } | LanProtocol::Gopro { .. } => ModalityKind::Bytes,
+            LanProtocol::Udp { .. } | LanProtocol::Gopro { preview: None, .. } => ModalityKind::Bytes,
         }
     }
 
@@ -180,7 +184,8 @@ impl LanSpec {
     pub const fn picture(&self) -> Option<LanPicture> {
         match &self.protocol {
             LanProtocol::Mjpeg { picture, .. } | LanProtocol::Iphone { picture, .. } => Some(*picture),
-            LanProtocol::Udp { .. } | LanProtocol::Gopro { .. } => None,
+            LanProtocol::Gopro { preview, .. } => *preview,
+            LanProtocol::Udp { .. } => None,
         }
     }
 
@@ -191,7 +196,10 @@ impl LanSpec {
                 format!("mjpeg {width}x{height} {fps} fps {path}")
             }
             LanProtocol::Udp { port } => format!("udp port {port}"),
-            LanProtocol::Gopro { .. } => "gopro".to_owned(),
+            LanProtocol::Gopro { preview: None, .. } => "gopro".to_owned(),
+            LanProtocol::Gopro { preview: Some(LanPicture { width, height, fps }), .. } => {
+                format!("gopro preview {width}x{height} {fps} fps")
+            }
             LanProtocol::Iphone { stream: PhoneStream::Pose, port, .. } => format!("iphone pose port {port}"),
             LanProtocol::Iphone { port, picture: LanPicture { width, height, fps }, .. } => {
                 format!("iphone {width}x{height} {fps} fps port {port}")

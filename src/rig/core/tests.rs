@@ -26,7 +26,13 @@ fn plugged(serial: &str) -> Input {
         ..UsbIdentity::default()
     };
     let (syspath, node) = (PathBuf::from("/sys").join(serial), DeviceNode::Video(format!("/dev/{serial}").into()));
-    Input::Hotplug(HotplugEvent::Added(Attachment { syspath, node, unit: usb.into(), driver: None }))
+    Input::Hotplug(HotplugEvent::Added(Attachment {
+        syspath,
+        node,
+        unit: usb.into(),
+        driver: None,
+        formats: Vec::new(),
+    }))
 }
 
 #[test]

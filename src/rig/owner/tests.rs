@@ -123,6 +123,7 @@ impl Bench {
                     node: DeviceNode::Sim(unit),
                     unit: usb.into(),
                     driver: None,
+                    formats: Vec::new(),
                 }));
             }
             Pull(port) => self.units[port].unplug(),
@@ -176,6 +177,7 @@ impl Bench {
                     node: DeviceNode::Net(folder.display().to_string()),
                     unit: usb.into(),
                     driver: None,
+                    formats: Vec::new(),
                 }));
             }
             Logged(wanted) => loop {
@@ -506,8 +508,13 @@ async fn the_end_is_announced_before_a_slow_device_has_closed() {
     let unit = Arc::new(SimDevice::new("1", source, Stamp::now()).with_faults(faults));
     let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: "1".into(), ..UsbIdentity::default() };
     let syspath = PathBuf::from("/test/1");
-    let added =
-        HotplugEvent::Added(Attachment { syspath, node: DeviceNode::Sim(unit), unit: usb.into(), driver: None });
+    let added = HotplugEvent::Added(Attachment {
+        syspath,
+        node: DeviceNode::Sim(unit),
+        unit: usb.into(),
+        driver: None,
+        formats: Vec::new(),
+    });
     hotplug.unbounded_send(Ok(added)).expect("rig");
     let running = tokio::spawn(async move {
         let ended = rig.run(Box::pin(plugged), asked, CancellationToken::new()).await;
@@ -583,7 +590,13 @@ async fn the_mask_is_published_before_the_announcement_and_its_file_agrees_with_
         for is_there in [true, false] {
             let event = if is_there {
                 let (node, unit) = (DeviceNode::Sim(Arc::clone(&unit)), usb.clone().into());
-                HotplugEvent::Added(Attachment { syspath: syspath.clone(), node, unit, driver: None })
+                HotplugEvent::Added(Attachment {
+                    syspath: syspath.clone(),
+                    node,
+                    unit,
+                    driver: None,
+                    formats: Vec::new(),
+                })
             } else {
                 HotplugEvent::Removed { syspath: syspath.clone(), noticed: Stamp::now(), source: UnplugSource::Kernel }
             };

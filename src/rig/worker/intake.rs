@@ -54,6 +54,7 @@ enum Refusal {
 enum Expected {
     Scalars { channels: u32 },
     Image { width: u32, height: u32 },
+    Depth { width: u32, height: u32 },
     Bytes,
 }
 
@@ -76,6 +77,7 @@ impl Intake {
         let expected = match (process.kind, process.shape.as_slice()) {
             (ModalityKind::Scalars, [channels]) => Expected::Scalars { channels: *channels },
             (ModalityKind::Image, [height, width]) => Expected::Image { width: *width, height: *height },
+            (ModalityKind::Depth, [height, width]) => Expected::Depth { width: *width, height: *height },
             _ => Expected::Bytes,
         };
         Self {
@@ -141,24 +143,25 @@ impl Intake {
             (
                 Expected::Image { width, height },
                 Some(encoding @ (Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey)),
-            ) => {
+            )
+            | (Expected::Depth { width, height }, Some(encoding @ Encoding::Depth)) => {
                 let states = (header.width, header.height);
                 if states != (width, height) && states != (0, 0) {
                     return Err(Refusal::Picture(states.0, states.1, width, height));
                 }
                 let pixels = u64::from(width) * u64::from(height);
-                match encoding {
-                    Encoding::Yuyv => exact(payload, 2 * pixels)?,
-                    Encoding::Grey => exact(payload, pixels)?,
+                match encoding.pixel_bytes() {
+                    Some(bytes) => exact(payload, bytes as u64 * pixels)?,
                     // Start of image: ITU-T T.81, B.1.1.3.
-                    _ if !payload.starts_with(&[0xff, 0xd8]) => return Err(Refusal::NotJpeg),
-                    _ => {}
+                    None if !payload.starts_with(&[0xff, 0xd8]) => return Err(Refusal::NotJpeg),
+                    None => {}
                 }
                 Ok((encoding, width, height))
             }
             (Expected::Bytes, Some(Encoding::Bytes)) => Ok((Encoding::Bytes, 0, 0)),
             (Expected::Scalars { .. }, _) => Err(Refusal::Encoding(header.encoding, "4 (f64)")),
             (Expected::Image { .. }, _) => Err(Refusal::Encoding(header.encoding, "1 (mjpeg), 2 (yuyv), 3 (grey)")),
+            (Expected::Depth { .. }, _) => Err(Refusal::Encoding(header.encoding, "6 (depth)")),
             (Expected::Bytes, _) => Err(Refusal::Encoding(header.encoding, "0 (bytes)")),
         }
     }

@@ -91,6 +91,7 @@ fn whole(bench: &Bench, length: Duration, full: bool) -> Result<Run, Failure> {
         node: DeviceNode::Tty(path),
         unit: usb.into(),
         driver: None,
+        formats: Vec::new(),
     };
     let plugged = || {
         let events = futures::stream::iter([Ok(HotplugEvent::Added(attachment))]);

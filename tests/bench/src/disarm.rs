@@ -63,7 +63,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
         let stop = stop.clone();
         async move {
             let syspath = "/sys/bench/1-1".into();
-            let plugged = Attachment { syspath, node, unit: unit.into(), driver: None };
+            let plugged = Attachment { syspath, node, unit: unit.into(), driver: None, formats: Vec::new() };
             let plugs = futures::stream::iter([Ok(HotplugEvent::Added(plugged))]);
             let plugs: HotplugStream = Box::pin(futures::StreamExt::chain(plugs, futures::stream::pending()));
             let (_commands, asked) = tokio::sync::mpsc::channel(1);

@@ -5,7 +5,7 @@ use crate::sample::FLAG_ERROR;
 use crate::time::Stamp;
 
 fn spec(format: PixelFormat) -> CameraSpec {
-    CameraSpec { width: 640, height: 480, fps: 30, format, controls: Vec::new() }
+    CameraSpec { width: 640, height: 480, fps: 30, format, depth_unit_um: 1000, controls: Vec::new() }
 }
 
 fn agreed(fourcc: [u8; 4], width: u32, rate: Option<(u32, u32)>) -> Agreed {

@@ -473,8 +473,13 @@ fn attachments(unit: usize, port: usize) -> Vec<Attachment> {
         ..UsbIdentity::default()
     };
     let path = PathBuf::from(format!("/sys/{hub}/{port}"));
-    let attachment =
-        |node: DeviceNode, name| Attachment { syspath: path.join(name), node, unit: usb.clone().into(), driver: None };
+    let attachment = |node: DeviceNode, name| Attachment {
+        syspath: path.join(name),
+        node,
+        unit: usb.clone().into(),
+        driver: None,
+        formats: Vec::new(),
+    };
     let mut nodes = vec![attachment(DeviceNode::Video("/dev/video0".into()), "video")];
     if model == 3 {
         nodes.push(attachment(DeviceNode::Tty("/dev/ttyACM0".into()), "tty"));
