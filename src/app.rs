@@ -39,7 +39,7 @@ use std::time::Duration;
 
 use futures::FutureExt;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
@@ -245,7 +245,8 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let duration = episode_time.or(options.duration.filter(|_| is_single));
     let episode = EpisodeRequest { duration, ..options.episode };
     let is_kept = !(is_single && options.record && options.screen != Screen::Monitor);
-    let collection = Collection::new(recorder, episode, options.plan, is_kept, &board)?;
+    let (modules, mountable) = watch::channel(registry.modules.clone());
+    let collection = Collection::new(recorder, episode, options.plan, is_kept, (&board, mountable))?;
     let kind = options.screen;
     let (to_scenario, replugs) = mpsc::unbounded_channel();
     let (to_alignment, to_align) = mpsc::unbounded_channel();
@@ -289,6 +290,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         recorder: to_recorder,
         alignment: to_alignment,
         live: to_live,
+        modules,
         topics: Vec::new(),
     };
     requests::sorted(to_conductor, from_screen, (arrivals, attached), to_rig, to_registry, to_scenario);

@@ -187,6 +187,16 @@ pub enum Command {
     /// Add an entry to the registry for a connected device
     #[command(after_long_help = registry::REGISTER)]
     Register(Box<RegisterArgs>),
+    /// List the types of modules that `rapid register --module` knows
+    #[command(
+        after_long_help = "A file of the same form describes a type of your own.\n\nExamples:\n  rapid modules\n  \
+        rapid modules tip_tactile > my_tip.toml && rapid register --module ./my_tip.toml"
+    )]
+    Modules {
+        /// Print the descriptor of this one
+        #[arg(value_name = "NAME", value_hint = ValueHint::FilePath)]
+        name: Option<String>,
+    },
     /// Remove an entry from the registry; the rest is kept unchanged
     #[command(after_long_help = "Examples:\n  rapid unregister cam_left --dry-run\n  rapid unregister cam_left --yes")]
     Unregister(UnregisterArgs),

@@ -126,6 +126,10 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             devices(global, formats, format, out)
         }
         Command::Register(args) => register(global, &args, format, out),
+        Command::Modules { name } => {
+            let registry = find_registry(global).and_then(|path| load(&path).ok());
+            Ok(commands::modules::modules(name.as_deref(), registry.as_ref(), format, out)?)
+        }
         Command::Unregister(args) => unregister(global, &args, format, out),
         Command::Doctor { out: episodes } => {
             let registry = registry_path(global).and_then(|path| load(&path)).map_err(|failure| failure.text);
@@ -602,6 +606,7 @@ failures! {
     ReadError: read_code;
     commands::artifacts::ArtifactsError: |_| 1;
     commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
+    commands::modules::ModulesError: |error| argument_code(!matches!(error, commands::modules::ModulesError::Output(_)));
     commands::session::RequestError: |_| 1;
     commands::logs::LogsError: |error| match error {
         commands::logs::LogsError::NoDevice { .. } => 2,

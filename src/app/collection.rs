@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender};
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
 
 use super::AppError;
@@ -17,6 +17,7 @@ use super::requests::Reply;
 use super::stage::join;
 use crate::record::inspect::{self, Judgement, Listed};
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
+use crate::registry::{self, ModuleError, ModuleSpec};
 use crate::session::journal::{self, Journal, Plan, SessionFile};
 use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
 use crate::session::{Answer, Effect, Session};
@@ -60,12 +61,28 @@ pub(super) fn examine(folder: &Path, file: String, found: &UnboundedSender<Found
     let _ = found.send(Found { file, end });
 }
 
+/// Dismounts every declared module.
+const NO_MODULE: &str = "none";
+
+/// What is mounted once these are: each in place of the one in its slot.
+fn mounted(now: &[String], requested: &[String], known: &[ModuleSpec]) -> Result<Vec<String>, ModuleError> {
+    let names: Vec<String> = requested.iter().filter(|name| *name != NO_MODULE).cloned().collect();
+    let new = registry::mounted(known, &names)?;
+    let is_dismounted = requested.len() > names.len();
+    let slot_of = |name: &String| known.iter().find(|module| module.name == *name).map(|module| module.mount);
+    let stays = |name: &&String| !is_dismounted && new.iter().all(|module| slot_of(name) != Some(module.mount));
+    let kept = now.iter().filter(stays).cloned();
+    Ok(kept.chain(new.iter().map(|module| module.name.clone())).collect())
+}
+
 /// See the module's comment.
 pub(super) struct Collection {
     board: Arc<Board>,
     pub(super) recorder: Recorder,
     /// Folder, modules and duration of each episode; task and tags are the session's.
     episode: EpisodeRequest,
+    /// The modules of the registry.
+    mountable: watch::Receiver<Vec<ModuleSpec>>,
     session: Session,
     keeper: Keeper,
     /// What the keeper is to do for the request that is being carried out.
@@ -98,7 +115,7 @@ impl Collection {
         episode: EpisodeRequest,
         plan: Plan,
         is_kept: bool,
-        board: &Arc<Board>,
+        (board, mountable): (&Arc<Board>, watch::Receiver<Vec<ModuleSpec>>),
     ) -> Result<Self, AppError> {
         let (journal, before, error) = Journal::open(&episode.out);
         if let Some(error) = error {
@@ -113,6 +130,7 @@ impl Collection {
             board: Arc::clone(board),
             recorder,
             episode,
+            mountable,
             session,
             keeper,
             operations: Vec::new(),
@@ -179,10 +197,26 @@ impl Collection {
         let is_shown = *request != SessionRequest::Show;
         let replaces = self.session.newest().filter(|_| *request == SessionRequest::Redo).map(str::to_owned);
         self.is_kept |= is_shown;
+        let mounted = match request {
+            SessionRequest::Plan { modules, .. } => mounted(&self.episode.modules, modules, &self.mountable.borrow()),
+            _ => Ok(self.episode.modules.clone()),
+        };
+        let mounted = match mounted {
+            Ok(mounted) => mounted,
+            Err(error) => {
+                self.answer(Err(error.to_string()), reply);
+                self.show();
+                return Ok(());
+            }
+        };
         match self.session.request(request, at) {
             Ok((answer, effects)) => {
+                self.episode.modules = mounted;
                 let pending = match answer {
-                    Answer::Now(text) => {
+                    Answer::Now(mut text) => {
+                        if matches!(request, SessionRequest::Plan { .. }) && !self.episode.modules.is_empty() {
+                            text = format!("{text}, with {}", self.episode.modules.join(", "));
+                        }
                         let to = reply.into_iter().collect();
                         Some(Pending { text, is_done: false, replaces: None, is_shown, to })
                     }
@@ -442,5 +476,31 @@ impl Collection {
             self.take(outcome);
         }
         outcome
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::registry::Registry;
+
+    #[test]
+    fn a_module_is_mounted_in_place_of_the_one_in_its_slot() {
+        let text = "[device.a]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\nbit = 0\n\
+            [module.soft]\nslot = \"tip\"\n[module.rigid]\nslot = \"tip\"\n[module.handle]\nslot = \"bottom\"\n";
+        let known = Registry::parse(text, None).unwrap().registry.modules;
+        let after = |now: &[&str], requested: &[&str]| {
+            let names = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+            mounted(&names(now), &names(requested), &known)
+                .map(|names| names.join(" "))
+                .map_err(|error| error.to_string())
+        };
+        assert_eq!(after(&[], &["soft"]).as_deref(), Ok("soft"));
+        assert_eq!(after(&["soft", "handle"], &["rigid"]).as_deref(), Ok("handle rigid"));
+        assert_eq!(after(&["soft"], &[]).as_deref(), Ok("soft"));
+        assert_eq!(after(&["soft", "handle"], &["none"]).as_deref(), Ok(""));
+        assert_eq!(after(&["soft", "handle"], &["none", "rigid"]).as_deref(), Ok("rigid"));
+        assert!(after(&["soft"], &["sofd"]).is_err_and(|error| error.contains("did you mean \"soft\"?")));
+        assert!(after(&[], &["soft", "rigid"]).is_err_and(|error| error.contains("both sit in the slot tip")));
     }
 }

@@ -13,7 +13,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_blocking;
 
 use super::live::LiveAddition;
@@ -22,7 +22,7 @@ use super::stage::Stage;
 use crate::bus::{BusError, Extension, Membership, Subscription};
 use crate::record::RecorderAddition;
 use crate::registration;
-use crate::registry::{DeviceSpec, Difference, Registry};
+use crate::registry::{DeviceSpec, Difference, ModuleSpec, Registry};
 use crate::rig::{Addition, RigCommand};
 use crate::status::session::Answered;
 use crate::status::{Board, Level, RegistryRequest, What};
@@ -44,6 +44,8 @@ pub(super) struct Reload {
     pub(super) alignment: mpsc::UnboundedSender<(Arc<DeviceSpec>, Subscription)>,
     /// The Foxglove server, if there is one.
     pub(super) live: Option<std::sync::mpsc::Sender<LiveAddition>>,
+    /// The modules that can be mounted.
+    pub(super) modules: watch::Sender<Vec<ModuleSpec>>,
     /// Topics of added entries.
     pub(super) topics: Vec<Extension>,
 }
@@ -115,23 +117,25 @@ impl Reload {
     /// Takes over what was added to the file.
     async fn reload(&mut self) -> Result<String, String> {
         let running = Arc::clone(&self.registry);
-        let (registry, added) = blocking(move || changed(&running)).await??;
-        if added.is_empty() {
+        let (registry, added, modules) = blocking(move || changed(&running)).await??;
+        if added.is_empty() && modules.is_empty() {
             return Ok("no entry was added, and no other change needs a restart".to_owned());
         }
         let (bus, is_live) = (self.bus.clone(), self.live.is_some());
         let opened = blocking(move || open(&bus, added, is_live)).await?;
         let opened = opened.map_err(|error| format!("{error}; {UNCHANGED}"))?;
-        let names: Vec<_> = opened
-            .iter()
-            .map(|opened| format!("[device.{}] as bit {}", opened.device.name, opened.device.id))
-            .collect();
+        let devices =
+            opened.iter().map(|opened| format!("[device.{}] as bit {}", opened.device.name, opened.device.id));
+        let names: Vec<_> = devices.chain(modules.iter().map(|name| format!("[module.{name}]"))).collect();
         let names = names.join(", ");
         let episode = if self.board.is_recording() { "; recorded from the next episode on" } else { "" };
         self.board.announce(What::Log { level: Level::Info, text: format!("registry: added {names}{episode}") });
+        // A stage that is gone has ended with the run, or ends it.
+        let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(&registry), subscription: None });
         for opened in opened {
             self.add(opened, &registry).await?;
         }
+        self.modules.send_replace(registry.modules.clone());
         self.registry = registry;
         Ok(format!("added {names}{episode}"))
     }
@@ -140,7 +144,7 @@ impl Reload {
         let Opened { device, topic, recorder, alignment, live } = opened;
         self.board.add(&device);
         // A stage that is gone has ended with the run, or ends it.
-        let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(registry), subscription: recorder });
+        let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(registry), subscription: Some(recorder) });
         let _ = self.alignment.send((Arc::clone(&device), alignment));
         if let Some((to_live, live)) = self.live.as_ref().zip(live) {
             let _ = to_live.send((Arc::clone(&device), live));
@@ -161,8 +165,10 @@ fn file(registry: &Registry) -> Result<&Path, String> {
     registry.path.as_deref().ok_or_else(|| why.to_owned())
 }
 
-/// The registry of the file, as the run would have it, and the entries that it has more.
-fn changed(running: &Registry) -> Result<(Arc<Registry>, Vec<DeviceSpec>), String> {
+/// The registry of the file, as the run would have it, and the entries and the names of the modules that it has more.
+type Changed = (Arc<Registry>, Vec<DeviceSpec>, Vec<String>);
+
+fn changed(running: &Registry) -> Result<Changed, String> {
     let path = file(running)?;
     let mut new = Registry::load(path).map_err(|error| format!("{error}\n{UNCHANGED}"))?.registry;
     // Without what the command line changed.
@@ -171,13 +177,13 @@ fn changed(running: &Registry) -> Result<(Arc<Registry>, Vec<DeviceSpec>), Strin
         "" => running.clone(),
         text => Registry::parse(text, Some(path)).map_err(|error| format!("{error}\n{UNCHANGED}"))?.registry,
     };
-    let Difference { added, needs_restart } = Difference::between(&declared, &new);
+    let Difference { added, modules, needs_restart } = Difference::between(&declared, &new);
     if !needs_restart.is_empty() {
         let lines: Vec<_> = needs_restart.iter().map(|line| format!("\n  {line}")).collect();
         return Err(format!("{}: restart rapid to apply this; {UNCHANGED}{}", path.display(), lines.concat()));
     }
     new.rig = running.rig.clone();
-    Ok((Arc::new(new), added))
+    Ok((Arc::new(new), added, modules))
 }
 
 /// Opens the topics of these entries, or none.

@@ -14,6 +14,7 @@ that `rapid artifacts` writes are written too, to udev/ beside the registry.
 Examples:
   rapid register
   rapid register --vid 046d --pid 0825 --name cam_left --node camera --set camera.width=1280
+  rapid register --module tip_tactile
   rapid register --import ~/.config/rapid_driver/registry.toml --dry-run
   rapid register --sim scenario.toml          without a device";
 
@@ -56,8 +57,11 @@ pub struct RegisterArgs {
     /// Print the entry without writing it
     #[arg(long)]
     pub dry_run: bool,
+    /// Type of module, from `rapid modules` or a file: its sensor, slot and tags are added with it
+    #[arg(long, help = "Type of module (`rapid modules` lists them, or a file): its sensor, slot and tags are added with it", value_name = "NAME", value_hint = ValueHint::FilePath, conflicts_with_all = ["node", "slot"])]
+    pub module: Option<String>,
     /// Import the devices of a registry.toml of `rapid_driver`
-    #[arg(long, help = "Import the devices of a registry.toml of rapid_driver", value_name = "FILE", value_hint = ValueHint::FilePath, conflicts_with_all = ["vid", "pid", "serial", "port", "name", "bit", "slot", "set"])]
+    #[arg(long, help = "Import the devices of a registry.toml of rapid_driver", value_name = "FILE", value_hint = ValueHint::FilePath, conflicts_with_all = ["vid", "pid", "serial", "port", "name", "bit", "slot", "set", "module"])]
     pub import: Option<PathBuf>,
     /// Its `mask_layout.toml`, for the bits
     #[arg(long, help = "Its mask_layout.toml, for the bits", value_name = "FILE", value_hint = ValueHint::FilePath, requires = "import")]

@@ -123,7 +123,7 @@ impl EpisodeCommand {
 pub enum SessionCommand {
     /// Change what the next episodes are of
     #[command(
-        after_long_help = "Examples:\n  rapid session plan --task \"place block\" --tag finger=soft --goal 50\n  rapid session plan --tag finger="
+        after_long_help = "Examples:\n  rapid session plan --task \"place block\" --tag finger=soft --goal 50\n  rapid session plan --tag finger=\n  rapid session plan --module tip_soft"
     )]
     Plan {
         /// Task, part of the file's name
@@ -135,6 +135,9 @@ pub enum SessionCommand {
         /// Episodes wanted; 0 removes the goal
         #[arg(long, value_name = "COUNT")]
         goal: Option<u32>,
+        /// Module that is mounted now, in place of the one in its slot; none: no declared one; repeatable
+        #[arg(long, value_name = "NAME")]
+        module: Vec<String>,
     },
     /// End the session: close its file and delete what was discarded
     #[command(after_long_help = "Examples:\n  rapid session end")]
@@ -145,7 +148,7 @@ impl SessionCommand {
     /// The request to the session.
     pub fn into_request(self) -> SessionRequest {
         match self {
-            Self::Plan { task, tag, goal } => SessionRequest::Plan { task, tags: tag, goal },
+            Self::Plan { task, tag, goal, module } => SessionRequest::Plan { task, tags: tag, goal, modules: module },
             Self::End => SessionRequest::EndSession,
         }
     }

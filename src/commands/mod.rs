@@ -20,6 +20,7 @@ pub mod inspect;
 pub mod list;
 pub mod logs;
 pub mod mask;
+pub mod modules;
 pub mod monitor;
 pub mod plot;
 pub mod progress;

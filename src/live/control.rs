@@ -140,7 +140,7 @@ fn plan(parameters: Vec<Parameter>) -> Option<SessionRequest> {
             _ => {}
         }
     }
-    (task.is_some() || !tags.is_empty()).then_some(SessionRequest::Plan { task, tags, goal: None })
+    (task.is_some() || !tags.is_empty()).then_some(SessionRequest::Plan { task, tags, goal: None, modules: Vec::new() })
 }
 
 fn texts(dict: BTreeMap<String, ParameterValue>) -> impl Iterator<Item = (String, String)> {

@@ -152,7 +152,7 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
 /// [`CONFIGURATION`] in the metadata of an episode's beginning.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub(super) struct Configuration {
-    /// Mounted modules: those declared, and those whose sensors are all present.
+    /// Mounted modules: those declared, and those whose sensors are all present and of no other module.
     pub(super) modules: Vec<String>,
     /// Modalities whose bits are set when the episode begins, ascending by bit.
     pub(super) present: Vec<String>,
@@ -174,7 +174,13 @@ impl Configuration {
             tags: tags.to_vec(),
         };
         for module in &registry.modules {
-            let sensed = !module.devices.is_empty() && module.devices.iter().all(is_present);
+            // One that shares a sensor with another is not known by it.
+            let is_shared = |name: &String| {
+                registry.modules.iter().any(|other| other.name != module.name && other.devices.contains(name))
+            };
+            let sensed = !module.devices.is_empty()
+                && module.devices.iter().all(is_present)
+                && !module.devices.iter().any(is_shared);
             if !sensed && !report.contains(&module.name) {
                 continue;
             }
@@ -209,5 +215,12 @@ mod tests {
         assert_eq!(of(&[], &[], 0b011), "tactile | cam_wrist tactile_tip | finger=tactile");
         assert_eq!(of(&["soft"], &[], 0b001), "soft | cam_wrist | finger=soft colour=red");
         assert_eq!(of(&["soft"], &[("finger", "mine")], 0), "soft |  | finger=mine colour=red");
+        // Two mounts for one camera: which of them carries it is declared.
+        let mounts = "[module.straight]\nslot = \"top\"\ntags = [\"wrist=straight\"]\ndevices = [\"cam_wrist\"]\n\
+            [module.angled]\nslot = \"top\"\ntags = [\"wrist=angled\"]\ndevices = [\"cam_wrist\"]\n";
+        let registry = Registry::parse(&format!("{}{mounts}", crate::registry::BUILTIN), None).unwrap().registry;
+        let of = |report: &[String]| Configuration::of(&registry, report, &[], PhysicalMask(0b001)).modules;
+        assert_eq!(of(&[]), Vec::<String>::new());
+        assert_eq!(of(&["angled".to_owned()]), ["angled"]);
     }
 }

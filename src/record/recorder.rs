@@ -155,8 +155,8 @@ pub struct Recorder {
 pub struct RecorderAddition {
     /// What may be recorded from now on.
     pub registry: Arc<Registry>,
-    /// Its samples.
-    pub subscription: Subscription,
+    /// Its samples; `None` if only modules are added.
+    pub subscription: Option<Subscription>,
 }
 
 impl Recorder {
@@ -356,7 +356,9 @@ impl Writer {
     fn turn(&mut self, source: &mut impl Source) -> ControlFlow<()> {
         fault::point("writer");
         while let Ok(RecorderAddition { registry, subscription }) = self.added.try_recv() {
-            source.add(subscription);
+            if let Some(subscription) = subscription {
+                source.add(subscription);
+            }
             self.config.registry = registry;
         }
         if let Err(error) = source.wait(TURN) {

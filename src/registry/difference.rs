@@ -15,6 +15,8 @@ use super::spec::{
 pub struct Difference {
     /// Entries that a run can take over, ascending by bit.
     pub added: Vec<DeviceSpec>,
+    /// Names of modules that a run can take over.
+    pub modules: Vec<String>,
     /// What it cannot take over: one line each, what and why.
     pub needs_restart: Vec<String>,
 }
@@ -40,7 +42,10 @@ impl Difference {
                 None => found.added.push(device.clone()),
             }
         }
-        found.list(modules, &new.modules, "[module]", |module: &ModuleSpec| &module.name);
+        let is_added = |module: &&ModuleSpec| modules.iter().all(|other| other.name != module.name);
+        let (added, kept): (Vec<_>, Vec<_>) = new.modules.iter().cloned().partition(|module| is_added(&module));
+        found.modules = added.into_iter().map(|module| module.name).collect();
+        found.list(modules, &kept, "[module]", |module: &ModuleSpec| &module.name);
         found.list(stops, &new.stops, "[stop]", |stop: &InterlockSpec| &stop.name);
         found.list(buttons, &new.buttons, "[button]", |button: &ButtonSpec| &button.name);
         found

@@ -22,6 +22,13 @@ pub enum Setting {
     Typed(String),
 }
 
+impl Setting {
+    /// As a person would type it: TOML that evaluates to it.
+    pub fn typed(&self) -> String {
+        value(self).to_string()
+    }
+}
+
 /// An entry to be added.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewEntry {
@@ -62,11 +69,13 @@ pub enum EditError {
 /// # Errors
 /// When a key is invalid, or is given twice with different meanings.
 pub fn append(text: &str, entries: &[NewEntry]) -> Result<String, EditError> {
-    let mut added = String::new();
-    for entry in entries {
-        added.push('\n');
-        added.push_str(&written(entry)?);
-    }
+    let parts: Vec<String> = entries.iter().map(written).collect::<Result<_, _>>()?;
+    Ok(append_lines(text, &parts))
+}
+
+/// `text` with these parts at its end, each after an empty line.
+pub fn append_lines(text: &str, parts: &[String]) -> String {
+    let added: String = parts.iter().flat_map(|part| ["\n", part]).collect();
     let mut new = text.to_owned();
     if !new.is_empty() && !new.ends_with('\n') {
         new.push('\n');
@@ -78,7 +87,25 @@ pub fn append(text: &str, entries: &[NewEntry]) -> Result<String, EditError> {
     } else {
         new.push_str(added);
     }
-    Ok(new)
+    new
+}
+
+/// The lines of a `[module.NAME]`, including line ends.
+///
+/// # Errors
+/// Never: each value is a text or a list of texts.
+pub fn module(name: &str, slot: &str, tags: &[String], devices: &[String]) -> Result<String, EditError> {
+    let mut table = Table::new();
+    put(&mut table, "slot", &Setting::Text(slot.to_owned()))?;
+    for (key, texts) in [("tags", tags), ("devices", devices)].into_iter().filter(|(_, texts)| !texts.is_empty()) {
+        table.insert(key, Item::Value(texts.iter().map(String::as_str).collect::<Value>()));
+    }
+    let mut modules = Table::new();
+    modules.set_implicit(true);
+    modules.insert(name, Item::Table(table));
+    let mut document = DocumentMut::new();
+    document.insert("module", Item::Table(modules));
+    Ok(format!("{}\n", document.to_string().trim_matches('\n')))
 }
 
 /// The lines of one entry, including line ends.

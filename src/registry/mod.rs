@@ -7,6 +7,7 @@
 pub mod ablation;
 pub mod artifacts;
 pub mod candidate;
+pub mod catalogue;
 mod diagnostic;
 mod difference;
 pub mod edit;

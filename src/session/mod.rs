@@ -235,7 +235,7 @@ impl Session {
                 Ok((Answer::Now(text), vec![Effect::Save]))
             }
             SessionRequest::Plan { task: Some(task), .. } if task.trim().is_empty() => Err(Refusal::NoTask),
-            SessionRequest::Plan { task, tags, goal } => Ok(self.change_plan(task.as_deref(), tags, *goal)),
+            SessionRequest::Plan { task, tags, goal, .. } => Ok(self.change_plan(task.as_deref(), tags, *goal)),
             SessionRequest::EndSession => self.end_session(),
             SessionRequest::Show => {
                 let shown = Shown { event: "session", session: &self.status() };

@@ -69,6 +69,9 @@ pub enum SessionRequest {
         /// How many episodes are wanted; 0 removes the goal.
         #[serde(default)]
         goal: Option<u32>,
+        /// Modules to mount, each in place of the one in its slot; `none` dismounts those that were declared.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        modules: Vec<String>,
     },
     /// End the session: its file is closed, and its trash is emptied.
     EndSession,

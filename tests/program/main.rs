@@ -30,6 +30,7 @@ mod lan_hostile;
 mod lan_mdns;
 mod list;
 mod many_devices;
+mod modules;
 mod nodes;
 mod plot;
 mod process;

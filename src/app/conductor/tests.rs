@@ -76,7 +76,8 @@ impl Bench {
         let (keys, requests) = mpsc::unbounded_channel();
         let episode = EpisodeRequest { out: out.path().to_owned(), ..EpisodeRequest::default() };
         let plan = Plan { task: "test".to_owned(), ..plan };
-        let collection = Collection::new(recorder, episode, plan, true, &board).unwrap();
+        let collection =
+            Collection::new(recorder, episode, plan, true, (&board, watch::channel(Vec::new()).1)).unwrap();
         let conductor = Conductor {
             found: tokio::sync::mpsc::unbounded_channel(),
             events: board.events(),
@@ -357,7 +358,8 @@ async fn the_file_of_an_earlier_session_is_kept_whenever_this_one_gets_its_own()
         let recorder = Recorder::spawn(Quiet, RecorderConfig::new(registry, Arc::clone(&board))).unwrap();
         let episode = EpisodeRequest { out: out.path().to_owned(), ..EpisodeRequest::default() };
         let plan = Plan { task: "now".to_owned(), ..Plan::default() };
-        let mut collection = Collection::new(recorder, episode, plan, is_kept, &board).unwrap();
+        let mut collection =
+            Collection::new(recorder, episode, plan, is_kept, (&board, watch::channel(Vec::new()).1)).unwrap();
         collection.start().await.unwrap();
         let label = SessionRequest::Label { episode: None, label: Label::Success, reason: String::new() };
         collection.request(&label, Stamp::now(), None).await.unwrap();

@@ -17,6 +17,7 @@ use tokio::time::{Instant, timeout_at};
 
 use self::fields::{Selection, choose, identity, name, node, settings, slot};
 use super::artifacts::ArtifactsError;
+use super::modules::{self, ModulesError};
 use super::{Format, artifacts};
 use crate::cli::{RegisterArgs, UnregisterArgs};
 use crate::device::{Attachment, DeviceNode};
@@ -70,6 +71,20 @@ pub enum RegisterError {
     /// The registry is written, its artifacts are not.
     #[error("the registry is written, its artifacts are not: {0}")]
     Artifacts(#[from] ArtifactsError),
+    /// The type of module.
+    #[error(transparent)]
+    Module(#[from] ModulesError),
+    /// The registry has a module of this name.
+    #[error("[module.{0}] is in the registry already: give the new one another name with --name")]
+    HasModule(String),
+    /// Each of its sensors needs a unit of its own.
+    #[error("module {name} has {} sensors without an entry ({}): register each, then the module", sensors.len(), sensors.join(", "))]
+    SeveralSensors {
+        /// The type of module.
+        name: String,
+        /// Their names.
+        sensors: Vec<String>,
+    },
     /// The file to import.
     #[error(transparent)]
     Import(#[from] ImportError),
@@ -100,8 +115,17 @@ pub async fn register(
     let units = unregistered(target.registry.as_ref(), attached);
     if let Some(file) = &args.import {
         let entries = import::read(file, args.layout.as_deref(), args.node.as_deref(), attached, target)?;
-        return commit(target, &entries, talk.as_mut(), args, format, out);
+        return commit(target, &entries, &[], talk.as_mut(), args, format, out);
     }
+    let module = args.module.as_deref().map(|name| Mounting::of(name, args, target)).transpose()?;
+    let module = match module {
+        Some(Mounting { entry: None, text, .. }) => {
+            return commit(target, &[], &[text], talk.as_mut(), args, format, out);
+        }
+        module => module,
+    };
+    let args = module.as_ref().and_then(|module| module.entry.as_ref()).unwrap_or(args);
+    let parts: Vec<String> = module.iter().map(|module| module.text.clone()).collect();
     let unit = match choose(&units, args, talk.as_mut(), format, out)? {
         Selection::Nothing => return Ok(()),
         Selection::NotPlugged => None,
@@ -138,7 +162,52 @@ pub async fn register(
             }
         }
     }
-    commit(target, &[entry], talk.as_mut(), args, format, out)
+    commit(target, &[entry], &parts, talk.as_mut(), args, format, out)
+}
+
+/// A module that is to be added.
+struct Mounting {
+    /// The arguments by which an entry is made for its sensor; `None` if it has none, or all of them have entries.
+    entry: Option<RegisterArgs>,
+    /// The lines of its table.
+    text: String,
+}
+
+impl Mounting {
+    /// Of this type. `--name` is the name of the module and of its sensor.
+    fn of(name: &str, args: &RegisterArgs, target: &Target) -> Result<Self, RegisterError> {
+        let descriptor = modules::descriptor(name)?;
+        let registry = target.registry.as_ref();
+        let module = args.name.clone().unwrap_or_else(|| descriptor.name.clone());
+        if registry.is_some_and(|registry| registry.modules.iter().any(|other| other.name == module)) {
+            return Err(RegisterError::HasModule(module));
+        }
+        let is_new = |sensor: &str| registry.is_none_or(|registry| registry.named(sensor).is_none());
+        let new: Vec<_> =
+            descriptor.sensors.iter().filter(|(sensor, _)| args.name.is_some() || is_new(sensor)).collect();
+        let mut devices = descriptor.devices.clone();
+        let entry = match new.as_slice() {
+            [] => None,
+            [(sensor, keys)] => {
+                let own = args.name.clone().unwrap_or_else(|| sensor.clone());
+                devices.iter_mut().filter(|device| *device == sensor).for_each(|device| device.clone_from(&own));
+                let node = keys.iter().find_map(|(key, value)| match value {
+                    Setting::Text(node) if key == "node" => Some(node.clone()),
+                    _ => None,
+                });
+                let set = keys.iter().filter(|(key, _)| key != "node").map(|(key, value)| (key.clone(), value.typed()));
+                let set = set.chain(args.set.iter().cloned()).collect();
+                let slot = Some(descriptor.mount.to_string());
+                Some(RegisterArgs { name: Some(own), node, slot, set, ..args.clone() })
+            }
+            several => {
+                let sensors = several.iter().map(|(sensor, _)| sensor.clone()).collect();
+                return Err(RegisterError::SeveralSensors { name: descriptor.name, sensors });
+            }
+        };
+        let text = edit::module(&module, descriptor.mount.word(), &descriptor.tags, &devices)?;
+        Ok(Self { entry, text })
+    }
 }
 
 /// Removes an entry.
@@ -193,14 +262,16 @@ pub fn unregister(
 fn commit(
     target: &Target,
     entries: &[NewEntry],
+    more: &[String],
     talk: Option<&mut Dialogue<'_>>,
     args: &RegisterArgs,
     format: Format,
     out: &mut dyn Write,
 ) -> Result<(), RegisterError> {
-    let new = edit::append(&target.base(), entries)?;
+    let mut written: Vec<String> = entries.iter().map(edit::written).collect::<Result<_, _>>()?;
+    written.extend_from_slice(more);
+    let new = edit::append_lines(&target.base(), &written);
     let parsed = target.parse(&new).map_err(RegisterError::Refused)?;
-    let written: Vec<String> = entries.iter().map(edit::written).collect::<Result<_, _>>()?;
     let shown = written.join("\n");
     if let Some(talk) = talk.filter(|_| !args.yes && !args.dry_run) {
         talk.print(&format!("\n{shown}"))?;
@@ -235,6 +306,11 @@ fn commit(
             entry: text,
             dry_run: args.dry_run,
         };
+        writeln!(out, "{}", text::json(&line).map_err(io::Error::from)?)?;
+    }
+    for module in more {
+        let line = serde_json::json!({ "event": "registered_module", "file": target.path.to_string_lossy(),
+            "entry": module, "dry_run": args.dry_run });
         writeln!(out, "{}", text::json(&line).map_err(io::Error::from)?)?;
     }
     Ok(())

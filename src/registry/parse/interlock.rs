@@ -186,8 +186,10 @@ fn module(name: &str, section: &Section<'_>, drafts: &[Draft<'_>], earlier: &[Mo
             let message = format!("slot of [device.{device}] is {own}, and of its module {mount}");
             section.report("slot", message, "write the same slot in both, or in the module alone");
         }
-        if let Some(other) = earlier.iter().find(|other| other.devices.contains(device)) {
-            let message = format!("[device.{device}] is a sensor of [module.{}] already", other.name);
+        // Of one slot, one is mounted at a time: which of them has the sensor is named.
+        let elsewhere = |other: &&ModuleSpec| other.devices.contains(device) && Some(other.mount) != mount;
+        if let Some(other) = earlier.iter().find(elsewhere) {
+            let message = format!("[device.{device}] is a sensor of [module.{}] already, in another slot", other.name);
             section.report("devices", message, "name it in one of the two");
         }
     }

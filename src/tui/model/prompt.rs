@@ -190,7 +190,9 @@ impl Model {
         let request = match question {
             Question::Note => SessionRequest::Note { episode, text },
             Question::WhyFailed => SessionRequest::Label { episode, label: Label::Failure, reason: text },
-            Question::Task => SessionRequest::Plan { task: Some(text), tags: Vec::new(), goal: None },
+            Question::Task => {
+                SessionRequest::Plan { task: Some(text), tags: Vec::new(), goal: None, modules: Vec::new() }
+            }
             Question::Search => {
                 self.log.search = text;
                 return Effect::None;

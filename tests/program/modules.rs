@@ -1,0 +1,106 @@
+//! The module catalogue: listed, added to a registry, taken over by a run and mounted while it runs.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+
+use crate::support::{Episode, Place, until};
+use serde_json::Value;
+
+const SCENARIO: &str =
+    "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"spare\"\nlike = \"tactile_tip\"\nserial = \"SPARE1\"\n";
+
+fn ok(place: &Place, options: &[&str]) -> String {
+    let output = place.run(options);
+    let (text, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{options:?}: {text}{errors}");
+    text.into_owned()
+}
+
+fn refused(place: &Place, options: &[&str]) -> String {
+    let output = place.run(options);
+    assert_eq!(output.status.code(), Some(2), "{options:?}: {}", String::from_utf8_lossy(&output.stdout));
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[test]
+fn a_type_of_module_is_taken_up_and_mounted_while_the_rig_runs() {
+    let place = Place::new();
+    place.write("devices.toml", include_str!("../../devices.toml"));
+    place.write("scenario.toml", SCENARIO);
+    let running =
+        place.start(&["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out"], "streaming");
+    let sim = ["--sim", "scenario.toml"];
+    ok(&place, &[&["register", "--module", "tip_tactile", "--serial", "SPARE1"][..], &sim].concat());
+    ok(&place, &["register", "--module", "handheld_adapter"]);
+    ok(&place, &["register", "--module", "robot_adapter"]);
+    let taken = ok(&place, &["reload"]);
+    assert!(taken.contains("[device.tip_tactile] as bit 3") && taken.contains("[module.handheld_adapter]"), "{taken}");
+    until("the fingertip", || ok(&place, &["mask"]).contains("0x09"));
+    let mut recorded = Vec::new();
+    for module in ["handheld_adapter", "robot_adapter", "none"] {
+        let planned = ok(&place, &["session", "plan", "--module", module]);
+        assert_eq!(planned.contains(&format!("with {module}")), module != "none", "{planned}");
+        recorded.push(ok(&place, &["episode", "next"]));
+    }
+    let unknown = place.run(&["session", "plan", "--module", "tip_sofd"]);
+    assert!(String::from_utf8_lossy(&unknown.stderr).contains("no [module.tip_sofd] in the registry"));
+    ok(&place, &["episode", "stop"]);
+    drop(running);
+    let files: Vec<_> = place.episodes("out").into_iter().filter(|name| name.ends_with("mcap")).collect();
+    let of = |file: &String| {
+        let episode = Episode::read(&place.path("out").join(file));
+        let configuration: Value = serde_json::from_str(episode.value("rapid", "configuration")).expect("JSON");
+        let tags = episode.value("rapid", "tags").to_owned();
+        (configuration["modules"].clone(), tags)
+    };
+    let found: Vec<_> = files.iter().map(of).collect();
+    assert_eq!(found.len(), 4, "{files:?}, {recorded:?}");
+    assert_eq!(found[1].0, serde_json::json!(["tip_tactile", "handheld_adapter"]), "{found:?}");
+    assert!(found[1].1.contains("handheld") && found[1].1.contains("tactile"), "{found:?}");
+    assert_eq!(found[2].0, serde_json::json!(["tip_tactile", "robot_adapter"]), "{found:?}");
+    assert_eq!(found[3].0, serde_json::json!(["tip_tactile"]), "{found:?}");
+}
+
+#[test]
+fn the_catalogue_is_listed_and_a_file_describes_a_type_of_ones_own() {
+    let place = Place::new();
+    let rig = include_str!("../../devices.toml");
+    place.write("devices.toml", rig);
+    let listed = ok(&place, &["modules"]);
+    assert_eq!(listed.lines().filter(|line| line.contains(" tip ") || line.contains(" top ")).count(), 5, "{listed}");
+    let lines = ok(&place, &["modules", "--json"]);
+    assert_eq!(lines.lines().count(), 9, "{lines}");
+    // The angled mount carries the camera of the other one.
+    let adapter = ["--vid", "2672", "--pid", "0059", "--serial", "C3441325012345"];
+    ok(&place, &[&["register", "--module", "wrist_mount"][..], &adapter].concat());
+    ok(&place, &["register", "--module", "wrist_mount_angled"]);
+    ok(&place, &["check"]);
+    assert!(ok(&place, &["modules"]).contains("* wrist_mount_angled"));
+    // A type of one's own, and twice.
+    let tip = ok(&place, &["modules", "tip_tactile"]).replace("tip_tactile", "tip_thermal").replace("320", "160");
+    place.write("thermal.toml", &tip);
+    let unit = |serial: &'static str| ["--vid", "2bc5", "--pid", "0502", "--serial", serial];
+    ok(&place, &[&["register", "--module", "./thermal.toml"][..], &unit("T1")].concat());
+    ok(&place, &[&["register", "--module", "thermal.toml", "--name", "thermal_left"][..], &unit("T2")].concat());
+    let text = std::fs::read_to_string(place.path("devices.toml")).expect("a file");
+    assert!(text.starts_with(rig), "what was there has changed");
+    assert!(text.contains("[device.thermal_left.camera]"), "{}", &text[rig.len()..]);
+    assert!(text.matches("width = 160").count() == 2, "{}", &text[rig.len()..]);
+    assert!(
+        text.contains(
+            "[module.thermal_left]\nslot = \"tip\"\ntags = [\"finger=tactile\"]\ndevices = [\"thermal_left\"]"
+        )
+    );
+    // What is refused changes nothing.
+    place.write("wrong.toml", "[module.a]\nslot = \"side\"\n");
+    for (options, why) in [
+        (["register", "--module", "wrist_mount"], "[module.wrist_mount] is in the registry already"),
+        (["register", "--module", "tip_sofd"], "did you mean \"tip_soft\"?"),
+        (["register", "--module", "wrong.toml"], "its slot is none of front"),
+        (["register", "--module", "missing.toml"], "missing.toml"),
+        (["modules", "--json", "tip_sofd"], "tip_sofd"),
+    ] {
+        let errors = refused(&place, &options);
+        assert!(errors.contains(why), "{options:?}: {errors}");
+    }
+    assert_eq!(std::fs::read_to_string(place.path("devices.toml")).expect("a file"), text);
+}
