@@ -219,7 +219,7 @@ fn camera(modes: &[Mode], first: u32, given: Option<Records>, store: &mut Pictur
     for mode in modes {
         let size @ (width, height) = (mode.width, mode.height);
         let pictures = match (mode.format, &given, store.get(&size)) {
-            (Format::Yuyv, ..) => Pictures::default(),
+            (Format::Yuyv | Format::Z16, ..) => Pictures::default(),
             (Format::Mjpg, Some(given), _) => {
                 let fits = |jpeg: &Vec<u8>| frame::is_whole_jpeg(jpeg) && jpeg.len() + frame::STAMP <= uvc::room(mode);
                 match given.iter().position(|jpeg| !fits(jpeg)) {

@@ -104,6 +104,8 @@ pub enum Format {
     Mjpg,
     /// YUV 4:2:2, packed.
     Yuyv,
+    /// Distances of 16 bits.
+    Z16,
 }
 
 /// A specification that cannot be read.
@@ -295,7 +297,9 @@ impl FromStr for DeviceSpec {
                 ("manufacturer", _) => spec.identity.manufacturer = string()?,
                 ("feed", _) => spec.feed = string()?,
                 ("mode", Kind::Uvc(modes)) if modes.len() < MODES => {
-                    modes.push(parse_mode(value).ok_or_else(|| wrong("FORMAT-WxH@FPS[/FPS..], FORMAT MJPG or YUYV"))?);
+                    modes.push(
+                        parse_mode(value).ok_or_else(|| wrong("FORMAT-WxH@FPS[/FPS..], FORMAT MJPG, YUYV or Z16"))?,
+                    );
                 }
                 ("motor", Kind::Can { motors, .. }) if motors.len() < MODES => {
                     let expected = "SLAVE/MASTER/TYPE, ids in hexadecimal, such as 5/15/DMH3510";
@@ -346,6 +350,7 @@ fn parse_mode(text: &str) -> Option<Mode> {
     let format = match format {
         "MJPG" => Format::Mjpg,
         "YUYV" => Format::Yuyv,
+        "Z16" => Format::Z16,
         _ => return None,
     };
     let fps: Vec<u32> =
@@ -362,6 +367,7 @@ impl fmt::Display for Format {
         f.write_str(match self {
             Self::Mjpg => "MJPG",
             Self::Yuyv => "YUYV",
+            Self::Z16 => "Z16",
         })
     }
 }

@@ -23,6 +23,8 @@ const INTERVALS_PER_SECOND: u32 = 10_000_000;
 
 const GUID_YUYV: [u8; 16] = [b'Y', b'U', b'Y', b'2', 0, 0, 0x10, 0, 0x80, 0, 0, 0xaa, 0, 0x38, 0x9b, 0x71];
 
+const GUID_Z16: [u8; 16] = [b'Z', b'1', b'6', b' ', 0, 0, 0x10, 0, 0x80, 0, 0, 0xaa, 0, 0x38, 0x9b, 0x71];
+
 /// The pictures of one size, encoded once and shared by all cameras of that size.
 pub type Pictures = std::sync::Arc<Vec<Vec<u8>>>;
 
@@ -179,7 +181,8 @@ impl Uvc {
         let place = self.next_frame.wrapping_sub(self.first_frame) as usize;
         match mode.format {
             Format::Mjpg => frame::stamp_jpeg(&pictures[place % pictures.len()], id, out),
-            Format::Yuyv => frame::stamp_yuyv(mode.width, mode.height, id, frame::light(), out),
+            // As many bytes, of which the first are its identity.
+            Format::Yuyv | Format::Z16 => frame::stamp_yuyv(mode.width, mode.height, id, frame::light(), out),
         }
     }
 
@@ -263,8 +266,9 @@ impl FormatGroup {
                 out.push(&[CS_INTERFACE, 6, index, count, 1, 1, 0, 0, 0, 0]);
                 7
             }
-            Format::Yuyv => {
-                out.push(&[&[CS_INTERFACE, 4, index, count], &GUID_YUYV[..], &[16, 1, 0, 0, 0, 0]].concat());
+            Format::Yuyv | Format::Z16 => {
+                let guid = if self.format == Format::Z16 { &GUID_Z16 } else { &GUID_YUYV };
+                out.push(&[&[CS_INTERFACE, 4, index, count], &guid[..], &[16, 1, 0, 0, 0, 0]].concat());
                 5
             }
         };

@@ -36,6 +36,19 @@ fps = 15
 format = "YUYV"
 controls = { contrast = 60 }
 
+[device.cam_depth]
+vid = "8086"
+pid = "0b07"
+serial = "Z1"
+node = "camera"
+topic = "/rapid/camera/depth"
+bit = 3
+[device.cam_depth.camera]
+width = 320
+height = 240
+fps = 15
+format = "Z16"
+
 [device.force]
 vid = "0x0403"
 pid = "0x6001"
@@ -51,9 +64,9 @@ channels = 4
 "#;
 
 const SCRIPT: &str = r#"
-emu plug 0 1 2 3
-wait_for 60 attached 0 1 2 3 || fail 'not attached'
-wait_for 30 test -e /dev/video2 -a -e /dev/ttyUSB0 -a -e /dev/ttyACM0
+emu plug 0 1 2 3 4
+wait_for 60 attached 0 1 2 3 4 || fail 'not attached'
+wait_for 30 test -e /dev/video4 -a -e /dev/ttyUSB0 -a -e /dev/ttyACM0
 udevadm settle
 # A camera that is not on USB.
 modprobe vivid n_devs=1 node_types=0x1 vid_cap_nr=9 || fail 'no vivid'
@@ -113,6 +126,7 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
         .device(DeviceSpec::uvc(0x2bc5, 0x0501).serial("YUV1").mode(Format::Yuyv, 320, 240, &[15]))
         .device(DeviceSpec::ftdi(0x0403, 0x6001, 50.0).serial("FT1"))
         .device(DeviceSpec::acm(0x2e8a, 0x000a, 10.0).serial("STRANGER"))
+        .device(DeviceSpec::uvc(0x8086, 0x0b07).serial("Z1").mode(Format::Z16, 320, 240, &[15]))
         .registry(REGISTRY)
         .script(SCRIPT)
         .run()
@@ -128,6 +142,7 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
         "STRANGER",
         "MJPG 640x480",
         "YUYV 320x240",
+        "Z16 320x240",
         "Brightness -64..=64 (default 0)",
     ] {
         assert!(listing.contains(word), "{word} not in:\n{listing}");
@@ -151,7 +166,7 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
     for link in ["cam_raw -> ../video", "cam_wide -> ../video", "force -> ../ttyUSB0"] {
         assert!(outcome.file("links").contains(link), "{link} not in:\n{}", outcome.file("links"));
     }
-    assert_eq!(outcome.file("left").split_whitespace().collect::<Vec<_>>(), ["cam_wide"]);
+    assert_eq!(outcome.file("left").split_whitespace().collect::<Vec<_>>(), ["cam_depth", "cam_wide"]);
 
     let failed = outcome.rapid.iter().find(|line| line["device"] == "cam_wide" && line["state"] == "failed");
     let detail = failed.expect("cam_wide has failed")["detail"].as_str().unwrap().to_owned();
@@ -174,5 +189,13 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
     assert_eq!(pictures.len(), episode.topic("/rapid/camera/raw").count(), "some pictures carry no number");
     assert_accounted(&episode, "/rapid/camera/raw", pictures);
     assert_lines(&episode, "/rapid/force");
+    // Distances: `encoding` is field 4.
+    let depths: Vec<&Message> = episode.topic("/rapid/camera/depth").collect();
+    assert!(depths.len() > 10, "{}", depths.len());
+    assert!(depths.iter().all(|message| proto::bytes(&message.data, 4) == b"16UC1"));
+    assert!(depths.iter().all(|message| proto::bytes(&message.data, 6).len() == 2 * 320 * 240));
+    let numbers: Vec<u64> = depths.iter().filter_map(|message| number(message)).collect();
+    assert_eq!(numbers.len(), depths.len(), "some have no number");
+    assert_accounted(&episode, "/rapid/camera/depth", numbers);
     assert_eq!(episode.topic("/rapid/camera/wide").count(), 0);
 }
