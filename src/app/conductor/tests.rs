@@ -1,7 +1,7 @@
 use std::fs::File;
 use std::io;
 
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::super::Signals;

@@ -88,7 +88,8 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
         ),
         ("the rig", RIG.replace("\"1s\"", "\"2s\"").replace("bench", "bank"), &[], &["[rig]: name, cooldown changed"]),
         ("an expectation", RIG.replace("cooldown", "expect = [\"cam\"]\ncooldown"), &[], &["[rig]: expect changed"]),
-        ("a module", RIG.replace("soft_tip", "hard_tip"), &[], &["[module]: soft_tip removed, hard_tip added"]),
+        ("a module", RIG.replace("soft_tip", "hard_tip"), &[], &["[module]: soft_tip removed"]),
+        ("a new module", with("[module.hard]\nslot = \"front\""), &[], &[]),
         (
             "its program",
             spare("node = \"/bin/true\"\nbit = 3\nprocess = { kind = \"bytes\" }"),
@@ -124,7 +125,13 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
             &["[device.cam]: its depth 60 is now"],
         ),
     ] {
-        let Difference { added, needs_restart } = Difference::between(&parsed(RIG), &parsed(&text));
+        let Difference { added, modules, needs_restart } = Difference::between(&parsed(RIG), &parsed(&text));
+        let mountable = match case {
+            "a module" => vec!["hard_tip"],
+            "a new module" => vec!["hard"],
+            _ => Vec::new(),
+        };
+        assert_eq!(modules, mountable, "{case}");
         assert_eq!(added.iter().map(|device| device.id.bit()).collect::<Vec<_>>(), bits, "{case}: {needs_restart:?}");
         let lines = needs_restart.join("\n");
         assert_eq!(needs_restart.is_empty(), reasons.is_empty(), "{case}: {lines}");
