@@ -58,7 +58,7 @@ test: setup ## the whole truth: format, lints, all tests with the virtual bench,
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
 features: ## compile the program with no cargo feature, and with each alone
-	$(TESTED) scripts/features.sh '' export foxglove lan motors policy
+	$(TESTED) scripts/features.sh '' export foxglove lan motors policy web
 
 lint: ## format and clippy
 	cargo fmt --all --check

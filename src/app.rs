@@ -30,6 +30,8 @@ pub(crate) mod signals;
 mod stage;
 mod streaming;
 mod watchdog;
+#[cfg_attr(not(feature = "web"), path = "app/web_absent.rs")]
+mod web;
 
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
@@ -76,6 +78,7 @@ use signals::Signals;
 use stage::Stage;
 use streaming::Streaming;
 use watchdog::Watchdog;
+pub use web::WebOptions;
 
 /// Where devices come from.
 #[derive(Debug)]
@@ -136,6 +139,8 @@ pub struct Options {
     pub group_control: bool,
     /// The Foxglove server, if there is one.
     pub live: Option<LiveOptions>,
+    /// The page, if there is one.
+    pub web: Option<WebOptions>,
 }
 
 /// Where the mask of an instance is published.
@@ -236,6 +241,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         Some(live) => Some(live::listen(live, &registry, &board, &permission, &to_conductor).await?),
         None => None,
     };
+    let web = options.web.map(|options| web::start(&options, &board, &to_conductor)).transpose()?;
     let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let (following, to_recorder, clock) = (recorder.episode(), recorder.additions(), recorder.clock());
@@ -321,6 +327,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         recording,
         inference,
         live,
+        web,
         reload: reload.start(about_registry),
         mask_ended,
         kind,
@@ -388,6 +395,7 @@ struct Running {
     recording: Stage,
     inference: Option<Stage>,
     live: Option<Stage>,
+    web: Option<Stage>,
     reload: Stage,
     mask_ended: CancellationToken,
     kind: Screen,
@@ -429,9 +437,9 @@ async fn finish(
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
         keep_first(&mut outcome, running.discovery.end().await);
-        if let Some(live) = &mut running.live {
+        for server in [&mut running.live, &mut running.web].into_iter().flatten() {
             // The last events are shown by then. It is no reason for the run to fail.
-            let _ = live.end().await;
+            let _ = server.end().await;
         }
         keep_first(&mut outcome, running.reload.end().await);
     };

@@ -28,7 +28,7 @@ pub use measure::{AblationArgs, Calibration, Count, LatencyArgs};
 pub use policy::EvalArgs;
 pub use policy::{InferenceArgs, PolicyArgs, ReplayArgs};
 pub use registry::{RegisterArgs, UnregisterArgs};
-pub use run::{LiveArgs, RunArgs, ShownArgs, TaskArgs};
+pub use run::{LiveArgs, RunArgs, ShownArgs, TaskArgs, WebArgs};
 pub use session::{EpisodeCommand, SessionCommand};
 
 /// Record robot demonstrations with hot-plugged sensors
@@ -74,6 +74,7 @@ Examples:
   rapid --sim                           a first look, without any hardware
   rapid devices                         what is plugged in, and which entry it matches
   rapid                                 the monitor on the real rig
+  rapid --web 0.0.0.0                   also a page for a phone; W shows its link as a QR code
   rapid --headless --record --duration 30s --task \"place block\" --tag finger=soft
   rapid --infer --sim task --duration 20s         a policy sorts a simulated block
   rapid inspect episodes/20260101_place-block_001.mcap

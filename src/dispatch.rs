@@ -6,6 +6,8 @@
 mod live;
 #[cfg_attr(not(feature = "policy"), path = "dispatch/policy_absent.rs")]
 mod policy;
+#[cfg_attr(not(feature = "web"), path = "dispatch/web_absent.rs")]
+mod web;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -410,6 +412,7 @@ fn run(
         instance: global.instance.clone(),
         group_control: args.group_control,
         live: live::options_of(args.live)?,
+        web: web::options_of(&args.web)?,
     };
     Ok(block_on(app::run(options))??)
 }

@@ -1,7 +1,7 @@
 #![doc = include_str!("../docs/architecture.md")]
 // The whole program is linted with all features; with fewer, code that only they use is unused.
 #![cfg_attr(
-    not(all(feature = "foxglove", feature = "lan", feature = "motors", feature = "policy")),
+    not(all(feature = "foxglove", feature = "lan", feature = "motors", feature = "policy", feature = "web")),
     allow(dead_code, unused_imports, unused_variables, clippy::match_same_arms, clippy::needless_pass_by_value)
 )]
 
@@ -55,6 +55,7 @@ pub mod points;
 #[cfg(feature = "policy")]
 pub mod policy;
 pub mod provenance;
+pub mod qr;
 pub mod random;
 pub mod realtime;
 pub mod record;
@@ -69,3 +70,5 @@ pub mod sync;
 pub mod text;
 pub mod time;
 pub mod tui;
+#[cfg(feature = "web")]
+pub mod web;

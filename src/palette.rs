@@ -54,6 +54,11 @@ impl Palette {
         self.wrap("1", text)
     }
 
+    /// `text` as a row of a QR code: white on black, whatever the colours of the terminal are.
+    pub fn code(self, text: &str) -> String {
+        self.wrap("97;40", text)
+    }
+
     /// `text` in the colour of a state.
     pub fn state(self, state: SlotState, text: &str) -> String {
         match state {

@@ -144,6 +144,13 @@ fn shade(count: [u8; 2]) -> u8 {
     }
 }
 
+/// Every n-th pixel of every n-th row of a picture of this height and width: width, height and the pixels.
+pub fn every(step: usize, [height, width]: [usize; 2], rgb: &[u8]) -> (usize, usize, Vec<u8>) {
+    let rows = rgb.chunks_exact((width * CHANNELS).max(1)).step_by(step);
+    let thinned = rows.flat_map(|row| row.chunks_exact(CHANNELS).step_by(step).flatten().copied()).collect();
+    (width.div_ceil(step), height.div_ceil(step), thinned)
+}
+
 /// Two pixels of YUYV in red, green and blue: ITU-R BT.601 of limited range, what V4L2 means by YUYV
 /// unless it states otherwise; coefficients in 1/65536.
 fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {

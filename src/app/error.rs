@@ -15,6 +15,8 @@ use crate::record::RecordError;
 use crate::rig::RigError;
 use crate::rig::presence::PresenceError;
 use crate::tui::TuiError;
+#[cfg(feature = "web")]
+use crate::web::WebError;
 
 /// Why a run could not begin or continue.
 #[derive(Debug, thiserror::Error)]
@@ -44,6 +46,10 @@ pub enum AppError {
     #[cfg(feature = "foxglove")]
     #[error(transparent)]
     Live(#[from] LiveError),
+    /// The page.
+    #[cfg(feature = "web")]
+    #[error(transparent)]
+    Web(#[from] WebError),
     /// The output of a headless run.
     #[error("output: {0}")]
     Output(io::Error),

@@ -10,14 +10,14 @@ pub(super) use crate::live::LiveAddition;
 pub use crate::live::LiveOptions;
 
 use super::AppError;
-use super::requests::Request;
+use super::requests::{Request, asker};
 use super::stage::Stage;
 use crate::bus::Bus;
 use crate::live::{Controls, Feed, Live};
 use crate::permission::Permission;
 use crate::registry::Registry;
 use crate::status::Board;
-use crate::time::{Stamp, WallClock};
+use crate::time::WallClock;
 
 /// Listens, before anything of the run is started: a port in use is an error of the start.
 pub(super) async fn listen(
@@ -27,14 +27,7 @@ pub(super) async fn listen(
     permission: &Arc<Permission>,
     conductor: &UnboundedSender<Request>,
 ) -> Result<Listening, AppError> {
-    let conductor = conductor.clone();
-    let controls = options.control.then(|| Controls {
-        ask: Arc::new(move |request, reply| {
-            // Without a receiver the run is ending; so is then the other end of the answer.
-            let _ = conductor.send(Request::Session(request, Stamp::now(), Some(reply)));
-        }),
-        permission: Arc::clone(permission),
-    });
+    let controls = options.control.then(|| Controls { ask: asker(conductor), permission: Arc::clone(permission) });
     Ok(Listening(Live::listen(options, Arc::clone(registry), Arc::clone(board), controls).await?))
 }
 

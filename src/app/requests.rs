@@ -12,7 +12,7 @@ use super::attached::Attached;
 use super::controls;
 use crate::orders::receive::{Arrival, Wanted};
 use crate::rig::RigCommand;
-use crate::status::session::SessionRequest;
+use crate::status::session::{Asker, SessionRequest};
 use crate::status::{Command, RegistryRequest};
 use crate::time::Stamp;
 
@@ -26,6 +26,15 @@ pub(super) enum Request {
     Session(SessionRequest, Stamp, Reply),
     /// End the run.
     Quit,
+}
+
+/// Passes requests of a server's clients on to the conductor, as made when they arrive.
+pub(super) fn asker(conductor: &mpsc::UnboundedSender<Request>) -> Asker {
+    let conductor = conductor.clone();
+    Arc::new(move |request, reply| {
+        // Without a receiver the run is ending; so is then the other end of the answer.
+        let _ = conductor.send(Request::Session(request, Stamp::now(), Some(reply)));
+    })
 }
 
 /// Sorts requests until the screen, and what receives those of other programs, have ended. Those to the conductor wait in

@@ -9,6 +9,7 @@
 //! | inference       | loads the policy, starts it and joins its threads  | threads `grid` and `policy`                  |
 //! | registry        | takes over entries that are added to the registry  | reads of files, opening of topics            |
 //! | Foxglove        | waits for its thread                               | thread `foxglove`                            |
+//! | page            | waits for its thread                               | thread `web`                                 |
 //!
 //! Recording and inference do not wait for the observations of synchronisation: they apply the same rules
 //! ([`crate::sync`]) at their own ticks, the recorder once the samples in transit have arrived, the policy on its own

@@ -67,6 +67,9 @@ pub struct RunArgs {
     /// What other programs see live.
     #[command(flatten)]
     pub live: LiveArgs,
+    /// The page for a phone.
+    #[command(flatten)]
+    pub web: WebArgs,
     /// How the monitor is shown.
     #[command(flatten)]
     pub shown: ShownArgs,
@@ -89,6 +92,21 @@ pub struct LiveArgs {
     pub foxglove_control: bool,
 }
 
+/// The page for a phone.
+#[derive(Debug, Clone, Args)]
+pub struct WebArgs {
+    /// Serve a page for a phone: bits, pictures, verdict, buttons [default address: 127.0.0.1:8766]
+    ///
+    /// For a phone in the same network: `--web 0.0.0.0`. Such an address needs the link with a token, which the monitor shows
+    /// as a QR code (key W) and a run without a monitor prints. Whoever has the link sees the cameras and begins, ends and
+    /// discards episodes; motors it neither arms nor disarms.
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = web_address, default_missing_value = "127.0.0.1:8766", hide_short_help = true)]
+    pub web: Option<SocketAddr>,
+    /// Keep the page's token in this file, so that links remain valid; rapid writes it
+    #[arg(long, value_name = "FILE", requires = "web", value_hint = ValueHint::FilePath, hide_short_help = true)]
+    pub web_token: Option<PathBuf>,
+}
+
 /// How the monitor is shown.
 #[derive(Debug, Clone, Copy, Args)]
 pub struct ShownArgs {
@@ -108,20 +126,27 @@ pub struct TaskArgs {
     #[arg(long, value_name = "N", default_value_t = 0, hide_short_help = true)]
     pub seed: u64,
     /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
-    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm", "foxglove"], hide_short_help = true)]
+    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm", "foxglove", "web"], hide_short_help = true)]
     pub expert: bool,
     /// Demonstrations to record, one trial each
     #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert", hide_short_help = true)]
     pub episodes: usize,
 }
 
-/// An address to listen on: an IP address and a port, or one of them.
 fn live_address(text: &str) -> Result<SocketAddr, String> {
-    const PORT: u16 = 8765;
+    address(text, 8765)
+}
+
+fn web_address(text: &str) -> Result<SocketAddr, String> {
+    address(text, 8766)
+}
+
+/// An address to listen on: an IP address and a port, or one of them.
+fn address(text: &str, port: u16) -> Result<SocketAddr, String> {
     let address = text.parse().ok();
-    let address = address.or_else(|| Some(SocketAddr::new(text.parse::<IpAddr>().ok()?, PORT)));
+    let address = address.or_else(|| Some(SocketAddr::new(text.parse::<IpAddr>().ok()?, port)));
     let address = address.or_else(|| Some(SocketAddr::from(([127, 0, 0, 1], text.parse().ok()?))));
-    address.ok_or_else(|| "write an IP address and a port, such as 127.0.0.1:8765, or one of them".to_owned())
+    address.ok_or_else(|| format!("write an IP address and a port, such as 127.0.0.1:{port}, or one of them"))
 }
 
 /// The name of a task.

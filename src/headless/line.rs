@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use crate::modality::ModalityId;
 use crate::palette::Palette;
+use crate::qr;
 use crate::status::{DeviceStatus, Event, Snapshot, What};
 use crate::text;
 use crate::time::Stamp;
@@ -28,6 +29,9 @@ struct Begin<'a> {
     stamp: Stamp,
     rig: &'a str,
     devices: Vec<BeginDevice<'a>>,
+    /// To the page of the run.
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    links: &'a [String],
     time: String,
 }
 
@@ -47,6 +51,7 @@ pub(super) fn begin_json(snapshot: &Snapshot, wall_ns: u64) -> serde_json::Resul
         stamp: snapshot.taken,
         rig: &snapshot.rig,
         devices: snapshot.devices.iter().map(device).collect(),
+        links: &snapshot.links,
         time: crate::time::rfc3339(wall_ns),
     })
 }
@@ -72,6 +77,13 @@ impl Columns {
         let names: Vec<_> = snapshot.devices.iter().map(|device| text::plain(&device.name)).collect();
         let rig = self.palette.bold(&text::plain(&snapshot.rig));
         format!("{time}  rig {rig} looks for {}; ctrl-c ends the run", names.join(", "))
+    }
+
+    /// The links to the page of the run, as lines; with `code` the first also as a QR code.
+    pub(super) fn links(self, links: &[String], code: bool) -> Vec<String> {
+        let code = links.first().filter(|_| code).and_then(|link| qr::half_blocks(link)).unwrap_or_default();
+        let code = code.iter().map(|row| self.palette.code(row));
+        links.iter().map(|link| format!("page: {link}")).chain(code).collect()
     }
 
     /// An event as a line; without a line end.

@@ -155,15 +155,15 @@ impl Printer {
         outlet.finish(LAST).await
     }
 
-    /// The start of the output: the rig and its modalities.
+    /// The start of the output: the rig, its modalities and its page.
     fn opening(&mut self, snapshot: &Snapshot) -> io::Result<String> {
         let wall_ns = self.wall.wall_ns(snapshot.taken);
-        let line = if self.options.json {
-            line::begin_json(snapshot, wall_ns)?
-        } else {
-            self.columns.begin(snapshot, wall_ns)
-        };
-        Ok(self.whole_line(&line))
+        if self.options.json {
+            return Ok(self.whole_line(&line::begin_json(snapshot, wall_ns)?));
+        }
+        let begin = self.columns.begin(snapshot, wall_ns);
+        let links = self.columns.links(&snapshot.links, self.options.in_place);
+        Ok([begin].iter().chain(&links).map(|line| self.whole_line(line)).collect())
     }
 
     fn event(&mut self, event: &Event) -> io::Result<String> {

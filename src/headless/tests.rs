@@ -248,6 +248,24 @@ fn json_is_the_event_with_its_wall_time() {
 }
 
 #[test]
+fn the_link_to_the_page_is_printed_and_on_a_terminal_also_as_a_code() {
+    let mut snapshot = three_streaming();
+    snapshot.links = vec!["http://192.168.1.20:8766/#0123456789abcdefghijkl".to_owned(), "http://10.0.0.7/".to_owned()];
+    let opening = |options| Printer::new(&snapshot, options).opening(&snapshot).unwrap();
+    let lines = opening(HeadlessOptions::default());
+    assert_eq!(
+        lines.lines().skip(1).collect::<Vec<_>>(),
+        snapshot.links.iter().map(|link| format!("page: {link}")).collect::<Vec<_>>()
+    );
+    let code = opening(HeadlessOptions { in_place: true, ..HeadlessOptions::default() });
+    assert_eq!(code.lines().count(), 3 + 17, "{code}");
+    assert!(code.contains("██ ▄▄▄▄▄ █"), "{code}");
+    let json: Value =
+        serde_json::from_str(&opening(HeadlessOptions { json: true, ..HeadlessOptions::default() })).unwrap();
+    assert_eq!(json["links"], serde_json::json!(snapshot.links));
+}
+
+#[test]
 fn a_run_begins_with_its_modalities() {
     let snapshot = three_streaming();
     let columns = line::Columns { name: 9, palette: Palette::Plain };

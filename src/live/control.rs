@@ -14,11 +14,8 @@ use foxglove::websocket::{
 use tokio::sync::oneshot;
 
 use crate::permission::Permission;
-use crate::status::session::SessionRequest;
+use crate::status::session::{Asker, SessionRequest};
 use crate::time::Stamp;
-
-/// Passes a request to the session on; the answer is what was done, or why it was refused.
-pub type Asker = Arc<dyn Fn(SessionRequest, oneshot::Sender<Result<String, String>>) + Send + Sync>;
 
 /// What clients may request.
 #[derive(Clone)]

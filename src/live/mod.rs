@@ -29,7 +29,7 @@ use tokio::sync::{oneshot, watch};
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
-pub use control::{Asker, Controls};
+pub use control::Controls;
 use topics::Topics;
 
 use crate::bus::{BusError, Queues, Subscription};
@@ -96,7 +96,7 @@ fn fix(error: &io::Error) -> &'static str {
     match error.kind() {
         io::ErrorKind::AddrInUse => {
             ": another program listens there, perhaps another rapid; end it, or name another port: \
-             --foxglove 127.0.0.1:8766"
+             --foxglove 127.0.0.1:8767"
         }
         io::ErrorKind::AddrNotAvailable => ": this machine has no such address; `ip address` lists those that it has",
         io::ErrorKind::PermissionDenied => ": ports below 1024 are for root; name another",

@@ -22,7 +22,7 @@ use super::{
 };
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use crate::registry::{DeviceSpec, InterlockSpec, Registry};
 use crate::sample::{Epoch, SampleHeader};
 use crate::text;
@@ -162,6 +162,7 @@ pub struct Board {
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     session: Mutex<Option<SessionStatus>>,
     disk_free: Mutex<Option<u64>>,
+    links: Mutex<Vec<String>>,
     simulated: AtomicBool,
     last_end: Mutex<Option<EpisodeEnd>>,
     episodes: Mutex<EpisodeCounts>,
@@ -180,6 +181,7 @@ struct Entry {
     id: ModalityId,
     name: String,
     topic: String,
+    kind: ModalityKind,
     nominal_hz: Option<f64>,
     detail: StaticDetail,
 }
@@ -191,6 +193,7 @@ impl Entry {
             id: *id,
             name: name.clone(),
             topic: topic.clone(),
+            kind: device.node.modality_kind(),
             nominal_hz: verdict.hz,
             detail: StaticDetail::of(device),
         }
@@ -219,6 +222,7 @@ impl Board {
             last_episode: Mutex::new(None),
             session: Mutex::new(None),
             disk_free: Mutex::new(None),
+            links: Mutex::new(Vec::new()),
             simulated: AtomicBool::new(false),
             last_end: Mutex::new(None),
             episodes: Mutex::new(EpisodeCounts::default()),
@@ -331,6 +335,11 @@ impl Board {
         *lock(&self.disk_free) = free;
     }
 
+    /// Reports the links to the page of this run, the likeliest first.
+    pub fn set_links(&self, links: Vec<String>) {
+        *lock(&self.links) = links;
+    }
+
     /// Adds a line to the log, now. The device that it is about is the one with which it begins.
     pub fn log(&self, level: Level, text: &str) {
         self.write(level, text, (self.device_in(text).as_deref(), None));
@@ -419,6 +428,16 @@ impl Board {
         previews.extend(Preview::of(id, header, payload).map(Arc::new));
     }
 
+    /// The newest sample of a device that is looked at, if there is one.
+    pub fn newest_preview(&self, id: ModalityId) -> Option<Arc<Preview>> {
+        lock(&self.previews).iter().find(|preview| preview.device == id).cloned()
+    }
+
+    /// The modalities whose samples are pictures.
+    pub fn cameras(&self) -> Vec<ModalityId> {
+        lock(&self.entries).iter().filter(|entry| entry.kind == ModalityKind::Image).map(|entry| entry.id).collect()
+    }
+
     /// The node of a device that was opened.
     pub fn node(&self, id: ModalityId) -> Option<String> {
         lock(&self.opened).get(id.index())?.as_ref().map(|opened| opened.node.clone())
@@ -496,6 +515,7 @@ impl Board {
             last_verdict,
             session: lock(&self.session).clone(),
             disk_free: *lock(&self.disk_free),
+            links: lock(&self.links).clone(),
             simulated: self.simulated.load(Ordering::Relaxed),
             log: lock(&self.log).lines.iter().cloned().collect(),
             details: self.details(taken),

@@ -62,6 +62,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         last_verdict: None,
         session: None,
         disk_free: None,
+        links: Vec::new(),
         simulated: false,
         log: Vec::new(),
         details: Vec::new(),

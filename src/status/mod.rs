@@ -266,6 +266,9 @@ pub struct Snapshot {
     pub session: Option<SessionStatus>,
     /// Free space on the disk of the episodes, bytes.
     pub disk_free: Option<u64>,
+    /// Links to the page of this run, the likeliest first. Whoever has one may begin and end episodes.
+    #[serde(default)]
+    pub links: Vec<String>,
     /// The devices are simulated.
     pub simulated: bool,
     /// The newest log lines, oldest first.

@@ -174,6 +174,7 @@ mod tests {
             last_verdict: None,
             session: None,
             disk_free: None,
+            links: Vec::new(),
             simulated: false,
             log: Vec::new(),
         }

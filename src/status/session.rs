@@ -4,9 +4,11 @@
 
 use std::fmt;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
+use tokio::sync::oneshot;
 
 use super::{Grade, Sensors, Verdict};
 use crate::time::Stamp;
@@ -78,6 +80,9 @@ pub enum SessionRequest {
     /// Answer with a [`SessionStatus`] as JSON.
     Show,
 }
+
+/// Passes a request to the session on; the answer is what was done, or why it was refused.
+pub type Asker = Arc<dyn Fn(SessionRequest, oneshot::Sender<Result<String, String>>) + Send + Sync>;
 
 /// A press that asks for one of the requests that [count once](SessionRequest::counts_once), so soon after the last one,
 /// is the repeat of a held key, which few terminals distinguish, or a hand that trembles.

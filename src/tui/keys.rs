@@ -87,6 +87,8 @@ pub(super) enum Act {
     Older,
     /// Scroll to newer lines of the log.
     Newer,
+    /// Show the link to the page for a phone, or close it.
+    Web,
     /// Open or close the help.
     Help,
     /// End the program.
@@ -208,7 +210,7 @@ use KeyCode::{Char, Down, End, Esc, F, Home, Left, PageDown, PageUp, Right, Up};
 use When::{Always, Control, ControlRepeated, Pressed, Repeated};
 
 /// All keys. The footer shows as many as fit, in this order; the help and the last two always.
-pub(super) const TABLE: [Binding; 41] = [
+pub(super) const TABLE: [Binding; 42] = [
     row(Act::Toggle, &[Char(' ')], Pressed, ("space", "start an episode, end the one in progress"), |m| {
         Some(toggles(m))
     }),
@@ -265,6 +267,7 @@ pub(super) const TABLE: [Binding; 41] = [
     row(Act::Pictures, &[Char('c')], Pressed, ("c", "pictures of cameras: on or off"), never),
     row(Act::Older, &[PageUp], Repeated, ("pgup, pgdn", "scroll the log; esc goes to its end"), never),
     row(Act::Newer, &[PageDown], Repeated, ("", ""), never),
+    row(Act::Web, &[Char('W')], Pressed, ("W", "page for a phone: its link as a QR code"), never),
     row(Act::Help, &[Char('?'), F(1)], Repeated, ("?", "this help"), |_| Some("help")),
     row(Act::Quit, &[Char('q')], Repeated, ("q, ctrl-c", "quit; ctrl-c disarms first"), |_| Some("quit")),
     row(Act::Interrupt, &[Char('c')], ControlRepeated, ("", ""), never),

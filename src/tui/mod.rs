@@ -22,6 +22,7 @@ mod log;
 mod log_view;
 mod mask;
 pub mod model;
+mod page_link;
 pub mod picture;
 mod policy;
 mod recording;

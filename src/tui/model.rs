@@ -94,6 +94,15 @@ pub enum Page {
     Episodes,
 }
 
+/// What lies over the page, until a key closes it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Overlay {
+    /// This page of the help, from 1.
+    Help(usize),
+    /// The link to the page for a phone.
+    Link,
+}
+
 /// Whether the user asked to quit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Quit {
@@ -169,8 +178,8 @@ pub struct Model {
     naming: Naming,
     /// Leads through the first minute.
     pub(super) tour: Option<Tour>,
-    /// The open page of the help, from 1.
-    pub(super) help: Option<usize>,
+    /// What lies over everything else.
+    pub(super) overlay: Option<Overlay>,
     /// Whether the user has asked to quit.
     pub(super) quit: Quit,
     /// When the user asked to arm the actuator: the next key confirms or cancels.
@@ -233,7 +242,7 @@ impl Model {
             seen: Seen::default(),
             naming: Naming::default(),
             tour: None,
-            help: None,
+            overlay: None,
             quit: Quit::No,
             arming: None,
             prompt: None,
@@ -389,9 +398,11 @@ impl Model {
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
-        if let Some(page) = self.help {
-            // The key that closes the help has no other effect.
-            self.help = (act == Some(Act::Help) && page < help::PAGES).then_some(page + 1);
+        if let Some(overlay) = self.overlay.take() {
+            // The key that closes it has no other effect.
+            if let (Overlay::Help(page @ ..help::PAGES), Some(Act::Help)) = (overlay, act) {
+                self.overlay = Some(Overlay::Help(page + 1));
+            }
             return Effect::None;
         }
         let effect = act.map_or(Effect::None, |act| self.act(act));
@@ -461,7 +472,8 @@ impl Model {
             Act::Bell => self.toggle_bell(),
             Act::Order => self.toggle_order(),
             Act::Pause => self.toggle_pause(),
-            Act::Help => self.help = Some(1),
+            Act::Help => self.overlay = Some(Overlay::Help(1)),
+            Act::Web => self.show_link(),
             Act::Up | Act::Down | Act::First | Act::Last => self.step(act),
             Act::Older | Act::Newer => self.scroll(act, SCROLL_STEP),
             Act::Detail => self.turn_to(Page::Device),
@@ -662,6 +674,14 @@ impl Model {
         Effect::Send(Command::Plug(name))
     }
 
+    fn show_link(&mut self) {
+        if self.latest.links.is_empty() {
+            self.notify("this run has no page: rapid --web 0.0.0.0 serves one");
+        } else {
+            self.overlay = Some(Overlay::Link);
+        }
+    }
+
     fn toggle_bell(&mut self) {
         self.is_silent = !self.is_silent;
         self.notify(if self.is_silent { "bell off" } else { "bell on" });
@@ -838,8 +858,8 @@ impl Model {
 
     /// Disarms, and closes any open dialog, as Esc usually does.
     fn disarm(&mut self, is_escape: bool) -> Effect {
-        let (help, prompt) = (self.help.take(), self.prompt.take());
-        let mut is_open = help.is_some() || prompt.is_some();
+        let (overlay, prompt) = (self.overlay.take(), self.prompt.take());
+        let mut is_open = overlay.is_some() || prompt.is_some();
         if self.quit == Quit::Asked {
             (self.quit, is_open) = (Quit::No, true);
         }

@@ -53,14 +53,14 @@ impl Picture {
     /// Every n-th pixel, so that no side is longer than [`LARGEST`].
     fn thinned(preview: &Preview, [height, width]: [usize; 2], values: &[u8]) -> Self {
         let step = width.max(height).div_ceil(LARGEST).max(1);
-        let (width, height, rgb) = every(step, [height, width], values);
+        let (width, height, rgb) = pixels::every(step, [height, width], values);
         Self { device: preview.device, seq: preview.seq, width, height, rgb }
     }
 
     /// Every n-th pixel, so that none of its sides is much longer than the larger of `sides`.
     fn image(&self, [width, height]: [usize; 2]) -> Option<DynamicImage> {
         let step = (self.width / width.max(1)).min(self.height / height.max(1)).max(1);
-        let (width, height, rgb) = every(step, [self.height, self.width], &self.rgb);
+        let (width, height, rgb) = pixels::every(step, [self.height, self.width], &self.rgb);
         let side = |side: usize| u32::try_from(side).ok();
         Some(DynamicImage::ImageRgb8(RgbImage::from_raw(side(width)?, side(height)?, rgb)?))
     }
@@ -74,13 +74,6 @@ impl Picture {
             self.rgb.get(place..place + pixels::CHANNELS).unwrap_or_default().iter().map(|v| u32::from(*v)).sum();
         f64::from(sum) / (255.0 * pixels::CHANNELS as f64)
     }
-}
-
-/// Every n-th pixel of every n-th row: width, height and the pixels.
-fn every(step: usize, [height, width]: [usize; 2], rgb: &[u8]) -> (usize, usize, Vec<u8>) {
-    let rows = rgb.chunks_exact((width * pixels::CHANNELS).max(1)).step_by(step);
-    let thinned = rows.flat_map(|row| row.chunks_exact(pixels::CHANNELS).step_by(step).flatten().copied()).collect();
-    (width.div_ceil(step), height.div_ceil(step), thinned)
 }
 
 /// Where pictures are drawn, and the last one as the terminal takes it.

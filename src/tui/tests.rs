@@ -327,6 +327,27 @@ fn the_help_lists_every_key() {
 }
 
 #[test]
+fn the_link_to_the_page_is_a_code_where_there_is_room() {
+    let mut snapshot = three_streaming();
+    snapshot.links =
+        ["192.168.1.20", "10.0.0.7"].map(|ip| format!("http://{ip}:8766/#0123456789abcdefghijkl")).to_vec();
+    let mut model = measured(&snapshot);
+    model.update(press(KeyCode::Char('W')));
+    assert_snapshot!("link_80x24", draw(&model, (80, 24), THEME));
+    assert_snapshot!("link_60x12", draw(&model, (60, 12), THEME));
+    let shown = |model: &Model, theme| draw(model, (80, 24), theme).to_string();
+    let ascii = Theme { charset: Charset::Ascii, ..THEME };
+    assert!(shown(&model, ascii).contains("http://192.168.1.20:8766/#"));
+    // The key that closes it has no other effect.
+    assert_eq!(model.update(press(KeyCode::Char(' '))), model::Effect::None);
+    assert!(!shown(&model, THEME).contains("192.168.1.20"));
+    // A run without a page says how it gets one.
+    let mut without = measured(&three_streaming());
+    without.update(press(KeyCode::Char('W')));
+    assert!(shown(&without, THEME).contains("rapid --web 0.0.0.0"));
+}
+
+#[test]
 fn an_edge_is_highlighted_for_a_second() {
     let mut model = measured(&three_streaming());
     let mut later = three_streaming();

@@ -8,10 +8,10 @@ use ratatui::style::Stylize;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 
-use super::model::{Model, Page};
+use super::model::{Model, Overlay, Page};
 use super::picture::Canvas;
 use super::theme::Theme;
-use super::{detail, devices, episodes, footer, header, help, log, mask, policy, recording, timeline};
+use super::{detail, devices, episodes, footer, header, help, log, mask, page_link, policy, recording, timeline};
 
 /// Below this size the screen only shows the size it needs.
 pub const MINIMUM: (u16, u16) = (60, 12);
@@ -55,8 +55,10 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme, canvas: &mut Can
         Page::Episodes => episodes::draw_page(frame, middle, model, theme),
     }
     footer::draw(frame, footer_area, model, theme);
-    if let Some(page) = model.help {
-        help::draw(frame, area, page, model, theme);
+    match model.overlay {
+        Some(Overlay::Help(page)) => help::draw(frame, area, page, model, theme),
+        Some(Overlay::Link) => page_link::draw(frame, area, model, theme),
+        None => {}
     }
 }
 

@@ -91,6 +91,7 @@ impl Bench {
         let running = Running {
             inference: None,
             live: None,
+            web: None,
             discovery: idle_stage(),
             recording: idle_stage(),
             synchronisation: idle_stage(),

@@ -111,7 +111,7 @@ impl Model {
 
     /// In a rig without entries, asks for the name of each device that is plugged in, one after the other.
     pub(super) fn ask_for_names(&mut self) {
-        let is_free = self.prompt.is_none() && self.help.is_none() && self.quit == Quit::No;
+        let is_free = self.prompt.is_none() && self.overlay.is_none() && self.quit == Quit::No;
         if self.naming.is_new_rig && is_free && self.unasked().next().is_some() {
             self.ask_for_name();
         }

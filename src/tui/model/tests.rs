@@ -119,7 +119,7 @@ fn keys_that_stop_motion_work_at_any_moment() {
             // Ctrl-C confirms the question whether to leave.
             let leaves = question == "leaving" && what.contains("'c'");
             assert_eq!(effect, if leaves { Effect::Leave } else { Effect::Order(Order::Disarm) }, "{what}");
-            assert!(model.help.is_none() || what.contains("'c'"), "{what}");
+            assert!(model.overlay.is_none() || what.contains("'c'"), "{what}");
             // The next key does not answer the question.
             assert_eq!(model.update(control('y')), Effect::None, "{what}");
         }
@@ -627,7 +627,7 @@ fn on_the_page_of_episodes_keys_are_about_the_marked_one() {
     for opens in ["n", "-", "?"] {
         typed(&mut model, opens);
         assert_eq!(model.update(press(KeyCode::Esc)), Effect::Order(Order::Disarm));
-        assert_eq!((model.prompt(), model.help, model.page), (None, None, Page::Episodes), "{opens}");
+        assert_eq!((model.prompt(), model.overlay, model.page), (None, None, Page::Episodes), "{opens}");
         let undo = sent(SessionRequest::Label { episode: Some(file(2)), label: Label::Success, reason: String::new() });
         assert_eq!(model.update(press(KeyCode::Char('+'))), undo);
     }
