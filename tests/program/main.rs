@@ -48,3 +48,5 @@ mod stops;
 mod streams;
 mod task;
 mod verdict;
+#[cfg(feature = "web")]
+mod web;

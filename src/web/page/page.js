@@ -81,7 +81,7 @@ function show(view, lost) {
   document.title = (view.recording && !lost ? "● " : "") + view.rig;
   const { session, recording } = view;
   const counts = session ? ["GOOD", "SUSPECT", "BAD"].map((word, i) => session.verdicts[i] && `${session.verdicts[i]} ${word}`) : [];
-  set(at("progress"), session ? [`${session.count} kept`, ...counts.filter(Boolean)].join(" · ") : "");
+  set(at("progress"), session ? [`${session.count} episodes`, ...counts.filter(Boolean)].join(" · ") : "");
   const waiting = view.begins_in === null ? "" : ` ${view.begins_in} s`;
   const running = recording && view.phase === "recording" ? ` ${recording.time}` : "";
   set(at("now"), lost ? "?" : WORDS[view.phase] + waiting + running);
