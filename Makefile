@@ -78,7 +78,7 @@ fuzz: ## feed every reader of untrusted bytes with generated ones, each for FUZZ
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
 
-fleet-test: ## upload to a real S3 server, export on a cluster of Ray, UMI's buffer, Rerun, with breaks (fetches 1 GB once)
+fleet-test: ## upload to a real S3 server, export on a cluster of Ray, UMI's buffer, Rerun, the page in Chromium (fetches 1.5 GB once)
 	RAPID_BIN='$(BUILT)' scripts/fleet.sh
 
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Tests what happens to episodes after a rig: the upload, a cluster's export, UMI's replay buffer, Rerun. Fetches 1 GB of
-# Go's modules and Python packages once, and is no part of `make test`. RAPID_BIN is the program; without one, what needs
+# Tests what happens to episodes after a rig: the upload, a cluster's export, UMI's replay buffer, Rerun; and the page for a
+# phone in Chromium. Fetches 1.5 GB of Go's modules, Python packages and a browser once, and is no part of `make test`. RAPID_BIN is the program; without one, what needs
 # episodes reports that it is skipped.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -20,6 +20,17 @@ if [[ ! -x $cache/versitygw ]]; then
   GOBIN=$cache go install "$server"
 fi
 python3 tests/fleet/upload.py udev/rapid-upload.service "$cache/versitygw"
+
+if [[ -n ${RAPID_BIN:-} ]]; then
+  if ! command -v chromium >/dev/null; then
+    echo "fleet: installing Chromium" >&2
+    $sudo apt-get update -q
+    $sudo apt-get install -y -q --no-install-recommends chromium
+  fi
+  python3 tests/fleet/page.py "$RAPID_BIN" "$(command -v chromium)" "$cache/page"
+else
+  echo "page: skipped: no program is built" >&2
+fi
 
 python=$(scripts/venv.sh venv-fleet models/requirements-fleet.txt --no-deps)
 RERUN=$(dirname "$(scripts/venv.sh venv-rerun models/requirements-rerun.txt --no-deps)")/rerun

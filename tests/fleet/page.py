@@ -5,7 +5,7 @@
 
 Screenshots of each state go to FOLDER. Chromium is spoken to by its DevTools protocol over a pipe
 (https://chromedevtools.github.io/devtools-protocol), for which Python needs nothing. A run is stopped, ended and started
-again under the page: it shows that it knows nothing, and then goes on.
+again under the page: it shows that it knows nothing, and then continues.
 """
 
 import base64
@@ -200,13 +200,13 @@ def check(rapid, page, place, shots):
     page.shot(shots, "lost")
     page.shot(shots, "lost-dark", dark=True)
     run.process.send_signal(signal.SIGCONT)
-    until("it goes on", lambda: page.text("#now") == "Idle" and page.value(pictures) == 2)
+    until("it continues", lambda: page.text("#now") == "Idle" and page.value(pictures) == 2)
 
     # The run ends, and another begins at its place.
     run.end()
     until("it is lost", lambda: is_lost() and page.text("#lost").startswith("No connection since"))
     run = Run(rapid, place, port)
-    until("it goes on", lambda: page.text("#now") == "Idle" and page.value(pictures) == 2)
+    until("it continues", lambda: page.text("#now") == "Idle" and page.value(pictures) == 2)
     page.press("#toggle")
     until("it records", lambda: page.text("#now").startswith("● REC"))
     page.press("#toggle")

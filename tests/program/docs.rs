@@ -63,6 +63,7 @@ const NOT_RUN: &[(&str, &str)] = &[
     ),
     ("docs/registry.md", "rapid register                                              # asks, and shows a sample"),
     ("docs/registry.md", "sudo install -D -m 644 devices.toml /etc/rapid/devices.toml"),
+    ("docs/web.md", "rapid --web 0.0.0.0                         # then W in the monitor: scan the QR code"),
 ];
 
 fn root() -> &'static Path {

@@ -4,7 +4,7 @@
 "use strict";
 
 const LOST = 3000; // ms without a sign of life; the server gives one each second
-const AGAIN = 2000; // ms between two attempts to connect
+const AGAIN = 4000; // ms between two attempts to connect
 const OLD = 2500; // ms after which a picture is old
 const NEXT_PICTURE = 350; // ms between two requests for a picture
 const PRESS_AGAIN = 700; // ms: a press so soon after a change was meant for what was shown before
@@ -12,7 +12,7 @@ const SURE = 4000; // ms within which the second press of a discard counts
 const WORDS = { idle: "Idle", countdown: "Begins in", recording: "● REC", ending: "Ending…", reset: "Next in" };
 
 const at = (id) => document.getElementById(id);
-const now = () => performance.now();
+const now = () => Date.now(); // the clock that counts while a phone sleeps
 const set = (element, text) => { if (element.textContent !== text) element.textContent = text; };
 
 let view = null; // the newest view
@@ -20,32 +20,38 @@ let source = null; // the connection
 let heard = -Infinity; // when something arrived that was current
 let tried = -Infinity; // when the connection was last attempted
 let skew = Infinity; // the smallest difference seen between this clock and the server's
+let token = ""; // of the link, until the server has taken it
 let denied = ""; // why the server shows nothing
 let changed = -Infinity; // when the phase last changed
 let sureUntil = -Infinity;
 const pictures = new Map(); // by bit
 
-const isLost = () => now() - heard > LOST;
+// A clock that was set back says nothing about what has arrived.
+const isWithin = (ms, most) => ms >= 0 && ms <= most;
+const isLost = () => !isWithin(now() - heard, LOST);
 
 // --- the connection
 
 async function enter() {
-  const token = location.hash.slice(1);
-  // Out of the address, which is copied and shown; a reload has the cookie.
-  if (token) history.replaceState(null, "", location.pathname);
+  if (location.hash.length > 1) {
+    token = location.hash.slice(1);
+    // Out of the address, which is copied and shown; a reload has the cookie.
+    history.replaceState(null, "", location.pathname);
+  }
   try {
-    const answer = await fetch("/enter", { method: "POST", body: token });
+    const answer = await fetch("/enter", { method: "POST", body: token, signal: AbortSignal.timeout(LOST) });
     denied = answer.ok ? "" : await answer.text();
+    if (answer.ok) token = "";
   } catch { /* There is no network: it is tried again. */ }
 }
 
 async function connect() {
-  tried = now();
+  const attempt = (tried = now());
   if (source) source.close();
   source = null;
   skew = Infinity;
   await enter();
-  if (denied) return;
+  if (denied || attempt !== tried) return;
   source = new EventSource("/events");
   source.addEventListener("view", (event) => { hear(event); view = JSON.parse(event.data); render(); });
   source.addEventListener("beat", hear);
@@ -59,7 +65,7 @@ function hear(event) {
 }
 
 function watch() {
-  if (isLost() && now() - tried > (denied ? 2 * LOST : Math.max(AGAIN, LOST))) connect();
+  if (isLost() && !isWithin(now() - tried, AGAIN)) connect();
   render();
 }
 
@@ -69,7 +75,7 @@ function render() {
   const lost = isLost();
   document.body.classList.toggle("lost", lost);
   at("lost").hidden = !lost;
-  const since = Number.isFinite(heard) ? `No connection since ${Math.round((now() - heard) / 1000)} s` : "Connecting…";
+  const since = Number.isFinite(heard) ? `No connection since ${Math.max(0, Math.round((now() - heard) / 1000))} s` : "Connecting…";
   set(at("lost"), denied || since);
   if (view) show(view, lost);
   for (const [bit, picture] of pictures) age(bit, picture, lost);
@@ -170,7 +176,7 @@ async function fetchPictures(picture) {
 
 function age(bit, picture, lost) {
   const ms = now() - picture.captured;
-  const isOld = lost || ms > OLD || !picture.of.is_set;
+  const isOld = lost || !isWithin(ms, OLD) || !picture.of.is_set;
   picture.figure.classList.toggle("old", isOld);
   const seen = Number.isFinite(ms) ? `${Math.round(ms / 1000)} s old` : "no picture";
   const why = picture.of.is_set || lost ? "" : ` (${picture.of.state})`;
