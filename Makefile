@@ -23,7 +23,7 @@ TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' R
 TESTS := cargo test --locked --workspace
 # What `make quick` runs, and the tests of the program that it leaves out: those that wait for long, or need Python or C.
 QUICK := --lib --test layering --test library --test memory --test guard --test short
-SLOW := calibrate docs ends export hooks infer json kill lan many_devices nodes process python scenarios screen second_run shared_memory stops task verdict
+SLOW := calibrate docs ends export hooks infer json kill lan many_devices nodes process python scenarios screen second_run shared_memory stops task verdict web
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | sed 's/[$$](SLOW)/$(SLOW)/' | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done

@@ -193,7 +193,7 @@ fn the_page_does_what_keys_do() {
     client.done(&json!({ "do": "discard", "episode": second }));
     page.until("it is in the trash", |view| view["session"]["discarded"] == 1 && view["phase"] == "idle");
     assert_eq!(file_of(&page.view), first);
-    let files = || place.episodes("out").into_iter().filter(|name| name.ends_with(".mcap")).collect::<Vec<_>>();
+    let files = || place.episodes("out").into_iter().filter(|name| !name.starts_with('.')).collect::<Vec<_>>();
     until("only the first is left", || files() == [first.clone()]);
     // The press arrives again: nothing else is discarded.
     let again = client.request("POST /do", &json!({ "do": "discard", "episode": second }).to_string());
