@@ -13,6 +13,7 @@
 
 use std::cell::{Cell, RefCell};
 use std::convert::Infallible;
+use std::io::Write as _;
 use std::net::SocketAddr;
 use std::pin::Pin;
 use std::rc::Rc;
@@ -57,6 +58,9 @@ const PAUSE: Duration = Duration::from_millis(200);
 const LONGEST_HEAD: usize = 16_384;
 /// Longest body of a request, bytes: a note of 500 characters, each of them escaped, is less.
 const LONGEST_BODY: usize = 8192;
+
+/// The answer to a connection beyond [`CONNECTIONS`].
+const FULL: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\ncontent-length: 0\r\n\r\n";
 
 /// What the page is made of, and its types.
 const PAGE: [(&str, &str, &str); 3] = [
@@ -134,9 +138,8 @@ impl Server {
                 continue;
             };
             if self.connections.get() >= CONNECTIONS {
-                // One that does not fit into the kernel's buffer is closed without it.
-                let _ = stream
-                    .try_write(b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\ncontent-length: 0\r\n\r\n");
+                // Not by tokio, which has not heard yet that it can be written to. What does not fit is left out.
+                let _ = stream.into_std().and_then(|mut stream| stream.write_all(FULL));
                 continue;
             }
             spawn_local(Rc::clone(self).connect(stream, peer));

@@ -86,14 +86,14 @@ function show(view, lost) {
   set(at("rig"), view.rig + (view.is_simulated ? " (simulated)" : ""));
   document.title = (view.recording && !lost ? "● " : "") + view.rig;
   const { session, recording } = view;
-  const counts = session ? ["GOOD", "SUSPECT", "BAD"].map((word, i) => session.verdicts[i] && `${session.verdicts[i]} ${word}`) : [];
+  const counts = session ? ["GOOD", "SUSPECT", "BAD"].map((word, i) => session.verdicts[i] && `${session.verdicts[i]}\u00a0${word}`) : [];
   set(at("progress"), session ? [`${session.count} episodes`, ...counts.filter(Boolean)].join(" · ") : "");
   const waiting = view.begins_in === null ? "" : ` ${view.begins_in} s`;
   const running = recording && view.phase === "recording" ? ` ${recording.time}` : "";
   set(at("now"), lost ? "?" : WORDS[view.phase] + waiting + running);
   document.body.classList.toggle("recording", Boolean(recording) && !lost);
   const disk = view.disk_free && `disk: ${view.disk_free} free`;
-  const figures = recording ? [view.current, recording.size, `dropped ${recording.dropped}`] : [session && session.task, disk];
+  const figures = recording ? [view.current, recording.size, `dropped\u00a0${recording.dropped}`] : [session && session.task, disk];
   set(at("figures"), figures.filter(Boolean).join(" · "));
   const verdict = recording ? [`would be ${recording.verdict}`, ...recording.reasons] : [];
   list(at("reasons"), verdict, () => recording.verdict);
@@ -137,7 +137,7 @@ function showLast(last) {
   if (!last) return;
   set(at("last-verdict"), last.verdict || "");
   at("last-verdict").className = last.verdict || "";
-  set(at("last-file"), `${last.file}, ${last.seconds.toFixed(1)} s`);
+  set(at("last-file"), `${last.file}, ${last.seconds.toFixed(1)}\u00a0s`);
   list(at("last-reasons"), last.reasons || [], () => last.verdict || "");
   at("success").classList.toggle("chosen", last.label === "success");
   at("failure").classList.toggle("chosen", last.label === "failure");
