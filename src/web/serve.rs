@@ -142,12 +142,13 @@ impl Server {
                 let _ = stream.into_std().and_then(|mut stream| stream.write_all(FULL));
                 continue;
             }
-            spawn_local(Rc::clone(self).connect(stream, peer));
+            // From now on, and not from when its task first runs.
+            let place = Place::take(self);
+            spawn_local(Rc::clone(self).connect(stream, peer, place));
         }
     }
 
-    async fn connect(self: Rc<Self>, stream: TcpStream, peer: SocketAddr) {
-        let _place = Place::take(&self);
+    async fn connect(self: Rc<Self>, stream: TcpStream, peer: SocketAddr, _place: Place) {
         let connection = Rc::new(Connection { peer, last: Cell::new(Instant::now()), waits: Cell::new(false) });
         let service = service_fn(|request| {
             let (server, connection) = (Rc::clone(&self), Rc::clone(&connection));
