@@ -14,7 +14,6 @@ use crate::status::Board;
 pub enum WebOptions {}
 
 /// Starts nothing.
-#[expect(clippy::unnecessary_wraps, reason = "as with the feature")]
 pub(super) fn start(options: &WebOptions, _: &Arc<Board>, _: &UnboundedSender<Request>) -> Result<Stage, AppError> {
     match *options {}
 }
