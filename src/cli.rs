@@ -21,7 +21,7 @@ use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum, ValueHint};
 
 #[cfg(feature = "export")]
-pub use export::{ExportArgs, Layout};
+pub use export::{ExportArgs, Layout, PictureForm};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
 pub use measure::{AblationArgs, Calibration, Count, LatencyArgs};
 #[cfg(feature = "policy")]

@@ -638,7 +638,13 @@ failures! {
     commands::export::ExportError: |error| match error {
         commands::export::ExportError::Episodes(error) => read_code(error),
         commands::export::ExportError::NoEpisodes(_)
-        | commands::export::ExportError::Set(crate::export::SetError::Foreign { .. }) => 2,
+        | commands::export::ExportError::Set(
+            crate::export::SetError::Foreign { .. }
+            | crate::export::SetError::Pictures { .. }
+            | crate::export::SetError::Ffmpeg(
+                crate::export::FfmpegError::Missing { .. } | crate::export::FfmpegError::Encoder { .. },
+            ),
+        ) => 2,
         _ => 1,
     };
     commands::calibrate::CalibrateError: |error| argument_code(error.is_bad_argument());

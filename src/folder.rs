@@ -212,11 +212,19 @@ impl Folder {
     /// # Errors
     /// `AlreadyExists` when the new name is taken.
     pub fn rename_new(&self, from: &OsStr, to: &OsStr) -> io::Result<()> {
-        match rustix::fs::renameat_with(&self.open, from, &self.open, to, RenameFlags::NOREPLACE) {
+        self.move_new(from, self, to)
+    }
+
+    /// Moves a file to another folder, under a new name; an existing file with that name is not changed.
+    ///
+    /// # Errors
+    /// `AlreadyExists` when the new name is taken.
+    pub fn move_new(&self, from: &OsStr, into: &Self, to: &OsStr) -> io::Result<()> {
+        match rustix::fs::renameat_with(&self.open, from, &into.open, to, RenameFlags::NOREPLACE) {
             Ok(()) => Ok(()),
             // A file system without the flag (NFS, some FUSE): checked instead.
-            Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) if !self.has(to) => {
-                Ok(rustix::fs::renameat(&self.open, from, &self.open, to)?)
+            Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) if !into.has(to) => {
+                Ok(rustix::fs::renameat(&self.open, from, &into.open, to)?)
             }
             Err(error) => Err(error.into()),
         }

@@ -6,7 +6,7 @@ use clap::{Args, ValueEnum, ValueHint};
 
 pub(super) const EXPORT: &str = "\
 A row is a tick of the frame index (/rapid/frame), with the sample of each sensor that belongs to it: pictures as \
-observation.images.NAME, JPEGs byte for byte and others as PNG; numbers as observation.state; /action as action; and \
+observation.images.NAME, JPEGs byte for byte and others as PNG, or with --pictures av1 as a video; numbers as observation.state; /action as action; and \
 rapid.mask, rapid.valid, rapid.age, rapid.time_ns. What is absent is black or zero, with its mask.
 
 Episodes that DIR has already are skipped, new ones are appended. An episode that does not fit is left out and named; so \
@@ -15,6 +15,7 @@ is one that is BAD. Interrupted, DIR has the episodes so far, and the same comma
 Examples:
   rapid export episodes --to lerobot --out place-block
   rapid export episodes --to lerobot --out place-block --verify
+  rapid export episodes --to lerobot --out small --pictures av1
   rapid export monday tuesday/*.mcap --to lerobot --out both --state motor_state,force
   rapid export episodes --to lerobot --out own --state force --action motor_state
   rapid export $(cat training.txt) --to lerobot --out good        # of `rapid list`
@@ -43,7 +44,13 @@ pub struct ExportArgs {
     /// Sensor whose numbers are action [default: the topic /action; or as in DIR]
     #[arg(long, value_name = "NAME")]
     pub action: Option<String>,
-    /// Read DIR back and compare it with the episodes, bit for bit
+    /// Pictures as the camera's own JPEGs, or as videos that ffmpeg encodes: jpeg, av1 or h264 [default: jpeg; or as in DIR]
+    #[arg(long, value_name = "FORM", hide_possible_values = true)]
+    pub pictures: Option<PictureForm>,
+    /// Program that encodes and decodes videos [default: ffmpeg on the PATH]
+    #[arg(long, value_name = "PROGRAM", value_hint = ValueHint::ExecutablePath)]
+    pub ffmpeg: Option<PathBuf>,
+    /// Read DIR back and compare it with the episodes, bit for bit; frames of a video within what an encoder loses
     #[arg(long)]
     pub verify: bool,
 }
@@ -53,4 +60,15 @@ pub struct ExportArgs {
 pub enum Layout {
     /// LeRobot v3.0.
     Lerobot,
+}
+
+/// How a data set has its pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum PictureForm {
+    /// Each as it is, JPEG or PNG.
+    Jpeg,
+    /// Videos in AV1.
+    Av1,
+    /// Videos in H.264.
+    H264,
 }

@@ -1,21 +1,26 @@
 //! `rapid export`: episodes become a data set, or are appended to one.
 //!
-//! Episodes are surveyed in parallel and written one after the other, because a row has its number in the whole set.
+//! Episodes are surveyed in parallel, and so are their videos encoded; rows are written one episode after the other, because
+//! each has its number in the whole set.
 //!
 //! Invariant: an episode that cannot be exported is named with the reason, and the others are exported nevertheless.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
 
 use serde::Serialize;
 
-use super::progress::Bar;
-use super::{Format, json_line, progress};
-use crate::cli::ExportArgs;
+use super::progress::{self, Work};
+use super::{Format, json_line};
+use crate::cli::{ExportArgs, PictureForm};
 use crate::episode::sha256;
-use crate::export::{self, Choice, DataSet, Difference, Features, Known, Refusal, SetError, Survey};
+use crate::export::{
+    self, Choice, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Refusal, SetError,
+    Survey, Verified,
+};
 use crate::record::inspect::{self, ReadError};
 use crate::status::Grade;
 use crate::text;
@@ -90,6 +95,8 @@ struct Summary<'a> {
     /// Frames compared with their episodes; `None` without `--verify`.
     verified: Option<usize>,
     differences: usize,
+    /// How near the worst frame of a video is to its picture, dB; `None` without `--verify` and without videos.
+    psnr_db: Option<f64>,
 }
 
 impl<'a> Summary<'a> {
@@ -104,6 +111,7 @@ impl<'a> Summary<'a> {
             frames: 0,
             verified: None,
             differences: 0,
+            psnr_db: None,
         }
     }
 }
@@ -137,32 +145,22 @@ pub fn export(
         return Err(ExportError::NoEpisodes(places.join(", ")));
     }
     let mut set = DataSet::open(&args.out)?;
+    let pictures = set.pictures(args.pictures.map(pictures))?;
+    let ffmpeg = match pictures {
+        Pictures::Files => None,
+        Pictures::Video(codec) => {
+            let found = Ffmpeg::find(args.ffmpeg.as_deref(), codec, &|| stop.load(Ordering::Relaxed));
+            Some(found.map_err(SetError::from)?)
+        }
+    };
     let mut report = Report { format, out, err, summary: Summary::of(&args.out) };
     let found = found(&files, args, &set, stop, &mut report)?;
     let mut sources = found.already;
-    let fitting = fitting(found.new, args, &set, &mut report)?;
-    let mut bar = Bar::new("exporting", fitting.len(), fitting.len() > 1);
-    for (done, (episode, features)) in fitting.iter().enumerate() {
-        bar.at(done);
-        if stop.load(Ordering::Relaxed) {
-            break;
-        }
-        let appended = set.append(episode, features, stop);
-        bar.clear();
-        match appended {
-            Ok(number) => {
-                report.exported(episode, number)?;
-                sources.insert(number, episode.file.clone());
-            }
-            Err(SetError::Refused(Refusal::Interrupted)) => break,
-            Err(SetError::Refused(refusal)) => report.left_out(&episode.file, &refusal)?,
-            Err(error) => return Err(error.into()),
-        }
-    }
-    drop(bar);
+    let fitting = fitting(found.new, args, pictures, &set, &mut report)?;
+    append(&fitting, &mut set, ffmpeg.as_ref(), stop, &mut report, &mut sources)?;
     interrupted(&set, stop)?;
     if args.verify {
-        verify(&set, &sources, stop, &mut report)?;
+        verify(&set, &sources, ffmpeg.as_ref(), stop, &mut report)?;
         interrupted(&set, stop)?;
     }
     report.summary.episodes = set.episodes();
@@ -172,6 +170,60 @@ pub fn export(
         return Err(ExportError::Nothing(text::counted(files.len() as u64, "episode")));
     }
     Ok(report.summary.differences == 0)
+}
+
+fn pictures(form: PictureForm) -> Pictures {
+    match form {
+        PictureForm::Jpeg => Pictures::Files,
+        PictureForm::Av1 => Pictures::Video(Codec::Av1),
+        PictureForm::H264 => Pictures::Video(Codec::H264),
+    }
+}
+
+/// Appends episodes, in their order; their videos are encoded before, of as many at a time as the processors are enough for.
+fn append(
+    fitting: &[(Survey, Features)],
+    set: &mut DataSet,
+    ffmpeg: Option<&Ffmpeg>,
+    stop: &AtomicBool,
+    report: &mut Report<'_>,
+    sources: &mut BTreeMap<usize, PathBuf>,
+) -> Result<(), ExportError> {
+    let Some((_, features)) = fitting.first() else { return Ok(()) };
+    let cameras = features.videos_per_episode();
+    if cameras > 0 {
+        set.prepare_videos(features)?;
+    }
+    let (folder, failed, frames) = (set.folder().to_owned(), AtomicBool::new(false), AtomicUsize::new(0));
+    let encode = |(episode, features): &(Survey, Features)| match ffmpeg {
+        _ if stop.load(Ordering::Relaxed) => Err(SetError::Refused(Refusal::Interrupted)),
+        None => {
+            frames.fetch_add(episode.rows, Ordering::Relaxed);
+            Ok(Encoded::default())
+        }
+        Some(ffmpeg) => export::encode(&folder, episode, features, ffmpeg, Ends { stop, failed: &failed }, &frames),
+    };
+    let processors = thread::available_parallelism().map_or(1, usize::from);
+    let work = Work {
+        label: "exporting",
+        workers: processors.div_ceil(cameras.max(1)),
+        total: fitting.iter().map(|(episode, _)| episode.rows * cameras.max(1)).sum(),
+        done: Some(&frames),
+    };
+    work.each(fitting, encode, |(episode, features), encoded| {
+        let appended = encoded.and_then(|encoded| set.append(episode, features, encoded, stop));
+        let taken = match appended {
+            Ok(number) => {
+                sources.insert(number, episode.file.clone());
+                report.exported(episode, number).map_err(ExportError::from)
+            }
+            Err(SetError::Refused(Refusal::Interrupted)) => Ok(()),
+            Err(SetError::Refused(refusal)) => report.left_out(&episode.file, &refusal).map_err(ExportError::from),
+            Err(error) => Err(error.into()),
+        };
+        failed.store(taken.is_err(), Ordering::Relaxed);
+        taken
+    })
 }
 
 fn interrupted(set: &DataSet, stop: &AtomicBool) -> Result<(), ExportError> {
@@ -211,24 +263,28 @@ fn found(
         }
     };
     let mut found = Found { already: BTreeMap::new(), new: Vec::new() };
-    progress::each(files, read, |file, read| {
-        match read {
-            Ok(Read::Already(number)) => {
-                report.already(file, number)?;
-                found.already.insert(number, file.to_owned());
-            }
-            Ok(Read::New(survey)) => match found.new.iter().find(|other| other.sha256 == survey.sha256) {
-                Some(other) => {
-                    let same = format!("the same as {}", other.file.display());
-                    report.left_out(file, &Refusal::Different(same))?;
+    progress::each(
+        files,
+        |file| read(file),
+        |file, read| {
+            match read {
+                Ok(Read::Already(number)) => {
+                    report.already(file, number)?;
+                    found.already.insert(number, file.to_owned());
                 }
-                None => found.new.push(*survey),
-            },
-            Err(Refusal::Interrupted) => {}
-            Err(refusal) => report.left_out(file, &refusal)?,
-        }
-        Ok::<_, ExportError>(())
-    })?;
+                Ok(Read::New(survey)) => match found.new.iter().find(|other| other.sha256 == survey.sha256) {
+                    Some(other) => {
+                        let same = format!("the same as {}", other.file.display());
+                        report.left_out(file, &Refusal::Different(same))?;
+                    }
+                    None => found.new.push(*survey),
+                },
+                Err(Refusal::Interrupted) => {}
+                Err(refusal) => report.left_out(file, &refusal)?,
+            }
+            Ok::<_, ExportError>(())
+        },
+    )?;
     Ok(found)
 }
 
@@ -236,6 +292,7 @@ fn found(
 fn fitting(
     episodes: Vec<Survey>,
     args: &ExportArgs,
+    pictures: Pictures,
     set: &DataSet,
     report: &mut Report<'_>,
 ) -> Result<Vec<(Survey, Features)>, ExportError> {
@@ -247,6 +304,7 @@ fn fitting(
     let choice = Choice {
         state: if args.state.is_empty() { of_set.state } else { args.state.clone() },
         action: args.action.clone().or(of_set.action),
+        pictures,
     };
     let mut common = set.features().cloned();
     let mut fitting = Vec::new();
@@ -264,6 +322,7 @@ fn fitting(
 fn verify(
     set: &DataSet,
     sources: &BTreeMap<usize, PathBuf>,
+    ffmpeg: Option<&Ffmpeg>,
     stop: &AtomicBool,
     report: &mut Report<'_>,
 ) -> Result<(), ExportError> {
@@ -273,13 +332,18 @@ fn verify(
     report.summary.verified = Some(0);
     progress::each(
         &files,
-        |file| export::verify(set, number(file), file, stop),
+        |file| export::verify(set, number(file), file, ffmpeg, stop),
         |file, verified| {
-            let (rows, differences) = match verified {
+            let Verified { rows, differences, psnr_db } = match verified {
                 Ok(verified) => verified,
                 Err(SetError::Refused(Refusal::Interrupted)) => return Ok(()),
-                Err(error) => (0, vec![Difference { frame: None, feature: None, what: error.to_string() }]),
+                Err(error) => {
+                    let differences = vec![Difference { frame: None, feature: None, what: error.to_string() }];
+                    Verified { differences, ..Verified::default() }
+                }
             };
+            let worst = report.summary.psnr_db.into_iter().chain(psnr_db);
+            report.summary.psnr_db = worst.min_by(f64::total_cmp);
             report.summary.verified = report.summary.verified.map(|before| before + rows);
             for difference in &differences {
                 report.difference(&Differing { file, episode: number(file), difference })?;
@@ -383,7 +447,8 @@ impl Report<'_> {
         if self.format == Format::Json {
             return writeln!(self.out, "{}", json_line("export", &self.summary)?);
         }
-        let Summary { out, exported, already, left_out, bad, episodes, frames, verified, differences } = &self.summary;
+        let Summary { out, exported, already, left_out, bad, episodes, frames, verified, differences, psnr_db } =
+            &self.summary;
         let (episodes, frames) = (text::counted(*episodes as u64, "episode"), text::counted(*frames, "frame"));
         let bad = if *bad > 0 { format!(" ({bad} BAD)") } else { String::new() };
         let mut line = format!(
@@ -394,6 +459,9 @@ impl Report<'_> {
             let (verified, differences) =
                 (text::counted(*verified as u64, "frame"), text::counted(*differences as u64, "difference"));
             line = format!("{line}; {verified} compared, {differences}");
+        }
+        if let Some(worst) = psnr_db {
+            line = format!("{line}; videos within {worst:.1} dB");
         }
         writeln!(self.out, "{}", text::plain(&line))
     }

@@ -5,14 +5,16 @@
 use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write, stderr};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::text;
 
 const EVERY: Duration = Duration::from_millis(100);
+/// How soon a worker notices that there is room for its result.
+const WAIT: Duration = Duration::from_millis(5);
 const BLOCKS: usize = 20;
 
 /// `label ██████·········· 12/72  0:07 left`, redrawn in place; only on a terminal.
@@ -63,48 +65,94 @@ fn line(label: &str, done: usize, total: usize, elapsed: Duration) -> String {
     format!("{label} {bar} {done}/{total}{left}")
 }
 
-/// Applies `read` to every file and passes the results to `take`, in the order of the files, each as soon as
-/// possible. On a terminal a line on standard error shows the progress.
+/// Applies `read` to every file, on all processors, and passes the results to `take`: see [`Work::each`].
 ///
 /// # Errors
-/// The first of `take`; the remaining files are then not read.
+/// The first of `take`.
 pub(super) fn each<T: Send, E>(
     files: &[PathBuf],
     read: impl Fn(&Path) -> T + Sync,
     mut take: impl FnMut(&Path, T) -> Result<(), E>,
 ) -> Result<(), E> {
-    let workers = thread::available_parallelism().map_or(1, usize::from).min(files.len());
-    let mut bar = Bar::new("episodes", files.len(), files.len() > 1);
-    let next = AtomicUsize::new(0);
-    thread::scope(|scope| {
-        let (done, results) = mpsc::sync_channel(2 * workers);
-        for _ in 0..workers {
-            let (done, next, read) = (done.clone(), &next, &read);
-            scope.spawn(move || {
-                loop {
-                    let index = next.fetch_add(1, Ordering::Relaxed);
-                    // After an error the receiver is dropped.
-                    let Some(file) = files.get(index) else { break };
-                    if done.send((index, read(file))).is_err() {
-                        break;
+    let workers = thread::available_parallelism().map_or(1, usize::from);
+    let work = Work { label: "episodes", workers, total: files.len(), done: None };
+    work.each(files, |file| read(file), |file, result| take(file, result))
+}
+
+/// Work on many items in parallel.
+#[derive(Debug)]
+pub(super) struct Work<'a> {
+    /// What the line begins with.
+    pub(super) label: &'static str,
+    /// How many items are worked on at a time.
+    pub(super) workers: usize,
+    /// Units of work.
+    pub(super) total: usize,
+    /// The units done so far; `None` where an item is one.
+    pub(super) done: Option<&'a AtomicUsize>,
+}
+
+impl Work<'_> {
+    /// Applies `read` to every item and passes the results to `take`, in the order of the items, each as soon as
+    /// possible. No more results wait than there are workers, twice. On a terminal a line on standard error shows the
+    /// progress.
+    ///
+    /// # Errors
+    /// The first of `take`; the remaining items are then not read.
+    pub(super) fn each<I: Sync, T: Send, E>(
+        self,
+        items: &[I],
+        read: impl Fn(&I) -> T + Sync,
+        mut take: impl FnMut(&I, T) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let workers = self.workers.clamp(1, items.len().max(1));
+        let mut bar = Bar::new(self.label, self.total, self.total > 1);
+        let (next, taken, ended) = (AtomicUsize::new(0), AtomicUsize::new(0), AtomicBool::new(false));
+        thread::scope(|scope| {
+            let (done, results) = mpsc::sync_channel(2 * workers);
+            for _ in 0..workers {
+                let (done, next, taken, ended, read) = (done.clone(), &next, &taken, &ended, &read);
+                scope.spawn(move || {
+                    loop {
+                        let index = next.fetch_add(1, Ordering::Relaxed);
+                        let Some(item) = items.get(index) else { break };
+                        // One that takes long keeps back the results of those after it.
+                        while index >= taken.load(Ordering::Relaxed) + 2 * workers && !ended.load(Ordering::Relaxed) {
+                            thread::sleep(WAIT);
+                        }
+                        // After an error the receiver is dropped.
+                        if ended.load(Ordering::Relaxed) || done.send((index, read(item))).is_err() {
+                            break;
+                        }
                     }
-                }
-            });
-        }
-        drop(done);
-        let mut early = BTreeMap::new();
-        let mut index = 0;
-        for (done, result) in results {
-            early.insert(done, result);
-            while let Some((file, result)) = files.get(index).zip(early.remove(&index)) {
-                index += 1;
-                bar.clear();
-                take(file, result)?;
+                });
             }
-            bar.at(index);
-        }
-        Ok(())
-    })
+            drop(done);
+            let mut early = BTreeMap::new();
+            let mut index = 0;
+            let units = |index| self.done.map_or(index, |done| done.load(Ordering::Relaxed));
+            let outcome = loop {
+                match results.recv_timeout(EVERY) {
+                    Ok((done, result)) => early.insert(done, result),
+                    Err(RecvTimeoutError::Timeout) => None,
+                    Err(RecvTimeoutError::Disconnected) => break Ok(()),
+                };
+                let mut outcome = Ok(());
+                while let (Ok(()), Some((item, result))) = (&outcome, items.get(index).zip(early.remove(&index))) {
+                    index += 1;
+                    bar.clear();
+                    outcome = take(item, result);
+                    taken.store(index, Ordering::Relaxed);
+                }
+                if outcome.is_err() {
+                    break outcome;
+                }
+                bar.at(units(index));
+            };
+            ended.store(true, Ordering::Relaxed);
+            outcome
+        })
+    }
 }
 
 #[cfg(test)]

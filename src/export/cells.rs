@@ -6,16 +6,17 @@
 use std::borrow::Cow;
 
 use super::features::{Actions, Features};
-use super::picture;
+use super::picture::{self, Pictures};
 use super::rows::{Payload, Refusal, Row};
 use super::survey::{is_usable, narrow};
+use super::video::Damaged;
 use crate::modality::ModalityKind;
 use crate::pixels::Pixels;
 
 /// The values of a row.
 #[derive(Debug, Default)]
 pub(super) struct Cells<'a> {
-    /// The file of each camera's picture.
+    /// The file of each camera's picture; none if they are in videos.
     pub(super) pictures: Vec<Cow<'a, [u8]>>,
     pub(super) state: Vec<f32>,
     pub(super) action: Vec<f32>,
@@ -35,14 +36,17 @@ pub(super) struct CellMaker<'f> {
     /// A black picture of each camera.
     black: Vec<Vec<u8>>,
     pixels: Pixels,
+    /// Pictures that a video does not have, and which are therefore not valid.
+    pub(super) damaged: Damaged,
 }
 
 impl<'f> CellMaker<'f> {
     /// For rows of an episode whose modalities are of these kinds.
     pub(super) fn new(features: &'f Features, kinds: Vec<ModalityKind>) -> Result<Self, Refusal> {
-        let black = features.cameras.iter().map(|(_, shape)| picture::black(*shape)).collect::<Result<_, _>>();
+        let cameras = if features.pictures == Pictures::Files { &*features.cameras } else { &[] };
+        let black = cameras.iter().map(|(_, shape)| picture::black(*shape)).collect::<Result<_, _>>();
         let black = black.map_err(|error| Refusal::Different(error.to_string()))?;
-        Ok(Self { features, kinds, black, pixels: Pixels::default() })
+        Ok(Self { features, kinds, black, pixels: Pixels::default(), damaged: Damaged::new() })
     }
 
     pub(super) fn cells<'a>(&mut self, row: &'a Row<'_>) -> Result<Cells<'a>, Refusal>
@@ -51,7 +55,8 @@ impl<'f> CellMaker<'f> {
     {
         let usable = |place: usize| -> Option<&'a Payload> {
             let kind = self.kinds.get(place)?;
-            row.samples.get(place)?.as_deref().filter(|payload| is_usable(*kind, payload))
+            let payload = row.samples.get(place)?.as_deref().filter(|payload| is_usable(*kind, payload));
+            payload.filter(|_| !self.damaged.contains(&(place, row.number)))
         };
         let vector = |place: usize, length: usize, into: &mut Vec<f32>| {
             let end = into.len() + length;

@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 
 use serde_json::{Map, Value, json};
 
-use super::picture::Shape;
+use super::picture::{Codec, Pictures, Shape};
 use super::rows::Refusal;
 use super::statistics::Column;
 use super::survey::{Content, Survey};
@@ -33,6 +33,8 @@ pub struct Choice {
     pub state: Vec<String>,
     /// The modality of [`ACTION`]; without one the topic `/action`.
     pub action: Option<String>,
+    /// How the data set has its pictures.
+    pub pictures: Pictures,
 }
 
 /// A name that an episode has nothing for.
@@ -69,6 +71,7 @@ pub struct Features {
     pub(super) modalities: Vec<String>,
     /// Cameras: their place among the modalities.
     pub(super) cameras: Vec<(usize, Shape)>,
+    pub(super) pictures: Pictures,
     /// The vectors of the state: place and length.
     pub(super) state: Vec<(usize, usize)>,
     pub(super) actions: Actions,
@@ -81,6 +84,8 @@ pub(super) struct Feature {
     pub(super) dtype: &'static str,
     pub(super) shape: Vec<u32>,
     names: Value,
+    /// Of a video: as `lerobot.datasets.video_utils.get_video_info` has it.
+    info: Option<Value>,
 }
 
 impl Features {
@@ -94,6 +99,7 @@ impl Features {
             fps: episode.fps,
             modalities: episode.streams.iter().map(|stream| stream.name.clone()).collect(),
             cameras: Vec::new(),
+            pictures: choice.pictures,
             state: Vec::new(),
             actions: Actions::Absent,
         };
@@ -103,7 +109,15 @@ impl Features {
             match stream.content {
                 Content::Camera { found, declared } => {
                     let shape = found.or_else(|| known.shape(name)).or(declared);
-                    features.cameras.push((place, shape.ok_or_else(|| Refusal::NoSize(name.clone()))?));
+                    let mut shape = shape.ok_or_else(|| Refusal::NoSize(name.clone()))?;
+                    if let Pictures::Video(_) = choice.pictures {
+                        if shape.width % 2 + shape.height % 2 > 0 {
+                            return Err(Refusal::OddSize { name: name.clone(), shape: shape.to_string() });
+                        }
+                        // A video has colours, also of grey pictures.
+                        shape.channels = 3;
+                    }
+                    features.cameras.push((place, shape));
                 }
                 Content::Vector { found, declared } => {
                     let length = found.or_else(|| known.length(name)).or(declared);
@@ -136,7 +150,10 @@ impl Features {
 
     /// All features, in the order of the table's columns.
     pub(super) fn all(&self) -> Vec<Feature> {
-        let feature = |key: &str, dtype, shape: Vec<u32>, names| Feature { key: key.to_owned(), dtype, shape, names };
+        let feature = |key: &str, dtype, shape: Vec<u32>, names| {
+            let key = key.to_owned();
+            Feature { key, dtype, shape, names, info: None }
+        };
         let wide = |length: usize| vec![u32::try_from(length).unwrap_or(u32::MAX)];
         let name = |place: usize| self.modalities.get(place).map_or("", String::as_str);
         let numbered = |place, length| (0..length).map(move |at| format!("{}.{at}", name(place)));
@@ -145,7 +162,12 @@ impl Features {
             .iter()
             .map(|(place, Shape { height, width, channels })| {
                 let shape = vec![*height, *width, (*channels).into()];
-                feature(&format!("{IMAGES}{}", name(*place)), "image", shape, json!(["height", "width", "channels"]))
+                let (dtype, info) = match self.pictures {
+                    Pictures::Files => ("image", None),
+                    Pictures::Video(codec) => ("video", Some(self.video_info(codec, *height, *width))),
+                };
+                let names = json!(["height", "width", "channels"]);
+                Feature { info, ..feature(&self.camera_key(*place), dtype, shape, names) }
             })
             .collect();
         let state: Vec<String> = self.state.iter().flat_map(|(place, length)| numbered(*place, *length)).collect();
@@ -173,11 +195,43 @@ impl Features {
         all
     }
 
+    /// The feature of a camera.
+    pub(super) fn camera_key(&self, place: usize) -> String {
+        format!("{IMAGES}{}", self.modalities.get(place).map_or("", String::as_str))
+    }
+
+    /// The features whose pictures are in videos, in the order of the cameras.
+    pub(super) fn videos(&self) -> impl Iterator<Item = (String, Shape)> {
+        let cameras = if self.pictures == Pictures::Files { &[] } else { &*self.cameras };
+        cameras.iter().map(|(place, shape)| (self.camera_key(*place), *shape))
+    }
+
+    /// How many videos an episode has.
+    pub fn videos_per_episode(&self) -> usize {
+        self.videos().count()
+    }
+
+    /// How the data set has its pictures.
+    pub fn pictures(&self) -> Pictures {
+        self.pictures
+    }
+
+    fn video_info(&self, codec: Codec, height: u32, width: u32) -> Value {
+        json!({
+            "video.height": height, "video.width": width, "video.codec": codec.name(), "video.pix_fmt": "yuv420p",
+            "video.is_depth_map": false, "video.fps": self.fps, "video.channels": 3, "has_audio": false,
+        })
+    }
+
     /// The value of `features` in `info.json`.
     pub(super) fn json(&self) -> Value {
         let of = |feature: Feature| {
-            let Feature { key, dtype, shape, names } = feature;
-            (key, json!({ "dtype": dtype, "shape": shape, "names": names }))
+            let Feature { key, dtype, shape, names, info } = feature;
+            let mut value = json!({ "dtype": dtype, "shape": shape, "names": names });
+            if let Some(info) = info {
+                value["info"] = info;
+            }
+            (key, value)
         };
         Value::Object(self.all().into_iter().map(of).collect())
     }
@@ -192,11 +246,16 @@ impl Features {
         let modalities = names(MASK)?;
         let place = |name: &str| modalities.iter().position(|modality| modality == name);
         let mut cameras = Vec::new();
+        let mut pictures = Pictures::Files;
         for (at, modality) in modalities.iter().enumerate() {
             let Some(feature) = features.get(&format!("{IMAGES}{modality}")) else { continue };
             let side = |axis: usize| feature.get("shape")?.get(axis)?.as_u64();
             let (height, width) = (u32::try_from(side(0)?).ok()?, u32::try_from(side(1)?).ok()?);
             cameras.push((at, Shape::new(height, width, u8::try_from(side(2)?).ok()?)?));
+            if let Some(info) = feature.get("info") {
+                let codec = info.get("video.codec")?.as_str()?;
+                pictures = Pictures::Video(Codec::ALL.into_iter().find(|known| known.name() == codec)?);
+            }
         }
         let mut state: Vec<(usize, usize)> = Vec::new();
         for name in names(STATE).unwrap_or_default() {
@@ -214,7 +273,7 @@ impl Features {
             },
         };
         let fps = u32::try_from(info.get("fps")?.as_u64()?).ok()?;
-        let found = Self { fps, modalities, cameras, state, actions };
+        let found = Self { fps, modalities, cameras, pictures, state, actions };
         (found.json() == Value::Object(features.clone())).then_some(found)
     }
 
@@ -225,7 +284,8 @@ impl Features {
             Actions::Modality(place, _) => Some(name(place)),
             Actions::Absent | Actions::Topic(_) => None,
         };
-        Choice { state: self.state.iter().map(|(place, _)| name(*place)).collect(), action }
+        let state = self.state.iter().map(|(place, _)| name(*place)).collect();
+        Choice { state, action, pictures: self.pictures }
     }
 
     /// Why an episode with the features `other` does not belong to a set with these.
@@ -261,6 +321,11 @@ impl Features {
             columns.resize(length, Column::default());
             columns
         };
+        // In a video a grey picture has three equal channels.
+        let channels = |place: usize, count: usize| {
+            let found = stream(place).map(|stream| stream.columns.as_slice()).unwrap_or_default();
+            if let [grey] = found { vec![*grey; count] } else { columns(place, count) }
+        };
         let of = |key: &str| match key {
             STATE => self.state.iter().flat_map(|(place, length)| columns(*place, *length)).collect(),
             ACTION => match self.actions {
@@ -276,7 +341,7 @@ impl Features {
                 let camera = self.cameras.iter().find(|(place, _)| {
                     key.strip_prefix(IMAGES).is_some_and(|name| self.modalities.get(*place).is_some_and(|m| m == name))
                 });
-                camera.map(|(place, shape)| columns(*place, shape.channels.into())).unwrap_or_default()
+                camera.map(|(place, shape)| channels(*place, shape.channels.into())).unwrap_or_default()
             }
         };
         let keys = self.all().into_iter().map(|feature| feature.key).filter(|key| !OWN.contains(&key.as_str()));
@@ -344,6 +409,7 @@ mod tests {
             fps: 30,
             modalities: ["cam", "arm", "force", "raw"].map(str::to_owned).into(),
             cameras: vec![(0, Shape { height: 480, width: 640, channels: 3 })],
+            pictures: Pictures::Files,
             state: vec![(2, 1), (1, 3)],
             actions: Actions::Topic(2),
         }
@@ -356,10 +422,18 @@ mod tests {
             let info = json!({ "fps": 30, "features": features.json() });
             assert_eq!(Features::of_set(&info), Some(features));
         }
+        for codec in Codec::ALL {
+            let features = Features { pictures: Pictures::Video(codec), ..features() };
+            let info = json!({ "fps": 30, "features": features.json() });
+            assert_eq!(Features::of_set(&info), Some(features));
+        }
         let mut info = json!({ "fps": 30, "features": features().json() });
         info["features"]["observation.state"]["shape"] = json!([5]);
         assert_eq!(Features::of_set(&info), None, "of another program");
-        assert_eq!(features().choice(), Choice { state: vec!["force".to_owned(), "arm".to_owned()], action: None });
+        assert_eq!(
+            features().choice(),
+            Choice { state: vec!["force".to_owned(), "arm".to_owned()], ..Choice::default() }
+        );
     }
 
     fn episode(contents: &[(&str, Content)]) -> Survey {
@@ -412,6 +486,7 @@ mod tests {
             let choice = Choice {
                 state: state.iter().map(|name| (*name).to_owned()).collect(),
                 action: action.map(str::to_owned),
+                ..Choice::default()
             };
             Features::of(&episode, &choice, &Known::default()).map_err(|refusal| refusal.to_string())
         };

@@ -1,8 +1,8 @@
 //! Episodes as a data set of LeRobot v3.0: Parquet tables, one row for each tick of the frame index.
 //!
 //! `rows` reads an episode tick by tick, `survey` finds out what it holds and whether it can be exported, `features` is
-//! what all episodes of a data set have in common, `cells` the values of one row, `table` and `set` the files, and
-//! `verify` compares them with the episodes again.
+//! what all episodes of a data set have in common, `cells` the values of one row, `table` and `set` the files, `video` and
+//! `ffmpeg` the videos, and `verify` compares all of it with the episodes again.
 //!
 //! The format is that of `lerobot` 0.4.4, `CODEBASE_VERSION` v3.0:
 //! <https://huggingface.co/docs/lerobot/lerobot-dataset-v3>.
@@ -15,6 +15,8 @@
 
 mod cells;
 mod features;
+mod ffmpeg;
+mod files;
 mod picture;
 mod rows;
 mod set;
@@ -24,9 +26,13 @@ mod table;
 #[cfg(test)]
 mod tests;
 mod verify;
+mod video;
 
 pub use features::{Choice, ChoiceError, Features, Known};
+pub use ffmpeg::{Ffmpeg, FfmpegError};
+pub use picture::{Codec, Pictures};
 pub use rows::Refusal;
 pub use set::{DataSet, SetError};
 pub use survey::{Survey, survey};
-pub use verify::{Difference, verify};
+pub use verify::{Difference, Verified, verify};
+pub use video::{Encoded, Ends, encode};

@@ -12,6 +12,64 @@ use crate::pixels::{LARGEST, Picture, PixelError, Pixels};
 use crate::record::is_whole_jpeg;
 use crate::sample::Encoding;
 
+/// How a data set has its pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Pictures {
+    /// A file of each, in the rows.
+    #[default]
+    Files,
+    /// A video of each camera and episode.
+    Video(Codec),
+}
+
+impl fmt::Display for Pictures {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Files => "jpeg",
+            Self::Video(codec) => codec.name(),
+        })
+    }
+}
+
+/// How a video is encoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Codec {
+    /// AV1: small, and slower.
+    Av1,
+    /// H.264: what every player can decode.
+    H264,
+}
+
+impl Codec {
+    pub(super) const ALL: [Self; 2] = [Self::Av1, Self::H264];
+
+    /// As ffmpeg and LeRobot call it.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Av1 => "av1",
+            Self::H264 => "h264",
+        }
+    }
+
+    /// The encoder in ffmpeg.
+    pub(super) fn encoder(self) -> &'static str {
+        match self {
+            Self::Av1 => "libsvtav1",
+            Self::H264 => "libx264",
+        }
+    }
+
+    /// Its options: every second frame is a picture of its own, as LeRobot has it, so that any of them is soon decoded. The
+    /// quality of AV1 is LeRobot's, that of H.264 the encoder's default. No frame has to wait for a later one: the first is
+    /// then at 0.
+    pub(super) fn options(self) -> &'static [&'static str] {
+        match self {
+            Self::Av1 => &["-c:v", "libsvtav1", "-g", "2", "-crf", "30", "-preset", "12"],
+            Self::H264 => &["-c:v", "libx264", "-g", "2", "-crf", "23", "-preset", "veryfast", "-bf", "0"],
+        }
+    }
+}
+
 /// Pixels along each side, and values of a pixel: 3, and 1 in the pictures of a camera that sends grey JPEGs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Shape {

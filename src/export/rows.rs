@@ -79,6 +79,14 @@ pub enum Refusal {
         /// That of the first one.
         expected: String,
     },
+    /// A picture that no video can have.
+    #[error("{name}: pictures of {shape}, and a video takes even numbers of pixels: --pictures jpeg has no such limit")]
+    OddSize {
+        /// The camera.
+        name: String,
+        /// Their size.
+        shape: String,
+    },
     /// A sensor without any sample, here or in the set.
     #[error("{0}: no usable sample to know the size of, and neither the other episodes nor the registry have it")]
     NoSize(String),
@@ -318,18 +326,18 @@ impl Index {
         (!self.actions.times.is_empty()).then_some(self.actions.length)
     }
 
-    /// Reads the samples of the episode at `path` and passes every row to `take`, in order.
-    pub(super) fn rows(
+    /// Reads the samples of the episode at `path` and passes every row to `take`, in order, until it fails.
+    pub(super) fn rows<E: From<Refusal>>(
         &self,
         path: &Path,
         stop: &AtomicBool,
-        mut take: impl FnMut(&Row<'_>) -> Result<(), Refusal>,
-    ) -> Result<(), Refusal> {
+        mut take: impl FnMut(&Row<'_>) -> Result<(), E>,
+    ) -> Result<(), E> {
         let mut waiting = Waiting::new(self);
-        let mut reader = Reader::open(path)?;
+        let mut reader = Reader::open(path).map_err(Refusal::from)?;
         let mut scratch = Scratch::default();
         waiting.flush(&mut take)?;
-        while waiting.row < self.ticks.len() && reader.advance()? {
+        while waiting.row < self.ticks.len() && reader.advance().map_err(Refusal::from)? {
             let Item::Message(message) = reader.item() else { continue };
             let (Kind::Sample(_), Some(id)) = (message.channel.kind, message.channel.bit) else { continue };
             let Some(Content::Sample(sample)) = message.content(&mut scratch) else { continue };
@@ -339,7 +347,7 @@ impl Index {
             }
         }
         // All samples were there when the frames were read.
-        if waiting.row < self.ticks.len() { Err(Refusal::Changed) } else { Ok(()) }
+        if waiting.row < self.ticks.len() { Err(Refusal::Changed.into()) } else { Ok(()) }
     }
 }
 
@@ -471,7 +479,7 @@ impl<'a> Waiting<'a> {
     }
 
     /// Passes on all rows whose samples are there.
-    fn flush(&mut self, take: &mut impl FnMut(&Row<'_>) -> Result<(), Refusal>) -> Result<(), Refusal> {
+    fn flush<E>(&mut self, take: &mut impl FnMut(&Row<'_>) -> Result<(), E>) -> Result<(), E> {
         while let Some(tick) = self.index.ticks.get(self.row) {
             let slots = self.index.slots(self.row);
             for ((shown, samples), slot) in self.shown.iter_mut().zip(&self.samples).zip(slots) {

@@ -3,6 +3,7 @@
 //! | file | |
 //! |---|---|
 //! | `data/chunk-CCC/file-FFF.parquet` | the rows of an episode |
+//! | `videos/KEY/chunk-CCC/file-FFF.mp4` | the pictures of a camera, if they are in videos |
 //! | `meta/episodes/chunk-CCC/file-FFF.parquet` | its length, task and statistics, and the file that it was made of (`rapid/...`) |
 //! | `meta/tasks.parquet` | the tasks by number, as pandas writes them |
 //! | `meta/stats.json`, `meta/info.json` | the statistics of all episodes; how many there are, and the features |
@@ -21,26 +22,26 @@ use std::sync::atomic::AtomicBool;
 use arrow_array::builder::{Float64Builder, Int64Builder, ListBuilder, StringBuilder};
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int64Type};
-use arrow_array::{Array, ArrayRef, Int64Array, RecordBatch, StringArray};
+use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{ArrowError, DataType, Field, Schema};
-use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::errors::ParquetError;
-use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use rustix::fs::FlockOperation;
 use serde_json::{Map, Value, json};
 
 use super::cells::CellMaker;
 use super::features::{Features, IMAGES, OWN};
+use super::ffmpeg::FfmpegError;
+use super::files::{self, CHUNK, NewFile, VIDEOS, numbered, write, write_parquet};
+use super::picture::Pictures;
 use super::rows::{Index, Refusal};
 use super::statistics::Column;
 use super::survey::Survey;
-use super::table::{CREATED_BY, Position, Table, one_row, timestamp};
+use super::table::{Position, Table, one_row, timestamp};
+use super::video::{Damaged, Encoded};
 use crate::episode::sha256;
-use crate::folder::{Folder, FolderError, Links, Missing, Sync};
+use crate::folder::{Folder, FolderError, Links, Missing};
 
-/// Files of a folder; also `chunks_size` in `info.json`.
-const CHUNK: u64 = 1000;
 /// Bytes of a file in JSON, at most.
 const LARGEST_JSON: u64 = 64 << 20;
 /// Column of an episode's facts: the file's name, its SHA-256, its size, the verdict; and by modality the valid rows.
@@ -72,6 +73,19 @@ pub enum SetError {
         path: PathBuf,
         /// What is wrong with it.
         source: ParquetError,
+    },
+    /// A video.
+    #[error(transparent)]
+    Ffmpeg(FfmpegError),
+    /// The data set has its pictures otherwise.
+    #[error("{}: its pictures are {of_set}, and --pictures is {requested}: leave it out, or name another --out", folder.display())]
+    Pictures {
+        /// The data set.
+        folder: PathBuf,
+        /// How it has them.
+        of_set: Pictures,
+        /// What was asked for.
+        requested: Pictures,
     },
     /// A file that this program did not write.
     #[error("{}: {problem}; --out takes a new folder, or a data set that `rapid export` made", path.display())]
@@ -149,10 +163,10 @@ impl DataSet {
             merge(&mut set.statistics, &entry.statistics);
             set.entries.push(entry);
         }
-        // Rows whose facts are missing: the program was killed between the two, and LeRobot would read them.
-        let (left, name) = (set.data_path(set.entries.len() as u64), numbered("data", set.entries.len() as u64));
-        if set.lock.is_some() && left.exists() {
-            std::fs::remove_file(&left).map_err(|source| SetError::Io { path: name.into(), source })?;
+        // Rows and videos whose facts are missing: the program was killed between the two, and LeRobot would read them.
+        let next = set.entries.len() as u64;
+        for left in set.video_paths(next).into_iter().chain([set.data_path(next)]).filter(|left| left.exists()) {
+            std::fs::remove_file(&left).map_err(|source| SetError::Io { path: left, source })?;
         }
         // The program was killed between an episode and the files about all of them.
         if value["total_episodes"].as_u64() != Some(set.entries.len() as u64) {
@@ -165,7 +179,8 @@ impl DataSet {
     fn unnamed(self) -> Result<Self, SetError> {
         let folder = &self.folder;
         let entries = std::fs::read_dir(folder).map_err(|source| SetError::Io { path: folder.clone(), source })?;
-        let other = entries.flatten().find(|entry| entry.file_name() != "data" && entry.file_name() != "meta");
+        let is_ours = |name: &OsStr| ["data", "meta", VIDEOS].iter().any(|ours| name == *ours);
+        let other = entries.flatten().find(|entry| !is_ours(&entry.file_name()));
         match other {
             Some(other) => Err(SetError::Foreign { path: other.path(), problem: "not of a data set".to_owned() }),
             None => Ok(self),
@@ -188,6 +203,29 @@ impl DataSet {
         &self.folder
     }
 
+    /// How it has its pictures, or has to get them.
+    ///
+    /// # Errors
+    /// When it has them otherwise than `requested`.
+    pub fn pictures(&self, requested: Option<Pictures>) -> Result<Pictures, SetError> {
+        let of_set = self.features().map(Features::pictures);
+        match (of_set, requested) {
+            (Some(of_set), Some(requested)) if of_set != requested => {
+                Err(SetError::Pictures { folder: self.folder.clone(), of_set, requested })
+            }
+            (of_set, requested) => Ok(of_set.or(requested).unwrap_or_default()),
+        }
+    }
+
+    /// Prepares the encoding of videos in it: what a program left that was killed is removed.
+    ///
+    /// # Errors
+    /// When it cannot be created, or another program writes to it.
+    pub fn prepare_videos(&mut self, features: &Features) -> Result<(), SetError> {
+        self.lock(Missing::All)?;
+        features.videos().try_for_each(|(key, _)| files::remove_temporary(&self.folder.join(VIDEOS).join(key)))
+    }
+
     /// How many episodes it has.
     pub fn episodes(&self) -> usize {
         self.entries.len()
@@ -208,17 +246,27 @@ impl DataSet {
         self.entries.iter().position(|entry| entry.sha256 == sha256)
     }
 
-    /// Appends an episode, and returns its number. Its features are those of the set, or become them.
+    /// Appends an episode with its videos, and returns its number. Its features are those of the set, or become them.
     ///
     /// # Errors
     /// When a file cannot be written, or the episode has changed since it was surveyed. The set is then as it was.
-    pub fn append(&mut self, episode: &Survey, features: &Features, stop: &AtomicBool) -> Result<usize, SetError> {
+    pub fn append(
+        &mut self,
+        episode: &Survey,
+        features: &Features,
+        Encoded { videos, damaged }: Encoded,
+        stop: &AtomicBool,
+    ) -> Result<usize, SetError> {
         self.lock(Missing::All)?;
         let number = self.entries.len();
         let known = self.tasks.iter().position(|task| task == episode.task());
         let task = known.unwrap_or(self.tasks.len()) as u64;
         let position = Position { episode: number as u64, first: self.rows(), task };
-        self.write_rows(episode, features, position, stop)?;
+        let rows = self.write_rows(episode, features, position, damaged, stop)?;
+        for (video, (key, _)) in videos.into_iter().zip(features.videos()) {
+            video.keep(&self.folder.join(files::video(&key, position.episode)))?;
+        }
+        rows.keep(&self.data_path(position.episode))?;
         if known.is_none() {
             self.tasks.push(episode.task().to_owned());
             self.write_tasks()?;
@@ -244,41 +292,37 @@ impl DataSet {
         episode: &Survey,
         features: &Features,
         position: Position,
+        damaged: Damaged,
         stop: &AtomicBool,
-    ) -> Result<(), SetError> {
+    ) -> Result<NewFile, SetError> {
         let path = self.data_path(position.episode);
         let new = NewFile::create(&path)?;
         let wrong = |source| SetError::Parquet { path: path.clone(), source };
-        let file = new.file.try_clone().map_err(|source| SetError::Io { path: path.clone(), source })?;
-        let mut table = Table::new(file, features, position).map_err(wrong)?;
+        let mut table = Table::new(new.again()?, features, position).map_err(wrong)?;
         let mut maker = CellMaker::new(features, episode.kinds.clone())?;
+        maker.damaged = damaged;
         let index = Index::read(&episode.file, stop)?;
-        let mut failed = None;
-        let read = index.rows(&episode.file, stop, |row| {
-            table.push(&maker.cells(row)?).map_err(|error| {
-                failed = Some(error);
-                // Only ends the reading.
-                Refusal::Interrupted
-            })
-        });
-        match failed {
-            Some(error) => return Err(wrong(error)),
-            None => read?,
-        }
+        index.rows(&episode.file, stop, |row| table.push(&maker.cells(row)?).map_err(wrong))?;
         table.finish().map_err(wrong)?;
         // The statistics, and the name by which it is found again, are those of the survey.
         if sha256(&episode.file).map_err(Refusal::from)? != episode.sha256 {
             return Err(Refusal::Changed.into());
         }
-        new.keep()
+        Ok(new)
     }
 
     pub(super) fn data_path(&self, episode: u64) -> PathBuf {
-        self.folder.join(numbered("data", episode))
+        self.folder.join(numbered("data", episode, "parquet"))
+    }
+
+    /// The videos of an episode, in the order of the cameras.
+    pub(super) fn video_paths(&self, episode: u64) -> Vec<PathBuf> {
+        let videos = self.features().into_iter().flat_map(Features::videos);
+        videos.map(|(key, _)| self.folder.join(files::video(&key, episode))).collect()
     }
 
     fn entry_path(&self, episode: u64) -> PathBuf {
-        self.folder.join(numbered("meta/episodes", episode))
+        self.folder.join(numbered("meta/episodes", episode, "parquet"))
     }
 
     /// Reads the facts of the next episode, if there is one.
@@ -291,9 +335,10 @@ impl DataSet {
         let entry = batch.and_then(|batch| self.entry_of(&batch));
         let problem = || "not the facts of an episode of rapid".to_owned();
         let entry = entry.ok_or_else(|| SetError::Foreign { path: path.clone(), problem: problem() })?;
-        let data = self.data_path(self.entries.len() as u64);
-        let missing = |source| SetError::Io { path: data.clone(), source };
-        std::fs::metadata(&data).map_err(missing)?;
+        let number = self.entries.len() as u64;
+        for path in self.video_paths(number).into_iter().chain([self.data_path(number)]) {
+            std::fs::metadata(&path).map_err(|source| SetError::Io { path, source })?;
+        }
         Ok(Some(entry))
     }
 
@@ -361,6 +406,14 @@ impl DataSet {
             (BYTES, episode.bytes),
         ] {
             row.number(key, value);
+        }
+        for (key, _) in features.videos() {
+            row.number(&format!("{VIDEOS}/{key}/chunk_index"), chunk);
+            row.number(&format!("{VIDEOS}/{key}/file_index"), file);
+            let end = entry.rows as f64 / f64::from(features.fps);
+            for (name, time) in [("from_timestamp", 0.0), ("to_timestamp", end)] {
+                row.push(&format!("{VIDEOS}/{key}/{name}"), Arc::new(Float64Array::from(vec![time])));
+            }
         }
         for (key, text) in [(SOURCE, &*entry.source), (SHA256, &*entry.sha256), (VERDICT, episode.grade.word())] {
             row.push(key, Arc::new(StringArray::from(vec![text])));
@@ -436,92 +489,20 @@ impl DataSet {
             statistics.insert(key.clone(), Value::Object(named));
         }
         let (episodes, rows) = (self.entries.len(), self.rows());
+        let videos = features.videos().next();
+        let videos =
+            videos.map(|_| format!("{VIDEOS}/{{video_key}}/chunk-{{chunk_index:03d}}/file-{{file_index:03d}}.mp4"));
         let info = json!({
             "codebase_version": "v3.0", "robot_type": "rapid", "total_episodes": episodes, "total_frames": rows,
             "total_tasks": self.tasks.len(), "chunks_size": CHUNK, "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200, "fps": features.fps, "splits": {"train": format!("0:{episodes}")},
-            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", "video_path": null,
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", "video_path": videos,
             "features": features.json(),
         });
         for (name, value) in [("meta/stats.json", Value::Object(statistics)), ("meta/info.json", info)] {
             write(&self.folder.join(name), format!("{value:#}\n").as_bytes())?;
         }
         Ok(())
-    }
-}
-
-fn write_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<(), SetError> {
-    let written = batch.map_err(ParquetError::from).and_then(|batch| {
-        let mut bytes = Vec::new();
-        // Of one row in hundreds of columns, dictionaries and indices would be most of the file.
-        let properties = WriterProperties::builder()
-            .set_dictionary_enabled(false)
-            .set_statistics_enabled(EnabledStatistics::None)
-            .set_offset_index_disabled(true)
-            .set_created_by(CREATED_BY.to_owned())
-            .build();
-        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(properties))?;
-        writer.write(&batch)?;
-        writer.close()?;
-        Ok(bytes)
-    });
-    write(path, &written.map_err(|source| SetError::Parquet { path: path.to_owned(), source })?)
-}
-
-fn write(path: &Path, contents: &[u8]) -> Result<(), SetError> {
-    let (folder, name) = place(path)?;
-    folder.replace_by_umask(name, contents, Sync::Wait).map_err(|source| SetError::Io { path: path.to_owned(), source })
-}
-
-fn numbered(folder: &str, episode: u64) -> String {
-    format!("{folder}/chunk-{:03}/file-{:03}.parquet", episode / CHUNK, episode % CHUNK)
-}
-
-/// The folder of a file, which is created, and its name in it.
-fn place(path: &Path) -> Result<(Folder, &OsStr), SetError> {
-    let parent = path.parent().unwrap_or(Path::new("."));
-    Ok((Folder::open(parent, Links::Own, Missing::All)?, path.file_name().unwrap_or_default()))
-}
-
-/// A file that gets its name when it is complete, and disappears if it is not.
-struct NewFile<'a> {
-    path: &'a Path,
-    folder: Folder,
-    temporary: String,
-    file: File,
-    is_kept: bool,
-}
-
-impl<'a> NewFile<'a> {
-    fn create(path: &'a Path) -> Result<Self, SetError> {
-        let (folder, name) = place(path)?;
-        let temporary = format!(".{}.tmp", name.to_string_lossy());
-        // The set is locked: it is what a program left that was killed.
-        let _ = folder.remove(&temporary);
-        let file =
-            folder.create_new(&temporary, 0o666).map_err(|source| SetError::Io { path: path.to_owned(), source })?;
-        Ok(Self { path, folder, temporary, file, is_kept: false })
-    }
-
-    fn keep(mut self) -> Result<(), SetError> {
-        let name = self.path.file_name().unwrap_or_default();
-        // Rows without facts: of a program that was killed between the two.
-        let _ = self.folder.remove(name);
-        let kept = self
-            .file
-            .sync_all()
-            .and_then(|()| self.folder.rename_new(self.temporary.as_ref(), name))
-            .and_then(|()| self.folder.sync());
-        self.is_kept = kept.is_ok();
-        kept.map_err(|source| SetError::Io { path: self.path.to_owned(), source })
-    }
-}
-
-impl Drop for NewFile<'_> {
-    fn drop(&mut self) {
-        if !self.is_kept {
-            let _ = self.folder.remove(&self.temporary);
-        }
     }
 }
 

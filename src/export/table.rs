@@ -96,7 +96,8 @@ pub(super) struct Table {
 impl Table {
     pub(super) fn new(file: File, features: &Features, position: Position) -> Result<Self, ParquetError> {
         let fps = features.fps;
-        let features = features.all();
+        // Those in videos have no column.
+        let features: Vec<Feature> = features.all().into_iter().filter(|feature| feature.dtype != "video").collect();
         let schema = Arc::new(Schema::new(features.iter().map(field).collect::<Vec<_>>()));
         let pictures: Vec<String> =
             features.iter().filter(|feature| feature.dtype == "image").map(|feature| feature.key.clone()).collect();

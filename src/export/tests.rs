@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use super::cells::CellMaker;
 use super::features::{Actions, Features, MASK, STATE, VALID};
-use super::picture::Shape;
+use super::picture::{Pictures, Shape};
 use super::rows::{Index, Refusal, Row};
 use super::table::{Position, Rows, Table};
 use crate::action::ACTION_TOPIC;
@@ -122,6 +122,7 @@ fn raw_pictures_lose_nothing_and_what_cannot_be_used_is_black_and_not_valid() {
         modalities: vec!["cam".to_owned(), "force".to_owned()],
         cameras: vec![(0, Shape::new(2, 4, 3).unwrap())],
         state: vec![(1, 1)],
+        pictures: Pictures::Files,
         actions: Actions::Topic(2),
     };
     let kinds = index.modalities.iter().map(|modality| modality.kind).collect();
@@ -131,7 +132,7 @@ fn raw_pictures_lose_nothing_and_what_cannot_be_used_is_black_and_not_valid() {
     let mut written = Table::new(File::create(&table).unwrap(), &features, position).unwrap();
     let write = |row: &Row<'_>| {
         written.push(&maker.cells(row)?).unwrap();
-        Ok(())
+        Ok::<_, Refusal>(())
     };
     index.rows(&path, &stop, write).unwrap();
     written.finish().unwrap();
