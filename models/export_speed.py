@@ -3,7 +3,8 @@
 
     export_speed.py episodes/20261125_place-block_001.mcap --rapid target/release/rapid
 
-Of the program everything is measured: its start, reading the episode twice, statistics, checksum, writing. Of LeRobot only
+Of the program everything is measured: its start, reading the episode twice, statistics, checksum, writing; where there is an
+ffmpeg, its AV1 videos too. Of LeRobot only
 `add_frame`, `save_episode` and `finalize`, on pictures that are decoded already, with the four threads per camera that
 lerobot-record has: pictures as PNG, and as AV1 video. Prints one JSON object. Needs the packages of
 models/requirements-lerobot.txt and an idle machine.
@@ -13,6 +14,7 @@ import argparse
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -33,21 +35,25 @@ def main() -> int:
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        found = {"event": "export_speed", "rapid_s": ours(options, folder)}
-        features, rows = load(folder / "rapid-0")
+        found = {"event": "export_speed"}
+        for form in ("jpeg", "av1") if shutil.which("ffmpeg") else ("jpeg",):
+            found[f"rapid_{form}_s"] = ours(options, folder, form)
+        features, rows = load(folder / "jpeg-0")
         found["frames"] = len(rows)
-        for kind in ("image", "video"):
-            seconds = theirs(options, folder, features, rows, kind)
-            found |= {f"lerobot_{kind}_s": seconds, f"{kind}_ratio": round(seconds / found["rapid_s"], 1)}
+        for kind, form in (("image", "jpeg"), ("video", "av1")):
+            seconds = found[f"lerobot_{kind}_s"] = theirs(options, folder, features, rows, kind)
+            if own := found.get(f"rapid_{form}_s"):
+                found[f"{kind}_ratio"] = round(seconds / own, 1)
     print(json.dumps(found))
     return 0
 
 
-def ours(options: argparse.Namespace, folder: Path) -> float:
+def ours(options: argparse.Namespace, folder: Path, form: str) -> float:
     """Seconds of the fastest run."""
     seconds = []
     for at in range(options.times):
-        command = [options.rapid, "export", options.episode, "--to", "lerobot", "--out", folder / f"rapid-{at}", "--include-bad"]
+        command = [options.rapid, "export", options.episode, "--to", "lerobot", "--out", folder / f"{form}-{at}"]
+        command += ["--include-bad", "--pictures", form]
         begin = time.monotonic()
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         seconds.append(time.monotonic() - begin)

@@ -141,7 +141,8 @@ impl Ffmpeg {
 
     /// Reads all of `file` without decoding it. It has to have this many frames, one after the other.
     pub(super) fn check(&self, file: File, frames: usize, fps: u32, stop: Stop<'_>) -> Result<(), FfmpegError> {
-        let words = ["-i", "file:/dev/stdin", "-map", "0:v:0", "-c", "copy", "-f", "framecrc", "pipe:1"];
+        // By its own times: a video that begins late is not moved to 0.
+        let words = ["-copyts", "-i", "file:/dev/stdin", "-map", "0:v:0", "-c", "copy", "-f", "framecrc", "pipe:1"];
         let mut running = self.start(&words, file.into(), Stdio::piped())?;
         let mut packets = Packets { fps, ..Packets::default() };
         let mut part = [0; 4096];

@@ -6,9 +6,10 @@ use std::sync::atomic::AtomicBool;
 
 use super::cells::CellMaker;
 use super::features::{Actions, Features, MASK, STATE, VALID};
-use super::picture::{Pictures, Shape};
+use super::picture::{Codec, Pictures, Shape};
 use super::rows::{Index, Refusal, Row};
 use super::table::{Position, Rows, Table};
+use super::video::{FrameMaker, Shown};
 use crate::action::ACTION_TOPIC;
 use crate::episode::encode;
 use crate::episode::schema::{FRAME, SampleSchema};
@@ -82,6 +83,53 @@ impl Recording {
         self.writer.finish().unwrap();
         self.path
     }
+}
+
+#[test]
+fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut recording = Recording::new(folder.path());
+    for number in 0..3 {
+        recording.frame(number, [(number < 2).then_some(number.into()), None]);
+    }
+    let mut jpeg = Vec::new();
+    jpeg_encoder::Encoder::new(&mut jpeg, 90).encode(&[200; 8], 4, 2, jpeg_encoder::ColorType::Luma).unwrap();
+    recording.sample(Some(0), 0, Encoding::Mjpeg, &jpeg);
+    // With its beginning, its size and its end, but without the pixels.
+    let scan = jpeg.windows(2).position(|mark| mark == [0xff, 0xda]).unwrap();
+    let cut = [&jpeg[..scan], &[0xff, 0xd9]].concat();
+    recording.sample(Some(0), 1, Encoding::Mjpeg, &cut);
+    let path = recording.end();
+
+    let stop = AtomicBool::new(false);
+    let index = Index::read(&path, &stop).unwrap();
+    let shape = Shape::new(2, 4, 3).unwrap();
+    let features = Features {
+        fps: index.fps,
+        modalities: vec!["cam".to_owned(), "force".to_owned()],
+        cameras: vec![(0, shape)],
+        pictures: Pictures::Video(Codec::Av1),
+        state: Vec::new(),
+        actions: Actions::Absent,
+    };
+    let kinds = index.modalities.iter().map(|modality| modality.kind).collect();
+    let (mut frames, mut maker) = (FrameMaker::default(), CellMaker::new(&features, kinds).unwrap());
+    let mut found = Vec::new();
+    let take = |row: &Row<'_>| {
+        let (frame, shown) = frames.frame(row, 0, shape);
+        let (brightness, length) = (frame[0], frame.len());
+        if shown == Shown::Damaged {
+            maker.damaged.insert((0, row.number));
+        }
+        let cells = maker.cells(row)?;
+        assert!(cells.pictures.is_empty() && length == 24);
+        found.push((shown, brightness > 100, cells.mask[0] > 0.0, cells.valid[0] > 0.0));
+        Ok::<_, Refusal>(())
+    };
+    index.rows(&path, &stop, take).unwrap();
+    let expected =
+        [(Shown::Picture, true, true, true), (Shown::Damaged, false, true, false), (Shown::Black, false, false, false)];
+    assert_eq!(found, expected);
 }
 
 fn rgb(encoding: Encoding, bytes: &[u8]) -> Vec<u8> {

@@ -16,6 +16,8 @@ use serde_json::Value;
 
 use crate::support::{Episode, Place};
 
+mod videos;
+
 const DATA: &str = "set/data/chunk-000/file-000.parquet";
 const PNG: &[u8] = b"\x89PNG";
 const JPEG: &[u8] = &[0xff, 0xd8];
@@ -265,6 +267,8 @@ fn an_interrupted_export_has_the_episodes_so_far() {
         include_bad: true,
         state: Vec::new(),
         action: None,
+        pictures: None,
+        ffmpeg: None,
         verify: true,
     };
     let stop = AtomicBool::new(true);

@@ -4,6 +4,7 @@ The episodes are read once more by `recorded`, which shares nothing with the pro
 """
 
 import json
+import shutil
 import sys
 import tempfile
 import unittest
@@ -15,6 +16,7 @@ import torch
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import get_video_duration_in_s, get_video_info
 from mcap.reader import make_reader
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -136,6 +138,68 @@ class ExportedDataSet(Folder):
             for key in ours:
                 if isinstance(ours[key], torch.Tensor):
                     torch.testing.assert_close(merged[key], ours[key], msg=key)
+
+
+@unittest.skipUnless(shutil.which("ffmpeg"), "skipped: no ffmpeg, which encodes the videos")
+class ExportedVideos(Folder):
+    """The same episode with its pictures as files, in AV1 and in H.264."""
+
+    FORMS = ("jpeg", "av1", "h264")
+
+    @classmethod
+    def setUpClass(cls) -> None:
+        super().setUpClass()
+        # The demonstration unplugs the tactile camera after 4 s.
+        rapid("--sim", "--headless", "--record", "--out", "episodes", "--duration", "5s", cwd=cls.folder)
+        for form in cls.FORMS:
+            rapid("export", "episodes", "--to", "lerobot", "--out", form, "--include-bad", "--pictures", form, cwd=cls.folder)
+        cls.sets = {form: LeRobotDataset(f"rapid/{form}", root=cls.folder / form) for form in cls.FORMS}
+
+    def test_every_frame_is_near_its_picture_and_black_where_there_is_none(self) -> None:
+        files = self.sets["jpeg"]
+        for form in ("av1", "h264"):
+            videos = self.sets[form]
+            self.assertEqual((len(videos), sorted(videos.meta.video_keys)), (len(files), sorted(files.meta.camera_keys)))
+            absent = 0
+            # Backwards: each is sought on its own.
+            for at in reversed(range(len(files))):
+                found, expected = videos[at], files[at]
+                for key in files.meta.camera_keys:
+                    error = float(((found[key] - expected[key]) ** 2).mean())
+                    self.assertLess(error, 1e-3, f"{form}, frame {at}, {key}")
+                    absent += not expected[key].any()
+                torch.testing.assert_close(found["observation.state"], expected["observation.state"])
+            self.assertGreater(absent, 10)
+
+    def test_what_lerobot_reads_of_the_file_is_what_the_facts_say(self) -> None:
+        for form in ("av1", "h264"):
+            meta = self.sets[form].meta
+            for key in meta.video_keys:
+                path = self.folder / form / meta.get_video_file_path(0, key)
+                self.assertEqual(get_video_info(path), meta.info["features"][key]["info"])
+                end = meta.episodes[0][f"videos/{key}/to_timestamp"]
+                self.assertAlmostEqual(end, get_video_duration_in_s(path), places=3)
+
+    def test_deltas_and_batches(self) -> None:
+        deltas = {"observation.images.cam_wrist": [-1 / FPS, 0.0]}
+        paired = LeRobotDataset("rapid/av1", root=self.folder / "av1", delta_timestamps=deltas)
+        data = self.sets["av1"]
+        torch.testing.assert_close(paired[50]["observation.images.cam_wrist"][0], data[49]["observation.images.cam_wrist"])
+        batch = next(iter(torch.utils.data.DataLoader(data, batch_size=8, shuffle=True)))
+        self.assertEqual(batch["observation.images.tactile_tip"].shape, (8, 3, 240, 320))
+
+    def test_lerobot_merges_two_of_them(self) -> None:
+        folder = self.folder
+        rapid("export", "episodes", "--to", "lerobot", "--out", "again", "--include-bad", "--pictures", "av1", cwd=folder)
+        aggregate_datasets(
+            ["rapid/av1", "rapid/again"], "rapid/both", roots=[folder / "av1", folder / "again"], aggr_root=folder / "both"
+        )
+        both, one = LeRobotDataset("rapid/both", root=folder / "both"), self.sets["av1"]
+        self.assertEqual(len(both), 2 * len(one))
+        for at in range(0, len(one), 23):
+            for key in one.meta.camera_keys:
+                for merged in (both[at], both[len(one) + at]):
+                    torch.testing.assert_close(merged[key], one[at][key], msg=f"frame {at}, {key}")
 
 
 @unittest.skipUnless(PROGRAM, "skipped: no program in $RAPID_BIN")

@@ -14,6 +14,7 @@ mod disarm;
 mod drawn;
 mod eager;
 mod eval;
+mod export;
 mod feed;
 mod figure;
 mod frame;
@@ -116,6 +117,7 @@ enum Section {
     Disarm,
     Can,
     Eval,
+    Export,
     Unplug,
     Capture,
     Cycles,
@@ -125,7 +127,7 @@ enum Section {
 
 impl Section {
     /// In this order: measurements that must not be disturbed come before those that leave dirty pages behind.
-    const ALL: [Self; 23] = [
+    const ALL: [Self; 24] = [
         Self::Start,
         Self::Infer,
         Self::Sync,
@@ -149,6 +151,7 @@ impl Section {
         Self::Cycles,
         Self::Sweep,
         Self::Deaf,
+        Self::Export,
     ];
 
     fn name(self) -> &'static str {
@@ -171,6 +174,7 @@ impl Section {
             Self::Disarm => "disarm",
             Self::Can => "can",
             Self::Eval => "eval",
+            Self::Export => "export",
             Self::Unplug => "unplug",
             Self::Capture => "capture",
             Self::Cycles => "cycles",
@@ -204,6 +208,7 @@ impl Section {
             Self::Disarm => disarm::measure(bench),
             Self::Can => can::measure(bench),
             Self::Eval => eval::measure(bench),
+            Self::Export => export::measure(bench),
             Self::Unplug => others::unplug(bench),
             Self::Capture => others::capture(bench),
             Self::Cycles => others::cycles(bench),

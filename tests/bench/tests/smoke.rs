@@ -31,7 +31,7 @@ fn measured(sections: &[&str]) -> Vec<serde_json::Value> {
 fn every_section_that_needs_no_guest_measures() {
     let sections = [
         "start", "infer", "sync", "picture", "policy", "control", "motors", "safety", "disarm", "can", "eval",
-        "replug", "unplug", "mask", "screen", "many", "load", "write",
+        "replug", "unplug", "mask", "screen", "many", "load", "write", "export",
     ];
     let figures = measured(&sections);
     for section in sections {
