@@ -446,7 +446,7 @@ mod tests {
             let written = (0..100).try_for_each(|_| running.write(&picture, &|| false));
             written.unwrap_err().to_string()
         };
-        let failed = write("yes 'a line' | head -c 300000 >&2; echo no space >&2; exit 1");
+        let failed = write("yes 'a line' | head -n 40000 >&2; echo no space >&2; exit 1");
         assert!(failed.contains("exit status: 1: ") && failed.ends_with("a line; no space"), "{failed}");
         assert!(failed.len() < 2 * MESSAGES, "{}", failed.len());
         let ended = write("head -c 1000 >/dev/null");
