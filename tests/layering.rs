@@ -126,6 +126,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("lz4", &["episode"]),
     ("mcap", &["episode", "record/file"]),
     ("mdns_sd", &["hotplug/lan"]),
+    ("nix", &["driver/datagram", "driver/lan/udp", "driver/can/socket"]),
     ("nokhwa", &["driver/camera"]),
     ("ort", &["policy/library", "policy/graphs"]),
     ("parking_lot", &["bus/shared"]),

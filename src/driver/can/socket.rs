@@ -8,6 +8,8 @@ use std::mem::{size_of, zeroed};
 use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 use std::time::Duration;
 
+use nix::sys::socket::setsockopt;
+use nix::sys::socket::sockopt::RcvBufForce;
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 
 use super::link::{Arrival, LinkError, is_overflow};
@@ -148,7 +150,7 @@ fn set_up(socket: &CanSocket) -> io::Result<()> {
     socket.set_nonblocking(true)?;
     datagram::prepare(socket.as_fd())?;
     // Past the limit of the machine, which root alone may do.
-    let _ = datagram::set(socket.as_fd(), libc::SO_RCVBUFFORCE, &datagram::QUEUE.to_ne_bytes());
+    let _ = setsockopt(socket, RcvBufForce, &datagram::QUEUE);
     Ok(())
 }
 
@@ -170,7 +172,7 @@ fn receive(socket: &CanSocket) -> io::Result<Option<(libc::can_frame, Datagram)>
     let size = size_of::<libc::can_frame>();
     // SAFETY: `frame` is of integers, without gaps, so that all of it is bytes, and outlives the slice.
     let place = unsafe { std::slice::from_raw_parts_mut((&raw mut frame).cast::<u8>(), size) };
-    let datagram = datagram::receive(socket.as_fd(), place, None)?;
+    let (datagram, _) = datagram::receive::<()>(socket.as_fd(), place)?;
     Ok((datagram.length == size && !datagram.is_cut).then_some((frame, datagram)))
 }
 

@@ -7,12 +7,14 @@
 //!
 //! Invariant: receiving a packet does not allocate.
 
+use std::ffi::OsString;
 use std::io;
-use std::mem::zeroed;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, SocketAddr};
 use std::os::fd::{AsFd as _, OwnedFd};
 use std::time::Duration;
 
+use nix::sys::socket::sockopt::BindToDevice;
+use nix::sys::socket::{SockaddrStorage, setsockopt};
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -68,9 +70,7 @@ impl Packets {
                 continue;
             };
             let mut guard = ready.map_err(|error| self.place.lost(error))?;
-            // SAFETY: all zeroes are a valid value.
-            let mut from: libc::sockaddr_storage = unsafe { zeroed() };
-            let received = match datagram::receive(guard.get_inner().as_fd(), &mut self.packet, Some(&mut from)) {
+            let (received, from) = match datagram::receive(guard.get_inner().as_fd(), &mut self.packet) {
                 Ok(received) => received,
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                     guard.clear_ready();
@@ -80,7 +80,7 @@ impl Packets {
                 Err(error) => return Err(self.place.lost(error)),
             };
             drop(guard);
-            if let Some(captured) = self.take(received, address(&from)) {
+            if let Some(captured) = self.take(received, from.as_ref().and_then(address)) {
                 break captured;
             }
         };
@@ -134,24 +134,15 @@ fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
     let socket = rustix::net::socket_with(family, SocketType::DGRAM, flags, None)?;
     datagram::prepare(socket.as_fd())?;
     if let Some(interface) = place.interface() {
-        datagram::set(socket.as_fd(), libc::SO_BINDTODEVICE, interface.as_bytes())?;
+        setsockopt(&socket, BindToDevice, &OsString::from(interface))?;
     }
     rustix::net::bind(&socket, &own)?;
     Ok(socket)
 }
 
-fn address(from: &libc::sockaddr_storage) -> Option<IpAddr> {
-    let from = &raw const *from;
-    // SAFETY: for either family the storage holds that type, and is large enough and aligned for both.
-    unsafe {
-        match i32::from((*from).ss_family) {
-            libc::AF_INET => {
-                Some(Ipv4Addr::from(u32::from_be((*from.cast::<libc::sockaddr_in>()).sin_addr.s_addr)).into())
-            }
-            libc::AF_INET6 => Some(Ipv6Addr::from((*from.cast::<libc::sockaddr_in6>()).sin6_addr.s6_addr).into()),
-            _ => None,
-        }
-    }
+fn address(from: &SockaddrStorage) -> Option<IpAddr> {
+    let v4 = from.as_sockaddr_in().map(|from| from.ip().into());
+    v4.or_else(|| from.as_sockaddr_in6().map(|from| from.ip().into()))
 }
 
 #[cfg(test)]
