@@ -103,6 +103,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("clap", &["cli", "dispatch", "main", "commands"]),
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("clap_mangen", &["commands"]),
+    ("cobs", &["driver/serial"]),
     ("crc32fast", &["episode"]),
     ("crossterm", &["tui"]),
     ("evdev", &["registry/parse", "inputs"]),

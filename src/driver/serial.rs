@@ -548,28 +548,11 @@ impl Framer {
     }
 }
 
-/// Undoes consistent overhead byte stuffing in place (Cheshire and Baker, 1999): a code byte `n` is followed by `n - 1`
-/// bytes and stands for a zero after them, except where `n` is 255 or the message ends. `message` contains no zero.
-/// False if a code points beyond the end.
+/// Undoes consistent overhead byte stuffing in place. False if a code points beyond the end.
 fn unstuff(message: &mut Vec<u8>) -> bool {
-    let (mut read, mut written) = (0, 0);
-    while let Some(&code) = message.get(read) {
-        let run = usize::from(code).saturating_sub(1);
-        let (from, to) = (read + 1, read + 1 + run);
-        if code == 0 || to > message.len() {
-            return false;
-        }
-        message.copy_within(from..to, written);
-        written += run;
-        read = to;
-        if code != u8::MAX && read < message.len() {
-            // `written` is below `read`: the code byte left space.
-            message[written] = 0;
-            written += 1;
-        }
-    }
-    message.truncate(written);
-    true
+    let length = cobs::decode_in_place(message).ok();
+    message.truncate(length.unwrap_or_default());
+    length.is_some()
 }
 
 #[cfg(test)]
