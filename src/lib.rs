@@ -61,6 +61,7 @@ pub mod realtime;
 pub mod record;
 pub mod registration;
 pub mod registry;
+pub mod remote;
 pub mod rig;
 pub mod sample;
 pub mod session;

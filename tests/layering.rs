@@ -35,6 +35,7 @@ const LAYERS: &[&[&str]] = &[
         "provenance",
         "flash",
         "points",
+        "remote",
     ],
     &[
         "registry",

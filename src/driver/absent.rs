@@ -48,6 +48,10 @@ impl Absent {
         match self.never {}
     }
 
+    pub fn clock(&self) -> Option<super::ClockOffset> {
+        match self.never {}
+    }
+
     pub fn close(self) -> Pending<()> {
         match self.never {}
     }

@@ -62,6 +62,15 @@ pub struct Reading<'a> {
     pub lost: u64,
 }
 
+/// The clock of another computer, of which the capture times of a device are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ClockOffset {
+    /// That clock minus this one, ns.
+    pub offset_ns: i64,
+    /// How far that may be wrong, either way, ns.
+    pub uncertainty_ns: u64,
+}
+
 /// The settings agreed with a device when it was opened.
 #[derive(Debug, Clone, Default)]
 pub struct Agreed {
@@ -248,6 +257,11 @@ impl Driver {
             }
             _ => Ok(()),
         }
+    }
+
+    /// The clock of the computer that the device is on, if that is another one and it has sent a sample.
+    pub fn clock(&self) -> Option<ClockOffset> {
+        if let Self::Lan(driver) = self { driver.clock() } else { None }
     }
 
     /// Ends in order the device's own activities: the run ends, or the device was unplugged. Abandoned after a moment.

@@ -2,7 +2,7 @@
 //! `schemas_match_their_proto_files` shows how.
 
 use crate::modality::ModalityKind;
-use crate::registry::{DeviceSpec, NodeSpec, PixelFormat};
+use crate::registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PixelFormat, RemoteSamples};
 use crate::sample::{Encoding, SampleHeader};
 
 /// Message encoding and schema encoding of every channel.
@@ -87,10 +87,11 @@ impl SampleSchema {
     /// The schema expected of a device by the registry.
     pub fn expected(device: &DeviceSpec) -> Self {
         match &device.node {
-            NodeSpec::Camera(camera) => match camera.format {
-                PixelFormat::Mjpg => Self::CompressedImage,
-                PixelFormat::Yuyv | PixelFormat::Grey | PixelFormat::Z16 => Self::RawImage,
-            },
+            NodeSpec::Camera(camera) => Self::of_pictures(camera.format),
+            NodeSpec::Lan(LanSpec {
+                protocol: LanProtocol::Remote { samples: RemoteSamples::Pictures(_, format), .. },
+                ..
+            }) => Self::of_pictures(*format),
             NodeSpec::Serial(_) | NodeSpec::Process(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => {
                 match device.modality().kind {
                     ModalityKind::Scalars => Self::Scalars,
@@ -100,6 +101,13 @@ impl SampleSchema {
                     ModalityKind::Bytes => Self::Bytes,
                 }
             }
+        }
+    }
+
+    const fn of_pictures(format: PixelFormat) -> Self {
+        match format {
+            PixelFormat::Mjpg => Self::CompressedImage,
+            PixelFormat::Yuyv | PixelFormat::Grey | PixelFormat::Z16 => Self::RawImage,
         }
     }
 

@@ -173,6 +173,7 @@ impl Printer {
             _ if self.options.json => line::json(event, wall_ns)?,
             // Chunks arrive continuously; progress shows their rate.
             What::Chunk(chunk) if chunk.skipped == 0 => return Ok(String::new()),
+            What::Clock { .. } => return Ok(String::new()),
             _ => self.columns.line(event, wall_ns),
         };
         Ok(self.whole_line(&line))

@@ -28,6 +28,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use self::mdns::Browser;
+use self::probe::Question;
 use self::watch::Watch;
 use super::{HotplugError, HotplugEvent};
 use crate::registry::{LanFind, NodeSpec, Probe, Registry};
@@ -58,7 +59,11 @@ impl LanMonitor {
                 LanFind::Host { host, probe, port } => {
                     // While the driver waits for the end of a cooldown, no packets are received.
                     let grace = if *probe == Probe::Udp { registry.rig.cooldown } else { Duration::ZERO };
-                    tasks.spawn(probe::watch(watch().waits(grace), lan.server(*host), (*host, *port).into(), *probe));
+                    let question = match lan.request() {
+                        Some(request) => Question::Remote(request),
+                        None => (*probe).into(),
+                    };
+                    tasks.spawn(probe::watch(watch().waits(grace), lan.server(*host), (*host, *port).into(), question));
                 }
                 LanFind::Mdns { service, instance } => {
                     let wanted = mdns::Wanted::new(watch(), instance.clone(), lan);

@@ -240,6 +240,9 @@ impl OpenEpisode {
         if let What::Attach { bit, .. } | What::Detach { bit, .. } = &event.what {
             self.measures.plugged(*bit, event.stamp.0, matches!(event.what, What::Attach { .. }));
         }
+        if let What::Clock { bit, uncertainty_ns, .. } = &event.what {
+            self.measures.uncertainty(*bit, *uncertainty_ns);
+        }
     }
 
     /// Counts events that were missed because they came too fast.

@@ -108,6 +108,9 @@ pub struct Quality {
     pub clock_drift: Option<f64>,
     /// Largest excess of a capture time over its receipt, ms: the clock is ahead.
     pub clock_ahead: f64,
+    /// How far the capture times of a device of another computer may be wrong, ms: the most of the episode, by the
+    /// events.
+    pub clock_uncertainty: Option<f64>,
     /// Distance between a tick and its sample, ms.
     pub offset: Option<Spread>,
     /// Share of the episode in which it was present, 0 to 1; unknown without a mask.
@@ -160,6 +163,7 @@ struct Lane {
     longest_gap_ns: u64,
     pending: Vec<(u64, u64)>,
     plugged: Plugged,
+    uncertainty_ns: Option<u64>,
 }
 
 impl Measures {
@@ -175,6 +179,7 @@ impl Measures {
                     longest_gap_ns: 0,
                     pending: Vec::with_capacity(PENDING),
                     plugged: Plugged::default(),
+                    uncertainty_ns: None,
                 });
             }
         }
@@ -229,6 +234,13 @@ impl Measures {
         }
     }
 
+    /// Takes how far the capture times of a device of another computer may be wrong.
+    pub(super) fn uncertainty(&mut self, id: ModalityId, ns: u64) {
+        if let Some(Some(lane)) = self.lanes.get_mut(id.index()) {
+            lane.uncertainty_ns = lane.uncertainty_ns.max(Some(ns));
+        }
+    }
+
     /// Takes a frame: per modality its number, whether it is present, and the age in ns of its sample in the window, if
     /// any.
     pub(super) fn frame(&mut self, slots: impl Iterator<Item = (ModalityId, bool, Option<i64>)>) {
@@ -269,7 +281,8 @@ impl Measures {
 
     /// The quality of a modality in an episode that ended at `end_ns`; `None` if it is not measured.
     pub(super) fn quality(&self, id: ModalityId, end_ns: u64) -> Option<Quality> {
-        let Lane { measured, meter, longest_gap_ns, pending, plugged } = self.lanes.get(id.index())?.as_ref()?;
+        let Lane { measured, meter, longest_gap_ns, pending, plugged, uncertainty_ns } =
+            self.lanes.get(id.index())?.as_ref()?;
         let gaps = pending.iter().copied().chain([(meter.latest_ns, end_ns)]);
         let longest_gap_ns = gaps
             .fold(*longest_gap_ns, |longest, (from, to)| longest.max(without_samples(&self.presence, id, from, to)));
@@ -284,6 +297,7 @@ impl Measures {
             lateness: meter.lateness.spread(),
             clock_drift: meter.drift.over_the_episode().map(|ns| ns as f64 / 1e6),
             clock_ahead: meter.ahead_ns as f64 / 1e6,
+            clock_uncertainty: uncertainty_ns.map(|ns| ns as f64 / 1e6),
             offset: meter.offset.spread(),
             presence: (known && length > 0.0).then(|| (present / length).clamp(0.0, 1.0)),
             present,

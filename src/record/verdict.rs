@@ -209,10 +209,24 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
     let rate = rate(quality, limits).filter(|rate| unless(rate, [&gap, &lost, &dropped]));
     let valid =
         valid(quality, limits).filter(|valid| unless(valid, [&gap, &lost, &dropped, &damaged, &late, &opening, &rate]));
-    [dropped, lost, damaged, duplicate, repeated, frozen, late, gap, opening, clock(quality, limits), rate, valid]
-        .into_iter()
-        .flatten()
-        .collect()
+    [
+        dropped,
+        lost,
+        damaged,
+        duplicate,
+        repeated,
+        frozen,
+        late,
+        gap,
+        opening,
+        clock(quality, limits),
+        uncertain(quality, limits),
+        rate,
+        valid,
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
 }
 
 /// The findings of a modality that sent nothing and was present too briefly to be missing.
@@ -237,6 +251,13 @@ fn clock(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
         let way = if drift > 0.0 { "fell behind" } else { "ran ahead of" };
         format!("its clock {way} this machine's by {} (limit {limit})", seconds(drifted))
     };
+    Some((grade, text))
+}
+
+fn uncertain(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
+    let uncertainty = quality.clock_uncertainty? / 1e3;
+    let (grade, limit) = longer(limits, |limits| limits.uncertain, uncertainty)?;
+    let text = format!("the clock of its computer was known to {} only (limit {limit})", seconds(uncertainty));
     Some((grade, text))
 }
 

@@ -34,6 +34,6 @@ pub use spec::{
     Hooks, IdentitySpec, InputSpec, InterlockSpec, JointsSpec, KeyInput, LanFind, LanPicture, LanProtocol, LanSpec,
     Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError,
     ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
-    PixelFormat, PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec, Quantity, Registry, RigSpec, SLCAN_BITRATES,
-    SerialSpec, Stop, StopSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale, mounted, own_side,
+    PixelFormat, PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec, Quantity, Registry, RemoteSamples, RigSpec,
+    SLCAN_BITRATES, SerialSpec, Stop, StopSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale, mounted, own_side,
 };

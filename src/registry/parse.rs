@@ -129,7 +129,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     let buttons = button::buttons(root, &drafts, &stops);
     root.check()?;
 
-    let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
+    let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict, rig.sync_window)).collect();
     devices.sort_by_key(|(_, device)| device.id);
     warn_of_narrow_window(&devices, rig.sync_window);
     motors::warn_of_slow_stop(&devices);

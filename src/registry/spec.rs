@@ -27,7 +27,7 @@ pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
 };
-pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, own_side};
+pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, RemoteSamples, own_side};
 pub use motors::{
     BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
 };
@@ -704,6 +704,8 @@ pub struct Limits {
     /// Change of the stamps against this machine's clock over the episode, and how far they are in
     /// the future.
     pub clock: Option<Duration>,
+    /// How far the capture times may be wrong, of a device of another computer.
+    pub uncertain: Option<Duration>,
     /// Least rate while the device was attached, as a share of the nominal one.
     pub rate: Option<f64>,
     /// Least share of the ticks while the device was attached that have a sample of it in `sync_window`.
@@ -755,6 +757,7 @@ impl VerdictSpec {
             gap: Some(stall_after),
             opening: Some(Duration::from_secs(5)),
             clock: Some(Duration::from_millis(10)),
+            uncertain: None,
             rate: Some(0.9),
             valid: Some(0.9),
         };
@@ -769,10 +772,18 @@ impl VerdictSpec {
             gap: Some(stall_after.saturating_mul(10)),
             opening: None,
             clock: Some(Duration::from_millis(100)),
+            uncertain: None,
             rate: Some(0.5),
             valid: Some(0.5),
         };
         Self { suspect, bad, hz }
+    }
+
+    /// Also judges the clock of another computer: beyond half of `sync_window` a sample may belong to another frame.
+    #[must_use]
+    pub fn of_another_computer(mut self, sync_window: Duration) -> Self {
+        self.suspect.uncertain = Some(sync_window / 2);
+        self
     }
 
     /// Whether any check here compares payloads for equality.

@@ -24,7 +24,7 @@ use super::{Addition, RigCommand, RigError};
 use crate::action::{ActuatorNotice, Arming};
 use crate::bus::{Bus, TopicId, Writer};
 use crate::device::Attachment;
-use crate::driver::DriverError;
+use crate::driver::{ClockOffset, DriverError};
 use crate::hotplug::HotplugStream;
 use crate::inputs::tap::Tap;
 use crate::mask::SizedMask;
@@ -345,7 +345,7 @@ impl Rig {
             Report::Event(event) => return self.step(Input::Stream { id, epoch, event }),
             Report::LinkDown => self.step(Input::Stream { id, epoch, event: StreamEvent::LinkDown }),
             Report::Opened(..) => self.step(Input::Stream { id, epoch, event: StreamEvent::Opened }),
-            Report::Silent(_) | Report::Refused(_) | Report::Actuator(_) => {}
+            Report::Silent(_) | Report::Refused(_) | Report::Actuator(_) | Report::Clock(_) => {}
         }
         let Some(modality) = self.modalities.iter_mut().find(|modality| modality.spec.id == id) else { return };
         let device = modality.spec.name.clone();
@@ -366,6 +366,9 @@ impl Rig {
                 What::Log { level: Level::Warn, text: format!("{device}: open, but it has sent nothing for {limit} s") }
             }
             Report::Refused(reason) => What::Log { level: Level::Error, text: format!("{device}: {reason}") },
+            Report::Clock(ClockOffset { offset_ns, uncertainty_ns }) => {
+                What::Clock { device, bit: id, offset_ns, uncertainty_ns }
+            }
             Report::Actuator(ActuatorNotice { arming, text, is_problem }) => {
                 modality.detail = format!("{}: {text}", arming.word());
                 modality.arming = Some(arming);

@@ -21,7 +21,7 @@ use super::worker::Seat;
 use crate::action::ActuatorNotice;
 use crate::bus::Writer;
 use crate::device::Attachment;
-use crate::driver::{Driver, DriverError, Reading};
+use crate::driver::{ClockOffset, Driver, DriverError, Reading};
 use crate::fault;
 use crate::inputs::tap::{Tap, lost_at_the_end};
 use crate::modality::ModalityId;
@@ -39,6 +39,8 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 /// Cameras and programs always send: one that has sent nothing for this long after opening is reopened. Six of these
 /// and the delays between them fit into the minute in which five restarts are allowed.
 const START_LIMIT: Duration = Duration::from_secs(5);
+/// How often the clock of another computer is reported: in each episode that is long enough to be used.
+const CLOCK_EVERY: Duration = Duration::from_millis(500);
 /// How long the orderly closing of a device may take.
 const CLOSE_LIMIT: Duration = Duration::from_secs(4);
 
@@ -61,6 +63,8 @@ pub(super) enum Report {
     Refused(String),
     /// A notice from an actuator.
     Actuator(ActuatorNotice),
+    /// The clock of the computer that the device is on, with the worst uncertainty since the last report.
+    Clock(ClockOffset),
 }
 
 /// A report with its sender.
@@ -190,6 +194,9 @@ impl Stream {
                     };
                     newest = Instant::now();
                     self.pass_on_sample(&reading, &mut progress).await;
+                    if let Some(clock) = source.clock() && let Some(worst) = progress.clock(clock, newest) {
+                        self.report(Report::Clock(worst)).await;
+                    }
                     // A device that always has something to read never reaches `news`.
                     self.pass_on_episode(source, &mut episode).await;
                 }
@@ -347,6 +354,23 @@ struct StreamProgress {
     has_lost: bool,
     /// An action was refused.
     has_refused: bool,
+    /// When the clock of another computer was last reported, and the worst uncertainty since.
+    clock: Option<(Instant, u64)>,
+}
+
+impl StreamProgress {
+    /// Takes the clock of a sample; returns it when it is to be reported, at first at once.
+    fn clock(&mut self, clock: ClockOffset, now: Instant) -> Option<ClockOffset> {
+        let worst = self.clock.map_or(0, |(_, worst)| worst).max(clock.uncertainty_ns);
+        if let Some((reported, so_far)) = &mut self.clock
+            && now.duration_since(*reported) < CLOCK_EVERY
+        {
+            *so_far = worst;
+            return None;
+        }
+        self.clock = Some((now, 0));
+        Some(ClockOffset { uncertainty_ns: worst, ..clock })
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -184,6 +184,17 @@ pub enum What {
     },
     /// The policy ended.
     PolicyEnd(PolicyEnd),
+    /// The clock of the computer that a device is on, twice a second while its samples arrive.
+    Clock {
+        /// Modality.
+        device: String,
+        /// Its bit.
+        bit: ModalityId,
+        /// That clock minus the one here, ns.
+        offset_ns: i64,
+        /// How far that, and so the capture times since the last such event, may be wrong, either way, ns.
+        uncertainty_ns: u64,
+    },
     /// An actuator was armed or disarmed, or disabled itself.
     Actuator {
         /// Modality.
@@ -375,6 +386,11 @@ impl What {
                     format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are");
                 D::of(Level::Warn, "clock", "warn", sentence)
             }
+            Self::Clock { device, bit, offset_ns, uncertainty_ns } => {
+                let (offset, within) = (*offset_ns as f64 / 1e9, *uncertainty_ns as f64 / 1e6);
+                let rest = format!("of its computer is {offset:+.6} s from this one, within {within:.3} ms");
+                D::joined(Level::Debug, device, "clock", " ", &rest).with_bit(*bit)
+            }
             Self::Actuator { device, bit, arming, is_problem, text } => {
                 let prefix = format!("{device}: ");
                 let sentence = format!("{prefix}{text}");
@@ -401,8 +417,9 @@ impl What {
     pub fn log_line(&self) -> Option<(Level, String)> {
         let described = self.describe();
         let is_silent = match self {
-            // The slot's state changes with it; that event names the source or the agreed settings.
-            Self::Detach { .. } | Self::Opened { .. } => true,
+            // The slot's state changes with the first two; that event names the source or the agreed settings. The last
+            // is a measurement, twice a second.
+            Self::Detach { .. } | Self::Opened { .. } | Self::Clock { .. } => true,
             // A policy produces them continuously.
             Self::Chunk(chunk) => chunk.skipped == 0,
             _ => false,
@@ -417,6 +434,7 @@ impl What {
             | Self::Opened { device, .. }
             | Self::Detach { device, .. }
             | Self::State { device, .. }
+            | Self::Clock { device, .. }
             | Self::Actuator { device, .. } => (Some(device), None),
             Self::Printed { device, printed, .. } => (Some(device), Some(*printed)),
             _ => (None, None),

@@ -17,15 +17,16 @@ mod jpeg;
 mod mjpeg;
 mod multipart;
 mod place;
+mod remote;
 mod udp;
 
 use std::time::Duration;
 
-use super::{Agreed, DriverError, Reading};
+use super::{Agreed, ClockOffset, DriverError, Reading};
 use crate::device::DeviceNode;
 use crate::link::{Link, LinkState, LinkWatch};
 use crate::provenance::{Format, Negotiated};
-use crate::registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec};
+use crate::registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec, RemoteSamples};
 use place::Place;
 
 /// A camera or a phone that sends no complete sample for this long is reconnected. Six of these and the delays between
@@ -46,6 +47,7 @@ enum Protocol {
     Udp(udp::Packets),
     Gopro(gopro::Gopro),
     Iphone(iphone::Phone),
+    Remote(Box<remote::Remote>),
 }
 
 impl Lan {
@@ -80,6 +82,11 @@ impl Lan {
             LanProtocol::Iphone { port, stream, picture } => {
                 Protocol::Iphone(iphone::Phone::open(&spec.name, place, *port, *stream, *picture, spec.max_bytes)?)
             }
+            LanProtocol::Remote { host, device, port, samples } => {
+                let server = place.server(*port)?;
+                let wanted = remote::Wanted { host, device, samples: *samples, lease: lan.lease };
+                Protocol::Remote(Box::new(remote::Remote::open(&spec.name, server, wanted, spec.max_bytes).await?))
+            }
         };
         let (description, format) = describe(lan, &at);
         let card = if let Protocol::Gopro(gopro) = &protocol { gopro.card() } else { None };
@@ -100,6 +107,7 @@ impl Lan {
                 Protocol::Udp(packets) => packets.read().await,
                 Protocol::Gopro(gopro) => gopro.read().await,
                 Protocol::Iphone(phone) => phone.read().await,
+                Protocol::Remote(remote) => remote.read().await,
             }
         };
         tokio::select! {
@@ -107,6 +115,11 @@ impl Lan {
             reading = read => reading,
             () = link.lost() => Err(DriverError::Unlinked),
         }
+    }
+
+    /// The clock of the computer that the device is on, if that is another one.
+    pub fn clock(&self) -> Option<ClockOffset> {
+        if let Protocol::Remote(remote) = &self.protocol { remote.clock() } else { None }
     }
 
     /// The episode with this file begins, or with `None` the one in progress ends: a camera that records by itself
@@ -154,6 +167,15 @@ fn describe(lan: &LanSpec, at: &str) -> (String, Option<Format>) {
             let shape = lan.shape();
             let format = if shape.len() == 2 { pictures(*picture) } else { None };
             (format!("phone at {at}, which connects to port {port}"), format)
+        }
+        LanProtocol::Remote { host, device, samples, .. } => {
+            let format = match *samples {
+                RemoteSamples::Pictures(LanPicture { width, height, .. }, format) => {
+                    Some(Format::Pictures { fourcc: format.to_string(), width, height, fps: None })
+                }
+                RemoteSamples::Numbers(_) | RemoteSamples::Bytes => None,
+            };
+            (format!("{device} of {host}"), format)
         }
     }
 }

@@ -6,6 +6,7 @@ use std::future::Future;
 use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -17,10 +18,35 @@ use super::watch::Watch;
 use crate::device::LastReceived;
 use crate::link::LOOK_EVERY;
 use crate::registry::{Probe, own_side};
+use crate::remote::{HEAD, Head, Kind, LONGEST_REASON};
 use crate::time::Stamp;
 
 /// Interval between queries; also the time limit of an answer.
 const EVERY: Duration = Duration::from_secs(1);
+
+/// How a device is queried.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Question {
+    /// Whether it accepts a TCP connection.
+    Tcp,
+    /// Whether it answers an HTTP request.
+    Http,
+    /// Whether its packets arrive.
+    Udp,
+    /// `rapid-remote` is sent this line.
+    Remote(String),
+}
+
+impl From<Probe> for Question {
+    /// A question to `rapid-remote` needs its line: without one the port alone is tried.
+    fn from(probe: Probe) -> Self {
+        match probe {
+            Probe::Tcp | Probe::Remote => Self::Tcp,
+            Probe::Http => Self::Http,
+            Probe::Udp => Self::Udp,
+        }
+    }
+}
 
 /// Result of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,10 +60,13 @@ enum Answer {
 }
 
 /// Monitors an entry whose device is at `server` and is queried at `asked`.
-pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAddr, probe: Probe) {
+pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAddr, question: Question) {
+    let question = Arc::new(question);
+    // It accepts any number of connections, so that its refusal is one.
+    let is_shared = matches!(*question, Question::Remote(_));
     let mut look = interval(LOOK_EVERY);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut answer: Pin<Box<dyn Future<Output = Answer> + Send>> = Box::pin(ask(probe, asked));
+    let mut answer: Pin<Box<dyn Future<Output = Answer> + Send>> = Box::pin(ask(Arc::clone(&question), asked));
     loop {
         tokio::select! {
             answered = &mut answer => {
@@ -45,12 +74,12 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
                 match answered {
                     Answer::Here => watch.found(server, None, now).await,
                     // A server that accepts one connection refuses the next while the driver holds it.
-                    Answer::Refused if watch.is_sending(watch.length, now) => {}
+                    Answer::Refused if !is_shared && watch.is_sending(watch.length, now) => {}
                     Answer::Refused => watch.gone(UnplugSource::Lease, now).await,
                     Answer::Silence => {}
                 }
-                let driver_has_port = probe == Probe::Udp && watch.is_there();
-                answer = Box::pin(next(watch.last_received.clone(), driver_has_port, probe, asked));
+                let driver_has_port = *question == Question::Udp && watch.is_there();
+                answer = Box::pin(next(watch.last_received.clone(), driver_has_port, Arc::clone(&question), asked));
             }
             _ = look.tick() => watch.look(Stamp::now()).await,
         }
@@ -58,18 +87,24 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
 }
 
 /// The next query; none if the driver receives from the device, or holds the port it sends to.
-async fn next(last_received: LastReceived, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
+async fn next(
+    last_received: LastReceived,
+    driver_has_port: bool,
+    question: Arc<Question>,
+    asked: SocketAddr,
+) -> Answer {
     sleep(EVERY).await;
     let is_received = Stamp::now().since(last_received.at()) < EVERY;
-    if is_received || driver_has_port { Answer::Silence } else { ask(probe, asked).await }
+    if is_received || driver_has_port { Answer::Silence } else { ask(question, asked).await }
 }
 
-async fn ask(probe: Probe, asked: SocketAddr) -> Answer {
+async fn ask(question: Arc<Question>, asked: SocketAddr) -> Answer {
     let answer = async {
-        match probe {
-            Probe::Tcp => TcpStream::connect(asked).await.map(|_| Answer::Here),
-            Probe::Http => http(asked).await,
-            Probe::Udp => udp(asked).await,
+        match &*question {
+            Question::Tcp => TcpStream::connect(asked).await.map(|_| Answer::Here),
+            Question::Http => http(asked).await,
+            Question::Udp => udp(asked).await,
+            Question::Remote(request) => remote(asked, request).await,
         }
     };
     match timeout(EVERY, answer).await {
@@ -91,6 +126,19 @@ async fn http(asked: SocketAddr) -> io::Result<Answer> {
     let mut beginning = [0; BEGINNING.len()];
     stream.read_exact(&mut beginning).await?;
     Ok(if beginning == BEGINNING { Answer::Here } else { Answer::Silence })
+}
+
+/// Sends the line and reads the first frame.
+async fn remote(asked: SocketAddr, request: &str) -> io::Result<Answer> {
+    let mut stream = TcpStream::connect(asked).await?;
+    stream.write_all(request.as_bytes()).await?;
+    let mut head = [0; HEAD];
+    stream.read_exact(&mut head).await?;
+    Ok(match Head::read(&head, LONGEST_REASON) {
+        Ok(Head { kind: Kind::Refused, .. }) => Answer::Refused,
+        Ok(_) => Answer::Here,
+        Err(_) => Answer::Silence,
+    })
 }
 
 /// Receives a packet of the device at a local port, which is released at once.

@@ -179,6 +179,7 @@ impl Collected {
         }
         match (&mut self.judge, kind) {
             (Some(judge), "publisher") => judge.publisher(json),
+            (Some(judge), "clock") => judge.clock(device, json),
             (Some(judge), "attach" | "detach") => {
                 self.plugs += 1;
                 if self.plugs <= MAX_EVENTS {
@@ -188,6 +189,10 @@ impl Collected {
                 }
             }
             _ => {}
+        }
+        // Two a second are measurements and no events of a report.
+        if kind == "clock" {
+            return;
         }
         if self.events.len() < MAX_EVENTS && self.event_bytes < MAX_EVENT_BYTES {
             self.event_bytes += EVENT + bytes;

@@ -118,6 +118,20 @@ impl Judge {
         }
     }
 
+    /// Takes the event `clock` of a device, as JSON.
+    pub(super) fn clock(&mut self, device: &str, json: &str) {
+        #[derive(serde::Deserialize)]
+        struct Clock {
+            uncertainty_ns: u64,
+        }
+        let known = self.modalities.iter().find(|known| known.name == device);
+        // One that cannot be read is as bad as a clock that is not known.
+        let ns = serde_json::from_str::<Clock>(json).map_or(u64::MAX, |clock| clock.uncertainty_ns);
+        if let Some(known) = known {
+            self.measures.uncertainty(known.id, ns);
+        }
+    }
+
     /// Takes the event `publisher`, as JSON.
     pub(super) fn publisher(&mut self, json: &str) {
         self.publishers.event(json);

@@ -253,6 +253,7 @@ fn a_disabled_check_gives_no_reason() {
         gap: None,
         opening: None,
         clock: None,
+        uncertain: None,
         rate: None,
         valid: None,
     };
@@ -268,6 +269,7 @@ fn a_disabled_check_gives_no_reason() {
         opening: 9.0,
         clock_drift: Some(999.0),
         clock_ahead: 999.0,
+        clock_uncertainty: Some(999.0),
         hz: Some(1.0),
         frames_missed: 500,
         ..good()

@@ -77,14 +77,17 @@ pub(super) struct Draft<'a> {
 }
 
 impl<'d> Draft<'d> {
-    /// The entry, with the settings of `[verdict]`; `None` only if a problem with it was reported.
-    pub(super) fn finish(self, rig: &VerdictTable) -> Option<(Section<'d>, DeviceSpec)> {
+    /// The entry, with the settings of `[verdict]` and `[rig]`; `None` only if a problem with it was reported.
+    pub(super) fn finish(self, rig: &VerdictTable, sync_window: Duration) -> Option<(Section<'d>, DeviceSpec)> {
         let node = self.node?;
         let fps = node.picture().map(|picture| f64::from(picture.fps));
         let mut usual = VerdictSpec::of(node.modality_kind(), self.stall_after, fps);
         if node::is_gopro(&node) {
             // Its samples report its state once a second, and are not observations: its pictures are in the clip.
             (usual.suspect.valid, usual.bad.valid) = (None, None);
+        }
+        if node::is_remote(&node) {
+            usual = usual.of_another_computer(sync_window);
         }
         let spec = DeviceSpec {
             verdict: verdict::changed(usual, rig, &self.verdict),

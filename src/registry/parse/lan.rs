@@ -1,23 +1,35 @@
 //! `[device.NAME.lan]`.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
 use super::device::{Draft, IDENTITY_KEYS};
+use crate::modality::ModalityKind;
 use crate::registry::section::Section;
-use crate::registry::spec::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
+use crate::registry::spec::{
+    KINDS, LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, PixelFormat, Probe, RemoteSamples,
+};
+use crate::remote;
 
 const KEYS: [&str; 8] = ["protocol", "mdns", "instance", "host", "port", "probe", "probe_port", "lease"];
 /// Keys of the table that only some protocols have.
-const OWN: [(Word, &[&str]); 4] = [
+const OWN: [(Word, &[&str]); 5] = [
     (Word::Mjpeg, &["path", "width", "height", "fps"]),
     (Word::Udp, &[]),
     (Word::Gopro, &["download", "stream", "width", "height", "fps"]),
     (Word::Iphone, &["stream", "width", "height", "fps"]),
+    (Word::Remote, &["device", "kind", "width", "height", "fps", "format", "channels"]),
 ];
-const OPTIONAL: [&str; 6] = ["path", "width", "height", "fps", "download", "stream"];
+const OPTIONAL: [&str; 10] =
+    ["path", "width", "height", "fps", "download", "stream", "device", "kind", "format", "channels"];
+/// Keys for pictures of another computer, and for its numbers.
+const OF_PICTURES: [&str; 4] = ["width", "height", "fps", "format"];
+const OF_NUMBERS: [&str; 1] = ["channels"];
+const PROTOCOLS: &str = "write protocol = \"mjpeg\", \"udp\", \"gopro\", \"iphone\" or \"remote\"";
 
 const DEFAULT_LEASE: Duration = Duration::from_secs(3);
+/// `rapid-remote` sends ten times a second.
+const REMOTE_LEASE: Duration = Duration::from_secs(1);
 /// Default ports: that of a GoPro's HTTP server, and the one a phone's app connects to.
 const GOPRO_PORT: u16 = 8080;
 const PHONE_PORT: u16 = 5555;
@@ -28,11 +40,17 @@ enum Word {
     Udp,
     Gopro,
     Iphone,
+    Remote,
 }
 
 impl Word {
-    const WORDS: [(&str, Self); 4] =
-        [("mjpeg", Self::Mjpeg), ("udp", Self::Udp), ("gopro", Self::Gopro), ("iphone", Self::Iphone)];
+    const WORDS: [(&str, Self); 5] = [
+        ("mjpeg", Self::Mjpeg),
+        ("udp", Self::Udp),
+        ("gopro", Self::Gopro),
+        ("iphone", Self::Iphone),
+        ("remote", Self::Remote),
+    ];
 
     fn name(self) -> &'static str {
         Self::WORDS.iter().find(|(_, word)| *word == self).map_or("", |(name, _)| name)
@@ -47,21 +65,24 @@ impl Word {
 pub(super) fn lan(section: &Section<'_>) -> Option<LanSpec> {
     section.no_tables(&["camera", "tty", "serial"], "a network device", "lan");
     if !section.is_table("lan") {
-        let fix =
-            format!("write [{}] with protocol = \"mjpeg\", \"udp\", \"gopro\" or \"iphone\"", section.child("lan"));
+        let fix = PROTOCOLS.replacen("write", &format!("write [{}] with", section.child("lan")), 1);
         section.missing("the table of the network device", &fix);
         return None;
     }
     let table = section.table("lan")?;
     table.allow(&[&KEYS[..], &OPTIONAL].concat());
-    table.need("protocol", "write protocol = \"mjpeg\", \"udp\", \"gopro\" or \"iphone\"");
+    table.need("protocol", PROTOCOLS);
     let word = table.choice("protocol", &Word::WORDS);
     let port = port(&table, "port");
-    let lease = table.duration("lease", Duration::from_millis(500)..=Duration::from_mins(1)).unwrap_or(DEFAULT_LEASE);
+    let lease = table.duration("lease", Duration::from_millis(500)..=Duration::from_mins(1));
     let word = word?;
+    let lease = lease.unwrap_or(if word == Word::Remote { REMOTE_LEASE } else { DEFAULT_LEASE });
     for key in OPTIONAL.into_iter().filter(|key| table.has(key) && !word.own().contains(key)) {
         let message = format!("protocol {:?} has no {key}", word.name());
         table.report(key, message, format!("remove {key}, or correct the protocol"));
+    }
+    if word == Word::Remote {
+        return remote(section, &table, port.unwrap_or(remote::PORT), lease);
     }
     let protocol = protocol(&table, word, port);
     let find = find(section, &table, word, port);
@@ -72,8 +93,75 @@ fn port(table: &Section<'_>, key: &str) -> Option<u16> {
     table.integer(key, 1..=65_535)
 }
 
+/// A device of another computer: the host is a name, and what is probed is `rapid-remote` on this one.
+fn remote(section: &Section<'_>, table: &Section<'_>, port: u16, lease: Duration) -> Option<LanSpec> {
+    let elsewhere = ["mdns", "instance", "probe", "probe_port"];
+    for key in elsewhere.into_iter().filter(|key| table.has(key)) {
+        let message = format!("a device of another computer has no {key}: rapid-remote reports when it is present");
+        table.report(key, message, format!("remove {key}"));
+    }
+    for key in IDENTITY_KEYS.into_iter().filter(|key| section.has(key)) {
+        let message = format!("{key} belongs to the device's entry on the other computer");
+        section.report(key, message, format!("remove {key}; here its identity is host and device"));
+    }
+    table.need("host", "write host = the name that `rapid-remote serve` has on the other computer");
+    let host = name(table, "host", "the name of the other computer, for example host = \"robot-b\"");
+    let own = section.entry.strip_prefix("device.").unwrap_or_default();
+    let device = if table.has("device") {
+        name(table, "device", "the name of the device in devices.toml there, for example device = \"cam_wrist\"")
+    } else {
+        Some(own.to_owned())
+    };
+    let samples = samples(table);
+    let protocol = LanProtocol::Remote { host: host?, device: device?, port, samples };
+    Some(LanSpec {
+        protocol,
+        find: LanFind::Host { host: Ipv4Addr::LOCALHOST.into(), probe: Probe::Remote, port },
+        lease,
+    })
+}
+
+fn samples(table: &Section<'_>) -> RemoteSamples {
+    let kind = table.choice("kind", &KINDS).unwrap_or(ModalityKind::Image);
+    let (word, own): (_, &[&str]) = match kind {
+        ModalityKind::Image => ("image", &OF_PICTURES),
+        ModalityKind::Scalars => ("scalars", &OF_NUMBERS),
+        ModalityKind::Bytes => ("bytes", &[]),
+    };
+    for key in [&OF_PICTURES[..], &OF_NUMBERS].concat() {
+        if table.has(key) && !own.contains(&key) {
+            let owner = if OF_NUMBERS.contains(&key) { "scalars" } else { "image" };
+            let message = format!("samples of kind {word:?} have no {key}");
+            table.report(key, message, format!("remove {key}, or write kind = {owner:?}"));
+        }
+    }
+    match kind {
+        ModalityKind::Image => {
+            let format = table.choice("format", &PixelFormat::WORDS).unwrap_or(PixelFormat::Mjpg);
+            RemoteSamples::Pictures(picture(table, LanPicture::OF_A_CAMERA), format)
+        }
+        ModalityKind::Scalars => {
+            table.need("channels", "write channels = the count of numbers in a sample");
+            RemoteSamples::Numbers(table.integer("channels", 1..=1024).unwrap_or(1))
+        }
+        ModalityKind::Bytes => RemoteSamples::Bytes,
+    }
+}
+
+fn name(table: &Section<'_>, key: &str, what: &str) -> Option<String> {
+    let name = table.text(key)?;
+    if remote::is_name(name) {
+        return Some(name.to_owned());
+    }
+    let most = remote::LONGEST_NAME;
+    let message = format!("{name:?} is no name: up to {most} letters, digits, `_` and `-` are");
+    table.refuse(key, message, format!("write {what}"))
+}
+
 fn protocol(table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanProtocol> {
     Some(match word {
+        // Read by `remote`.
+        Word::Remote => return None,
         Word::Mjpeg => {
             let path = path(table);
             LanProtocol::Mjpeg { port, path, picture: picture(table, LanPicture::OF_A_CAMERA) }
@@ -199,6 +287,7 @@ fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16
     const PROBES: [(&str, Probe); 3] = [("tcp", Probe::Tcp), ("http", Probe::Http), ("udp", Probe::Udp)];
     let default = match word {
         Word::Mjpeg | Word::Iphone => Probe::Tcp,
+        Word::Remote => Probe::Remote,
         Word::Gopro => Probe::Http,
         Word::Udp => Probe::Udp,
     };
@@ -213,7 +302,7 @@ fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16
         Word::Gopro => Some(port.unwrap_or(GOPRO_PORT)),
         Word::Udp if probe == Probe::Udp => port,
         // There `port` is one of this computer.
-        Word::Udp | Word::Iphone => None,
+        Word::Udp | Word::Iphone | Word::Remote => None,
     };
     if probe == Probe::Udp && table.has("probe_port") {
         let message = "probe \"udp\" listens on port".to_owned();

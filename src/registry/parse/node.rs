@@ -216,6 +216,10 @@ pub(super) fn is_gopro(node: &NodeSpec) -> bool {
     matches!(node, NodeSpec::Lan(LanSpec { protocol: LanProtocol::Gopro { preview: None, .. }, .. }))
 }
 
+pub(super) fn is_remote(node: &NodeSpec) -> bool {
+    matches!(node, NodeSpec::Lan(LanSpec { protocol: LanProtocol::Remote { .. }, .. }))
+}
+
 const PROCESS_KEYS: [&str; 7] = ["args", "opens", "kind", "channels", "width", "height", "heartbeat"];
 /// Sufficient for a program that only checks once a second whether its device still answers.
 const DEFAULT_HEARTBEAT: Duration = Duration::from_secs(2);

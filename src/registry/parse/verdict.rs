@@ -28,11 +28,12 @@ const SHARES: [(&str, Share, Worse); 8] = [
     ("valid", |limits| &mut limits.valid, Worse::Less),
 ];
 /// Checks whose limit is a time; longer is worse.
-const TIMES: [(&str, Time); 4] = [
+const TIMES: [(&str, Time); 5] = [
     ("frozen", |limits| &mut limits.frozen),
     ("gap", |limits| &mut limits.gap),
     ("opening", |limits| &mut limits.opening),
     ("clock", |limits| &mut limits.clock),
+    ("uncertain", |limits| &mut limits.uncertain),
 ];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

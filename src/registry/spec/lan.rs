@@ -3,7 +3,9 @@
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
 
+use super::PixelFormat;
 use crate::modality::ModalityKind;
+use crate::remote;
 
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
@@ -12,7 +14,8 @@ pub struct LanSpec {
     pub protocol: LanProtocol,
     /// How it is found.
     pub find: LanFind,
-    /// How long it counts as present after data was last received from it, 500 ms to 60 s, default 3 s.
+    /// How long it counts as present after data was last received from it, 500 ms to 60 s, default 3 s; of a device of
+    /// another computer 1 s.
     pub lease: Duration,
 }
 
@@ -53,6 +56,28 @@ pub enum LanProtocol {
         /// The format of the pictures, default 1920x1440 at 30.
         picture: LanPicture,
     },
+    /// A device of a `rapid` on another computer; one sample per sample there.
+    Remote {
+        /// The name of that computer.
+        host: String,
+        /// The name of the device there, default that of the entry.
+        device: String,
+        /// Port of `rapid-remote` on this computer, default [`remote::PORT`].
+        port: u16,
+        /// Its samples.
+        samples: RemoteSamples,
+    },
+}
+
+/// The samples of a device of another computer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RemoteSamples {
+    /// Pictures in this format.
+    Pictures(LanPicture, PixelFormat),
+    /// So many numbers each, `1..=1024`.
+    Numbers(u32),
+    /// Bytes.
+    Bytes,
 }
 
 /// The format of the pictures of a network camera.
@@ -110,6 +135,8 @@ pub enum Probe {
     Http,
     /// Its packets arrive.
     Udp,
+    /// `rapid-remote` reports that it is present.
+    Remote,
 }
 
 /// Port of a server whose port is not reported.
@@ -168,6 +195,11 @@ impl LanSpec {
             | LanProtocol::Gopro { preview: Some(_), .. } => ModalityKind::Image,
             LanProtocol::Iphone { stream: PhoneStream::Pose, .. } => ModalityKind::Scalars,
             LanProtocol::Udp { .. } | LanProtocol::Gopro { preview: None, .. } => ModalityKind::Bytes,
+            LanProtocol::Remote { samples, .. } => match samples {
+                RemoteSamples::Pictures(..) => ModalityKind::Image,
+                RemoteSamples::Numbers(_) => ModalityKind::Scalars,
+                RemoteSamples::Bytes => ModalityKind::Bytes,
+            },
         }
     }
 
@@ -175,17 +207,33 @@ impl LanSpec {
     pub fn shape(&self) -> Vec<u32> {
         match (self.modality_kind(), self.picture()) {
             (ModalityKind::Image, Some(picture)) => vec![picture.height, picture.width],
-            (ModalityKind::Scalars, _) => vec![POSE],
+            (ModalityKind::Scalars, _) => vec![self.numbers()],
             _ => Vec::new(),
         }
+    }
+
+    /// How many numbers a sample of numbers has.
+    const fn numbers(&self) -> u32 {
+        match &self.protocol {
+            LanProtocol::Remote { samples: RemoteSamples::Numbers(count), .. } => *count,
+            _ => POSE,
+        }
+    }
+
+    /// The line that `rapid-remote` is sent for it, if it is a device of another computer.
+    pub fn request(&self) -> Option<String> {
+        let LanProtocol::Remote { host, device, .. } = &self.protocol else { return None };
+        Some(remote::request(host, device))
     }
 
     /// The format of its pictures, if it sends any.
     pub const fn picture(&self) -> Option<LanPicture> {
         match &self.protocol {
-            LanProtocol::Mjpeg { picture, .. } | LanProtocol::Iphone { picture, .. } => Some(*picture),
+            LanProtocol::Mjpeg { picture, .. }
+            | LanProtocol::Iphone { picture, .. }
+            | LanProtocol::Remote { samples: RemoteSamples::Pictures(picture, _), .. } => Some(*picture),
             LanProtocol::Gopro { preview, .. } => *preview,
-            LanProtocol::Udp { .. } => None,
+            LanProtocol::Udp { .. } | LanProtocol::Remote { .. } => None,
         }
     }
 
@@ -204,6 +252,16 @@ impl LanSpec {
             LanProtocol::Iphone { port, picture: LanPicture { width, height, fps }, .. } => {
                 format!("iphone {width}x{height} {fps} fps port {port}")
             }
+            LanProtocol::Remote { host, device, samples, .. } => {
+                let samples = match samples {
+                    RemoteSamples::Pictures(LanPicture { width, height, fps }, format) => {
+                        format!("{format} {width}x{height} {fps} fps")
+                    }
+                    RemoteSamples::Numbers(count) => format!("{count} numbers"),
+                    RemoteSamples::Bytes => "bytes".to_owned(),
+                };
+                format!("{device} of {host}, {samples}")
+            }
         }
     }
 
@@ -221,7 +279,8 @@ impl LanSpec {
                 };
                 (most.max(SMALLEST_JPEG), 4096)
             }
-            (ModalityKind::Scalars, _) => (8 * u64::from(POSE), 8 * u64::from(POSE)),
+            (ModalityKind::Scalars, _) => (8 * u64::from(self.numbers()), 8 * u64::from(self.numbers())),
+            (ModalityKind::Bytes, _) if matches!(self.protocol, LanProtocol::Remote { .. }) => (64 << 10, 1),
             // The payload of an Ethernet frame is under 1500.
             _ => (2048, 64),
         }
@@ -231,9 +290,10 @@ impl LanSpec {
     pub const fn port(&self) -> Option<u16> {
         match &self.protocol {
             LanProtocol::Mjpeg { port, .. } => *port,
-            LanProtocol::Udp { port } | LanProtocol::Gopro { port, .. } | LanProtocol::Iphone { port, .. } => {
-                Some(*port)
-            }
+            LanProtocol::Udp { port }
+            | LanProtocol::Gopro { port, .. }
+            | LanProtocol::Iphone { port, .. }
+            | LanProtocol::Remote { port, .. } => Some(*port),
         }
     }
 
@@ -247,7 +307,7 @@ impl LanSpec {
         match &self.protocol {
             LanProtocol::Udp { port } => Some((true, *port)),
             LanProtocol::Iphone { port, .. } => Some((false, *port)),
-            LanProtocol::Mjpeg { .. } | LanProtocol::Gopro { .. } => None,
+            LanProtocol::Mjpeg { .. } | LanProtocol::Gopro { .. } | LanProtocol::Remote { .. } => None,
         }
     }
 }

@@ -8,7 +8,7 @@ use tokio::time::timeout;
 
 use super::{CLOSE_LIMIT, Stream};
 use crate::action::{ActionSource, ActuatorNotice, Order};
-use crate::driver::{Driver, DriverError, Reading};
+use crate::driver::{ClockOffset, Driver, DriverError, Reading};
 use crate::permission::Attended;
 use crate::provenance::Negotiated;
 use crate::registry::NodeSpec;
@@ -39,6 +39,10 @@ impl Source {
             Self::Driver(driver) => driver.read().await,
             Self::Worker(worker) => worker.read().await,
         }
+    }
+
+    pub(super) fn clock(&self) -> Option<ClockOffset> {
+        if let Self::Driver(driver) = self { driver.clock() } else { None }
     }
 
     pub(super) fn description(&self) -> String {

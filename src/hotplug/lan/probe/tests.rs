@@ -55,7 +55,36 @@ async fn a_reply_is_distinguished_from_silence() {
         (Probe::Http, closed_port(), Answer::Refused),
         (Probe::Udp, closed_port(), Answer::Silence),
     ] {
-        assert_eq!(ask(probe, address).await, expected, "{probe:?} {address}");
+        assert_eq!(ask(Arc::new(probe.into()), address).await, expected, "{probe:?} {address}");
+    }
+}
+
+#[tokio::test]
+async fn a_device_of_another_computer_is_asked_for_by_its_name() {
+    let reply = |head: Head| {
+        server(move |mut stream| async move {
+            let mut line = [0; 40];
+            let count = stream.read(&mut line).await.unwrap_or(0);
+            if line[..count] == *b"rapid-remote-1 robot-b cam\n" {
+                let _ = stream.write_all(&head.bytes()).await;
+            }
+        })
+    };
+    let question = || Arc::new(Question::Remote("rapid-remote-1 robot-b cam\n".to_owned()));
+    let present = reply(Head::default()).await;
+    let absent = reply(Head { kind: Kind::Refused, length: 3, ..Head::default() }).await;
+    let other = server(|mut stream| async move {
+        let _ = stream.write_all(&[b'x'; HEAD]).await;
+    })
+    .await;
+    let cases = [
+        (present, Answer::Here),
+        (absent, Answer::Refused),
+        (other, Answer::Silence),
+        (closed_port(), Answer::Refused),
+    ];
+    for (address, expected) in cases {
+        assert_eq!(ask(question(), address).await, expected, "{address}");
     }
 }
 
@@ -63,7 +92,7 @@ async fn a_reply_is_distinguished_from_silence() {
 async fn packets_of_the_device_are_received_and_the_port_is_released() {
     let port = closed_port();
     let sender = UdpSocket::bind((LOCAL, 0)).await.expect("a port");
-    let mut received = Box::pin(ask(Probe::Udp, port));
+    let mut received = Box::pin(ask(Arc::new(Question::Udp), port));
     let answer = loop {
         tokio::select! {
             answer = &mut received => break answer,
@@ -75,7 +104,7 @@ async fn packets_of_the_device_are_received_and_the_port_is_released() {
     UdpSocket::bind(port).await.expect("the port is free for the driver");
     // Such packets are no evidence of another device.
     let elsewhere = SocketAddr::from(([127, 0, 0, 9], closed_port().port()));
-    let mut received = Box::pin(ask(Probe::Udp, elsewhere));
+    let mut received = Box::pin(ask(Arc::new(Question::Udp), elsewhere));
     let answer = loop {
         tokio::select! {
             answer = &mut received => break answer,
@@ -90,7 +119,7 @@ async fn packets_of_the_device_are_received_and_the_port_is_released() {
 #[tokio::test]
 async fn a_device_on_this_machine_is_not_listened_for_on_the_network() {
     let asked = closed_port();
-    let mut received = Box::pin(ask(Probe::Udp, asked));
+    let mut received = Box::pin(ask(Arc::new(Question::Udp), asked));
     let is_held = || std::net::UdpSocket::bind(asked).is_err();
     while !is_held() {
         tokio::select! {
@@ -109,7 +138,7 @@ async fn a_refused_probe_proves_nothing_while_the_driver_holds_the_connection() 
     let address = listener.local_addr().expect("an address");
     let (notify, mut reported) = mpsc::channel(8);
     let lease = EVERY * 4;
-    tokio::spawn(watch(Watch::new("cam", lease, notify), address, address, Probe::Tcp));
+    tokio::spawn(watch(Watch::new("cam", lease, notify), address, address, Question::Tcp));
     let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     // It has a connection, and sends less often than it would be queried.
@@ -146,7 +175,7 @@ async fn a_device_appears_and_disappears_and_a_sending_one_is_not_probed() {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
     let (notify, mut reported) = mpsc::channel(8);
-    tokio::spawn(watch(Watch::new("cam", EVERY * 3, notify), address, address, Probe::Tcp));
+    tokio::spawn(watch(Watch::new("cam", EVERY * 3, notify), address, address, Question::Tcp));
     let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     drop(listener.accept().await);

@@ -1,0 +1,204 @@
+//! Sensors of another computer: `rapid-remote` on this one sends their samples, with capture times on this clock
+//! ([`crate::remote`]).
+//!
+//! Invariant: a sample has the format that the entry states, and a capture time that can be one: the sender is another
+//! program.
+//! Invariant: the connection ends when the sensor is absent there; then, and after a lease without a frame, the device
+//! is gone.
+
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+use tokio::time::{Instant, timeout, timeout_at};
+
+use super::place::Server;
+use crate::driver::{ClockOffset, DriverError, Reading};
+use crate::registry::{PixelFormat, RemoteSamples};
+use crate::remote::{FrameError, Frames, Head, Kind, request};
+use crate::sample::Encoding;
+use crate::time::Stamp;
+
+/// More samples at once are not missing: their numbers began again.
+const MOST_MISSING: u64 = 1 << 20;
+/// A capture time further in the past, or in the future, is none.
+const OLDEST: Duration = Duration::from_mins(1);
+const FURTHEST: Duration = Duration::from_secs(1);
+
+/// What is read.
+pub(super) struct Wanted<'a> {
+    /// The other computer.
+    pub(super) host: &'a str,
+    /// The device there.
+    pub(super) device: &'a str,
+    pub(super) samples: RemoteSamples,
+    pub(super) lease: Duration,
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Remote {
+    name: String,
+    server: Server,
+    stream: TcpStream,
+    frames: Frames,
+    samples: RemoteSamples,
+    lease: Duration,
+    /// When something was last received.
+    received: Instant,
+    /// The number of the newest sample.
+    newest: Option<u64>,
+    clock: Option<ClockOffset>,
+}
+
+impl Remote {
+    pub(super) async fn open(
+        name: &str,
+        server: Server,
+        wanted: Wanted<'_>,
+        max_bytes: usize,
+    ) -> Result<Self, DriverError> {
+        let Wanted { host, device, samples, lease } = wanted;
+        let mut stream = server.connect().await?;
+        let asked = timeout(lease, stream.write_all(request(host, device).as_bytes())).await;
+        if !matches!(asked, Ok(Ok(()))) {
+            return Err(server.place.lost("rapid-remote does not take the request"));
+        }
+        let mut remote = Self {
+            name: name.to_owned(),
+            server,
+            stream,
+            frames: Frames::new(max_bytes),
+            samples,
+            lease,
+            received: Instant::now(),
+            newest: None,
+            clock: None,
+        };
+        // Its first frame reports that it is present.
+        remote.frame().await?;
+        Ok(remote)
+    }
+
+    pub(super) const fn clock(&self) -> Option<ClockOffset> {
+        self.clock
+    }
+
+    /// The next sample. Cancel-safe: what has been received stays with the frame.
+    pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        let (head, encoding) = loop {
+            let head = self.frame().await?;
+            if let (Kind::Sample, Some(encoding)) = (head.kind, head.encoding) {
+                break (head, encoding);
+            }
+        };
+        self.check(&head, encoding)?;
+        let captured = Stamp(head.capture_ns);
+        let now = Stamp::now();
+        if captured.since(now) > FURTHEST || now.since(captured) > OLDEST {
+            return Err(self.server.place.lost("a sample has no capture time of this computer's clock"));
+        }
+        let missing = self.newest.map_or(0, |newest| head.seq.saturating_sub(newest.saturating_add(1)));
+        self.newest = Some(head.seq);
+        let Head { offset_ns, uncertainty_ns, .. } = head;
+        self.clock = Some(ClockOffset { offset_ns, uncertainty_ns });
+        Ok(Reading {
+            bytes: self.frames.payload(),
+            encoding,
+            captured,
+            flags: head.flags,
+            width: head.width,
+            height: head.height,
+            lost: if missing < MOST_MISSING { missing } else { 0 },
+        })
+    }
+
+    /// The next frame that is no refusal.
+    async fn frame(&mut self) -> Result<Head, DriverError> {
+        loop {
+            let ends = self.received + self.lease;
+            let Ok(count) = timeout_at(ends, self.stream.read(self.frames.room())).await else {
+                return Err(DriverError::Gone);
+            };
+            let count = match count {
+                Ok(0) => return Err(DriverError::Gone),
+                Ok(count) => count,
+                Err(error) => return Err(self.server.place.lost(format_args!("rapid-remote: {error}"))),
+            };
+            self.received = Instant::now();
+            self.server.place.received();
+            match self.frames.filled(count).map_err(|error| self.refuse(&error))? {
+                Some(Head { kind: Kind::Refused, .. }) => {
+                    tracing::debug!(device = self.name, reason = ?String::from_utf8_lossy(self.frames.payload()), "absent");
+                    return Err(DriverError::Gone);
+                }
+                Some(head) => return Ok(head),
+                None => {}
+            }
+        }
+    }
+
+    fn refuse(&self, error: &FrameError) -> DriverError {
+        match error {
+            FrameError::TooLong { .. } => {
+                DriverError::Fatal(format!("{error}: write a larger max_bytes in [device.{}]", self.name))
+            }
+            FrameError::Foreign | FrameError::Field(..) => {
+                DriverError::Fatal(format!("{error}: use the rapid-remote of this version on port {}", self.port()))
+            }
+        }
+    }
+
+    fn port(&self) -> u16 {
+        self.server.address.port()
+    }
+
+    /// Checks that a sample is of the kind and size that the entry states.
+    fn check(&self, head: &Head, encoding: Encoding) -> Result<(), DriverError> {
+        let bytes = self.frames.payload().len();
+        let table = format_args!("[device.{}.lan]", self.name);
+        let wrong = |text: String| Err(DriverError::Fatal(text));
+        match (self.samples, format_of(encoding)) {
+            (RemoteSamples::Pictures(size, format), Some(sent)) if format == sent => {
+                if (head.width, head.height) != (size.width, size.height) {
+                    let Head { width, height, .. } = head;
+                    return wrong(format!(
+                        "its pictures are {width}x{height}: write width = {width} and height = {height} in {table}"
+                    ));
+                }
+                Ok(())
+            }
+            (RemoteSamples::Pictures(..), Some(sent)) => {
+                wrong(format!("its pictures are {sent}: write format = \"{sent}\" in {table}"))
+            }
+            (RemoteSamples::Numbers(count), None) if encoding == Encoding::F64 => {
+                let sent = bytes / size_of::<f64>();
+                if !bytes.is_multiple_of(size_of::<f64>()) || u32::try_from(sent) != Ok(count) {
+                    return wrong(format!("its samples have {sent} numbers: write channels = {sent} in {table}"));
+                }
+                Ok(())
+            }
+            (RemoteSamples::Bytes, None) if encoding == Encoding::Bytes => Ok(()),
+            (_, sent) => {
+                let kind = match (sent, encoding) {
+                    (Some(_), _) => "image",
+                    (None, Encoding::F64) => "scalars",
+                    (None, _) => "bytes",
+                };
+                wrong(format!("its samples are of another kind: write kind = \"{kind}\" in {table}"))
+            }
+        }
+    }
+}
+
+const fn format_of(encoding: Encoding) -> Option<PixelFormat> {
+    match encoding {
+        Encoding::Mjpeg => Some(PixelFormat::Mjpg),
+        Encoding::Yuyv => Some(PixelFormat::Yuyv),
+        Encoding::Grey => Some(PixelFormat::Grey),
+        Encoding::Bytes | Encoding::F64 | Encoding::Mask => None,
+    }
+}
+
+#[cfg(test)]
+mod tests;
