@@ -174,6 +174,20 @@ fn devices_on_the_network_are_parsed() {
     assert_eq!(lan("phone").find, LanFind::Mdns { service: "_iphonevio._tcp".to_owned(), instance });
     let protocol = LanProtocol::Iphone { port: 5556, stream: PhoneStream::Pose, picture: picture(1920, 1440, 30) };
     assert_eq!(lan("phone_pose").protocol, protocol);
+    let cam_far = lan("cam_far");
+    assert_eq!(cam_far.request().as_deref(), Some("rapid-remote-1 robot-b cam_wrist\n"));
+    assert_eq!((cam_far.find, cam_far.lease.as_millis()), (fixed("127.0.0.1", Probe::Remote, 7448), 1000));
+    assert_eq!(lan("state_far").request().as_deref(), Some("rapid-remote-1 robot-b state_far\n"));
+    assert_eq!(lan("state_far").find, fixed("127.0.0.1", Probe::Remote, 7449));
+    let far = |name: &str| registry.named(name).unwrap().clone();
+    assert_eq!((far("cam_far").modality().shape, far("cam_far").max_bytes), (vec![720, 1280], 2 * 1280 * 720));
+    assert_eq!((far("state_far").modality().shape, far("state_far").max_bytes), (vec![7], 56));
+    assert_eq!(far("scan_far").modality().kind, ModalityKind::Bytes);
+    // Half of the usual window.
+    let limits = |name: &str| (far(name).verdict.suspect.uncertain, far(name).verdict.bad.uncertain);
+    assert_eq!(limits("cam_far"), (Some(Duration::from_micros(12_500)), None));
+    assert_eq!(limits("scan_far"), (Some(Duration::from_millis(30)), Some(Duration::from_secs(1))));
+    assert_eq!(limits("lidar"), (None, None));
     let modality = |name: &str| registry.named(name).unwrap().modality();
     assert_eq!((modality("phone").kind, modality("phone").shape), (ModalityKind::Image, vec![1440, 1920]));
     assert_eq!((modality("phone_pose").kind, modality("phone_pose").shape), (ModalityKind::Scalars, vec![16]));
