@@ -5,6 +5,7 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::support::mistakes;
 use proptest::prelude::*;
@@ -30,7 +31,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_reported_in_full() {
-    mistakes::check("registry/invalid", "toml", 209, |text| {
+    mistakes::check("registry/invalid", "toml", 268, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });

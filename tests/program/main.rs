@@ -28,6 +28,7 @@ mod lan;
 mod lan_gopro;
 mod lan_hostile;
 mod lan_mdns;
+mod lan_remote;
 mod list;
 mod many_devices;
 mod modules;

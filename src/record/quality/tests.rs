@@ -334,6 +334,17 @@ proptest! {
 }
 
 #[test]
+fn the_largest_uncertainty_of_a_clock_counts() {
+    let mut measures = measures(ModalityKind::Image);
+    assert_eq!(quality_at(&measures, 0).clock_uncertainty, None);
+    for ns in [3 * MS, 7 * MS, 5 * MS] {
+        measures.uncertainty(id(0), ns);
+    }
+    measures.uncertainty(id(9), MS);
+    assert_eq!(quality_at(&measures, 0).clock_uncertainty, Some(7.0));
+}
+
+#[test]
 fn only_a_frame_at_the_edge_of_a_presence_may_lack_a_sample() {
     // Present with (v) and without (-) a valid sample, absent (.).
     for (frames, missed) in [

@@ -3,6 +3,8 @@
 use rapid::driver::lan::fuzzing;
 use rapid::hotplug::lan::fuzz_label;
 use rapid::points::{self, PacketFormat};
+use rapid::remote::{Frames, Head, Kind, request, requested};
+use rapid::sample::Encoding;
 
 /// Of the smallest entry.
 const LARGEST: usize = 1024;
@@ -35,6 +37,39 @@ pub fn phone(bytes: &[u8]) {
         fuzzing::Sent::Session(session) => session.len() <= LARGEST_SESSION,
     }));
     assert_eq!((sent, malformed), fuzzing::phone(LARGEST, [bytes.get(1..).unwrap_or_default()]));
+}
+
+/// A stream of another computer: no sample is larger than permitted, a head that is read can be written again, and how
+/// the bytes come in pieces does not matter.
+pub fn remote(bytes: &[u8]) {
+    let frames = |pieces: &mut dyn Iterator<Item = &[u8]>| {
+        let (mut reader, mut found) = (Frames::new(LARGEST), Vec::new());
+        for mut piece in pieces {
+            while !piece.is_empty() {
+                let room = reader.room();
+                let count = room.len().min(piece.len());
+                let (now, rest) = piece.split_at(count);
+                room[..count].copy_from_slice(now);
+                piece = rest;
+                match reader.filled(count) {
+                    Ok(Some(head)) => found.push((head, reader.payload().to_vec())),
+                    Ok(None) => {}
+                    Err(error) => return (found, Some(error)),
+                }
+            }
+        }
+        (found, None)
+    };
+    let (found, error) = frames(&mut pieces(bytes));
+    for (head, payload) in &found {
+        assert!(payload.len() <= LARGEST && usize::try_from(head.length) == Ok(payload.len()));
+        assert_eq!(Head::read(&head.bytes(), LARGEST), Ok(*head));
+    }
+    let whole = bytes.get(1..).unwrap_or_default();
+    assert_eq!((found, error), frames(&mut std::iter::once(whole)));
+    if let Some((host, device)) = requested(bytes) {
+        assert_eq!(request(host, device).trim_end().as_bytes(), bytes);
+    }
 }
 
 /// What is looked at in the answers of a server: no path leaves its folder.
@@ -101,6 +136,23 @@ pub fn phones() -> Vec<Vec<u8>> {
         [&[7][..], &message(0, b"{\"sessionId\":\"a\"}"), &frame(b"one"), &message(3, b"{}"), &frame(b"")].concat(),
         [&[200][..], &message(0, &[b' '; 2000]), &frame(b"one"), &message(0, &[b' '; 70_000]), &frame(b"two")].concat(),
         [&[255][..], &frame(&[9; 1024]), &frame(&[9; 1025]), &message(1, b"short"), &frame(b"two")].concat(),
+    ]
+}
+
+/// Streams of another computer, and a request.
+pub fn remotes() -> Vec<Vec<u8>> {
+    let sample = |payload: &[u8], encoding| {
+        let length = u32::try_from(payload.len()).unwrap_or(0);
+        let head = Head { kind: Kind::Sample, length, encoding: Some(encoding), seq: 9, ..Head::default() };
+        [&head.bytes()[..], payload].concat()
+    };
+    let alive = Head { offset_ns: -5, uncertainty_ns: 7, ..Head::default() }.bytes();
+    let refused = Head { kind: Kind::Refused, length: 6, ..Head::default() }.bytes();
+    vec![
+        [&[70][..], &alive, &sample(b"\xff\xd8\xff\xd9", Encoding::Mjpeg), &alive].concat(),
+        [&[9][..], &sample(&[0; 24], Encoding::F64), &sample(b"", Encoding::Bytes), &refused, b"absent"].concat(),
+        [&[255][..], &sample(&[1; 1024], Encoding::Grey), &sample(&[1; 1025], Encoding::Yuyv)].concat(),
+        b"rapid-remote-1 robot-b cam_wrist".to_vec(),
     ]
 }
 

@@ -38,6 +38,7 @@ pub const TARGETS: &[Target] = &[
     Target { name: "multipart", run: lan::multipart, seeds: lan::multiparts },
     Target { name: "points", run: lan::points, seeds: lan::packets },
     Target { name: "phone", run: lan::phone, seeds: lan::phones },
+    Target { name: "remote", run: lan::remote, seeds: lan::remotes },
     Target { name: "http_answer", run: lan::answer, seeds: lan::answers },
     Target { name: "mdns_name", run: lan::label, seeds: lan::labels },
     Target { name: "message", run: targets::message, seeds: seeds::messages },

@@ -1,0 +1,123 @@
+//! Sensors of another computer: a server in the place of rapid-remote, in front of the real binary.
+
+#![expect(clippy::expect_used, reason = "what fails here fails a test")]
+
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use rapid::remote::{Head, Kind, requested};
+use rapid::sample::Encoding;
+use rapid::time::Stamp;
+
+use crate::support::lan::{HEIGHT, RIG, RUN, Server, WIDTH, free_ports, life, life_of, picture, stop, wait_for};
+use crate::support::{self, Episode, EventMessage, Place};
+
+/// The clock there is 1000 s ahead.
+const OFFSET: i64 = 1_000_000_000_000;
+
+/// Sends `cam_wrist` of robot-b at 50 Hz, with a clock that is known to `uncertainty_ns`, and refuses any other.
+fn remote(uncertainty_ns: u64) -> impl Fn(TcpStream) + Send + Sync {
+    move |mut stream| {
+        let mut line = Vec::new();
+        while line.last() != Some(&b'\n') {
+            let mut byte = [0];
+            if !matches!(stream.read(&mut byte), Ok(1)) {
+                return;
+            }
+            line.push(byte[0]);
+        }
+        if requested(line.trim_ascii_end()) != Some(("robot-b", "cam_wrist")) {
+            let head = Head { kind: Kind::Refused, length: 6, ..Head::default() };
+            let _ = stream.write_all(&[&head.bytes()[..], b"absent"].concat());
+            return;
+        }
+        let mut send = |bytes: &[u8]| stream.write_all(bytes).is_ok();
+        for number in 0_u32.. {
+            let picture = picture(number);
+            let head = Head {
+                kind: Kind::Sample,
+                length: u32::try_from(picture.len()).expect("small"),
+                encoding: Some(Encoding::Mjpeg),
+                // Each second one is lost on the way.
+                seq: 2 * u64::from(number),
+                capture_ns: Stamp::now().0,
+                offset_ns: OFFSET,
+                uncertainty_ns,
+                width: WIDTH,
+                height: HEIGHT,
+                ..Head::default()
+            };
+            if !(send(&Head::default().bytes()) && send(&head.bytes()) && send(&picture)) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
+fn entry(name: &str, bit: u32, device: &str, port: u16) -> String {
+    format!(
+        "[device.{name}]\nnode = \"lan\"\nbit = {bit}\n[device.{name}.lan]\nprotocol = \"remote\"\nhost = \"robot-b\"\n\
+         device = \"{device}\"\nport = {port}\nwidth = {WIDTH}\nheight = {HEIGHT}\nfps = 50\n"
+    )
+}
+
+#[test]
+fn a_sensor_of_another_computer_comes_goes_and_is_recorded_with_its_clock() {
+    let (place, [port]) = (Place::new(), free_ports());
+    let (cam, away) = (entry("cam", 0, "cam_wrist", port), entry("away", 1, "other", port));
+    place.write("devices.toml", &format!("{RIG}{cam}{away}"));
+    let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+    let first = Server::start(port, remote(40_000_000));
+    wait_for(&running, "cam", "streaming", 1);
+    drop(first);
+    wait_for(&running, "cam", "absent", 1);
+    let _second = Server::start(port, remote(1_000_000));
+    wait_for(&running, "cam", "streaming", 2);
+    assert_eq!(life(&running, "away"), Vec::<String>::new(), "what is refused is not there");
+    let reported = stop(running);
+    let clocks: Vec<_> = reported.iter().filter(|event| event["event"] == "clock").collect();
+    assert!(clocks.len() >= 2 && clocks.iter().all(|clock| clock["offset_ns"] == OFFSET), "{clocks:?}");
+    // The bit fell with the connection.
+    let gone = reported.iter().find(|event| event["state"] == "absent").expect("gone");
+    assert_eq!(gone["mask"], "0x00", "{:?}", life_of(&reported, "cam"));
+
+    let files = place.files("out");
+    let episode = Episode::read(&place.path("out").join(&files[0]));
+    assert_eq!(episode.mask_edges().iter().map(|(_, mask)| *mask).collect::<Vec<_>>(), [0, 1, 0, 1]);
+    let pictures: Vec<Vec<u8>> = episode.topic("/rapid/lan/cam").map(support::Message::payload).collect();
+    assert_eq!(pictures[0], picture(0), "the picture is as it was sent");
+    let recorded: Vec<EventMessage> = episode.topic("/rapid/event").map(support::Message::decode).collect();
+    let recorded: Vec<_> = recorded.iter().filter(|event| event.json.contains("\"event\":\"clock\"")).collect();
+    assert_eq!(recorded.len(), clocks.len());
+    assert!(recorded[0].json.contains("\"uncertainty_ns\":40000000"), "{}", recorded[0].json);
+
+    // The recorder and a reader of the file agree.
+    let reason = "cam: the clock of its computer was known to 40 ms only (limit 12 ms)";
+    let ended = reported.iter().find(|event| event["event"] == "episode").expect("an episode");
+    assert!(ended["reasons"].as_array().expect("reasons").contains(&reason.into()), "{ended}");
+    let inspected = place.run(&["inspect", "--json", &format!("out/{}", files[0])]);
+    let inspected: serde_json::Value = serde_json::from_slice(&inspected.stdout).expect("JSON");
+    assert!(inspected["reasons"].as_array().expect("reasons").contains(&reason.into()), "{inspected}");
+    let quality = &inspected["modalities"][0]["quality"];
+    assert_eq!(quality["clock_uncertainty"], 40.0, "{quality}");
+    let numbers: Vec<u32> = episode.topic("/rapid/lan/cam").map(|message| message.sequence).collect();
+    let missing = numbers[numbers.len() - 1] - numbers[0] + 1 - u32::try_from(numbers.len()).expect("few");
+    assert!(missing > 0);
+    assert_eq!(quality["lost"], missing, "{quality}");
+}
+
+#[test]
+fn a_sensor_in_another_format_fails_with_the_line_to_write() {
+    let (place, [port]) = (Place::new(), free_ports());
+    let cam = entry("cam", 0, "cam_wrist", port).replace("fps = 50", "fps = 50\nformat = \"GREY\"");
+    place.write("devices.toml", &format!("{RIG}{cam}"));
+    let running = place.start(&RUN, "begin");
+    let _server = Server::start(port, remote(0));
+    wait_for(&running, "cam", "failed", 1);
+    let reported = stop(running);
+    let failed = reported.iter().find(|event| event["state"] == "failed").expect("failed");
+    let detail = failed["detail"].as_str().expect("text");
+    assert!(detail.contains("write format = \"MJPG\" in [device.cam.lan]"), "{detail}");
+}
