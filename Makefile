@@ -62,6 +62,7 @@ features: ## compile the program with no cargo feature, and with each alone
 
 lint: ## format and clippy
 	cargo fmt --all --check
+	cargo fmt --check --manifest-path examples/remote/Cargo.toml
 	cargo clippy --locked --workspace --all-targets -- -D warnings
 
 check: setup-build lint ## lints, documentation, licences, bans, sources and known vulnerabilities of the dependencies
@@ -78,7 +79,7 @@ fuzz: ## feed every reader of untrusted bytes with generated ones, each for FUZZ
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
 
-fleet-test: ## upload to a real S3 server, export on a cluster of Ray, UMI's buffer, Rerun, the page in Chromium (fetches 1.5 GB once)
+fleet-test: ## upload to a real S3 server, sensors of another computer, the page in Chromium, Ray, UMI, Rerun, with breaks (fetches 2 GB once; needs root)
 	RAPID_BIN='$(BUILT)' scripts/fleet.sh
 
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Tests what happens to episodes after a rig: the upload, a cluster's export, UMI's replay buffer, Rerun; and the page for a
-# phone in Chromium. Fetches 1.5 GB of Go's modules, Python packages and a browser once, and is no part of `make test`. RAPID_BIN is the program; without one, what needs
+# Tests what needs more than a rig: the upload, the page for a phone in Chromium, sensors of another computer, a cluster's export,
+# UMI's replay buffer, Rerun. Fetches 2 GB of Go's modules, crates, Python packages and a browser once, and is no part of
+# `make test`. RAPID_BIN is the program; without one, what needs
 # episodes reports that it is skipped.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -33,6 +34,19 @@ else
 fi
 
 python=$(scripts/venv.sh venv-fleet models/requirements-fleet.txt --no-deps)
+
+remote=(--locked --manifest-path examples/remote/Cargo.toml --target-dir "$cache/remote")
+cargo test "${remote[@]}"
+cargo build "${remote[@]}"
+if [[ ! -x $cache/bin/zenohd ]]; then
+  echo "fleet: building zenoh's router, once" >&2
+  cargo install zenohd --version 1.10.2 --locked --no-default-features --root "$cache"
+fi
+if [[ -n ${RAPID_BIN:-} && -e /dev/net/tun ]]; then
+  $sudo "$python" tests/fleet/remote.py "$RAPID_BIN" "$cache/remote/debug/rapid-remote" "$cache/bin/zenohd"
+else
+  echo "fleet: SKIPPED: sensors of another computer: no program is built, or no /dev/net/tun" >&2
+fi
 RERUN=$(dirname "$(scripts/venv.sh venv-rerun models/requirements-rerun.txt --no-deps)")/rerun
 export RERUN
 # The merge is LeRobot's: gigabytes that are not fetched for this alone.

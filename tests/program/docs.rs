@@ -54,6 +54,14 @@ const NOT_RUN: &[(&str, &str)] = &[
         "rapid monitor                         # the monitor of a rapid that runs headless, as a service or in another terminal",
     ),
     (
+        "docs/network.md",
+        "cargo build --release --locked --manifest-path examples/remote/Cargo.toml    # on both; the program is in examples/remote/target",
+    ),
+    (
+        "docs/network.md",
+        "rapid-remote serve --listen tcp/127.0.0.1:7447                         # on B: only through SSH",
+    ),
+    (
         "docs/policies.md",
         "make train                                              # models/tactile-id, from 72 such demonstrations",
     ),

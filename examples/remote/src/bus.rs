@@ -83,7 +83,7 @@ impl Topic {
     }
 }
 
-/// Follows the mask: `take` gets each new one, `None` when `rapid` has ended, and is called at least every `LOOK`. Never
+/// Follows the mask: `take` gets it every `LOOK` whether it has changed or not, `None` while no `rapid` runs. Never
 /// returns.
 pub fn follow_mask(place: &Place, running: &Running, mut take: impl FnMut(Option<PhysicalMask>)) {
     loop {

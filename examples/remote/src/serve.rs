@@ -101,7 +101,7 @@ fn read(session: &Session, host: &str, device: &DeviceSpec, place: &Place, runni
         .declare_subscriber(wire::taken_key(host, &device.name))
         .callback(move |sample| {
             if let Some(number) = wire::read_number(&sample.payload().to_bytes()) {
-                reported.fetch_max(number, Ordering::Relaxed);
+                reported.store(number, Ordering::Relaxed);
             }
         })
         .background()
