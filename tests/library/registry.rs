@@ -181,9 +181,10 @@ fn devices_on_the_network_are_parsed() {
     assert_eq!(lan("state_far").request().as_deref(), Some("rapid-remote-1 robot-b state_far\n"));
     assert_eq!(lan("state_far").find, fixed("127.0.0.1", Probe::Remote, 7449));
     let far = |name: &str| registry.named(name).unwrap().clone();
-    assert_eq!((far("cam_far").modality().shape, far("cam_far").max_bytes), (vec![720, 1280], 2 * 1280 * 720));
+    assert_eq!((far("cam_far").modality().shape, far("cam_far").max_bytes), (vec![240, 320], 2 * 320 * 240));
     assert_eq!((far("state_far").modality().shape, far("state_far").max_bytes), (vec![7], 56));
-    assert_eq!(far("scan_far").modality().kind, ModalityKind::Bytes);
+    assert_eq!((far("scan_far").modality().kind, far("scan_far").depth), (ModalityKind::Bytes, 60));
+    assert_eq!(far("depth_far").modality().kind, ModalityKind::Depth);
     // Half of the usual window.
     let limits = |name: &str| (far(name).verdict.suspect.uncertain, far(name).verdict.bad.uncertain);
     assert_eq!(limits("cam_far"), (Some(Duration::from_micros(12_500)), None));

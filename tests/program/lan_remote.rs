@@ -119,5 +119,5 @@ fn a_sensor_in_another_format_fails_with_the_line_to_write() {
     let reported = stop(running);
     let failed = reported.iter().find(|event| event["state"] == "failed").expect("failed");
     let detail = failed["detail"].as_str().expect("text");
-    assert!(detail.contains("write format = \"MJPG\" in [device.cam.lan]"), "{detail}");
+    assert!(detail.contains("write kind = \"image\" and format = \"MJPG\" in [device.cam.lan]"), "{detail}");
 }

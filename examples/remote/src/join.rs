@@ -264,7 +264,7 @@ async fn pass_on(
     };
     let Estimate { offset_ns, uncertainty_ns } = clock;
     let capture_ns = clock.here(head.capture_ns).min(now.0).max(last.capture_ns.saturating_add(1));
-    let is_picture = matches!(head.encoding, Some(Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey));
+    let is_picture = matches!(head.encoding, Some(Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey | Encoding::Depth));
     *last = Last { seq: head.seq, capture_ns, is_picture };
     writer.write_all(&Head { capture_ns, offset_ns, uncertainty_ns, ..head }.bytes()).await?;
     writer.write_all(payload).await?;

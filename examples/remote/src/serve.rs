@@ -108,7 +108,7 @@ fn read(session: &Session, host: &str, device: &DeviceSpec, place: &Place, runni
         .wait()?;
     let (name, topic, place, running) = (device.name.clone(), device.topic.clone(), place.clone(), running.clone());
     let (depth, out) = match device.modality().kind {
-        ModalityKind::Image => (PICTURES, PICTURES_OUT),
+        ModalityKind::Image | ModalityKind::Depth => (PICTURES, PICTURES_OUT),
         ModalityKind::Scalars | ModalityKind::Bytes => (device.depth, OTHERS_OUT),
     };
     // Samples on their way that are not reported yet, by number.

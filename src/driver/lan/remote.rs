@@ -168,8 +168,11 @@ impl Remote {
                 }
                 Ok(())
             }
+            (RemoteSamples::Pictures(..), Some(PixelFormat::Z16)) => {
+                wrong(format!("its pictures are distances: write kind = \"depth\" in {table}, without a format"))
+            }
             (RemoteSamples::Pictures(..), Some(sent)) => {
-                wrong(format!("its pictures are {sent}: write format = \"{sent}\" in {table}"))
+                wrong(format!("its pictures are {sent}: write kind = \"image\" and format = \"{sent}\" in {table}"))
             }
             (RemoteSamples::Numbers(count), None) if encoding == Encoding::F64 => {
                 let sent = bytes / size_of::<f64>();
@@ -181,6 +184,7 @@ impl Remote {
             (RemoteSamples::Bytes, None) if encoding == Encoding::Bytes => Ok(()),
             (_, sent) => {
                 let kind = match (sent, encoding) {
+                    (Some(PixelFormat::Z16), _) => "depth",
                     (Some(_), _) => "image",
                     (None, Encoding::F64) => "scalars",
                     (None, _) => "bytes",
@@ -196,6 +200,7 @@ const fn format_of(encoding: Encoding) -> Option<PixelFormat> {
         Encoding::Mjpeg => Some(PixelFormat::Mjpg),
         Encoding::Yuyv => Some(PixelFormat::Yuyv),
         Encoding::Grey => Some(PixelFormat::Grey),
+        Encoding::Depth => Some(PixelFormat::Z16),
         Encoding::Bytes | Encoding::F64 | Encoding::Mask => None,
     }
 }

@@ -22,8 +22,9 @@ const OWN: [(Word, &[&str]); 5] = [
 ];
 const OPTIONAL: [&str; 10] =
     ["path", "width", "height", "fps", "download", "stream", "device", "kind", "format", "channels"];
-/// Keys for pictures of another computer, and for its numbers.
+/// Keys for pictures of another computer, for pictures of distances, and for its numbers.
 const OF_PICTURES: [&str; 4] = ["width", "height", "fps", "format"];
+const OF_DEPTH: [&str; 3] = ["width", "height", "fps"];
 const OF_NUMBERS: [&str; 1] = ["channels"];
 const PROTOCOLS: &str = "write protocol = \"mjpeg\", \"udp\", \"gopro\", \"iphone\" or \"remote\"";
 
@@ -125,6 +126,7 @@ fn samples(table: &Section<'_>) -> RemoteSamples {
     let kind = table.choice("kind", &KINDS).unwrap_or(ModalityKind::Image);
     let (word, own): (_, &[&str]) = match kind {
         ModalityKind::Image => ("image", &OF_PICTURES),
+        ModalityKind::Depth => ("depth", &OF_DEPTH),
         ModalityKind::Scalars => ("scalars", &OF_NUMBERS),
         ModalityKind::Bytes => ("bytes", &[]),
     };
@@ -140,6 +142,7 @@ fn samples(table: &Section<'_>) -> RemoteSamples {
             let format = table.choice("format", &PixelFormat::WORDS).unwrap_or(PixelFormat::Mjpg);
             RemoteSamples::Pictures(picture(table, LanPicture::OF_A_CAMERA), format)
         }
+        ModalityKind::Depth => RemoteSamples::Pictures(picture(table, LanPicture::OF_A_CAMERA), PixelFormat::Z16),
         ModalityKind::Scalars => {
             table.need("channels", "write channels = the count of numbers in a sample");
             RemoteSamples::Numbers(table.integer("channels", 1..=1024).unwrap_or(1))

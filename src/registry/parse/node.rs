@@ -207,6 +207,7 @@ pub(super) fn default_depth(node: Option<&NodeSpec>) -> u64 {
         Some(node) if is_gopro(node) => 16,
         // For a camera with 30 pictures a second, and for anything that may be as large.
         Some(NodeSpec::Process(process)) if process.kind != ModalityKind::Scalars => 60,
+        Some(node) if is_remote(node) && node.modality_kind() == ModalityKind::Bytes => 60,
         node => node.and_then(NodeSpec::picture).map_or(2048, |picture| (2 * u64::from(picture.fps)).clamp(16, 1024)),
     }
 }

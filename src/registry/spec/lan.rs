@@ -196,6 +196,7 @@ impl LanSpec {
             LanProtocol::Iphone { stream: PhoneStream::Pose, .. } => ModalityKind::Scalars,
             LanProtocol::Udp { .. } | LanProtocol::Gopro { preview: None, .. } => ModalityKind::Bytes,
             LanProtocol::Remote { samples, .. } => match samples {
+                RemoteSamples::Pictures(_, PixelFormat::Z16) => ModalityKind::Depth,
                 RemoteSamples::Pictures(..) => ModalityKind::Image,
                 RemoteSamples::Numbers(_) => ModalityKind::Scalars,
                 RemoteSamples::Bytes => ModalityKind::Bytes,
@@ -206,7 +207,7 @@ impl LanSpec {
     /// Image: `[height, width]`. Scalars: how many. Bytes: empty.
     pub fn shape(&self) -> Vec<u32> {
         match (self.modality_kind(), self.picture()) {
-            (ModalityKind::Image, Some(picture)) => vec![picture.height, picture.width],
+            (ModalityKind::Image | ModalityKind::Depth, Some(picture)) => vec![picture.height, picture.width],
             (ModalityKind::Scalars, _) => vec![self.numbers()],
             _ => Vec::new(),
         }
@@ -270,7 +271,7 @@ impl LanSpec {
         /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
         const SMALLEST_JPEG: u64 = 64 << 10;
         match (self.modality_kind(), self.picture()) {
-            (ModalityKind::Image, Some(picture)) => {
+            (ModalityKind::Image | ModalityKind::Depth, Some(picture)) => {
                 let pixels = u64::from(picture.width) * u64::from(picture.height);
                 let most = match &self.protocol {
                     // It compresses to about a fifth of a byte per pixel (quality 0.7), and its pictures are large.

@@ -91,7 +91,12 @@ async fn what_does_not_fit_the_entry_is_named_with_its_fix() {
     use Encoding::{Bytes, F64, Grey, Mjpeg};
     let numbers = RemoteSamples::Numbers(1);
     for (samples, encoding, payload, expected) in [
-        (PICTURES, Mjpeg, &b"x"[..], "its pictures are MJPG: write format = \"MJPG\" in [device.x.lan]"),
+        (
+            PICTURES,
+            Mjpeg,
+            &b"x"[..],
+            "its pictures are MJPG: write kind = \"image\" and format = \"MJPG\" in [device.x.lan]",
+        ),
         (PICTURES, F64, &[0; 8], "its samples are of another kind: write kind = \"scalars\" in [device.x.lan]"),
         (PICTURES, Bytes, b"x", "its samples are of another kind: write kind = \"bytes\" in [device.x.lan]"),
         (numbers, Grey, &[0; 8], "its samples are of another kind: write kind = \"image\" in [device.x.lan]"),
