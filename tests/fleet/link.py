@@ -4,6 +4,7 @@ The kernel's netem is not in every kernel. Here each namespace has a TUN device,
 Needs root.
 """
 
+import ctypes
 import fcntl
 import heapq
 import os
@@ -13,7 +14,6 @@ import struct
 import subprocess
 import threading
 import time
-import ctypes
 
 CLONE_NEWNET = 0x40000000
 TUNSETIFF = 0x400454CA

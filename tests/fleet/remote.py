@@ -177,7 +177,7 @@ class Episode:
 
     def __init__(self, folder):
         (path,) = sorted(folder.glob("*.mcap"))
-        self.samples, self.masks, self.clocks, self.numbers = {}, [], [], {}
+        self.samples, self.masks, self.clocks, self.numbers, self.late = {}, [], [], {}, {}
         with path.open("rb") as file:
             reader = make_reader(file)
             for schema, channel, message in reader.iter_messages():
@@ -194,6 +194,7 @@ class Episode:
                     payload = own[2]
                     self.samples.setdefault(channel.topic, []).append((message.log_time, payload))
                     self.numbers.setdefault(channel.topic, []).append(message.sequence)
+                    self.late.setdefault(channel.topic, []).append(message.publish_time - message.log_time)
             summary = {record.name: record.metadata for record in reader.iter_metadata()}["rapid/summary"]
         self.verdict, self.reasons = summary["verdict"], json.loads(summary["reasons"])
         self.summary = summary
@@ -305,7 +306,8 @@ def impaired(place, link, rapid, remote):
         judged = [reason for reason in episode.reasons if "clock of its computer" in reason]
         print(
             f"remote: {name}: {pictures} pictures, {lost} lost and counted, the clock wrong by {wrong / 1e6:.2f} ms and "
-            f"known to {worst / 1e6:.2f} ms, times shifted by up to {shifted / 1e6:.2f} ms: {episode.verdict} {judged}"
+            f"known to {worst / 1e6:.2f} ms, times shifted by up to {shifted / 1e6:.2f} ms, half of the pictures here "
+            f"{sorted(episode.late[CAMERA])[pictures // 2] / 1e6:.0f} ms after their capture: {episode.verdict} {judged}"
         )
         assert shifted <= worst + 5e6, "capture times are further off than reported"
         assert bool(judged) == (worst > 12.5e6), (episode.reasons, worst)

@@ -29,8 +29,9 @@ Examples:
     host = \"robot-b\"
     device = \"cam_wrist\"
 
-Whoever reaches the port of `serve` can see its sensors, and whoever `join` connects to can send it samples: use a
-network of your own, an SSH tunnel or WireGuard, or certificates and passwords in a file of zenoh's (--zenoh).";
+Whoever reaches the port of `serve` can see its sensors, and whoever `join` connects to can
+send it samples: use a network of your own, an SSH tunnel or WireGuard, or passwords and access
+lists in a configuration file of zenoh's (--zenoh).";
 
 /// See [`Cli`].
 #[derive(Debug, Subcommand)]
@@ -96,7 +97,7 @@ pub struct Network {
     /// Through a router (zenohd) at this endpoint
     #[arg(long, value_name = "ENDPOINT")]
     pub router: Option<String>,
-    /// A configuration file of zenoh, for certificates, passwords, other transports; what is given here goes before it
+    /// A configuration file of zenoh, for passwords and access lists; what is given here goes before it
     #[arg(long, value_name = "FILE")]
     pub zenoh: Option<PathBuf>,
 }
