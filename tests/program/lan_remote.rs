@@ -11,7 +11,7 @@ use rapid::sample::Encoding;
 use rapid::time::Stamp;
 
 use crate::support::lan::{HEIGHT, RIG, RUN, Server, WIDTH, free_ports, life, life_of, picture, stop, wait_for};
-use crate::support::{self, Episode, EventMessage, Place};
+use crate::support::{self, Episode, EventMessage, Place, until};
 
 /// The clock there is 1000 s ahead.
 const OFFSET: i64 = 1_000_000_000_000;
@@ -75,6 +75,10 @@ fn a_sensor_of_another_computer_comes_goes_and_is_recorded_with_its_clock() {
     wait_for(&running, "cam", "absent", 1);
     let _second = Server::start(port, remote(1_000_000));
     wait_for(&running, "cam", "streaming", 2);
+    // Half a second of samples.
+    until("two reports of the second clock", || {
+        running.reported().iter().filter(|event| event["uncertainty_ns"] == 1_000_000).count() >= 2
+    });
     assert_eq!(life(&running, "away"), Vec::<String>::new(), "what is refused is not there");
     let reported = stop(running);
     let clocks: Vec<_> = reported.iter().filter(|event| event["event"] == "clock").collect();
