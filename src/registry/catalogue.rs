@@ -169,6 +169,7 @@ impl Descriptor {
 
 #[cfg(test)]
 mod tests {
+    use Mount::{Bottom, Front, Tip, Top};
     use proptest::prelude::*;
 
     use super::*;
@@ -179,7 +180,6 @@ mod tests {
         let all = all().unwrap();
         let rows: Vec<_> =
             all.iter().map(|descriptor| (descriptor.mount, descriptor.devices.len(), descriptor.bring_up())).collect();
-        use Mount::{Bottom, Front, Tip, Top};
         let (none, usb, net) = ((0, ""), (1, "usb"), (1, "net"));
         let wanted = [
             (Front, none),

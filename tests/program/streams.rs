@@ -93,7 +93,7 @@ fn distances_are_recorded_replayed_and_shown() {
     let same = replayed.iter().filter(|picture| pictures.contains(picture)).count();
     assert!(same == replayed.len() && same + 5 > pictures.len(), "{same} of {}", pictures.len());
     // A picture for people has them as shades.
-    run(&["plot", &file, "--out", "plot.svg"]);
+    run(&["inspect", &file, "--plot=plot.svg"]);
     let svg = std::fs::read_to_string(place.path("plot.svg")).expect("a picture");
     assert!(svg.contains("d435_depth") && svg.matches("data:image/jpeg").count() > 10, "{}", svg.len());
 }
