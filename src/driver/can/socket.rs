@@ -4,12 +4,13 @@
 //! kernel. Its stamps are of the wall clock and are converted to the monotonic clock when read.
 
 use std::io;
-use std::mem::{size_of, zeroed};
-use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
+use std::num::NonZeroU32;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::Duration;
 
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::RcvBufForce;
+use rustix::net::{AddressFamily, Protocol, SendFlags, SocketFlags, SocketType};
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 
 use super::link::{Arrival, LinkError, is_overflow};
@@ -18,6 +19,10 @@ use crate::control::can::CanFrame;
 use crate::driver::datagram::{self, Datagram};
 use crate::time::{Stamp, WallClock};
 
+/// Bytes of a classical frame (`struct can_frame`, linux/can.h): identifier, length, three that mean nothing, data.
+const FRAME: usize = 16;
+/// linux/can.h.
+const CAN_RAW: Protocol = Protocol::from_raw(NonZeroU32::MIN);
 /// A longer wait of a frame is impossible: the wall clock was set.
 const OLDEST: Duration = Duration::from_secs(10);
 
@@ -57,24 +62,14 @@ impl Socket {
         if frame.error {
             return Ok(());
         }
-        let raw = to_raw(frame);
-        // SAFETY: `raw` is a whole can_frame that outlives the call.
-        let written = unsafe {
-            libc::send(
-                self.bound.as_raw_fd(),
-                (&raw const raw).cast(),
-                size_of::<libc::can_frame>(),
-                libc::MSG_DONTWAIT,
-            )
-        };
-        if written >= 0 {
-            return Ok(());
+        match rustix::net::send(&self.bound, &to_bytes(frame), SendFlags::DONTWAIT) {
+            Ok(_) => Ok(()),
+            Err(error) => self.result_of(&error.into(), "sending to").map_or(Err(LinkError::Full), Err),
         }
-        self.result_of(&io::Error::last_os_error(), "sending to").map_or(Err(LinkError::Full), Err)
     }
 
     pub(super) fn try_recv(&mut self, frame: &mut CanFrame) -> Result<Option<Arrival>, LinkError> {
-        let (raw, datagram) = loop {
+        let (received, datagram) = loop {
             match receive(&self.bound) {
                 Ok(Some(received)) => break received,
                 // Not a classical frame.
@@ -82,7 +77,7 @@ impl Socket {
                 Err(error) => return self.result_of(&error, "reading from").map_or(Ok(None), Err),
             }
         };
-        *frame = from_raw(&raw);
+        *frame = received;
         self.lost += datagram.newly_dropped(&mut self.dropped) + u64::from(is_overflow(frame));
         Ok(Some(arrival(datagram.stamp_ns)))
     }
@@ -123,20 +118,12 @@ impl AsFd for Socket {
 
 /// Passes a frame to a shared socket; returns how many bytes it took.
 pub(super) fn put(socket: BorrowedFd<'_>, frame: &CanFrame) -> rustix::io::Result<usize> {
-    let raw = to_raw(frame);
-    // SAFETY: `raw` is a whole can_frame of integers, without gaps, that outlives the slice.
-    let bytes = unsafe { std::slice::from_raw_parts((&raw const raw).cast::<u8>(), size_of::<libc::can_frame>()) };
-    rustix::io::write(socket, bytes)
+    rustix::io::write(socket, &to_bytes(frame))
 }
 
 /// Opens a socket and closes it: the first one of a kind makes the kernel load its modules.
 pub(super) fn load() {
-    // SAFETY: plain numbers.
-    let socket = unsafe { libc::socket(libc::PF_CAN, libc::SOCK_RAW | libc::SOCK_CLOEXEC, libc::CAN_RAW) };
-    if socket >= 0 {
-        // SAFETY: it was just opened and has no other owner.
-        drop(unsafe { OwnedFd::from_raw_fd(socket) });
-    }
+    let _ = rustix::net::socket_with(AddressFamily::CAN, SocketType::RAW, SocketFlags::CLOEXEC, Some(CAN_RAW));
 }
 
 fn listen(index: u32) -> io::Result<CanSocket> {
@@ -166,14 +153,10 @@ fn open_error(name: &str, error: &io::Error) -> LinkError {
 }
 
 /// The next pending frame; `None` if it is not a classical frame.
-fn receive(socket: &CanSocket) -> io::Result<Option<(libc::can_frame, Datagram)>> {
-    // SAFETY: integers alone, for which zero is a value.
-    let mut frame: libc::can_frame = unsafe { zeroed() };
-    let size = size_of::<libc::can_frame>();
-    // SAFETY: `frame` is of integers, without gaps, so that all of it is bytes, and outlives the slice.
-    let place = unsafe { std::slice::from_raw_parts_mut((&raw mut frame).cast::<u8>(), size) };
-    let (datagram, _) = datagram::receive::<()>(socket.as_fd(), place)?;
-    Ok((datagram.length == size && !datagram.is_cut).then_some((frame, datagram)))
+fn receive(socket: &CanSocket) -> io::Result<Option<(CanFrame, Datagram)>> {
+    let mut bytes = [0; FRAME];
+    let (datagram, _) = datagram::receive::<()>(socket.as_fd(), &mut bytes)?;
+    Ok((datagram.length == FRAME && !datagram.is_cut).then(|| (from_bytes(bytes), datagram)))
 }
 
 /// Converts a stamp of the wall clock to the monotonic clock.
@@ -186,13 +169,12 @@ fn arrival(wall_ns: Option<u64>) -> Arrival {
     }
 }
 
-fn to_raw(frame: &CanFrame) -> libc::can_frame {
-    // SAFETY: integers alone, for which zero is a value.
-    let mut raw: libc::can_frame = unsafe { zeroed() };
-    raw.can_id = can_id(frame);
-    raw.can_dlc = frame.len.min(8);
-    raw.data = frame.data;
-    raw
+fn to_bytes(frame: &CanFrame) -> [u8; FRAME] {
+    let mut bytes = [0; FRAME];
+    bytes[..4].copy_from_slice(&can_id(frame).to_ne_bytes());
+    bytes[4] = frame.len.min(8);
+    bytes[8..].copy_from_slice(&frame.data);
+    bytes
 }
 
 /// The identifier with the flags of linux/can.h.
@@ -205,18 +187,12 @@ pub(super) fn can_id(frame: &CanFrame) -> u32 {
         | flag(frame.error, libc::CAN_ERR_FLAG)
 }
 
-fn from_raw(raw: &libc::can_frame) -> CanFrame {
-    let is = |flag| raw.can_id & flag != 0;
+fn from_bytes([a, b, c, d, len, _, _, _, data @ ..]: [u8; FRAME]) -> CanFrame {
+    let id = u32::from_ne_bytes([a, b, c, d]);
+    let is = |flag| id & flag != 0;
     let (extended, error) = (is(libc::CAN_EFF_FLAG), is(libc::CAN_ERR_FLAG));
     let mask = if extended || error { libc::CAN_EFF_MASK } else { libc::CAN_SFF_MASK };
-    CanFrame {
-        id: raw.can_id & mask,
-        extended,
-        remote: is(libc::CAN_RTR_FLAG),
-        error,
-        len: raw.can_dlc.min(8),
-        data: raw.data,
-    }
+    CanFrame { id: id & mask, extended, remote: is(libc::CAN_RTR_FLAG), error, len: len.min(8), data }
 }
 
 #[cfg(test)]
