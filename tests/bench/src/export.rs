@@ -20,14 +20,17 @@ struct Baseline {
     video: f64,
 }
 
+/// Which of them.
+type Which = fn(&Baseline) -> f64;
+
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let folder = bench.scratch.path().join("export");
     std::fs::create_dir_all(&folder)?;
     let episode = record(bench, &folder)?;
     let mut figures = Vec::new();
     let baseline = baseline(bench, &episode);
-    let lerobot = |of: fn(&Baseline) -> f64| baseline.as_ref().ok().map(of);
-    let forms: [(&str, fn(&Baseline) -> f64, &str); 3] =
+    let lerobot = |of: Which| baseline.as_ref().ok().map(of);
+    let forms: [(&str, Which, &str); 3] =
         [("jpeg", |base| base.image, ">= 20"), ("av1", |base| base.video, ">= 2"), ("h264", |base| base.video, "")];
     let has_ffmpeg =
         Command::new("ffmpeg").arg("-version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok();

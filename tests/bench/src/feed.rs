@@ -66,7 +66,7 @@ impl Feed {
             let (encoding, hz, width, height) = match device.source {
                 SimSource::Camera { width, height, fps, .. } => (Encoding::Mjpeg, fps, width, height),
                 SimSource::Serial { channels, hz, .. } => (Encoding::F64, hz, u32::try_from(channels)?, 0),
-                SimSource::Task { .. } | SimSource::Replay { .. } | SimSource::Process => {
+                SimSource::Depth { .. } | SimSource::Task { .. } | SimSource::Replay { .. } | SimSource::Process => {
                     return Err("the load is made of cameras and serial lines".into());
                 }
             };
