@@ -38,12 +38,8 @@ python=$(scripts/venv.sh venv-fleet models/requirements-fleet.txt --no-deps)
 remote=(--locked --manifest-path examples/remote/Cargo.toml --target-dir "$cache/remote")
 cargo test "${remote[@]}"
 cargo build "${remote[@]}"
-if [[ ! -x $cache/bin/zenohd ]]; then
-  echo "fleet: building zenoh's router, once" >&2
-  cargo install zenohd --version 1.10.2 --locked --no-default-features --root "$cache"
-fi
 if [[ -n ${RAPID_BIN:-} && -e /dev/net/tun ]]; then
-  $sudo "$python" tests/fleet/remote.py "$RAPID_BIN" "$cache/remote/debug/rapid-remote" "$cache/bin/zenohd"
+  $sudo "$python" tests/fleet/remote.py "$RAPID_BIN" "$cache/remote/debug/rapid-remote"
 else
   echo "fleet: SKIPPED: sensors of another computer: no program is built, or no /dev/net/tun" >&2
 fi
