@@ -199,6 +199,7 @@ pub fn strings(bytes: &[u8]) {
     let Some(serial) = short(bytes).map(String::from_utf8_lossy) else { return };
     let text = text_with(&serial);
     let device = |serial: &str| Attachment {
+        formats: Vec::new(),
         syspath: PathBuf::from("/sys/devices/1-1/1-1:1.0/video4linux/video0"),
         node: DeviceNode::Video(PathBuf::from("/dev/video0")),
         driver: None,
