@@ -165,7 +165,7 @@ pub struct Global {
 fn general_options(command: &str) -> &'static [&'static str] {
     match command {
         "devices" | "register" | "calibrate" => &["sim", "config", "json"],
-        "unregister" | "check" | "doctor" | "ablation" => &["config", "json"],
+        "unregister" | "modules" | "check" | "doctor" | "ablation" => &["config", "json"],
         "artifacts" => &["config"],
         "mask" | "replay" | "episode" | "session" | "reload" | "logs" => &["json", "instance"],
         "arm" | "disarm" | "monitor" => &["instance"],

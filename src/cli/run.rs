@@ -16,14 +16,14 @@ pub struct RunArgs {
     /// Print events as plain text (no monitor)
     #[arg(long)]
     pub headless: bool,
-    /// Record an episode from the start
+    /// Record from the start, into episodes/ (see --out)
     #[arg(long)]
     pub record: bool,
     /// End after recording (or running) this long: 30s, 5m
     #[arg(long, value_name = "TIME", value_parser = duration, hide_short_help = true)]
     pub duration: Option<Duration>,
     /// Folder for episodes
-    #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
+    #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath, hide_short_help = true)]
     pub out: PathBuf,
     /// Task, part of the file's name
     #[arg(long, value_name = "TEXT", default_value = "episode", value_parser = task, hide_short_help = true)]

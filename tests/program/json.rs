@@ -155,6 +155,8 @@ fn finished(place: &Place, printed: &mut String) {
         0,
     );
     run(&["unregister", "cam_wrist", "--dry-run", "--json"], 0);
+    run(&["register", "--module", "tip_soft", "--dry-run", "--json"], 0);
+    run(&["modules", "--json"], 0);
 }
 
 /// What ends the program is the last object, whether it is an argument, a file or a rig.
@@ -205,6 +207,8 @@ const EVENTS: &[&str] = &[
     "repair",
     "configuration",
     "registered",
+    "registered_module",
+    "module_type",
     "unregistered",
     "error",
 ];
