@@ -3,7 +3,8 @@
 //! Velodyne's sensors with 16 lasers (VLP-16 user manual 63-9243, sections 6, 9 and appendix A): a data packet has 1206
 //! bytes: 12 blocks of 100 bytes, a time of 4 bytes, the return mode and the model. A block is `ff ee`, the azimuth in
 //! hundredths of a degree (u16), and 32 returns of 3 bytes: distance in 2 mm (u16; 0 is none) and reflectivity. The 16 lasers
-//! fire twice in a block, the second time half way to the azimuth of the next; the laser of return n is n modulo 16.
+//! fire twice in a block, the second time half way to the azimuth of the next; the laser of return n is n modulo 16. All
+//! of a firing get its azimuth: the last fires a tenth to a quarter of a degree later.
 //!
 //! Livox sensors of the second protocol (Mid-360, HAP; "Point Cloud & IMU Data Protocol"): a header of 36 bytes (version,
 //! length u16 at 1, number of points u16 at 5, type u8 at 10, time at 28), then the points: type 1 x, y, z in mm (i32),
@@ -60,8 +61,9 @@ mod velodyne {
     const TURN: u32 = 36_000;
     /// The return mode of two returns: each azimuth has two blocks.
     const DUAL: u8 = 0x39;
-    /// Models that send packets of this size with other lasers: HDL-32E, VLP-32C, VLS-128.
-    const OTHERS: [u8; 3] = [0x21, 0x28, 0xa1];
+    /// VLP-16, Puck LITE, and what firmware before 3.0.29 writes. Other models send packets of this size with other lasers: HDL-32E,
+    /// Puck Hi-Res, VLP-32C, VLS-128.
+    const MODELS: [u8; 3] = [0x22, 0x23, 0];
     /// Vertical angle of each laser in degrees, and where its beam begins above the middle, in mm.
     const LASER: [(f64, f64); LASERS] = [
         (-15.0, 11.2),
@@ -86,7 +88,7 @@ mod velodyne {
         let blocks = packet.get(..BLOCK * BLOCKS).filter(|_| packet.len() == PACKET)?;
         let [mode, model] = bytes(packet, PACKET - 2);
         let is_one = blocks.chunks_exact(BLOCK).all(|block| block.starts_with(&[0xff, 0xee]));
-        if !is_one || OTHERS.contains(&model) {
+        if !is_one || !MODELS.contains(&model) {
             return None;
         }
         let azimuth = |block: usize| u32::from(u16::from_le_bytes(bytes(packet, block * BLOCK + 2))) % TURN;

@@ -59,6 +59,7 @@ pub fn modules(
             Format::Text => {
                 let has_it = if is_declared(&descriptor, registry) { "*" } else { " " };
                 let (Descriptor { name, mount, title, .. }, bring_up) = (&descriptor, descriptor.bring_up());
+                let mount = mount.word();
                 let what = title.split(": rapid").next().unwrap_or_default();
                 writeln!(out, "{has_it} {name:20} {mount:7} {bring_up:4} {what}")?;
             }

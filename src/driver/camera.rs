@@ -350,18 +350,24 @@ fn merge(found: Vec<Mode>, exact: Vec<Mode>) -> Vec<Mode> {
 
 /// The V4L2 names of the pixel formats that the node at `path` offers; none if it does not answer.
 pub fn formats(path: &Path) -> Vec<String> {
-    let mut formats: Vec<_> = enumerate(path).unwrap_or_default().into_iter().map(|mode| mode.fourcc).collect();
-    formats.dedup();
-    formats
+    let listed =
+        listing(path).and_then(|device| device.enum_formats().map_err(|error| setup_error(path, "formats", &error)));
+    listed.unwrap_or_default().into_iter().map(|format| fourcc_text(format.fourcc.repr)).collect()
 }
 
-fn enumerate(path: &Path) -> Result<Vec<Mode>, DriverError> {
+/// The node at `path` for its lists.
+fn listing(path: &Path) -> Result<v4l::Device, DriverError> {
     let device = v4l::Device::with_path(path).map_err(|error| open_error(path, &error))?;
     let handle = device.handle();
     // SAFETY: the descriptor is open as long as `handle` lives, which is to the end of the function.
     let fd = unsafe { BorrowedFd::borrow_raw(handle.fd()) };
     // The v4l crate opens without this flag, and a child process must not inherit the node.
     fcntl_setfd(fd, FdFlags::CLOEXEC).map_err(|errno| setup_error(path, "listing", &errno.into()))?;
+    Ok(device)
+}
+
+fn enumerate(path: &Path) -> Result<Vec<Mode>, DriverError> {
+    let device = listing(path)?;
     let formats = device.enum_formats().map_err(|error| setup_error(path, "formats", &error))?;
     let mut modes = Vec::new();
     for format in formats {

@@ -82,7 +82,7 @@ fn the_second_firing_is_half_way_to_the_next_block() {
 #[test]
 fn a_packet_of_another_model_or_length_has_no_points() {
     let packet = velodyne(0, 40, 2500, [0x37, 0x22]);
-    for model in [0x21, 0x28, 0xa1] {
+    for model in [0x21, 0x24, 0x28, 0xa1, 0x42] {
         assert_eq!(points(PacketFormat::Velodyne, &velodyne(0, 40, 2500, [0x37, model])), None, "{model:x}");
     }
     let mut other = packet.clone();

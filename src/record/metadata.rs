@@ -12,7 +12,7 @@ use super::quality::{Quality, Spread};
 use super::verdict::Facts;
 use crate::episode::{self, BOOT_ID, text_map};
 use crate::mask::PhysicalMask;
-use crate::registry::{Registry, WhenStale};
+use crate::registry::{ModuleSpec, Registry, WhenStale};
 use crate::status::Verdict;
 use crate::time::{Stamp, WallClock, nanoseconds};
 
@@ -152,13 +152,16 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
 /// [`CONFIGURATION`] in the metadata of an episode's beginning.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub(super) struct Configuration {
-    /// Mounted modules: those declared, and those whose sensors are all present and of no other module.
+    /// Mounted modules, one for each slot: those whose sensors are all present and of no other module, and those named.
     pub(super) modules: Vec<String>,
     /// Modalities whose bits are set when the episode begins, ascending by bit.
     pub(super) present: Vec<String>,
     /// Those of the user, then those of the modules whose keys the user did not use.
     #[serde(skip)]
     pub(super) tags: Vec<(String, String)>,
+    /// Modules that were named although another one reports by its sensors that it is in their slot: both names.
+    #[serde(skip)]
+    pub(super) contradicted: Vec<(String, String)>,
 }
 
 /// Key of the configuration in the metadata of an episode's beginning.
@@ -172,21 +175,32 @@ impl Configuration {
             modules: Vec::new(),
             present: registry.devices.iter().map(|device| device.name.clone()).filter(is_present).collect(),
             tags: tags.to_vec(),
+            contradicted: Vec::new(),
         };
-        for module in &registry.modules {
+        let is_sensed = |module: &ModuleSpec| {
             // One that shares a sensor with another is not known by it.
             let is_shared = |name: &String| {
                 registry.modules.iter().any(|other| other.name != module.name && other.devices.contains(name))
             };
-            let sensed = !module.devices.is_empty()
-                && module.devices.iter().all(is_present)
-                && !module.devices.iter().any(is_shared);
-            if !sensed && !report.contains(&module.name) {
-                continue;
+            !module.devices.is_empty() && module.devices.iter().all(is_present) && !module.devices.iter().any(is_shared)
+        };
+        for module in &registry.modules {
+            let in_its_slot = |other: &&ModuleSpec| other.mount == module.mount && is_sensed(other);
+            let sensed = registry.modules.iter().find(in_its_slot).map(|other| &other.name);
+            match sensed {
+                // What a sensor reports is there, whatever was named.
+                Some(sensed) if *sensed != module.name => {
+                    if report.contains(&module.name) {
+                        found.contradicted.push((module.name.clone(), sensed.clone()));
+                    }
+                    continue;
+                }
+                None if !report.contains(&module.name) => continue,
+                Some(_) | None => {}
             }
             found.modules.push(module.name.clone());
             for (key, value) in &module.tags {
-                if !tags.iter().any(|(own, _)| own == key) {
+                if !found.tags.iter().any(|(own, _)| own == key) {
                     found.tags.push((key.clone(), value.clone()));
                 }
             }
@@ -215,6 +229,11 @@ mod tests {
         assert_eq!(of(&[], &[], 0b011), "tactile | cam_wrist tactile_tip | finger=tactile");
         assert_eq!(of(&["soft"], &[], 0b001), "soft | cam_wrist | finger=soft colour=red");
         assert_eq!(of(&["soft"], &[("finger", "mine")], 0), "soft |  | finger=mine colour=red");
+        assert_eq!(
+            of(&["soft"], &[], 0b011),
+            "tactile | cam_wrist tactile_tip | finger=tactile",
+            "its sensor is there"
+        );
         // Two mounts for one camera: which of them carries it is declared.
         let mounts = "[module.straight]\nslot = \"top\"\ntags = [\"wrist=straight\"]\ndevices = [\"cam_wrist\"]\n\
             [module.angled]\nslot = \"top\"\ntags = [\"wrist=angled\"]\ndevices = [\"cam_wrist\"]\n";

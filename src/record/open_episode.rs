@@ -39,7 +39,7 @@ use crate::mask::{Bits, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Event, Outlook, RecordingStatus, What};
+use crate::status::{Board, Event, Level, Outlook, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
 use crate::time::{Stamp, WallClock};
 
@@ -113,6 +113,11 @@ impl OpenEpisode {
         let units = Units::new(attached);
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, bits, _)| bits.mask);
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
+        for (named, sensed) in &configuration.contradicted {
+            let text =
+                format!("module {named} was named, but {sensed} is in its slot by its sensor: recorded as {sensed}");
+            board.announce(What::Log { level: Level::Warn, text });
+        }
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, Guard::begin(&path))?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();

@@ -121,9 +121,10 @@ pub fn parse(text: &str) -> Result<Descriptor, CatalogueError> {
                 "[device.{sensor}] is not among the devices of [module.{name}]"
             )));
         }
-        if let Some(own) = table.keys().find(|key| OF_A_UNIT.contains(&key.as_str())) {
+        if let Some(own) = table.keys().find(|key| !OF_A_TYPE.contains(&key.as_str())) {
             return Err(CatalogueError::Wrong(format!(
-                "{own} of [device.{sensor}] belongs to a unit, not to a type of module"
+                "{own} of [device.{sensor}] belongs to a unit or a rig, not to a type of module: {}",
+                OF_A_TYPE.join(", ")
             )));
         }
         if !table.contains_key("node") {
@@ -133,13 +134,35 @@ pub fn parse(text: &str) -> Result<Descriptor, CatalogueError> {
         flatten("", table, &mut keys);
         sensors.push((sensor.clone(), keys));
     }
+    let tags = texts("tags")?;
+    if let Some(tag) = tags.iter().find(|tag| tag.split_once('=').is_none_or(|(key, _)| key.is_empty())) {
+        return Err(CatalogueError::Wrong(format!("{tag:?} is not a tag: write KEY=VALUE, as \"finger=soft\"")));
+    }
     let title = text.lines().next().and_then(|line| line.strip_prefix('#')).unwrap_or_default().trim().to_owned();
-    let (name, tags, text) = (name.clone(), texts("tags")?, text.to_owned());
+    let (name, text) = (name.clone(), text.to_owned());
     Ok(Descriptor { name, title, mount, tags, devices, sensors, text })
 }
 
-/// Keys of an entry that differ from unit to unit.
-const OF_A_UNIT: [&str; 6] = ["vid", "pid", "serial_number", "port", "bit", "topic"];
+/// Keys of an entry that are the same for every unit of a type.
+const OF_A_TYPE: [&str; 17] = [
+    "node",
+    "camera",
+    "tty",
+    "can",
+    "lan",
+    "process",
+    "verdict",
+    "pose",
+    "joints",
+    "calibration",
+    "points",
+    "slot",
+    "stall_after",
+    "max_bytes",
+    "depth",
+    "when_stale",
+    "latency",
+];
 
 fn flatten(before: &str, table: &Table, keys: &mut Vec<(String, Setting)>) {
     for (key, value) in table {
@@ -225,6 +248,15 @@ mod tests {
                 "[module.a]\nslot = \"tip\"\ndevices = [\"b\"]\n[device.b]\nvid = \"1\"",
                 "vid of [device.b] belongs to a unit",
             ),
+            (
+                "[module.a]\nslot = \"tip\"\ndevices = [\"b\"]\n[device.b]\nnode = \"camera\"\nserial = \"1\"",
+                "serial of [device.b] belongs to a unit",
+            ),
+            (
+                "[module.a]\nslot = \"tip\"\ndevices = [\"b\"]\n[device.b]\nnode = \"camera\"\non_attach = [\"sh\"]",
+                "on_attach of [device.b] belongs to a unit or a rig",
+            ),
+            ("[module.a]\nslot = \"tip\"\ntags = [\"x\"]", "\"x\" is not a tag"),
             ("[", "the descriptor is not TOML"),
         ] {
             let error = parse(text).unwrap_err().to_string();

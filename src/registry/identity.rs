@@ -218,7 +218,7 @@ impl Assigner {
         let fits: Vec<_> = self
             .entries
             .iter()
-            .filter(|entry| entry.reads(&attachment.node) && entry.shows(&attachment.formats))
+            .filter(|entry| entry.reads(&attachment.node) && entry.shows(attachment))
             .filter_map(|entry| Some((rule(entry, &attachment.unit)?, entry)))
             .collect();
         let best = fits.iter().map(|(rule, _)| *rule).min();
@@ -381,10 +381,11 @@ impl Entry {
         (expected.vid, expected.pid) == (usb.vid, usb.pid)
     }
 
-    /// Whether a node that offers these pixel formats can be its stream.
-    fn shows(&self, formats: &[String]) -> bool {
-        let is_offered = |format: PixelFormat| formats.iter().any(|offered| offered == format.word());
-        !self.is_stream || formats.is_empty() || self.format.is_none_or(is_offered)
+    /// Whether a node can be its stream, by the pixel formats that it offers. One that did not answer is of none: each would
+    /// be as good as another.
+    fn shows(&self, attachment: &Attachment) -> bool {
+        let is_offered = |format: PixelFormat| attachment.formats.iter().any(|offered| offered == format.word());
+        !self.is_stream || !matches!(attachment.node, DeviceNode::Video(_)) || self.format.is_none_or(is_offered)
     }
 
     fn reads(&self, node: &DeviceNode) -> bool {

@@ -94,6 +94,7 @@ fn the_catalogue_is_listed_and_a_file_describes_a_type_of_ones_own() {
     place.write("wrong.toml", "[module.a]\nslot = \"side\"\n");
     for (options, why) in [
         (["register", "--module", "wrist_mount"], "[module.wrist_mount] is in the registry already"),
+        (["register", "--module=tip_soft", "--bit=9"], "has no sensor that needs an entry"),
         (["register", "--module", "tip_sofd"], "did you mean \"tip_soft\"?"),
         (["register", "--module", "wrong.toml"], "its slot is none of front"),
         (["register", "--module", "missing.toml"], "missing.toml"),

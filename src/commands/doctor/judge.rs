@@ -91,15 +91,24 @@ pub(super) fn plugged<'a>(
     // In the order in which hot-plug reports them at the start.
     units.sort_by(|a, b| a.port.cmp(&b.port));
     for unit in units {
-        for node in nodes_of(unit) {
+        for mut node in nodes_of(unit) {
+            // Which of its nodes has which format is not asked here: the unit is what is looked for.
+            node.formats = PixelFormat::WORDS.map(|(word, _)| word.to_owned()).to_vec();
             assigner.attach(&node);
         }
     }
     let matching = |entry: &'a DeviceSpec| {
-        let attached = assigner.attached_as(entry.id)?;
+        // The further streams of a camera are those of its unit.
+        let is_of_it = |other: &&DeviceSpec| other.id == entry.id || is_stream_beside(registry, entry, other);
+        let mut same = registry.devices.iter().filter(is_of_it);
+        let attached = same.find_map(|same| assigner.attached_as(same.id))?;
         Some((entry, usb.iter().find(|unit| unit.port == attached.unit.place())?))
     };
     registry.devices.iter().filter_map(matching).collect()
+}
+
+fn is_stream_beside(registry: &Registry, entry: &DeviceSpec, other: &DeviceSpec) -> bool {
+    registry.shares_unit(entry) && other.node.opens() == Opens::Video && other.identity == entry.identity
 }
 
 /// A node of each kind, whether or not the device has it.

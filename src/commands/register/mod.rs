@@ -85,6 +85,14 @@ pub enum RegisterError {
         /// Their names.
         sensors: Vec<String>,
     },
+    /// Nothing of a unit is registered.
+    #[error(
+        "module {0} has no sensor that needs an entry: leave out what is given of a unit (--vid, --serial, --bit ...)"
+    )]
+    NoSensor(String),
+    /// It is a part of another entry.
+    #[error("[device.{0}] is a further stream of a camera: remove its table [device.CAMERA.stream.NAME] in {1}")]
+    IsStream(String, String),
     /// The file to import.
     #[error(transparent)]
     Import(#[from] ImportError),
@@ -187,7 +195,14 @@ impl Mounting {
             descriptor.sensors.iter().filter(|(sensor, _)| args.name.is_some() || is_new(sensor)).collect();
         let mut devices = descriptor.devices.clone();
         let entry = match new.as_slice() {
-            [] => None,
+            [] => {
+                let is_of_unit =
+                    args.vid.is_some() || args.pid.is_some() || args.serial.is_some() || args.port.is_some();
+                if is_of_unit || args.bit.is_some() || !args.set.is_empty() || args.test {
+                    return Err(RegisterError::NoSensor(descriptor.name));
+                }
+                None
+            }
             [(sensor, keys)] => {
                 let own = args.name.clone().unwrap_or_else(|| sensor.clone());
                 devices.iter_mut().filter(|device| *device == sensor).for_each(|device| device.clone_from(&own));
@@ -221,7 +236,13 @@ pub fn unregister(
     format: Format,
     out: &mut dyn Write,
 ) -> Result<(), RegisterError> {
-    let new = edit::remove(&edit::renamed(&target.text), &args.name)?;
+    let is_known = target.registry.as_ref().is_some_and(|registry| registry.named(&args.name).is_some());
+    let new = match edit::remove(&edit::renamed(&target.text), &args.name) {
+        Err(EditError::NoEntry(name)) if is_known => {
+            return Err(RegisterError::IsStream(name, target.path.display().to_string()));
+        }
+        new => new?,
+    };
     let left = target.parse(&new).map_err(RegisterError::Refused)?.registry;
     let before = target.registry.as_ref().map(|registry| registry.devices.as_slice()).unwrap_or_default();
     let moved: Vec<String> = before

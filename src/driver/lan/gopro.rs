@@ -160,7 +160,9 @@ impl Gopro {
     /// Stops the shutter, if this program started it, and notes the clip.
     pub(super) async fn close(self) {
         let Self { reported, task, states, preview, .. } = self;
-        drop(preview);
+        if let Some(preview) = preview {
+            preview.close().await;
+        }
         reported.send_replace(Some(None));
         drop((reported, states));
         // If the caller abandons this, the task still runs: the camera must not keep recording.

@@ -84,9 +84,11 @@ impl Panels {
             let (frame, settings) = match form {
                 Form::Pose(pose) => (pose.parent.clone(), json!({ "visible": true })),
                 // A packet is a part of a turn: what the last ones had is shown together.
-                Form::Points(points) => {
-                    (points.frame.clone(), json!({ "visible": true, "decayTime": TURN_S, "colorField": "intensity" }))
-                }
+                Form::Points(points) => (
+                    points.frame.clone(),
+                    json!({ "visible": true, "decayTime": TURN_S, "colorMode": "colormap",
+                        "colorField": "intensity", "colorMap": "turbo" }),
+                ),
                 Form::Joints(_) | Form::Calibration(_) => return None,
             };
             Some((format!("{}{}", device.topic, form.ending()), frame, settings))

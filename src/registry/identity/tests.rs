@@ -133,10 +133,10 @@ fn the_streams_of_a_camera_are_told_apart_by_their_formats() {
     assert_eq!(assigner.attach(&node(0, "L", "1-4", &depth)), entry(0));
     assert!(waits(&assigner.attach(&node(9, "L", "1-4", &depth))), "a second node of a taken stream");
     assert_eq!(assigner.attach(&node(4, "L", "1-4", &colour)), entry(3));
-    // A camera that does not answer: by the order of its nodes.
+    // A node that does not answer is no stream, and takes that of no other.
     let mut assigner = Assigner::new(&registry);
-    assert_eq!(assigner.attach(&node(0, "R", "1-2", &[])), entry(1));
-    assert_eq!(assigner.attach(&node(2, "R", "1-2", &[])), entry(2));
+    assert!(matches!(assigner.attach(&node(0, "R", "1-2", &[])), Assignment::WrongNode { .. }));
+    assert_eq!(assigner.attach(&node(2, "R", "1-2", &depth)), entry(2));
 }
 
 #[test]

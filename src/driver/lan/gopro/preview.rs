@@ -13,6 +13,7 @@
 use std::io;
 use std::net::SocketAddr;
 use std::ops::Range;
+use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
@@ -36,6 +37,10 @@ use crate::time::Stamp;
 pub(crate) const DECODER: &str = "ffmpeg";
 /// Without a packet for this long the stream is requested again.
 const SILENT: Duration = Duration::from_secs(3);
+/// A stream that pauses for this long has ended: pictures that the decoder still holds are old by then.
+const GAP: Duration = Duration::from_millis(500);
+/// Requests without a packet before that is reported.
+const TRIES: u32 = 2;
 /// Before the decoder is started again.
 const PAUSE: Duration = Duration::from_secs(1);
 /// A datagram of the stream has seven packets of 188 bytes.
@@ -44,6 +49,8 @@ const LARGEST_DATAGRAM: usize = 64 << 10;
 const PIECE: usize = 64 << 10;
 /// Of `mpjpeg`.
 const BOUNDARY: &str = "ffmpeg";
+/// Ends the stream.
+const STOP: &str = "/gopro/camera/stream/stop";
 
 /// See the module's comment.
 #[derive(Debug)]
@@ -61,7 +68,8 @@ pub(super) struct Preview {
     begun: Stamp,
     picture: LanPicture,
     lost: u64,
-    _task: AbortOnDropHandle<()>,
+    server: Server,
+    task: AbortOnDropHandle<()>,
 }
 
 impl Preview {
@@ -89,7 +97,8 @@ impl Preview {
             begun: Stamp::now(),
             picture,
             lost: 0,
-            _task: AbortOnDropHandle::new(tokio::spawn(stream.supervise(to))),
+            server: server.clone(),
+            task: AbortOnDropHandle::new(tokio::spawn(stream.supervise(to))),
         })
     }
 
@@ -126,6 +135,14 @@ impl Preview {
             height,
             lost: std::mem::take(&mut self.lost),
         })
+    }
+
+    /// Ends the camera's stream, which would stay directed to a port that is not read any more.
+    pub(super) async fn close(self) {
+        let Self { server, task, .. } = self;
+        drop(task);
+        // It ends with the next start too.
+        let _ = ask(&server, STOP).await;
     }
 
     /// Parses what was read, up to the end of a picture.
@@ -189,6 +206,8 @@ impl Stream {
             .args(input)
             .args(["-f", "mpegts", "-i", "pipe:0", "-an", "-vf", &filter, "-r", &rate])
             .args(["-c:v", "mjpeg", "-q:v", "4", "-f", "mpjpeg", "-flush_packets", "1", "pipe:1"])
+            // Ctrl-C in the terminal ends the run, which ends it.
+            .process_group(0)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -220,22 +239,36 @@ impl Stream {
     /// Passes the camera's packets on, and requests them when none come.
     async fn pass(&self, input: &mut pipe::Sender) -> String {
         let mut datagram = vec![0; LARGEST_DATAGRAM];
+        // What came while no decoder ran is old.
+        while self.packets.try_recv_from(&mut datagram).is_ok() {}
         let path = format!("/gopro/camera/stream/start?port={}", self.port);
+        let (mut has_packets, mut tries) = (false, 0);
         loop {
-            // A camera that is busy answers with an error, and is asked again.
-            if let Err(error) = ask(&self.server, &path).await {
-                tracing::debug!(device = self.name, %error, "the preview does not start");
+            // A stream that another run did not stop goes to its port, and start is refused.
+            let _ = ask(&self.server, STOP).await;
+            let started = ask(&self.server, &path).await;
+            tries += 1;
+            if tries == TRIES {
+                let why = started.err().map(|error| format!(": {error}")).unwrap_or_default();
+                tracing::warn!(device = self.name, "the camera sends no preview{why}; it is requested again");
             }
-            while let Ok(received) = timeout(SILENT, self.packets.recv_from(&mut datagram)).await {
+            while let Ok(received) =
+                timeout(if has_packets { GAP } else { SILENT }, self.packets.recv_from(&mut datagram)).await
+            {
                 let (count, from) = match received {
                     Ok(received) => received,
                     Err(error) => return error.to_string(),
                 };
-                if self.server.place.means(from.ip())
-                    && let Err(error) = input.write_all(datagram.get(..count).unwrap_or_default()).await
-                {
+                if !self.server.place.means(from.ip()) {
+                    continue;
+                }
+                has_packets = true;
+                if let Err(error) = input.write_all(datagram.get(..count).unwrap_or_default()).await {
                     return format!("{DECODER} takes no more of it: {error}");
                 }
+            }
+            if has_packets {
+                return "the camera sends no more of it".to_owned();
             }
         }
     }
