@@ -132,7 +132,9 @@ pub fn read(place: &Place, running: &Running, topic: &str, depth: usize, mut tak
                 take(sample.user_header(), sample.payload());
             }
             if open.node.wait(LOOK).is_err() {
-                return;
+                // It is opened again, if that run is still there.
+                std::thread::sleep(RETRY);
+                break;
             }
         }
     }

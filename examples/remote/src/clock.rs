@@ -12,9 +12,9 @@
 
 use std::collections::VecDeque;
 
-/// Two quartz clocks, each within 50 parts in a million.
-const DRIFT_PPM: i128 = 100;
-/// Exchanges that are kept: with four a second those of the last 16 s, in which the clocks drift 1.6 ms.
+/// NTP slews a clock by up to 500 parts in a million, and two may be slewed apart; quartz alone is far below that.
+const DRIFT_PPM: i128 = 1000;
+/// Exchanges that are kept: with four a second those of the last 16 s, in which the clocks drift 16 ms at most.
 const KEPT: usize = 64;
 
 /// See the module's comment.

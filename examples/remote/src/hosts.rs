@@ -57,7 +57,10 @@ impl Hosts {
     pub fn state(&self, host: &str, sensors: BTreeSet<String>, now: Stamp) {
         let mut known = self.lock();
         if known.len() >= MOST && !known.contains_key(host) {
-            return;
+            // One that is absent makes room.
+            let absent = known.iter().find(|(_, entry)| entry.state.is_none()).map(|(name, _)| name.clone());
+            let Some(absent) = absent else { return };
+            known.remove(&absent);
         }
         let entry = known.entry(host.to_owned()).or_default();
         if entry.sensors != sensors || entry.state.is_none() {

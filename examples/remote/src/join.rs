@@ -40,6 +40,8 @@ const ANSWER_LIMIT: Duration = Duration::from_secs(1);
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
 /// Samples that may wait for the reader.
 const WAITING: usize = 256;
+/// Bytes of them, at most.
+const WAITING_BYTES: usize = 64 << 20;
 /// Samples that are not pictures are reported to their sender together.
 const NUMBERS: u64 = 16;
 /// Connections at once: more than a rig has sensors, twice.
@@ -183,11 +185,17 @@ async fn answer(mut stream: TcpStream, session: &Session, hosts: &Hosts) -> Resu
     if let Err(absent) = hosts.sensor(host, device, Stamp::now()) {
         return refuse(&mut writer, &format!("{device} of {host}: {absent}")).await;
     }
-    let queue = Arc::new(Queue::new(WAITING));
+    let queue = Arc::new(Queue::new(WAITING, WAITING_BYTES));
     let arrivals = Arc::clone(&queue);
     let _subscriber = session
         .declare_subscriber(wire::sample_key(host, device))
-        .callback(move |sample| arrivals.push(sample.payload().clone()))
+        .callback(move |sample| {
+            let payload = sample.payload();
+            // What no entry can take is not kept.
+            if payload.len() <= HEAD + LARGEST {
+                arrivals.push(payload.clone(), payload.len());
+            }
+        })
         .await?;
     let mut look = interval(LOOK_EVERY);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -201,6 +209,8 @@ async fn answer(mut stream: TcpStream, session: &Session, hosts: &Hosts) -> Resu
     let mut rest = [0; 16];
     loop {
         tokio::select! {
+            // What the reader gets first is that the sensor is present, and the clock.
+            biased;
             // The reader sends nothing more: this is its end.
             _ = reader.read(&mut rest) => return Ok(()),
             _ = look.tick() => {

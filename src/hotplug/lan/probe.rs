@@ -18,7 +18,7 @@ use super::watch::Watch;
 use crate::device::LastReceived;
 use crate::link::LOOK_EVERY;
 use crate::registry::{Probe, own_side};
-use crate::remote::{HEAD, Head, Kind, LONGEST_REASON};
+use crate::remote::{HEAD, Head, Kind};
 use crate::time::Stamp;
 
 /// Interval between queries; also the time limit of an answer.
@@ -134,7 +134,8 @@ async fn remote(asked: SocketAddr, request: &str) -> io::Result<Answer> {
     stream.write_all(request.as_bytes()).await?;
     let mut head = [0; HEAD];
     stream.read_exact(&mut head).await?;
-    Ok(match Head::read(&head, LONGEST_REASON) {
+    // What follows a sample's head is not read here.
+    Ok(match Head::read(&head, usize::MAX) {
         Ok(Head { kind: Kind::Refused, .. }) => Answer::Refused,
         Ok(_) => Answer::Here,
         Err(_) => Answer::Silence,

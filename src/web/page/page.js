@@ -8,6 +8,7 @@ const AGAIN = 4000; // ms between two attempts to connect
 const OLD = 2500; // ms after which a picture is old
 const NEXT_PICTURE = 350; // ms between two requests for a picture
 const PRESS_AGAIN = 700; // ms: a press so soon after a change was meant for what was shown before
+const WAIT = 8000; // ms for an answer: an episode that begins or ends answers when its file is there
 const SURE = 4000; // ms within which the second press of a discard counts
 const WORDS = { idle: "Idle", countdown: "Begins in", recording: "● REC", ending: "Ending…", reset: "Next in" };
 
@@ -22,8 +23,8 @@ let tried = -Infinity; // when the connection was last attempted
 let skew = Infinity; // the smallest difference seen between this clock and the server's
 let token = ""; // of the link, until the server has taken it
 let denied = ""; // why the server shows nothing
-let changed = -Infinity; // when the phase last changed
-let sureUntil = -Infinity;
+let changed = -Infinity; // when the phase, or the episode that buttons are about, last changed
+let asked = -Infinity; // when a discard was pressed for the first time
 const pictures = new Map(); // by bit
 
 // A clock that was set back says nothing about what has arrived.
@@ -162,14 +163,15 @@ async function fetchPictures(picture) {
     await new Promise((next) => setTimeout(next, NEXT_PICTURE));
     if (isLost() || document.hidden || !picture.of.is_set) continue;
     try {
+      // Its age is as of the answer, which may have come slowly: counted from the request it is never too young.
+      const sent = now();
       const answer = await fetch(`/picture/${picture.of.bit}?after=${picture.seq}`, { signal: AbortSignal.timeout(LOST) });
       if (answer.status !== 200) continue;
-      const arrived = now();
       const url = URL.createObjectURL(await answer.blob());
       URL.revokeObjectURL(picture.image.src);
       picture.image.src = url;
       picture.seq = answer.headers.get("x-seq");
-      picture.captured = arrived - Number(answer.headers.get("x-age-ms"));
+      picture.captured = sent - Number(answer.headers.get("x-age-ms"));
     } catch { /* The next one is requested. */ }
   }
 }
@@ -186,15 +188,17 @@ function age(bit, picture, lost) {
 // --- buttons
 
 function buttons(lost) {
-  const busy = lost || !view || now() - changed < PRESS_AGAIN;
   const phase = view ? view.phase : "idle";
+  const last = view && view.last ? view.last.file : "";
+  if (buttons.phase !== phase) { buttons.phase = phase; changed = now(); asked = -Infinity; }
+  if (buttons.last !== last) { buttons.last = last; changed = now(); }
+  const busy = lost || !view || isWithin(now() - changed, PRESS_AGAIN);
   const isRecording = phase === "recording";
   const waits = phase === "countdown" || phase === "reset";
-  if (buttons.phase !== phase) { buttons.phase = phase; changed = now(); sureUntil = -Infinity; }
   set(at("toggle"), isRecording ? "■ End" : waits ? "Start now" : "● Start");
   at("toggle").disabled = busy || phase === "ending";
   const subject = view && (view.current || (view.last && view.last.file));
-  const isSure = now() < sureUntil && subject === buttons.subject;
+  const isSure = isWithin(now() - asked, SURE) && subject === buttons.subject;
   set(at("discard"), isSure ? "Really discard" : view && view.current ? "Discard this" : "Discard last");
   at("discard").classList.toggle("sure", isSure);
   at("discard").disabled = busy || !subject;
@@ -202,12 +206,12 @@ function buttons(lost) {
   at("mark").disabled = busy;
   at("undo").hidden = isRecording || !(view && view.session && view.session.discarded);
   at("undo").disabled = busy;
-  for (const id of ["success", "failure"]) at(id).disabled = lost;
+  for (const id of ["success", "failure"]) at(id).disabled = busy;
 }
 
 async function request(what) {
   try {
-    const answer = await fetch("/do", { method: "POST", body: JSON.stringify(what), signal: AbortSignal.timeout(60000) });
+    const answer = await fetch("/do", { method: "POST", body: JSON.stringify(what), signal: AbortSignal.timeout(WAIT) });
     if (!answer.ok) return tell(await answer.text(), true);
     const { text, refused } = await answer.json();
     tell(text, refused);
@@ -228,16 +232,21 @@ at("toggle").addEventListener("click", () => {
 });
 at("discard").addEventListener("click", () => {
   const subject = view.current || view.last.file;
-  if (now() < sureUntil && subject === buttons.subject) {
-    sureUntil = -Infinity;
+  if (isWithin(now() - asked, SURE) && subject === buttons.subject) {
+    asked = -Infinity;
     request({ do: "discard", episode: subject });
   } else {
-    [sureUntil, buttons.subject] = [now() + SURE, subject];
+    [asked, buttons.subject] = [now(), subject];
   }
   render();
 });
-at("mark").addEventListener("click", () => request({ do: "mark" }));
-at("undo").addEventListener("click", () => request({ do: "undo" }));
+for (const what of ["mark", "undo"]) {
+  at(what).addEventListener("click", () => {
+    changed = now(); // One press, one mark, and one episode back.
+    request({ do: what });
+    render();
+  });
+}
 for (const label of ["success", "failure"]) {
   at(label).addEventListener("click", () => request({ do: "label", episode: view.last.file, label }));
 }
