@@ -243,7 +243,7 @@ mod tests {
             ("[module.a]\nslot = \"tip\"\ntags = \"x\"", "tags is no list of texts"),
             ("[rig]\n[module.a]\nslot = \"tip\"", "\"rig\" is neither"),
             ("[module.a]\nslot = \"tip\"\n[device.b]\nnode = \"camera\"", "not among the devices"),
-            ("[module.a]\nslot = \"tip\"\ndevices = [\"b\"]\n[device.b]\nx = 1", "[device.b] has no node"),
+            ("[module.a]\nslot = \"tip\"\ndevices = [\"b\"]\n[device.b]\ndepth = 8", "[device.b] has no node"),
             (
                 "[module.a]\nslot = \"tip\"\ndevices = [\"b\"]\n[device.b]\nvid = \"1\"",
                 "vid of [device.b] belongs to a unit",

@@ -44,8 +44,8 @@ node = "camera"
 topic = "/rapid/camera/depth"
 bit = 3
 [device.cam_depth.camera]
-width = 320
-height = 240
+width = 64
+height = 48
 fps = 15
 format = "Z16"
 
@@ -126,7 +126,7 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
         .device(DeviceSpec::uvc(0x2bc5, 0x0501).serial("YUV1").mode(Format::Yuyv, 320, 240, &[15]))
         .device(DeviceSpec::ftdi(0x0403, 0x6001, 50.0).serial("FT1"))
         .device(DeviceSpec::acm(0x2e8a, 0x000a, 10.0).serial("STRANGER"))
-        .device(DeviceSpec::uvc(0x8086, 0x0b07).serial("Z1").mode(Format::Z16, 320, 240, &[15]))
+        .device(DeviceSpec::uvc(0x8086, 0x0b07).serial("Z1").mode(Format::Z16, 64, 48, &[15]))
         .registry(REGISTRY)
         .script(SCRIPT)
         .run()
@@ -142,7 +142,7 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
         "STRANGER",
         "MJPG 640x480",
         "YUYV 320x240",
-        "Z16 320x240",
+        "Z16 64x48",
         "Brightness -64..=64 (default 0)",
     ] {
         assert!(listing.contains(word), "{word} not in:\n{listing}");
@@ -193,7 +193,7 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
     let depths: Vec<&Message> = episode.topic("/rapid/camera/depth").collect();
     assert!(depths.len() > 10, "{}", depths.len());
     assert!(depths.iter().all(|message| proto::bytes(&message.data, 4) == b"16UC1"));
-    assert!(depths.iter().all(|message| proto::bytes(&message.data, 6).len() == 2 * 320 * 240));
+    assert!(depths.iter().all(|message| proto::bytes(&message.data, 6).len() == 2 * 64 * 48));
     let numbers: Vec<u64> = depths.iter().filter_map(|message| number(message)).collect();
     assert_eq!(numbers.len(), depths.len(), "some have no number");
     assert_accounted(&episode, "/rapid/camera/depth", numbers);
