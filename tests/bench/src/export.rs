@@ -100,6 +100,8 @@ fn baseline(bench: &Bench, episode: &Path) -> Result<Baseline, Failure> {
     let mut command = Command::new(python);
     command.arg("models/export_speed.py").arg(episode).arg("--rapid").arg(&bench.rapid);
     command.args(["--times", &bench.runs.to_string()]).env("HF_HUB_OFFLINE", "1");
+    // PyTorch leaves its cache there.
+    command.env("TMPDIR", episode.parent().unwrap_or(episode));
     let usage = Running::start(&mut command)?.finish(LIMIT, || {})?;
     let line = usage.output.lines().last().unwrap_or_default();
     let found: Value =
