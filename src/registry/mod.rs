@@ -33,7 +33,8 @@ pub use spec::{
     CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, FieldInput, Form, Framing, GpioInput, Hook,
     Hooks, IdentitySpec, InputSpec, InterlockSpec, JointsSpec, KeyInput, LanFind, LanPicture, LanProtocol, LanSpec,
     Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError,
-    ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
-    PixelFormat, PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec, Quantity, Registry, RemoteSamples, RigSpec,
-    SLCAN_BITRATES, SerialSpec, Stop, StopSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale, mounted, own_side,
+    ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, PREVIEW_DECODER,
+    Parse, PhoneStream, PixelFormat, PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec, Quantity, Registry,
+    RemoteSamples, RigSpec, SLCAN_BITRATES, SerialSpec, Stop, StopSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale,
+    mounted, own_side,
 };

@@ -3,14 +3,13 @@
 //! Invariant: every value here is within the range its comment states; names, topics and bits are
 //! unique; no two entries of one kind of node identify the same unit; `Registry::devices` is in
 //! ascending order of bit.
-//!
-//! The reason for every default limit of the verdict is given here; `[verdict]` changes it for all devices,
-//! `[device.NAME.verdict]` for one.
 
 mod form;
 mod input;
 mod lan;
+mod module;
 mod motors;
+mod verdict;
 
 use std::fmt;
 use std::path::PathBuf;
@@ -27,10 +26,14 @@ pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
 };
-pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, RemoteSamples, own_side};
+pub use lan::{
+    LanFind, LanPicture, LanProtocol, LanSpec, PREVIEW_DECODER, PhoneStream, Probe, RemoteSamples, own_side,
+};
+pub use module::{ModuleError, ModuleSpec, mounted};
 pub use motors::{
     BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
 };
+pub use verdict::{Limits, VerdictSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: those that 8 subscribers hold, 4 each, the
 /// one being written, and one that is about to be replaced. The bus reserves them.
@@ -450,70 +453,6 @@ impl Hooks {
     }
 }
 
-/// `[module.NAME]`: a part that is mounted on the gripper, either with sensors or purely mechanical (paper, section
-/// "Module Catalog").
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct ModuleSpec {
-    /// Its name, as a modality's.
-    pub name: String,
-    /// Its position.
-    #[serde(rename = "slot")]
-    pub mount: Mount,
-    /// Tags of episodes with it: keys and values.
-    pub tags: Vec<(String, String)>,
-    /// The entries of its sensors; a module without any is mounted only if `--module` names it.
-    pub devices: Vec<String>,
-}
-
-/// Why modules cannot be mounted as requested.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum ModuleError {
-    /// There is no such module.
-    #[error("--module {name}: no [module.{name}] in the registry; {fix}")]
-    Unknown {
-        /// The name that was given.
-        name: String,
-        /// The known modules.
-        fix: String,
-    },
-    /// Two in one slot.
-    #[error("--module {first} and --module {second} both sit in the slot {mount}: name the one that is mounted")]
-    SameSlot {
-        /// One.
-        first: String,
-        /// The other.
-        second: String,
-        /// The slot.
-        mount: Mount,
-    },
-}
-
-/// The modules of these names.
-///
-/// # Errors
-/// When one is unknown, or two are in one slot.
-pub fn mounted<'a>(modules: &'a [ModuleSpec], names: &[String]) -> Result<Vec<&'a ModuleSpec>, ModuleError> {
-    let mut found: Vec<&ModuleSpec> = Vec::new();
-    for name in names {
-        let Some(module) = modules.iter().find(|module| module.name == *name) else {
-            let fix = if modules.is_empty() {
-                "it names no modules: write one, or use --tag".to_owned()
-            } else {
-                crate::registry::did_you_mean(name, modules.iter().map(|module| &module.name), "modules are")
-            };
-            return Err(ModuleError::Unknown { name: name.clone(), fix });
-        };
-        if let Some(other) = found.iter().find(|other| other.mount == module.mount && other.name != module.name) {
-            let (first, second) = (other.name.clone(), module.name.clone());
-            return Err(ModuleError::SameSlot { first, second, mount: module.mount });
-        }
-        if !found.contains(&module) {
-            found.push(module);
-        }
-    }
-    Ok(found)
-}
-
 /// Numbers in a sample of one motor: position rad, velocity rad/s, torque Nm, temperatures of its
 /// transistors and of its winding °C, and its error code.
 pub const MOTOR_CHANNELS: usize = 6;
@@ -674,121 +613,6 @@ impl NodeSpec {
                 }
             }
         }
-    }
-}
-
-/// How many defects an episode may have before it gets a grade: the limits of one grade. A figure beyond its limit
-/// leads to the grade; `None` is a check that is off.
-///
-/// Shares are of the expected samples, `0.0..=1.0`.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Limits {
-    /// Samples the device lost before `rapid` received them.
-    pub lost: Option<f64>,
-    /// Samples lost between the driver and the file.
-    pub dropped: Option<f64>,
-    /// Samples that the driver reported as damaged, and JPEG pictures without their beginning or end.
-    pub damaged: Option<f64>,
-    /// Samples with a non-increasing sequence number or capture time.
-    pub duplicate: Option<f64>,
-    /// Samples that are byte-identical to the one before.
-    pub repeated: Option<f64>,
-    /// Longest time in which every sample is byte-identical to the one before.
-    pub frozen: Option<Duration>,
-    /// Samples that came too late for their frame.
-    pub late: Option<f64>,
-    /// Longest time without a sample while the device was attached.
-    pub gap: Option<Duration>,
-    /// Longest time in which the device was plugged in and did not run.
-    pub opening: Option<Duration>,
-    /// Change of the stamps against this machine's clock over the episode, and how far they are in
-    /// the future.
-    pub clock: Option<Duration>,
-    /// How far the capture times may be wrong, of a device of another computer.
-    pub uncertain: Option<Duration>,
-    /// Least rate while the device was attached, as a share of the nominal one.
-    pub rate: Option<f64>,
-    /// Least share of the ticks while the device was attached that have a sample of it in `sync_window`.
-    pub valid: Option<f64>,
-}
-
-/// Limits for the verdict on a modality.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct VerdictSpec {
-    /// Beyond these the episode is SUSPECT.
-    pub suspect: Limits,
-    /// Beyond these it is BAD.
-    pub bad: Limits,
-    /// Nominal samples per second of the device, if known: a camera's `fps`, or `hz`.
-    pub hz: Option<f64>,
-}
-
-impl VerdictSpec {
-    /// The default limits of a modality.
-    ///
-    /// * lost 1 %, 5 %: one missing picture in a hundred is replaced by a neighbour; other recorders call a
-    ///   rig overloaded from some 2 to 5 % on.
-    /// * dropped 0, 5 %: this machine could not keep up, which it always should.
-    /// * damaged 1 %, 5 %: equivalent to lost. A camera's first picture after a plug often is.
-    /// * duplicate 0.1 %, 5 %: a stamp that does not increase puts a sample into the wrong frame.
-    /// * repeated 10 %, 60 %: a camera that sends every second picture twice (50 %) runs at half its
-    ///   rate; with more than that it has stopped.
-    /// * frozen 500 ms, 2 s: a live sensor has noise, and no two pictures of it are equal. Only for
-    ///   images: numbers and bytes may well be constant.
-    /// * late 1 %, 20 %: they are missing from their frame, although the file has them.
-    /// * gap `stall_after`, ten times that: from this length on the monitor shows stalled.
-    /// * opening 5 s, off: two of them are the cooldown of a replugged device, and a slow camera takes
-    ///   another two. Longer is a node that does not start. How bad that is depends on the task.
-    /// * clock 10 ms, 100 ms: less than half the usual window of 25 ms cannot move many samples into
-    ///   another frame.
-    /// * valid 90 %, 50 %: a policy is trained on the content of the frames, and a tick without a valid sample has
-    ///   an old one or none. A device slower than twice `sync_window` misses ticks by its phase alone.
-    /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
-    pub fn of(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
-        let image = matches!(kind, ModalityKind::Image | ModalityKind::Depth);
-        let suspect = Limits {
-            lost: Some(0.01),
-            dropped: Some(0.0),
-            damaged: Some(0.01),
-            duplicate: Some(0.001),
-            repeated: image.then_some(0.1),
-            frozen: image.then_some(Duration::from_millis(500)),
-            late: Some(0.01),
-            gap: Some(stall_after),
-            opening: Some(Duration::from_secs(5)),
-            clock: Some(Duration::from_millis(10)),
-            uncertain: None,
-            rate: Some(0.9),
-            valid: Some(0.9),
-        };
-        let bad = Limits {
-            lost: Some(0.05),
-            dropped: Some(0.05),
-            damaged: Some(0.05),
-            duplicate: Some(0.05),
-            repeated: image.then_some(0.6),
-            frozen: image.then_some(Duration::from_secs(2)),
-            late: Some(0.2),
-            gap: Some(stall_after.saturating_mul(10)),
-            opening: None,
-            clock: Some(Duration::from_millis(100)),
-            uncertain: None,
-            rate: Some(0.5),
-            valid: Some(0.5),
-        };
-        Self { suspect, bad, hz }
-    }
-
-    /// Also judges the clock of another computer: beyond half of `sync_window` a sample may belong to another frame.
-    #[must_use]
-    pub fn of_another_computer(mut self, sync_window: Duration) -> Self {
-        self.suspect.uncertain = Some(sync_window / 2);
-        self
-    }
-
-    /// Whether any check here compares payloads for equality.
-    pub fn compares(&self) -> bool {
-        [self.suspect, self.bad].iter().any(|limits| limits.frozen.is_some() || limits.repeated.is_some())
     }
 }
 

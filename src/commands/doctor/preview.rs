@@ -3,10 +3,7 @@
 use std::ffi::OsStr;
 
 use super::judge::Finding;
-use crate::registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec};
-
-/// What decodes them.
-const DECODER: &str = "ffmpeg";
+use crate::registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PREVIEW_DECODER as DECODER};
 
 /// Whether there is such a program in the folders of `path`.
 pub(super) fn is_on(path: Option<&OsStr>) -> bool {

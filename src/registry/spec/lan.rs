@@ -139,6 +139,8 @@ pub enum Probe {
     Remote,
 }
 
+/// The program that decodes the preview of a GoPro.
+pub const PREVIEW_DECODER: &str = "ffmpeg";
 /// Port of a server whose port is not reported.
 const HTTP_PORT: u16 = 80;
 /// The pose of a phone's camera is a matrix of 4 by 4.

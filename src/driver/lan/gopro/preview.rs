@@ -29,12 +29,10 @@ use super::super::multipart::{Cut, Multipart};
 use super::super::place::Server;
 use super::ask;
 use crate::driver::{DriverError, Reading};
-use crate::registry::{LanPicture, own_side};
+use crate::registry::{LanPicture, PREVIEW_DECODER as DECODER, own_side};
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
-/// The program that decodes.
-pub(crate) const DECODER: &str = "ffmpeg";
 /// Without a packet for this long the stream is requested again.
 const SILENT: Duration = Duration::from_secs(3);
 /// A stream that pauses for this long has ended: pictures that the decoder still holds are old by then.
