@@ -4,6 +4,7 @@
 
 mod facts;
 mod judge;
+mod load;
 mod preview;
 
 use std::io::{self, Write};
