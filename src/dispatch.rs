@@ -6,10 +6,11 @@
 mod live;
 #[cfg_attr(not(feature = "policy"), path = "dispatch/policy_absent.rs")]
 mod policy;
+mod registry;
 #[cfg_attr(not(feature = "web"), path = "dispatch/web_absent.rs")]
 mod web;
 
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, IsTerminal};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -19,25 +20,23 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
+use self::registry::{
+    connected, devices, find_registry, load, print_warning, register, registry_or_builtin, registry_path, unregister,
+    usual_places,
+};
 use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{
-    Calibration, Cli, Command, Global, LevelArg, PolicyArgs, RegisterArgs, RunArgs, SessionCommand, UnregisterArgs,
-};
-use crate::commands::devices::{Entries, Formats};
+use crate::cli::{Calibration, Cli, Command, Global, LevelArg, PolicyArgs, RunArgs, SessionCommand};
+use crate::commands::devices::Formats;
 use crate::commands::inspect::InspectFailure;
 use crate::commands::logs::LogsOptions;
 use crate::commands::mask::MaskOptions;
-use crate::commands::register::{self, Dialogue};
 use crate::commands::{self, CommandStatus, Format};
-use crate::device::Attachment;
-use crate::driver::{camera, replay};
-use crate::hotplug::udev::Ask;
-use crate::hotplug::{HotplugError, udev};
+use crate::driver::replay;
+use crate::hotplug::HotplugError;
 use crate::palette::Palette;
 use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError};
-use crate::registration::Target;
 use crate::registry::scenario::Scenario;
 use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
@@ -269,41 +268,6 @@ fn is_task(global: &Global) -> bool {
     global.sim.as_ref().is_some_and(|scenario| scenario.as_deref() == Some(Path::new("task")))
 }
 
-/// The registry, and the devices that are connected.
-fn connected(global: &Global) -> Result<(Registry, Vec<Attachment>), Failure> {
-    let (registry, devices) = rig(global, 0)?;
-    let attached = match devices {
-        Devices::Machine => udev::enumerate(&asked(Some(&registry)))?,
-        Devices::Simulated(scenario) => crate::hotplug::script::attached(&scenario),
-    };
-    Ok((registry, attached))
-}
-
-/// What capture nodes are asked in order to assign them.
-fn asked(registry: Option<&Registry>) -> Ask {
-    registry.map_or(Ask::NOTHING, |registry| Ask::of(registry, camera::formats))
-}
-
-/// Lists connected devices first, even if the registry is invalid.
-fn devices(global: &Global, formats: Formats, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
-    if global.sim.is_some() {
-        let (registry, attached) = connected(global)?;
-        let listed = commands::devices::list(Entries::Of(&registry), &attached, formats);
-        return Ok(commands::devices::print(&listed, Some(&registry), format, out)?);
-    }
-    let registry = find_registry(global).map(|path| load(&path)).transpose();
-    let known = match &registry {
-        Ok(Some(registry)) => Entries::Of(registry),
-        Ok(None) => Entries::NoFile,
-        Err(_) => Entries::Wrong,
-    };
-    let ask = asked(registry.as_ref().ok().and_then(Option::as_ref));
-    let mut listed = commands::devices::list(known, &udev::enumerate(&ask)?, formats);
-    listed.extend(commands::devices::other_cameras(formats));
-    commands::devices::print(&listed, registry.as_ref().ok().and_then(Option::as_ref), format, out)?;
-    registry.map(drop)
-}
-
 fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let path = mask_path(global.instance.as_deref());
     let json = json_path(&path);
@@ -459,70 +423,6 @@ fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     let done = catch_unwind(AssertUnwindSafe(|| runtime.block_on(work)));
     runtime.shutdown_timeout(TASKS_TIMEOUT);
     done.map_err(|_| Failure::panicked())
-}
-
-fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
-    find_registry(global).map_or_else(|| Ok(Registry::builtin()), |path| load(&path))
-}
-
-/// Reads a registry; its warnings go to standard error.
-fn load(path: &Path) -> Result<Registry, Failure> {
-    let loaded = Registry::load(path)?;
-    for warning in &loaded.warnings {
-        print_warning(warning);
-    }
-    Ok(loaded.registry)
-}
-
-fn print_warning(warning: &dyn std::fmt::Display) {
-    let _ = writeln!(io::stderr(), "{} {warning}", Palette::of(&io::stderr()).warn("warning:"));
-}
-
-fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
-    find_registry(global).ok_or_else(Failure::no_registry)
-}
-
-/// The registry named, or the first that exists in the usual places.
-fn find_registry(global: &Global) -> Option<PathBuf> {
-    if let Some(path) = &global.config {
-        return Some(path.clone());
-    }
-    usual_places().into_iter().find(|path| path.exists())
-}
-
-fn usual_places() -> Vec<PathBuf> {
-    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
-    let config = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
-    let mut places = vec![PathBuf::from("devices.toml")];
-    places.extend(config.or_else(home).map(|folder| folder.join("rapid/devices.toml")));
-    places.push(PathBuf::from("/etc/rapid/devices.toml"));
-    places
-}
-
-/// Adds an entry.
-fn register(global: &Global, args: &RegisterArgs, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
-    let target = Target::read(find_registry(global).unwrap_or_else(|| PathBuf::from("devices.toml")))?;
-    let attached = match udev::enumerate(&Ask::NOTHING) {
-        _ if global.sim.is_some() => connected(global)?.1,
-        // An entry for a device that is not plugged in can be created on any machine.
-        Err(_) if args.vid.is_some() => Vec::new(),
-        attached => attached?,
-    };
-    let (input, output) = (&mut io::stdin().lock(), &mut io::stdout());
-    let talk = is_interactive(format).then_some(Dialogue { input, out: output });
-    Ok(block_on(register::register(&target, &attached, args, talk, format, out))??)
-}
-
-/// Removes an entry.
-fn unregister(global: &Global, args: &UnregisterArgs, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
-    let target = Target::read(registry_path(global)?)?;
-    let (input, output) = (&mut io::stdin().lock(), &mut io::stdout());
-    let talk = is_interactive(format).then_some(Dialogue { input, out: output });
-    Ok(register::unregister(&target, args, talk, format, out)?)
-}
-
-fn is_interactive(format: Format) -> bool {
-    format == Format::Text && io::stdin().is_terminal() && io::stdout().is_terminal()
 }
 
 /// Why a command failed: the text to print, if it was not printed already, and the exit code: 1 failed while running, 2
