@@ -119,6 +119,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     rig.expect = section.map(|section| expected(&section, &drafts)).unwrap_or_default();
     check_actuators(&drafts);
     lan::check_ports(&drafts);
+    lan::check_gopros(&drafts);
     assign_bits(&mut drafts);
     node::warn_of_old_names(&drafts);
     warn_of_unused_ports(&drafts);
@@ -240,7 +241,7 @@ fn check_identities(drafts: &[Draft<'_>]) {
     }
 }
 
-/// The streams of a camera are told apart by their pixel formats, and their entries by their names.
+/// The streams of a camera are distinguished by their pixel formats, and their entries by their names.
 fn check_streams(drafts: &[Draft<'_>]) {
     for (index, draft) in drafts.iter().enumerate() {
         let Some(owner) = &draft.stream_of else { continue };
@@ -253,7 +254,7 @@ fn check_streams(drafts: &[Draft<'_>]) {
         let Some(earlier) = drafts.iter().take(index).filter(is_of_it).find(same) else { continue };
         let format = draft.format().map(|format| format.to_string()).unwrap_or_default();
         let message =
-            format!("pictures in {format}, as of [{}]: nothing else tells the streams apart", earlier.section.entry);
+            format!("pictures in {format}, as of [{}]: nothing else distinguishes the streams", earlier.section.entry);
         draft.section.report(
             "camera",
             message,

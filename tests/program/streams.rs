@@ -115,3 +115,19 @@ fn a_data_set_has_the_other_stream_alone() {
     assert!(features.contains_key("observation.images.d435") && !features.keys().any(|key| key.contains("d435_depth")));
     assert_eq!(features["rapid.mask"]["names"], serde_json::json!(["d435", "d435_depth"]), "{info}");
 }
+
+#[test]
+fn a_camera_is_unregistered_with_its_streams_and_no_stream_alone() {
+    let place = Place::new();
+    place.write(
+        "devices.toml",
+        &[RIG, "[device.other]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\nbit = 9\n"].concat(),
+    );
+    let alone = place.run(&["unregister", "d435_depth", "--yes"]);
+    let errors = String::from_utf8_lossy(&alone.stderr);
+    assert_eq!(alone.status.code(), Some(2), "{errors}");
+    assert!(errors.contains("[device.d435_depth] is a further stream of a camera"), "{errors}");
+    let removed = place.run(&["unregister", "d435", "--yes"]);
+    let text = String::from_utf8_lossy(&removed.stdout);
+    assert!(text.contains("removed [device.d435] with its streams d435_depth"), "{text}");
+}

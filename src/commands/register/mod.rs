@@ -251,11 +251,14 @@ pub fn unregister(
         .filter(|(entry, now)| entry.id != now.id)
         .map(|(entry, now)| format!("[device.{}] from bit {} to bit {}", entry.name, entry.id.bit(), now.id.bit()))
         .collect();
+    // Its further streams are modalities of their own.
+    let is_gone = |entry: &&DeviceSpec| entry.name != args.name && left.named(&entry.name).is_none();
+    let streams: Vec<&str> = before.iter().filter(is_gone).map(|entry| entry.name.as_str()).collect();
     if !moved.is_empty() {
         return Err(RegisterError::BitsMove { name: args.name.clone(), moved: moved.join(", ") });
     }
     if let Some(mut talk) = talk.filter(|_| !args.yes && !args.dry_run)
-        && !talk.agrees(&format!("Remove [device.{}] from {}", args.name, target.path.display()))?
+        && !talk.agrees(&format!("Remove [device.{}]{} from {}", args.name, with(&streams), target.path.display()))?
     {
         talk.print("Nothing was written.")?;
         return Ok(());
@@ -273,10 +276,14 @@ pub fn unregister(
         Format::Text if args.dry_run => out.write_all(new.as_bytes())?,
         Format::Text => {
             out.write_all(&written_files)?;
-            writeln!(out, "removed [device.{}]", args.name)?;
+            writeln!(out, "removed [device.{}]{}", args.name, with(&streams))?;
         }
     }
     Ok(())
+}
+
+fn with(streams: &[&str]) -> String {
+    if streams.is_empty() { String::new() } else { format!(" with its streams {}", streams.join(", ")) }
 }
 
 /// Parses, shows, asks, writes.
@@ -312,7 +319,15 @@ fn commit(
     if format == Format::Text {
         out.write_all(&written_files)?;
         if !args.dry_run {
-            writeln!(out, "a running rapid takes it over: rapid reload")?;
+            let is_taken_over = |entry: &NewEntry| {
+                let node = parsed.registry.named(&entry.name).map(|device| &device.node);
+                matches!(node, Some(NodeSpec::Camera(_) | NodeSpec::Serial(_)))
+            };
+            if entries.iter().all(is_taken_over) {
+                writeln!(out, "a running rapid takes it over: rapid reload")?;
+            } else {
+                writeln!(out, "a running rapid takes it over when it is started again")?;
+            }
             writeln!(out, "for stable device names, install the udev rules: rapid artifacts --help")?;
         }
         return Ok(());

@@ -239,6 +239,23 @@ pub(super) fn check_ports(drafts: &[Draft<'_>]) {
     }
 }
 
+/// A GoPro has one shutter, and one entry: its samples are its state or its preview.
+pub(super) fn check_gopros(drafts: &[Draft<'_>]) {
+    let gopro = |draft: &Draft<'_>| {
+        let lan = draft.lan().filter(|lan| matches!(lan.protocol, LanProtocol::Gopro { .. }))?;
+        match &lan.find {
+            LanFind::Host { host, .. } => Some(*host),
+            LanFind::Adapter { .. } | LanFind::Mdns { .. } => None,
+        }
+    };
+    for (index, draft) in drafts.iter().enumerate() {
+        let Some(host) = gopro(draft) else { continue };
+        let Some(earlier) = drafts.iter().take(index).find(|other| gopro(other) == Some(host)) else { continue };
+        let message = format!("the GoPro at {host} is [{}] already", earlier.section.entry);
+        draft.section.report("lan", message, "keep one of them: stream = \"preview\" or stream = \"state\"");
+    }
+}
+
 /// Exactly one way: the USB identity of the entry, `mdns`, or `host`.
 fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanFind> {
     let is_usb = IDENTITY_KEYS.iter().any(|key| section.has(key));
