@@ -210,6 +210,25 @@ fn every_dependency_has_a_home() {
     assert!(homeless.is_empty(), "Cargo.toml depends on {homeless:?}: name their homes in HOMES");
 }
 
+/// `rapid-remote` is in no workspace of this repository, and its lock is not written by a build of it.
+#[test]
+fn the_lock_of_rapid_remote_has_what_every_program_needs() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let read = |path: &str| -> toml::Table { fs::read_to_string(root.join(path)).unwrap().parse().unwrap() };
+    let (manifest, lock) = (read("Cargo.toml"), read("examples/remote/Cargo.lock"));
+    let packages = lock["package"].as_array().unwrap();
+    let own = packages.iter().find(|package| package["name"].as_str() == Some("rapid")).unwrap();
+    let locked: BTreeSet<&str> =
+        own["dependencies"].as_array().unwrap().iter().filter_map(|name| name.as_str()?.split(' ').next()).collect();
+    let is_needed = |value: &toml::Value| value.get("optional").is_none();
+    let needed = manifest["dependencies"].as_table().unwrap().iter().filter(|(_, value)| is_needed(value));
+    let missing: Vec<_> = needed.map(|(name, _)| name).filter(|name| !locked.contains(name.as_str())).collect();
+    assert!(
+        missing.is_empty(),
+        "{missing:?}: run `cargo update --workspace --manifest-path examples/remote/Cargo.toml`"
+    );
+}
+
 /// Something that breaks a rule, and which.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Violation {

@@ -7,6 +7,7 @@ use std::io::Write;
 use std::net::{TcpStream, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::support::lan::{
@@ -44,6 +45,40 @@ fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
     assert_eq!(pictures[0], picture(0), "the picture is as the camera sent it");
 }
 
+/// A sender of packets to a port of this machine, and a stranger who sends there too.
+struct Packets {
+    sends: Arc<AtomicBool>,
+    sent: Arc<AtomicU32>,
+    thread: JoinHandle<()>,
+}
+
+impl Packets {
+    fn send(port: u16, packet: impl Fn(u32) -> Vec<u8> + Send + 'static) -> Self {
+        let (sends, sent) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU32::new(0)));
+        let thread = std::thread::spawn({
+            let (sends, sent) = (Arc::clone(&sends), Arc::clone(&sent));
+            move || {
+                let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
+                let stranger = UdpSocket::bind("127.0.0.9:0").expect("a port");
+                for number in (0..).take_while(|_| sends.load(Ordering::Relaxed)) {
+                    let _ = socket.send_to(&packet(number), ("127.0.0.1", port));
+                    let _ = stranger.send_to(b"not mine", ("127.0.0.1", port));
+                    sent.store(number + 1, Ordering::Relaxed);
+                    std::thread::sleep(Duration::from_millis(2));
+                }
+            }
+        });
+        Self { sends, sent, thread }
+    }
+
+    fn end_after_a_hundred(self) {
+        let before = self.sent.load(Ordering::Relaxed);
+        until("a hundred packets", || self.sent.load(Ordering::Relaxed) > before + 100);
+        self.sends.store(false, Ordering::Relaxed);
+        self.thread.join().expect("no panic");
+    }
+}
+
 #[test]
 fn packets_become_samples_unchanged() {
     let (place, [port]) = (Place::new(), free_ports());
@@ -53,29 +88,14 @@ fn packets_become_samples_unchanged() {
     );
     place.write("devices.toml", &entry);
     let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
-    let (sends, sent) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU32::new(0)));
-    let sender = std::thread::spawn({
-        let (sends, sent) = (Arc::clone(&sends), Arc::clone(&sent));
-        move || {
-            let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
-            let stranger = UdpSocket::bind("127.0.0.9:0").expect("a port");
-            while sends.load(Ordering::Relaxed) {
-                let number = sent.load(Ordering::Relaxed);
-                let mut packet = number.to_le_bytes().to_vec();
-                // Each tenth is larger than the entry permits.
-                packet.resize(if number % 10 == 9 { 1025 } else { 1000 }, 7);
-                let _ = socket.send_to(&packet, ("127.0.0.1", port));
-                let _ = stranger.send_to(b"not mine", ("127.0.0.1", port));
-                sent.store(number + 1, Ordering::Relaxed);
-                std::thread::sleep(Duration::from_millis(2));
-            }
-        }
+    let packets = Packets::send(port, |number| {
+        let mut packet = number.to_le_bytes().to_vec();
+        // Each tenth is larger than the entry permits.
+        packet.resize(if number % 10 == 9 { 1025 } else { 1000 }, 7);
+        packet
     });
     wait_for(&running, "lidar", "streaming", 1);
-    let before = sent.load(Ordering::Relaxed);
-    until("a hundred packets", || sent.load(Ordering::Relaxed) > before + 100);
-    sends.store(false, Ordering::Relaxed);
-    sender.join().expect("no panic");
+    packets.end_after_a_hundred();
     wait_for(&running, "lidar", "by lease", 1);
     let reported = stop(running);
     let lost = reported.iter().rfind(|event| event["event"] == "summary").expect("a summary")["devices"][0].clone();
@@ -107,26 +127,13 @@ fn packets_of_a_lidar_are_recorded_with_their_points() {
     );
     place.write("devices.toml", &entry);
     let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
-    let (sends, sent) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU32::new(0)));
-    let sender = std::thread::spawn({
-        let (sends, sent) = (Arc::clone(&sends), Arc::clone(&sent));
-        move || {
-            let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
-            for number in (0..).take_while(|_| sends.load(Ordering::Relaxed)) {
-                // Each tenth is none: it is recorded all the same.
-                let packet = lidar::packet(number, 0);
-                let length = if number % 10 == 9 { 1205 } else { packet.len() };
-                let _ = socket.send_to(&packet[..length], ("127.0.0.1", port));
-                sent.store(number + 1, Ordering::Relaxed);
-                std::thread::sleep(Duration::from_millis(2));
-            }
-        }
+    let packets = Packets::send(port, |number| {
+        // Each tenth is none: it is recorded all the same.
+        let packet = lidar::packet(number, 0);
+        packet[..if number % 10 == 9 { 1205 } else { packet.len() }].to_vec()
     });
     wait_for(&running, "lidar", "streaming", 1);
-    let before = sent.load(Ordering::Relaxed);
-    until("a hundred packets", || sent.load(Ordering::Relaxed) > before + 100);
-    sends.store(false, Ordering::Relaxed);
-    sender.join().expect("no panic");
+    packets.end_after_a_hundred();
     stop(running);
     let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
     let packets: Vec<_> = episode.topic("/rapid/lan/lidar").collect();
