@@ -31,7 +31,7 @@ use crate::time::Stamp;
 const NODE_SUBSYSTEMS: [&str; 3] = ["video4linux", "tty", "net"];
 
 /// Which capture nodes are asked for the pixel formats that they offer, and how: those of cameras with several streams, which
-/// are told apart by them. No others: asking opens the node.
+/// are distinguished by them. No others: asking opens the node.
 #[derive(Debug, Clone)]
 pub struct Ask {
     /// Vendor and product ids.

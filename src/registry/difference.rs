@@ -165,7 +165,9 @@ fn obstacle(device: &DeviceSpec, running: &Registry, new: &Registry) -> Option<S
         return Some("an actuator is set up at the start, before anything may move".to_owned());
     }
     if new.shares_unit(device) {
-        return Some("the streams of a camera are told apart by what discovery asks of it from the start".to_owned());
+        return Some(
+            "the streams of a camera are distinguished by what discovery asks of it from the start".to_owned(),
+        );
     }
     if !device.hooks.is_empty() {
         return Some("its hooks need what a run sets up for programs at its start".to_owned());

@@ -215,7 +215,7 @@ def check(rapid, page, place, shots):
 
     # With a token: without the link there is nothing, and with it everything; the address bar has no token.
     run = Run(rapid, place, port, ["--web-token", "token"])
-    until("it says what it needs", lambda: "QR code" in page.text("#lost"))
+    until("it shows what it needs", lambda: "QR code" in page.text("#lost"))
     page.shot(shots, "token")
     token = (place / "token").read_text().strip()
     page.ask("Page.navigate", url=f"http://127.0.0.1:{port}/#{token}")

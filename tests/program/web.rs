@@ -178,7 +178,7 @@ fn the_page_does_what_keys_do() {
     assert_eq!((&view["phase"], &view["recording"]["verdict"]), (&json!("recording"), &json!("GOOD")));
     assert!(view["current"].as_str().expect("an episode").ends_with("pour-tea_001.mcap"), "{view}");
     client.done(&json!({ "do": "mark" }));
-    // What the session refuses is told, and no error of the page.
+    // What the session refuses is reported, and no error of the page.
     let again = client.request("POST /do", r#"{"do":"start"}"#);
     assert_eq!((again.status, &again.json()["refused"]), (200, &json!(true)));
     client.done(&json!({ "do": "stop" }));

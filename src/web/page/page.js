@@ -27,7 +27,7 @@ let changed = -Infinity; // when the phase, or the episode that buttons are abou
 let asked = -Infinity; // when a discard was pressed for the first time
 const pictures = new Map(); // by bit
 
-// A clock that was set back says nothing about what has arrived.
+// A clock that was set back proves nothing about what has arrived.
 const isWithin = (ms, most) => ms >= 0 && ms <= most;
 const isLost = () => !isWithin(now() - heard, LOST);
 
