@@ -11,7 +11,7 @@ use crate::commands::register::{self, Dialogue};
 use crate::commands::{self, Format};
 use crate::device::Attachment;
 use crate::driver::camera;
-use crate::hotplug::udev::{self, Ask};
+use crate::hotplug::udev::{Ask, enumerate};
 use crate::palette::Palette;
 use crate::registration::Target;
 use crate::registry::Registry;
@@ -62,7 +62,7 @@ pub(super) fn register(
     out: &mut dyn Write,
 ) -> Result<(), Failure> {
     let target = Target::read(find_registry(global).unwrap_or_else(|| PathBuf::from("devices.toml")))?;
-    let attached = match udev::enumerate(&asked(target.registry.as_ref())) {
+    let attached = match enumerate(&asked(target.registry.as_ref())) {
         _ if global.sim.is_some() => connected(global)?.1,
         // An entry for a device that is not plugged in can be created on any machine.
         Err(_) if args.vid.is_some() => Vec::new(),
@@ -94,7 +94,7 @@ fn is_interactive(format: Format) -> bool {
 pub(super) fn connected(global: &Global) -> Result<(Registry, Vec<Attachment>), Failure> {
     let (registry, devices) = rig(global, 0)?;
     let attached = match devices {
-        Devices::Machine => udev::enumerate(&asked(Some(&registry)))?,
+        Devices::Machine => enumerate(&asked(Some(&registry)))?,
         Devices::Simulated(scenario) => crate::hotplug::script::attached(&scenario),
     };
     Ok((registry, attached))
@@ -119,7 +119,7 @@ pub(super) fn devices(global: &Global, formats: Formats, format: Format, out: &m
         Err(_) => Entries::Wrong,
     };
     let ask = asked(registry.as_ref().ok().and_then(Option::as_ref));
-    let mut listed = commands::devices::list(known, &udev::enumerate(&ask)?, formats);
+    let mut listed = commands::devices::list(known, &enumerate(&ask)?, formats);
     listed.extend(commands::devices::other_cameras(formats));
     commands::devices::print(&listed, registry.as_ref().ok().and_then(Option::as_ref), format, out)?;
     registry.map(drop)
