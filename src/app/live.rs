@@ -5,6 +5,7 @@
 use std::sync::{Arc, mpsc};
 
 use tokio::sync::mpsc::UnboundedSender;
+use tokio::sync::watch;
 
 pub(super) use crate::live::LiveAddition;
 pub use crate::live::LiveOptions;
@@ -13,6 +14,7 @@ use super::AppError;
 use super::requests::{Request, asker};
 use super::stage::Stage;
 use crate::bus::Bus;
+use crate::episode::made::Made;
 use crate::live::{Controls, Feed, Live};
 use crate::permission::Permission;
 use crate::registry::Registry;
@@ -41,7 +43,7 @@ impl Listening {
         self,
         bus: &Bus,
         board: &Board,
-        clock: tokio::sync::watch::Receiver<WallClock>,
+        (clock, made): (watch::Receiver<WallClock>, mpsc::Receiver<Made>),
     ) -> Result<(Stage, mpsc::Sender<LiveAddition>), AppError> {
         let Self(mut live) = self;
         let mut queues = bus.queues()?;
@@ -49,7 +51,7 @@ impl Listening {
             queues.add(observations);
         }
         let (added, additions) = mpsc::channel();
-        live.feed(Feed { queues, events: board.events(), clock, additions });
+        live.feed(Feed { queues, events: board.events(), clock, made, additions });
         let stage = Stage::start("the Foxglove server", |stop| async move {
             live.run(stop).await;
             Ok(())

@@ -9,6 +9,7 @@ use super::AppError;
 use super::requests::Request;
 use super::stage::Stage;
 use crate::bus::{Bus, Subscription};
+use crate::episode::made::Made;
 use crate::permission::Permission;
 use crate::registry::{DeviceSpec, Registry};
 use crate::status::Board;
@@ -43,7 +44,7 @@ impl Listening {
         self,
         _: &Bus,
         _: &Board,
-        _: watch::Receiver<WallClock>,
+        _: (watch::Receiver<WallClock>, mpsc::Receiver<Made>),
     ) -> Result<(Stage, mpsc::Sender<LiveAddition>), AppError> {
         match self {}
     }

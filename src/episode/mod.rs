@@ -15,6 +15,7 @@ pub mod form;
 mod hash;
 mod index;
 mod integrity;
+pub(crate) mod made;
 mod names;
 pub(crate) mod op;
 pub(crate) mod own;

@@ -33,6 +33,7 @@ pub use control::Controls;
 use topics::Topics;
 
 use crate::bus::{BusError, Queues, Subscription};
+use crate::episode::made::Made;
 use crate::fault;
 use crate::registry::{DeviceSpec, Registry};
 use crate::status::{Board, Event, Level, What};
@@ -116,6 +117,8 @@ pub struct Feed {
     pub events: broadcast::Receiver<Event>,
     /// The clock of the episode in progress.
     pub clock: watch::Receiver<WallClock>,
+    /// What the recorder makes.
+    pub made: mpsc::Receiver<Made>,
     /// Entries that are added.
     pub additions: mpsc::Receiver<LiveAddition>,
 }
@@ -286,12 +289,16 @@ impl Server {
             feed.queues.add(subscription);
             topics.add(&device);
         }
-        let Feed { queues, events, clock, .. } = feed;
+        let Feed { queues, events, clock, made, .. } = feed;
         // After the capture of whatever is taken below: an episode's clock is in force before it begins.
         let drained = queues.drain(&mut |topic, header, payload| {
             topics.take(topic, header, payload, *clock.borrow());
         });
         topics.send_pictures();
+        for made in made.try_iter() {
+            topics.made(&made);
+        }
+        topics.send_places(Stamp::now());
         loop {
             match events.try_recv() {
                 Ok(event) => topics.event(&event, *clock.borrow()),

@@ -1,10 +1,12 @@
-//! The topics as clients see them: the channels of an episode's file, and the observations.
+//! The topics as clients see them: the channels of an episode's file, and the observations. The frame index lasts from the
+//! beginning of an episode to its end.
 //!
 //! Invariant: schema, metadata and bytes are those of the file.
 //! Invariant: what belongs to a channel without a subscriber is not encoded.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use foxglove::{Context, PartialMetadata, RawChannel, Schema as ChannelSchema};
 
@@ -12,9 +14,10 @@ use super::pictures::Pace;
 use crate::action::ACTION_TOPIC;
 use crate::bus::TopicId;
 use crate::episode::encode::{self, Announced, logged};
-use crate::episode::form::Derived;
+use crate::episode::form::{Derived, TRANSFORM_TOPIC};
+use crate::episode::made::{Made, MadeKind};
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
-use crate::episode::{EVENT_TOPIC, LOG_TOPIC, channel};
+use crate::episode::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, channel};
 use crate::mask::{Bits, MASK_TOPIC};
 use crate::modality::MAX_MODALITIES;
 use crate::observation::{OBSERVATION_TOPIC, Observation};
@@ -23,18 +26,25 @@ use crate::sample::SampleHeader;
 use crate::status::Event;
 use crate::time::{Stamp, WallClock};
 
+/// Time between two messages about where a sensor sits.
+const PLACES_EVERY: Duration = Duration::from_secs(1);
+
 /// See the module's comment.
 pub(super) struct Topics {
     context: Arc<Context>,
     tracks: Vec<Option<Track>>,
     mask: Option<Arc<RawChannel>>,
     observation: Option<Arc<RawChannel>>,
-    /// None without a pose in the registry.
+    frame: Option<Arc<RawChannel>>,
+    /// None without a pose, and without the place of a sensor, in the registry.
     transforms: Option<Arc<RawChannel>>,
     event: Option<Arc<RawChannel>>,
     log: Option<Arc<RawChannel>>,
     /// None without an actuator in the registry.
     action: Option<Arc<RawChannel>>,
+    /// Where the sensors of the mounted modules sit: the transforms of the newest episode.
+    places: Vec<Made>,
+    places_sent: Stamp,
     message: Vec<u8>,
     /// Pictures that were left out, and events that were missed, since the last report.
     left_out: LeftOut,
@@ -75,14 +85,20 @@ impl Topics {
             tracks: std::iter::repeat_with(|| None).take(MAX_MODALITIES).collect(),
             mask: own(schema::MASK, MASK_TOPIC),
             observation: own(schema::FRAME, OBSERVATION_TOPIC),
+            frame: own(schema::FRAME, FRAME_TOPIC),
             transforms: None,
             event: own(schema::EVENT, EVENT_TOPIC),
             log: own(schema::LOG, LOG_TOPIC),
             action,
+            places: Vec::new(),
+            places_sent: Stamp::default(),
             message: Vec::new(),
             left_out: LeftOut::default(),
         };
         registry.devices.iter().for_each(|device| topics.add(device));
+        if topics.transforms.is_none() && registry.modules.iter().any(|module| !module.transforms.is_empty()) {
+            topics.transforms = own(schema::TRANSFORM, TRANSFORM_TOPIC);
+        }
         topics
     }
 
@@ -177,6 +193,36 @@ impl Topics {
         {
             encode::log(message, log_time, level, text);
             send(channel, message, log_time);
+        }
+    }
+
+    /// Sends what the recorder made; where sensors sit, by [`Self::send_places`].
+    pub(super) fn made(&mut self, made: &Made) {
+        match made.kind {
+            MadeKind::Frame => {
+                if let Some(channel) = wanted(self.frame.as_ref()) {
+                    send(channel, made.message(), made.log_time);
+                }
+            }
+            MadeKind::Transform { first } => {
+                if first {
+                    self.places.clear();
+                }
+                self.places.push(*made);
+                self.places_sent = Stamp::default();
+            }
+        }
+    }
+
+    /// Sends where sensors sit, again and again: a client that connects later needs it too.
+    pub(super) fn send_places(&mut self, now: Stamp) {
+        if now.since(self.places_sent) < PLACES_EVERY {
+            return;
+        }
+        self.places_sent = now;
+        let Some(channel) = wanted(self.transforms.as_ref()) else { return };
+        for made in &self.places {
+            send(channel, made.message(), made.log_time);
         }
     }
 

@@ -20,14 +20,15 @@ use crate::action::ACTION_TOPIC;
 use crate::episode::channel;
 use crate::episode::chunk_writer::{self, ChunkWriter, Sink, io_error};
 use crate::episode::encode::{self, EventText};
-use crate::episode::form::Derived;
+use crate::episode::form::{Derived, TRANSFORM_TOPIC};
+use crate::episode::made::{MadeKind, Shown};
 use crate::episode::own::EpisodeId;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
 use crate::mask::{Bits, MASK_TOPIC};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::observation::Observation;
-use crate::registry::{Form, Registry};
+use crate::registry::{Form, ModuleSpec, Registry, TransformSpec};
 use crate::sample::SampleHeader;
 use crate::status::Level;
 use crate::time::{Stamp, WallClock};
@@ -42,6 +43,8 @@ pub(super) struct EpisodeFile {
     written: Arc<AtomicU64>,
     /// Checks at every flush and at the end whether another program has damaged the file.
     guard: Guard,
+    /// Where what only it writes is shown.
+    shown: Option<Shown>,
     clock: WallClock,
     message: Vec<u8>,
     tracks: Vec<Option<Track>>,
@@ -128,7 +131,7 @@ impl EpisodeFile {
         clock: WallClock,
         begin: Stamp,
         metadata: BTreeMap<String, String>,
-        guard: Guard,
+        (guard, shown): (Guard, Option<Shown>),
     ) -> io::Result<Self> {
         let (shut, written) = (Shut::default(), Arc::<AtomicU64>::default());
         let wall_ns = clock.wall_ns(begin);
@@ -164,6 +167,7 @@ impl EpisodeFile {
             writer,
             written,
             guard,
+            shown,
             clock,
             message: Vec::new(),
             tracks,
@@ -244,7 +248,33 @@ impl EpisodeFile {
     pub(super) fn frame(&mut self, index: u64, observation: &Observation, deadline: Stamp) -> io::Result<()> {
         let log_time = self.clock.wall_ns(observation.tick);
         encode::frame(&mut self.message, log_time, index, observation);
-        self.write(self.frame, index, log_time, deadline)
+        self.write(self.frame, index, log_time, deadline)?;
+        self.show(MadeKind::Frame, log_time);
+        Ok(())
+    }
+
+    /// Writes where the sensors of these modules sit.
+    pub(super) fn transforms<'a>(
+        &mut self,
+        modules: impl Iterator<Item = &'a ModuleSpec>,
+        begin: Stamp,
+    ) -> io::Result<()> {
+        let log_time = self.clock.wall_ns(begin);
+        for (number, spec) in (0..).zip(modules.flat_map(|module| &module.transforms)) {
+            let TransformSpec { sensor, parent, position, rotation } = spec;
+            let channel = add_channel(&mut self.writer, schema::TRANSFORM, TRANSFORM_TOPIC, &BTreeMap::new())?;
+            let pose = encode::Pose { position: *position, rotation: *rotation };
+            encode::transform(&mut self.message, log_time, [parent, sensor], &pose);
+            self.write(channel, number, log_time, begin)?;
+            self.show(MadeKind::Transform { first: number == 0 }, log_time);
+        }
+        Ok(())
+    }
+
+    fn show(&self, kind: MadeKind, log_time: u64) {
+        if let Some(shown) = &self.shown {
+            shown.show(kind, log_time, &self.message);
+        }
     }
 
     /// Writes an event.

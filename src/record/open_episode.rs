@@ -35,9 +35,10 @@ use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge}
 use super::writeback::Writeback;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::encode::{Announced as Report, logged};
+use crate::episode::made::Shown;
 use crate::mask::{Bits, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::{DeviceSpec, Registry};
+use crate::registry::{DeviceSpec, ModuleSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Event, Level, Outlook, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
@@ -65,6 +66,8 @@ pub(super) struct Beginning<'a> {
     pub(super) attached: &'a Attached,
     pub(super) clock: WallClock,
     pub(super) begin: Stamp,
+    /// Where what is written is shown.
+    pub(super) shown: Option<Shown>,
 }
 
 /// The measured quality of each modality in an episode that ends at `end`.
@@ -109,7 +112,7 @@ pub(super) struct OpenEpisode {
 impl OpenEpisode {
     /// Begins an episode and writes the file's initial records.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
-        let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
+        let Beginning { registry, board, request, path, sink, attached, clock, begin, shown } = beginning;
         let units = Units::new(attached);
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, bits, _)| bits.mask);
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
@@ -119,7 +122,10 @@ impl OpenEpisode {
             board.announce(What::Log { level: Level::Warn, text });
         }
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
-        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, Guard::begin(&path))?;
+        let guard = Guard::begin(&path);
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, (guard, shown))?;
+        let is_mounted = |module: &&ModuleSpec| configuration.modules.contains(&module.name);
+        file.transforms(registry.modules.iter().filter(is_mounted), begin)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         let mut measures = Measures::new(&Measured::all(&registry), Frames::of(&registry, begin, settle));
         for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {

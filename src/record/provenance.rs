@@ -228,6 +228,7 @@ mod tests {
             actions: 0,
             held: 0,
             chunks: 0,
+            late: 0,
             unused: 0,
             latency_p50_ms: 0.0,
             latency_p99_ms: 0.0,

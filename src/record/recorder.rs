@@ -32,6 +32,7 @@ use super::streams::Streams;
 use crate::bus::{Foreign, Inbox, Queues, Subscription, TopicId};
 use crate::disk::Disk;
 use crate::episode::chunk_writer::Sink;
+use crate::episode::made::Shown;
 use crate::episode::partial::PARTIAL;
 use crate::fault;
 use crate::registry::Registry;
@@ -122,6 +123,8 @@ pub struct RecorderConfig {
     /// Returns the start time of an episode requested now: now. Tests use it to send the samples of the beginning, so
     /// that they belong to it on machines of any speed.
     pub begin: Box<dyn FnMut() -> Stamp + Send>,
+    /// Where what is written is shown, if anywhere.
+    pub shown: Option<Shown>,
 }
 
 impl RecorderConfig {
@@ -134,6 +137,7 @@ impl RecorderConfig {
             disk: Box::new(Disk::of),
             clock: Box::new(WallClock::now),
             begin: Box::new(Stamp::now),
+            shown: None,
         }
     }
 }
@@ -466,6 +470,7 @@ impl Writer {
             attached: &self.attached,
             clock,
             begin,
+            shown: self.config.shown.clone(),
         };
         let mut open = OpenEpisode::begin(beginning, &self.streams.masks).map_err(failed)?;
         // An episode records their state at its beginning, not only changes.

@@ -65,6 +65,7 @@ impl Stepped {
             attached: &self.attached,
             clock: self.clock,
             begin,
+            shown: None,
         };
         self.open = Some(OpenEpisode::begin(beginning, &self.streams.masks).map_err(failed)?);
         Ok(())

@@ -40,6 +40,8 @@ pub struct Descriptor {
     pub devices: Vec<String>,
     /// Those that an entry is made for: name, and keys with their values; `camera.width` is one of `[device.NAME.camera]`.
     pub sensors: Vec<(String, Vec<(String, Setting)>)>,
+    /// Where they sit: `[module.NAME.transform]`.
+    pub transforms: Vec<(String, Vec<(String, Setting)>)>,
     /// The whole of it.
     pub text: String,
 }
@@ -101,8 +103,10 @@ pub fn parse(text: &str) -> Result<Descriptor, CatalogueError> {
         return Err(wrong("it describes one module: write one [module.NAME]"));
     };
     let module = module.as_table().ok_or_else(|| wrong("[module.NAME] is no table"))?;
-    if let Some(other) = module.keys().find(|key| !["slot", "tags", "devices"].contains(&key.as_str())) {
-        return Err(CatalogueError::Wrong(format!("[module.{name}] has no key {other:?}: slot, tags and devices")));
+    if let Some(other) = module.keys().find(|key| !["slot", "tags", "devices", TRANSFORM].contains(&key.as_str())) {
+        return Err(CatalogueError::Wrong(format!(
+            "[module.{name}] has no key {other:?}: slot, tags, devices and transform"
+        )));
     }
     let slot = module.get("slot").and_then(Value::as_str).unwrap_or_default();
     let mount = Mount::WORDS.iter().find(|(word, _)| *word == slot).map(|(_, mount)| *mount);
@@ -134,14 +138,26 @@ pub fn parse(text: &str) -> Result<Descriptor, CatalogueError> {
         flatten("", table, &mut keys);
         sensors.push((sensor.clone(), keys));
     }
+    let mut transforms = Vec::new();
+    for (sensor, place) in module.get(TRANSFORM).and_then(Value::as_table).into_iter().flatten() {
+        let place = place.as_table().filter(|_| devices.contains(sensor));
+        let place =
+            place.ok_or_else(|| wrong("transform: write [module.NAME.transform.SENSOR] for one of its devices"))?;
+        let mut keys = Vec::new();
+        flatten("", place, &mut keys);
+        transforms.push((sensor.clone(), keys));
+    }
     let tags = texts("tags")?;
     if let Some(tag) = tags.iter().find(|tag| tag.split_once('=').is_none_or(|(key, _)| key.is_empty())) {
         return Err(CatalogueError::Wrong(format!("{tag:?} is not a tag: write KEY=VALUE, as \"finger=soft\"")));
     }
     let title = text.lines().next().and_then(|line| line.strip_prefix('#')).unwrap_or_default().trim().to_owned();
     let (name, text) = (name.clone(), text.to_owned());
-    Ok(Descriptor { name, title, mount, tags, devices, sensors, text })
+    Ok(Descriptor { name, title, mount, tags, devices, sensors, transforms, text })
 }
+
+/// Where the sensors of a module sit.
+const TRANSFORM: &str = "transform";
 
 /// Keys of an entry that are the same for every unit of a type.
 const OF_A_TYPE: [&str; 17] = [

@@ -93,12 +93,22 @@ pub fn append_lines(text: &str, parts: &[String]) -> String {
 /// The lines of a `[module.NAME]`, including line ends.
 ///
 /// # Errors
-/// Never: each value is a text or a list of texts.
-pub fn module(name: &str, slot: &str, tags: &[String], devices: &[String]) -> Result<String, EditError> {
+/// When a key is invalid.
+pub fn module(
+    name: &str,
+    slot: &str,
+    (tags, devices): (&[String], &[String]),
+    transforms: &[(String, Vec<(String, Setting)>)],
+) -> Result<String, EditError> {
     let mut table = Table::new();
     put(&mut table, "slot", &Setting::Text(slot.to_owned()))?;
     for (key, texts) in [("tags", tags), ("devices", devices)].into_iter().filter(|(_, texts)| !texts.is_empty()) {
         table.insert(key, Item::Value(texts.iter().map(String::as_str).collect::<Value>()));
+    }
+    for (sensor, place) in transforms {
+        for (key, setting) in place {
+            put(&mut table, &format!("transform.{sensor}.{key}"), setting)?;
+        }
     }
     let mut modules = Table::new();
     modules.set_implicit(true);

@@ -266,9 +266,13 @@ fn every_message_is_the_one_that_is_recorded() {
     }
     assert!(!topics.contains(&"/action"), "there is no actuator: {topics:?}");
     let counts = client.compare(&place, &file);
-    for (topic, least) in
-        [("/rapid/mask", 1500), ("/rapid/camera/wrist", 40), ("/rapid/serial/motor", 150), ("/rapid/event", 1)]
-    {
+    for (topic, least) in [
+        ("/rapid/mask", 1500),
+        ("/rapid/camera/wrist", 40),
+        ("/rapid/serial/motor", 150),
+        ("/rapid/frame", 40),
+        ("/rapid/event", 1),
+    ] {
         assert!(counts[topic] >= least, "{counts:?}");
     }
     assert!(client.count("/rapid/observation") > 20);
@@ -320,6 +324,37 @@ fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
     let report = place.run(&["inspect", "--json", &file]).stdout;
     let report: Value = serde_json::from_slice(&report).expect("JSON");
     assert_eq!(report["modalities"].as_array().map(Vec::len), Some(4), "{report}");
+}
+
+#[test]
+fn where_the_sensors_of_the_mounted_modules_sit_is_recorded_and_shown() {
+    let place = Place::new();
+    let modules = "[module.straight]\nslot = \"top\"\ndevices = [\"cam_wrist\"]\n\
+        [module.straight.transform.cam_wrist]\nposition = [0, 0, 0.1]\n\
+        [module.angled]\nslot = \"top\"\ndevices = [\"cam_wrist\"]\n\
+        [module.angled.transform.cam_wrist]\nparent = \"flange\"\nposition = [0, 0.5, 0.25]\nrotation = [0.6, 0, 0, 0.8]\n";
+    place.write("devices.toml", &[include_str!("../../devices.toml"), modules, LENIENT].concat());
+    let running = start(&place, &["--module", "angled"]);
+    // A client that connects during the episode has them too, again and again.
+    let mut client = Client::connect(&address(&running));
+    client.read_until("transforms", |client| client.count("/tf") > 1 && client.count("/rapid/camera/wrist") > 30);
+    let file = good(&place, running);
+    client.read();
+    assert!(client.compare(&place, &file)["/tf"] > 1);
+    let episode = Episode::read(&place.path(&file));
+    let of_places: Vec<_> = episode.messages.iter().filter(|message| message.topic == "/tf").collect();
+    let [transform] = of_places[..] else { panic!("{}", of_places.len()) };
+    assert_eq!(transform.log_time.to_string(), episode.value("rapid", "begin_wall_ns"));
+    let channel = client.channels.values().find(|channel| channel.topic == "/tf").expect("the channel");
+    let message = DynamicMessage::decode(channel.message.clone(), &transform.data[..]).expect("a transform");
+    let text = |field: &str| message.get_field_by_name(field).expect("a field").as_str().expect("text").to_owned();
+    assert_eq!([text("parent_frame_id"), text("child_frame_id")], ["flange", "cam_wrist"]);
+    let number = |part: &str, field: &str| {
+        let part = message.get_field_by_name(part).expect("a part").into_owned();
+        part.as_message().expect("a message").get_field_by_name(field).expect("a field").as_f64().expect("a number")
+    };
+    assert_eq!(["x", "y", "z"].map(|field| number("translation", field)), [0.0, 0.5, 0.25]);
+    assert_eq!(["x", "y", "z", "w"].map(|field| number("rotation", field)), [0.6, 0.0, 0.0, 0.8]);
 }
 
 #[cfg(feature = "policy")]

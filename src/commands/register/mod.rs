@@ -193,7 +193,7 @@ impl Mounting {
         let is_new = |sensor: &str| registry.is_none_or(|registry| registry.named(sensor).is_none());
         let new: Vec<_> =
             descriptor.sensors.iter().filter(|(sensor, _)| args.name.is_some() || is_new(sensor)).collect();
-        let mut devices = descriptor.devices.clone();
+        let (mut devices, mut transforms) = (descriptor.devices.clone(), descriptor.transforms.clone());
         let entry = match new.as_slice() {
             [] => {
                 let is_of_unit =
@@ -205,7 +205,9 @@ impl Mounting {
             }
             [(sensor, keys)] => {
                 let own = args.name.clone().unwrap_or_else(|| sensor.clone());
-                devices.iter_mut().filter(|device| *device == sensor).for_each(|device| device.clone_from(&own));
+                let placed = transforms.iter_mut().map(|(device, _)| device);
+                let named = devices.iter_mut().chain(placed).filter(|device| *device == sensor);
+                named.for_each(|device| device.clone_from(&own));
                 let node = keys.iter().find_map(|(key, value)| match value {
                     Setting::Text(node) if key == "node" => Some(node.clone()),
                     _ => None,
@@ -220,7 +222,7 @@ impl Mounting {
                 return Err(RegisterError::SeveralSensors { name: descriptor.name, sensors });
             }
         };
-        let text = edit::module(&module, descriptor.mount.word(), &descriptor.tags, &devices)?;
+        let text = edit::module(&module, descriptor.mount.word(), (&descriptor.tags, &devices), &transforms)?;
         Ok(Self { entry, text })
     }
 }

@@ -29,6 +29,7 @@ fn open_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHi
         attached: &Attached::default(),
         clock,
         begin: Stamp(1000 * MS),
+        shown: None,
     };
     OpenEpisode::begin(beginning, masks).unwrap()
 }

@@ -1,17 +1,14 @@
-//! `[stop.NAME]` and `[module.NAME]`.
+//! `[stop.NAME]`.
 
 use std::time::Duration;
 
 use super::device::{Draft, Kind};
 use super::identity::name_problem;
 use super::input::{self, INPUTS, LEVELS, are_one};
-use super::names;
 use crate::interlock::{MAX_STOPS, StopKind};
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::Section;
-use crate::registry::spec::{
-    FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff, ModuleSpec, Mount,
-};
+use crate::registry::spec::{FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff};
 
 const KINDS: [(&str, StopKind); 2] = [("emergency", StopKind::Emergency), ("enabling", StopKind::Enabling)];
 /// A stop that is silent for this long is lost, unless its entry states otherwise.
@@ -145,57 +142,4 @@ fn field(table: &Section<'_>, drafts: &[Draft<'_>]) -> Option<FieldInput> {
 
 fn silence(table: &Section<'_>) -> Duration {
     table.duration("silence", Duration::from_millis(10)..=Duration::from_secs(5)).unwrap_or(SILENCE)
-}
-
-/// Reads the modules, in the order of the file.
-pub(super) fn modules(root: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<ModuleSpec> {
-    let Some(tables) = root.table("module") else { return Vec::new() };
-    let mut modules: Vec<ModuleSpec> = Vec::new();
-    for (_, name, _) in tables.fields() {
-        let Some(section) = tables.table(name) else { continue };
-        if let Some((_, fix)) = name_problem(name) {
-            let fix = fix.replace("[device.", "[module.");
-            section.report_at(section.at, format!("{name:?} cannot be a module's name"), fix);
-        }
-        if name == "none" {
-            let fix = "give it another name: `--module none` is that no named one is mounted";
-            section.report_at(section.at, "\"none\" cannot be a module's name", fix);
-        }
-        modules.extend(module(name, &section, drafts, &modules));
-    }
-    modules
-}
-
-fn module(name: &str, section: &Section<'_>, drafts: &[Draft<'_>], earlier: &[ModuleSpec]) -> Option<ModuleSpec> {
-    section.allow(&["slot", "tags", "devices"]);
-    section.need("slot", "write slot = \"front\", \"tip\", \"top\" or \"bottom\"");
-    let mount = section.choice("slot", &Mount::WORDS);
-    let mut tags = Vec::new();
-    for tag in section.texts("tags").unwrap_or_default() {
-        match tag.split_once('=') {
-            Some((key, value)) if !key.is_empty() => tags.push((key.to_owned(), value.to_owned())),
-            _ => section.report("tags", format!("{tag:?} is not a tag"), "write KEY=VALUE, as \"finger=soft\""),
-        }
-    }
-    let devices = section.texts("devices").unwrap_or_default();
-    for device in &devices {
-        let Some(draft) = drafts.iter().find(|draft| draft.name == *device) else {
-            let fix = did_you_mean(device, names(drafts), "entries are");
-            section.report("devices", format!("there is no [device.{device}]"), fix);
-            continue;
-        };
-        if let (Some(mount), Some(own)) = (mount, draft.mount)
-            && mount != own
-        {
-            let message = format!("slot of [device.{device}] is {own}, and of its module {mount}");
-            section.report("slot", message, "write the same slot in both, or in the module alone");
-        }
-        // Of one slot, one is mounted at a time: which of them has the sensor is named.
-        let elsewhere = |other: &&ModuleSpec| other.devices.contains(device) && Some(other.mount) != mount;
-        if let Some(other) = earlier.iter().find(elsewhere) {
-            let message = format!("[device.{device}] is a sensor of [module.{}] already, in another slot", other.name);
-            section.report("devices", message, "name it in one of the two");
-        }
-    }
-    Some(ModuleSpec { name: name.to_owned(), mount: mount?, tags, devices })
 }

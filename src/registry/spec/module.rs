@@ -6,7 +6,7 @@ use super::Mount;
 
 /// `[module.NAME]`: a part that is mounted on the gripper, either with sensors or purely mechanical (paper, section
 /// "Module Catalog").
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ModuleSpec {
     /// Its name, as a modality's.
     pub name: String,
@@ -17,6 +17,21 @@ pub struct ModuleSpec {
     pub tags: Vec<(String, String)>,
     /// The entries of its sensors; a module without any is mounted only if `--module` names it.
     pub devices: Vec<String>,
+    /// Where its sensors sit, as far as it is known.
+    pub transforms: Vec<TransformSpec>,
+}
+
+/// `[module.NAME.transform.SENSOR]`: where a sensor sits while its module is mounted.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TransformSpec {
+    /// The entry of the sensor, which is the name of its frame too.
+    pub sensor: String,
+    /// The frame in which it is given.
+    pub parent: String,
+    /// In m.
+    pub position: [f64; 3],
+    /// A quaternion `x y z w` of length 1.
+    pub rotation: [f64; 4],
 }
 
 /// Why modules cannot be mounted as requested.
