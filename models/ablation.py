@@ -3,8 +3,8 @@
 
     ablation.py EPISODES --rapid target/release/rapid [--only NAME]... [--trials 100] [--iterations 3900]
 
-The configurations are those of the RAPID paper's appendix. Each is trained, exported and evaluated by `rapid eval`,
-the program that runs policies, with everything plugged in. Configurations already trained under --runs are not trained
+The configurations are those of the RAPID paper's appendix, each an experiment of `experiments/`. Each is trained,
+exported and evaluated by `rapid eval`, the program that runs policies, with everything plugged in. Configurations already trained under --runs are not trained
 again; the results are rewritten after every configuration, with all that are available.
 """
 
@@ -17,21 +17,23 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from rapid_policy import results
+from rapid_policy.checkpoint import CHECKPOINT, begin, read_checkpoint
+from rapid_policy.corpus import load
 from rapid_policy.dataset import Dataset
-from rapid_policy.episodes import Episode, EpisodeError
+from rapid_policy.episodes import EpisodeError
+from rapid_policy.experiment import Experiment
+from rapid_policy.experiment_file import ExperimentError, read_experiment
 from rapid_policy.export import export
-from rapid_policy.spec import Spec, arm, tactile, tactile_id, wrist
-from rapid_policy.train import CHECKPOINT, Schedule, begin, hardware, load_episodes, pick_device, provenance, train
+from rapid_policy.ranks import join
+from rapid_policy.train import Trainer, hardware, provenance, with_options
 
-ALL = "both textures"
-ONE = "triangular"
+MODELS = Path(__file__).parent
 FIRST_SEED = 50_000
 
 
@@ -39,11 +41,10 @@ FIRST_SEED = 50_000
 class Configuration:
     """One row of the table."""
 
+    name: str
+    """Of its experiment, its policy and its folder."""
     title: str
     """Its name in the paper."""
-    spec: Callable[[], Spec]
-    data: str
-    """Trained on all episodes, or on those of one texture."""
     paper: float
     """Its success rate in the paper."""
     shipped: bool = False
@@ -51,27 +52,21 @@ class Configuration:
 
     def bundle(self, runs: Path) -> Path:
         """The folder of its bundle, existing or not."""
-        return Path(__file__).parent / self.name if self.shipped else runs / self.name / "bundle"
+        return MODELS / self.name if self.shipped else runs / self.name / "bundle"
 
-    @property
-    def name(self) -> str:
-        """Name of its policy, and of its folder."""
-        return self.spec().name
+    def experiment(self) -> Experiment:
+        """What is trained."""
+        return read_experiment(MODELS / "experiments" / f"{self.name}.toml")
 
 
 CONFIGURATIONS = (
-    Configuration("vision only", lambda: Spec("vision", (wrist(required=True), arm()), mask_aware=False), ALL, 0.5),
+    Configuration("vision", "vision only", 0.5),
     # Without its single picture, only the arm's own state remains.
-    Configuration("vision + mask", lambda: Spec("vision-mask", (wrist(dropout=0.3), arm())), ALL, 0.5),
-    Configuration("vision + mask + diff", tactile_id, ALL, 1.0, shipped=True),
-    Configuration("vision + diff", lambda: unmasked("vision-diff-one"), ONE, 0.5),
-    Configuration("vision + diff", lambda: unmasked("vision-diff"), ALL, 1.0),
+    Configuration("vision-mask", "vision + mask", 0.5),
+    Configuration("tactile-id", "vision + mask + diff", 1.0, shipped=True),
+    Configuration("vision-diff-one", "vision + diff", 0.5),
+    Configuration("vision-diff", "vision + diff", 1.0),
 )
-
-
-def unmasked(name: str) -> Spec:
-    """Both pictures, neither ever masked: such a policy cannot run without one."""
-    return Spec(name, (wrist(required=True), tactile(required=True), arm()), mask_aware=False)
 
 
 def main() -> None:
@@ -83,7 +78,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--only", action="append", choices=names, help="this configuration; may be repeated")
     parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--iterations", type=int, default=Schedule().iterations)
+    parser.add_argument("--iterations", type=int, default=3900)
     parser.add_argument("--minutes", type=float, default=math.inf, help="end each training after so long at the latest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
@@ -94,7 +89,7 @@ def main() -> None:
             try:
                 learn(configuration, args)
                 judge(configuration, args)
-            except (OSError, EpisodeError, ValueError, subprocess.CalledProcessError) as error:
+            except (OSError, EpisodeError, ExperimentError, ValueError, subprocess.CalledProcessError) as error:
                 sys.exit(f"ablation: {configuration.name}: {error}")
             summarize(args)
 
@@ -105,21 +100,15 @@ def learn(configuration: Configuration, args: argparse.Namespace) -> None:
     if (bundle / "policy.json").exists():
         return
     run_folder.mkdir(parents=True, exist_ok=True)
-    spec = configuration.spec()
-    episodes = [e for e in load_episodes(spec, args.episodes) if wanted(configuration, e)]
-    dataset = Dataset(spec, episodes)
-    schedule = Schedule(iterations=args.iterations, minutes=args.minutes, seed=args.seed)
-    device = pick_device("auto")
-    facts = provenance(episodes, f"ablation.py EPISODES --only {spec.name}")
-    run = begin(spec, schedule, dataset, {**facts, "hardware": hardware(device)}, device)
-    final = train(run, dataset, run_folder)
+    spec, ranks = with_options(configuration.experiment(), args), join("auto")
+    corpus = load(spec, [args.episodes], args.runs / "cache", args.threads)
+    print(corpus.report(), file=sys.stderr)
+    dataset = Dataset(spec, corpus.training)
+    facts = provenance(corpus.training, f"ablation.py EPISODES --only {spec.name}")
+    run = begin(spec, len(dataset.windows), dataset.ranges, {**facts, "hardware": hardware(ranks.device)}, ranks.device)
+    final = Trainer(run, dataset, run_folder, minutes=args.minutes).train()
     print(f"{spec.name}: final loss {final:.4f}, {run.seconds / 60:.1f} min", flush=True)
-    export(torch.load(run_folder / CHECKPOINT, map_location="cpu", weights_only=False), bundle)
-
-
-def wanted(configuration: Configuration, episode: Episode) -> bool:
-    """Whether the configuration learns from the episode."""
-    return configuration.data == ALL or episode.tags.get("texture") == configuration.data
+    export(read_checkpoint(run_folder / CHECKPOINT), bundle)
 
 
 def judge(configuration: Configuration, args: argparse.Namespace) -> None:
@@ -156,6 +145,7 @@ def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
         return None
     judged = json.loads(record.read_text(encoding="utf-8"))
     trained = json.loads((configuration.bundle(runs) / "policy.json").read_text(encoding="utf-8"))["training"]
+    spec = configuration.experiment()
     trials = [line for line in judged["lines"] if line["event"] == "trial"]
     outcomes = Counter("crash" if t["status"] == "crash" else t["outcome"] for t in trials)
     # Left is the bin of a triangular block, and wrong for a hexagonal one.
@@ -163,10 +153,10 @@ def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
     return {
         "name": configuration.name,
         "title": configuration.title,
-        "data": configuration.data,
+        "data": ", ".join(str(value) for value in spec.data.tags.values()) or "both textures",
         "episodes": trained["episodes"],
-        "dropout": {o.key: o.dropout for o in configuration.spec().images},
-        "mask_aware": configuration.spec().mask_aware,
+        "dropout": {o.key: o.dropout.window for o in spec.images},
+        "mask_aware": spec.policy.mask_aware,
         "iterations": trained["iterations"],
         "minutes": trained["minutes"],
         "final_loss": trained["final_loss"],

@@ -2,7 +2,7 @@
 """Classifies the texture of a block from single pictures: how well the tactile camera shows it, raw and as difference
 to the untouched gel, and whether the wrist camera shows it too.
 
-    texture.py EPISODES [--out results] [--folds 10] [--iterations 200] [--seed 0] [--threads 1]
+    texture.py EPISODES [--cache runs/cache] [--out results] [--folds 10] [--iterations 200] [--seed 0] [--threads 1]
 
 The classifier is an image encoder of the policy with one additional layer. Every episode is tested by a classifier that
 was not trained on it: the episodes are divided into folds, and each fold is tested by one trained on the others.
@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +21,24 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from rapid_policy.dataset import PAD, pool
+from rapid_policy.corpus import load
 from rapid_policy.episodes import Episode, EpisodeError
-from rapid_policy.model import ImageEncoder
+from rapid_policy.experiment import SMALL_POOL, Encoder
+from rapid_policy.experiment_file import ExperimentError, read_experiment
+from rapid_policy.model import SmallEncoder
 from rapid_policy.results import wilson, write
-from rapid_policy.spec import Network, Observation, tactile, tactile_id, wrist
-from rapid_policy.train import load_episodes
 from torch import nn
 
 TEXTURES = ("triangular", "hexagonal")
+# Modality of the pictures, and whether they are the difference to the first one.
 INPUTS = {
-    "tactile, difference to the first picture": tactile(),
-    "tactile, as it is": replace(tactile(), operation=None),
-    "wrist camera": wrist(),
+    "tactile, difference to the first picture": ("tactile_tip", True),
+    "tactile, as it is": ("tactile_tip", False),
+    "wrist camera": ("cam_wrist", False),
 }
+SIDE = 96
+# Random shift of a pooled picture, each way.
+PAD = 2
 # In contact: the gel has changed by this multiple of its noise before the touch.
 CONTACT = 1.5
 UNTOUCHED = 10
@@ -57,6 +61,7 @@ class Pictures:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Tells the texture of a block from single pictures.")
     parser.add_argument("episodes", type=Path)
+    parser.add_argument("--cache", type=Path, default=Path(__file__).parent / "runs" / "cache", help="decoded episodes")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--folds", type=int, default=10)
     parser.add_argument("--iterations", type=int, default=200, help="of each training")
@@ -65,14 +70,17 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     try:
-        episodes = load_episodes(tactile_id(), args.episodes)
+        experiment = read_experiment(Path(__file__).parent / "experiments" / "tactile-id.toml")
+        corpus = load(experiment, [args.episodes], args.cache, args.threads)
+        print(corpus.report(), file=sys.stderr)
+        episodes = corpus.training
         labels = [label(e) for e in episodes]
-    except EpisodeError as error:
+    except (EpisodeError, ExperimentError) as error:
         sys.exit(f"texture: {error}")
     contact = [in_contact(e) for e in episodes]
     begin, rows = time.monotonic(), {}
-    for name, observation in INPUTS.items():
-        pictures = gather(episodes, labels, contact, observation)
+    for name, (modality, differs) in INPUTS.items():
+        pictures = gather(episodes, labels, contact, modality, differs)
         rows[name] = cross_validate(pictures, args.folds, args.iterations, args.seed)
         print(f"{name}: accuracy {rows[name]['accuracy']:.4f} of {rows[name]['pictures']} pictures", flush=True)
     report = {
@@ -91,24 +99,40 @@ def main() -> None:
 def label(episode: Episode) -> int:
     """The texture, from the tags that the simulation writes into an episode."""
     try:
-        return TEXTURES.index(episode.tags["texture"])
+        return TEXTURES.index(episode.facts.tags["texture"])
     except (KeyError, ValueError) as error:
         raise EpisodeError(episode.path, f"no tag `texture` of {' or '.join(TEXTURES)}") from error
 
 
 def in_contact(episode: Episode) -> NDArray[np.bool_]:
     """[T] whether the fingertip is pressed on the block."""
-    change = np.abs(pool(tactile(), episode)).mean((1, 2, 3))
-    return episode.present["tactile_tip"] & (change > CONTACT * np.median(change[1:UNTOUCHED]))
+    change = np.abs(pool(episode, "tactile_tip", differs=True)).mean((1, 2, 3))
+    return episode.present("tactile_tip") & (change > CONTACT * np.median(change[1:UNTOUCHED]))
+
+
+def pool(episode: Episode, modality: str, differs: bool) -> NDArray[np.float32]:
+    """[T, 3, h, w]: pictures in -1..1, averaged as the encoder does, with their edges repeated outwards."""
+    pictures = _unit(episode.value(modality))
+    if differs:
+        pictures = pictures - _unit(episode.value(modality)[episode.first(modality)][None])
+    else:
+        pictures = pictures * 2 - 1
+    padded = F.pad(F.avg_pool2d(pictures, SMALL_POOL), (PAD, PAD, PAD, PAD), mode="replicate")
+    return padded.numpy() * episode.present(modality)[:, None, None, None]
+
+
+def _unit(pictures: NDArray[np.uint8]) -> torch.Tensor:
+    """u8 [T, H, W, 3] -> f32 [T, 3, H, W] in 0..1"""
+    return torch.from_numpy(np.array(pictures)).permute(0, 3, 1, 2).float() / 255
 
 
 def gather(
-    episodes: list[Episode], labels: list[int], contact: list[NDArray[np.bool_]], observation: Observation
+    episodes: list[Episode], labels: list[int], contact: list[NDArray[np.bool_]], modality: str, differs: bool
 ) -> Pictures:
     """The pictures of one input at all ticks in contact."""
-    chosen = [c & e.present[observation.modality] for c, e in zip(contact, episodes, strict=True)]
+    chosen = [c & e.present(modality) for c, e in zip(contact, episodes, strict=True)]
     return Pictures(
-        pixels=np.concatenate([pool(observation, e)[c] for e, c in zip(episodes, chosen, strict=True)]),
+        pixels=np.concatenate([pool(e, modality, differs)[c] for e, c in zip(episodes, chosen, strict=True)]),
         labels=np.concatenate([np.full(c.sum(), k) for c, k in zip(chosen, labels, strict=True)]),
         episodes=np.concatenate([np.full(c.sum(), i) for i, c in enumerate(chosen)]),
     )
@@ -137,10 +161,10 @@ def deal(pictures: Pictures, folds: int, random: np.random.Generator) -> list[ND
 class Classifier(nn.Module):
     """Pooled pictures [B, 3, h, w] -> [B, 2]"""
 
-    def __init__(self, side: tuple[int, ...]) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.encoder = ImageEncoder(*side, Network())
-        self.head = nn.Linear(Network().image_features, len(TEXTURES))
+        self.encoder = SmallEncoder(SIDE, SIDE, Encoder())
+        self.head = nn.Linear(Encoder().features, len(TEXTURES))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.head(self.encoder.pooled(x))
@@ -148,7 +172,7 @@ class Classifier(nn.Module):
 
 def fit(pixels: NDArray[np.float32], labels: NDArray[np.int64], steps: int, random: np.random.Generator) -> Classifier:
     """Trains on pictures randomly shifted, rotated by quarter turns and mirrored, which preserve a lattice."""
-    classifier = Classifier(wrist().shape[1:])
+    classifier = Classifier()
     optimizer = torch.optim.AdamW(classifier.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
     height, width = pixels.shape[2] - 2 * PAD, pixels.shape[3] - 2 * PAD

@@ -47,7 +47,7 @@ def main() -> None:
         sys.exit(f"torch_latency: {args.bundle}: {error}")
     spec = policy.spec
     observation = encoder_example(spec, batch=1)
-    noise = torch.randn(1, spec.horizon, len(spec.action_names))
+    noise = torch.randn(1, spec.policy.horizon, spec.action_length)
     ways = {"pytorch_eager": in_torch(policy), "onnxruntime": in_onnxruntime(policy, args.bundle, args.threads)}
     chunks = [way(observation, noise) for way in ways.values()]
     difference = float((chunks[0] - chunks[1]).abs().max())
@@ -55,7 +55,7 @@ def main() -> None:
         sys.exit(f"torch_latency: the two ways differ by {difference:.1e}")
     report = {
         "bundle": str(args.bundle),
-        "denoising_steps": spec.inference_steps,
+        "denoising_steps": spec.policy.inference_steps,
         "chunks": args.chunks,
         "threads": args.threads,
         "torch": torch.__version__,
@@ -75,7 +75,7 @@ def in_torch(policy: Policy) -> Way:
     def chunk(observation: tuple[Tensor, ...], noise: Tensor) -> Tensor:
         with torch.inference_mode():
             condition = policy.encoder(*observation)
-            return ddim(lambda x, t: policy.denoiser(x, t, condition), noise, policy.spec.inference_steps)
+            return ddim(lambda x, t: policy.denoiser(x, t, condition), noise, policy.spec.policy.inference_steps)
 
     return chunk
 
@@ -93,7 +93,7 @@ def in_onnxruntime(policy: Policy, folder: Path, threads: int) -> Way:
             feed = {"sample": sample.numpy(), "timestep": timestep.numpy(), "global_cond": condition}
             return torch.from_numpy(denoiser.run(None, feed)[0])
 
-        return ddim(denoise, noise, policy.spec.inference_steps)
+        return ddim(denoise, noise, policy.spec.policy.inference_steps)
 
     return chunk
 

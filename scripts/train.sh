@@ -2,6 +2,7 @@
 # Trains and measures policies, in its own Python environment.
 #
 #     train.sh policy [RAPID]      demonstrations, training, export to models/tactile-id
+#     train.sh experiment FILE ARGS...   training as an experiment (*.toml) has it, export; see models/README.md
 #     train.sh ablation RAPID      the contribution of each input of the policy: models/results/ablation.{json,md}
 #     train.sh texture             how well pictures show the texture: models/results/texture.{json,md}
 #     train.sh test                tests of the Python under models/
@@ -31,17 +32,19 @@ report() { printf 'train: %s\n' "$*"; }
 die() { printf 'train: %s\n' "$*" >&2; exit 1; }
 
 main() {
-    local part="${1:-}" rapid
-    rapid="$(realpath -m -- "${2:-target/release/rapid}")"
+    local part="${1:-}" rapid=target/release/rapid
+    [[ $part != policy && $part != ablation ]] || rapid="${2:-$rapid}"
+    rapid="$(realpath -m -- "$rapid")"
     # The verdict on the episodes before they are used for training.
     [[ $part = test ]] || export RAPID_BIN="${RAPID_BIN:-$rapid}"
     case "$part" in
         policy) environment; demonstrations "$rapid"; policy ;;
         ablation) environment; demonstrations "$rapid"; ablation "$rapid" ;;
-        texture) environment; [[ -d $DEMONSTRATIONS ]] || die "no demonstrations: run make train first"; in_models texture.py "$DEMONSTRATIONS" --threads "$THREADS" ;;
+        experiment) environment; shift; experiment "$@" ;;
+        texture) environment; texture ;;
         test) environment; in_models -m unittest discover -s tests -v ;;
         python) environment; shift; in_models "$@" ;;
-        *) die "unknown part '$part': policy, ablation, texture, test or python" ;;
+        *) die "unknown part '$part': policy, experiment, ablation, texture, test or python" ;;
     esac
 }
 
@@ -68,10 +71,28 @@ demonstrations() {
 }
 
 policy() {
-    local run="$RUNS/tactile-id" options=("${SCHEDULE[@]}")
+    learn experiments/tactile-id.toml tactile-id --data "$DEMONSTRATIONS"
+}
+
+# The name of the run and of the bundle is that of the file.
+experiment() {
+    [[ -f ${1:-} ]] || die "no experiment '${1:-}': name a file, for example models/experiments/tactile-id-handheld.toml"
+    local file
+    file="$(realpath "$1")"
+    learn "$file" "$(basename "$file" .toml)" "${@:2}"
+}
+
+# Trains an experiment under the name of its bundle, or continues, and exports.
+learn() {
+    local file="$1" name="$2" run="$RUNS/$2" options=("${SCHEDULE[@]}")
     [[ ! -f $run/checkpoint.pt ]] || options+=(--resume)
-    in_models -m rapid_policy.train "$DEMONSTRATIONS" --out "$run" "${options[@]}"
-    in_models -m rapid_policy.export "$run/checkpoint.pt" --out tactile-id
+    in_models -m rapid_policy.train "$file" --out "$run" --cache "$RUNS/cache" "${options[@]}" "${@:3}"
+    in_models -m rapid_policy.export "$run/checkpoint.pt" --out "$name"
+}
+
+texture() {
+    [[ -d $DEMONSTRATIONS ]] || die "no demonstrations: run make train first"
+    in_models texture.py "$DEMONSTRATIONS" --cache "$RUNS/cache" --threads "$THREADS"
 }
 
 ablation() {

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
+from .cache import sha256
 from .diffusion import TRAIN_TIMESTEPS
 from .normalize import MinMax
-from .spec import Observation, Spec
+from .experiment import Experiment, Observation
 
 FORMAT = "rapid-policy/1"
 ENCODER, DENOISER, POLICY = "encoder.onnx", "denoiser.onnx", "policy.json"
@@ -18,45 +18,35 @@ MASK = "mask"
 LIMIT_MARGIN = 0.05
 
 
-def encoder_inputs(spec: Spec) -> list[str]:
+def encoder_inputs(spec: Experiment) -> list[str]:
     """Names of the encoder's inputs, in order."""
-    return [*(o.key for o in spec.observations), *([MASK] if spec.mask_aware else [])]
+    return [*(o.key for o in spec.observation), *([MASK] if spec.policy.mask_aware else [])]
 
 
-def write_policy(spec: Spec, facts: dict[str, Any], folder: Path) -> dict[str, Any]:
+def write_policy(spec: Experiment, facts: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Writes `policy.json` beside the graphs, which exist already. `facts` is the provenance of the weights."""
     policy = policy_json(spec, facts, {name: sha256(folder / name) for name in (ENCODER, DENOISER)})
     (folder / POLICY).write_text(json.dumps(policy, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return policy
 
 
-def policy_json(spec: Spec, facts: dict[str, Any], hashes: dict[str, str]) -> dict[str, Any]:
+def policy_json(spec: Experiment, facts: dict[str, Any], hashes: dict[str, str]) -> dict[str, Any]:
     """The content of `policy.json`; models/README.md describes each key."""
     ranges = {key: MinMax.from_dict(value) for key, value in facts["normalization"].items()}
-    limits = ranges["action"].widened(LIMIT_MARGIN)
-    actions = len(spec.action_names)
-    order = [o.modality for o in spec.images]
+    policy, order = spec.policy, [o.modality for o in spec.images]
     return {
         "format": FORMAT,
         "name": spec.name,
-        "mask_aware": spec.mask_aware,
-        "n_obs_steps": spec.n_obs_steps,
-        "horizon": spec.horizon,
-        "n_action_steps": spec.n_action_steps,
+        "mask_aware": policy.mask_aware,
+        "n_obs_steps": policy.n_obs_steps,
+        "horizon": policy.horizon,
+        "n_action_steps": policy.n_action_steps,
         "action_start": spec.action_start,
-        "control_hz": spec.control_hz,
-        "max_observation_age_ms": spec.max_observation_age_ms,
-        "observations": [_observation(o, ranges) for o in spec.observations],
-        "mask": {"input": MASK, "order": order, "absent": "zero_embedding"} if spec.mask_aware else None,
-        "action": {
-            "actuator": spec.actuator,
-            "shape": [actions],
-            "names": list(spec.action_names),
-            "units": list(spec.action_units),
-            "representation": "absolute",
-            "limits": {"min": limits.low.round(4).tolist(), "max": limits.high.round(4).tolist()},
-            "normalization": [{"slice": [0, actions], **ranges["action"].to_dict()}],
-        },
+        "control_hz": policy.control_hz,
+        "max_observation_age_ms": policy.max_observation_age_ms,
+        "observations": [_observation(o, ranges) for o in spec.observation],
+        "mask": {"input": MASK, "order": order, "absent": "zero_embedding"} if policy.mask_aware else None,
+        "action": _action(spec, ranges["action"]),
         "scheduler": {
             "type": "DDIM",
             "num_train_timesteps": TRAIN_TIMESTEPS,
@@ -69,7 +59,7 @@ def policy_json(spec: Spec, facts: dict[str, Any], hashes: dict[str, str]) -> di
             "set_alpha_to_one": True,
             "steps_offset": 0,
             "timestep_spacing": "leading",
-            "num_inference_steps": spec.inference_steps,
+            "num_inference_steps": policy.inference_steps,
         },
         "graphs": {
             "encoder": {"file": ENCODER, "sha256": hashes[ENCODER]},
@@ -79,92 +69,119 @@ def policy_json(spec: Spec, facts: dict[str, Any], hashes: dict[str, str]) -> di
     }
 
 
+def _action(spec: Experiment, range_: MinMax) -> dict[str, Any]:
+    action, limits = spec.action, range_.widened(LIMIT_MARGIN)
+    rotation = {} if action.rotation == "none" else {"rotation": action.rotation}
+    return {
+        "actuator": action.actuator,
+        "shape": [spec.action_length],
+        "names": list(action.names),
+        "units": list(action.units),
+        "representation": action.representation,
+        **rotation,
+        "limits": {"min": limits.low.round(4).tolist(), "max": limits.high.round(4).tolist()},
+        "normalization": [{"slice": [0, spec.action_length], **range_.to_dict()}],
+    }
+
+
 def _observation(o: Observation, ranges: dict[str, MinMax]) -> dict[str, Any]:
     common = {"key": o.key, "kind": o.kind, "modality": o.modality, "required": o.required, "shape": list(o.shape)}
     if o.kind == "vector":
-        return {**common, "slice": [0, o.shape[0]], "normalization": ranges[o.key].to_dict()}
+        return {**common, "slice": list(o.run_slice), "normalization": ranges[o.key].to_dict()}
     return {
         **common,
-        "color": "rgb",
-        "resize": None,
-        "crop": None,
+        "color": o.color,
+        "resize": list(o.resize) if o.resize else None,
+        "crop": list(o.crop) if o.crop else None,
         "operation": o.operation,
         "normalization": {"mode": "min_max", "min": [0.0] * 3, "max": [1.0] * 3},
     }
 
 
-def sha256(path: Path) -> str:
-    """The hash of a file, in hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 CARD = """\
 # {name}
 
-A mask-aware diffusion policy for `rapid`: {does}
+{kind} diffusion policy for `rapid`{does}
 
 | | |
 |---|---|
 | Observes | {observes} |
 | Absent pictures | {absent} |
-| Does | {actions} of `{actuator}`, absolute targets, {n_action_steps} of {horizon} predicted at {control_hz:g} Hz |
+| Does | {actions} of `{actuator}`, {representation}, {n_action_steps} of {horizon} predicted at {control_hz:g} Hz |
+| Actions in the data | {source} |
 | Parameters | {parameters:,}, float32 |
-| Data | {episodes} simulated demonstrations ({textures}), {frames} ticks, recorded by {recorded_by}; seeds of the episodes {episode_seeds} |
+| Data | {episodes} episodes{tagged}, {frames} ticks, recorded by {recorded_by}; seeds of the episodes {seeds} |
 | Data, SHA-256 | `{episodes_sha256}` |
 | Training | {iterations} iterations of {windows} windows x {draws} noises, {minutes:.1f} min on {hardware}; seed {seed} |
 | Final loss | {final_loss:.4f} (mean squared error of the noise, mean of the last hundred iterations) |
 | Exported graphs against PyTorch | largest difference {difference:.1e} over all masks |
-
-Trained in simulation only: it knows the two lattices of `rapid --sim task` and no real gel.
-
+{note}
 ![The loss over the iterations](loss.png)
 
 ## Made with
+{recorded}
+    {command}
+    python -m rapid_policy.export RUN/checkpoint.pt --out {name}
 
+in `models/`. The seed fixes the first weights, the order of the windows and the noise. Sums on another processor, or with
+another number of threads, round differently, so that another machine gets weights that differ in detail.
+"""
+SIMULATED = """
     make train
 
 which does, one after the other:
 
-    rapid --sim task --expert --record --episodes {episodes} --out EPISODES --seed {first_seed}
-    {command}
-    python -m rapid_policy.export RUN/checkpoint.pt --out models/{name}
-
-The seed fixes the first weights, the order of the windows and the noise. Sums on another processor, or with another
-number of threads, round differently, so that another machine gets weights that differ in detail.
-"""
-DOES = {
-    "tactile-id": "it grasps a block, tells by touch whether its surface is a triangular or a hexagonal lattice, and "
-    "puts it to the left or to the front. Without the tactile sensor it continues and has to guess; without the wrist "
-    "camera it continues and rarely finds the block; without both it holds.",
-}
+    rapid --sim task --expert --record --episodes {episodes} --out EPISODES --seed {first}"""
 
 
-def write_card(spec: Spec, facts: dict[str, Any], folder: Path) -> None:
+def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
     """Writes the model card, `README.md` of the bundle; every figure in it comes from `facts`."""
-    seeds = facts["episode_seeds"]
-    dropped = [f"`{o.key}` {o.dropout:g}" for o in spec.images if o.dropout > 0]
-    absent = "zeroed after their encoders, by the mask; taken away in training: " + ", ".join(dropped)
+    seeds, action = facts["episode_seeds"], spec.action
+    # The one policy that `make train` makes.
+    made = SIMULATED.format(episodes=facts["episodes"], first=seeds[0]) if spec.name == "tactile-id" and seeds else ""
     card = CARD.format(
         **{
             **facts,
             "name": spec.name,
-            "does": DOES.get(spec.name, "a configuration of an experiment."),
-            "observes": ", ".join(
-                f"`{o.key}` ({o.modality}{', difference to the first picture' if o.operation else ''})"
-                for o in spec.observations
-            )
-            + f", {spec.n_obs_steps} steps",
-            "absent": absent if spec.mask_aware else "not provided for",
-            "actions": ", ".join(spec.action_names),
-            "actuator": spec.actuator,
-            "n_action_steps": spec.n_action_steps,
-            "horizon": spec.horizon,
-            "control_hz": spec.control_hz,
+            "kind": "A mask-aware" if spec.policy.mask_aware else "A",
+            "does": f": {' '.join(spec.description.split())}" if spec.description else ".",
+            "observes": ", ".join(_seen(o) for o in spec.observation) + f", {spec.policy.n_obs_steps} steps",
+            "absent": _absent(spec),
+            "actions": ", ".join(action.names),
+            "actuator": action.actuator,
+            "representation": f"{action.representation} targets",
+            "source": "`/action`" if action.source == "action" else f"the next pose of `{action.pose}`",
+            "n_action_steps": spec.policy.n_action_steps,
+            "horizon": spec.policy.horizon,
+            "control_hz": spec.policy.control_hz,
             "windows": facts["batch_windows"],
-            "textures": ", ".join(f"{n} {texture}" for texture, n in facts["textures"].items()),
+            "tagged": _tagged(facts.get("tags", {})),
             "recorded_by": ", ".join(facts["recorded_by"]),
-            "episode_seeds": f"{seeds[0]} to {seeds[1]}" if seeds else "unknown",
-            "first_seed": seeds[0] if seeds else "SEED",
+            "seeds": f"{seeds[0]} to {seeds[1]}" if seeds else "unknown",
+            "note": f"\n{spec.note}\n" if spec.note else "",
+            "recorded": made,
         }
     )
     (folder / "README.md").write_text(card, encoding="utf-8")
+
+
+def _seen(o: Observation) -> str:
+    sizes = [f"{what} to {size[1]}x{size[0]}" for what, size in (("resized", o.resize), ("cropped", o.crop)) if size]
+    what = [o.modality, *sizes, *(["difference to the first picture"] if o.operation else [])]
+    return f"`{o.key}` ({', '.join(what)})"
+
+
+def _absent(spec: Experiment) -> str:
+    if not spec.policy.mask_aware:
+        return "not provided for"
+    dropped = []
+    for o in spec.images:
+        ways = {"window": o.dropout.window, "replug": o.dropout.replug, "episode": o.dropout.episode}
+        given = ", ".join(f"{'' if way == 'window' else way + ' '}{share:g}" for way, share in ways.items() if share)
+        dropped += [f"`{o.key}` {given}"] if given else []
+    return "zeroed after their encoders, by the mask; taken away in training: " + (", ".join(dropped) or "none")
+
+
+def _tagged(tags: dict[str, dict[str, int]]) -> str:
+    counts = [", ".join(f"{n} {value}" for value, n in values.items()) for values in tags.values() if len(values) > 1]
+    return f" ({'; '.join(counts)})" if counts else ""

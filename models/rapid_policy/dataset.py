@@ -1,7 +1,13 @@
-"""Windows of episodes as inputs of the networks: normalised, pooled, shifted at random."""
+"""Windows of episodes as inputs of the networks.
+
+A batch is made in three steps. `plan` makes every random decision, in one order, so that neither workers nor several
+processes change what is learned; `gather` copies what the plan names out of the episodes, which may lie on a disk;
+`inputs` turns pixels into numbers on the device that trains.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,29 +16,40 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .episodes import Episode
-from .model import POOL
+from . import poses
+from .episodes import Episode, picture_source
+from .experiment import POSITION, ROTATIONS, Experiment, Observation, Part
 from .normalize import MinMax
-from .spec import Observation, Spec
 
-# Random shift of a picture in pooled pixels, each way: the gel may sit anywhere in its holder, the wrist camera is
-# what the arm is guided by and may not.
-SHIFT = {None: 1, "diff_to_reference": 2}
-PAD = max(SHIFT.values())
-BRIGHTNESS = 0.1
-STATE_NOISE = 0.01
+# The range of the gripper's opening as it was seen, beside those of inputs and actions.
+OPENING = "opening"
+
+Plan = dict[str, NDArray]
+Bools = NDArray[np.bool_]
 
 
 @dataclass
 class Batch:
     """B windows."""
 
-    observations: dict[str, Tensor]
-    """Pictures f32 [B, To, 3, H / POOL, W / POOL] and vectors f32 [B, To, D], in -1..1, by key."""
-    present: Tensor
-    """bool [B, M]"""
+    pictures: dict[str, Tensor]
+    """u8 [B, To, H, W, 3] by key; of a picture that is masked or absent anything."""
+    references: dict[str, Tensor]
+    """u8 [B, H, W, 3] by key: of differences, what to compare with."""
+    gains: dict[str, Tensor]
+    """f32 [B, 1, 1, 1, 1] by key: brightness."""
+    shown: dict[str, Tensor]
+    """bool [B, To] by key: there is a picture."""
+    vectors: dict[str, Tensor]
+    """f32 [B, To, D] in -1..1 by key."""
+    mask: Tensor
+    """f32 [B, M], 1 for pictures that are present."""
     actions: Tensor
     """f32 [B, Tp, Da] in -1..1"""
+
+
+class Unfit(ValueError):
+    """An episode that an experiment cannot learn from."""
 
 
 class Dataset:
@@ -40,93 +57,361 @@ class Dataset:
 
     A window belongs to a tick. It does not reach over a tick that lacks a required modality or an action, nor over a
     gap in the frame index: at such a place one segment ends and another begins, and steps beyond either end repeat it.
+    Pictures stay in the episodes.
     """
 
-    def __init__(self, spec: Spec, episodes: list[Episode]) -> None:
-        self.spec = spec
-        self.windows = np.concatenate(list(_windows(spec, episodes)))
+    def __init__(self, spec: Experiment, episodes: Sequence[Episode], ranges: dict[str, MinMax] | None = None) -> None:
+        self.spec, self.episodes = spec, list(episodes)
+        self.names = {o.key: picture_source(o).name for o in spec.images}
+        read = [_Rows(spec, e) for e in self.episodes]
+        self.starts = np.cumsum([0, *(len(e) for e in self.episodes)])
+        self.windows = np.concatenate(
+            [r.windows() + start for r, start in zip(read, self.starts[:-1], strict=True)]
+            or [np.empty((0, 3), np.int64)]
+        )
         if not len(self.windows):
             raise ValueError("no window to learn from: every tick lacks an action or a required modality")
+        self.present = np.concatenate([r.present for r in read])
+        self.targets = np.concatenate([r.targets for r in read])
+        self.now = np.concatenate([r.now for r in read]) if read[0].now is not None else None
+        vectors = {o.key: np.concatenate([r.vectors[o.key] for r in read]) for o in spec.vectors}
+        self.ranges = dict(ranges or {})
+        if spec.action.gripper_squeeze:
+            self._squeeze(spec.action.gripper_squeeze)
+        if ranges is None:
+            self.ranges |= self._ranges(vectors)
+        self.vectors = {key: self.ranges[key].apply(values) for key, values in vectors.items()}
+
+    def _squeeze(self, far: float) -> None:
+        """The more closed the gripper was, the further it closes: what is wholly open stays so."""
+        opening = self.targets[:, -1:]
+        if OPENING not in self.ranges:
+            self.ranges[OPENING] = MinMax.of(OPENING, opening[self.windows[:, 0]])
+        closed = (1 - self.ranges[OPENING].apply(opening).astype(np.float64)) / 2
+        self.targets[:, -1:] = opening - far * closed
+
+    def _ranges(self, vectors: dict[str, NDArray[np.float64]]) -> dict[str, MinMax]:
         used = self.windows[:, 0]
-        self.present = np.stack([np.concatenate([e.present[o.modality] for e in episodes]) for o in spec.images], 1)
-        self.ranges: dict[str, MinMax] = {}
-        self.vectors: dict[str, NDArray[np.float32]] = {}
-        for o in spec.vectors:
-            values = np.concatenate([e.values[o.modality] for e in episodes])
-            self.ranges[o.key] = MinMax.of(o.key, values[used])
-            self.vectors[o.key] = self.ranges[o.key].apply(values)
-        actions = np.concatenate([e.actions for e in episodes])
-        self.ranges["action"] = MinMax.of("action", actions[used])
-        self.actions = self.ranges["action"].apply(actions)
-        self.pictures = {o.key: np.concatenate([pool(o, e) for e in episodes]) for o in spec.images}
-
-    def draw(self, random: np.random.Generator, size: int) -> Batch:
-        """`size` windows at random, each with its own shift, brightness and noise."""
-        tick, begin, end = self.windows[random.integers(len(self.windows), size=size)].T
-        seen = tick[:, None] + np.arange(1 - self.spec.n_obs_steps, 1)
-        seen = np.maximum(seen, begin[:, None])
-        done = tick[:, None] - self.spec.action_start + np.arange(self.spec.horizon)
-        done = np.clip(done, begin[:, None], end[:, None] - 1)
-        observations = {}
-        for i, o in enumerate(self.spec.images):
-            # Just plugged in again: the earlier steps show the first new picture, as at the start.
-            steps = np.where(self.present[seen, i], seen, tick[:, None])
-            observations[o.key] = torch.from_numpy(self._pictures(o, steps, random))
+        ranges = {}
         for o in self.spec.vectors:
-            values = self.vectors[o.key][seen]
-            noise = random.standard_normal(values.shape, np.float32) * STATE_NOISE
-            observations[o.key] = torch.from_numpy(values + noise)
-        return Batch(observations, torch.from_numpy(self.present[tick]), torch.from_numpy(self.actions[done]))
+            ranges[o.key] = MinMax.of(o.key, vectors[o.key][used], _turns([p.take for p in o.sources], o))
+        action = self.spec.action
+        if action.representation == "absolute":
+            seen = [self._actions(used[:, None], used)]
+        else:
+            # What an action is relative to depends on the window.
+            seen = [
+                self._actions(self._done(part), part[:, 0])
+                for part in np.array_split(self.windows, len(used) // 4096 + 1)
+            ]
+        low, high = (np.stack([f(s.reshape(-1, s.shape[-1]), axis=0) for s in seen]) for f in (np.min, np.max))
+        turns = range(POSITION, POSITION + ROTATIONS[action.rotation]) if action.source == "pose" else ()
+        ranges["action"] = MinMax.of("action", np.concatenate([low, high]), turns)
+        return ranges
 
-    def _pictures(self, o: Observation, steps: NDArray[np.int64], random: np.random.Generator) -> NDArray[np.float32]:
-        """[B, To, 3, h, w] of the rows `steps` [B, To]; all steps of a window have the same shift."""
-        source = self.pictures[o.key]
-        height, width = (side // POOL for side in o.shape[1:])
-        shift = SHIFT[o.operation]
-        corners = random.integers(PAD - shift, PAD + shift + 1, (len(steps), 2))
-        pictures = np.empty((*steps.shape, 3, height, width), np.float32)
-        for i, (top, left) in enumerate(corners):
-            pictures[i] = source[steps[i], :, top : top + height, left : left + width]
-        if o.operation is None:
-            gain = random.uniform(1 - BRIGHTNESS, 1 + BRIGHTNESS, (len(steps), 1, 1, 1, 1)).astype(np.float32)
-            pictures = (pictures + 1) * gain - 1
-        return pictures
+    def plan(self, random: np.random.Generator, size: int, *, vary: bool = True) -> Plan:
+        """`size` windows at random; each has its own shift, brightness, noise and dropout unless `vary` is false."""
+        spec = self.spec
+        windows = self.windows[random.integers(len(self.windows), size=size)]
+        tick = windows[:, 0]
+        seen = np.maximum(tick[:, None] + np.arange(1 - spec.policy.n_obs_steps, 1), windows[:, 1:2])
+        plan: Plan = {"tick": tick, "seen": seen, "done": self._done(windows)}
+        pool = spec.encoder.pool
+        for o in spec.images:
+            varied = o.augmentation
+            if varied.shift and vary:
+                far = varied.shift // pool
+                plan[f"corner {o.key}"] = random.integers(-far, far + 1, (size, 2)) * pool
+            if varied.brightness and vary:
+                gain = random.uniform(1 - varied.brightness, 1 + varied.brightness, (size, 1, 1, 1, 1))
+                plan[f"gain {o.key}"] = gain.astype(np.float32)
+        for o in spec.vectors:
+            if o.augmentation.noise and vary:
+                noise = random.standard_normal((*seen.shape, *o.shape), np.float32)
+                plan[f"noise {o.key}"] = noise * np.float32(o.augmentation.noise)
+        visible = self.present[seen]
+        if spec.policy.mask_aware and vary:
+            visible = drop(spec, visible, seen, self._episode_spans(tick), random)
+        plan["visible"] = visible
+        return plan
+
+    def gather(self, plan: Plan) -> Batch:
+        """The windows of a plan, or of a part of its rows."""
+        spec, visible = self.spec, plan["visible"]
+        batch = Batch(
+            {}, {}, {}, {}, {}, torch.from_numpy(visible[:, -1].astype(np.float32)), self._batch_actions(plan)
+        )
+        for i, o in enumerate(spec.images):
+            steps, shown = _replugged(plan["seen"], visible[:, :, i])
+            batch.shown[o.key] = torch.from_numpy(shown)
+            self._pictures(batch, o, plan, steps, shown)
+            if (gain := plan.get(f"gain {o.key}")) is not None:
+                batch.gains[o.key] = torch.from_numpy(gain)
+        for o in spec.vectors:
+            values = self.vectors[o.key][plan["seen"]]
+            if (noise := plan.get(f"noise {o.key}")) is not None:
+                values = values + noise
+            batch.vectors[o.key] = torch.from_numpy(values)
+        return batch
+
+    def _pictures(self, batch: Batch, o: Observation, plan: Plan, steps: NDArray[np.int64], shown: Bools) -> None:
+        """All steps of a window have the same shift; beyond an edge the edge is repeated."""
+        name, (_, height, width), pool = self.names[o.key], o.shape, self.spec.encoder.pool
+        corners = plan.get(f"corner {o.key}")
+        pictures = np.zeros((*steps.shape, height, width, 3), np.uint8)
+        compared = np.zeros((len(steps), height, width, 3), np.uint8) if o.operation else None
+        owners = np.searchsorted(self.starts, steps[:, -1], "right") - 1
+        for b in np.flatnonzero(shown[:, -1]):
+            episode = self.episodes[owners[b]]
+            source, rows = episode.value(name), steps[b] - self.starts[owners[b]]
+            corner = (0, 0) if corners is None else corners[b]
+            for step, row in enumerate(rows):
+                _shift(source[row], corner, pool, pictures[b, step])
+            if compared is not None:
+                _shift(source[episode.first(name)], corner, pool, compared[b])
+        batch.pictures[o.key] = torch.from_numpy(pictures)
+        if compared is not None:
+            batch.references[o.key] = torch.from_numpy(compared)
+
+    def _done(self, windows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """[B, Tp] rows of the actions of windows."""
+        done = windows[:, 0][:, None] - self.spec.action_start + np.arange(self.spec.policy.horizon)
+        return np.clip(done, windows[:, 1:2], windows[:, 2:3] - 1)
+
+    def _batch_actions(self, plan: Plan) -> Tensor:
+        return torch.from_numpy(self.ranges["action"].apply(self._actions(plan["done"], plan["tick"])))
+
+    def _actions(self, done: NDArray[np.int64], tick: NDArray[np.int64]) -> NDArray[np.float64]:
+        """[B, Tp, Da] of the rows `done` [B, Tp], where the newest observation is of `tick` [B]."""
+        action, targets = self.spec.action, self.targets[done]
+        if self.now is None:
+            return targets
+        wanted = targets[..., :16].reshape(*done.shape, 4, 4)
+        turned = action.rotation != "none"
+        if action.representation == "relative":
+            wanted = poses.relative(wanted, self.now[tick][:, None], turned)
+        elif action.representation == "delta":
+            wanted = poses.delta(wanted, np.concatenate([self.now[done[:, :1]], wanted[:, :-1]], 1))
+        return np.concatenate([poses.numbers(wanted, action.rotation), targets[..., 16:]], -1)
+
+    def _episode_spans(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:
+        """[B, 2] first row, and row behind the last, of each window's episode."""
+        owners = np.searchsorted(self.starts, tick, "right") - 1
+        return np.stack([self.starts[owners], self.starts[owners + 1]], 1)
 
 
-def pool(o: Observation, episode: Episode) -> NDArray[np.float32]:
-    """[T, 3, H / POOL + 2 PAD, W / POOL + 2 PAD]: pictures in -1..1, averaged, with their edges repeated outwards.
+def inputs(spec: Experiment, batch: Batch, device: torch.device) -> dict[str, Tensor]:
+    """By key: pictures f32 [B, To, 3, H / pool, W / pool] and vectors f32 [B, To, D], in -1..1."""
+    out = {}
+    for o in spec.images:
+        pixels = batch.pictures[o.key].to(device, non_blocking=True)
+        pictures = _unit(pixels.flatten(0, 1))
+        if o.operation == "diff_to_reference":
+            # With min 0 and max 1, normalising (v - reference) / 2 + 0.5 gives v - reference.
+            reference = _unit(batch.references[o.key].to(device, non_blocking=True))
+            pictures = pictures - reference.repeat_interleave(pixels.shape[1], 0)
+        else:
+            pictures = pictures * 2 - 1
+        if spec.encoder.pool > 1:
+            pictures = F.avg_pool2d(pictures, spec.encoder.pool)
+        pictures = pictures.contiguous().unflatten(0, pixels.shape[:2])
+        if o.color == "bgr":
+            pictures = pictures.flip(2)
+        if o.key in batch.gains:
+            pictures = (pictures + 1) * batch.gains[o.key].to(device) - 1
+        shown = batch.shown[o.key].to(device)[:, :, None, None, None]
+        out[o.key] = torch.where(shown, pictures, torch.zeros((), device=device))
+    return out | {o.key: batch.vectors[o.key].to(device, non_blocking=True) for o in spec.vectors}
 
-    With min 0 and max 1, normalising is v * 2 - 1; of (v - reference) / 2 + 0.5 that is v - reference.
+
+def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArray[np.int64],
+         random: np.random.Generator) -> Bools:  # fmt: skip
+    """Takes pictures away at random: bool [B, To, M] of the rows `seen`, in episodes of the rows `spans` [B, 2].
+
+    Of several that are present at the newest step at least one always remains. A policy with one picture has its
+    vectors left.
     """
-    pictures = _unit(episode.values[o.modality])
-    if o.operation == "diff_to_reference":
-        pictures = pictures - _unit(episode.references[o.modality][None])
-    else:
-        pictures = pictures * 2 - 1
-    padded = F.pad(F.avg_pool2d(pictures, POOL), (PAD, PAD, PAD, PAD), mode="replicate")
-    return padded.numpy() * episode.present[o.modality][:, None, None, None]
+    out, there = present.copy(), present[:, -1]
+    kept = there & (random.random(there.shape) >= [o.dropout.window for o in spec.images])
+    away = np.zeros_like(present)
+    if any(o.dropout.episode for o in spec.images):
+        away = _absences(spec, present.shape, seen, spans, random)
+        kept &= ~away[:, -1]
+    if len(spec.images) > 1:
+        # The one that remains in a window that lost all: any present one, with equal probability.
+        lot = np.where(there, random.random(there.shape), -1.0)
+        lost = ~kept.any(1) & there.any(1)
+        kept[lost, lot[lost].argmax(1)] = True
+    out &= ~away
+    out[:, -1] = kept
+    if out.shape[1] > 1 and any(o.dropout.replug for o in spec.images):
+        cut = random.random(there.shape) < [o.dropout.replug for o in spec.images]
+        first = random.integers(1, out.shape[1], there.shape)
+        out &= ~(cut[:, None] & (np.arange(out.shape[1])[None, :, None] < first[:, None]))
+    return out
 
 
-def _unit(pictures: NDArray[np.uint8]) -> Tensor:
-    """u8 [T, H, W, 3] -> f32 [T, 3, H, W] in 0..1"""
-    return torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 255
+def _absences(spec: Experiment, shape: tuple[int, ...], seen: NDArray[np.int64], spans: NDArray[np.int64],
+              random: np.random.Generator) -> Bools:  # fmt: skip
+    """[B, To, M] where a picture is absent because it left in the middle of the episode, for a time or to its end."""
+    count = (shape[0], shape[2])
+    leaves = random.random(count) < [o.dropout.episode for o in spec.images]
+    begin, end = spans[:, :1], spans[:, 1:]
+    out = begin + (random.random(count) * (end - begin)).astype(np.int64)
+    back = np.where(random.random(count) < 0.5, end, out + 1 + (random.random(count) * (end - out)).astype(np.int64))
+    rows = seen[:, :, None]
+    return leaves[:, None] & (rows >= out[:, None]) & (rows < back[:, None])
 
 
-def _windows(spec: Spec, episodes: list[Episode]) -> list[NDArray[np.int64]]:
-    """For each episode [W, 3]: a tick, and the start and end of its segment, as rows of all episodes."""
-    windows, start = [], 0
-    for episode in episodes:
-        usable = episode.acted.copy()
-        for o in spec.observations:
+def _replugged(seen: NDArray[np.int64], visible: Bools) -> tuple[NDArray[np.int64], Bools]:
+    """[B, To] rows and whether there are pictures: just plugged in again, earlier steps show the first new one."""
+    rows, shown = seen.copy(), np.repeat(visible[:, -1:], seen.shape[1], 1)
+    for step in range(seen.shape[1] - 2, -1, -1):
+        rows[:, step] = np.where(visible[:, step], seen[:, step], rows[:, step + 1])
+    return rows, shown
+
+
+def _shift(picture: NDArray[np.uint8], corner: Sequence[int], pool: int, out: NDArray[np.uint8]) -> None:
+    """Writes the picture seen from `corner` [2]; beyond an edge its blocks of `pool` pixels are repeated."""
+    (height, width), (down, right) = picture.shape[:2], corner
+    top, bottom = max(0, -down), height - max(0, down)
+    left, end = max(0, -right), width - max(0, right)
+    out[top:bottom, left:end] = picture[top + down : bottom + down, left + right : end + right]
+    for beyond, edge in ((slice(0, left), slice(left, left + pool)), (slice(end, width), slice(end - pool, end))):
+        if beyond.start != beyond.stop:
+            block = out[top:bottom, edge]
+            out[top:bottom, beyond] = np.tile(block, (1, (beyond.stop - beyond.start) // pool, 1))
+    for beyond, edge in (
+        (slice(0, top), slice(top, top + pool)),
+        (slice(bottom, height), slice(bottom - pool, bottom)),
+    ):
+        if beyond.start != beyond.stop:
+            out[beyond] = np.tile(out[edge], ((beyond.stop - beyond.start) // pool, 1, 1))
+
+
+def _unit(pictures: Tensor) -> Tensor:
+    """u8 [N, H, W, 3] -> f32 [N, 3, H, W] in 0..1"""
+    return pictures.permute(0, 3, 1, 2).float() / 255
+
+
+def _turns(takes: list[str], o: Observation) -> list[int]:
+    """Numbers of a vector that are of a rotation."""
+    found, at = [], 0
+    for part, take in zip(o.sources, takes, strict=True):
+        found += range(at, at + part.length) if take in ("rotation_6d", "quaternion") else ()
+        at += part.length
+    return found
+
+
+class _Rows:
+    """What the rows of one episode are for an experiment: everything but pictures."""
+
+    def __init__(self, spec: Experiment, episode: Episode) -> None:
+        self.spec, self.episode = spec, episode
+        hz, wanted = episode.facts.observation_hz, spec.policy.control_hz
+        if hz is not None and abs(hz - wanted) > 1e-6 * wanted:
+            raise Unfit(f"recorded at {hz:g} Hz, the policy acts at {wanted:g}: write control_hz = {hz:g} in [policy]")
+        self.usable = np.ones(len(episode), bool)
+        self.vectors = {o.key: self._vector(o) for o in spec.vectors}
+        self.now: NDArray[np.float64] | None = None
+        self.targets = self._recorded() if spec.action.source == "action" else self._next_poses()
+        found = [np.asarray(episode.present(picture_source(o).name)) for o in spec.images]
+        self.present = np.stack(found, 1) if found else np.zeros((len(episode), 0), bool)
+        for o, present in zip(spec.images, found, strict=True):
             if o.required:
-                usable &= episode.present[o.modality]
+                self.usable &= present
         # Pictures that are not required: at least one of them must be present.
-        if spec.images:
-            usable &= np.logical_or.reduce([episode.present[o.modality] for o in spec.images])
-        breaks = np.flatnonzero(~(usable[1:] & usable[:-1] & (np.diff(episode.ticks) == 1))) + 1
-        for segment in np.split(np.arange(len(episode)), breaks):
+        if found:
+            self.usable &= self.present.any(1)
+
+    def windows(self) -> NDArray[np.int64]:
+        """[W, 3] a tick, and the start and end of its segment, as rows of the episode."""
+        usable, windows = self.usable, []
+        breaks = np.flatnonzero(~(usable[1:] & usable[:-1] & (np.diff(self.episode.ticks) == 1))) + 1
+        for segment in np.split(np.arange(len(self.episode)), breaks):
             if usable[segment[0]]:
                 ends = np.broadcast_to([segment[0], segment[-1] + 1], (len(segment), 2))
-                windows.append(np.column_stack([segment, ends]) + start)
-        start += len(episode)
-    return windows or [np.empty((0, 3), np.int64)]
+                windows.append(np.column_stack([segment, ends]))
+        return np.concatenate(windows) if windows else np.empty((0, 3), np.int64)
+
+    def _vector(self, o: Observation) -> NDArray[np.float64]:
+        """[T, D]"""
+        return np.concatenate([self._part(part) for part in o.sources], 1)
+
+    def _part(self, part: Part) -> NDArray[np.float64]:
+        if part.take == "columns":
+            return self._columns(part.modality, part.columns or ())
+        matrices, there = self._poses(part.modality)
+        self.usable &= there
+        if part.take == "position":
+            return matrices[:, :3, 3]
+        turned = poses.rotation_6d if part.take == "rotation_6d" else poses.quaternions
+        return turned(matrices[:, :3, :3])
+
+    def _columns(self, modality: str, columns: tuple[int, ...]) -> NDArray[np.float64]:
+        values, present = np.asarray(self.episode.value(modality)), np.asarray(self.episode.present(modality))
+        self.usable &= present
+        if not present.any():
+            return np.zeros((len(self.episode), len(columns)))
+        if max(columns) >= values.shape[1]:
+            raise Unfit(f"{modality}: {values.shape[1]} numbers, but number {max(columns)} (from 0) is taken")
+        return values[:, columns]
+
+    def _poses(self, modality: str) -> tuple[NDArray[np.float64], Bools]:
+        """[T, 4, 4] and [T] whether there is a pose."""
+        values, present = np.asarray(self.episode.value(modality)), np.asarray(self.episode.present(modality))
+        if not present.any():
+            return np.tile(np.eye(4), (len(values), 1, 1)), present
+        named = self.episode.facts.layouts.get(modality)
+        layout = poses.layout_of(values.shape[1], named)
+        if layout is None:
+            what = f"layout {named!r}" if named else f"no [device.{modality}.pose] in its registry"
+            raise Unfit(f"{modality}: {values.shape[1]} numbers and {what}: not a pose")
+        matrices, right = poses.matrices(values, layout)
+        return matrices, right & present
+
+    def _recorded(self) -> NDArray[np.float64]:
+        """[T, Da] as recorded on /action."""
+        actions, spec = np.asarray(self.episode.actions), self.spec.action
+        if not self.episode.acted.any():
+            raise Unfit('no action: nothing on /action; a demonstration by hand trains with from = "pose"')
+        if spec.columns is not None:
+            if max(spec.columns) >= actions.shape[1]:
+                raise Unfit(f"/action: {actions.shape[1]} numbers, but number {max(spec.columns)} (from 0) is taken")
+            actions = actions[:, spec.columns]
+        if actions.shape[1] != len(spec.names):
+            raise Unfit(f"/action: {actions.shape[1]} numbers, expected {len(spec.names)}")
+        self.usable &= np.asarray(self.episode.acted)
+        return actions
+
+    def _next_poses(self) -> NDArray[np.float64]:
+        """[T, ...] the pose of the next tick, and the opening then: as it is learned if it is absolute, otherwise as a
+        matrix. The last tick of a run of them has no action."""
+        spec = self.spec.action
+        matrices, there = self._poses(spec.pose or "")
+        absolute = spec.representation == "absolute"
+        parts = [poses.numbers(matrices, spec.rotation) if absolute else matrices.reshape(-1, 16)]
+        if spec.gripper:
+            parts.append(self._opening(spec.gripper, spec.gripper_column))
+            there = there & np.asarray(self.episode.present(spec.gripper))
+        self.now = None if absolute else matrices
+        follows = there[:-1] & there[1:] & (np.diff(self.episode.ticks) == 1)
+        self.usable &= np.append(follows, False)
+        targets = np.concatenate(parts, 1)
+        return np.concatenate([targets[1:], targets[-1:]])
+
+    def _opening(self, modality: str, column: int) -> NDArray[np.float64]:
+        before = self.usable.copy()
+        opening = self._columns(modality, (column,))
+        # `there` decides: the opening belongs to the next tick too.
+        self.usable = before
+        return opening
+
+
+def unfit(spec: Experiment, episode: Episode) -> str | None:
+    """Why an experiment cannot learn from an episode; none if it can."""
+    try:
+        rows = _Rows(spec, episode)
+    except Unfit as error:
+        return str(error)
+    return None if len(rows.windows()) else "every tick lacks an action or a required modality"

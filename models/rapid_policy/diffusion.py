@@ -11,7 +11,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-TRAIN_TIMESTEPS = 100
+from .experiment import TRAIN_TIMESTEPS
+
 MAX_BETA = 0.999
 
 

@@ -2,15 +2,15 @@
 
 The frame index of a file (`/rapid/frame`) names the sample of every modality at every tick by its sequence number, and
 the mask in force. What is read here is therefore what a policy would have been given, not the nearest sample by a rule
-of our own.
+of our own. What the numbers mean for a policy is `dataset`'s part.
 """
 
 from __future__ import annotations
 
-import io
 import json
+import tomllib
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,11 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from numpy.typing import NDArray
-from PIL import Image
 
-from .judgement import JudgementError, judge
-from .spec import Observation
+from . import lerobot_source
+from .experiment import Experiment
+from .lerobot_source import DatasetError
+from .pixels import FormatError, PixelError, decode, fit
 
 FRAMES = "/rapid/frame"
 ACTIONS = "/action"
@@ -35,79 +36,165 @@ class EpisodeError(Exception):
 
     def __init__(self, path: Path, what: str) -> None:
         super().__init__(f"{path}: {what}")
+        self.what = what
+
+
+@dataclass(frozen=True)
+class Source:
+    """A modality as it is read: pictures of one size, or all numbers of a vector."""
+
+    modality: str
+    kind: str
+    """`image` or `vector`."""
+    required: bool = True
+    """An episode whose rig has no such modality is of no use."""
+    size: tuple[int, int] | None = None
+    resize: tuple[int, int] | None = None
+    crop: tuple[int, int] | None = None
+
+    @property
+    def name(self) -> str:
+        """Of its arrays in an episode."""
+        parts = [self.modality]
+        parts += [f"resize {self.resize[0]}x{self.resize[1]}"] if self.resize else []
+        parts += [f"crop {self.crop[0]}x{self.crop[1]}"] if self.crop else []
+        return " ".join(parts)
+
+
+def picture_source(o: Any) -> Source:
+    """Where the pictures of an observation come from."""
+    return Source(o.modality, "image", o.required, o.size, o.resize, o.crop)
+
+
+def sources(spec: Experiment) -> tuple[Source, ...]:
+    """All that an experiment reads of an episode, each once."""
+    wanted = [picture_source(o) for o in spec.images]
+    names = [part.modality for o in spec.vectors for part in o.sources]
+    names += [name for name in (spec.action.pose, spec.action.gripper) if name]
+    wanted += [Source(name, "vector") for name in names]
+    return tuple({source.name: source for source in wanted}.values())
+
+
+@dataclass
+class Facts:
+    """What an episode's metadata say and training uses."""
+
+    software: str = ""
+    task: str = ""
+    observation_hz: float | None = None
+    tags: dict[str, str] = field(default_factory=dict)
+    modules: list[str] = field(default_factory=list)
+    layouts: dict[str, str] = field(default_factory=dict)
+    """By modality: how the registry says that a pose is laid out."""
+    notes: list[str] = field(default_factory=list)
+    """What was found in the samples and taken as absent."""
 
 
 @dataclass
 class Episode:
-    """One episode, a row for each of its T ticks. Rows that are not `present` are zeros."""
+    """One episode, a row for each of its T ticks. Rows that are not present are zeros."""
 
     path: Path
-    ticks: NDArray[np.int64]
-    """[T] the tick's number in the frame index."""
-    times: NDArray[np.int64]
-    """[T] ns of the wall clock."""
-    values: dict[str, NDArray[Any]]
-    """By modality: pictures u8 [T, H, W, 3] (red first) or vectors f64 [T, D]."""
-    present: dict[str, NDArray[np.bool_]]
-    """[T] by modality: its bit is set in the mask, and the tick has a sample of it."""
-    references: dict[str, NDArray[np.uint8]]
-    """[H, W, 3] by modality: the first picture of the episode."""
-    actions: NDArray[np.float64]
-    """[T, Da]"""
-    acted: NDArray[np.bool_]
-    """[T] whether an action was taken at the tick."""
-    facts: dict[str, str]
-    """The metadata record `rapid`, written at the beginning."""
-    summary: dict[str, str]
-    """The metadata record `rapid/summary`, written at the end."""
-    tags: dict[str, str] = field(default_factory=dict)
+    facts: Facts
+    arrays: Mapping[str, NDArray[Any]]
+    """`ticks` i64 [T], number in the frame index; `times` i64 [T], ns of the wall clock; `actions` f64 [T, Da] and `acted`
+    bool [T]; for each source `value NAME`, pictures u8 [T, H, W, 3] (red first) or vectors f64 [T, D], `present NAME`
+    bool [T], and of pictures `first NAME` i64 [1], the row of the first one or -1."""
+    sha256: str = ""
+    """Of the file."""
+
+    @property
+    def ticks(self) -> NDArray[np.int64]:
+        """[T]"""
+        return self.arrays["ticks"]
+
+    @property
+    def actions(self) -> NDArray[np.float64]:
+        """[T, Da]"""
+        return self.arrays["actions"]
+
+    @property
+    def acted(self) -> NDArray[np.bool_]:
+        """[T] whether an action was taken at the tick."""
+        return self.arrays["acted"]
+
+    def value(self, name: str) -> NDArray[Any]:
+        """[T, ...] of a source."""
+        return self.arrays[f"value {name}"]
+
+    def present(self, name: str) -> NDArray[np.bool_]:
+        """[T] of a source: its bit is set in the mask, and the tick has a sample of it."""
+        return self.arrays[f"present {name}"]
+
+    def first(self, name: str) -> int:
+        """The row of the first picture of a source; -1 if there is none."""
+        return int(self.arrays[f"first {name}"][0])
 
     def __len__(self) -> int:
         return len(self.ticks)
 
 
 def episode_files(folder: Path) -> list[Path]:
-    """The finished episodes of a folder, by name."""
-    files = sorted(folder.glob("*.mcap"))
+    """The finished episodes of a folder, by name; of a data set of LeRobot those in its files."""
+    if lerobot_source.is_dataset(folder):
+        try:
+            files = lerobot_source.episode_names(folder)
+        except (DatasetError, OSError, ValueError, KeyError) as error:
+            raise EpisodeError(folder, f"not a data set that is read: {error}") from error
+    else:
+        files = sorted(folder.glob("*.mcap"))
     if not files:
         raise EpisodeError(folder, "no episode (*.mcap) in this folder")
     return files
 
 
-def read_episodes(
-    files: Iterable[Path], observations: tuple[Observation, ...], actions: int
-) -> tuple[list[Episode], list[str]]:
-    """All files that are GOOD or SUSPECT at present, and a line for each that is not."""
-    files = list(files)
+def read_facts(path: Path) -> Facts:
+    """The metadata of a file, without its samples."""
     try:
-        judged = judge(files)
-    except JudgementError as error:
-        raise EpisodeError(files[0].parent, str(error)) from error
-    episodes, left_out = [], []
-    for path in files:
-        if judged[path].verdict in ("GOOD", "SUSPECT"):
-            episodes.append(read_episode(path, observations, actions))
-        else:
-            left_out.append(f"{path}: left out, {judged[path]}")
-    return episodes, left_out
+        if lerobot_source.split(path)[1] is not None:
+            return Facts(software="LeRobot", observation_hz=lerobot_source.rate(path))
+        with path.open("rb") as file:
+            records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+    except Exception as error:
+        raise EpisodeError(path, f"not a whole episode: {error}") from error
+    return _facts(path, records.get("rapid", {}))
 
 
-def read_episode(path: Path, observations: tuple[Observation, ...], actions: int) -> Episode:
-    """One file, read whole with its checksums. `actions` is the length of an action."""
+def _facts(path: Path, about: dict[str, str]) -> Facts:
+    try:
+        devices = tomllib.loads(about.get("registry") or "").get("device", {})
+        poses = {name: entry["pose"] for name, entry in devices.items() if isinstance(entry.get("pose"), dict)}
+        return Facts(
+            software=about.get("software", ""),
+            task=about.get("task", ""),
+            observation_hz=float(about["observation_hz"]) if "observation_hz" in about else None,
+            tags=json.loads(about.get("tags") or "{}"),
+            modules=json.loads(about.get("configuration") or "{}").get("modules", []),
+            layouts={name: pose["layout"] for name, pose in poses.items() if "layout" in pose},
+        )
+    except (ValueError, TypeError, AttributeError, KeyError) as error:
+        raise EpisodeError(path, f"metadata record `rapid`: {error}") from error
+
+
+def read_episode(path: Path, wanted: tuple[Source, ...]) -> Episode:
+    """One file, read whole with its checksums."""
+    if lerobot_source.split(path)[1] is not None:
+        return _read_rows(path, wanted)
     try:
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
             records = {record.name: record.metadata for record in reader.iter_metadata()}
-            facts, summary = records.get("rapid", {}), records.get("rapid/summary", {})
-            streams = _streams(path, facts)
-            wanted = {o.modality: streams[o.modality] for o in observations if o.modality in streams}
-            for o in observations:
-                if o.modality not in wanted:
-                    raise EpisodeError(path, f"no modality {o.modality!r}; it has {', '.join(sorted(streams))}")
-            topics = [FRAMES, ACTIONS, *(s["topic"] for s in wanted.values())]
+            facts = _facts(path, records.get("rapid", {}))
+            streams = _streams(path, records.get("rapid", {}))
+            for source in wanted:
+                if source.required and source.modality not in streams:
+                    raise EpisodeError(path, f"no modality {source.modality!r}; it has {', '.join(sorted(streams))}")
+            topics = {streams[s.modality]["topic"] for s in wanted if s.modality in streams}
             decoder = _Decoder(path)
             messages: dict[str, list[_Message]] = defaultdict(list)
-            for schema, channel, message in reader.iter_messages(topics=topics, log_time_order=False):
+            for schema, channel, message in reader.iter_messages(
+                topics=[FRAMES, ACTIONS, *topics], log_time_order=False
+            ):
                 decoded = decoder.decode(schema, message.data)
                 messages[channel.topic].append(_Message(message.log_time, message.sequence, schema.name, decoded))
     except EpisodeError:
@@ -115,7 +202,47 @@ def read_episode(path: Path, observations: tuple[Observation, ...], actions: int
     # Damage is found in the container, the compression, a schema or a message: each has its own errors.
     except Exception as error:
         raise EpisodeError(path, f"not a whole episode: {error}") from error
-    return _assemble(path, facts, summary, wanted, observations, actions, messages)
+    return _assemble(path, facts, streams, wanted, messages)
+
+
+def _read_rows(path: Path, wanted: tuple[Source, ...]) -> Episode:
+    """An episode of a data set of LeRobot."""
+    try:
+        facts, rows = read_facts(path), lerobot_source.tables(path)
+        count = len(rows["frame_index"])
+        arrays: dict[str, NDArray[Any]] = {
+            "ticks": rows["frame_index"].ravel().astype(np.int64),
+            "times": (rows["timestamp"].ravel() * 1e9).astype(np.int64),
+            "actions": rows.get("action", np.zeros((count, 0))).astype(np.float64),
+            "acted": np.full(count, "action" in rows),
+        }
+        for source in wanted:
+            found = _of_pictures(path, source, rows) if source.kind == "image" else _of_numbers(path, source, rows)
+            arrays |= {f"{what} {source.name}": array for what, array in found.items()}
+    except EpisodeError:
+        raise
+    # A damaged file fails in the container, the compression or a column: each has its own errors.
+    except Exception as error:
+        raise EpisodeError(path, f"not an episode that is read: {error}") from error
+    return Episode(path, facts, arrays)
+
+
+def _of_pictures(path: Path, source: Source, rows: dict[str, Any]) -> dict[str, NDArray[Any]]:
+    found = lerobot_source.pictures(rows, source.modality)
+    if found is None and source.required:
+        raise EpisodeError(path, f"no feature 'observation.images.{source.modality}'")
+    found = found or [None] * len(rows["frame_index"])
+    return _stacked(source, [None if p is None else _fitted(path, source, p) for p in found])
+
+
+def _of_numbers(path: Path, source: Source, rows: dict[str, Any]) -> dict[str, NDArray[Any]]:
+    found = lerobot_source.numbers(rows, source.modality)
+    if found is None:
+        what = f"no columns '{source.modality}.0' ... of observation.state and no 'observation.{source.modality}'"
+        raise EpisodeError(path, what)
+    values, present = found
+    present = present & np.isfinite(values).all(1)
+    return {"value": np.where(present[:, None], values, 0.0), "present": present}
 
 
 @dataclass(frozen=True)
@@ -126,10 +253,10 @@ class _Message:
     body: Any
 
 
-def _streams(path: Path, facts: dict[str, str]) -> dict[str, dict[str, Any]]:
+def _streams(path: Path, about: dict[str, str]) -> dict[str, dict[str, Any]]:
     """The registered modalities by name, as the file's own metadata lists them."""
     try:
-        return {entry["name"]: entry for entry in json.loads(facts["modalities"])}
+        return {entry["name"]: entry for entry in json.loads(about["modalities"])}
     except KeyError as error:
         raise EpisodeError(path, f"metadata record `rapid` without key {error}: not an episode of rapid") from error
     except (TypeError, ValueError) as error:
@@ -156,42 +283,25 @@ class _Decoder:
 
 def _assemble(
     path: Path,
-    facts: dict[str, str],
-    summary: dict[str, str],
+    facts: Facts,
     streams: dict[str, dict[str, Any]],
-    observations: tuple[Observation, ...],
-    actions: int,
+    wanted: tuple[Source, ...],
     messages: dict[str, list[_Message]],
 ) -> Episode:
     frames = messages[FRAMES]
     if not frames:
         raise EpisodeError(path, f"no frame index: nothing on {FRAMES}")
-    values, present, references = {}, {}, {}
-    for o in observations:
-        stream = streams[o.modality]
-        chosen = _chosen(stream, frames, messages[stream["topic"]])
-        present[o.modality] = np.array([m is not None for m in chosen])
-        read = _picture if o.kind == "image" else _vector
-        rows = [None if m is None else read(path, o, m) for m in chosen]
-        shape = (*o.shape[1:], o.shape[0]) if o.kind == "image" else o.shape
-        blank = np.zeros(shape, np.uint8 if o.kind == "image" else np.float64)
-        values[o.modality] = np.stack([blank if row is None else row for row in rows])
-        if o.kind == "image":
-            references[o.modality] = next((row for row in rows if row is not None), blank)
-    acts, acted = _actions(path, facts, frames, messages[ACTIONS], actions)
-    return Episode(
-        path=path,
-        ticks=np.array([m.body.index for m in frames], np.int64),
-        times=np.array([m.time for m in frames], np.int64),
-        values=values,
-        present=present,
-        references=references,
-        actions=acts,
-        acted=acted,
-        facts=facts,
-        summary=summary,
-        tags=json.loads(facts.get("tags") or "{}"),
-    )
+    arrays: dict[str, NDArray[Any]] = {
+        "ticks": np.array([m.body.index for m in frames], np.int64),
+        "times": np.array([m.time for m in frames], np.int64),
+    }
+    for source in wanted:
+        stream = streams.get(source.modality)
+        chosen = _chosen(stream, frames, messages[stream["topic"]]) if stream else [None] * len(frames)
+        read = _pictures if source.kind == "image" else _vectors
+        arrays |= {f"{what} {source.name}": array for what, array in read(path, source, chosen, facts.notes).items()}
+    arrays["actions"], arrays["acted"] = _actions(path, facts, frames, messages[ACTIONS])
+    return Episode(path, facts, arrays)
 
 
 def _chosen(stream: dict[str, Any], frames: list[_Message], samples: list[_Message]) -> list[_Message | None]:
@@ -214,47 +324,93 @@ def _chosen(stream: dict[str, Any], frames: list[_Message], samples: list[_Messa
     return chosen
 
 
-def _picture(path: Path, o: Observation, message: _Message) -> NDArray[np.uint8]:
-    """u8 [H, W, 3], red first."""
-    if message.schema != "foxglove.CompressedImage":
-        raise EpisodeError(path, f"{o.modality}: pictures of {message.schema} are not read, only compressed ones")
+def _pictures(path: Path, source: Source, chosen: list[_Message | None], notes: list[str]) -> dict[str, NDArray[Any]]:
+    """A damaged picture counts as none, as it does while a policy runs; one of another size ends it."""
+    rows: list[NDArray[np.uint8] | None] = []
+    damaged = 0
+    for message in chosen:
+        try:
+            rows.append(None if message is None else _picture(path, source, message))
+        except PixelError:
+            rows.append(None)
+            damaged += 1
+    if damaged:
+        notes.append(f"{source.modality}: {damaged} damaged pictures, taken as absent")
+    return _stacked(source, rows)
+
+
+def _stacked(source: Source, rows: list[NDArray[np.uint8] | None]) -> dict[str, NDArray[Any]]:
+    """The arrays of pictures, of which some are absent."""
+    present = np.array([row is not None for row in rows])
+    shape = source.crop or source.resize or source.size or (0, 0)
+    values = np.zeros((len(rows), *shape, 3), np.uint8)
+    for row, pixels in zip(values, rows, strict=True):
+        if pixels is not None:
+            row[:] = pixels
+    first = int(present.argmax()) if present.any() else -1
+    return {"value": values, "present": present, "first": np.array([first], np.int64)}
+
+
+def _picture(path: Path, source: Source, message: _Message) -> NDArray[np.uint8]:
     try:
-        picture = np.array(Image.open(io.BytesIO(message.body.data)).convert("RGB"))
-    except OSError as error:
-        raise EpisodeError(path, f"{o.modality}: picture {message.sequence}: {error}") from error
-    if picture.shape != (*o.shape[1:], 3):
-        got, want = picture.shape, o.shape
-        raise EpisodeError(path, f"{o.modality}: a picture of {got[1]}x{got[0]}, the policy takes {want[2]}x{want[1]}")
-    return picture
+        pixels = decode(message.schema, message.body)
+    except FormatError as error:
+        raise EpisodeError(path, f"{source.modality}: {error}") from error
+    return _fitted(path, source, pixels)
 
 
-def _vector(path: Path, o: Observation, message: _Message) -> NDArray[np.float64]:
-    """f64 [D]"""
-    return _numbers(path, o.modality, message, o.shape[0])
+def _fitted(path: Path, source: Source, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """At the size that the policy takes."""
+    fitted = fit(pixels, source.resize, source.crop)
+    wanted = source.crop or source.resize or source.size or pixels.shape[:2]
+    if fitted is None or fitted.shape[:2] != wanted:
+        got = f"{source.modality}: a picture of {pixels.shape[1]}x{pixels.shape[0]}"
+        raise EpisodeError(path, f"{got}, the policy takes {wanted[1]}x{wanted[0]}: add resize to the observation")
+    return fitted
 
 
-def _numbers(path: Path, what: str, message: _Message, length: int) -> NDArray[np.float64]:
+def _vectors(path: Path, source: Source, chosen: list[_Message | None], notes: list[str]) -> dict[str, NDArray[Any]]:
+    """A sample with a number that is not finite counts as none."""
+    rows = [None if m is None else _numbers(path, source.modality, m) for m in chosen]
+    length = next((len(row) for row in rows if row is not None), 0)
+    values, present = np.zeros((len(rows), length)), np.zeros(len(rows), bool)
+    odd = 0
+    for i, row in enumerate(rows):
+        if row is None:
+            continue
+        if len(row) != length:
+            raise EpisodeError(path, f"{source.modality}: {len(row)} numbers after samples of {length}")
+        present[i] = np.isfinite(row).all()
+        odd += not present[i]
+        values[i] = row if present[i] else 0.0
+    if odd:
+        notes.append(f"{source.modality}: {odd} samples with a number that is not finite, taken as absent")
+    return {"value": values, "present": present}
+
+
+def _numbers(path: Path, what: str, message: _Message) -> NDArray[np.float64]:
     if message.schema != "rapid.Scalars":
         raise EpisodeError(path, f"{what}: messages of {message.schema}, expected rapid.Scalars")
-    values = np.array(message.body.values, np.float64)
-    if values.shape != (length,):
-        raise EpisodeError(path, f"{what}: {len(values)} numbers, expected {length}")
-    if not np.isfinite(values).all():
-        raise EpisodeError(path, f"{what}: a number that is not finite in message {message.sequence}")
-    return values
+    return np.array(message.body.values, np.float64)
 
 
 def _actions(
-    path: Path, facts: dict[str, str], frames: list[_Message], messages: list[_Message], length: int
+    path: Path, facts: Facts, frames: list[_Message], messages: list[_Message]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """[T, Da] and [T]: an action belongs to the tick with its time."""
-    if not messages:
-        raise EpisodeError(path, f"no action: nothing on {ACTIONS}")
+    """[T, Da] and [T]: an action belongs to the tick with its time. Da is 0 without any."""
     times = np.array([m.time for m in frames])
-    half_period = 0.5e9 / float(facts["observation_hz"])
+    rows = [_numbers(path, ACTIONS, m) for m in messages]
+    length = len(rows[0]) if rows else 0
     actions, acted = np.zeros((len(frames), length)), np.zeros(len(frames), bool)
-    for message in messages:
+    if not rows:
+        return actions, acted
+    if facts.observation_hz is None:
+        raise EpisodeError(path, "metadata record `rapid` without key 'observation_hz': not an episode of rapid")
+    half_period = 0.5e9 / facts.observation_hz
+    for message, row in zip(messages, rows, strict=True):
+        if len(row) != length:
+            raise EpisodeError(path, f"{ACTIONS}: {len(row)} numbers after actions of {length}")
         tick = int(np.abs(times - message.time).argmin())
-        if abs(int(times[tick]) - message.time) < half_period:
-            actions[tick], acted[tick] = _numbers(path, ACTIONS, message, length), True
+        if abs(int(times[tick]) - message.time) < half_period and np.isfinite(row).all():
+            actions[tick], acted[tick] = row, True
     return actions, acted

@@ -1,6 +1,6 @@
 """Exports a checkpoint to a bundle: both graphs as ONNX, checked against PyTorch, `policy.json` and a model card.
 
-    python -m rapid_policy.export RUN/checkpoint.pt --out models/NAME
+python -m rapid_policy.export RUN/checkpoint.pt --out models/NAME
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from torch import Tensor, nn
 
 from . import bundle
 from .bundle import DENOISER, ENCODER, encoder_inputs
+from .checkpoint import read_checkpoint
 from .model import Policy, parameters
 from .progress import plot
-from .spec import Spec
+from .experiment import Experiment
 
 OPSET = 17
 # Both compute in float32, but in a different order.
@@ -31,7 +32,7 @@ TOLERANCE = 1e-4
 
 def export(state: dict[str, Any], out: Path) -> float:
     """Writes the bundle of the checkpoint `state` into `out`. Returns the largest difference from PyTorch."""
-    spec = Spec.from_dict(state["spec"])
+    spec = Experiment.from_text(state["experiment"])
     policy = Policy(spec)
     policy.load_state_dict(state["average"])
     policy.eval()
@@ -40,35 +41,44 @@ def export(state: dict[str, Any], out: Path) -> float:
     names = ["sample", "timestep", "global_cond"]
     write_graph(policy.denoiser, denoiser_example(spec), names, "epsilon", out / DENOISER)
     difference = largest_difference(spec, policy, out)
-    schedule = state["schedule"]
+    schedule = spec.training
     facts = {
         **state["provenance"],
-        "seed": schedule["seed"],
+        "seed": schedule.seed,
         "iterations": state["iteration"],
-        "batch_windows": schedule["windows"],
-        "draws": schedule["draws"],
+        "batch_windows": schedule.windows,
+        "draws": schedule.draws,
         "minutes": round(state["seconds"] / 60, 1),
         "parameters": parameters([policy]),
         "difference": difference,
+        "network": _network(spec),
     }
     bundle.write_policy(spec, facts, out)
     bundle.write_card(spec, facts, out)
-    plot(state["losses"], spec.name, out / "loss.png")
+    plot(state["losses"], spec.name, out / "loss.png", state["validation"])
     return difference
 
 
-def encoder_example(spec: Spec, batch: int = 2, mask: tuple[int, ...] | None = None) -> tuple[Tensor, ...]:
+def _network(spec: Experiment) -> dict[str, Any]:
+    """The sizes of the graphs, with which `weights` makes the networks again."""
+    encoder = spec.encoder.model_dump(mode="json")
+    if spec.encoder.weights:
+        encoder["weights"] = Path(spec.encoder.weights).name
+    return {"encoder": encoder, "denoiser": spec.denoiser.model_dump(mode="json")}
+
+
+def encoder_example(spec: Experiment, batch: int = 2, mask: tuple[int, ...] | None = None) -> tuple[Tensor, ...]:
     """Random inputs of the encoder."""
-    inputs = [torch.rand(batch, spec.n_obs_steps, *o.shape) * 2 - 1 for o in spec.observations]
-    if spec.mask_aware:
+    inputs = [torch.rand(batch, spec.policy.n_obs_steps, *o.shape) * 2 - 1 for o in spec.observation]
+    if spec.policy.mask_aware:
         row = torch.tensor(mask or (1,) * len(spec.images), dtype=torch.float32)
         inputs.append(row.repeat(batch, 1))
     return tuple(inputs)
 
 
-def denoiser_example(spec: Spec, batch: int = 2, timestep: int = 90) -> tuple[Tensor, ...]:
+def denoiser_example(spec: Experiment, batch: int = 2, timestep: int = 90) -> tuple[Tensor, ...]:
     """Random inputs of the denoiser."""
-    sample = torch.randn(batch, spec.horizon, len(spec.action_names))
+    sample = torch.randn(batch, spec.policy.horizon, spec.action_length)
     return sample, torch.full((batch,), timestep, dtype=torch.int64), torch.randn(batch, spec.condition)
 
 
@@ -90,10 +100,10 @@ def write_graph(module: nn.Module, example: tuple[Tensor, ...], inputs: list[str
     onnx.checker.check_model(str(path), full_check=True)
 
 
-def largest_difference(spec: Spec, policy: Policy, folder: Path) -> float:
+def largest_difference(spec: Experiment, policy: Policy, folder: Path) -> float:
     """Difference between graphs and PyTorch, over random inputs: every mask, batches of 1 and 3, all timesteps used."""
     encoder, denoiser = (session(folder / name) for name in (ENCODER, DENOISER))
-    masks = itertools.product((0, 1), repeat=len(spec.images)) if spec.mask_aware else [None]
+    masks = itertools.product((0, 1), repeat=len(spec.images)) if spec.policy.mask_aware else [None]
     differences = []
     with torch.no_grad():
         for mask, batch in itertools.product(masks, (1, 3)):
@@ -112,7 +122,7 @@ def largest_difference(spec: Spec, policy: Policy, folder: Path) -> float:
     return float(np.max(differences))
 
 
-def _spoil_absent(spec: Spec, inputs: tuple[Tensor, ...], mask: tuple[int, ...]) -> tuple[Tensor, ...]:
+def _spoil_absent(spec: Experiment, inputs: tuple[Tensor, ...], mask: tuple[int, ...]) -> tuple[Tensor, ...]:
     """The same inputs, with NaN where the mask has no picture."""
     absent = {o.key for o, there in zip(spec.images, mask, strict=True) if not there}
     named = zip(encoder_inputs(spec), inputs, strict=True)
@@ -142,9 +152,9 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     try:
-        state = torch.load(args.checkpoint, map_location="cpu", weights_only=False)
-    except OSError as error:
-        sys.exit(f"export: {args.checkpoint}: {error}")
+        state = read_checkpoint(args.checkpoint)
+    except ValueError as error:
+        sys.exit(f"export: {error}")
     if "final_loss" not in state["provenance"]:
         sys.exit(f"export: {args.checkpoint} belongs to a training that has not ended; continue it with --resume")
     difference = export(state, args.out)

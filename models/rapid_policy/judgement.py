@@ -42,7 +42,9 @@ def program() -> str:
     found = shutil.which(named or "rapid")
     if found is None:
         what = f"RAPID_BIN={named} is no program" if named else "no program `rapid` in the PATH"
-        raise JudgementError(f"{what}: build it (cargo build --release) and set RAPID_BIN=/path/to/target/release/rapid")
+        raise JudgementError(
+            f"{what}: build it (cargo build --release) and set RAPID_BIN=/path/to/target/release/rapid"
+        )
     return found
 
 
@@ -56,17 +58,23 @@ def judge(files: Iterable[Path]) -> dict[Path, Judgement]:
 
 
 def _ask(rapid: str, files: list[Path]) -> dict[Path, Judgement]:
+    # The program takes a file with several names once.
+    asked = {file: str(file.resolve()) for file in files}
+    names = sorted(set(asked.values()))
     # Naming a file twice makes the output a list, in which an unreadable file has a line like the others.
-    names = [str(file) for file in (files if len(files) > 1 else files * 2)]
+    names *= 2 if len(names) == 1 else 1
     command = [rapid, "inspect", "--json", "--", *names]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in (0, UNREADABLE):
         raise JudgementError(f"{rapid} inspect: exit code {done.returncode}: {done.stderr.strip()}")
     try:
         lines = [json.loads(line) for line in done.stdout.splitlines()]
-        judged = [Judgement(line["verdict"], tuple(line["reasons"])) for line in lines]
+        judged = {line["file"]: Judgement(line["verdict"], tuple(line["reasons"])) for line in lines}
     except (ValueError, KeyError, TypeError) as error:
-        raise JudgementError(f"{rapid} inspect: an answer that is not understood ({error}); is it this version?") from error
-    if len(judged) != len(names):
-        raise JudgementError(f"{rapid} inspect: {len(judged)} answers for {len(names)} files: {done.stderr.strip()}")
-    return dict(zip((Path(name) for name in names), judged, strict=True))
+        raise JudgementError(
+            f"{rapid} inspect: an answer that is not understood ({error}); is it this version?"
+        ) from error
+    missing = [name for name in names if name not in judged]
+    if missing:
+        raise JudgementError(f"{rapid} inspect: no answer about {missing[0]}: {done.stderr.strip()}")
+    return {file: judged[name] for file, name in asked.items()}

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .spec import Network, Spec
+from .experiment import SMALL_POOL, Encoder, Experiment
+from .resnet import CHANNELS, STRIDE, ResNet18
 
-# The first thing an image encoder does is to average this many pixels each way: half the picture is enough to see the
-# lattice, and training keeps the smaller pictures in memory.
-POOL = 2
+SHARED = "shared"
 
 
 class SpatialSoftmax(nn.Module):
@@ -36,41 +36,72 @@ class SpatialSoftmax(nn.Module):
         return (attention @ self.grid).flatten(1)
 
 
-class ImageEncoder(nn.Module):
-    """One picture [B, 3, H, W] in -1..1 -> [B, image_features]."""
+class SmallEncoder(nn.Module):
+    """One picture [B, 3, H, W] in -1..1 -> [B, features].
 
-    def __init__(self, height: int, width: int, sizes: Network) -> None:
+    Half the picture is enough to see a lattice: it is averaged to that first.
+    """
+
+    def __init__(self, height: int, width: int, sizes: Encoder) -> None:
         super().__init__()
 
         def block(inputs: int, outputs: int, kernel: int, stride: int) -> nn.Sequential:
             convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
             return nn.Sequential(convolution, nn.GroupNorm(max(1, outputs // 8), outputs), nn.ReLU())
 
-        c = sizes.image_width
+        c = sizes.width
         self.net = nn.Sequential(block(3, c, 5, 2), block(c, 2 * c, 3, 2), block(2 * c, 4 * c, 3, 1))
         # The mean shows what is present, the keypoints where it is.
-        self.where = SpatialSoftmax(4 * c, sizes.keypoints, height // POOL // 4, width // POOL // 4)
-        self.out = nn.Linear(4 * c + 2 * sizes.keypoints, sizes.image_features)
+        self.where = SpatialSoftmax(4 * c, sizes.keypoints, height // SMALL_POOL // 4, width // SMALL_POOL // 4)
+        self.out = nn.Linear(4 * c + 2 * sizes.keypoints, sizes.features)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.pooled(F.avg_pool2d(x, POOL))
+        return self.pooled(F.avg_pool2d(x, SMALL_POOL))
 
     def pooled(self, x: Tensor) -> Tensor:
-        """The same for a picture that is already pooled: [B, 3, H / POOL, W / POOL]."""
+        """The same for a picture that is already pooled: [B, 3, H / 2, W / 2]."""
         features = self.net(x)
         return self.out(torch.cat([features.mean((2, 3)), self.where(features)], 1))
+
+
+class ResNetEncoder(nn.Module):
+    """One picture [B, 3, H, W] in -1..1 -> [B, features]: mean and keypoints of what ResNet-18 finds."""
+
+    # Of the pictures that torchvision's weights were trained on, for values in 0..1.
+    MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+    def __init__(self, height: int, width: int, sizes: Encoder) -> None:
+        super().__init__()
+        self.trunk = ResNet18(frozen=sizes.weights is not None)
+        self.where = SpatialSoftmax(CHANNELS[-1], sizes.keypoints, -(-height // STRIDE), -(-width // STRIDE))
+        self.out = nn.Linear(CHANNELS[-1] + 2 * sizes.keypoints, sizes.features)
+        mean, std = (torch.tensor(v).view(3, 1, 1) for v in (self.MEAN, self.STD))
+        plain = sizes.weights is None
+        self.register_buffer("scale", torch.ones(3, 1, 1) if plain else 0.5 / std, persistent=False)
+        self.register_buffer("offset", torch.zeros(3, 1, 1) if plain else (0.5 - mean) / std, persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        features = self.trunk(x * self.scale + self.offset)
+        return self.out(torch.cat([features.mean((2, 3)), self.where(features)], 1))
+
+    pooled = forward
+
+
+ENCODERS = {"small": SmallEncoder, "resnet18": ResNetEncoder}
 
 
 class ObservationEncoder(nn.Module):
     """All observations -> `global_cond` [B, Dc]: at each step the vectors, then an embedding of each picture."""
 
-    def __init__(self, spec: Spec) -> None:
+    def __init__(self, spec: Experiment) -> None:
         super().__init__()
-        self.keys = [o.key for o in spec.observations]
+        self.keys = [o.key for o in spec.observation]
         self.image_keys = [o.key for o in spec.images]
         self.vector_keys = [o.key for o in spec.vectors]
-        self.mask_aware = spec.mask_aware
-        self.images = nn.ModuleDict({o.key: ImageEncoder(*o.shape[1:], spec.network) for o in spec.images})
+        self.mask_aware, self.shared = spec.policy.mask_aware, spec.encoder.shared
+        kind = ENCODERS[spec.encoder.type]
+        one_each = {SHARED: spec.images[0]} if self.shared and spec.images else {o.key: o for o in spec.images}
+        self.images = nn.ModuleDict({key: kind(*o.shape[1:], spec.encoder) for key, o in one_each.items()})
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Inputs in the order of the observations: pictures [B, To, 3, H, W], vectors [B, To, D]; then the mask."""
@@ -82,7 +113,7 @@ class ObservationEncoder(nn.Module):
         vectors = [observations[key] for key in self.vector_keys]
         embeddings = []
         for i, key in enumerate(self.image_keys):
-            pictures, encoder = observations[key], self.images[key]
+            pictures, encoder = observations[key], self.images[SHARED if self.shared else key]
             embedding = (encoder.pooled if pooled else encoder)(pictures.flatten(0, 1))
             embedding = embedding.unflatten(0, pictures.shape[:2])
             if mask is not None:
@@ -96,9 +127,10 @@ class ObservationEncoder(nn.Module):
 class ConvBlock(nn.Module):
     """[B, C, T] -> [B, outputs, T]"""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
         super().__init__()
-        self.block = nn.Sequential(nn.Conv1d(inputs, outputs, 5, padding=2), nn.GroupNorm(8, outputs), nn.Mish())
+        convolution = nn.Conv1d(inputs, outputs, kernel, padding=kernel // 2)
+        self.block = nn.Sequential(convolution, nn.GroupNorm(8, outputs), nn.Mish())
 
     def forward(self, x: Tensor) -> Tensor:
         return self.block(x)
@@ -107,9 +139,9 @@ class ConvBlock(nn.Module):
 class ResidualBlock(nn.Module):
     """Two convolutions, scaled and shifted by the condition (FiLM): [B, inputs, T], [B, D] -> [B, outputs, T]."""
 
-    def __init__(self, inputs: int, outputs: int, condition: int) -> None:
+    def __init__(self, inputs: int, outputs: int, condition: int, kernel: int) -> None:
         super().__init__()
-        self.first, self.second = ConvBlock(inputs, outputs), ConvBlock(outputs, outputs)
+        self.first, self.second = ConvBlock(inputs, outputs, kernel), ConvBlock(outputs, outputs, kernel)
         self.film = nn.Sequential(nn.Mish(), nn.Linear(condition, 2 * outputs))
         self.skip = nn.Conv1d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
 
@@ -123,7 +155,7 @@ class Denoiser(nn.Module):
 
     STEP_FEATURES = 64
 
-    def __init__(self, actions: int, condition: int, widths: tuple[int, ...]) -> None:
+    def __init__(self, actions: int, condition: int, widths: tuple[int, ...], kernel: int = 5) -> None:
         super().__init__()
         d = self.STEP_FEATURES
         frequencies = torch.exp(torch.arange(d // 2) * -(math.log(10_000) / (d // 2 - 1)))
@@ -132,17 +164,19 @@ class Denoiser(nn.Module):
         c = condition + d
         levels = list(zip((actions, *widths[:-1]), widths, strict=True))
         self.down = nn.ModuleList(
-            nn.ModuleList([ResidualBlock(i, o, c), ResidualBlock(o, o, c), shrink])
+            nn.ModuleList([ResidualBlock(i, o, c, kernel), ResidualBlock(o, o, c, kernel), shrink])
             for (i, o), shrink in zip(
                 levels, [*(nn.Conv1d(o, o, 3, 2, 1) for _, o in levels[:-1]), nn.Identity()], strict=True
             )
         )
-        self.middle = nn.ModuleList(ResidualBlock(widths[-1], widths[-1], c) for _ in range(2))
+        self.middle = nn.ModuleList(ResidualBlock(widths[-1], widths[-1], c, kernel) for _ in range(2))
         self.up = nn.ModuleList(
-            nn.ModuleList([ResidualBlock(2 * o, i, c), ResidualBlock(i, i, c), nn.ConvTranspose1d(i, i, 4, 2, 1)])
+            nn.ModuleList(
+                [ResidualBlock(2 * o, i, c, kernel), ResidualBlock(i, i, c, kernel), nn.ConvTranspose1d(i, i, 4, 2, 1)]
+            )
             for i, o in reversed(levels[1:])
         )
-        self.out = nn.Sequential(ConvBlock(widths[0], widths[0]), nn.Conv1d(widths[0], actions, 1))
+        self.out = nn.Sequential(ConvBlock(widths[0], widths[0], kernel), nn.Conv1d(widths[0], actions, 1))
 
     def forward(self, sample: Tensor, timestep: Tensor, global_cond: Tensor) -> Tensor:
         phase = timestep[:, None].float() * self.frequencies[None]
@@ -162,11 +196,16 @@ class Denoiser(nn.Module):
 class Policy(nn.Module):
     """Both networks, for training."""
 
-    def __init__(self, spec: Spec) -> None:
+    def __init__(self, spec: Experiment) -> None:
         super().__init__()
         self.spec = spec
         self.encoder = ObservationEncoder(spec)
-        self.denoiser = Denoiser(len(spec.action_names), spec.condition, spec.network.denoiser)
+        self.denoiser = Denoiser(spec.action_length, spec.condition, spec.denoiser.widths, spec.denoiser.kernel)
+
+    def start_from(self, weights: Path) -> None:
+        """The image encoders begin with torchvision's weights."""
+        for encoder in self.encoder.images.values():
+            encoder.trunk.load_file(weights)
 
 
 def parameters(modules: Iterable[nn.Module]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +20,17 @@ class MinMax:
     """[D]"""
 
     @staticmethod
-    def of(what: str, values: NDArray[np.float64]) -> MinMax:
-        """The range of `values` [N, D]; a dimension that never changes cannot be normalised."""
+    def of(what: str, values: NDArray[np.float64], turns: Iterable[int] = ()) -> MinMax:
+        """The range of `values` [N, D]; a dimension that never changes cannot be normalised.
+
+        The dimensions `turns` are of a rotation and keep their range, -1 to 1: scaled apart they are no rotation.
+        """
         low, high = values.min(0), values.max(0)
+        low[list(turns)], high[list(turns)] = -1.0, 1.0
         for dimension in np.flatnonzero(~(high > low)):
-            raise ValueError(f"{what}: dimension {dimension} is {low[dimension]} in all data, it has no range")
+            raise ValueError(
+                f"{what}: dimension {dimension} is {low[dimension]} in all data, it has no range: leave it out"
+            )
         return MinMax(low, high)
 
     def apply(self, values: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -1,21 +1,25 @@
-"""Trains a policy from recorded episodes.
+"""Trains a policy as an experiment describes it.
 
-    python -m rapid_policy.train EPISODES --out RUN [--resume]
+    python -m rapid_policy.train EXPERIMENT.toml [--data FOLDER...] --out RUN [--resume]
+    torchrun --nproc-per-node 2 -m rapid_policy.train EXPERIMENT.toml --out RUN
 
-Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` continues) and RUN/loss.png.
+Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` continues), RUN/best.pt (of the
+lowest loss on held-out episodes, if there are any), curves for TensorBoard and RUN/loss.png. SIGTERM and SIGINT end it
+after the present iteration, with a checkpoint.
 """
 
 from __future__ import annotations
 
 import argparse
-import copy
 import hashlib
 import math
 import platform
+import shutil
+import signal
 import sys
 import time
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,173 +28,190 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .dataset import Batch, Dataset
+from .checkpoint import BEST, CHECKPOINT, Run, begin, read_checkpoint
+from .corpus import Corpus, load
+from .dataset import Batch, Dataset, inputs
 from .diffusion import TRAIN_TIMESTEPS, add_noise, alphas_cumprod
-from .episodes import Episode, EpisodeError, episode_files, read_episodes
+from .episodes import Episode, EpisodeError
+from .experiment import Experiment
+from .experiment_file import ExperimentError, read_experiment
+from .feed import Feed
 from .model import Policy, parameters
-from .progress import Progress, plot, recent
-from .spec import SPECS, Spec
+from .progress import BOARD_EVERY, Board, Progress, plot, recent
+from .ranks import Ranks, join
 
-CHECKPOINT = "checkpoint.pt"
-SAVE_EVERY = 500
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Training schedule."""
-
-    iterations: int = 3900
-    minutes: float = math.inf
-    """The learning rate falls with whichever limit is reached first; training ends there."""
-    seed: int = 0
-    windows: int = 64
-    """Batch size."""
-    draws: int = 2
-    """Noises drawn for each window: the encoder is the more expensive half, and runs once for all of them."""
-    learning_rate: float = 1e-3
-    final_rate: float = 0.005
-    """Share of the learning rate that is left at the end."""
-    warmup: int = 100
-    """Iterations."""
-    decay: float = 0.995
-    """Decay of the moving average of the weights, which is exported."""
+# Batches of a measurement on held-out episodes, at most.
+VALIDATION_BATCHES = 16
+# Values of a tag that the model card counts.
+COUNTED = 8
 
 
-@dataclass
-class Run:
-    """The contents of a checkpoint."""
-
-    spec: Spec
-    schedule: Schedule
-    policy: Policy
-    average: Policy
-    optimizer: torch.optim.Optimizer
-    random: np.random.Generator
-    provenance: dict[str, Any]
-    iteration: int = 0
-    seconds: float = 0.0
-    losses: list[float] = field(default_factory=list)
-
-    def save(self, path: Path) -> None:
-        """Writes the checkpoint; a run that is stopped meanwhile leaves the previous one."""
-        state = {
-            "spec": self.spec.to_dict(),
-            "schedule": vars(self.schedule),
-            "policy": self.policy.state_dict(),
-            "average": self.average.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "random": self.random.bit_generator.state,
-            "torch_random": torch.get_rng_state(),
-            "provenance": self.provenance,
-            "iteration": self.iteration,
-            "seconds": self.seconds,
-            "losses": self.losses,
-        }
-        partial = path.with_suffix(".partial")
-        torch.save(state, partial)
-        partial.replace(path)
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Continues from the checkpoint `state`."""
-        self.policy.load_state_dict(state["policy"])
-        self.average.load_state_dict(state["average"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.random.bit_generator.state = state["random"]
-        torch.set_rng_state(state["torch_random"])
-        self.iteration, self.seconds, self.losses = state["iteration"], state["seconds"], state["losses"]
+class Stopped(Exception):
+    """A signal ended the training; its checkpoint is written."""
 
 
-def begin(spec: Spec, schedule: Schedule, dataset: Dataset, provenance: dict[str, Any], device: torch.device) -> Run:
-    """Networks with random weights, determined by the seed."""
-    torch.manual_seed(schedule.seed)
-    policy = Policy(spec).to(device)
-    optimizer = torch.optim.AdamW(
-        policy.parameters(), schedule.learning_rate, betas=(0.95, 0.999), weight_decay=1e-6, fused=True
-    )
-    ranges = {key: value.to_dict() for key, value in dataset.ranges.items()}
-    facts = {**provenance, "windows": len(dataset.windows), "normalization": ranges}
-    random = np.random.default_rng(schedule.seed)
-    return Run(spec, schedule, policy, copy.deepcopy(policy).requires_grad_(False), optimizer, random, facts)
+class Losses(nn.Module):
+    """The loss of a batch, as one module: what several processes compute together."""
+
+    def __init__(self, policy: Policy, device: torch.device) -> None:
+        super().__init__()
+        self.policy = policy
+        self._device, self._precision = device, policy.spec.training.precision
+        self._table = alphas_cumprod().to(device)
+
+    def forward(self, observations: dict[str, Tensor], mask: Tensor | None, clean: Tensor, timestep: Tensor,
+                noise: Tensor) -> Tensor:  # fmt: skip
+        """Mean squared error of the predicted noise."""
+        # By itself only the encoder: its convolutions gain most from half precision, the denoiser's small ones nothing.
+        both = self._precision == "bf16"
+        half = both or (self._precision == "auto" and half_width(self._device))
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=half):
+            condition = self.policy.encoder.encode(observations, mask, pooled=True)
+        draws = len(clean) // len(condition)
+        condition = condition.float().repeat(draws, 1)
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=both):
+            predicted = self.policy.denoiser(add_noise(clean, noise, timestep, self._table), timestep, condition)
+        return F.mse_loss(predicted.float(), noise)
 
 
-def train(run: Run, dataset: Dataset, out: Path) -> float:
-    """Trains to the end of the schedule. Returns the final loss: the mean of the last hundred iterations.
+class Trainer:
+    """A run, what it learns from, and where it writes."""
 
-    Whatever ends it before, the checkpoint in `out` is the one to continue from.
-    """
-    progress = Progress(run.spec.name, run.schedule.iterations, run.iteration)
-    try:
-        _iterate(run, dataset, out, progress)
-        run.provenance["final_loss"] = recent(run.losses)
-    finally:
-        progress.close()
-        run.save(out / CHECKPOINT)
-    plot(run.losses, run.spec.name, out / "loss.png")
-    return run.provenance["final_loss"]
+    def __init__(self, run: Run, dataset: Dataset, out: Path, *, held_out: Dataset | None = None,
+                 ranks: Ranks | None = None, workers: int = 0, minutes: float = math.inf) -> None:  # fmt: skip
+        self.run, self.dataset, self.out, self.held_out = run, dataset, out, held_out
+        self.ranks = ranks or Ranks(device=next(run.policy.parameters()).device)
+        self.workers = workers
+        self.minutes = min(minutes, run.schedule.minutes or math.inf)
+        self.losses = self.ranks.together(Losses(run.policy, self.ranks.device))
+        self.rows = self.ranks.rows(run.schedule.windows)
+        self.stopping = False
 
+    def train(self) -> float:
+        """Trains to the end of the schedule. Returns the final loss: the mean of the last hundred iterations.
 
-def _iterate(run: Run, dataset: Dataset, out: Path, progress: Progress) -> None:
-    schedule, device = run.schedule, next(run.policy.parameters()).device
-    table = alphas_cumprod().to(device)
-    started, before = time.monotonic(), run.seconds
-    while run.iteration < schedule.iterations:
-        run.seconds = before + time.monotonic() - started
-        done = max(run.iteration / schedule.iterations, run.seconds / (60 * schedule.minutes))
-        if done >= 1:
-            break
-        _set_rate(run, done)
-        loss = _loss(run, dataset.draw(run.random, schedule.windows), table, device)
-        if not torch.isfinite(loss):
+        Whatever ends it before, the checkpoint in `out` is the one to continue from.
+        """
+        run, first = self.run, self.ranks.first
+        progress = Progress(run.spec.name, run.iterations, run.iteration, first)
+        board = Board(self.out / "tensorboard", run.iteration) if first else None
+        feed = Feed(self.dataset, run.random, run.schedule.windows, self.rows, self.workers)
+        before = {number: signal.signal(number, self._stop) for number in _signals()}
+        try:
+            self._iterate(feed, progress, board)
+            run.provenance["final_loss"] = recent(run.losses)
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            feed.close()
+            progress.close()
+            if first:
+                board.close()
+                run.save(self.out / CHECKPOINT)
+        if first:
+            plot(run.losses, run.spec.name, self.out / "loss.png", run.validation)
+        return run.provenance["final_loss"]
+
+    def _stop(self, *_: Any) -> None:
+        self.stopping = True
+
+    def _iterate(self, feed: Feed, progress: Progress, board: Board | None) -> None:
+        run, schedule = self.run, self.run.schedule
+        started = saved = time.monotonic()
+        before = run.seconds
+        while run.iteration < run.iterations:
+            run.seconds = before + time.monotonic() - started
+            done = max(run.iteration / run.iterations, run.seconds / (60 * self.minutes))
+            done, stopping = self.ranks.agree(done, self.stopping)
+            if stopping:
+                raise Stopped
+            if done >= 1:
+                break
+            rate = _set_rate(run, done)
+            batch, state = feed.next()
+            loss = self._step(batch)
+            run.random_state = state
+            run.iteration += 1
+            run.losses.append(loss)
+            if not self.ranks.first:
+                continue
+            progress.step(run.losses, done, run.seconds)
+            if run.iteration % BOARD_EVERY == 0:
+                board.add(run.iteration, loss=loss, learning_rate=rate)
+            if self.held_out and (run.iteration % schedule.validate_every == 0 or run.iteration == run.iterations):
+                self._validate(board)
+            if time.monotonic() - saved >= 60 * schedule.checkpoint_minutes:
+                run.save(self.out / CHECKPOINT)
+                saved = time.monotonic()
+
+    def _step(self, batch: Batch) -> float:
+        run, device = self.run, self.ranks.device
+        loss = self.losses(*self._arguments(run.spec, batch, run.schedule.windows, self.rows, device))
+        mean = self.ranks.mean(loss)
+        if not math.isfinite(mean):
             raise ValueError(f"the loss is not finite in iteration {run.iteration}")
         run.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        nn.utils.clip_grad_norm_(run.policy.parameters(), 1.0)
+        nn.utils.clip_grad_norm_(run.policy.parameters(), run.schedule.clip)
         run.optimizer.step()
         _follow(run)
-        run.iteration += 1
-        run.losses.append(loss.item())
-        progress.step(run.losses, done, run.seconds)
-        if run.iteration % SAVE_EVERY == 0:
-            run.save(out / CHECKPOINT)
+        return mean
+
+    @staticmethod
+    def _arguments(spec: Experiment, batch: Batch, size: int, rows: slice, device: torch.device,
+                   random: torch.Generator | None = None) -> tuple[Any, ...]:  # fmt: skip
+        """Of `Losses`. The noise is drawn for the whole batch of `size` windows, whatever part `rows` is of it."""
+        draws = spec.training.draws
+        shape = (draws * size, spec.policy.horizon, spec.action_length)
+        timestep = torch.randint(0, TRAIN_TIMESTEPS, (draws * size,), generator=random)
+        noise = torch.randn(shape, generator=random)
+        timestep, noise = (x.unflatten(0, (draws, size))[:, rows].flatten(0, 1).to(device) for x in (timestep, noise))
+        mask = batch.mask.to(device) if spec.policy.mask_aware else None
+        clean = batch.actions.to(device).repeat(draws, 1, 1)
+        return inputs(spec, batch, device), mask, clean, timestep, noise
+
+    def _validate(self, board: Board) -> None:
+        """The loss of the averaged weights on held-out episodes: the same windows and noise each time, nothing varied."""
+        run, held_out = self.run, self.held_out
+        measure = Losses(run.average, self.ranks.device)
+        random, noise = np.random.default_rng(0), torch.Generator().manual_seed(0)
+        size, found = run.schedule.windows, []
+        with torch.no_grad():
+            for _ in range(min(VALIDATION_BATCHES, math.ceil(len(held_out.windows) / size))):
+                batch = held_out.gather(held_out.plan(random, size, vary=False))
+                found.append(
+                    measure(*self._arguments(run.spec, batch, size, slice(None), self.ranks.device, noise)).item()
+                )
+        loss = float(np.mean(found))
+        best = loss < run.best
+        run.validation.append((run.iteration, loss))
+        board.add(run.iteration, validation=loss)
+        print(
+            f"{run.spec.name}: {run.iteration}/{run.iterations} held out {loss:.4f}{', the best' if best else ''}",
+            flush=True,
+        )
+        if best:
+            run.save(self.out / BEST, final_loss=recent(run.losses), validation_loss=loss)
 
 
-def _set_rate(run: Run, done: float) -> None:
-    """Warm-up, then half a cosine down."""
+def _signals() -> list[signal.Signals]:
+    import threading
+
+    main = threading.current_thread() is threading.main_thread()
+    return [signal.SIGTERM, signal.SIGINT] if main else []
+
+
+def _set_rate(run: Run, done: float) -> float:
+    """Warm-up, then down as the schedule has it. Returns the rate."""
     schedule = run.schedule
-    share = 0.5 * (1 + math.cos(math.pi * done)) + schedule.final_rate
+    fallen = {"cosine": 0.5 * (1 + math.cos(math.pi * done)), "linear": 1 - done, "constant": 1.0}[schedule.scheduler]
+    share = fallen + (schedule.final_rate if schedule.scheduler != "constant" else 0.0)
+    rate = schedule.learning_rate * min(1.0, run.iteration / max(1, schedule.warmup)) * share
+    if not schedule.warmup:
+        rate = schedule.learning_rate * share
     for group in run.optimizer.param_groups:
-        group["lr"] = schedule.learning_rate * min(1.0, run.iteration / schedule.warmup) * share
-
-
-def _loss(run: Run, batch: Batch, table: Tensor, device: torch.device) -> Tensor:
-    """Mean squared error of the predicted noise."""
-    observations = {key: value.to(device) for key, value in batch.observations.items()}
-    mask = drop(run.spec, batch.present, run.random).to(device) if run.spec.mask_aware else None
-    # Only the encoder: its convolutions gain most from half precision, the denoiser's small ones nothing.
-    with torch.autocast(device.type, torch.bfloat16, enabled=half_width(device)):
-        condition = run.policy.encoder.encode(observations, mask, pooled=True)
-    condition = condition.float().repeat(run.schedule.draws, 1)
-    clean = batch.actions.to(device).repeat(run.schedule.draws, 1, 1)
-    timestep = torch.randint(0, TRAIN_TIMESTEPS, (len(clean),)).to(device)
-    noise = torch.randn(clean.shape).to(device)
-    predicted = run.policy.denoiser(add_noise(clean, noise, timestep, table), timestep, condition)
-    return F.mse_loss(predicted, noise)
-
-
-def drop(spec: Spec, present: Tensor, random: np.random.Generator) -> Tensor:
-    """Masks pictures at random, f32 [B, M]: of several `present` ones, bool [B, M], at least one always remains.
-
-    A policy with one picture has its vectors left.
-    """
-    rates = np.array([o.dropout for o in spec.images])
-    there = present.numpy()
-    kept = there & (random.random(there.shape) >= rates)
-    if len(rates) > 1:
-        # The one that remains in a window that lost all: any present one, with equal probability.
-        lot = np.where(there, random.random(there.shape), -1.0)
-        lost = ~kept.any(1) & there.any(1)
-        kept[lost, lot[lost].argmax(1)] = True
-    return torch.from_numpy(kept.astype(np.float32))
+        group["lr"] = rate
+    return rate
 
 
 @torch.no_grad()
@@ -208,94 +229,143 @@ def half_width(device: torch.device) -> bool:
     return bool(torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
-def provenance(episodes: list[Episode], command: str) -> dict[str, Any]:
+def provenance(episodes: Sequence[Episode], command: str) -> dict[str, Any]:
     """The origin of the weights: training data and software."""
     digest = hashlib.sha256()
     for episode in episodes:
-        digest.update(hashlib.sha256(episode.path.read_bytes()).digest())
-    seeds = sorted(int(e.tags["seed"]) for e in episodes if e.tags.get("seed", "").isdigit())
+        digest.update(bytes.fromhex(episode.sha256))
+    tags = [e.facts.tags for e in episodes]
+    seeds = sorted(int(t["seed"]) for t in tags if t.get("seed", "").isdigit())
     return {
         "episodes": len(episodes),
         "frames": sum(len(e) for e in episodes),
-        "textures": dict(sorted(Counter(e.tags.get("texture", "unknown") for e in episodes).items())),
+        "tags": _counted(tags),
         "episode_seeds": [seeds[0], seeds[-1]] if seeds else None,
         "episodes_sha256": digest.hexdigest(),
-        "recorded_by": sorted({e.facts.get("software", "") for e in episodes}),
+        "recorded_by": sorted({e.facts.software for e in episodes}),
         "command": command,
-        "torch": torch.__version__,
+        "torch": str(torch.__version__),
         "python": platform.python_version(),
     }
 
 
-def load_episodes(spec: Spec, folder: Path) -> list[Episode]:
-    """The episodes of a folder; prints those left out."""
-    episodes, left_out = read_episodes(episode_files(folder), spec.observations, len(spec.action_names))
-    for line in left_out:
-        print(line, file=sys.stderr)
-    if not episodes:
-        raise EpisodeError(folder, "no episode that is fit to learn from")
-    return episodes
+def _counted(tags: list[dict[str, str]]) -> dict[str, dict[str, int]]:
+    """How many episodes have each value of a tag, of tags with few values."""
+    counts = {key: Counter(t[key] for t in tags if key in t) for key in sorted({key for t in tags for key in t})}
+    return {key: dict(sorted(of.items())) for key, of in counts.items() if key != "seed" and len(of) <= COUNTED}
 
 
-def pick_device(name: str) -> torch.device:
-    """`auto`: the GPU if there is one."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
-
-
-def hardware(device: torch.device) -> str:
+def hardware(device: torch.device, world: int = 1) -> str:
     """The device of the training, in words."""
     if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    threads = torch.get_num_threads()
-    return f"{threads} CPU thread{'s' if threads > 1 else ''}"
+        name = torch.cuda.get_device_name(device)
+    else:
+        threads = torch.get_num_threads()
+        name = f"{threads} CPU thread{'s' if threads > 1 else ''}"
+    return name if world == 1 else f"{world} processes, each {name}"
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="rapid_policy.train", description="Trains a policy from recorded episodes.")
+    add = parser.add_argument
+    add("experiment", type=Path, help="its description (*.toml)")
+    add("--data", type=Path, nargs="+", metavar="FOLDER", help="episodes, in place of the experiment's folders")
+    add(
+        "--out", type=Path, required=True, metavar="RUN", help="folder for checkpoints, curves and the plot of the loss"
+    )
+    add("--cache", type=Path, help="folder of decoded episodes (default: cache, beside RUN)")
+    add("--iterations", type=int, help="in place of the experiment's")
+    add("--minutes", type=float, default=math.inf, help="end after so long at the latest")
+    add("--seed", type=int, help="in place of the experiment's")
+    add("--threads", type=int, default=2, help="of the CPU")
+    add("--workers", type=int, default=1, help="threads that read ahead, and processes that decode")
+    add("--device", default="auto", help="auto, cpu, cuda")
+    add("--resume", action="store_true", help="continue from the checkpoint in --out")
+    return parser.parse_args()
+
+
+def with_options(spec: Experiment, args: argparse.Namespace) -> Experiment:
+    """The experiment, with what the command line has in place of it."""
+    changes: dict[str, Any] = {} if args.iterations is None else {"iterations": args.iterations, "epochs": None}
+    changes |= {} if args.seed is None else {"seed": args.seed}
+    return spec.model_copy(update={"training": spec.training.model_copy(update=changes)})
+
+
+def open_corpus(spec: Experiment, args: argparse.Namespace, ranks: Ranks) -> Corpus:
+    """The episodes; the first process decodes, the others use what it made."""
+    folders = args.data or [Path(folder) for folder in spec.data.folders]
+    if not folders:
+        raise ExperimentError(f"{args.experiment}: data.folders: missing: add it, or give --data FOLDER")
+    cache = args.cache or args.out.parent / "cache"
+    if not ranks.first:
+        ranks.wait()
+        return load(spec, folders, cache)
+    try:
+        corpus = load(spec, folders, cache, max(1, args.workers))
+        print(corpus.report(), file=sys.stderr)
+        return corpus
+    finally:
+        ranks.wait()
+
+
+def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
+    """All that a training needs, from the command line."""
+    spec = with_options(read_experiment(args.experiment), args)
+    args.out.mkdir(parents=True, exist_ok=True)
+    checkpoint = args.out / CHECKPOINT
+    state = read_checkpoint(checkpoint) if args.resume else None
+    if state and (changed := spec.learns_the_same(Experiment.from_text(state["experiment"]))):
+        raise ValueError(
+            f"{args.experiment}: {changed}: not as in {checkpoint}: use another --out, or leave it as it was"
+        )
+    corpus = open_corpus(spec, args, ranks)
+    dataset = Dataset(spec, corpus.training)
+    held_out = Dataset(spec, corpus.held_out, dataset.ranges) if corpus.held_out and ranks.first else None
+    facts = provenance(corpus.training, command(args, spec))
+    facts |= {"hardware": hardware(ranks.device, ranks.world), "held_out": len(corpus.held_out)}
+    if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
+        raise ValueError(f"{checkpoint} was trained on other episodes than these")
+    run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device)
+    if state:
+        run.load(state)
+    if ranks.first:
+        shutil.copyfile(args.experiment, args.out / "experiment.toml")
+        counts = (
+            f"{len(corpus.training)} episodes, {len(dataset.windows)} windows, {parameters([run.policy]):,} parameters"
+        )
+        print(f"{spec.name}: {counts}", flush=True)
+    return Trainer(run, dataset, args.out, held_out=held_out, ranks=ranks, workers=args.workers, minutes=args.minutes)
+
+
+def command(args: argparse.Namespace, spec: Experiment) -> str:
+    """How the training is repeated."""
+    words = ["python -m rapid_policy.train", f"experiments/{args.experiment.name}", "--data EPISODES --out RUN"]
+    words += [f"--iterations {args.iterations}"] if args.iterations is not None else []
+    return " ".join([*words, f"--seed {spec.training.seed}"])
 
 
 def main() -> None:
-    defaults = Schedule()
-    parser = argparse.ArgumentParser(prog="rapid_policy.train", description="Trains a policy from recorded episodes.")
-    parser.add_argument("episodes", type=Path, help="folder of episodes (*.mcap)")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint and the plot of the loss")
-    parser.add_argument("--policy", choices=sorted(SPECS), default="tactile-id")
-    parser.add_argument("--iterations", type=int, default=defaults.iterations)
-    parser.add_argument("--minutes", type=float, default=math.inf, help="end after so long at the latest")
-    parser.add_argument("--seed", type=int, default=defaults.seed)
-    parser.add_argument("--threads", type=int, default=2, help="of the CPU")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda")
-    parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in --out")
-    args = parser.parse_args()
+    args = parse()
     torch.set_num_threads(args.threads)
-    args.out.mkdir(parents=True, exist_ok=True)
-    checkpoint = args.out / CHECKPOINT
+    ranks = join(args.device)
     try:
-        state = torch.load(checkpoint, weights_only=False) if args.resume else None
-        spec = Spec.from_dict(state["spec"]) if state else SPECS[args.policy]()
-        episodes = load_episodes(spec, args.episodes)
-        dataset = Dataset(spec, episodes)
-    except (OSError, EpisodeError, ValueError) as error:
-        sys.exit(f"train: {error}")
-    command_line = f"python -m rapid_policy.train EPISODES --out RUN --iterations {args.iterations} --seed {args.seed}"
-    schedule = replace(defaults, iterations=args.iterations, minutes=args.minutes, seed=args.seed)
-    if state:
-        schedule = replace(Schedule(**state["schedule"]), minutes=args.minutes)
-    device = pick_device(args.device)
-    facts = provenance(episodes, command_line)
-    facts["hardware"] = hardware(device)
-    if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
-        sys.exit(f"train: {checkpoint} was trained on other episodes than those in {args.episodes}")
-    run = begin(spec, schedule, dataset, facts, device)
-    if state:
-        run.load(state)
-    counts = f"{len(episodes)} episodes, {len(dataset.windows)} windows, {parameters([run.policy]):,} parameters"
-    print(f"{spec.name}: {counts}", flush=True)
-    try:
-        final = train(run, dataset, args.out)
-    except ValueError as error:
-        sys.exit(f"train: {error}")
-    except KeyboardInterrupt:
-        sys.exit(f"train: stopped after {run.iteration} iterations; --resume continues from {checkpoint}")
-    print(f"final loss {final:.4f} after {run.iteration} iterations, {run.seconds / 60:.1f} min: {checkpoint}")
+        trainer = prepare(args, ranks)
+        run = trainer.run
+        try:
+            final = trainer.train()
+        except Stopped:
+            where = args.out / CHECKPOINT
+            sys.exit(f"train: stopped after {run.iteration} iterations; --resume continues from {where}")
+        if ranks.first:
+            print(
+                f"final loss {final:.4f} after {run.iteration} iterations, {run.seconds / 60:.1f} min: {args.out / CHECKPOINT}"
+            )
+    except (OSError, EpisodeError, ExperimentError, ValueError) as error:
+        lines = str(error).splitlines()
+        sys.exit("\n".join(f"train: {line}" for line in lines))
+    finally:
+        ranks.end()
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from torch import nn
 
 from .bundle import DENOISER, ENCODER, POLICY
 from .model import Policy
-from .spec import Network, Observation, Spec
+from .experiment import Experiment
 
 
 def load_policy(folder: Path) -> Policy:
@@ -39,34 +39,47 @@ def _load(module: nn.Module, found: dict[str, torch.Tensor], path: Path) -> None
     module.load_state_dict({name: found[name] for name in module.state_dict()})
 
 
-def _spec(described: dict[str, Any], encoder: dict[str, torch.Tensor], denoiser: dict[str, torch.Tensor]) -> Spec:
-    """The contents of `policy.json`, with the sizes that only the weights show."""
-    observations = tuple(
-        Observation(o["key"], o["kind"], o["modality"], tuple(o["shape"]), o["required"], o.get("operation"))
-        for o in described["observations"]
-    )
+def _spec(described: dict[str, Any], encoder: dict[str, torch.Tensor], denoiser: dict[str, torch.Tensor]) -> Experiment:
+    """The contents of `policy.json`, with the networks as it has them, otherwise as the weights show them."""
     action = described["action"]
-    image = next(o.key for o in observations if o.kind == "image")
+    network = described["training"].get("network") or _network(described, encoder, denoiser)
+    horizon = ("n_obs_steps", "horizon", "n_action_steps", "control_hz", "mask_aware", "max_observation_age_ms")
+    return Experiment.from_text(
+        json.dumps(
+            {
+                "format": "rapid-experiment/1",
+                "name": described["name"],
+                "policy": {key: described[key] for key in horizon}
+                | {"inference_steps": described["scheduler"]["num_inference_steps"]},
+                "observation": [_observation(o) for o in described["observations"]],
+                # Where the actions came from is no part of a bundle; what they are is in `policy.json`.
+                "action": {"actuator": action["actuator"], "names": action["names"], "units": action["units"]},
+                **network,
+                "training": {"iterations": 1},
+            }
+        )
+    )
+
+
+def _observation(o: dict[str, Any]) -> dict[str, Any]:
+    named = {key: o[key] for key in ("key", "kind", "modality", "required")}
+    if o["kind"] == "vector":
+        begin, end = o.get("slice") or (0, o["shape"][0])
+        return {**named, "columns": list(range(begin, end))}
+    size = {key: o[key] for key in ("resize", "crop", "operation") if o.get(key)}
+    return {**named, **({"size": o["shape"][1:]} if not {"resize", "crop"} & set(size) else {}), **size}
+
+
+def _network(
+    described: dict[str, Any], encoder: dict[str, torch.Tensor], denoiser: dict[str, torch.Tensor]
+) -> dict[str, Any]:
+    image = next(o["key"] for o in described["observations"] if o["kind"] == "image")
     widths = []
     while (weight := denoiser.get(f"down.{len(widths)}.0.first.block.0.weight")) is not None:
         widths.append(weight.shape[0])
-    network = Network(
-        image_width=encoder[f"images.{image}.net.0.0.weight"].shape[0],
-        image_features=encoder[f"images.{image}.out.weight"].shape[0],
-        keypoints=encoder[f"images.{image}.where.features.weight"].shape[0],
-        denoiser=tuple(widths),
-    )
-    return Spec(
-        name=described["name"],
-        observations=observations,
-        action_names=tuple(action["names"]),
-        action_units=tuple(action["units"]),
-        actuator=action["actuator"],
-        n_obs_steps=described["n_obs_steps"],
-        horizon=described["horizon"],
-        n_action_steps=described["n_action_steps"],
-        control_hz=described["control_hz"],
-        mask_aware=described["mask_aware"],
-        inference_steps=described["scheduler"]["num_inference_steps"],
-        network=network,
-    )
+    sizes = {
+        "width": encoder[f"images.{image}.net.0.0.weight"].shape[0],
+        "features": encoder[f"images.{image}.out.weight"].shape[0],
+        "keypoints": encoder[f"images.{image}.where.features.weight"].shape[0],
+    }
+    return {"encoder": sizes, "denoiser": {"widths": widths}}

@@ -1,44 +1,23 @@
 """Windows: which ticks are learned from, and what a policy would have been given at each."""
 
-import sys
 import unittest
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+import torch
+from made_up import by_hand, experiment, made_up, observed, small
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+from rapid_policy.dataset import Dataset, drop, inputs, unfit
+from rapid_policy.experiment import Experiment
 
-from rapid_policy import dataset as module
-from rapid_policy.dataset import Dataset
-from rapid_policy.episodes import Episode
-from rapid_policy.spec import PICTURE, tactile_id
-
-SIDE = PICTURE[1]
+CPU = torch.device("cpu")
 
 
-def made_up(length: int, seed: int = 0) -> Episode:
-    """An episode in which everything is there; the number of the tick is in every picture and vector."""
-    random = np.random.default_rng(seed)
-    count = np.arange(length)
-    pictures = np.broadcast_to(count[:, None, None, None], (length, SIDE, SIDE, 3)).astype(np.uint8)
-    names = ("cam_wrist", "tactile_tip", "arm")
-    return Episode(
-        path=Path("made-up"),
-        ticks=count.astype(np.int64),
-        times=count * 100_000_000,
-        values={
-            "cam_wrist": pictures,
-            "tactile_tip": pictures + 100,
-            "arm": count[:, None] + random.uniform(0, 1, (length, 4)),
-        },
-        present={name: np.ones(length, bool) for name in names},
-        references={"cam_wrist": pictures[0], "tactile_tip": pictures[0] + 100},
-        actions=np.repeat(count[:, None] * 1.0, 4, 1),
-        acted=np.ones(length, bool),
-        facts={},
-        summary={},
-    )
+def plain() -> Experiment:
+    """The policy without chance: no noise on vectors, no gain, no shift, nothing taken away."""
+    spec = experiment()
+    for key in ("wrist", "tactile", "state"):
+        spec = observed(spec, key, augmentation={}, **({"dropout": {}} if key != "state" else {}))
+    return spec
 
 
 def segments(dataset: Dataset) -> list[tuple[int, int]]:
@@ -46,72 +25,167 @@ def segments(dataset: Dataset) -> list[tuple[int, int]]:
     return sorted({(int(begin), int(end)) for _, begin, end in dataset.windows})
 
 
+def drawn(dataset: Dataset, size: int, seed: int = 0):
+    """A batch, and the inputs of the encoder."""
+    batch = dataset.gather(dataset.plan(np.random.default_rng(seed), size))
+    return batch, inputs(dataset.spec, batch, CPU)
+
+
 class Windows(unittest.TestCase):
-    def setUp(self):
-        # Without chance: no noise on vectors, no gain, no shift.
-        self.plain = {"STATE_NOISE": 0.0, "BRIGHTNESS": 0.0, "SHIFT": dict.fromkeys(module.SHIFT, 0)}
-        self.before = {name: getattr(module, name) for name in self.plain}
-        for name, value in self.plain.items():
-            setattr(module, name, value)
-
-    def tearDown(self):
-        for name, value in self.before.items():
-            setattr(module, name, value)
-
     def test_episodes_do_not_run_into_each_other(self):
-        dataset = Dataset(tactile_id(), [made_up(30), made_up(20)])
+        dataset = Dataset(plain(), [made_up(30), made_up(20)])
         self.assertEqual(segments(dataset), [(0, 30), (30, 50)])
         self.assertEqual(len(dataset.windows), 50)
 
     def test_what_is_missing_breaks_a_segment(self):
         episode = made_up(30)
-        episode.present["arm"][10] = False
+        episode.present("arm")[10] = False
         episode.acted[20] = False
-        self.assertEqual(segments(Dataset(tactile_id(), [episode])), [(0, 10), (11, 20), (21, 30)])
+        self.assertEqual(segments(Dataset(plain(), [episode])), [(0, 10), (11, 20), (21, 30)])
 
     def test_a_gap_in_the_frame_index_breaks_a_segment(self):
         episode = made_up(30)
         episode.ticks[12:] += 1
-        self.assertEqual(segments(Dataset(tactile_id(), [episode])), [(0, 12), (12, 30)])
+        self.assertEqual(segments(Dataset(plain(), [episode])), [(0, 12), (12, 30)])
 
     def test_what_is_not_required_may_be_absent(self):
         episode = made_up(30)
-        episode.present["tactile_tip"][10:20] = False
-        dataset = Dataset(tactile_id(), [episode])
+        episode.present("tactile_tip")[10:20] = False
+        dataset = Dataset(plain(), [episode])
         self.assertEqual(segments(dataset), [(0, 30)])
         dataset.windows = dataset.windows[10:21]
-        batch = dataset.draw(np.random.default_rng(0), 200)
-        tactile = batch.observations["tactile"]
-        absent = ~batch.present[:, 1]
+        batch, given = drawn(dataset, 200)
+        absent = batch.mask[:, 1] == 0
         self.assertTrue(absent.any() and not absent.all())
-        self.assertEqual(float(tactile[absent][:, 1].abs().max()), 0)
+        self.assertEqual(float(given["tactile"][absent].abs().max()), 0)
         # Plugged in again at 20: the step before shows what tick 20 shows, the difference of 20 grey levels.
-        self.assertAlmostEqual(float(tactile[~absent][:, 0].min()), 20 / 255, places=5)
+        self.assertAlmostEqual(float(given["tactile"][~absent][:, 0].min()), 20 / 255, places=5)
 
     def test_a_window_is_of_its_tick(self):
-        dataset = Dataset(tactile_id(), [made_up(40)])
+        dataset = Dataset(plain(), [made_up(40)])
         dataset.windows = dataset.windows[[0, 12, 39]]
-        batch = dataset.draw(np.random.default_rng(0), 100)
+        batch, given = drawn(dataset, 100)
         actions = dataset.ranges["action"].invert(batch.actions.numpy())[:, :, 0].round().astype(int)
         seen = {tuple(row) for row in actions}
         # The action of the tick has index 1; beyond an end the last one is repeated.
         expected = {(0, *range(15)), tuple(range(11, 27)), (38, *[39] * 15)}
         self.assertEqual(seen, expected)
-        wrist = ((batch.observations["wrist"][:, :, 0, 0, 0] + 1) * 127.5).round().int()
+        wrist = ((given["wrist"][:, :, 0, 0, 0] + 1) * 127.5).round().int()
         self.assertEqual({tuple(row) for row in wrist.tolist()}, {(0, 0), (11, 12), (38, 39)})
 
     def test_nothing_to_learn_from_is_said(self):
         episode = made_up(10)
-        episode.acted[:] = False
+        episode.present("arm")[:] = False
         with self.assertRaisesRegex(ValueError, "no window"):
-            Dataset(tactile_id(), [episode])
+            Dataset(plain(), [episode])
 
-    def test_a_policy_without_pictures_that_may_be_absent(self):
-        spec = tactile_id()
-        spec = replace(spec, observations=tuple(replace(o, required=True) for o in spec.observations))
+    def test_what_is_required_ends_a_segment(self):
+        spec = experiment("vision-diff")
         episode = made_up(30)
-        episode.present["tactile_tip"][:15] = False
+        episode.present("tactile_tip")[:15] = False
         self.assertEqual(segments(Dataset(spec, [episode])), [(15, 30)])
+
+    def test_why_an_episode_is_unfit(self):
+        silent, other = made_up(10), made_up(10)
+        silent.acted[:] = False
+        other.facts.observation_hz = 30.0
+        short = made_up(10)
+        short.arrays["value arm"] = short.arrays["value arm"][:, :3]
+        strange = by_hand(10)
+        strange.arrays["value phone"] = strange.arrays["value phone"][:, :12]
+        for spec, episode, reason in (
+            (plain(), made_up(10), None),
+            (plain(), silent, "no action"),
+            (plain(), other, "recorded at 30 Hz, the policy acts at 10: write control_hz = 30"),
+            (plain(), short, "arm: 3 numbers, but number 3"),
+            (experiment("tactile-id-handheld"), by_hand(10), None),
+            (experiment("tactile-id-handheld"), strange, "phone: 12 numbers and layout 'columns': not a pose"),
+        ):
+            with self.subTest(reason):
+                found = unfit(spec, episode)
+                self.assertRegex(found, reason) if reason else self.assertIsNone(found)
+
+
+class Pictures(unittest.TestCase):
+    def test_a_shift_repeats_the_edges(self):
+        spec = observed(plain(), "tactile", augmentation={"shift": 4})
+        episode = made_up(5)
+        episode.arrays["value tactile_tip"] = np.tile(np.arange(96, dtype=np.uint8)[None, :, None, None], (5, 1, 96, 3))
+        episode.arrays["value tactile_tip"][1:] += 50
+        episode.arrays["value tactile_tip"][1:, 40] += 4
+        dataset = Dataset(spec, [episode])
+        dataset.windows = dataset.windows[3:4]
+        _, given = drawn(dataset, 64)
+        # The reference is shifted with the picture: the difference is 50 everywhere, and the brighter row moves.
+        rows = (given["tactile"][:, 1, 0, :, 0] * 255).round()
+        self.assertEqual(set(rows.unique().tolist()), {50.0, 52.0})
+        places = {int(row.argmax()) for row in rows}
+        self.assertEqual(places, {18, 19, 20, 21, 22})
+
+    def test_colours_may_be_the_other_way_round(self):
+        episode = made_up(5)
+        episode.arrays["value cam_wrist"] = np.tile(np.array([255, 0, 128], np.uint8), (5, 96, 96, 1))
+        for color, expected in (("rgb", [1, -1, 0]), ("bgr", [0, -1, 1])):
+            _, given = drawn(Dataset(observed(plain(), "wrist", color=color), [episode]), 2)
+            self.assertEqual(given["wrist"][0, 0, :, 3, 3].round().tolist(), expected)
+
+    def test_an_encoder_of_whole_pictures_is_given_them(self):
+        spec = experiment(encoder={"type": "resnet18"})
+        _, given = drawn(Dataset(spec, [made_up(5)]), 2)
+        self.assertEqual(tuple(given["wrist"].shape), (2, 2, 3, 96, 96))
+
+
+class Dropout(unittest.TestCase):
+    def masked(self, spec: Experiment, present: np.ndarray, steps: int = 2) -> np.ndarray:
+        """[B, To, M] of windows at random places of an episode of 100 ticks."""
+        count = len(present)
+        tick = np.random.default_rng(1).integers(steps, 100, count)
+        seen = tick[:, None] + np.arange(1 - steps, 1)
+        shape = (count, steps, present.shape[1])
+        spans = np.tile([0, 100], (count, 1))
+        return drop(spec, np.broadcast_to(present[:, None], shape), seen, spans, np.random.default_rng(0))
+
+    def test_dropout_leaves_one_picture_and_brings_none_back(self):
+        present = np.ones((20_000, 2), bool)
+        kept = self.masked(experiment(), present)[:, -1]
+        self.assertTrue(kept.any(1).all())
+        # Each is taken with 0.3; both with 0.09, and then one of them comes back by lot.
+        for share in (1 - kept.mean(0)).tolist():
+            self.assertAlmostEqual(share, 0.3 - 0.09 / 2, delta=0.015)
+        present[:, 0] = False
+        kept = self.masked(experiment(), present)[:, -1]
+        self.assertEqual((int(kept[:, 0].max()), int(kept[:, 1].min())), (0, 1))
+
+    def test_in_the_middle_of_a_window_the_first_new_picture_is_shown(self):
+        spec = observed(plain(), "wrist", dropout={"replug": 0.5})
+        dataset = Dataset(spec, [made_up(40)])
+        dataset.windows = dataset.windows[20:21]
+        batch, given = drawn(dataset, 2000)
+        self.assertTrue((batch.mask == 1).all())
+        wrist = ((given["wrist"][:, :, 0, 0, 0] + 1) * 127.5).round().int()
+        pairs = {tuple(row) for row in wrist.tolist()}
+        self.assertEqual(pairs, {(19, 20), (20, 20)})
+        self.assertAlmostEqual(float((wrist[:, 0] == 20).float().mean()), 0.5, delta=0.05)
+
+    def test_in_the_middle_of_an_episode_it_is_gone_more_often_towards_the_end(self):
+        spec = observed(plain(), "tactile", dropout={"episode": 0.6})
+        kept = self.masked(spec, np.ones((40_000, 2), bool))
+        tick = np.random.default_rng(1).integers(2, 100, 40_000)
+        self.assertTrue(kept[:, :, 0].all())
+        gone = [1 - kept[(tick >= a) & (tick < a + 20), -1, 1].mean() for a in (0, 40, 80)]
+        self.assertLess(gone[0], gone[1])
+        self.assertLess(gone[1], gone[2])
+        # Where it is back the step before may have been without it.
+        self.assertTrue((kept[:, 1, 1] & ~kept[:, 0, 1]).any())
+
+    def test_without_dropout_nothing_is_taken(self):
+        self.assertTrue(self.masked(plain(), np.ones((100, 2), bool)).all())
+
+    def test_a_measurement_varies_nothing(self):
+        dataset = Dataset(small(), [made_up(40)])
+        plan = dataset.plan(np.random.default_rng(0), 50, vary=False)
+        self.assertEqual(sorted(plan), ["done", "seen", "tick", "visible"])
+        self.assertTrue(plan["visible"].all())
 
 
 if __name__ == "__main__":

@@ -1,21 +1,17 @@
-"""The networks: what the mask hides, what dropout takes away, and that a bundle's graphs hold the whole policy."""
+"""The networks: what the mask hides, and that a bundle's graphs hold the whole policy."""
 
-import sys
+import json
 import tempfile
 import unittest
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
+from made_up import Experiment, experiment, observed
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json
-from rapid_policy.export import denoiser_example, encoder_example, largest_difference, write_graph
+from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json, write_card
+from rapid_policy.export import _network, denoiser_example, encoder_example, largest_difference, write_graph
 from rapid_policy.model import Policy
-from rapid_policy.spec import Spec, tactile_id
-from rapid_policy.train import drop
+from rapid_policy.resnet import ResNet18
 from rapid_policy.weights import load_policy
 
 RANGES = {
@@ -24,7 +20,7 @@ RANGES = {
 }
 
 
-def random_policy(spec: Spec) -> Policy:
+def random_policy(spec: Experiment) -> Policy:
     """With weights that are all different: those of a new network are ones and zeros in places."""
     torch.manual_seed(0)
     policy = Policy(spec).eval()
@@ -36,59 +32,144 @@ def random_policy(spec: Spec) -> Policy:
 
 class Mask(unittest.TestCase):
     def test_an_absent_picture_changes_nothing_even_if_it_is_not_a_number(self):
-        spec = tactile_id()
-        policy = random_policy(spec)
-        wrist, tactile, state, _ = encoder_example(spec)
-        absent = torch.tensor([[1.0, 0.0]]).repeat(2, 1)
-        with torch.no_grad():
-            plain = policy.encoder(wrist, tactile, state, absent)
-            spoilt = policy.encoder(wrist, tactile * torch.nan, state, absent)
-            present = policy.encoder(wrist, tactile, state, torch.ones(2, 2))
-        self.assertTrue(torch.equal(plain, spoilt))
-        self.assertFalse(torch.equal(plain, present))
+        for encoder in ({}, {"shared": True}):
+            spec = experiment(encoder=encoder)
+            policy = random_policy(spec)
+            wrist, tactile, state, _ = encoder_example(spec)
+            absent = torch.tensor([[1.0, 0.0]]).repeat(2, 1)
+            with torch.no_grad():
+                plain = policy.encoder(wrist, tactile, state, absent)
+                spoilt = policy.encoder(wrist, tactile * torch.nan, state, absent)
+                present = policy.encoder(wrist, tactile, state, torch.ones(2, 2))
+            self.assertTrue(torch.equal(plain, spoilt))
+            self.assertFalse(torch.equal(plain, present))
 
-    def test_dropout_leaves_one_picture_and_brings_none_back(self):
-        spec = tactile_id()
-        random = np.random.default_rng(0)
-        present = torch.ones(20_000, 2, dtype=torch.bool)
-        kept = drop(spec, present, random)
-        self.assertEqual(float(kept.amax(1).min()), 1)
-        # Each is taken with 0.3; both with 0.09, and then one of them comes back by lot.
-        for share in (1 - kept.mean(0)).tolist():
-            self.assertAlmostEqual(share, 0.3 - 0.09 / 2, delta=0.015)
-        present[:, 0] = False
-        kept = drop(spec, present, random)
-        self.assertEqual((float(kept[:, 0].max()), float(kept[:, 1].min())), (0, 1))
+
+class Encoders(unittest.TestCase):
+    def test_a_shared_encoder_is_one(self):
+        policy = random_policy(experiment(encoder={"shared": True}))
+        self.assertEqual(list(policy.encoder.images), ["shared"])
+        wrist, _, state, mask = encoder_example(policy.spec)
+        with torch.no_grad():
+            condition = policy.encoder(wrist, wrist, state, mask).unflatten(1, (2, -1))
+        self.assertTrue(torch.equal(condition[:, :, 4:68], condition[:, :, 68:]))
+
+    def test_resnet18_has_the_names_and_sizes_of_torchvision(self):
+        state = ResNet18(frozen=True).state_dict()
+        # All of torchvision's resnet18 but its classifier (fc) and its counters of batches.
+        self.assertEqual(len(state), 100)
+        self.assertEqual(sum(v.numel() for k, v in state.items() if "running" not in k), 11_689_512 - 513_000)
+        for name, shape in (
+            ("conv1.weight", (64, 3, 7, 7)),
+            ("bn1.running_mean", (64,)),
+            ("layer1.1.conv2.weight", (64, 64, 3, 3)),
+            ("layer2.0.downsample.0.weight", (128, 64, 1, 1)),
+            ("layer2.0.downsample.1.running_var", (128,)),
+            ("layer4.1.bn2.bias", (512,)),
+        ):
+            self.assertEqual(tuple(state[name].shape), shape)
+
+    def test_weights_come_from_a_file(self):
+        with tempfile.TemporaryDirectory() as name:
+            file = Path(name) / "resnet18.pth"
+            state = {k: torch.randn_like(v).abs() for k, v in ResNet18(frozen=True).state_dict().items()}
+            torch.save({**state, "fc.weight": torch.zeros(1000, 512)}, file)
+            spec = experiment(encoder={"type": "resnet18", "weights": str(file)})
+            policy = Policy(spec)
+            policy.start_from(file)
+            for encoder in policy.encoder.images.values():
+                for key, value in encoder.trunk.state_dict().items():
+                    self.assertTrue(torch.equal(value, state[key]), key)
+            torch.save({k: v for k, v in state.items() if k != "layer3.0.bn1.bias"}, file)
+            with self.assertRaisesRegex(
+                ValueError, "resnet18.pth: not the state_dict .* no weight 'layer3.0.bn1.bias'"
+            ):
+                policy.start_from(file)
+            file.write_bytes(b"no weights")
+            with self.assertRaisesRegex(ValueError, "not the state_dict"):
+                policy.start_from(file)
+
+    def test_frozen_statistics_are_those_of_batch_normalisation(self):
+        torch.manual_seed(0)
+        trunk, norm = ResNet18(frozen=True), torch.nn.BatchNorm2d(64).eval()
+        for name, value in norm.state_dict().items():
+            if value.dim():
+                value.copy_(torch.rand_like(value) + 0.5)
+                trunk.bn1.get_buffer(name).copy_(value)
+        x = torch.randn(2, 64, 5, 5)
+        torch.testing.assert_close(trunk.bn1(x), norm(x))
 
 
 class Bundle(unittest.TestCase):
     def test_graphs_equal_pytorch_and_hold_its_weights(self):
-        import json
-
-        for spec in (tactile_id(), replace(tactile_id(), name="without-mask", mask_aware=False)):
-            with self.subTest(spec.name), tempfile.TemporaryDirectory() as name:
-                folder = Path(name)
+        sizes = {
+            "encoder": {"type": "resnet18", "features": 16, "keypoints": 4},
+            "denoiser": {"widths": [8, 16], "kernel": 3},
+        }
+        for name, spec in (
+            ("tactile-id", experiment()),
+            ("without mask", experiment("vision-diff")),
+            ("shared", experiment(encoder={"shared": True})),
+            ("resnet18", experiment(**sizes)),
+            ("by hand", experiment("tactile-id-handheld")),
+        ):
+            with self.subTest(name), tempfile.TemporaryDirectory() as folder_name:
+                folder = Path(folder_name)
                 policy = random_policy(spec)
                 write_graph(policy.encoder, encoder_example(spec), encoder_inputs(spec), "c", folder / ENCODER)
                 inputs = ["sample", "timestep", "global_cond"]
                 write_graph(policy.denoiser, denoiser_example(spec), inputs, "e", folder / DENOISER)
-                self.assertLess(largest_difference(spec, policy, folder), 1e-4)
-                hashes = {ENCODER: "", DENOISER: ""}
-                described = policy_json(spec, {"normalization": RANGES}, hashes)
-                self.assertEqual(described["mask"] is None, not spec.mask_aware)
+                self.assertLess(largest_difference(spec, policy, folder), 2e-4)
+                facts = {"normalization": RANGES, "network": _network(spec)}
+                described = policy_json(spec, facts, {ENCODER: "", DENOISER: ""})
+                self.assertEqual(described["mask"] is None, not spec.policy.mask_aware)
                 (folder / "policy.json").write_text(json.dumps(described))
                 again = load_policy(folder)
                 for key, weight in policy.state_dict().items():
                     self.assertTrue(torch.equal(weight, again.state_dict()[key]), key)
 
+    def test_the_bundle_of_the_repository_is_loaded(self):
+        policy = load_policy(Path(__file__).parents[1] / "tactile-id")
+        self.assertEqual(sum(p.numel() for p in policy.parameters()), 1_645_286)
+
     def test_limits_are_the_range_and_a_margin(self):
-        described = policy_json(tactile_id(), {"normalization": RANGES}, {ENCODER: "", DENOISER: ""})
+        described = policy_json(experiment(), {"normalization": RANGES}, {ENCODER: "", DENOISER: ""})
         limits = described["action"]["limits"]
         self.assertEqual(limits, {"min": [-1.1, -1.1, -0.05, -0.1], "max": [1.1, 1.1, 1.05, 2.1]})
 
-    def test_a_checkpoint_brings_its_description_back(self):
-        spec = tactile_id()
-        self.assertEqual(Spec.from_dict(spec.to_dict()), spec)
+    def test_what_the_program_does_with_pictures_and_actions_is_written(self):
+        spec = observed(experiment(), "wrist", size=None, resize=[120, 160], crop=[96, 96], color="bgr")
+        described = policy_json(spec, {"normalization": RANGES}, {ENCODER: "", DENOISER: ""})
+        wrist = described["observations"][0]
+        self.assertEqual(
+            [wrist[key] for key in ("shape", "color", "resize", "crop")], [[3, 96, 96], "bgr", [120, 160], [96, 96]]
+        )
+        spec = observed(experiment(), "state", columns=[2, 3])
+        two = {**RANGES, "state": {"mode": "min_max", "min": [0, 0], "max": [1, 1]}}
+        described = policy_json(spec, {"normalization": two}, {ENCODER: "", DENOISER: ""})
+        self.assertEqual([described["observations"][2][key] for key in ("shape", "slice")], [[2], [2, 4]])
+        names = [f"n{i}" for i in range(10)]
+        action = {"representation": "relative", "rotation": "rotation_6d", "names": names, "units": ["1"] * 10}
+        ten = {"mode": "min_max", "min": [-1] * 10, "max": [1] * 10}
+        spec = experiment("tactile-id-handheld", action=action)
+        described = policy_json(spec, {"normalization": {**RANGES, "action": ten}}, {ENCODER: "", DENOISER: ""})
+        self.assertEqual(
+            [described["action"][key] for key in ("representation", "rotation", "shape")],
+            ["relative", "rotation_6d", [10]],
+        )
+
+    def test_a_card_is_written_of_every_experiment(self):
+        facts = {
+            "parameters": 10, "episodes": 2, "frames": 20, "recorded_by": ["rapid"], "episode_seeds": None,
+            "episodes_sha256": "00", "iterations": 3, "batch_windows": 4, "draws": 2, "minutes": 1.0, "hardware": "a CPU",
+            "seed": 0, "final_loss": 0.5, "difference": 1e-6, "command": "python", "tags": {"texture": {"a": 1, "b": 1}},
+        }  # fmt: skip
+        with tempfile.TemporaryDirectory() as name:
+            for experiment_name in ("tactile-id", "tactile-id-handheld", "vision"):
+                write_card(experiment(experiment_name), facts, Path(name))
+                card = (Path(name) / "README.md").read_text(encoding="utf-8")
+                self.assertIn("2 episodes (1 a, 1 b), 20 ticks", card)
+                self.assertEqual("the next pose of `phone`" in card, experiment_name == "tactile-id-handheld")
 
 
 if __name__ == "__main__":

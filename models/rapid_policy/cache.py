@@ -1,0 +1,265 @@
+"""Decoded episodes on disk, so that training reads pixels and decodes nothing.
+
+    python -m rapid_policy.cache build  EXPERIMENT.toml --cache DIR [--data FOLDER...]
+    python -m rapid_policy.cache verify EXPERIMENT.toml --cache DIR [--data FOLDER...]
+    python -m rapid_policy.cache bench  EXPERIMENT.toml --cache DIR [--data FOLDER...]
+
+Below DIR is a folder for each set of modalities and sizes that an experiment reads. In it is a file for each episode,
+named by the SHA-256 of its source, with the arrays of `Episode` one behind the other; and `index.jsonl`, where the last
+line about a source holds. Files are complete when they have their name, and lines are appended whole: an interrupted
+run leaves what it finished. A source whose size or time of change differs is hashed again.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from .episodes import Episode, EpisodeError, Facts, Source, read_episode, read_facts
+from .lerobot_source import split
+
+MAGIC = b"RAPIDCACHE1\n"
+ALIGN = 64
+INDEX = "index.jsonl"
+# Maps that are open at a time; each costs address space and no memory.
+OPEN = 512
+
+
+@dataclass
+class Entry:
+    """What is known of a source."""
+
+    path: str
+    size: int
+    changed_ns: int
+    sha256: str
+    error: str | None = None
+    """Why it cannot be read, if it cannot."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    content: str | None = None
+    """SHA-256 of its decoded file; none before it is decoded."""
+    verdict: str | None = None
+    reasons: tuple[str, ...] = ()
+    judged_by: str | None = None
+    """The program that gave the verdict; none before it is judged."""
+
+
+class Cache:
+    """The cache of one set of sources."""
+
+    def __init__(self, folder: Path, wanted: tuple[Source, ...]) -> None:
+        described = [asdict(source) for source in sorted(wanted, key=lambda s: s.name)]
+        recipe = hashlib.sha256(json.dumps([MAGIC.decode(), described]).encode()).hexdigest()
+        self.folder, self.wanted = folder / recipe[:16], wanted
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "sources.json").write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
+        self._entries = {entry.path: entry for entry in _read_index(self.folder / INDEX)}
+
+    def entry(self, path: Path) -> Entry:
+        """What is known of a file as it is now; read from the disk if it has changed."""
+        stat = split(path)[0].stat()
+        known = self._entries.get(str(path))
+        if known and (known.size, known.changed_ns) == (stat.st_size, stat.st_mtime_ns):
+            return known
+        digest = sha256(path)
+        entry = Entry(str(path), stat.st_size, stat.st_mtime_ns, digest)
+        if known and known.sha256 == digest:
+            entry = Entry(**{**asdict(known), "size": stat.st_size, "changed_ns": stat.st_mtime_ns})
+        else:
+            try:
+                entry.facts = asdict(read_facts(path))
+            except EpisodeError as error:
+                entry.error = error.what
+        self.record(entry)
+        return entry
+
+    def record(self, entry: Entry) -> None:
+        """Writes a line about a source."""
+        self._entries[entry.path] = entry
+        line = json.dumps(asdict(entry)) + "\n"
+        with (self.folder / INDEX).open("ab", buffering=0) as file:
+            file.write(line.encode())
+
+    def build(self, entries: list[Entry], workers: int) -> None:
+        """Decodes those that are not yet; what cannot be decoded gets its reason."""
+        missing = [e for e in entries if e.error is None and not self._whole(e)]
+        if not missing:
+            return
+        progress = tqdm(total=len(missing), desc="decoding", unit="episode", disable=not sys.stderr.isatty())
+        with progress:
+            for entry, made in self._make(missing, workers):
+                changed = {"error": made.get("error"), "content": made.get("content")}
+                self.record(Entry(**{**asdict(entry), **changed, "facts": made.get("facts", entry.facts)}))
+                progress.update()
+
+    def _make(self, missing: list[Entry], workers: int) -> Iterator[tuple[Entry, dict[str, Any]]]:
+        jobs = [(entry, self.file(entry.sha256)) for entry in missing]
+        if workers <= 1 or len(jobs) == 1:
+            yield from ((entry, _decode(entry.path, entry.sha256, self.wanted, file)) for entry, file in jobs)
+            return
+        # Not forked: a fork of a process with threads may hang.
+        with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
+            running = {pool.submit(_decode, e.path, e.sha256, self.wanted, file): e for e, file in jobs}
+            try:
+                for done in as_completed(running):
+                    yield running[done], done.result()
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+    def _whole(self, entry: Entry) -> bool:
+        """Its file is there, of the right source and length. Contents are what `verify` reads."""
+        file = self.file(entry.sha256)
+        if entry.content is None or not file.exists():
+            return False
+        try:
+            header, begin = _header(file)
+            return header["sha256"] == entry.sha256 and file.stat().st_size == begin + header["length"]
+        except (OSError, ValueError, KeyError):
+            return False
+
+    def file(self, digest: str) -> Path:
+        """Of an episode."""
+        return self.folder / f"{digest}.episode"
+
+    def episode(self, entry: Entry) -> Episode:
+        """A decoded episode; its arrays are mapped when they are read."""
+        now = self._entries[entry.path]
+        return Episode(Path(now.path), Facts(**now.facts), Mapped(self.file(now.sha256)), now.sha256)
+
+    def verify(self, entries: list[Entry]) -> list[str]:
+        """Hashes every source and every decoded file; a line for each that is not what the index says.
+
+        A decoded file that is damaged is removed, so that the next run makes it again.
+        """
+        wrong = []
+        for entry in entries:
+            now, file = self._entries[entry.path], self.file(entry.sha256)
+            if sha256(Path(entry.path)) != now.sha256:
+                wrong.append(f"{entry.path}: changed without a new time of change")
+                self.record(Entry(**{**asdict(now), "changed_ns": 0}))
+            elif now.content is not None and (not file.exists() or sha256(file) != now.content):
+                wrong.append(f"{file}: damaged; removed")
+                file.unlink(missing_ok=True)
+        return wrong
+
+
+class Mapped(Mapping[str, NDArray[Any]]):
+    """The arrays of a file, mapped into memory; few maps are open at a time."""
+
+    __slots__ = ("file",)
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return _mapped(self.file)[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_mapped(self.file))
+
+    def __len__(self) -> int:
+        return len(_mapped(self.file))
+
+
+@functools.lru_cache(maxsize=OPEN)
+def _mapped(file: Path) -> dict[str, NDArray[Any]]:
+    header, begin = _header(file)
+    # As a plain array: each slice of a memmap costs as much again. It keeps the map alive.
+    whole = np.memmap(file, np.uint8, "r", begin, header["length"]).view(np.ndarray)
+    arrays = {}
+    for name, (kind, shape, at) in header["arrays"].items():
+        length = int(np.prod(shape)) * np.dtype(kind).itemsize
+        arrays[name] = whole[at : at + length].view(kind).reshape(shape)
+    return arrays
+
+
+def _header(file: Path) -> tuple[dict[str, Any], int]:
+    """Its description, and where the arrays begin."""
+    with file.open("rb") as opened:
+        start = opened.read(len(MAGIC) + 8)
+        if start[: len(MAGIC)] != MAGIC:
+            raise ValueError(f"{file}: not a file of this cache")
+        length = int.from_bytes(start[len(MAGIC) :], "little")
+        return json.loads(opened.read(length)), _padded(len(start) + length)
+
+
+def _padded(length: int) -> int:
+    return -(-length // ALIGN) * ALIGN
+
+
+def write(file: Path, episode: Episode) -> str:
+    """Writes an episode; it has its name when it is whole. Returns the SHA-256 of the file."""
+    described, at = {}, 0
+    arrays = {name: np.ascontiguousarray(array) for name, array in episode.arrays.items()}
+    for name, array in arrays.items():
+        described[name] = (array.dtype.str, array.shape, at)
+        at = _padded(at + array.nbytes)
+    header = json.dumps({"sha256": episode.sha256, "length": at, "arrays": described}).encode()
+    partial = file.with_suffix(f".partial-{os.getpid()}")
+    digest = hashlib.sha256()
+    try:
+        with partial.open("wb") as opened:
+            for part in (MAGIC, len(header).to_bytes(8, "little"), header, *arrays.values()):
+                # Before each array, and behind the last one, zeros up to the next multiple.
+                pad = b"\0" * (_padded(opened.tell()) - opened.tell()) if isinstance(part, np.ndarray) else b""
+                for data in (pad, part.data.cast("B") if isinstance(part, np.ndarray) and part.size else bytes(part)):
+                    opened.write(data)
+                    digest.update(data)
+            pad = b"\0" * (_padded(opened.tell()) - opened.tell())
+            opened.write(pad)
+            digest.update(pad)
+        partial.replace(file)
+    finally:
+        partial.unlink(missing_ok=True)
+    return digest.hexdigest()
+
+
+def _decode(path: str, digest: str, wanted: tuple[Source, ...], file: Path) -> dict[str, Any]:
+    """Decodes one source, in a process of its own: its facts and the hash of its file, or the reason that it cannot."""
+    try:
+        episode = read_episode(Path(path), wanted)
+        episode.sha256 = digest
+        return {"content": write(file, episode), "facts": asdict(episode.facts)}
+    except EpisodeError as error:
+        return {"error": error.what}
+
+
+def _read_index(file: Path) -> Iterator[Entry]:
+    if not file.exists():
+        return
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            known = json.loads(line)
+            yield Entry(**{**known, "reasons": tuple(known["reasons"])})
+        except (ValueError, TypeError, KeyError):
+            # The end of a line that a full disk or a power cut took; its source is read again.
+            continue
+
+
+def sha256(path: Path) -> str:
+    """The hash of a file, in hexadecimal; of one of several episodes in a file that of the file and its index."""
+    file, index = split(path)
+    with file.open("rb") as opened:
+        digest = hashlib.file_digest(opened, "sha256")
+    if index is not None:
+        digest.update(f"#{index}".encode())
+    return digest.hexdigest()
+
+
+if __name__ == "__main__":
+    from .cache_commands import main
+
+    main()

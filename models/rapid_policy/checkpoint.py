@@ -1,0 +1,116 @@
+"""The state of a training, and its file: plain data and tensors, so that reading one runs no code of it."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from .experiment import Experiment, Training
+from .model import Policy
+
+CHECKPOINT, BEST = "checkpoint.pt", "best.pt"
+
+
+@dataclass
+class Run:
+    """A training."""
+
+    spec: Experiment
+    policy: Policy
+    average: Policy
+    optimizer: torch.optim.Optimizer
+    random: np.random.Generator
+    provenance: dict[str, Any]
+    iterations: int
+    """Of the whole schedule."""
+    iteration: int = 0
+    seconds: float = 0.0
+    losses: list[float] = field(default_factory=list)
+    validation: list[tuple[int, float]] = field(default_factory=list)
+    """Iteration and loss on the episodes that are held out."""
+    random_state: dict[str, Any] | None = None
+    """Of `random` behind the last batch that was learned from: the feed is ahead."""
+
+    @property
+    def schedule(self) -> Training:
+        """How it is trained."""
+        return self.spec.training
+
+    def save(self, path: Path, **facts: Any) -> None:
+        """Writes the checkpoint; a run that is stopped meanwhile leaves the previous one. `facts` are added to the
+        provenance."""
+        state = {
+            "experiment": self.spec.to_text(),
+            "policy": self.policy.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "random": json.dumps(self.random_state or self.random.bit_generator.state),
+            "torch_random": torch.get_rng_state(),
+            "provenance": {**self.provenance, **facts},
+            "iterations": self.iterations,
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "losses": self.losses,
+            "validation": self.validation,
+        }
+        partial = path.with_suffix(".partial")
+        torch.save(state, partial)
+        partial.replace(path)
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continues from the checkpoint `state`."""
+        self.policy.load_state_dict(state["policy"])
+        self.average.load_state_dict(state["average"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.random.bit_generator.state = self.random_state = json.loads(state["random"])
+        torch.set_rng_state(state["torch_random"])
+        self.iterations, self.iteration, self.seconds = state["iterations"], state["iteration"], state["seconds"]
+        self.losses, self.validation = state["losses"], state["validation"]
+
+    @property
+    def best(self) -> float:
+        """The lowest loss on the episodes that are held out."""
+        return min((loss for _, loss in self.validation), default=float("inf"))
+
+
+def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: dict[str, Any], device: Any) -> Run:
+    """Networks with random weights, determined by the seed, for `windows` windows whose vectors have these ranges."""
+    schedule = spec.training
+    torch.manual_seed(schedule.seed)
+    policy = Policy(spec)
+    if spec.encoder.weights:
+        policy.start_from(Path(spec.encoder.weights))
+    policy = policy.to(device)
+    facts = {**provenance, "windows": windows, "normalization": {key: value.to_dict() for key, value in ranges.items()}}
+    iterations = schedule.iterations or max(1, round((schedule.epochs or 1) * windows / schedule.windows))
+    average, random = copy.deepcopy(policy).requires_grad_(False), np.random.default_rng(schedule.seed)
+    return Run(spec, policy, average, optimizer(schedule, policy), random, facts, iterations)
+
+
+def optimizer(schedule: Training, policy: Policy) -> torch.optim.Optimizer:
+    """As the schedule has it."""
+    weights, rate, decay = policy.parameters(), schedule.learning_rate, schedule.weight_decay
+    if schedule.optimizer == "sgd":
+        return torch.optim.SGD(weights, rate, momentum=schedule.betas[0], weight_decay=decay)
+    kind = torch.optim.AdamW if schedule.optimizer == "adamw" else torch.optim.Adam
+    return kind(weights, rate, betas=schedule.betas, weight_decay=decay, fused=True)
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The state in a checkpoint. Its pickle may hold tensors and plain data alone: others are refused, not run."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        Experiment.from_text(state["experiment"])
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror or error}") from error
+    # What is no checkpoint fails in the container, the unpickler or the description.
+    except Exception as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ValueError(f"{path}: not a checkpoint of rapid_policy.train: {reason}") from error
+    return state

@@ -1,0 +1,92 @@
+"""Data sets of LeRobot as a source: what `rapid export` made of episodes is learned from as the episodes are."""
+
+import json
+import os
+import subprocess
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+from made_up import experiment
+
+from rapid_policy import lerobot_source
+from rapid_policy.corpus import load
+from rapid_policy.dataset import Dataset
+from rapid_policy.episodes import EpisodeError, episode_files, read_episode, sources
+
+RAPID = os.environ.get("RAPID_BIN", "")
+
+
+class Present(unittest.TestCase):
+    def test_with_its_bit_and_a_sample_that_can_be_used(self):
+        rows = {
+            "names": {"rapid.mask": ["cam", "arm"]},
+            "rapid.mask": np.array([[1, 1], [0, 1], [1, 1], [0, 1]]),
+            "rapid.valid": np.array([[1, 1], [1, 1], [0, 1], [0, 0]]),
+        }
+        self.assertEqual(lerobot_source._present(rows, "cam", 4).tolist(), [True, False, False, False])
+        self.assertEqual(lerobot_source._present(rows, "arm", 4).tolist(), [True, True, True, False])
+        self.assertTrue(lerobot_source._present({"names": {}}, "arm", 4).all())
+
+
+@unittest.skipUnless(RAPID, "RAPID_BIN names no program: DATA SETS OF LEROBOT ARE NOT TESTED")
+class Exported(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        temporary = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(temporary.cleanup)
+        cls.folder, cls.spec = Path(temporary.name), experiment()
+        cls.episodes, cls.rows = cls.folder / "episodes", cls.folder / "rows"
+        for words in (
+            ("--sim", "task", "--expert", "--record", "--episodes", "2", "--seed", "1000", "--out", cls.episodes),
+            ("export", cls.episodes, "--to", "lerobot", "--out", cls.rows),
+        ):
+            subprocess.run([RAPID, *words], check=True, capture_output=True, timeout=200, cwd=cls.folder)
+
+    def test_both_are_the_same(self):
+        wanted = sources(self.spec)
+        names = episode_files(self.rows)
+        self.assertEqual(len(names), 2)
+        for file, name in zip(episode_files(self.episodes), names, strict=True):
+            recorded, exported = read_episode(file, wanted), read_episode(name, wanted)
+            self.assertEqual(len(recorded), len(exported))
+            self.assertEqual(exported.facts.observation_hz, 10)
+            for modality in ("cam_wrist", "tactile_tip", "arm"):
+                np.testing.assert_array_equal(recorded.present(modality), exported.present(modality), modality)
+                np.testing.assert_allclose(recorded.value(modality), exported.value(modality), rtol=1e-6, atol=1e-7)
+            acted = np.asarray(recorded.acted)
+            np.testing.assert_allclose(recorded.actions[acted], exported.actions[acted], rtol=1e-6, atol=1e-7)
+
+    def test_a_training_takes_them(self):
+        cache = self.folder / "cache"
+        found = load(self.spec, [self.rows], cache)
+        self.assertEqual((len(found.training), found.left_out), (2, []))
+        self.assertNotEqual(found.training[0].sha256, found.training[1].sha256)
+        self.assertGreater(len(Dataset(self.spec, found.training).windows), 100)
+        # Beside the files that they were made of.
+        self.assertEqual(len(load(self.spec, [self.rows, self.episodes], cache).training), 4)
+
+    def test_what_it_lacks_is_named(self):
+        head = self.spec.to_text().replace('"modality":"arm"', '"modality":"leg"')
+        with self.assertRaisesRegex(EpisodeError, "no columns 'leg.0' ... of observation.state"):
+            read_episode(episode_files(self.rows)[0], sources(type(self.spec).from_text(head)))
+
+    def test_a_video_and_an_old_version_are_refused_with_the_fix(self):
+        path = self.rows / "meta" / "info.json"
+        before = path.read_text()
+        self.addCleanup(path.write_text, before)
+        described = json.loads(before)
+        described["features"]["observation.images.cam_wrist"]["dtype"] = "video"
+        path.write_text(json.dumps(described))
+        with self.assertRaisesRegex(
+            EpisodeError, "cam_wrist is a video, which is not read: export with --pictures jpeg"
+        ):
+            read_episode(episode_files(self.rows)[0], sources(self.spec))
+        path.write_text(json.dumps({**described, "codebase_version": "v2.1"}))
+        with self.assertRaisesRegex(EpisodeError, "version 'v2.1': convert it to v3.0"):
+            episode_files(self.rows)
+
+
+if __name__ == "__main__":
+    unittest.main()
