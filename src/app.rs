@@ -29,6 +29,7 @@ mod screen;
 pub(crate) mod signals;
 mod stage;
 mod streaming;
+mod trials;
 mod watchdog;
 #[cfg_attr(not(feature = "web"), path = "app/web_absent.rs")]
 mod web;
@@ -47,6 +48,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::alignment::Alignment;
 use crate::bus::{self, Bus, TopicId};
+use crate::episode::made::Shown;
 use crate::episode::recover::Repairs;
 use crate::fault;
 use crate::interlock::Interlocks;
@@ -62,6 +64,7 @@ use crate::registry::scenario::Scenario;
 use crate::rig::Rig;
 use crate::rig::presence::{Claim, Presence};
 use crate::session::journal::Plan;
+use crate::simulation::SimSource;
 use crate::status::Board;
 use crate::time::Stamp;
 use crate::tui::ScreenOptions;
@@ -242,7 +245,9 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         None => None,
     };
     let web = options.web.map(|options| web::start(&options, &board, &to_conductor)).transpose()?;
-    let config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
+    let (shown, made) = Shown::channel();
+    let mut config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
+    config.shown = listening.is_some().then_some(shown);
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let (following, to_recorder, clock) = (recorder.episode(), recorder.additions(), recorder.clock());
     // Ending by itself after some time is the run's, unless it has several episodes.
@@ -256,9 +261,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let kind = options.screen;
     let (to_scenario, replugs) = mpsc::unbounded_channel();
     let (to_alignment, to_align) = mpsc::unbounded_channel();
-    if matches!(options.devices, Devices::Simulated(_)) {
-        board.set_simulated();
-    }
+    let trials = simulated(&options.devices, &board);
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
         let alignment = alignment(&registry, bus, &board)?.extended_by(to_align);
@@ -272,7 +275,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration, options.shown);
         let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
         let inference = options.policy.map(start).transpose()?;
-        let live = listening.map(|listening| listening.start(bus, &board, clock)).transpose()?;
+        let live = listening.map(|listening| listening.start(bus, &board, (clock, made))).transpose()?;
         Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live))
     };
     let (discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live) = match others() {
@@ -328,6 +331,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         inference,
         live,
         web,
+        trials,
         reload: reload.start(about_registry),
         mask_ended,
         kind,
@@ -336,6 +340,17 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         requests,
     };
     Ok((running, conductor))
+}
+
+/// What a run of simulated devices has besides: the board says so, and trials of the task are followed.
+fn simulated(devices: &Devices, board: &Arc<Board>) -> Option<Stage> {
+    let Devices::Simulated(scenario) = devices else { return None };
+    board.set_simulated();
+    let trial = scenario.devices.iter().find_map(|device| match &device.source {
+        SimSource::Task { trial, .. } => Some(trial.clone()),
+        _ => None,
+    });
+    Some(trials::start(trial?, Arc::clone(board)))
 }
 
 fn alignment(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Result<Alignment, AppError> {
@@ -395,6 +410,7 @@ struct Running {
     recording: Stage,
     inference: Option<Stage>,
     live: Option<Stage>,
+    trials: Option<Stage>,
     web: Option<Stage>,
     reload: Stage,
     mask_ended: CancellationToken,
@@ -437,7 +453,7 @@ async fn finish(
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
         keep_first(&mut outcome, running.discovery.end().await);
-        for server in [&mut running.live, &mut running.web].into_iter().flatten() {
+        for server in [&mut running.live, &mut running.web, &mut running.trials].into_iter().flatten() {
             // The last events are shown by then. It is no reason for the run to fail.
             let _ = server.end().await;
         }

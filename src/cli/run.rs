@@ -128,6 +128,9 @@ pub struct TaskArgs {
     /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
     #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm", "foxglove", "web"], hide_short_help = true)]
     pub expert: bool,
+    /// With the gripper in a hand: its pose and opening are recorded, no arm and no action
+    #[arg(long, requires = "expert", hide_short_help = true)]
+    pub handheld: bool,
     /// Demonstrations to record, one trial each
     #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert", hide_short_help = true)]
     pub episodes: usize,

@@ -32,20 +32,20 @@ pub enum DemonstrateError {
     Output(#[from] io::Error),
 }
 
-/// Records `count` demonstrations from seed `first` on, half of them of each texture, and lists them.
+/// Records `count` demonstrations on the rig of `registry` from seed `first` on, half of them of each texture, and lists them.
 /// Stops between two of them when `stop` returns true.
 ///
 /// # Errors
 /// When one cannot be recorded; those before it are complete.
 pub fn run(
+    registry: Registry,
     request: &EpisodeRequest,
-    first: u64,
-    count: usize,
+    (first, count): (u64, usize),
     format: Format,
     stop: &dyn Fn() -> bool,
     out: &mut dyn Write,
 ) -> Result<(), DemonstrateError> {
-    let registry = Arc::new(Registry::task());
+    let registry = Arc::new(registry);
     let board = Arc::new(Board::new(&registry));
     let begun = Instant::now();
     let mut bar = Bar::new("episodes", count, format == Format::Text);

@@ -293,6 +293,8 @@ impl Sim {
                 _ => format!("simulated serial line, {channels} numbers at {hz} Hz"),
             },
             SimSource::Task { part: TaskPart::Arm, .. } => "arm of the simulated task".to_owned(),
+            SimSource::Task { part: TaskPart::Phone, .. } => "phone of the simulated task".to_owned(),
+            SimSource::Task { part: TaskPart::Gripper, .. } => "gripper of the simulated task".to_owned(),
             SimSource::Task { .. } => {
                 format!("camera of the simulated task, MJPG {0}x{0} at {1} fps", task::SIDE, task::STEP_HZ)
             }
@@ -313,14 +315,16 @@ impl Sim {
                 let channels = if matches!(self.content, Content::Records { .. }) { 0 } else { channels };
                 Some(Format::Messages { baud: None, channels, hz: Some(hz.into()) })
             }
-            SimSource::Task { part: TaskPart::Arm, .. } => {
-                Some(Format::Messages { baud: None, channels: task::AXES, hz: Some(task::STEP_HZ.into()) })
-            }
-            SimSource::Task { .. } => Some(Format::Pictures {
-                fourcc: "MJPG".to_owned(),
-                width: task::SIDE_PIXELS,
-                height: task::SIDE_PIXELS,
-                fps: Some(task::STEP_HZ.into()),
+            SimSource::Task { part, .. } => Some(match part.numbers() {
+                Some(count) => {
+                    Format::Messages { baud: None, channels: count as usize, hz: Some(task::STEP_HZ.into()) }
+                }
+                None => Format::Pictures {
+                    fourcc: "MJPG".to_owned(),
+                    width: task::SIDE_PIXELS,
+                    height: task::SIDE_PIXELS,
+                    fps: Some(task::STEP_HZ.into()),
+                },
             }),
             SimSource::Replay { .. } | SimSource::Process => None,
         };

@@ -89,6 +89,14 @@ impl Timeline {
         timeline
     }
 
+    /// Adds an event at the moment `at`, after those that are due by then. Only for a scenario that does not repeat.
+    pub fn schedule(&mut self, at: Stamp, device: &str, action: ScenarioAction) {
+        let event = ScenarioEvent { at: at.since(self.begun), device: device.to_owned(), action };
+        let left = self.events.get(self.next..).unwrap_or_default();
+        let place = self.next + left.partition_point(|other| other.at <= event.at);
+        self.events.insert(place, event);
+    }
+
     /// The next event that has happened by `now`, which may be in the past.
     pub fn next_by(&mut self, now: Stamp) -> Option<HotplugEvent> {
         loop {

@@ -7,7 +7,7 @@ use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
-use crate::simulation::task::{Expert, Outcome, Texture, World};
+use crate::simulation::task::{Expert, Outcome, Texture, Touch, UNSEEN_PERIOD, World};
 use crate::status::Board;
 use crate::time::{Stamp, WallClock};
 
@@ -32,13 +32,14 @@ pub struct Demonstration {
 }
 
 /// The seeds of `count` demonstrations from `first` on, the same number of each texture; for an odd count one more of
-/// the texture that comes first. Seeds whose demonstration would fail are skipped.
+/// the texture that comes first. Seeds whose demonstration would fail are skipped, and those whose lattice has the period
+/// that is left for evaluation.
 pub fn seeds(first: u64, count: usize) -> impl Iterator<Item = u64> {
     let mut left = [count.div_ceil(2), count.div_ceil(2)];
     let wanted = move |seed: &u64| {
         let world = World::new(*seed);
         let left = &mut left[usize::from(world.texture == Texture::Hexagonal)];
-        let taken = *left > 0 && succeeds(world, *seed);
+        let taken = *left > 0 && Touch::new(*seed).period != UNSEEN_PERIOD && succeeds(world, *seed);
         *left -= usize::from(taken);
         taken
     };

@@ -11,6 +11,7 @@ use super::timing::Timing;
 use super::{Lockstep, STEP, Taker, TrialError};
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
 use crate::policy::bundle::Bundle;
 use crate::policy::horizon::{Counts, WithoutMask};
 use crate::policy::model::{AnswerError, Model};
@@ -19,10 +20,10 @@ use crate::policy::request::Request;
 use crate::random::Random;
 use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
-use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
+use crate::registry::scenario::{Scenario, ScenarioAction};
 use crate::registry::{Registry, task};
 use crate::sample::SampleHeader;
-use crate::simulation::task::{AXES, Outcome, Texture};
+use crate::simulation::task::{AXES, Outcome, Texture, Touch, UNSEEN_PERIOD};
 use crate::status::Event;
 use crate::time::Stamp;
 
@@ -32,8 +33,17 @@ const WINDOWS: u64 = 0x7769_6e64_6f77;
 const PULLED: &str = task::PARTS[1].0;
 /// Steps in which all devices are plugged in and observed, before the policy begins.
 const SETTLE: u32 = 3;
+/// Pressure of the gel from which the texture is felt.
+const FELT: f64 = 0.2;
+/// How far the block is from where it was touched when the ways to the bins have parted, m.
+const PARTED: f64 = 0.08;
+/// A cable is plugged in again after this many steps at the latest: a policy may never touch the block.
+const LONGEST_OUT: u32 = 45;
+/// How long a read of the static loop waits for a sample: `async_read(timeout_ms=200)` of LeRobot's cameras, after which it
+/// raises `TimeoutError`.
+const READ_TIMEOUT: Duration = Duration::from_millis(200);
 
-/// The sensor conditions (paper, table "Hot-plug robustness", and one more).
+/// The sensor conditions (paper, table "Hot-plug robustness", and two more).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Condition {
@@ -41,18 +51,29 @@ pub enum Condition {
     Full,
     /// The tactile sensor is absent.
     NoTactile,
-    /// It is unplugged at a step of 30 to 74: the block is touched at 35 to 45, and the paths to the bins separate at
-    /// 60 to 70.
+    /// It is unplugged 3 to 14 steps after the touch: the texture has been felt, and the ways to the bins have not parted.
     HotUnplug,
-    /// It is unplugged at a step of 10 to 29 and plugged in again 15 to 29 steps later.
+    /// It is unplugged at a step of 10 to 24, and plugged in again 2 to 9 steps after the touch, or 45 later at the latest.
     HotReplug,
+    /// It is unplugged at a step of 10 to 24: before the touch. Not in the paper's table.
+    EarlyUnplug,
     /// The wrist camera is absent: nothing shows the block's position. Not in the paper's table.
     NoWrist,
 }
 
+/// When a cable is unplugged or plugged in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum When {
+    /// At this step.
+    Step(u32),
+    /// So many steps after the touch.
+    AfterTouch(u32),
+}
+
 impl Condition {
-    /// All of them, in the order of the paper's table.
-    pub const ALL: [Self; 5] = [Self::Full, Self::NoTactile, Self::HotUnplug, Self::HotReplug, Self::NoWrist];
+    /// All of them, those of the paper's table first.
+    pub const ALL: [Self; 6] =
+        [Self::Full, Self::NoTactile, Self::HotUnplug, Self::HotReplug, Self::EarlyUnplug, Self::NoWrist];
 
     /// Its word on the command line.
     pub const fn word(self) -> &'static str {
@@ -61,21 +82,20 @@ impl Condition {
             Self::NoTactile => "no-tactile",
             Self::HotUnplug => "hot-unplug",
             Self::HotReplug => "hot-replug",
+            Self::EarlyUnplug => "early-unplug",
             Self::NoWrist => "no-wrist",
         }
     }
 
-    /// The steps at which the sensor is unplugged and plugged in again in trial `seed`.
-    pub fn windows(self, seed: u64) -> (Option<u32>, Option<u32>) {
+    /// When the sensor is unplugged, and plugged in again, in trial `seed`.
+    fn windows(self, seed: u64) -> (Option<When>, Option<When>) {
         let mut random = Random::new(seed, WINDOWS);
         let mut step = |low: u32, high: u32| low + u32::try_from(random.below(u64::from(high - low))).unwrap_or(0);
         match self {
             Self::Full | Self::NoTactile | Self::NoWrist => (None, None),
-            Self::HotUnplug => (Some(step(30, 75)), None),
-            Self::HotReplug => {
-                let out = step(10, 30);
-                (Some(out), Some(out + step(15, 30)))
-            }
+            Self::HotUnplug => (Some(When::AfterTouch(step(3, 15))), None),
+            Self::EarlyUnplug => (Some(When::Step(step(10, 25))), None),
+            Self::HotReplug => (Some(When::Step(step(10, 25))), Some(When::AfterTouch(step(2, 10)))),
         }
     }
 
@@ -84,41 +104,125 @@ impl Condition {
         let away = match self {
             Self::NoTactile => Some(PULLED),
             Self::NoWrist => Some(task::PARTS[0].0),
-            Self::Full | Self::HotUnplug | Self::HotReplug => None,
+            Self::Full | Self::HotUnplug | Self::HotReplug | Self::EarlyUnplug => None,
         };
         for device in scenario.devices.iter_mut().filter(|device| Some(device.name.as_str()) == away) {
             device.plugged = false;
         }
-        let (out, back) = self.windows(seed);
-        // Between two ticks, so that at the tick of that step the bit is clear.
-        let at = |step: u32| STEP * (SETTLE + step - 1) + STEP / 2;
-        let event = |step, action| ScenarioEvent { at: at(step), device: PULLED.to_owned(), action };
-        scenario.events.extend(out.map(|step| event(step, ScenarioAction::Unplug)));
-        scenario.events.extend(back.map(|step| event(step, ScenarioAction::Plug { port: None })));
         scenario
     }
 }
 
-/// Which sensors a run requires.
+/// The hand at the cable: unplugs and plugs in as the condition says, and notes the milestones of the trial.
+#[derive(Debug)]
+struct Hand {
+    out: Option<When>,
+    back: Option<When>,
+    touched: Option<(u32, [f64; 3])>,
+    parted: Option<u32>,
+    unplugged: Option<u32>,
+    plugged: Option<u32>,
+}
+
+impl Hand {
+    fn new(condition: Condition, seed: u64) -> Self {
+        let (out, back) = condition.windows(seed);
+        Self { out, back, touched: None, parted: None, unplugged: None, plugged: None }
+    }
+
+    /// At tick `tick` of the control grid; what it does is seen at the next one.
+    fn act(&mut self, tick: u32, rig: &mut Lockstep) {
+        self.look(tick, rig);
+        let touched = self.touched.map(|(tick, _)| tick);
+        let is_due = |when: Option<When>| match when {
+            Some(When::Step(step)) => tick + 1 >= step,
+            Some(When::AfterTouch(steps)) => touched.is_some_and(|touched| tick + 1 >= touched + steps),
+            None => false,
+        };
+        if self.unplugged.is_none() && is_due(self.out) {
+            rig.schedule(PULLED, ScenarioAction::Unplug);
+            self.unplugged = Some(tick + 1);
+        } else if let (Some(out), Some(_), None) = (self.unplugged, self.back, self.plugged)
+            && (is_due(self.back) || tick + 1 >= out + LONGEST_OUT)
+        {
+            rig.schedule(PULLED, ScenarioAction::Plug { port: None });
+            self.plugged = Some(tick + 1);
+        }
+    }
+
+    fn look(&mut self, tick: u32, rig: &Lockstep) {
+        let trial = rig.trial().lock();
+        let world = &trial.world;
+        if self.touched.is_none() && world.pressure >= FELT {
+            self.touched = Some((tick, world.position));
+        }
+        if let (Some((_, [x, y, _])), None) = (self.touched, self.parted)
+            && world.held
+            && (world.position[0] - x).hypot(world.position[1] - y) >= PARTED
+        {
+            self.parted = Some(tick);
+        }
+    }
+}
+
+/// How sensors are read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Configuration {
-    /// Those that are present.
+    /// Those that are present, by the mask.
     Dynamic,
-    /// Those present at the start: a sensor that is missing later ends the run, as with a configuration file and a
-    /// driver that raises an exception.
+    /// Every sensor that was present at the start is read at every tick, without a mask, by a loop that fails when a read
+    /// does: [`StaticLoop`].
     Static,
 }
 
-/// The result of a run.
+/// The control loop of a fixed list of sensors, as robot-learning software has it: it waits for the next sample of each
+/// sensor, and a read without one in time is an error that ends the run.
+#[derive(Debug)]
+struct StaticLoop {
+    sensors: Vec<(ModalityId, String)>,
+    newest: Vec<Stamp>,
+}
+
+/// A sensor gave no sample in time.
+#[derive(Debug, thiserror::Error)]
+#[error("{name}: no sample within {READ_TIMEOUT:?}")]
+struct ReadError {
+    name: String,
+}
+
+impl StaticLoop {
+    /// A loop that reads these sensors.
+    fn new(registry: &Registry, mask: PhysicalMask) -> Self {
+        let sensors = registry.devices.iter().filter(|device| mask.contains(device.id));
+        let sensors: Vec<_> = sensors.map(|device| (device.id, device.name.clone())).collect();
+        Self { newest: vec![Stamp::default(); sensors.len()], sensors }
+    }
+
+    fn take(&mut self, topic: TopicId, header: &SampleHeader) {
+        for ((id, _), newest) in self.sensors.iter().zip(&mut self.newest) {
+            if topic == TopicId::Modality(*id) {
+                *newest = Stamp(header.recv_ns);
+            }
+        }
+    }
+
+    /// Reads every sensor at `now`.
+    fn read(&self, now: Stamp) -> Result<(), ReadError> {
+        let late = self.sensors.iter().zip(&self.newest).find(|(_, newest)| now.since(**newest) > READ_TIMEOUT);
+        late.map_or(Ok(()), |((_, name), _)| Err(ReadError { name: name.clone() }))
+    }
+}
+
+/// The result of a run, read from it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
-    /// All sensors were present.
+    /// All sensors were present at its end.
     Normal,
-    /// It continued without one.
+    /// One was absent at its end.
     Degraded,
-    /// It was aborted.
+    /// Its loop failed.
     Crash,
 }
 
@@ -131,6 +235,12 @@ pub struct Trial {
     pub condition: Condition,
     /// Texture of the block: true if triangular.
     pub triangular: bool,
+    /// Its lattice has the period that no demonstration shows.
+    pub unseen_period: bool,
+    /// Step at which the texture was first felt.
+    pub touched_at: Option<u32>,
+    /// Step from which the block was on its way to one of the bins.
+    pub parted_at: Option<u32>,
     /// Step at which the sensor was unplugged.
     pub unplugged_at: Option<u32>,
     /// Step at which it was plugged in again.
@@ -212,7 +322,7 @@ impl Bench<'_> {
             None => (None, None),
         };
         let mut witness =
-            Spectator { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed), recorder };
+            Spectator { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed), recorder, reads: None };
         let mut request = Request::new(self.bundle);
         let mut chunk = vec![0.0; self.model.chunk_len()];
         for _ in 0..SETTLE {
@@ -223,25 +333,27 @@ impl Bench<'_> {
             recorder.begin(request, rig.now())?;
             recorder.event(&Event { stamp: rig.now(), what: self.bundle.begins(library.to_owned(), false) });
         }
-        let launched = rig.mask();
-        let (mut status, mut failure) = (Status::Normal, None);
-        let mut tick = 0;
+        let mut hand = Hand::new(condition, seed);
+        if self.configuration == Configuration::Static {
+            witness.reads = Some(StaticLoop::new(self.registry, rig.mask()));
+        }
+        let (mut crash, mut failure) = (None, None);
+        let mut tick: u32 = 0;
         while !rig.trial().lock().world.is_done() {
             rig.deliver(&mut witness)?;
-            if self.configuration == Configuration::Static && missing(launched, rig.mask()) {
-                status = Status::Crash;
+            hand.act(tick, &mut rig);
+            if let Some(Err(error)) = witness.reads.as_ref().filter(|_| tick > 0).map(|reads| reads.read(rig.now())) {
+                crash = Some(error.to_string());
                 break;
             }
-            if missing(everything(self.registry), rig.mask()) {
-                status = Status::Degraded;
-            }
-            let answer = witness.pilot.look(tick, rig.now(), rig.now()).then(|| {
-                witness.pilot.fill(tick, rig.now(), &mut request);
+            let number = u64::from(tick);
+            let answer = witness.pilot.look(number, rig.now(), rig.now()).then(|| {
+                witness.pilot.fill(number, rig.now(), &mut request);
                 self.model.answer(&request, &mut chunk)
             });
-            let action = witness.pilot.step(tick).action.and_then(axes);
+            let action = witness.pilot.step(number).action.and_then(axes);
             if let Some(action) = action {
-                rig.act(tick, action, &mut witness);
+                rig.act(number, action, &mut witness);
             }
             rig.step(0.0, &mut witness)?;
             let skipped = take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
@@ -256,19 +368,26 @@ impl Bench<'_> {
             tick += 1;
         }
         let report = witness.recorder.as_mut().and_then(|recorder| recorder.finish(rig.now()));
+        let status = match &crash {
+            Some(_) => Status::Crash,
+            None if missing(everything(self.registry), rig.mask()) => Status::Degraded,
+            None => Status::Normal,
+        };
         let trial = rig.trial().lock();
-        let (unplugged_at, plugged_at) = condition.windows(seed);
         let trial = Trial {
             seed,
             condition,
             triangular: trial.world.texture == Texture::Triangular,
-            unplugged_at,
-            plugged_at,
+            unseen_period: Touch::new(seed).period == UNSEEN_PERIOD,
+            touched_at: hand.touched.map(|(tick, _)| tick),
+            parted_at: hand.parted,
+            unplugged_at: hand.unplugged,
+            plugged_at: hand.plugged,
             outcome: trial.world.outcome(),
             status,
             steps: trial.world.steps(),
             counts: witness.pilot.queue.counts(),
-            failure,
+            failure: crash.or(failure),
         };
         Ok((trial, report))
     }
@@ -313,16 +432,21 @@ fn axes(action: &[f32]) -> Option<[f64; AXES]> {
     Some(action.map(f64::from))
 }
 
-/// Receivers of the rig's samples: the policy, and the recorder if there is one.
+/// Receivers of the rig's samples: the policy, the recorder if there is one, and the reads of a static loop.
 struct Spectator<'a> {
     pilot: Pilot,
     recorder: Option<&'a mut Stepped>,
+    /// Of a static configuration.
+    reads: Option<StaticLoop>,
 }
 
 impl Taker for Spectator<'_> {
     fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         if let Some(recorder) = &mut self.recorder {
             recorder.take(topic, header, payload);
+        }
+        if let Some(reads) = &mut self.reads {
+            reads.take(topic, header);
         }
         self.pilot.take(topic, header, payload);
     }
@@ -373,9 +497,32 @@ mod tests {
         for seed in 0..500 {
             assert_eq!(Condition::Full.windows(seed), (None, None));
             let (out, back) = Condition::HotUnplug.windows(seed);
-            assert!(out.is_some_and(|out| (30..75).contains(&out)) && back.is_none());
-            let (Some(out), Some(back)) = Condition::HotReplug.windows(seed) else { panic!("none") };
-            assert!((10..30).contains(&out) && (15..30).contains(&(back - out)), "{out} {back}");
+            assert!(matches!(out, Some(When::AfterTouch(3..15))) && back.is_none());
+            let (out, back) = Condition::HotReplug.windows(seed);
+            assert!(
+                matches!((out, back), (Some(When::Step(10..25)), Some(When::AfterTouch(2..10)))),
+                "{out:?} {back:?}"
+            );
         }
+    }
+
+    #[test]
+    fn a_static_loop_fails_at_the_sensor_that_gives_no_sample() {
+        let registry = Registry::task();
+        let mut reads = StaticLoop::new(&registry, PhysicalMask(0b011));
+        let sample = |bit: u8, ms: u64| {
+            let id = ModalityId::new(bit).expect("a bit");
+            (TopicId::Modality(id), SampleHeader { recv_ns: ms * 1_000_000, ..SampleHeader::default() })
+        };
+        for (bit, ms) in [(0, 100), (1, 100), (0, 200)] {
+            let (topic, header) = sample(bit, ms);
+            reads.take(topic, &header);
+        }
+        assert!(reads.read(Stamp(300_000_000)).is_ok());
+        let error = reads.read(Stamp(300_000_001)).expect_err("tactile is late").to_string();
+        assert_eq!(error, "tactile_tip: no sample within 200ms");
+        let (topic, header) = sample(1, 300);
+        reads.take(topic, &header);
+        assert!(reads.read(Stamp(400_000_000)).is_ok());
     }
 }

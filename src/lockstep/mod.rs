@@ -22,7 +22,7 @@ use crate::modality::ModalityId;
 use crate::provenance::Negotiated;
 use crate::record::RecordError;
 use crate::record::stepped::Taker;
-use crate::registry::scenario::Scenario;
+use crate::registry::scenario::{Scenario, ScenarioAction};
 use crate::registry::{DeviceSpec, Registry};
 use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
 use crate::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
@@ -164,6 +164,11 @@ impl Lockstep {
         self.trial.lock().step(shake);
         self.stepping = Some(self.now);
         self.rest(taker)
+    }
+
+    /// Schedules a plug or an unplug half a step from now: between two ticks, so that the next one sees it.
+    pub fn schedule(&mut self, device: &str, action: ScenarioAction) {
+        self.timeline.schedule(self.now.after(STEP / 2), device, action);
     }
 
     /// Applies the plugs and unplugs due now, and lets every running device send the samples captured or delivered now.

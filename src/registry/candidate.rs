@@ -98,7 +98,8 @@ pub fn kind(attachment: &Attachment) -> Option<&'static str> {
             SimSource::Camera { .. }
             | SimSource::Depth { .. }
             | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => Some("camera"),
-            SimSource::Serial { .. } | SimSource::Task { part: TaskPart::Arm, .. } => Some("serial"),
+            SimSource::Serial { .. }
+            | SimSource::Task { part: TaskPart::Arm | TaskPart::Phone | TaskPart::Gripper, .. } => Some("serial"),
             SimSource::Process | SimSource::Replay { .. } => None,
         },
     }

@@ -406,7 +406,8 @@ impl Entry {
                     self.opens == Some(Opens::Video) && !self.is_process && self.format != Some(PixelFormat::Z16)
                 }
                 SimSource::Depth { .. } => self.format == Some(PixelFormat::Z16),
-                SimSource::Serial { .. } | SimSource::Task { part: TaskPart::Arm, .. } => {
+                SimSource::Serial { .. }
+                | SimSource::Task { part: TaskPart::Arm | TaskPart::Phone | TaskPart::Gripper, .. } => {
                     self.opens == Some(Opens::Tty) && !self.is_process
                 }
                 SimSource::Process => self.is_process,

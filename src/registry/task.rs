@@ -6,10 +6,18 @@ use crate::simulation::task::SharedTrial;
 use crate::simulation::{SimSource, TaskPart};
 
 const TEXT: &str = include_str!("task.toml");
+const HANDHELD: &str = include_str!("task_handheld.toml");
+/// The module of the handheld rig that has no sensor: it is named.
+pub const HANDHELD_MODULE: &str = "handheld_adapter";
 
 /// The entries of the registry with the part of the task that each of them is.
-pub const PARTS: [(&str, TaskPart); 3] =
-    [("cam_wrist", TaskPart::Wrist), ("tactile_tip", TaskPart::Tactile), ("arm", TaskPart::Arm)];
+pub const PARTS: [(&str, TaskPart); 5] = [
+    ("cam_wrist", TaskPart::Wrist),
+    ("tactile_tip", TaskPart::Tactile),
+    ("arm", TaskPart::Arm),
+    ("phone", TaskPart::Phone),
+    ("gripper", TaskPart::Gripper),
+];
 
 impl Registry {
     /// The registry of the simulated task.
@@ -19,6 +27,15 @@ impl Registry {
     #[expect(clippy::expect_used, reason = "a text fixed at build time, parsed by a test")]
     pub fn task() -> Self {
         Self::parse(TEXT, None).expect("the registry of the simulated task is valid").registry
+    }
+
+    /// The registry of the simulated task with the gripper in a hand, in place of the arm.
+    ///
+    /// # Panics
+    /// Never: as [`Self::task`].
+    #[expect(clippy::expect_used, reason = "a text fixed at build time, parsed by a test")]
+    pub fn task_handheld() -> Self {
+        Self::parse(HANDHELD, None).expect("the registry of the handheld task is valid").registry
     }
 }
 
@@ -42,10 +59,14 @@ mod tests {
     #[test]
     fn the_rig_of_the_task_has_its_parts_and_one_actuator() {
         let registry = Registry::task();
-        assert!(PARTS.iter().all(|(name, _)| registry.named(name).is_some()));
-        assert_eq!(registry.devices.len(), PARTS.len());
+        assert!(registry.devices.iter().all(|device| PARTS.iter().any(|(name, _)| *name == device.name)));
+        assert_eq!(registry.devices.len(), 3);
         let (device, action) = registry.actuator().unwrap();
         assert_eq!((device.name.as_str(), action.names.len()), ("arm", 4));
-        assert_eq!(Scenario::task(&registry, 7).devices.len(), PARTS.len());
+        assert_eq!(Scenario::task(&registry, 7).devices.len(), 3);
+        let handheld = Registry::task_handheld();
+        assert!(handheld.actuator().is_none());
+        assert_eq!(Scenario::task(&handheld, 7).devices.len(), 4);
+        assert_eq!(handheld.modules.first().map(|module| module.name.as_str()), Some(HANDHELD_MODULE));
     }
 }

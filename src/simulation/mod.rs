@@ -100,8 +100,25 @@ pub enum TaskPart {
     Wrist,
     /// The camera behind the gel of the fingertip.
     Tactile,
-    /// The arm with its gripper: reports its state, and is the actuator.
+    /// The arm: its state, and the actuator.
     Arm,
+    /// The pose of the gripper in a hand.
+    Phone,
+    /// The opening of the gripper in a hand.
+    Gripper,
+}
+
+impl TaskPart {
+    /// Numbers in a sample; `None` of a camera.
+    pub const fn numbers(self) -> Option<u32> {
+        match self {
+            Self::Wrist | Self::Tactile => None,
+            Self::Arm => Some(task::AXIS_COUNT),
+            // A homogeneous matrix.
+            Self::Phone => Some(16),
+            Self::Gripper => Some(1),
+        }
+    }
 }
 
 /// Reported in place of the kernel's driver of a simulated device.

@@ -63,6 +63,59 @@ fn demonstrations_are_whole_episodes_and_the_same_seed_gives_the_same_one() {
     }
 }
 
+#[test]
+fn a_demonstration_by_hand_has_poses_and_no_action() {
+    let place = Place::new();
+    let hand = ["--sim", "task", "--handheld", "--expert", "--record", "--seed", "1000", "--out", "hand"];
+    let arm = ["--sim", "task", "--expert", "--record", "--seed", "1000", "--out", "arm"];
+    for demonstrate in [&hand[..], &arm] {
+        assert_eq!(printed(&place, demonstrate)[0]["verdict"], "GOOD");
+    }
+    let read = |folder: &str| Episode::read(&place.path(folder).join(&place.files(folder)[0]));
+    let (hand, arm) = (read("hand"), read("arm"));
+    assert_eq!((hand.topic("/action").count(), hand.topic("/rapid/serial/arm").count()), (0, 0));
+    assert!(hand.value("rapid", "configuration").contains("handheld_adapter"), "the module at the bottom");
+    assert!(hand.value("rapid", "tags").contains("\"use\":\"handheld\""));
+    // The same hand moves both: what the phone and the fingers report is the state of the arm.
+    let numbers = |episode: &Episode, topic: &str| -> Vec<Vec<f64>> {
+        let of = |payload: Vec<u8>| payload.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect();
+        payloads(episode, topic).into_iter().map(of).collect()
+    };
+    let (phone, gripper) = (numbers(&hand, "/rapid/phone"), numbers(&hand, "/rapid/gripper"));
+    let states = numbers(&arm, "/rapid/serial/arm");
+    assert_eq!((phone.len(), gripper.len()), (states.len(), states.len()));
+    for ((phone, gripper), state) in phone.iter().zip(&gripper).zip(&states) {
+        assert_eq!([&phone[12..15], &gripper[..]].concat(), *state);
+        assert_eq!((phone.len(), phone[15]), (16, 1.0));
+    }
+    assert_eq!(hand.topic("/rapid/phone/pose").count(), phone.len());
+}
+
+#[test]
+fn a_live_trial_reports_where_the_block_went_and_the_next_one_begins() {
+    let place = Place::new();
+    let mut running = place.start(&["--sim", "task", "--infer", BUNDLE, "--json"], "\"event\":\"act\"");
+    running.wait_for("the next block is on the table");
+    let reported = running.reported();
+    let ended = support::logged(&reported, "trial 0: ");
+    assert!(ended[0].contains("the next block is on the table"), "{ended:?}");
+    assert!(
+        ["sorted: it is in the bin", "wrong bin", "neither bin"].iter().any(|end| ended[0].contains(end)),
+        "{ended:?}"
+    );
+}
+
+#[test]
+fn seeds_of_the_training_are_not_evaluated_without_a_warning() {
+    let place = Place::new();
+    let warned = |seed: &str| {
+        let output = place.run(&["eval", BUNDLE, "--trials", "1", "--condition", "full", "--seed", seed]);
+        assert_eq!(output.status.code(), Some(0));
+        String::from_utf8_lossy(&output.stderr).contains("that this policy was trained on")
+    };
+    assert!(warned("1000") && !warned("50000"));
+}
+
 /// Whatever the phases of its sensors are, and wherever between two of their samples an episode begins.
 #[test]
 fn the_frames_of_the_rig_are_valid_whatever_the_phases_are() {

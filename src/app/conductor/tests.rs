@@ -92,6 +92,7 @@ impl Bench {
             inference: None,
             live: None,
             web: None,
+            trials: None,
             discovery: idle_stage(),
             recording: idle_stage(),
             synchronisation: idle_stage(),

@@ -3,8 +3,9 @@
 //! The wrist camera looks down between the fingers; its picture does not depend on the texture. The tactile camera
 //! looks at a gel from behind, which is plain until it is pressed on the block.
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::TAU;
 
+use super::touch::{Touch, pixels};
 use super::world::{Texture, World, stream};
 use crate::random::Random;
 
@@ -12,11 +13,10 @@ use crate::random::Random;
 pub const SIDE_PIXELS: u32 = 96;
 /// The same as `usize`.
 pub const SIDE: usize = SIDE_PIXELS as usize;
-const PIXELS: usize = SIDE * SIDE;
+pub(super) const PIXELS: usize = SIDE * SIDE;
 /// Half the block's edge.
 const HALF_EDGE: f64 = 0.12;
 const WRIST_GRAIN: f32 = 0.015;
-const TACTILE_GRAIN: f32 = 0.02;
 
 /// The appearance of one trial, drawn once from its seed.
 #[derive(Debug)]
@@ -28,18 +28,21 @@ pub struct Looks {
     /// The gel at rest, and the change at full pressure: RGB of each pixel.
     gel: Vec<[f32; 3]>,
     imprint: Vec<[f32; 3]>,
+    /// Standard deviation of its noise.
+    tactile_noise: f32,
     wrist_grain: Random,
     tactile_grain: Random,
 }
 
 /// Offset of a pixel from the middle of the picture.
-fn offset(pixel: usize) -> f64 {
+pub(super) fn offset(pixel: usize) -> f64 {
     pixel as f64 - (SIDE as f64 - 1.0) / 2.0
 }
 
 impl Looks {
     /// The appearance of trial `seed`, in which the block has `texture`.
     pub fn new(seed: u64, texture: Texture) -> Self {
+        let touch = Touch::new(seed);
         let mut random = Random::new(seed, stream::LOOKS);
         let mut colour = |low, high| [(); 3].map(|()| narrow(random.uniform(low, high)));
         let table = colour(0.35, 0.6);
@@ -62,10 +65,17 @@ impl Looks {
             phases,
             gain,
             gel,
-            imprint: imprint(texture, &mut random),
+            imprint: touch.imprint(texture),
+            tactile_noise: touch.grain,
             wrist_grain: Random::new(seed, stream::WRIST_NOISE),
             tactile_grain: Random::new(seed, stream::TACTILE_NOISE),
         }
+    }
+
+    /// The appearance of trial `seed` from now on, with the gel at rest as it is: the fingertip stays the same.
+    pub fn next(&mut self, seed: u64, texture: Texture) {
+        let gel = std::mem::take(&mut self.gel);
+        *self = Self { gel, ..Self::new(seed, texture) };
     }
 
     /// Renders the wrist camera's picture into `picture`, 96 x 96 x 3 bytes.
@@ -116,65 +126,15 @@ impl Looks {
         picture.clear();
         for (gel, imprint) in self.gel.iter().zip(&self.imprint) {
             for channel in 0..3 {
-                let grain = TACTILE_GRAIN * self.tactile_grain.normal();
+                let grain = self.tactile_noise * self.tactile_grain.normal();
                 picture.push(byte(gel[channel] + pressure * imprint[channel] + grain));
             }
         }
     }
 }
 
-/// Horizontal and vertical offset of every pixel, row by row.
-fn pixels() -> impl Iterator<Item = (f64, f64)> {
-    (0..PIXELS).map(|at| (offset(at % SIDE), offset(at / SIDE)))
-}
-
-/// The change of the gel's picture by the texture at full pressure, lit by three coloured lights from three sides: the
-/// slope of the surface towards each.
-fn imprint(texture: Texture, random: &mut Random) -> Vec<[f32; 3]> {
-    let (angle, period) = (random.uniform(0.0, PI), random.uniform(15.0, 19.0));
-    let shift = [random.uniform(-20.0, 20.0), random.uniform(-20.0, 20.0)];
-    let middle = [random.uniform(-8.0, 8.0), random.uniform(-8.0, 8.0)];
-    let radius = random.uniform(34.0, 42.0);
-    let (glow, turn) = (random.uniform(0.8, 1.2), random.uniform(-0.3, 0.3));
-    let contact: Vec<f64> =
-        pixels().map(|(u, v)| 1.0 / (1.0 + (((u - middle[0]).hypot(v - middle[1]) - radius) / 3.0).exp())).collect();
-    let height: Vec<f64> = pixels()
-        .zip(&contact)
-        .map(|((u, v), contact)| {
-            let waves: [f64; 3] = std::array::from_fn(|family| {
-                let (sin, cos) = (angle + family as f64 * TAU / 3.0).sin_cos();
-                (TAU / period * (cos * (u - shift[0]) + sin * (v - shift[1]))).cos()
-            });
-            let relief = match texture {
-                // Ridges along three families of lines.
-                Texture::Triangular => (waves.into_iter().fold(f64::MIN, f64::max) - 0.75) / 0.25,
-                // The borders between the points of a triangular lattice are a honeycomb.
-                Texture::Hexagonal => (-waves.iter().sum::<f64>() - 0.35) / 0.65,
-            };
-            contact * (0.5 + relief.clamp(0.0, 1.0))
-        })
-        .collect();
-    let at = |u: usize, v: usize| height.get(v * SIDE + u).copied().unwrap_or(0.0);
-    (0..PIXELS)
-        .map(|pixel| {
-            let (u, v) = (pixel % SIDE, pixel / SIDE);
-            // Central differences, one-sided at the edges.
-            let slope = |low: f64, high: f64, steps: usize| (high - low) / steps.max(1) as f64;
-            let (left, right) = (u.saturating_sub(1), (u + 1).min(SIDE - 1));
-            let (up, down) = (v.saturating_sub(1), (v + 1).min(SIDE - 1));
-            let across = slope(at(left, v), at(right, v), right - left);
-            let along = slope(at(u, up), at(u, down), down - up);
-            std::array::from_fn(|light| {
-                let (sin, cos) = (turn + light as f64 * TAU / 3.0).sin_cos();
-                let shade = 1.1 * glow * (cos * across + sin * along);
-                narrow(shade + 0.06 * contact.get(pixel).copied().unwrap_or(0.0))
-            })
-        })
-        .collect()
-}
-
 #[expect(clippy::cast_possible_truncation, reason = "a colour needs no more than 32 bits")]
-fn narrow(value: f64) -> f32 {
+pub(super) fn narrow(value: f64) -> f32 {
     value as f32
 }
 

@@ -6,6 +6,7 @@
 
 mod expert;
 mod looks;
+mod touch;
 mod world;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,6 +15,7 @@ use jpeg_encoder::{ColorType, Encoder, EncodingError, SamplingFactor};
 
 pub use expert::Expert;
 pub use looks::{Looks, SIDE, SIDE_PIXELS};
+pub use touch::{Touch, UNSEEN_PERIOD};
 pub use world::{AXES, AXIS_COUNT, MAX_STEPS, Outcome, STEP_HZ, Texture, World};
 
 use super::TaskPart;
@@ -30,15 +32,35 @@ pub struct PictureError(#[from] EncodingError);
 
 /// Encoding of the samples of `part`, with width and height of the header.
 pub const fn layout(part: TaskPart) -> (Encoding, u32, u32) {
-    match part {
-        TaskPart::Arm => (Encoding::F64, AXIS_COUNT, 0),
-        TaskPart::Wrist | TaskPart::Tactile => (Encoding::Mjpeg, SIDE_PIXELS, SIDE_PIXELS),
+    match part.numbers() {
+        Some(count) => (Encoding::F64, count, 0),
+        None => (Encoding::Mjpeg, SIDE_PIXELS, SIDE_PIXELS),
     }
 }
 
-/// A trial in progress: the world and its appearance.
+/// Steps before the arm follows actions again after the next block was put on the table: the policy sees it first.
+const REST: u32 = 20;
+
+/// How a trial ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Ended {
+    /// Its seed.
+    pub seed: u64,
+    /// Where the block is.
+    pub outcome: Outcome,
+    /// Steps that it took.
+    pub steps: u32,
+}
+
+/// A trial in progress: the world and its appearance. In real time it is followed by the next one ([`Self::advance_to`]).
 #[derive(Debug)]
 pub struct Trial {
+    seed: u64,
+    /// Steps of the trials before it.
+    earlier: u32,
+    /// Steps in which the arm follows no action.
+    rest: u32,
+    ended: Vec<Ended>,
     /// The world.
     pub world: World,
     /// The same one step earlier.
@@ -54,12 +76,24 @@ impl Trial {
     pub fn new(seed: u64) -> Self {
         let world = World::new(seed);
         let looks = Looks::new(seed, world.texture);
-        Self { before: world.clone(), world, looks, command: None, picture: Vec::with_capacity(SIDE * SIDE * 3) }
+        Self {
+            seed,
+            earlier: 0,
+            rest: 0,
+            ended: Vec::new(),
+            before: world.clone(),
+            world,
+            looks,
+            command: None,
+            picture: Vec::with_capacity(SIDE * SIDE * 3),
+        }
     }
 
     /// Sets the action that the actuator follows from the next step on.
     pub fn command(&mut self, target: [f64; AXES]) {
-        self.command = Some(target);
+        if self.world.steps() >= self.rest {
+            self.command = Some(target);
+        }
     }
 
     /// Advances a tenth of a second. Without a command the arm stays in place.
@@ -69,11 +103,33 @@ impl Trial {
         self.world.step(target, shake);
     }
 
-    /// Advances until `steps` steps are done.
+    /// Advances until `steps` steps are done. When the block is in a bin, or time is up, the next trial begins: with the next
+    /// seed, the arm back at a start, and the gel that it has.
     pub fn advance_to(&mut self, steps: u32) {
-        while self.world.steps() < steps {
+        while self.earlier + self.world.steps() < steps {
             self.step(0.0);
+            // An arm without a policy rests, and nothing ends.
+            if self.command.is_some() && self.world.is_done() {
+                self.next();
+            }
         }
+    }
+
+    fn next(&mut self) {
+        let (outcome, steps) = (self.world.outcome(), self.world.steps());
+        self.ended.push(Ended { seed: self.seed, outcome, steps });
+        self.earlier += steps;
+        self.seed = self.seed.wrapping_add(1);
+        self.world = World::new(self.seed);
+        self.before.clone_from(&self.world);
+        self.looks.next(self.seed, self.world.texture);
+        self.command = None;
+        self.rest = REST;
+    }
+
+    /// The trials that have ended since the last call.
+    pub fn ended(&mut self) -> Vec<Ended> {
+        std::mem::take(&mut self.ended)
     }
 
     /// Writes the current sample of `part` into `payload`: a JPEG picture, or the four numbers of the state.
@@ -95,15 +151,26 @@ impl Trial {
         match part {
             TaskPart::Wrist => self.looks.wrist(world, &mut self.picture),
             TaskPart::Tactile => self.looks.tactile(world, &mut self.picture),
-            TaskPart::Arm => {
-                payload.extend(world.state().into_iter().flat_map(f64::to_le_bytes));
-                return Ok(());
+            TaskPart::Arm => put(payload, world.state()),
+            TaskPart::Gripper => put(payload, [world.grip]),
+            TaskPart::Phone => {
+                let [x, y, z] = world.position;
+                // It is not turned: its frame is the gripper's, column by column.
+                let columns = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [x, y, z, 1.0]];
+                put(payload, columns.into_iter().flatten());
             }
+        }
+        if part.numbers().is_some() {
+            return Ok(());
         }
         let mut encoder = Encoder::new(payload, JPEG_QUALITY);
         encoder.set_sampling_factor(SamplingFactor::F_1_1);
         Ok(encoder.encode(&self.picture, SIDE_U16, SIDE_U16, ColorType::Rgb)?)
     }
+}
+
+fn put(payload: &mut Vec<u8>, numbers: impl IntoIterator<Item = f64>) {
+    payload.extend(numbers.into_iter().flat_map(f64::to_le_bytes));
 }
 
 /// A trial whose parts are read by separate streams.

@@ -116,7 +116,7 @@ impl World {
             pressure: 0.0,
             released: false,
             steps: 0,
-            strongest: random.uniform(0.6, 1.0),
+            strongest: random.uniform(0.5, 1.0),
             noise: Random::new(seed, stream::DYNAMICS),
         }
     }
@@ -215,4 +215,5 @@ pub(super) mod stream {
     pub(in super::super) const WRIST_NOISE: u64 = 3;
     pub(in super::super) const TACTILE_NOISE: u64 = 4;
     pub(in super::super) const EXPERT: u64 = 5;
+    pub(in super::super) const TOUCH: u64 = 6;
 }

@@ -1,0 +1,254 @@
+//! What the block's texture does to the gel: the change of the tactile picture at full pressure.
+//!
+//! Both textures are one relief on a triangular lattice, and its inverse: bumps on the points of the lattice, or holes at
+//! them, whose borders are a honeycomb. Heights are equalised (uniform over the plane), so that the inverse has the same
+//! distribution of heights, the same slopes with the other sign, and, because the lattice has no direction, the same
+//! distribution of slopes and the same spectrum. What tells the textures apart is the arrangement alone: no statistic of
+//! single pixels does, and a test shows it.
+//!
+//! Period, rotation, offset, wear, dirt, the place and size of the contact, the lights and the noise are drawn for every
+//! block, independently of its texture.
+
+use std::f64::consts::{PI, TAU};
+use std::sync::LazyLock;
+
+use super::looks::{PIXELS, SIDE, narrow, offset};
+use super::world::{Texture, stream};
+use crate::random::Random;
+
+/// Distances of the lattice's lines, pixels. Each block has one of them.
+const PERIODS: [f64; 5] = [13.0, 15.0, 17.0, 19.0, 21.0];
+/// The one that no demonstration shows: whether a policy has learned the texture or its pictures.
+pub const UNSEEN_PERIOD: usize = 2;
+/// Points per side of the cell in which the distribution of heights is measured.
+const CELL: usize = 64;
+/// Most pieces of dirt on a gel.
+const MOST_DIRT: u64 = 3;
+
+/// The touch of one trial, drawn from its seed.
+#[derive(Debug, Clone)]
+pub struct Touch {
+    /// Index of its period among the possible ones.
+    pub period: usize,
+    /// Standard deviation of the noise of a pixel, of a full scale of 1.
+    pub grain: f32,
+    angle: f64,
+    shift: [f64; 2],
+    middle: [f64; 2],
+    radius: f64,
+    glow: f64,
+    turn: f64,
+    wear: Wear,
+    dirt: Vec<Dirt>,
+}
+
+/// How far the relief is worn: smoothly from place to place.
+#[derive(Debug, Clone)]
+struct Wear {
+    /// Largest share of the relief that is gone.
+    most: f64,
+    direction: f64,
+    phase: f64,
+    period: f64,
+}
+
+/// A spot through which less of the imprint is seen.
+#[derive(Debug, Clone)]
+struct Dirt {
+    middle: [f64; 2],
+    radius: f64,
+    shade: f64,
+}
+
+impl Touch {
+    /// That of trial `seed`.
+    pub fn new(seed: u64) -> Self {
+        let mut random = Random::new(seed, stream::TOUCH);
+        let period = usize::try_from(random.below(PERIODS.len() as u64)).unwrap_or(0);
+        let mut around = |reach: f64| [(); 2].map(|()| random.uniform(-reach, reach));
+        let (shift, middle) = (around(20.0), around(14.0));
+        let wear = Wear {
+            most: random.uniform(0.0, 0.6),
+            direction: random.uniform(0.0, PI),
+            phase: random.uniform(0.0, TAU),
+            period: random.uniform(60.0, 140.0),
+        };
+        let spots = random.below(MOST_DIRT + 1);
+        let dirt = (0..spots).map(|_| Dirt {
+            middle: [(); 2].map(|()| random.uniform(-40.0, 40.0)),
+            radius: random.uniform(3.0, 8.0),
+            shade: random.uniform(-0.12, -0.04),
+        });
+        let dirt = dirt.collect();
+        Self {
+            period,
+            grain: narrow(random.uniform(0.015, 0.035)),
+            angle: random.uniform(0.0, PI),
+            shift,
+            middle,
+            radius: random.uniform(24.0, 42.0),
+            glow: random.uniform(0.8, 1.2),
+            turn: random.uniform(-0.3, 0.3),
+            wear,
+            dirt,
+        }
+    }
+
+    /// The change of each pixel's RGB by `texture` at full pressure. Three coloured lights from three sides show the slope
+    /// of the surface towards each.
+    pub fn imprint(&self, texture: Texture) -> Vec<[f32; 3]> {
+        let contact: Vec<f64> = pixels().map(|at| self.contact(at)).collect();
+        let height: Vec<f64> =
+            pixels().zip(&contact).map(|(at, contact)| contact * (0.5 + self.relief(texture, at))).collect();
+        let at = |u: usize, v: usize| height.get(v * SIDE + u).copied().unwrap_or(0.0);
+        let shades = (0..PIXELS).map(|pixel| {
+            let (u, v) = (pixel % SIDE, pixel / SIDE);
+            // Central differences, one-sided at the edges.
+            let slope = |low: f64, high: f64, steps: usize| (high - low) / steps.max(1) as f64;
+            let (left, right) = (u.saturating_sub(1), (u + 1).min(SIDE - 1));
+            let (up, down) = (v.saturating_sub(1), (v + 1).min(SIDE - 1));
+            let across = slope(at(left, v), at(right, v), right - left);
+            let along = slope(at(u, up), at(u, down), down - up);
+            let (seen, shade) = self.dirt_at((offset(u), offset(v)));
+            std::array::from_fn(|light| {
+                let (sin, cos) = (self.turn + light as f64 * TAU / 3.0).sin_cos();
+                let lit = 1.1 * self.glow * (cos * across + sin * along);
+                narrow(seen * (lit + 0.06 * contact.get(pixel).copied().unwrap_or(0.0)) + shade)
+            })
+        });
+        shades.collect()
+    }
+
+    /// How firmly the gel lies on the block at a place, 0 to 1.
+    fn contact(&self, (u, v): (f64, f64)) -> f64 {
+        let away = (u - self.middle[0]).hypot(v - self.middle[1]) - self.radius;
+        1.0 / (1.0 + (away / 3.0).exp())
+    }
+
+    /// The height of the texture at a place, 0 to 1.
+    fn relief(&self, texture: Texture, (u, v): (f64, f64)) -> f64 {
+        let period = PERIODS.get(self.period).copied().unwrap_or(PERIODS[0]);
+        let waves: f64 = (0..3)
+            .map(|family| {
+                let (sin, cos) = (self.angle + f64::from(family) * TAU / 3.0).sin_cos();
+                (TAU / period * (cos * (u - self.shift[0]) + sin * (v - self.shift[1]))).cos()
+            })
+            .sum();
+        let bumps = equalised(waves);
+        let height = match texture {
+            Texture::Triangular => bumps,
+            Texture::Hexagonal => 1.0 - bumps,
+        };
+        0.5 + (1.0 - self.wear.at(u, v)) * (height - 0.5)
+    }
+
+    /// The share of the imprint that is seen at a place, and the shade of the dirt there.
+    fn dirt_at(&self, (u, v): (f64, f64)) -> (f64, f64) {
+        self.dirt.iter().fold((1.0, 0.0), |(seen, shade), dirt| {
+            let away = (u - dirt.middle[0]).hypot(v - dirt.middle[1]) - dirt.radius;
+            let covered = 1.0 / (1.0 + away.exp());
+            (seen * (1.0 - 0.7 * covered), shade + dirt.shade * covered)
+        })
+    }
+}
+
+impl Wear {
+    fn at(&self, u: f64, v: f64) -> f64 {
+        let (sin, cos) = self.direction.sin_cos();
+        let wave = (TAU / self.period * (cos * u + sin * v) + self.phase).cos();
+        self.most * (0.5 + 0.5 * wave)
+    }
+}
+
+/// The share of the plane on which the sum of the three waves of a lattice is at most `waves`: the height of a relief whose
+/// heights are uniform.
+fn equalised(waves: f64) -> f64 {
+    static SORTED: LazyLock<Vec<f64>> = LazyLock::new(|| {
+        // The phases of two waves determine that of the third: their directions sum to zero.
+        let phase = |step: usize| TAU * step as f64 / CELL as f64;
+        let cell = (0..CELL * CELL).map(|at| (phase(at % CELL), phase(at / CELL)));
+        let mut waves: Vec<f64> = cell.map(|(one, two)| one.cos() + two.cos() + (one + two).cos()).collect();
+        waves.sort_unstable_by(f64::total_cmp);
+        waves
+    });
+    SORTED.partition_point(|other| *other <= waves) as f64 / SORTED.len() as f64
+}
+
+/// Horizontal and vertical offset of every pixel, row by row.
+pub(super) fn pixels() -> impl Iterator<Item = (f64, f64)> {
+    (0..PIXELS).map(|at| (offset(at % SIDE), offset(at / SIDE)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Statistics of the pixels of a picture, each without regard to where they lie.
+    fn statistics(picture: &[[f32; 3]]) -> Vec<f64> {
+        let mut found = Vec::new();
+        for channel in 0..3 {
+            let values: Vec<f64> = picture.iter().map(|pixel| f64::from(pixel[channel])).collect();
+            let count = values.len() as f64;
+            let mean = values.iter().sum::<f64>() / count;
+            let moment = |power: i32| values.iter().map(|value| (value - mean).powi(power)).sum::<f64>() / count;
+            let deviation = moment(2).sqrt();
+            let mut sorted = values.clone();
+            sorted.sort_unstable_by(f64::total_cmp);
+            let quantile = |percent: usize| sorted[(sorted.len() - 1) * percent / 100];
+            found.extend([mean, deviation, moment(3) / deviation.powi(3), moment(4) / deviation.powi(4)]);
+            found.extend([0, 10, 50, 90, 100].map(quantile));
+        }
+        found
+    }
+
+    /// The share of the second half of the blocks that the best threshold of the first half tells apart.
+    fn told_apart(of: &[(f64, bool)]) -> f64 {
+        let (learn, test) = of.split_at(of.len() / 2);
+        let right = |set: &[(f64, bool)], threshold: f64, above: bool| {
+            set.iter().filter(|(value, texture)| ((*value > threshold) == above) == *texture).count()
+        };
+        let candidates = learn.iter().flat_map(|(value, _)| [(*value, true), (*value, false)]);
+        let (threshold, above) =
+            candidates.max_by_key(|(threshold, above)| right(learn, *threshold, *above)).expect("some blocks");
+        right(test, threshold, above) as f64 / test.len() as f64
+    }
+
+    #[test]
+    fn no_statistic_of_pixels_tells_the_textures_apart() {
+        let blocks: Vec<(Vec<f64>, bool)> = (0..300)
+            .flat_map(|seed| {
+                let touch = Touch::new(seed);
+                let of = |texture| statistics(&touch.imprint(texture));
+                [(of(Texture::Triangular), true), (of(Texture::Hexagonal), false)]
+            })
+            .collect();
+        for statistic in 0..blocks[0].0.len() {
+            let of: Vec<(f64, bool)> = blocks.iter().map(|(values, texture)| (values[statistic], *texture)).collect();
+            let share = told_apart(&of);
+            assert!(share < 0.6, "statistic {statistic} tells {share:.2} of the blocks apart");
+        }
+        // The check can fail: the mean height of the lattice's points does tell them apart.
+        let heights: Vec<(f64, bool)> = (0..100)
+            .flat_map(|seed| {
+                let touch = Touch::new(seed);
+                let at = (touch.shift[0], touch.shift[1]);
+                [Texture::Triangular, Texture::Hexagonal]
+                    .map(|texture| (touch.relief(texture, at), texture == Texture::Triangular))
+            })
+            .collect();
+        assert!(told_apart(&heights) > 0.95);
+    }
+
+    #[test]
+    fn heights_are_uniform_over_the_plane() {
+        assert!(equalised(-1.51) < 1e-9 && (equalised(3.0) - 1.0).abs() < 1e-9);
+        // Places that fill a cell evenly, between those that it was measured at.
+        let heights = (0..10_000).map(|at| {
+            let (one, two) = (f64::from(at) * TAU * 0.754_877_666, f64::from(at) * TAU * 0.569_840_291);
+            equalised(one.cos() + two.cos() + (one + two).cos())
+        });
+        let (sum, squares) = heights.fold((0.0, 0.0), |(sum, squares), h| (sum + h, squares + h * h));
+        let mean = sum / 1e4;
+        assert!((mean - 0.5).abs() < 0.01 && (squares / 1e4 - mean * mean - 1.0 / 12.0).abs() < 0.01, "{mean}");
+    }
+}
