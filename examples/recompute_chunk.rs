@@ -18,6 +18,7 @@ use rapid::policy::bundle::Bundle;
 use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::request::Request;
+use rapid::policy::sampler::Computing;
 use rapid::random::Random;
 use rapid::sample::{Encoding, SampleHeader};
 use serde::Deserialize;
@@ -72,7 +73,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let modalities = modalities(&bytes)?;
 
     let bundle = Bundle::open(arguments.next().as_deref().map(Path::new))?;
-    let mut model = Model::load(&bundle, &Environment::open(None)?, None)?;
+    let mut model = Model::load(&bundle, &Environment::open(None)?, Computing::default())?;
     let mut request = Request::new(&bundle);
     request.tick = chunk.tick;
     request.seed = chunk.seed;

@@ -25,7 +25,7 @@ pub use export::{ExportArgs, Layout, PictureForm};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
 pub use measure::{AblationArgs, Calibration, Count, LatencyArgs};
 #[cfg(feature = "policy")]
-pub use policy::EvalArgs;
+pub use policy::{EvalArgs, PolicyCommand, ShowArgs};
 pub use policy::{InferenceArgs, PolicyArgs, ReplayArgs};
 pub use registry::{RegisterArgs, UnregisterArgs};
 pub use run::{LiveArgs, RunArgs, ShownArgs, TaskArgs, WebArgs};
@@ -164,7 +164,7 @@ pub struct Global {
 /// The general options that have an effect on a command; the others are hidden there, and rejected.
 fn general_options(command: &str) -> &'static [&'static str] {
     match command {
-        "devices" | "register" | "calibrate" => &["sim", "config", "json"],
+        "devices" | "register" | "calibrate" | "policy" => &["sim", "config", "json"],
         "unregister" | "modules" | "check" | "doctor" | "ablation" => &["config", "json"],
         "artifacts" => &["config"],
         "mask" | "replay" | "episode" | "session" | "reload" | "logs" => &["json", "instance"],
@@ -335,7 +335,14 @@ pub enum Command {
     },
     /// Replay an episode as if its devices were plugged in
     #[command(after_long_help = policy::REPLAY)]
-    Replay(ReplayArgs),
+    Replay(Box<ReplayArgs>),
+    /// Show a policy: what it observes and moves, its speed here
+    #[cfg(feature = "policy")]
+    Policy {
+        /// What about it.
+        #[command(subcommand)]
+        what: PolicyCommand,
+    },
     /// Evaluate a policy on the simulated task with sensors unplugged
     #[cfg(feature = "policy")]
     #[command(after_long_help = policy::EVAL)]
@@ -351,8 +358,11 @@ pub enum Command {
         shell: clap_complete::Shell,
     },
     /// Write the manual pages, one per command
-    #[command(after_long_help = "Examples:\n  rapid man && man ./man/rapid-replay.1\n  \
-        sudo rapid man /usr/local/share/man/man1")]
+    #[command(
+        hide = true,
+        after_long_help = "Examples:\n  rapid man && man ./man/rapid-replay.1\n  \
+        sudo rapid man /usr/local/share/man/man1"
+    )]
     Man {
         /// Folder to write them to
         #[arg(value_name = "DIR", default_value = "man", value_hint = ValueHint::DirPath)]
@@ -422,8 +432,10 @@ impl Cli {
         });
         // `rapid eval` has them too, without --infer.
         let require = |command: clap::Command| {
-            let command = command.mut_arg("denoising_steps", |option| option.requires("infer").hide_short_help(true));
-            command.mut_arg("ort_lib", |option| option.requires("infer").hide_short_help(true))
+            let options = ["denoising_steps", "threads", "provider", "ort_lib"];
+            options.into_iter().fold(command, |command, option| {
+                command.mut_arg(option, |option| option.requires("infer").hide_short_help(true))
+            })
         };
         require(command).mut_subcommand("replay", require)
     }

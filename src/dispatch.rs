@@ -26,7 +26,9 @@ use self::registry::{
 };
 use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Calibration, Cli, Command, Global, LevelArg, PolicyArgs, RunArgs, SessionCommand};
+#[cfg(feature = "policy")]
+use crate::cli::PolicyCommand;
+use crate::cli::{Calibration, Cli, Command, Global, LatencyArgs, LevelArg, PolicyArgs, RunArgs, SessionCommand};
 use crate::commands::devices::Formats;
 use crate::commands::inspect::InspectFailure;
 use crate::commands::logs::LogsOptions;
@@ -174,10 +176,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             let request = what.map_or(SessionRequest::Show, SessionCommand::into_request);
             Ok(commands::session::ask(global.instance.as_deref(), &request, format, out)?)
         }
-        Command::Calibrate { what: Calibration::Latency(args) } => {
-            let (registry, attached) = connected(global)?;
-            Ok(block_on(commands::calibrate::latency(&registry, &attached, &args, format, out))??)
-        }
+        Command::Calibrate { what: Calibration::Latency(args) } => calibrate(global, &args, format, out),
         Command::Inspect { paths, plot: Some(to) } => {
             reported(commands::plot::plot(&paths, to.as_deref(), format, out, &mut io::stderr())?)
         }
@@ -200,8 +199,10 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             Ok(commands::ablation::ablation(&registry, global.config.as_deref(), &args, format, out)?)
         }
         #[cfg(feature = "policy")]
+        Command::Policy { what: PolicyCommand::Show(args) } => policy::show(global, &args, format, out),
+        #[cfg(feature = "policy")]
         Command::Eval(args) => policy::eval(args, format),
-        Command::Replay(args) if args.infer.is_some() => policy::compare(args, format),
+        Command::Replay(args) if args.infer.is_some() => policy::compare(*args, format),
         Command::Replay(args) => {
             let replay::Replayed { registry, scenario, length } =
                 replay::scenario(&args.file).map_err(Failure::argument)?;
@@ -215,6 +216,11 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::grammar(), shell, out)?),
         Command::Man { to } => Ok(commands::completions::man(Cli::grammar(), &to, out)?),
     }
+}
+
+fn calibrate(global: &Global, args: &LatencyArgs, format: Format, out: &mut dyn io::Write) -> Result<(), Failure> {
+    let (registry, attached) = connected(global)?;
+    Ok(block_on(commands::calibrate::latency(&registry, &attached, args, format, out))??)
 }
 
 /// Runs the rig, or records demonstrations of the simulated task.
@@ -551,6 +557,8 @@ failures! {
     commands::ablation::AblationError: |error| argument_code(error.is_bad_argument());
     #[cfg(feature = "policy")]
     commands::eval::EvalError: |error| argument_code(matches!(error, commands::eval::EvalError::Bundle(_)));
+    #[cfg(feature = "policy")]
+    commands::policy::ShowError: |error| argument_code(matches!(error, commands::policy::ShowError::Bundle(_)));
     #[cfg(feature = "policy")]
     CompareFailure: |error| argument_code(matches!(
         error,

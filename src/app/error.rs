@@ -64,6 +64,9 @@ pub enum AppError {
     #[cfg(feature = "policy")]
     #[error(transparent)]
     Policy(#[from] PolicyError),
+    /// Its chunks take longer than their actions.
+    #[error("the policy is too slow on this machine: {0}")]
+    TooSlow(String),
     /// What the policy requires is not present.
     #[error("the policy needs {0}: plug it in, or use --wait to start when it is there")]
     Required(String),

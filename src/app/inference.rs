@@ -18,6 +18,8 @@ use crate::modality::ModalityId;
 use crate::policy::library::Environment;
 use crate::policy::live::{Live, LiveOptions};
 use crate::policy::model::Model;
+use crate::policy::pace::{Pace, PaceVerdict};
+use crate::policy::sampler::Computing;
 use crate::registry::Registry;
 use crate::status::{Board, Level, What};
 
@@ -33,8 +35,8 @@ pub struct PolicyOptions {
     pub live: LiveOptions,
     /// Wait for required devices instead of failing.
     pub wait: bool,
-    /// Denoising steps instead of those of the bundle.
-    pub denoising_steps: Option<usize>,
+    /// How it is computed.
+    pub computing: Computing,
     /// Library of onnxruntime instead of the built-in one.
     pub library: Option<PathBuf>,
 }
@@ -87,19 +89,21 @@ struct Flight {
 impl Flight {
     async fn run(mut self, stop: CancellationToken) -> Result<(), AppError> {
         let loaded = tokio::task::spawn_blocking({
-            let (bundle, named, steps) =
-                (Arc::clone(&self.options.live.bundle), self.options.library.clone(), self.options.denoising_steps);
-            move || -> Result<(Model, String), AppError> {
+            let (bundle, named, computing) =
+                (Arc::clone(&self.options.live.bundle), self.options.library.clone(), self.options.computing);
+            move || -> Result<(Model, String, Duration), AppError> {
                 let environment = Environment::open(named.as_deref())?;
-                let model = Model::load(&bundle, &environment, steps)?;
-                Ok((model, environment.origin.to_string()))
+                let mut model = Model::load(&bundle, &environment, computing)?;
+                let chunk = model.rehearse()?;
+                Ok((model, environment.origin.to_string(), chunk))
             }
         });
-        let (model, library) = tokio::select! {
+        let (model, library, chunk) = tokio::select! {
             biased;
             () = stop.cancelled() => return Ok(()),
             loaded = loaded => loaded.map_err(|_| AppError::Panicked("the policy"))??,
         };
+        self.judge(chunk)?;
         if !self.settled(&stop).await? {
             return Ok(());
         }
@@ -119,6 +123,17 @@ impl Flight {
             // It ends without a request only when one of its threads has ended.
             Ok(Ok(())) | Err(_) => Err(AppError::Panicked("the policy")),
         }
+    }
+
+    /// Whether the time of a chunk suits the rate of its actions.
+    fn judge(&self, chunk: Duration) -> Result<(), AppError> {
+        let Pace { verdict, text } = Pace::of(&self.options.live.bundle, chunk);
+        match verdict {
+            PaceVerdict::Whole => tracing::debug!("{text}"),
+            PaceVerdict::Pauses => self.board.announce(What::Log { level: Level::Warn, text }),
+            PaceVerdict::TooSlow => return Err(AppError::TooSlow(text)),
+        }
+        Ok(())
     }
 
     /// Waits until everything required is present, and the episode has begun if the policy is to be recorded; `false`

@@ -1,13 +1,16 @@
 use super::*;
 use crate::action::{ActionSource, MAX_ACTION, NoAction};
 use crate::modality::ModalityId;
-use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale};
+use crate::registry::{
+    DeviceSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
+};
 use crate::sample::Encoding;
 use std::time::Duration;
 
 pub(super) fn registry(depth: usize) -> Registry {
     let id = ModalityId::new(3).expect("below 64");
     Registry {
+        inference: InferenceSpec::default(),
         rig: RigSpec {
             name: "test".into(),
             observation_hz: 30.0,

@@ -1,20 +1,31 @@
 //! The options of a policy, and the grammar of `rapid eval` and `rapid replay`.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
+#[cfg(feature = "policy")]
+use clap::Subcommand;
 use clap::{Args, ValueHint};
 
 use super::run::{RUN, RunArgs};
+use super::time;
 #[cfg(feature = "policy")]
 use crate::lockstep::evaluate::Condition;
+#[cfg(feature = "policy")]
+use crate::policy::sampler::Computing;
+use crate::registry::{InferenceSpec, Provider};
 
 const POLICY: &str = "Policy options";
 
 #[cfg(feature = "policy")]
 pub(super) const EVAL: &str = "\
-Conditions: full (all sensors), no-tactile (without the tactile sensor), hot-unplug (it is unplugged while \
-the block is carried), hot-replug (it is unplugged on the way to the block, and plugged in again), no-wrist \
-(without the camera that shows where the block lies).
+Conditions: full (all sensors), no-tactile (without the tactile sensor), hot-unplug (it is unplugged after \
+the touch, before the ways to the bins part), hot-replug (it is unplugged on the way to the block, and \
+plugged in again after the touch), early-unplug (it is unplugged before the touch), no-wrist (without the \
+camera that shows where the block lies).
+
+--hold-last keeps the last sample of a sensor that was unplugged for some time, as if it were there; without \
+it the policy sees zeros.
 
 The seed of a trial determines when each sensor captures (anywhere in its period of 100 ms) and how long \
 after that its sample is delivered (5 to 50 ms); the policy starts when the last of them was delivered. \
@@ -23,6 +34,7 @@ Trials run faster than real time; the same seed gives the same trial.
 Examples:
   rapid eval
   rapid eval --trials 100 --json > result.jsonl
+  rapid eval --hold-last 20s --condition hot-unplug --condition early-unplug
   rapid eval --static-config --condition hot-unplug models/tactile-id";
 
 /// Options of a policy.
@@ -47,9 +59,17 @@ pub struct PolicyArgs {
     /// Continue when a sensor is missing that the policy was not trained to miss
     #[arg(long, alias = "go-on", requires = "infer", hide_short_help = true)]
     pub ignore_missing: bool,
+    /// Hold the last sample of a sensor that is unplugged for this long [default: as the policy states]
+    #[arg(long, value_name = "TIME", value_parser = hold, requires = "infer", hide_short_help = true)]
+    pub hold_last: Option<Duration>,
     /// How inference runs.
     #[command(flatten, next_help_heading = POLICY)]
     pub inference: InferenceArgs,
+}
+
+fn hold(text: &str) -> Result<Duration, String> {
+    let range = Duration::from_millis(1)..=Duration::from_mins(10);
+    time(text, range, "must be between 1ms and 10min", "20s")
 }
 
 /// How inference runs.
@@ -58,9 +78,57 @@ pub struct InferenceArgs {
     /// Denoising steps [default: from the policy]
     #[arg(long, value_name = "COUNT")]
     pub denoising_steps: Option<usize>,
+    /// Threads to compute on [default: 1, or that of [inference] in devices.toml]
+    #[arg(long, value_name = "COUNT", value_parser = threads)]
+    pub threads: Option<usize>,
+    /// cpu, cuda or tensorrt [default: cpu, or that of [inference] in devices.toml]
+    #[arg(long, value_name = "NAME", value_parser = provider)]
+    pub provider: Option<Provider>,
     /// onnxruntime library to use instead of the built-in one
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub ort_lib: Option<PathBuf>,
+}
+
+impl InferenceArgs {
+    /// With what the registry states for this machine, where nothing is given.
+    #[cfg(feature = "policy")]
+    pub fn computing(&self, registry: InferenceSpec) -> Computing {
+        let threads = self.threads.unwrap_or(registry.threads);
+        let provider = self.provider.unwrap_or(registry.provider);
+        Computing { denoising_steps: self.denoising_steps, on: InferenceSpec { threads, provider } }
+    }
+}
+
+fn threads(text: &str) -> Result<usize, String> {
+    let count = text.parse().ok().filter(|count| (1..=InferenceSpec::MOST_THREADS).contains(count));
+    count.ok_or_else(|| format!("write a number from 1 to {}", InferenceSpec::MOST_THREADS))
+}
+
+fn provider(text: &str) -> Result<Provider, String> {
+    let known = Provider::WORDS.into_iter().find(|(word, _)| *word == text);
+    known.map(|(_, provider)| provider).ok_or_else(|| "one of cpu, cuda, tensorrt".to_owned())
+}
+
+/// `rapid policy`.
+#[cfg(feature = "policy")]
+#[derive(Debug, Clone, Subcommand)]
+pub enum PolicyCommand {
+    /// Show what a policy observes and moves, whether it suits the rig, and how long a chunk takes here
+    #[command(after_long_help = "Examples:\n  rapid policy show\n  rapid policy show models/tactile-id --sim task\n  \
+        rapid policy show POLICY --threads 4 --json")]
+    Show(ShowArgs),
+}
+
+/// Which policy is shown.
+#[cfg(feature = "policy")]
+#[derive(Debug, Clone, Args)]
+pub struct ShowArgs {
+    /// Folder of the policy [default: the one built into rapid]
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub bundle: Option<PathBuf>,
+    /// How inference runs.
+    #[command(flatten)]
+    pub inference: InferenceArgs,
 }
 
 /// What `rapid eval` runs.
@@ -79,9 +147,12 @@ pub struct EvalArgs {
     /// Condition, all of which --help explains; repeatable [default: all]
     #[arg(long, value_name = "NAME", value_parser = condition)]
     pub condition: Vec<Condition>,
-    /// Baseline with a fixed set of sensors: losing one ends the run
+    /// Baseline: a loop that reads a fixed list of sensors, and fails when a read does
     #[arg(long)]
     pub static_config: bool,
+    /// Hold the last sample of a sensor that is unplugged for this long [default: as the policy states]
+    #[arg(long, value_name = "TIME", value_parser = hold, conflicts_with = "static_config")]
+    pub hold_last: Option<Duration>,
     /// How inference runs.
     #[command(flatten)]
     pub inference: InferenceArgs,

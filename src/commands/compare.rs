@@ -9,6 +9,7 @@ use crate::cli::ReplayArgs;
 use crate::compare::{self, Again, Beside, CompareError, Compared, Comparison, Difference, Spread, Watcher};
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::{Environment, LibraryError};
+use crate::registry::InferenceSpec;
 use crate::text;
 
 /// Differences up to this come from the order of floating-point additions, which depends on the machine.
@@ -76,7 +77,13 @@ pub fn run(
     let bundle = Bundle::open(args.infer.as_ref().and_then(Option::as_deref))?;
     let environment = Environment::open(args.inference.ort_lib.as_deref())?;
     let mut progress = ProgressBar { bar: None, wanted: format == Format::Text, stop };
-    let compared = compare::compare(&args.file, &bundle, &environment, args.inference.denoising_steps, &mut progress)?;
+    let compared = compare::compare(
+        &args.file,
+        &bundle,
+        &environment,
+        args.inference.computing(InferenceSpec::default()),
+        &mut progress,
+    )?;
     drop(progress);
     match format {
         Format::Json => writeln!(out, "{}", json(&compared, &bundle, args)?)?,

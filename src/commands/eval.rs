@@ -11,6 +11,7 @@ use super::progress::Bar;
 use crate::cli::EvalArgs;
 use crate::lockstep::TrialError;
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, robot_time, wilson};
+use crate::palette::Palette;
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
@@ -49,7 +50,7 @@ struct Row {
 /// configuration. A condition that is not in the table has neither.
 const fn paper(condition: Condition, configuration: Configuration) -> (Option<f64>, &'static str) {
     match (condition, configuration) {
-        (Condition::NoWrist, _) => (None, "-"),
+        (Condition::NoWrist | Condition::EarlyUnplug, _) => (None, "-"),
         (Condition::Full, _) => (Some(0.92), "Normal"),
         (Condition::NoTactile, _) => (Some(0.52), "Degraded"),
         (_, Configuration::Static) => (None, "Crash"),
@@ -64,14 +65,15 @@ const fn paper(condition: Condition, configuration: Configuration) -> (Option<f6
 /// # Errors
 /// When the policy cannot be loaded or run.
 pub fn run(args: &EvalArgs, format: Format, stop: &dyn Fn() -> bool, out: &mut dyn Write) -> Result<(), EvalError> {
-    let bundle = Bundle::open(args.bundle.as_deref())?;
+    let bundle = Bundle::open(args.bundle.as_deref())?.holding_last(args.hold_last);
+    warn_of_training_seeds(&bundle, args);
     let registry = Registry::task();
     bundle.check_registry(&registry)?;
     let actuators: Vec<_> =
         registry.actuator().into_iter().map(|(device, action)| (device.name.as_str(), action.names.len())).collect();
     bundle.check_actuators(&actuators)?;
     let environment = Environment::open(args.inference.ort_lib.as_deref())?;
-    let mut model = Model::load(&bundle, &environment, args.inference.denoising_steps)?;
+    let mut model = Model::load(&bundle, &environment, args.inference.computing(registry.inference))?;
     let conditions = if args.condition.is_empty() { &Condition::ALL[..] } else { &args.condition };
     let configuration = if args.static_config { Configuration::Static } else { Configuration::Dynamic };
     let mut bench = Bench { bundle: &bundle, registry: &registry, model: &mut model, configuration };
@@ -109,6 +111,20 @@ pub fn run(args: &EvalArgs, format: Format, stop: &dyn Fn() -> bool, out: &mut d
     Ok(())
 }
 
+/// A trial whose block was demonstrated shows nothing about others.
+fn warn_of_training_seeds(bundle: &Bundle, args: &EvalArgs) {
+    let Some([first, last]) = bundle.training_seeds() else { return };
+    let end = args.seed.saturating_add(args.trials as u64);
+    if args.seed <= last && first < end {
+        let text = format!(
+            "the seeds {first} to {last} are those of demonstrations that this policy was trained on: choose others, \
+             such as --seed {}",
+            last.saturating_add(1)
+        );
+        let _ = writeln!(io::stderr(), "{} {text}", Palette::of(&io::stderr()).warn("warning:"));
+    }
+}
+
 fn tagged(event: &str, value: &serde_json::Value) -> serde_json::Value {
     let mut value = value.clone();
     value["event"] = event.into();
@@ -124,10 +140,9 @@ impl Row {
         self.trials.iter().filter(|trial| trial.status == Status::Crash).count()
     }
 
-    /// The worst status; a sensor that came back counts as present.
+    /// The worst status.
     fn status(&self) -> Status {
-        let worst = self.trials.iter().map(|trial| trial.status).max().unwrap_or(Status::Normal);
-        if worst == Status::Degraded && self.condition == Condition::HotReplug { Status::Normal } else { worst }
+        self.trials.iter().map(|trial| trial.status).max().unwrap_or(Status::Normal)
     }
 
     fn json(&self, bundle: &Bundle, configuration: Configuration) -> serde_json::Value {
@@ -154,7 +169,7 @@ fn table(
 ) -> Result<(), io::Error> {
     let kind = match configuration {
         Configuration::Dynamic => "dynamic configuration",
-        Configuration::Static => "static configuration: a missing sensor is fatal",
+        Configuration::Static => "a loop that reads a fixed list of sensors and fails when a read does",
     };
     writeln!(
         out,

@@ -23,6 +23,8 @@ pub mod mask;
 pub mod modules;
 pub mod monitor;
 pub mod plot;
+#[cfg(feature = "policy")]
+pub mod policy;
 pub mod progress;
 pub mod recover;
 pub mod register;

@@ -26,7 +26,7 @@ use crate::episode::ReadError;
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::Environment;
 use crate::policy::model::Model;
-use crate::policy::sampler::PolicyError;
+use crate::policy::sampler::{Computing, PolicyError};
 use crate::registry::Registry;
 
 /// Why there is no comparison.
@@ -99,7 +99,7 @@ pub fn compare(
     file: &Path,
     bundle: &Bundle,
     environment: &Environment,
-    steps: Option<usize>,
+    computing: Computing,
     watcher: &mut dyn Watcher,
 ) -> Result<Compared, CompareError> {
     let name = || file.display().to_string();
@@ -117,7 +117,7 @@ pub fn compare(
     if !survey.is_of_a_policy() && survey.actions.is_empty() {
         return Err(CompareError::Nothing(name()));
     }
-    let mut model = Model::load(bundle, environment, steps)?;
+    let mut model = Model::load(bundle, environment, computing)?;
     let mut ended = Ended { watcher, interrupted: false };
     let comparison = if survey.is_of_a_policy() {
         Comparison::Again(again::compare(file, &survey, bundle, &registry, &mut model, &mut ended)?)

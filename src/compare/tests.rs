@@ -77,7 +77,7 @@ impl Recorded {
         let bundle = Bundle::load(&folder.path().join("bundle")).unwrap();
         let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
         let registry = Arc::new(Registry::task());
-        let mut model = Model::load(&bundle, &environment, None).unwrap();
+        let mut model = Model::load(&bundle, &environment, Computing::default()).unwrap();
         let configuration = Configuration::Dynamic;
         let mut bench = Bench { bundle: &bundle, registry: &registry, model: &mut model, configuration };
         let board = Arc::new(Board::new(&registry));
@@ -153,7 +153,7 @@ impl Recorded {
     }
 
     fn compared(&self, bytes: &[u8]) -> Result<Compared, CompareError> {
-        compare(&self.file(bytes), &self.bundle, &self.environment, None, &mut Patient)
+        compare(&self.file(bytes), &self.bundle, &self.environment, Computing::default(), &mut Patient)
     }
 
     fn again(&self, bytes: &[u8]) -> Again {

@@ -1,23 +1,25 @@
 //! The policy of a run, demonstrations of the simulated task, and work that ctrl-C ends early.
 
-use std::io;
+use std::io::{self, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::Failure;
-use super::{block_on, check_writable, is_task, request};
+use super::registry::{find_registry, load};
+use super::{block_on, check_writable, is_task, request, rig};
 use crate::app::PolicyOptions;
-use crate::cli::{EvalArgs, Global, PolicyArgs, ReplayArgs, RunArgs, TaskArgs};
+use crate::cli::{EvalArgs, Global, PolicyArgs, ReplayArgs, RunArgs, ShowArgs, TaskArgs};
 use crate::commands::{self, Format};
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::horizon::WithoutMask;
 use crate::policy::live::LiveOptions;
 use crate::registry::Registry;
+use crate::registry::task::HANDHELD_MODULE;
 
 /// The policy of a run, if one was requested.
 pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Result<Option<PolicyOptions>, Failure> {
     let Some(named) = args.infer else { return Ok(None) };
-    let bundle = Bundle::open(named.as_deref()).map_err(Failure::argument)?;
+    let bundle = Bundle::open(named.as_deref()).map_err(Failure::argument)?.holding_last(args.hold_last);
     let unfit = |errors: BundleErrors| {
         let inside = "\nThe policy built into rapid is for the simulated task only: rapid --infer --sim task\n    fix: name the \
                       folder of a policy that was trained on this rig: rapid --infer FOLDER (models/README.md describes \
@@ -38,7 +40,7 @@ pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Res
             dry_run: args.dry_run,
         },
         wait: args.wait,
-        denoising_steps: args.inference.denoising_steps,
+        computing: args.inference.computing(registry.inference),
         library: args.inference.ort_lib,
     }))
 }
@@ -51,9 +53,23 @@ pub(super) fn demonstrate(global: &Global, args: &RunArgs, task: &TaskArgs, form
         ));
     }
     check_writable(&args.out).map_err(Failure::argument)?;
-    let request = request(args, &Registry::task())?;
-    let (seed, episodes) = (task.seed, task.episodes);
-    interruptible(move |stop| commands::demonstrate::run(&request, seed, episodes, format, stop, &mut io::stdout()))
+    let registry = if task.handheld { Registry::task_handheld() } else { Registry::task() };
+    let mut request = request(args, &registry)?;
+    if task.handheld && request.modules.is_empty() {
+        request.modules.push(HANDHELD_MODULE.to_owned());
+    }
+    let trials = (task.seed, task.episodes);
+    interruptible(move |stop| commands::demonstrate::run(registry, &request, trials, format, stop, &mut io::stdout()))
+}
+
+/// Shows a policy beside the rig, if there is one.
+pub(super) fn show(global: &Global, args: &ShowArgs, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
+    let registry = match find_registry(global) {
+        _ if global.sim.is_some() => Some(rig(global, 0)?.0),
+        Some(path) => Some(load(&path)?),
+        None => None,
+    };
+    Ok(commands::policy::show(args, registry.as_ref(), format, out)?)
 }
 
 /// Evaluates a policy on the simulated task.

@@ -137,6 +137,7 @@ pub(super) struct PolicyProgress<'a> {
     actions: u64,
     held: u64,
     chunks: u64,
+    late: u64,
     unused: u64,
 }
 
@@ -152,6 +153,7 @@ impl<'a> PolicyProgress<'a> {
             actions: policy.actions,
             held: policy.held,
             chunks: policy.chunks,
+            late: policy.late,
             unused: policy.unused,
         }
     }

@@ -117,6 +117,7 @@ fn policy_end(chunks: u64) -> What {
         actions: 812,
         held: 14,
         chunks,
+        late: 3,
         unused: 0,
         latency_p50_ms: 34.52,
         latency_p99_ms: 48.0,
@@ -213,8 +214,8 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  policy             late chunk    tick 40: 34.5 ms, 1 action too late, mask 0x05
     22:13:20.000Z  policy             late chunk    tick 40: 34.5 ms, 3 actions too late, mask 0x05
     22:13:20.000Z  policy             holds         a modality that the policy requires is missing: a [2Jrm
-    22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 104 chunks, 0 unused, latency p50 34.5 ms p99 48.0 ms
-    22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 0 chunks, 0 unused
+    22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 104 chunks, 3 late, 0 unused, latency p50 34.5 ms p99 48.0 ms
+    22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 0 chunks, 3 late, 0 unused
     22:13:20.000Z  pendant            pressed       emergency stop pendant pressed
     22:13:20.000Z  pendant            held          enabling switch pendant held: nothing moves before the next arm
     22:13:20.000Z  pendant            lost          enabling switch pendant lost (nothing was received for 200ms)
@@ -310,7 +311,7 @@ fn progress_shows_the_policy() {
     assert!(line(&snapshot).starts_with("00:12  mask 0x07  policy acts 35 ms  cam_wrist"), "{}", line(&snapshot));
     let expected = serde_json::json!({
         "policy": "tactile-id", "dry_run": false, "mask": "0x05", "hold": null, "latency_ms": 34.52, "chunk_age": 3,
-        "actions": 812, "held": 14, "chunks": 104, "unused": 0,
+        "actions": 812, "held": 14, "chunks": 104, "late": 3, "unused": 0,
     });
     assert_eq!(json(&snapshot), expected);
     let hold = Some(Hold { device: Some("a\x1b[2Jrm".to_owned()), reason: "a modality is missing".to_owned() });
@@ -335,12 +336,12 @@ fn the_summary_counts_the_policy() {
     let whole = summary(&[loaded(true), policy_end(104)]);
     let object = serde_json::to_value(&whole).unwrap();
     let expected = serde_json::json!({
-        "policy": "tactile-id", "dry_run": true, "actions": 812, "held": 14, "chunks": 104, "unused": 0,
+        "policy": "tactile-id", "dry_run": true, "actions": 812, "held": 14, "chunks": 104, "late": 3, "unused": 0,
         "latency_p50_ms": 34.52, "latency_p99_ms": 48.0,
     });
     assert_eq!(object["policy"], expected);
     let text = whole.text(9, Palette::Plain);
-    let expected = "policy   tactile-id  dry run  812 actions, 14 ticks held, 104 chunks, 0 unused, latency p50 34.5 ms p99 48.0 ms";
+    let expected = "policy   tactile-id  dry run  812 actions, 14 ticks held, 104 chunks, 3 late, 0 unused, latency p50 34.5 ms p99 48.0 ms";
     assert!(text.lines().any(|line| line == expected), "{text}");
     for events in [&[][..], &[loaded(false)]] {
         assert_eq!(serde_json::to_value(summary(events)).unwrap().get("policy"), None);

@@ -29,6 +29,6 @@ pub use files::{Graph, POLICY_FILE};
 pub use spec::{
     BetaSchedule, Bundle, BundleAction, BundleErrors, ColorOrder, GraphFile, ImageSpec, MaskSpec, Normalization,
     ObservationInput, ObservationSpec, Operation, PredictionType, SchedulerKind, SchedulerSpec, SliceNormalization,
-    TimestepSpacing, VectorSpec,
+    TimestepSpacing, VectorSpec, WhenAbsent,
 };
 pub use suits::{Element, GraphShape, TensorShape};

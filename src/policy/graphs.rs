@@ -6,6 +6,7 @@
 //!
 //! Invariant: a run on bound memory allocates nothing on this side of the library.
 
+use ort::ep;
 use ort::memory::Allocator;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::session::{HasSelectedOutputs, OutputSelector, RunOptions, Session, SessionInputValue};
@@ -13,6 +14,7 @@ use ort::value::{DynValue, Outlet, PrimitiveTensorElementType, Tensor, TensorEle
 
 use super::bundle::{Element, GraphShape, TensorShape};
 use super::library::Environment;
+use crate::registry::{InferenceSpec, Provider};
 
 /// Why a graph cannot be loaded or run.
 #[derive(Debug, thiserror::Error)]
@@ -30,6 +32,19 @@ pub enum GraphProblem {
     /// The file is not a graph, or not one this onnxruntime can run; with its message.
     #[error("onnxruntime cannot load it: {0}")]
     Load(String),
+    /// Its library does not compute on this provider.
+    #[error(
+        "--provider {provider}: {library} does not compute on it: {reason}; leave it out, or name a libonnxruntime.so with \
+         it by --ort-lib (the Python package `onnxruntime-gpu` holds one, in its folder `capi`)"
+    )]
+    Provider {
+        /// Its word.
+        provider: &'static str,
+        /// Where the library comes from.
+        library: String,
+        /// In onnxruntime's words.
+        reason: String,
+    },
     /// A tensor of this name has a type that no bundle uses.
     #[error("`{0}` is not a tensor of 32-bit floats or 64-bit integers with at most 2^31 elements")]
     Kind(String),
@@ -58,15 +73,19 @@ pub struct LoadedGraph {
 }
 
 impl LoadedGraph {
-    /// Reads a graph from the bytes of the file called `name`. It will run on `threads` threads, the
-    /// calling one among them, at least 1.
+    /// Reads a graph from the bytes of the file called `name`, to be computed on `on`.
     ///
     /// # Errors
-    /// When the bytes are not a graph that this onnxruntime can run.
-    pub fn load(environment: &Environment, name: &str, bytes: &[u8], threads: usize) -> Result<Self, GraphError> {
-        let session = Session::builder(&environment.ort)
-            .and_then(|builder| configure(builder, name, threads))
-            .and_then(|mut builder| builder.commit_from_memory(bytes))
+    /// When the bytes are not a graph that this onnxruntime can run, or it does not have the provider.
+    pub fn load(environment: &Environment, name: &str, bytes: &[u8], on: InferenceSpec) -> Result<Self, GraphError> {
+        let builder = Session::builder(&environment.ort).and_then(|builder| configure(builder, name, on.threads));
+        let builder = builder.map_err(|error| GraphProblem::Load(error.to_string()).of(name))?;
+        let session = provided(builder, on.provider)
+            .map_err(|error| {
+                let (provider, library) = (on.provider.word(), environment.origin.to_string());
+                GraphProblem::Provider { provider, library, reason: error.to_string() }.of(name)
+            })?
+            .commit_from_memory(bytes)
             .map_err(|error| GraphProblem::Load(error.to_string()).of(name))?;
         Ok(Self { name: name.to_owned(), session })
     }
@@ -192,6 +211,18 @@ fn configure(builder: SessionBuilder, name: &str, threads: usize) -> ort::Result
         .with_optimization_level(GraphOptimizationLevel::All)?
         .with_log_level(ort::logging::LogLevel::Warning)?
         .with_log_id(name)?)
+}
+
+/// Computes on this provider, or not at all: onnxruntime would go back to the processor without a word.
+fn provided(builder: SessionBuilder, provider: Provider) -> ort::Result<SessionBuilder> {
+    let cuda = || ep::CUDA::default().build().error_on_failure();
+    Ok(match provider {
+        Provider::Cpu => builder,
+        Provider::Cuda => builder.with_execution_providers([cuda()])?,
+        Provider::TensorRt => {
+            builder.with_execution_providers([ep::TensorRT::default().build().error_on_failure(), cuda()])?
+        }
+    })
 }
 
 fn tensor_shape(outlet: &Outlet) -> TensorShape {

@@ -372,6 +372,7 @@ impl Control {
             actions: counts.actions,
             held: counts.held_ticks,
             chunks: counts.chunks,
+            late: counts.late_chunks,
             unused: unused(&counts),
         }));
     }
@@ -383,6 +384,7 @@ impl Control {
             actions: counts.actions,
             held: counts.held_ticks,
             chunks: counts.chunks,
+            late: counts.late_chunks,
             unused: unused(&counts),
             latency_p50_ms: quantile(0.5),
             latency_p99_ms: quantile(0.99),

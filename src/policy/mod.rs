@@ -19,6 +19,7 @@ pub mod model;
 pub mod normalize;
 pub mod observation;
 pub mod observer;
+pub mod pace;
 pub mod picture;
 pub mod pilot;
 pub mod request;

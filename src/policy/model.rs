@@ -3,12 +3,14 @@
 //! Invariant: the same request gives the same chunk, given the same reference pictures.
 //! Invariant: samples of an absent modality are not read: its numbers are zeros and its element of the mask is 0.
 
+use std::time::{Duration, Instant};
+
 use super::bundle::{Bundle, ObservationInput};
 use super::library::Environment;
 use super::observation::{ObservationTensors, VectorError};
 use super::picture::{Picture, PictureError, Preprocessor};
 use super::request::{Cell, Request};
-use super::sampler::{PolicyError, Sampler};
+use super::sampler::{Computing, PolicyError, Sampler};
 use crate::sample::Encoding;
 
 /// Why a request has no answer.
@@ -41,6 +43,9 @@ pub enum SampleError {
     Encoding,
 }
 
+/// Chunks that are timed when a policy is loaded.
+const REHEARSALS: usize = 3;
+
 /// See the module's comment.
 #[derive(Debug)]
 pub struct Model {
@@ -59,11 +64,11 @@ struct Lane {
 }
 
 impl Model {
-    /// Loads the graphs of a bundle, with `steps` denoising steps instead of the bundle's own.
+    /// Loads the graphs of a bundle.
     ///
     /// # Errors
     /// When the graphs do not match the bundle.
-    pub fn load(bundle: &Bundle, environment: &Environment, steps: Option<usize>) -> Result<Self, PolicyError> {
+    pub fn load(bundle: &Bundle, environment: &Environment, computing: Computing) -> Result<Self, PolicyError> {
         let lanes = bundle.observations.iter().map(|observation| Lane {
             modality: observation.modality.clone(),
             pictures: match observation.input {
@@ -72,8 +77,25 @@ impl Model {
             },
             numbers: Vec::new(),
         });
-        let sampler = Sampler::new(bundle, environment, steps, 1)?;
+        let sampler = Sampler::new(bundle, environment, computing)?;
         Ok(Self { lanes: lanes.collect(), tensors: ObservationTensors::new(bundle), sampler })
+    }
+
+    /// The median time of a chunk, after a first one, which is slower. The observation is empty: the work is the same.
+    ///
+    /// # Errors
+    /// When onnxruntime fails.
+    pub fn rehearse(&mut self) -> Result<Duration, PolicyError> {
+        let mut chunk = vec![0.0; self.chunk_len()];
+        self.sampler.chunk(&self.tensors, 0, &mut chunk)?;
+        let mut times = [Duration::ZERO; REHEARSALS];
+        for time in &mut times {
+            let begun = Instant::now();
+            self.sampler.chunk(&self.tensors, 0, &mut chunk)?;
+            *time = begun.elapsed();
+        }
+        times.sort_unstable();
+        Ok(times[REHEARSALS / 2])
     }
 
     /// Values of a chunk.

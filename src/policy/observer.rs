@@ -2,13 +2,13 @@
 //!
 //! Samples are kept unchanged, one copy of each; the choices of as many ticks are remembered as an observation has
 //! steps. A step without its own sample (before the first tick, or before a modality was plugged in) uses the sample of
-//! the next step, as in training.
+//! the next step, as in training. The samples of a modality that has left are shown for as long as the bundle holds them.
 //!
 //! Invariant: nothing here allocates once the places of the samples have grown to the largest.
 
 use std::time::Duration;
 
-use super::bundle::Bundle;
+use super::bundle::{Bundle, WhenAbsent};
 use super::request::Request;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
@@ -35,6 +35,22 @@ struct Lane {
     next: usize,
     /// The choices of the last ticks, the newest first.
     chosen: Vec<Option<Chosen>>,
+    /// How long those of its last tick stand in for it while it is absent.
+    hold: Duration,
+    /// The choices of the last tick that had one, and when that was.
+    kept: Vec<Option<Chosen>>,
+    kept_at: Option<Stamp>,
+}
+
+impl Lane {
+    /// The choices that are shown to the policy at `tick`; `None` if the modality is absent.
+    fn shown(&self, tick: Stamp) -> Option<&[Option<Chosen>]> {
+        if self.chosen.first().is_some_and(Option::is_some) {
+            return Some(&self.chosen);
+        }
+        let is_held = self.kept_at.is_some_and(|at| tick.since(at) <= self.hold) && !self.hold.is_zero();
+        is_held.then_some(self.kept.as_slice())
+    }
 }
 
 #[derive(Debug, Clone, Default)]
@@ -63,11 +79,17 @@ impl Observer {
                 capacity: device.depth,
             })
             .collect();
-        let lanes = devices().map(|device| Lane {
+        let lanes = devices().zip(&bundle.observations).map(|(device, observation)| Lane {
             id: device.map(|device| device.id),
             places: vec![Place::default(); device.map_or(0, |device| device.depth)],
             next: 0,
             chosen: vec![None; bundle.n_obs_steps],
+            hold: match observation.when_absent {
+                WhenAbsent::Zero => Duration::ZERO,
+                WhenAbsent::HoldLast(time) => time,
+            },
+            kept: vec![None; bundle.n_obs_steps],
+            kept_at: None,
         });
         Self {
             lanes: lanes.collect(),
@@ -124,6 +146,10 @@ impl Observer {
             let sample = self.sync.sample(slot);
             *newest = sample.map(|sample| Chosen { place: sample.keep, seq: sample.seq });
             whole &= newest.is_some();
+            if newest.is_some() {
+                lane.kept.copy_from_slice(&lane.chosen);
+                lane.kept_at = Some(tick);
+            }
             let age = Duration::from_nanos(u64::try_from(slot.age_ns).unwrap_or(0));
             oldest = oldest.max(Some(age));
         }
@@ -133,16 +159,14 @@ impl Observer {
     /// Fills `request` with the samples chosen in the last ticks, up to its own tick.
     pub fn fill(&self, request: &mut Request) {
         for (at, lane) in self.lanes.iter().enumerate() {
-            let present = lane.chosen.first().is_some_and(Option::is_some);
-            request.set_present(at, present);
-            if !present {
-                continue;
-            }
+            let shown = lane.shown(request.stamp);
+            request.set_present(at, shown.is_some());
+            let Some(shown) = shown else { continue };
             let mut chosen = None;
             // From the newest step back: a step without a sample uses that of the following step, and so does one whose
             // sample has been overwritten.
             for (back, step) in (0..self.steps).rev().enumerate() {
-                let kept = lane.chosen.get(back).copied().flatten();
+                let kept = shown.get(back).copied().flatten();
                 let kept =
                     kept.filter(|kept| lane.places.get(kept.place).is_some_and(|place| place.header.seq == kept.seq));
                 chosen = kept.or(chosen);
@@ -159,6 +183,7 @@ impl Observer {
         self.sync.clear();
         for lane in &mut self.lanes {
             lane.chosen.fill(None);
+            lane.kept_at = None;
             lane.next = 0;
             for place in &mut lane.places {
                 place.header = SampleHeader::default();

@@ -15,6 +15,7 @@ use super::normalize::Normalizer;
 use super::observation::ObservationTensors;
 use super::scheduler::{Scheduler, SchedulerError};
 use crate::random::Random;
+use crate::registry::InferenceSpec;
 
 /// The stream of a seed that the noise is drawn from.
 const NOISE: u64 = 0x706f_6c69_6379;
@@ -41,6 +42,15 @@ pub enum PolicyError {
     },
 }
 
+/// How a policy is computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Computing {
+    /// Steps of denoising instead of the bundle's own number.
+    pub denoising_steps: Option<usize>,
+    /// On what.
+    pub on: InferenceSpec,
+}
+
 /// A policy, ready to run.
 #[derive(Debug)]
 pub struct Sampler {
@@ -60,25 +70,19 @@ pub struct Sampler {
 }
 
 impl Sampler {
-    /// Loads the graphs of a bundle and makes all memory. `steps` of denoising instead of the
-    /// bundle's own number; `threads` that onnxruntime computes on, 1 unless there is reason for
-    /// more.
+    /// Loads the graphs of a bundle and makes all memory.
     ///
     /// # Errors
     /// When the graphs do not match the bundle, or the schedule has fewer steps.
-    pub fn new(
-        bundle: &Bundle,
-        environment: &Environment,
-        steps: Option<usize>,
-        threads: usize,
-    ) -> Result<Self, PolicyError> {
+    pub fn new(bundle: &Bundle, environment: &Environment, computing: Computing) -> Result<Self, PolicyError> {
         let load = |graph: Graph| {
             let bytes = bundle.read_graph(graph)?;
-            Ok::<_, PolicyError>(LoadedGraph::load(environment, &bundle.graph(graph).file, &bytes, threads)?)
+            Ok::<_, PolicyError>(LoadedGraph::load(environment, &bundle.graph(graph).file, &bytes, computing.on)?)
         };
         let (encoder, denoiser) = (load(Graph::Encoder)?, load(Graph::Denoiser)?);
         bundle.check_graphs(&encoder.shape(), &denoiser.shape())?;
         let (encoder, denoiser) = (encoder.bind()?, denoiser.bind()?);
+        let steps = computing.denoising_steps.unwrap_or(bundle.scheduler.num_inference_steps);
         let names = bundle.observations.iter().map(|observation| &observation.key);
         Ok(Self {
             observations: names.map(|name| encoder.input_index(name)).collect::<Result<_, _>>()?,
@@ -86,7 +90,7 @@ impl Sampler {
             sample: denoiser.input_index("sample")?,
             timestep: denoiser.input_index("timestep")?,
             condition: denoiser.input_index("global_cond")?,
-            scheduler: Scheduler::new(&bundle.scheduler, steps.unwrap_or(bundle.scheduler.num_inference_steps))?,
+            scheduler: Scheduler::new(&bundle.scheduler, steps)?,
             normalizer: Normalizer::of_action(&bundle.action),
             noise: vec![0.0; bundle.horizon * bundle.action.len()],
             encoder,

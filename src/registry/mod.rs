@@ -31,10 +31,10 @@ pub use section::read_file;
 pub use spec::{
     ActionSpec, Bound, BrakeSpec, ButtonAction, ButtonSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CalibrationSpec,
     CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, FieldInput, Form, Framing, GpioInput, Hook,
-    Hooks, IdentitySpec, InputSpec, InterlockSpec, JointsSpec, KeyInput, LanFind, LanPicture, LanProtocol, LanSpec,
-    Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError,
-    ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, PREVIEW_DECODER,
-    Parse, PhoneStream, PixelFormat, PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec, Quantity, Registry,
-    RemoteSamples, RigSpec, SLCAN_BITRATES, SerialSpec, Stop, StopSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale,
-    mounted, own_side,
+    Hooks, IdentitySpec, InferenceSpec, InputSpec, InterlockSpec, JointsSpec, KeyInput, LanFind, LanPicture,
+    LanProtocol, LanSpec, Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS, MAX_MOTORS, MAX_SUBSCRIBERS,
+    MOTOR_CHANNELS, ModuleError, ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens,
+    POOL_SPARE, PREVIEW_DECODER, Parse, PhoneStream, PixelFormat, PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec,
+    Provider, Quantity, Registry, RemoteSamples, RigSpec, SLCAN_BITRATES, SerialSpec, Stop, StopSpec, TransformSpec,
+    UsbSpec, VerdictSpec, WatchSpec, WhenStale, mounted, own_side,
 };

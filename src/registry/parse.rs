@@ -13,6 +13,7 @@ mod identity;
 mod input;
 mod interlock;
 mod lan;
+mod module;
 mod motors;
 mod node;
 mod program;
@@ -23,7 +24,10 @@ use std::time::Duration;
 
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
 use super::section::{Section, file_label, read, read_file};
-use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, POOL_SPARE, RESERVED_BYTES, Registry, RigSpec, SAMPLE_OVERHEAD};
+use super::spec::{
+    DeviceSpec, IdentitySpec, InferenceSpec, NodeSpec, POOL_SPARE, Provider, RESERVED_BYTES, Registry, RigSpec,
+    SAMPLE_OVERHEAD,
+};
 use super::trust::distrust;
 use super::units::{show_duration, show_size};
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -98,15 +102,26 @@ impl Registry {
     /// A rig without entries, to which they are added while it runs; `path` is the file that they are written to.
     pub fn empty(path: &Path) -> Self {
         let (devices, modules, stops, buttons) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        Self { rig: rig(None), devices, modules, stops, buttons, path: Some(path.to_owned()), text: String::new() }
+        let inference = InferenceSpec::default();
+        Self {
+            rig: rig(None),
+            inference,
+            devices,
+            modules,
+            stops,
+            buttons,
+            path: Some(path.to_owned()),
+            text: String::new(),
+        }
     }
 }
 
 /// The content of the tables of the text.
 fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Registry, RegistryErrors> {
-    root.allow(&["rig", "verdict", "device", "module", "stop", "button"]);
+    root.allow(&["rig", "inference", "verdict", "device", "module", "stop", "button"]);
     let section = root.table("rig");
     let mut rig = rig(section.as_ref());
+    let inference = root.table("inference").map(|section| inference(&section)).unwrap_or_default();
     let verdict = verdict::read(root, Whose::Rig);
     let mut drafts = drafts(root, programs);
     if drafts.is_empty() && root.is_faultless() {
@@ -125,7 +140,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     warn_of_unused_ports(&drafts);
     program::warn_of_distrusted(&drafts);
     fit(&mut drafts, rig.memory_budget, root);
-    let modules = interlock::modules(root, &drafts);
+    let modules = module::modules(root, &drafts);
     let stops = interlock::interlocks(root, &drafts);
     let buttons = button::buttons(root, &drafts, &stops);
     root.check()?;
@@ -140,7 +155,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
             lan.keep_free(rig.disk_reserve);
         }
     }
-    Ok(Registry { rig, devices, modules, stops, buttons, path: None, text: String::new() })
+    Ok(Registry { rig, inference, devices, modules, stops, buttons, path: None, text: String::new() })
 }
 
 fn rig(section: Option<&Section<'_>>) -> RigSpec {
@@ -177,6 +192,15 @@ fn rig(section: Option<&Section<'_>>) -> RigSpec {
     rig.memory_budget = section.size("memory_budget", budget).unwrap_or(rig.memory_budget);
     rig.disk_reserve = section.size("disk_reserve", 0..=1 << 40);
     rig
+}
+
+fn inference(section: &Section<'_>) -> InferenceSpec {
+    let mut inference = InferenceSpec::default();
+    section.allow(&["threads", "provider"]);
+    let most = i64::try_from(InferenceSpec::MOST_THREADS).unwrap_or(i64::MAX);
+    inference.threads = section.integer("threads", 1..=most).unwrap_or(inference.threads);
+    inference.provider = section.choice("provider", &Provider::WORDS).unwrap_or(inference.provider);
+    inference
 }
 
 /// One draft per entry, in the order of the file.

@@ -5,6 +5,7 @@
 //! ascending order of bit.
 
 mod form;
+mod inference;
 mod input;
 mod lan;
 mod module;
@@ -22,6 +23,7 @@ use crate::points::PacketFormat;
 use crate::sample::{Encoding, SampleHeader};
 
 pub use form::{CalibrationSpec, Form, JointsSpec, PointsSpec, PoseLayout, PoseSpec, Quantity};
+pub use inference::{InferenceSpec, Provider};
 pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
@@ -29,7 +31,7 @@ pub use input::{
 pub use lan::{
     LanFind, LanPicture, LanProtocol, LanSpec, PREVIEW_DECODER, PhoneStream, Probe, RemoteSamples, own_side,
 };
-pub use module::{ModuleError, ModuleSpec, mounted};
+pub use module::{ModuleError, ModuleSpec, TransformSpec, mounted};
 pub use motors::{
     BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
 };
@@ -54,6 +56,8 @@ pub(super) const RESERVED_BYTES: u64 = 768 << 10;
 pub struct Registry {
     /// The `[rig]` table.
     pub rig: RigSpec,
+    /// The `[inference]` table.
+    pub inference: InferenceSpec,
     /// One entry per modality, ascending by bit, at least one, at most 64.
     pub devices: Vec<DeviceSpec>,
     /// The modules that can be mounted, in the order of the file.

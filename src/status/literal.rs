@@ -123,6 +123,7 @@ pub(crate) fn policy() -> PolicyStatus {
         actions: 812,
         held: 14,
         chunks: 104,
+        late: 3,
         unused: 0,
     }
 }
@@ -174,6 +175,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         ),
     };
     Board::new(&Registry {
+        inference: crate::registry::InferenceSpec::default(),
         rig: RigSpec {
             name: "bench-1".to_owned(),
             observation_hz: 30.0,

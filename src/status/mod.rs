@@ -502,6 +502,8 @@ pub struct PolicyStatus {
     pub held: u64,
     /// Chunks that were used.
     pub chunks: u64,
+    /// Those of them that came later than the tick after their observation, so that their first actions were skipped.
+    pub late: u64,
     /// Answers that were not used or never arrived.
     pub unused: u64,
 }
@@ -549,6 +551,8 @@ pub struct PolicyEnd {
     pub held: u64,
     /// Chunks that were used.
     pub chunks: u64,
+    /// Those of them that came later than the tick after their observation, so that their first actions were skipped.
+    pub late: u64,
     /// Answers that were not used or never arrived.
     pub unused: u64,
     /// Median time from the observation to the chunk, ms.
@@ -559,8 +563,8 @@ pub struct PolicyEnd {
 
 impl fmt::Display for PolicyEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { actions, held, chunks, unused, latency_p50_ms, latency_p99_ms } = self;
-        write!(f, "{actions} actions, {held} ticks held, {chunks} chunks, {unused} unused")?;
+        let Self { actions, held, chunks, late, unused, latency_p50_ms, latency_p99_ms } = self;
+        write!(f, "{actions} actions, {held} ticks held, {chunks} chunks, {late} late, {unused} unused")?;
         // Without a chunk there is no latency.
         if *chunks + *unused > 0 {
             write!(f, ", latency p50 {latency_p50_ms:.1} ms p99 {latency_p99_ms:.1} ms")?;

@@ -95,6 +95,7 @@ fn first(policy: &PolicyStatus, width: usize, theme: Theme) -> Line<'static> {
     let state = state(policy, width, theme);
     let counts = [
         ("chunks", policy.chunks, Style::new()),
+        ("late", policy.late, Style::new()),
         ("unused", policy.unused, if policy.unused > 0 { theme.warning() } else { Style::new() }),
         ("actions", policy.actions, Style::new()),
         ("held", policy.held, Style::new()),

@@ -4,11 +4,12 @@
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::support::mistakes;
 use proptest::prelude::*;
 use rapid::policy::bundle::{
-    BetaSchedule, Bundle, ColorOrder, Normalization, ObservationInput, Operation, SchedulerKind,
+    BetaSchedule, Bundle, ColorOrder, Normalization, ObservationInput, Operation, SchedulerKind, WhenAbsent,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -56,6 +57,8 @@ fn every_key_is_parsed() {
     assert_eq!((vector.len, vector.slice.clone(), &pose.normalization), (3, Some(0..3), &Normalization::Identity));
     let ObservationInput::Vector(vector) = &grip.input else { panic!("a vector") };
     assert_eq!((vector.len, vector.slice.clone(), grip.modality.as_str()), (1, None, "gripper"));
+    let held = [wrist.when_absent, grip.when_absent];
+    assert_eq!(held, [WhenAbsent::Zero, WhenAbsent::HoldLast(Duration::from_millis(2500))]);
     let slices: Vec<_> = bundle.action.normalization.iter().map(|part| part.slice.clone()).collect();
     assert_eq!(slices, [0..3, 3..4], "sorted, in any order in the file");
     assert_eq!((bundle.scheduler.kind, bundle.scheduler.beta_schedule), (SchedulerKind::Ddpm, BetaSchedule::Linear));

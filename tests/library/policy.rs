@@ -15,7 +15,8 @@ use rapid::policy::graphs::LoadedGraph;
 use rapid::policy::library::Environment;
 use rapid::policy::observation::ObservationTensors;
 use rapid::policy::picture::{Picture, Preprocessor};
-use rapid::policy::sampler::{PolicyError, Sampler};
+use rapid::policy::sampler::{Computing, PolicyError, Sampler};
+use rapid::registry::InferenceSpec;
 use rapid::sample::Encoding;
 
 fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
@@ -27,7 +28,7 @@ fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
 
 fn sampler(bundle: &Bundle, steps: Option<usize>) -> Sampler {
     let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
-    Sampler::new(bundle, &environment, steps, 1).unwrap()
+    Sampler::new(bundle, &environment, Computing { denoising_steps: steps, ..Computing::default() }).unwrap()
 }
 
 fn chunk(sampler: &mut Sampler, observation: &ObservationTensors, seed: u64) -> Vec<f32> {
@@ -119,7 +120,11 @@ fn a_chunk_matches_its_definition() {
     let mut four = self::sampler(&bundle, Some(4));
     close(&chunk(&mut four, &observation, 3), &in_units(&by_hand(0.25 / 3.0, &noise(3), 4)));
     assert!(matches!(
-        Sampler::new(&bundle, &Environment::open(None).unwrap(), Some(101), 1),
+        Sampler::new(
+            &bundle,
+            &Environment::open(None).unwrap(),
+            Computing { denoising_steps: Some(101), ..Computing::default() }
+        ),
         Err(PolicyError::Scheduler(_))
     ));
 }
@@ -153,14 +158,15 @@ fn with_ddpm_the_noise_of_the_steps_depends_on_the_seed_too() {
 #[test]
 fn invalid_or_foreign_graphs_are_rejected_and_named() {
     let environment = Environment::open(None).unwrap();
-    let error = LoadedGraph::load(&environment, "encoder.onnx", b"no graph", 1).unwrap_err().to_string();
+    let error =
+        LoadedGraph::load(&environment, "encoder.onnx", b"no graph", InferenceSpec::default()).unwrap_err().to_string();
     assert!(error.starts_with("encoder.onnx: onnxruntime cannot load it: "), "{error}");
 
     let (_folder, bundle) = bundle(&[
         Change { what: "\"horizon\": 16", with: "\"horizon\": 12" },
         Change { what: "\"key\": \"tactile\"", with: "\"key\": \"finger\"" },
     ]);
-    let Err(PolicyError::Bundle(errors)) = Sampler::new(&bundle, &environment, None, 1) else {
+    let Err(PolicyError::Bundle(errors)) = Sampler::new(&bundle, &environment, Computing::default()) else {
         panic!("graphs that do not suit are taken");
     };
     let errors = errors.to_string();

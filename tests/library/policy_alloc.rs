@@ -18,6 +18,7 @@ use rapid::policy::model::Model;
 use rapid::policy::observer::Observer;
 use rapid::policy::pilot::Pilot;
 use rapid::policy::request::Request;
+use rapid::policy::sampler::Computing;
 use rapid::registry::Registry;
 use rapid::registry::task::PARTS;
 use rapid::sample::{Encoding, FLAG_ERROR, SampleHeader};
@@ -170,7 +171,7 @@ fn an_answer_allocates_only_for_the_decoder_of_its_pictures() {
     const SIDE: u16 = 8;
     let (_folder, bundle) = bundle();
     let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
-    let mut model = Model::load(&bundle, &environment, None).unwrap();
+    let mut model = Model::load(&bundle, &environment, Computing::default()).unwrap();
     let mut request = Request::new(&bundle);
     let pictures: Vec<Vec<u8>> = [40, 200].map(|color| jpeg(SIDE, color)).into();
     let state: Vec<u8> = [0.1_f64, 0.2, 0.3, 0.4].into_iter().flat_map(f64::to_le_bytes).collect();

@@ -287,3 +287,53 @@ fn the_policy_continues_without_the_wrist_camera_and_holds_without_both() {
     );
     assert!(of(&printed, "chunk").all(|chunk| chunk["mask"] != "0x04"), "nothing is asked without both");
 }
+
+#[test]
+fn a_held_sensor_is_observed_as_it_was_and_then_not_at_all() {
+    let place = Place::new();
+    let options = ["--hold-last", "1s", "--record", "--duration", "6s", "--out", "out"];
+    let (code, printed, stderr) = infer(&place, BUNDLE, PULLED, &options);
+    assert_eq!(code, recorded_code(&printed), "{stderr}");
+    let seqs = |chunk: &Value| {
+        let samples = chunk["samples"].as_array().expect("samples");
+        let tactile = samples.iter().find(|of| of["modality"] == "tactile_tip").expect("the modality");
+        tactile["seqs"].as_array().expect("numbers").iter().filter_map(Value::as_u64).collect::<Vec<_>>()
+    };
+    let away: Vec<&Value> = of(&printed, "chunk").filter(|chunk| chunk["mask"] == "0x05").collect();
+    let ns = |chunk: &Value| chunk["observed_ns"].as_u64().expect("a time");
+    let first = away.first().expect("it is asked without the sensor");
+    let (held, gone): (Vec<&Value>, Vec<&Value>) = away.iter().partition(|chunk| ns(chunk) - ns(first) < 900_000_000);
+    assert!(!held.is_empty() && !gone.is_empty(), "{away:?}");
+    let last = seqs(first);
+    assert_eq!(last.len(), 2, "{first}");
+    assert!(held.iter().all(|chunk| seqs(chunk) == last), "the same samples again: {held:?}");
+    let late: Vec<&&Value> = gone.iter().filter(|chunk| ns(chunk) - ns(first) > 1_100_000_000).collect();
+    assert!(!late.is_empty() && late.iter().all(|chunk| seqs(chunk).is_empty()), "{gone:?}");
+
+    // What was held can be computed again from the recording.
+    let file = place.path("out").join(&place.files("out")[0]).display().to_string();
+    let replayed = place.run(&["--json", "replay", &file, "--infer", BUNDLE, "--tolerance", "1e-5"]);
+    assert_eq!(replayed.status.code(), Some(0), "{}", String::from_utf8_lossy(&replayed.stderr));
+}
+
+#[test]
+fn a_policy_too_slow_for_its_rate_is_refused_with_the_figures() {
+    let place = Place::new();
+    // Its 15 actions cover 15 ms, and a chunk has ten times its steps.
+    let fast = changed(&place, "\"control_hz\": 10.0", "\"control_hz\": 1000.0");
+    let (code, _, stderr) = infer(&place, &fast, PULLED, &["--denoising-steps", "100", "--duration", "5s"]);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("too slow on this machine") && stderr.contains("15 actions cover 15 ms"), "{stderr}");
+    assert!(stderr.contains("--threads"), "{stderr}");
+}
+
+#[test]
+fn threads_and_provider_are_options_and_what_a_library_lacks_is_named() {
+    let place = Place::new();
+    let (code, printed, stderr) = infer(&place, BUNDLE, PULLED, &["--threads", "2", "--duration", "2s"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(of(&printed, "chunk").next().is_some());
+    let (code, _, stderr) = infer(&place, BUNDLE, PULLED, &["--provider", "cuda", "--duration", "2s"]);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("--provider cuda: ") && stderr.contains("onnxruntime-gpu"), "{stderr}");
+}

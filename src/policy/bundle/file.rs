@@ -2,18 +2,21 @@
 //! a smaller range than their types.
 
 use std::ops::Range;
+use std::time::Duration;
 
 use serde::Deserialize;
 use serde::de::{Deserializer, Error, IgnoredAny, IntoDeserializer};
 use serde_json::{Map, Value};
 
-use super::spec::{ColorOrder, Operation};
+use super::spec::{ColorOrder, Operation, WhenAbsent};
 use crate::text;
 
 /// Maximum number of actions in a chunk, and of values in an action.
 const MAX_ACTION: i64 = 1024;
 /// Longest side of a picture, pixels.
 type Side = Whole<1, 8192>;
+/// Longest time for which samples of an absent modality are held, ms.
+const LONGEST_HOLD_MS: i64 = 600_000;
 /// Maximum length of a vector.
 const MAX_VALUES: i64 = 4096;
 
@@ -71,6 +74,8 @@ pub(super) struct ImageFile {
     #[serde(deserialize_with = "word_or_null")]
     pub(super) operation: Option<Operation>,
     pub(super) normalization: Value,
+    #[serde(default, deserialize_with = "when_absent")]
+    pub(super) when_absent: WhenAbsent,
     /// Observations are one tick of the control grid apart.
     #[serde(default, rename = "down_sample_steps")]
     _down_sample_steps: Option<Whole<1, 1>>,
@@ -88,6 +93,8 @@ pub(super) struct VectorFile {
     #[serde(default, deserialize_with = "some_slice")]
     pub(super) slice: Option<Range<usize>>,
     pub(super) normalization: Value,
+    #[serde(default, deserialize_with = "when_absent")]
+    pub(super) when_absent: WhenAbsent,
     /// Observations are one tick of the control grid apart.
     #[serde(default, rename = "down_sample_steps")]
     _down_sample_steps: Option<Whole<1, 1>>,
@@ -248,6 +255,19 @@ fn slice<'de, D: Deserializer<'de>>(value: D) -> Result<Range<usize>, D::Error> 
 
 fn some_slice<'de, D: Deserializer<'de>>(value: D) -> Result<Option<Range<usize>>, D::Error> {
     slice(value).map(Some)
+}
+
+fn when_absent<'de, D: Deserializer<'de>>(value: D) -> Result<WhenAbsent, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    enum Written {
+        Zero,
+        HoldLastMs(Whole<1, LONGEST_HOLD_MS>),
+    }
+    Ok(match Written::deserialize(value)? {
+        Written::Zero => WhenAbsent::Zero,
+        Written::HoldLastMs(ms) => WhenAbsent::HoldLast(Duration::from_millis(ms.get() as u64)),
+    })
 }
 
 pub(super) fn whole<'de, D: Deserializer<'de>, const MIN: i64, const MAX: i64>(value: D) -> Result<usize, D::Error> {

@@ -381,6 +381,7 @@ const KEYS: &[Key] = keys! {
     "resize": "[height, width] that pictures are resized to, or null", "[96, 96]";
     "crop": "[height, width] of the middle that is kept after the resize, or null", "[96, 96]";
     "operation": "\"diff_to_reference\" or null", "null";
+    "when_absent": "\"zero\" or {\"hold_last_ms\": 1 to 600000}; leave it out for zero", "\"zero\"";
     "down_sample_steps": "1, or leave it out: observations are one tick of the control grid apart", "1";
     "rotation": "null, or leave it out: a policy whose values are rotated does not run here", "null";
     "observations.slice": "[begin, end] of the sample's numbers, end not included; leave it out for all of them", "[0, 1]";

@@ -59,6 +59,24 @@ pub struct Bundle {
 }
 
 impl Bundle {
+    /// With the last samples of every modality that it does not require held for `time`, if given, while that is absent.
+    #[must_use]
+    pub fn holding_last(mut self, time: Option<Duration>) -> Self {
+        let Some(time) = time else { return self };
+        for observation in self.observations.iter_mut().filter(|observation| !observation.required) {
+            observation.when_absent = WhenAbsent::HoldLast(time);
+        }
+        self
+    }
+
+    /// The first and the last seed of the demonstrations that it was trained on, as far as `training` has them
+    /// (`episode_seeds`). Some between them may not have been used.
+    pub fn training_seeds(&self) -> Option<[u64; 2]> {
+        let seeds = self.training.get("episode_seeds")?.as_array()?;
+        let [begin, end] = seeds.as_slice() else { return None };
+        Some([begin.as_u64()?, end.as_u64()?])
+    }
+
     /// The event that announces its start, on the onnxruntime named `library`.
     pub fn begins(&self, library: String, dry_run: bool) -> What {
         What::Policy {
@@ -81,10 +99,22 @@ pub struct ObservationSpec {
     pub modality: String,
     /// `required`: without this modality the policy does not start, and holds when it disappears.
     pub required: bool,
+    /// `when_absent`: what stands in for it while its modality is absent.
+    pub when_absent: WhenAbsent,
     /// `kind` and its settings.
     pub input: ObservationInput,
     /// `normalization`, one entry per channel of a picture or per value of a vector.
     pub normalization: Normalization,
+}
+
+/// What stands in for an observation whose modality is absent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum WhenAbsent {
+    /// Zeros, and 0 in the mask (the paper's rule).
+    #[default]
+    Zero,
+    /// For this long the last samples before it left, and 1 in the mask; then zeros.
+    HoldLast(Duration),
 }
 
 /// The kind of samples in an observation, and their processing.

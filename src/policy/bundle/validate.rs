@@ -13,7 +13,7 @@ use super::file::{
 use super::read::{Problems, Strict, read, read_tagged};
 use super::spec::{
     Bundle, BundleAction, BundleErrors, ImageSpec, MaskSpec, Normalization, ObservationInput, ObservationSpec,
-    SchedulerSpec, SliceNormalization, TimestepSpacing, VectorSpec,
+    SchedulerSpec, SliceNormalization, TimestepSpacing, VectorSpec, WhenAbsent,
 };
 use crate::registry::did_you_mean;
 
@@ -159,19 +159,25 @@ fn observations(value: &Value, problems: &mut Problems) -> Option<Vec<Observatio
 }
 
 fn observation(entry: &str, value: &Value, problems: &mut Problems) -> Option<ObservationSpec> {
-    let (key, modality, required, numbers, len, input) = match read_tagged(entry, "kind", value, problems)? {
+    let (key, modality, required, when_absent, numbers, len, input) = match read_tagged(entry, "kind", value, problems)?
+    {
         ObservationFile::Image(file) => {
             let input = ObservationInput::Image(check_image(entry, &file, problems));
-            (file.key, file.modality, file.required, file.normalization, CHANNELS, input)
+            (file.key, file.modality, file.required, file.when_absent, file.normalization, CHANNELS, input)
         }
         ObservationFile::Vector(file) => {
             let vector = check_vector(entry, &file, problems);
             let len = vector.len;
-            (file.key, file.modality, file.required, file.normalization, len, ObservationInput::Vector(vector))
+            let input = ObservationInput::Vector(vector);
+            (file.key, file.modality, file.required, file.when_absent, file.normalization, len, input)
         }
     };
     let normalization = normalization(&format!("{entry}.normalization"), &numbers, Some(len), problems)?;
-    Some(ObservationSpec { key, modality, required, input, normalization })
+    if required && when_absent != WhenAbsent::Zero {
+        let fix = "leave it out: without what it requires the policy holds";
+        problems.report(&format!("{entry}.when_absent"), "the observation is required", fix);
+    }
+    Some(ObservationSpec { key, modality, required, when_absent, input, normalization })
 }
 
 fn check_image(entry: &str, file: &ImageFile, problems: &mut Problems) -> ImageSpec {

@@ -77,7 +77,10 @@ fn transforms(section: &Section<'_>, devices: &[String]) -> Vec<TransformSpec> {
     let mut found = Vec::new();
     for (at, sensor, _) in tables.fields() {
         if !devices.iter().any(|device| device == sensor) {
-            let fix = did_you_mean(sensor, devices, "its `devices` are");
+            let fix = match devices {
+                [] => "name it in its `devices`, or remove the table".to_owned(),
+                devices => did_you_mean(sensor, devices, "its `devices` are"),
+            };
             tables.report_child(at, sensor, format!("{sensor:?} is no sensor of this module"), fix);
             continue;
         }
@@ -90,24 +93,31 @@ fn transforms(section: &Section<'_>, devices: &[String]) -> Vec<TransformSpec> {
 fn transform(sensor: &str, table: &Section<'_>) -> Option<TransformSpec> {
     table.allow(&["parent", POSITION, ROTATION]);
     table.need(POSITION, "write position = [x, y, z], in m");
+    let (parent, position, rotation) =
+        (parent(sensor, table), numbers(table, POSITION, "write position = [x, y, z], in m"), rotation(table));
+    Some(TransformSpec { sensor: sensor.to_owned(), parent: parent?, position: position?, rotation: rotation? })
+}
+
+fn parent(sensor: &str, table: &Section<'_>) -> Option<String> {
     let parent = table.text("parent").unwrap_or(GRIPPER);
     if parent.is_empty() || parent == sensor || parent.len() > LONGEST {
         let fix = format!("name another frame, of at most {LONGEST} bytes, or remove the key: it is {GRIPPER:?} then");
         return table.refuse("parent", format!("{parent:?} cannot be the frame in which {sensor} sits"), fix);
     }
-    let position = numbers(table, POSITION, "write position = [x, y, z], in m");
-    let rotation = if table.has(ROTATION) {
-        let rotation: [f64; 4] = numbers(table, ROTATION, "write rotation = [x, y, z, w]")?;
-        let length = rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
-        if (length - 1.0).abs() > TOLERANCE {
-            let fix = "write a quaternion x y z w of length 1, or remove the key if the sensor is not turned";
-            return table.refuse(ROTATION, format!("not a rotation: its length is {length:.3}"), fix);
-        }
-        rotation.map(|part| part / length)
-    } else {
-        [0.0, 0.0, 0.0, 1.0]
-    };
-    Some(TransformSpec { sensor: sensor.to_owned(), parent: parent.to_owned(), position: position?, rotation })
+    Some(parent.to_owned())
+}
+
+fn rotation(table: &Section<'_>) -> Option<[f64; 4]> {
+    if !table.has(ROTATION) {
+        return Some([0.0, 0.0, 0.0, 1.0]);
+    }
+    let rotation: [f64; 4] = numbers(table, ROTATION, "write rotation = [x, y, z, w]")?;
+    let length = rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
+    if (length - 1.0).abs() > TOLERANCE {
+        let fix = "write a quaternion x y z w of length 1, or remove the key if the sensor is not turned";
+        return table.refuse(ROTATION, format!("not a rotation: its length is {length:.3}"), fix);
+    }
+    Some(rotation.map(|part| part / length))
 }
 
 fn numbers<const COUNT: usize>(table: &Section<'_>, key: &str, fix: &str) -> Option<[f64; COUNT]> {

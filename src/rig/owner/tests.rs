@@ -15,7 +15,8 @@ use crate::device::{DeviceNode, UsbIdentity};
 use crate::hotplug::{HotplugError, HotplugEvent};
 use crate::provenance::UnplugSource;
 use crate::registry::{
-    Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
+    Framing, IdentitySpec, InferenceSpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec,
+    WhenStale,
 };
 use crate::rig::presence::{Claim, read_mask};
 use crate::simulation::{SimDevice, SimSource};
@@ -52,6 +53,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         ),
     };
     Registry {
+        inference: InferenceSpec::default(),
         rig: RigSpec {
             name: "test".into(),
             observation_hz: 30.0,

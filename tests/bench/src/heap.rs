@@ -10,6 +10,7 @@ use std::time::Duration;
 use rapid::policy::bundle::Bundle;
 use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
+use rapid::policy::sampler::Computing;
 use serde::{Deserialize, Serialize};
 
 use crate::figure::Figure;
@@ -50,7 +51,7 @@ pub(crate) fn figure(bench: &Bench) -> Result<Figure, Failure> {
 /// Computes chunks.
 pub(crate) fn grown(folder: &Path, chunks: usize) -> Result<Memory, Failure> {
     let bundle = Bundle::load(folder)?;
-    let mut model = Model::load(&bundle, &Environment::open(None)?, None)?;
+    let mut model = Model::load(&bundle, &Environment::open(None)?, Computing::default())?;
     let mut request = policy::request(&bundle)?;
     let mut chunk = vec![0.0; model.chunk_len()];
     let mut memory = Memory::default();

@@ -11,8 +11,9 @@ use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::observation::ObservationTensors;
 use rapid::policy::request::Request;
-use rapid::policy::sampler::Sampler;
+use rapid::policy::sampler::{Computing, Sampler};
 use rapid::random::Random;
+use rapid::registry::InferenceSpec;
 use rapid::registry::task::PARTS;
 use rapid::sample::SampleHeader;
 use rapid::simulation::task::{Expert, Trial, layout};
@@ -91,12 +92,19 @@ struct Seen {
 impl Subject {
     fn load(bundle: &Bundle) -> Result<Self, Failure> {
         let environment = Environment::open(None)?;
-        let mut observer = Model::load(bundle, &environment, None)?;
+        let mut observer = Model::load(bundle, &environment, Computing::default())?;
         let request = request(bundle)?;
-        let sampler = Sampler::new(bundle, &environment, None, 1)?;
+        let sampler = Sampler::new(bundle, &environment, Computing::default())?;
         let bare = Bare::load(bundle, &environment, observer.observe(&request)?, sampler.steps())?;
         let chunk = vec![0.0; sampler.chunk_len()];
-        Ok(Self { model: Model::load(bundle, &environment, None)?, observer, sampler, bare, request, chunk })
+        Ok(Self {
+            model: Model::load(bundle, &environment, Computing::default())?,
+            observer,
+            sampler,
+            bare,
+            request,
+            chunk,
+        })
     }
 
     fn run(&mut self, chunks: usize) -> Result<Seen, Failure> {
@@ -156,7 +164,7 @@ impl Bare {
     ) -> Result<Self, Failure> {
         let load = |graph: Graph| -> Result<BoundGraph, Failure> {
             let bytes = bundle.read_graph(graph)?;
-            Ok(LoadedGraph::load(environment, &bundle.graph(graph).file, &bytes, 1)?.bind()?)
+            Ok(LoadedGraph::load(environment, &bundle.graph(graph).file, &bytes, InferenceSpec::default())?.bind()?)
         };
         let (mut encoder, mut denoiser) = (load(Graph::Encoder)?, load(Graph::Denoiser)?);
         for (at, spec) in bundle.observations.iter().enumerate() {
