@@ -47,12 +47,10 @@ class Configuration:
     """Its name in the paper."""
     paper: float
     """Its success rate in the paper."""
-    shipped: bool = False
-    """It is the policy of the repository: evaluated unchanged, not retrained."""
 
     def bundle(self, runs: Path) -> Path:
         """The folder of its bundle, existing or not."""
-        return MODELS / self.name if self.shipped else runs / self.name / "bundle"
+        return runs / self.name / "bundle"
 
     def experiment(self) -> Experiment:
         """What is trained."""
@@ -63,7 +61,7 @@ CONFIGURATIONS = (
     Configuration("vision", "vision only", 0.5),
     # Without its single picture, only the arm's own state remains.
     Configuration("vision-mask", "vision + mask", 0.5),
-    Configuration("tactile-id", "vision + mask + diff", 1.0, shipped=True),
+    Configuration("tactile-id-arm", "vision + mask + diff", 1.0),
     Configuration("vision-diff-one", "vision + diff", 0.5),
     Configuration("vision-diff", "vision + diff", 1.0),
 )

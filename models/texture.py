@@ -70,7 +70,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     try:
-        experiment = read_experiment(Path(__file__).parent / "experiments" / "tactile-id.toml")
+        experiment = read_experiment(Path(__file__).parent / "experiments" / "tactile-id-arm.toml")
         corpus = load(experiment, [args.episodes], args.cache, args.threads)
         print(corpus.report(), file=sys.stderr)
         episodes = corpus.training

@@ -9,7 +9,7 @@
 #     train.sh python ARGS...      that Python, run in models/
 #
 # RAPID is the program, default target/release/rapid. Demonstrations and checkpoints are in RUNS=models/runs; existing
-# ones are used again: a stopped training continues. EPISODES=72, SEED=1000 of the demonstrations, THREADS=2 and MINUTES
+# ones are used again: a stopped training continues. EPISODES (240 by hand, 72 with the arm), SEED=1000 of the demonstrations, THREADS=2 and MINUTES
 # of a training.
 #
 # Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks complete.
@@ -18,8 +18,13 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 RUNS="$(realpath -m "${RUNS:-models/runs}")"
 readonly RUNS
-readonly EPISODES="${EPISODES:-72}" SEED="${SEED:-1000}" THREADS="${THREADS:-2}"
-readonly DEMONSTRATIONS="$RUNS/demonstrations-$EPISODES-$SEED"
+# The policy learns from a gripper in the hand, the comparisons from an arm.
+case "${1:-}" in
+    policy) KIND=(--handheld) NAME=by-hand COUNT=240 ;;
+    *) KIND=() NAME=arm COUNT=72 ;;
+esac
+readonly KIND EPISODES="${EPISODES:-$COUNT}" SEED="${SEED:-1000}" THREADS="${THREADS:-2}"
+readonly DEMONSTRATIONS="$RUNS/$NAME-$EPISODES-$SEED"
 
 SCHEDULE=(--threads "$THREADS")
 [[ -z ${MINUTES:-} ]] || SCHEDULE+=(--minutes "$MINUTES")
@@ -66,7 +71,7 @@ demonstrations() {
     report "recording $EPISODES demonstrations: $DEMONSTRATIONS"
     rm -rf "$DEMONSTRATIONS.partial"
     mkdir -p "$DEMONSTRATIONS.partial"
-    "$rapid" --sim task --expert --record --episodes "$EPISODES" --out "$DEMONSTRATIONS.partial" --seed "$SEED"
+    "$rapid" --sim task "${KIND[@]}" --expert --record --episodes "$EPISODES" --out "$DEMONSTRATIONS.partial" --seed "$SEED"
     mv "$DEMONSTRATIONS.partial" "$DEMONSTRATIONS"
 }
 
@@ -76,7 +81,7 @@ policy() {
 
 # The name of the run and of the bundle is that of the file.
 experiment() {
-    [[ -f ${1:-} ]] || die "no experiment '${1:-}': name a file, for example models/experiments/tactile-id-handheld.toml"
+    [[ -f ${1:-} ]] || die "no experiment '${1:-}': name a file, for example models/experiments/tactile-id.toml"
     local file
     file="$(realpath "$1")"
     learn "$file" "$(basename "$file" .toml)" "${@:2}"

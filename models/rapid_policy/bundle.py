@@ -131,7 +131,7 @@ SIMULATED = """
 
 which does, one after the other:
 
-    rapid --sim task --expert --record --episodes {episodes} --out EPISODES --seed {first}"""
+    rapid --sim task --handheld --expert --record --episodes {episodes} --out EPISODES --seed {first}"""
 
 
 def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:

@@ -18,7 +18,7 @@ EXPERIMENTS = MODELS / "experiments"
 SIDE = 96
 
 
-def experiment(name: str = "tactile-id", **tables: dict[str, Any]) -> Experiment:
+def experiment(name: str = "tactile-id-arm", **tables: dict[str, Any]) -> Experiment:
     """An experiment of the repository, with other values in its tables."""
     described = json.loads(read_experiment(EXPERIMENTS / f"{name}.toml").to_text())
     for table, values in tables.items():
@@ -26,7 +26,7 @@ def experiment(name: str = "tactile-id", **tables: dict[str, Any]) -> Experiment
     return Experiment.from_text(json.dumps(described))
 
 
-def small(name: str = "tactile-id", **training: Any) -> Experiment:
+def small(name: str = "tactile-id-arm", **training: Any) -> Experiment:
     """The same with small networks."""
     sizes = {"encoder": {"width": 8, "features": 8, "keypoints": 4}, "denoiser": {"widths": [8, 16]}}
     training = {"iterations": 8, "windows": 4, "warmup": 2, **training}

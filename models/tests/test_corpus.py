@@ -18,7 +18,7 @@ from rapid_policy.corpus import Corpus, divide, load
 from rapid_policy.episodes import EpisodeError, read_episode, sources
 from rapid_policy.judgement import Judgement
 
-SPEC = experiment("tactile-id-handheld")
+SPEC = experiment("tactile-id")
 
 
 class Case(unittest.TestCase):
@@ -56,7 +56,7 @@ def names(episodes) -> list[str]:
 
 
 def with_data(**data) -> Experiment:
-    return experiment("tactile-id-handheld", data=data)
+    return experiment("tactile-id", data=data)
 
 
 class LeftOut(Case):

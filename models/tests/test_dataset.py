@@ -98,8 +98,8 @@ class Windows(unittest.TestCase):
             (plain(), silent, "no action"),
             (plain(), other, "recorded at 30 Hz, the policy acts at 10: write control_hz = 30"),
             (plain(), short, "arm: 3 numbers, but number 3"),
-            (experiment("tactile-id-handheld"), by_hand(10), None),
-            (experiment("tactile-id-handheld"), strange, "phone: 12 numbers and layout 'columns': not a pose"),
+            (experiment("tactile-id"), by_hand(10), None),
+            (experiment("tactile-id"), strange, "phone: 12 numbers and layout 'columns': not a pose"),
         ):
             with self.subTest(reason):
                 found = unfit(spec, episode)

@@ -41,7 +41,7 @@ class Mistakes(unittest.TestCase):
 class Ours(unittest.TestCase):
     def test_every_experiment_of_the_repository_is_right(self):
         names = {path.stem: read_experiment(path).name for path in EXPERIMENTS.glob("*.toml")}
-        self.assertTrue({"tactile-id", "tactile-id-handheld", "vision", "vision-mask"} <= set(names))
+        self.assertTrue({"tactile-id-arm", "tactile-id", "vision", "vision-mask"} <= set(names))
         for file, name in names.items():
             self.assertEqual(file, name)
 

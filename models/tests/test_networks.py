@@ -107,11 +107,11 @@ class Bundle(unittest.TestCase):
             "denoiser": {"widths": [8, 16], "kernel": 3},
         }
         for name, spec in (
-            ("tactile-id", experiment()),
+            ("tactile-id-arm", experiment()),
             ("without mask", experiment("vision-diff")),
             ("shared", experiment(encoder={"shared": True})),
             ("resnet18", experiment(**sizes)),
-            ("by hand", experiment("tactile-id-handheld")),
+            ("by hand", experiment("tactile-id")),
         ):
             with self.subTest(name), tempfile.TemporaryDirectory() as folder_name:
                 folder = Path(folder_name)
@@ -151,7 +151,7 @@ class Bundle(unittest.TestCase):
         names = [f"n{i}" for i in range(10)]
         action = {"representation": "relative", "rotation": "rotation_6d", "names": names, "units": ["1"] * 10}
         ten = {"mode": "min_max", "min": [-1] * 10, "max": [1] * 10}
-        spec = experiment("tactile-id-handheld", action=action)
+        spec = experiment("tactile-id", action=action)
         described = policy_json(spec, {"normalization": {**RANGES, "action": ten}}, {ENCODER: "", DENOISER: ""})
         self.assertEqual(
             [described["action"][key] for key in ("representation", "rotation", "shape")],
@@ -165,11 +165,11 @@ class Bundle(unittest.TestCase):
             "seed": 0, "final_loss": 0.5, "difference": 1e-6, "command": "python", "tags": {"texture": {"a": 1, "b": 1}},
         }  # fmt: skip
         with tempfile.TemporaryDirectory() as name:
-            for experiment_name in ("tactile-id", "tactile-id-handheld", "vision"):
+            for experiment_name in ("tactile-id-arm", "tactile-id", "vision"):
                 write_card(experiment(experiment_name), facts, Path(name))
                 card = (Path(name) / "README.md").read_text(encoding="utf-8")
                 self.assertIn("2 episodes (1 a, 1 b), 20 ticks", card)
-                self.assertEqual("the next pose of `phone`" in card, experiment_name == "tactile-id-handheld")
+                self.assertEqual("the next pose of `phone`" in card, experiment_name == "tactile-id")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ def posed(representation: str, rotation: str) -> Experiment:
     names = [f"n{i}" for i in range(NAMES[rotation] + 1)]
     action = {"representation": representation, "rotation": rotation, "names": names, "units": ["1"] * len(names)}
     action["gripper_squeeze"] = 0.0
-    return experiment("tactile-id-handheld", action=action)
+    return experiment("tactile-id", action=action)
 
 
 class Conventions(unittest.TestCase):
@@ -157,7 +157,7 @@ class Actions(unittest.TestCase):
 
     def test_the_state_is_made_of_parts(self):
         episode = by_hand(30)
-        dataset = Dataset(experiment("tactile-id-handheld"), [episode])
+        dataset = Dataset(experiment("tactile-id"), [episode])
         state = dataset.ranges["state"].invert(dataset.vectors["state"])
         np.testing.assert_allclose(state[:, :3], path(30)[:, :3, 3], atol=1e-6)
         np.testing.assert_allclose(state[:, 3], (np.arange(30) % 7) / 7, atol=1e-6)
@@ -168,7 +168,7 @@ class Files(unittest.TestCase):
 
     def test_an_episode_by_hand_is_read(self):
         wanted, opening = path(20), np.linspace(0, 1, 20)
-        spec = experiment("tactile-id-handheld")
+        spec = experiment("tactile-id")
         with tempfile.TemporaryDirectory() as folder:
             for late in (0, 1):
                 file = written.by_hand(Path(folder) / f"{late}.mcap", wanted, opening, late={"phone": late})
@@ -183,7 +183,7 @@ class Files(unittest.TestCase):
     def test_rows_are_read_as_rows(self):
         wanted = path(20)
         turned = wanted.transpose(0, 2, 1)
-        spec = experiment("tactile-id-handheld")
+        spec = experiment("tactile-id")
         with tempfile.TemporaryDirectory() as folder:
             file = written.by_hand(Path(folder) / "a.mcap", turned, np.linspace(0, 1, 20), poses={"phone": "rows"})
             dataset = Dataset(spec, [read_episode(file, sources(spec))])

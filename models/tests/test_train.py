@@ -271,7 +271,7 @@ class CommandLine(Case):
             opening = np.linspace(0, 1, 25)
             written.by_hand(self.data / f"{i}.mcap", path(25, i), opening, tags={"seed": str(i)}, modules=("handheld",))
         self.experiment = self.folder / "small.toml"
-        text = (MODELS / "experiments" / "tactile-id-handheld.toml").read_text(encoding="utf-8")
+        text = (MODELS / "experiments" / "tactile-id.toml").read_text(encoding="utf-8")
         for before, after in (
             ("width = 16", "width = 8"),
             ("widths = [32, 64, 128]", "widths = [8, 16]"),
