@@ -30,6 +30,7 @@ usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplu
        usbemu --beat MICROSECONDS FILE   sleep to absolute deadlines, note each waking in FILE
 
 SPEC: uvc:vid=046d,pid=0825,serial=A,port=0,mode=MJPG-640x480@30[,mode=..]
+      uvc:mode=Z16-64x48@15,also=YUYV-64x48@15[,mode=..]   one device of two cameras; at most four
       acm:vid=2e8a,pid=000a,serial=B,hz=100
       ftdi:vid=0403,pid=6001,serial=C,hz=50
       gsusb:serial=D,motor=5/15/DMH3510[,motor=..]   slcan:..   damiao:..

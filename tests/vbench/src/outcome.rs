@@ -75,10 +75,10 @@ impl Outcome {
         self.emu.iter().filter(of_device).filter_map(moment).collect()
     }
 
-    /// Frames that a camera sent, and ticks without a frame, in each of its finished streams.
-    pub fn streams(&self, device: usize) -> Vec<Stream> {
-        let of_device = |line: &&Value| line["device"] == device;
-        let lines: Vec<&Value> = self.emu.iter().filter(of_device).collect();
+    /// Frames that a device's camera with this endpoint sent, and ticks without a frame, in each of its finished streams.
+    pub fn streams(&self, device: usize, endpoint: u8) -> Vec<Stream> {
+        let of_camera = |line: &&Value| line["device"] == device && line["endpoint"] == endpoint;
+        let lines: Vec<&Value> = self.emu.iter().filter(of_camera).collect();
         let edges = |action: &str| lines.iter().filter(|line| line["action"] == action).copied().collect::<Vec<_>>();
         let number = |line: &Value, key: &str| line[key].as_u64().unwrap_or_default();
         let stream = |(on, off): (&Value, &Value)| Stream {

@@ -80,6 +80,19 @@ pub struct Frame {
     pub whole: bool,
 }
 
+/// A picture in a recording that is not compressed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Picture<'a> {
+    /// The identity written by the emulator; `None` if it cannot be read.
+    pub id: Option<FrameId>,
+    /// Wall clock, ns.
+    pub log_time: u64,
+    /// The name of its pixel format.
+    pub encoding: &'a [u8],
+    /// Its pixels.
+    pub data: &'a [u8],
+}
+
 impl Recording {
     /// Reads a whole file.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
@@ -140,6 +153,14 @@ impl Recording {
             Frame { id: frame::identity(data), log_time: message.log_time, whole: frame::is_whole_jpeg(data) }
         };
         self.topic(topic).map(read).collect()
+    }
+
+    /// The pictures of a camera topic that are not compressed (`foxglove.RawImage`: encoding is field 4, data field 6).
+    pub fn pictures<'a>(&'a self, topic: &'a str) -> impl Iterator<Item = Picture<'a>> {
+        self.topic(topic).map(|message| {
+            let [encoding, data] = [4, 6].map(|field| proto::bytes(&message.data, field));
+            Picture { id: frame::identity(data), log_time: message.log_time, encoding, data }
+        })
     }
 
     /// The rows of a serial topic (`rapid.Scalars`: values are field 2).

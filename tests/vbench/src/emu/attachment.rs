@@ -1,4 +1,4 @@
-//! An attached device: the thread that answers the host, and the thread that sends on the device's clock.
+//! An attached device: the thread that answers the host, and the threads that send on the device's clock, one per endpoint.
 //!
 //! Invariant: one mutex per device guards function, transfers and socket; nothing waits for clock or host holding it.
 //! Invariant: a tick that is late or finds no reader is skipped, not caught up: a camera does not deliver the past.
@@ -13,8 +13,9 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::descriptor::{Answer, Setup};
-use super::function::{DATA_IN, Function};
+use super::function::Function;
 use super::log::{Log, Moment};
+use super::source::Live;
 use super::wire::{self, HEADER_LEN, Request, Status, Submit};
 use crate::clock;
 
@@ -39,9 +40,18 @@ pub(super) struct State {
     pub(super) due_ns: u64,
     /// The emulator no longer needs it.
     pub(super) ended: bool,
-    pub(super) sent: u64,
-    skipped: u64,
+    /// By endpoint, as `waiting`.
+    pub(super) counts: [Counts; 16],
     pub(super) scratch: Vec<u8>,
+}
+
+/// What was sent through an endpoint since the emulator started, and what was not.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Counts {
+    /// Frames, lines, or transfers of a device with a protocol.
+    pub(super) sent: u64,
+    /// Ticks without a reader, or too late.
+    skipped: u64,
 }
 
 /// A transfer to the host that waits for data.
@@ -60,8 +70,7 @@ impl Shared {
             silent: false,
             due_ns: 0,
             ended: false,
-            sent: 0,
-            skipped: 0,
+            counts: Default::default(),
             scratch: Vec::new(),
         };
         Self { index, state: Mutex::new(state), changed: Condvar::new(), log }
@@ -109,9 +118,10 @@ impl Shared {
             self.answer(request, &data);
         }
         self.hang_up(epoch);
-        let state = self.lock();
-        let fields = json!({"device": self.index, "sent": state.sent, "skipped": state.skipped});
-        self.log.write("gone", Moment::now(), fields);
+        let counts = self.lock().counts;
+        let total = |count: fn(&Counts) -> u64| counts.iter().map(count).sum::<u64>();
+        let (sent, skipped) = (total(|counts| counts.sent), total(|counts| counts.skipped));
+        self.log.write("gone", Moment::now(), json!({"device": self.index, "sent": sent, "skipped": skipped}));
     }
 
     fn answer(&self, request: Request, data: &[u8]) {
@@ -123,23 +133,9 @@ impl Shared {
                 state.write(&wire::unlink_reply(seq, if found { Status::Unlinked } else { Status::Ok }));
             }
             Request::Submit(submit) if submit.endpoint == 0 => {
-                let before = state.function.live();
-                let setup = Setup::parse(&submit.setup);
-                let answer = state.function.control(setup, data, now.mono_ns);
-                match answer {
-                    Answer::Data(mut bytes) => {
-                        bytes.truncate(usize::from(setup.length).min(submit.length as usize));
-                        state.reply(submit.seq, &bytes);
-                    }
-                    Answer::Done => state.write(&wire::submit_reply(submit.seq, Status::Ok, data.len())),
-                    Answer::Stall => state.write(&wire::submit_reply(submit.seq, Status::Stall, 0)),
-                }
-                let after = state.function.live();
-                if before != after {
-                    let action = if after.is_some() { "stream_on" } else { "stream_off" };
-                    let fields = json!({"device": self.index, "sent": state.sent, "skipped": state.skipped});
-                    self.log.write(action, Moment::now(), fields);
-                }
+                let before = state.streams();
+                state.control(submit, data, now.mono_ns);
+                self.log_streams(&mut state, &before);
             }
             Request::Submit(Submit { seq, is_in: true, endpoint, length, .. }) => {
                 state.waiting[usize::from(endpoint)].push_back(Waiting { seq, room: length as usize });
@@ -158,13 +154,26 @@ impl Shared {
         self.changed.notify_all();
     }
 
-    /// Sends a frame or line at every tick until the connection ends.
-    pub(super) fn beat(&self, epoch: u32) {
+    /// Logs the streams that the host has started or stopped.
+    fn log_streams(&self, state: &mut State, before: &[(u8, Option<Live>)]) {
+        for (endpoint, before) in before {
+            let after = state.function.live(*endpoint);
+            if *before != after {
+                let action = if after.is_some() { "stream_on" } else { "stream_off" };
+                let Counts { sent, skipped } = state.counts[usize::from(*endpoint)];
+                let fields = json!({"device": self.index, "endpoint": endpoint, "sent": sent, "skipped": skipped});
+                self.log.write(action, Moment::now(), fields);
+            }
+        }
+    }
+
+    /// Sends a frame or line of an endpoint's source at every tick until the connection ends.
+    pub(super) fn beat(&self, epoch: u32, endpoint: u8) {
         let mut whole = Vec::new();
         let mut due_ns = 0;
         let mut state = self.lock();
         while state.is_attached(epoch) {
-            let Some(live) = state.function.live().filter(|_| !state.silent) else {
+            let Some(live) = state.function.live(endpoint).filter(|_| !state.silent) else {
                 due_ns = 0;
                 state = self.wait(state, Duration::from_secs(1));
                 continue;
@@ -180,13 +189,12 @@ impl Shared {
             }
             let late = (now_ns - due_ns) / period_ns;
             due_ns += (late + 1) * period_ns;
-            if state.data_endpoint().is_empty() {
-                state.skipped += late + 1;
-                continue;
+            let is_awaited = !state.waiting[usize::from(endpoint)].is_empty();
+            state.counts[usize::from(endpoint)].skipped += if is_awaited { late } else { late + 1 };
+            if is_awaited && let Some(source) = state.function.source(endpoint) {
+                source.produce(now_ns, &mut whole);
+                state = self.send(state, &whole, epoch, endpoint, live.stream);
             }
-            state.skipped += late;
-            state.function.produce(now_ns, &mut whole);
-            state = self.send(state, &whole, epoch, live.stream);
         }
     }
 
@@ -196,28 +204,24 @@ impl Shared {
         mut state: MutexGuard<'a, State>,
         whole: &[u8],
         epoch: u32,
+        endpoint: u8,
         stream: u32,
     ) -> MutexGuard<'a, State> {
         let mut at = 0;
         while at < whole.len() {
-            if !state.is_attached(epoch) || state.function.live().is_none_or(|live| live.stream != stream) {
+            let is_over = state.function.live(endpoint).is_none_or(|live| live.stream != stream);
+            if is_over || !state.is_attached(epoch) {
                 return state;
             }
-            let Some(transfer) = state.data_endpoint().pop_front() else {
-                state = self.wait(state, Duration::from_secs(1));
-                continue;
-            };
-            let mut packet = std::mem::take(&mut state.scratch);
-            packet.clear();
-            packet.resize(HEADER_LEN, 0);
-            at = state.function.packet(whole, at, transfer.room, &mut packet);
-            let length = packet.len() - HEADER_LEN;
-            packet[..HEADER_LEN].copy_from_slice(&wire::submit_reply(transfer.seq, Status::Ok, length));
-            state.write(&packet);
-            state.scratch = packet;
+            match state.waiting[usize::from(endpoint)].pop_front() {
+                Some(transfer) => at = state.complete(endpoint, &transfer, whole, at),
+                None => state = self.wait(state, Duration::from_secs(1)),
+            }
         }
-        state.function.sent();
-        state.sent += 1;
+        if let Some(source) = state.function.source(endpoint) {
+            source.sent();
+        }
+        state.counts[usize::from(endpoint)].sent += 1;
         state
     }
 
@@ -231,8 +235,36 @@ impl State {
         self.epoch == epoch && self.line.is_some()
     }
 
-    fn data_endpoint(&mut self) -> &mut VecDeque<Waiting> {
-        &mut self.waiting[usize::from(DATA_IN & 0x0f)]
+    /// The stream of each endpoint, if one runs.
+    fn streams(&mut self) -> Vec<(u8, Option<Live>)> {
+        self.function.endpoints().map(|endpoint| (endpoint, self.function.live(endpoint))).collect()
+    }
+
+    /// Answers a control request.
+    fn control(&mut self, submit: Submit, data: &[u8], now_ns: u64) {
+        let setup = Setup::parse(&submit.setup);
+        match self.function.control(setup, data, now_ns) {
+            Answer::Data(mut bytes) => {
+                bytes.truncate(usize::from(setup.length).min(submit.length as usize));
+                self.reply(submit.seq, &bytes);
+            }
+            Answer::Done => self.write(&wire::submit_reply(submit.seq, Status::Ok, data.len())),
+            Answer::Stall => self.write(&wire::submit_reply(submit.seq, Status::Stall, 0)),
+        }
+    }
+
+    /// Completes a transfer with the part of `whole` that begins at `at`; returns where the next one continues.
+    fn complete(&mut self, endpoint: u8, transfer: &Waiting, whole: &[u8], at: usize) -> usize {
+        let Some(source) = self.function.source(endpoint) else { return whole.len() };
+        let mut packet = std::mem::take(&mut self.scratch);
+        packet.clear();
+        packet.resize(HEADER_LEN, 0);
+        let next = source.packet(whole, at, transfer.room, &mut packet);
+        let length = packet.len() - HEADER_LEN;
+        packet[..HEADER_LEN].copy_from_slice(&wire::submit_reply(transfer.seq, Status::Ok, length));
+        self.write(&packet);
+        self.scratch = packet;
+        next
     }
 
     fn take_back(&mut self, victim: u32) -> bool {
@@ -254,3 +286,7 @@ impl State {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "attachment_tests.rs"]
+mod tests;

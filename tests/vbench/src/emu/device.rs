@@ -2,6 +2,7 @@
 
 use std::fs::OpenOptions;
 use std::io::{self, Write};
+use std::ops::Range;
 use std::os::fd::AsRawFd;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
@@ -57,20 +58,21 @@ pub struct Device {
     index: usize,
     next_port: u8,
     plugged: Option<u8>,
-    talks: bool,
+    /// Those that send on the device's own clock.
+    endpoints: Range<u8>,
     shared: Arc<Shared>,
 }
 
 impl Device {
     /// A device that is not plugged yet.
     pub fn new(index: usize, port: u8, function: Function, log: Arc<Log>) -> Self {
-        let talks = function.talks();
+        let (talks, endpoints) = (function.talks(), function.endpoints());
         let shared = Arc::new(Shared::new(index, function, log));
         if talks {
             let talking = Arc::clone(&shared);
             thread::spawn(move || talking.talk());
         }
-        Self { index, next_port: port, plugged: None, talks, shared }
+        Self { index, next_port: port, plugged: None, endpoints, shared }
     }
 
     /// The next plug goes to this port.
@@ -108,10 +110,11 @@ impl Device {
             state.epoch += 1;
             state.epoch
         };
-        let (serving, beating) = (Arc::clone(&self.shared), Arc::clone(&self.shared));
+        let serving = Arc::clone(&self.shared);
         thread::spawn(move || serving.serve(reader, epoch));
-        if !self.talks {
-            thread::spawn(move || beating.beat(epoch));
+        for endpoint in self.endpoints.clone() {
+            let beating = Arc::clone(&self.shared);
+            thread::spawn(move || beating.beat(epoch, endpoint));
         }
 
         // devid is bus and device number of the exporting side; nothing uses it here, but it must be unique.

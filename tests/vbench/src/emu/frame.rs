@@ -7,6 +7,8 @@ use std::path::Path;
 
 use jpeg_encoder::{ColorType, Encoder, EncodingError};
 
+use super::spec::CAMERAS;
+
 const COM_TAG: &str = "rapid-vbench";
 const YUYV_TAG: &[u8; 4] = b"RVBF";
 /// Maximum size of the identity in a JPEG, bytes.
@@ -26,7 +28,7 @@ pub fn light() -> Option<bool> {
 /// Number and send time (CLOCK_MONOTONIC) of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameId {
-    /// Counts the frames the device has sent, starting at its own `first_number`, across replugs.
+    /// Counts the frames the camera has sent, starting at its device's `first_number`, across replugs.
     pub number: u32,
     /// When the emulator sent it.
     pub sent_ns: u64,
@@ -34,6 +36,9 @@ pub struct FrameId {
 
 /// Number ranges of devices never overlap, so that a frame or line shows which of two equal units sent it.
 pub const NUMBERS_PER_DEVICE: u32 = 1_000_000;
+
+/// The ranges of a device's several cameras begin this far from each other.
+pub const NUMBERS_PER_CAMERA: u32 = NUMBERS_PER_DEVICE / CAMERAS as u32;
 
 /// The number of the first frame or line of the `index`-th device.
 pub fn first_number(index: usize) -> u32 {
@@ -44,6 +49,11 @@ impl FrameId {
     /// The device that sent it.
     pub fn device(self) -> usize {
         (self.number / NUMBERS_PER_DEVICE) as usize
+    }
+
+    /// Which of its device's several cameras sent it, counted from 0.
+    pub fn camera(self) -> usize {
+        (self.number % NUMBERS_PER_DEVICE / NUMBERS_PER_CAMERA) as usize
     }
 }
 
@@ -147,6 +157,15 @@ mod tests {
         }
         stamp_yuyv(64, 48, id, None, &mut frame);
         assert_eq!((frame.len(), identity(&frame)), (64 * 48 * 2, Some(id)));
+    }
+
+    #[test]
+    fn a_number_names_device_and_camera() {
+        let number = first_number(3) + NUMBERS_PER_CAMERA + 7;
+        let id = FrameId { number, sent_ns: 0 };
+        assert_eq!((id.device(), id.camera()), (3, 1));
+        assert_eq!(FrameId { number: first_number(3), sent_ns: 0 }.camera(), 0);
+        assert_eq!(FrameId { number: first_number(4) - 1, sent_ns: 0 }.camera(), CAMERAS - 1);
     }
 
     #[test]

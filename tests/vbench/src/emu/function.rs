@@ -1,13 +1,14 @@
-//! The function of a device, above its port: a camera, a serial line or a protocol device, behind chapter 9's requests.
+//! The function of a device, above its port: cameras, a serial line or a protocol device, behind chapter 9's requests.
 //!
 //! Invariant: no clock, no socket, no thread; requests and times are inputs, answers and packets are outputs.
 
 use std::collections::HashMap;
+use std::ops::Range;
 use std::path::Path;
-use std::time::Duration;
 
 use thiserror::Error;
 
+use super::cameras::Cameras;
 use super::can::adapter::Adapter;
 use super::descriptor::{self, Answer, Setup};
 use super::feed::{self, FeedError, Records};
@@ -15,21 +16,15 @@ use super::frame;
 use super::gpio::Gpio;
 use super::lan::ecm::Ecm;
 use super::serial::{Flavour, Serial};
+use super::source::{Live, Source};
 use super::spec::{DeviceSpec, Format, Identity, Kind, Mode};
 use super::talker::Talker;
-use super::uvc::{self, Pictures, Uvc};
+use super::uvc::{self, Content, Pictures};
 
-/// Address of the bulk endpoint that carries every kind's data to the host.
+/// Address of the bulk endpoint that carries every kind's data to the host; further cameras of a device have the next ones.
 pub const DATA_IN: u8 = 0x81;
-
-/// A device that has data to send, and how often.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Live {
-    /// Changes when the host starts another stream.
-    pub stream: u32,
-    /// Time between two frames or lines.
-    pub period: Duration,
-}
+/// Its number, without the direction bit.
+const DATA_ENDPOINT: u8 = DATA_IN & 0x0f;
 
 /// Pictures by size, so that cameras of one size share them.
 pub type PictureStore = HashMap<(u16, u16), Pictures>;
@@ -65,7 +60,7 @@ pub struct Function {
 
 #[derive(Debug)]
 enum Role {
-    Uvc(Uvc),
+    Uvc(Cameras),
     Serial(Serial),
     Talker(Box<dyn Talker>),
 }
@@ -76,7 +71,11 @@ impl Function {
     pub fn new(spec: &DeviceSpec, first: u32, store: &mut PictureStore) -> Result<Self, ContentError> {
         let given = (!spec.feed.is_empty()).then(|| feed::load(Path::new(&spec.feed))).transpose()?;
         let role = match &spec.kind {
-            Kind::Uvc(modes) => Role::Uvc(camera(modes, first, given, store)?),
+            Kind::Uvc(cameras) => {
+                let contents: Result<_, _> =
+                    cameras.iter().map(|modes| content(modes, given.as_ref(), store)).collect();
+                Role::Uvc(Cameras::new(contents?, first))
+            }
             Kind::Acm { hz } => Role::Serial(Serial::new(Flavour::Acm, *hz, first, given)),
             Kind::Ftdi { hz } => Role::Serial(Serial::new(Flavour::Ftdi, *hz, first, given)),
             Kind::Can { protocol, motors } => Role::Talker(Box::new(Adapter::new(*protocol, motors))),
@@ -90,8 +89,9 @@ impl Function {
     pub fn reset(&mut self) {
         self.configured = 0;
         match &mut self.role {
+            Role::Uvc(cameras) => cameras.stop(),
+            Role::Serial(_) => {}
             Role::Talker(talker) => talker.reset(),
-            Role::Uvc(_) | Role::Serial(_) => self.stop(),
         }
     }
 
@@ -101,7 +101,7 @@ impl Function {
             return self.standard(setup);
         }
         match &mut self.role {
-            Role::Uvc(camera) => camera.control(setup, data),
+            Role::Uvc(cameras) => cameras.control(setup, data),
             Role::Serial(serial) => serial.control(setup, data),
             Role::Talker(talker) => talker.control(setup, data, now_ns),
         }
@@ -120,46 +120,29 @@ impl Function {
         }
     }
 
-    /// The running stream, if there is one.
-    pub fn live(&self) -> Option<Live> {
-        match &self.role {
-            Role::Uvc(camera) => camera.live(),
-            Role::Serial(serial) => Some(serial.live()),
-            Role::Talker(_) => None,
-        }
+    /// Numbers of the endpoints through which it sends on its own clock.
+    pub fn endpoints(&self) -> Range<u8> {
+        let count = match &self.role {
+            Role::Uvc(cameras) => cameras.count(),
+            Role::Serial(_) => 1,
+            Role::Talker(_) => 0,
+        };
+        DATA_ENDPOINT..DATA_ENDPOINT.saturating_add(count)
     }
 
-    /// Writes the next frame or line over `out`.
-    pub fn produce(&mut self, sent_ns: u64, out: &mut Vec<u8>) {
+    /// What sends on its own clock through the endpoint with this number.
+    pub fn source(&mut self, endpoint: u8) -> Option<&mut dyn Source> {
+        let place = endpoint.checked_sub(DATA_ENDPOINT)?;
         match &mut self.role {
-            Role::Uvc(camera) => camera.frame(sent_ns, out),
-            Role::Serial(serial) => serial.line(sent_ns, out),
-            Role::Talker(_) => out.clear(),
+            Role::Uvc(cameras) => cameras.at(place).map(|camera| camera as &mut dyn Source),
+            Role::Serial(serial) if place == 0 => Some(serial),
+            Role::Serial(_) | Role::Talker(_) => None,
         }
     }
 
-    /// Appends the packet (at most `room` bytes) that continues `whole` at `at`; returns where the next one continues.
-    pub fn packet(&self, whole: &[u8], at: usize, room: usize, out: &mut Vec<u8>) -> usize {
-        match &self.role {
-            Role::Uvc(camera) => camera.payload(whole, at, room, out),
-            Role::Serial(serial) => serial.packet(whole, at, room, out),
-            Role::Talker(_) => whole.len(),
-        }
-    }
-
-    /// The output of `produce` was sent completely.
-    pub fn sent(&mut self) {
-        match &mut self.role {
-            Role::Uvc(camera) => camera.sent(),
-            Role::Serial(serial) => serial.sent(),
-            Role::Talker(_) => {}
-        }
-    }
-
-    fn stop(&mut self) {
-        if let Role::Uvc(camera) = &mut self.role {
-            camera.stop();
-        }
+    /// The running stream of the endpoint with this number, if there is one.
+    pub fn live(&mut self, endpoint: u8) -> Option<Live> {
+        self.source(endpoint)?.live()
     }
 
     /// Chapter 9. The host controller handles the address, and interfaces have one setting.
@@ -181,7 +164,10 @@ impl Function {
                 Answer::Done
             }
             CLEAR_FEATURE if setup.kind == TO_ENDPOINT => {
-                self.stop();
+                if let Role::Uvc(cameras) = &mut self.role {
+                    let [address, _] = setup.index.to_le_bytes();
+                    cameras.halt_cleared(address);
+                }
                 Answer::Done
             }
             _ if setup.is_in() => Answer::Stall,
@@ -192,7 +178,7 @@ impl Function {
     fn descriptor(&self, setup: Setup) -> Answer {
         let [index, kind] = setup.value.to_le_bytes();
         let (class, configuration) = match &self.role {
-            Role::Uvc(camera) => (camera.class(), camera.configuration()),
+            Role::Uvc(cameras) => (cameras.class(), cameras.configuration()),
             Role::Serial(serial) => (serial.class(), serial.configuration()),
             Role::Talker(talker) => (talker.class(), talker.configuration()),
         };
@@ -212,13 +198,14 @@ impl Function {
     }
 }
 
-fn camera(modes: &[Mode], first: u32, given: Option<Records>, store: &mut PictureStore) -> Result<Uvc, ContentError> {
+/// The modes of a camera with their pictures: made, or those of its device's feed.
+fn content(modes: &[Mode], given: Option<&Records>, store: &mut PictureStore) -> Result<Content, ContentError> {
     let default = [Mode { format: Format::Mjpg, width: 640, height: 480, fps: vec![30] }];
     let modes = if modes.is_empty() { &default } else { modes };
     let mut with_pictures = Vec::with_capacity(modes.len());
     for mode in modes {
         let size @ (width, height) = (mode.width, mode.height);
-        let pictures = match (mode.format, &given, store.get(&size)) {
+        let pictures = match (mode.format, given, store.get(&size)) {
             (Format::Yuyv | Format::Z16, ..) => Pictures::default(),
             (Format::Mjpg, Some(given), _) => {
                 let fits = |jpeg: &Vec<u8>| frame::is_whole_jpeg(jpeg) && jpeg.len() + frame::STAMP <= uvc::room(mode);
@@ -236,7 +223,7 @@ fn camera(modes: &[Mode], first: u32, given: Option<Records>, store: &mut Pictur
         };
         with_pictures.push((mode.clone(), pictures));
     }
-    Ok(Uvc::new(with_pictures, first))
+    Ok(with_pictures)
 }
 
 #[cfg(test)]
@@ -252,6 +239,7 @@ mod tests {
     fn every_kind_enumerates() {
         let specs = [
             DeviceSpec::uvc(0x046d, 0x0825),
+            DeviceSpec::uvc(0x8086, 0x0b07).mode(Format::Z16, 64, 48, &[15]).also(Format::Yuyv, 64, 48, &[15]),
             DeviceSpec::acm(0x2e8a, 0xa, 1.0),
             DeviceSpec::ftdi(0x0403, 0x6001, 1.0),
             DeviceSpec::can(Protocol::GsUsb),
@@ -272,6 +260,35 @@ mod tests {
             assert_eq!(function.control(configured, &[], 0), Answer::Data(vec![1]));
             function.reset();
             assert_eq!(function.control(configured, &[], 0), Answer::Data(vec![0]));
+        }
+    }
+
+    #[test]
+    fn a_cleared_halt_ends_the_stream_of_its_endpoint_alone() {
+        let spec = DeviceSpec::uvc(0x8086, 0x0b07).mode(Format::Z16, 64, 48, &[15]).also(Format::Yuyv, 64, 48, &[30]);
+        let mut function = Function::new(&spec, 0, &mut PictureStore::new()).unwrap();
+        assert_eq!(function.endpoints(), 1..3);
+        for interface in [1, 3] {
+            let commit = Setup { kind: 0x21, request: 1, value: 0x0200, index: interface, length: 26 };
+            assert_eq!(function.control(commit, &[], 0), Answer::Done);
+        }
+        let live = |function: &mut Function| [1, 2].map(|endpoint| function.live(endpoint).is_some());
+        assert_eq!(live(&mut function), [true, true]);
+        let clear = |address| Setup { kind: 0x02, request: 1, value: 0, index: address, length: 0 };
+        for (address, expected) in [(0x83, [true, true]), (0x82, [true, false]), (0x81, [false, false])] {
+            assert_eq!(function.control(clear(address), &[], 0), Answer::Done);
+            assert_eq!(live(&mut function), expected, "{address:#x}");
+        }
+    }
+
+    #[test]
+    fn there_is_a_source_for_each_endpoint_and_no_other() {
+        let specs = [(DeviceSpec::uvc(1, 2), 1), (DeviceSpec::acm(1, 2, 1.0), 1), (DeviceSpec::gpio(), 0)];
+        for (spec, count) in specs {
+            let mut function = Function::new(&spec, 0, &mut PictureStore::new()).unwrap();
+            let found: Vec<u8> = (0..16).filter(|endpoint| function.source(*endpoint).is_some()).collect();
+            assert_eq!(found.len(), count);
+            assert_eq!(found, function.endpoints().collect::<Vec<_>>());
         }
     }
 }

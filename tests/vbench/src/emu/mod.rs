@@ -8,6 +8,7 @@
 //! Invariant: no request of a host causes a panic; unknown requests are stalled, as by hardware.
 
 mod attachment;
+pub mod cameras;
 pub mod can;
 pub mod descriptor;
 pub mod device;
@@ -22,6 +23,7 @@ pub mod pace;
 pub mod reported;
 pub mod script;
 pub mod serial;
+pub mod source;
 pub mod spec;
 mod talk;
 pub mod talker;

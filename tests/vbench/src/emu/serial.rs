@@ -8,7 +8,8 @@ use std::time::Duration;
 
 use super::descriptor::{Answer, BULK_PACKET, CS_INTERFACE, Configuration, DeviceClass, Setup};
 use super::feed::Records;
-use super::function::{DATA_IN, Live};
+use super::function::DATA_IN;
+use super::source::{Live, Source};
 
 const DATA_OUT: u8 = 0x02;
 const NOTIFY_IN: u8 = 0x83;
@@ -90,14 +91,15 @@ impl Serial {
             (Flavour::Acm, _, true) => Answer::Stall,
         }
     }
+}
 
+impl Source for Serial {
     /// Always sending; whether anybody reads depends on the host.
-    pub fn live(&self) -> Live {
-        Live { stream: 0, period: self.period }
+    fn live(&self) -> Option<Live> {
+        Some(Live { stream: 0, period: self.period })
     }
 
-    /// Writes the next line over `out`.
-    pub fn line(&self, sent_ns: u64, out: &mut Vec<u8>) {
+    fn produce(&self, sent_ns: u64, out: &mut Vec<u8>) {
         out.clear();
         if let Some(feed) = &self.feed {
             let place = (self.next_line - self.first_line) as usize % feed.len();
@@ -111,13 +113,11 @@ impl Serial {
         out.extend_from_slice(text.as_bytes());
     }
 
-    /// The line was sent completely: the next one gets the next number.
-    pub fn sent(&mut self) {
+    fn sent(&mut self) {
         self.next_line += 1;
     }
 
-    /// Appends the packet that continues `line` at `at` to `out`; returns where the next one continues.
-    pub fn packet(&self, line: &[u8], at: usize, room: usize, out: &mut Vec<u8>) -> usize {
+    fn packet(&self, line: &[u8], at: usize, room: usize, out: &mut Vec<u8>) -> usize {
         let status: &[u8] = if self.flavour == Flavour::Ftdi { &FTDI_STATUS } else { &[] };
         let room = room.min(usize::from(BULK_PACKET)).saturating_sub(status.len()).max(1);
         let end = line.len().min(at + room);
@@ -143,11 +143,11 @@ mod tests {
     fn lines_count_only_when_sent() {
         let mut serial = Serial::new(Flavour::Acm, 100.0, 0, None);
         let mut line = Vec::new();
-        serial.line(5, &mut line);
-        serial.line(6, &mut line);
+        serial.produce(5, &mut line);
+        serial.produce(6, &mut line);
         assert_eq!(line, b"0,6,0.000000,1.000000\n");
         serial.sent();
-        serial.line(7, &mut line);
+        serial.produce(7, &mut line);
         assert!(line.starts_with(b"1,7,"));
     }
 
@@ -158,7 +158,7 @@ mod tests {
         let mut line = Vec::new();
         let mut lines = String::new();
         for _ in 0..3 {
-            serial.line(5, &mut line);
+            serial.produce(5, &mut line);
             lines.push_str(std::str::from_utf8(&line).unwrap());
             serial.sent();
         }

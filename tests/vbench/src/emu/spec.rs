@@ -5,6 +5,7 @@
 //! acm:port=2,vid=2e8a,pid=000a,serial=TOF1,hz=100
 //! ftdi:port=3,vid=0403,pid=6001,serial=FT1,hz=50
 //! uvc:mode=MJPG-96x96@10,feed=/tmp/bench/wrist.feed
+//! uvc:mode=Z16-64x48@15,also=YUYV-64x48@15,mode=MJPG-64x48@15    two cameras, the second of two modes
 //! gsusb:serial=CAN1,motor=5/15/DMH3510,motor=6/16/DM4310     slcan:..  damiao:..  the same bus behind a serial line
 //! ecm:serial=C3441325012345,gopro=4,lidar=100                a network adapter, clips of 4 MB, packets a second
 //! ```
@@ -27,6 +28,9 @@ pub const PORTS: u8 = 15;
 
 /// Maximum modes of a camera, and rates of a mode: far more than any test needs, far less than a descriptor holds.
 const MODES: usize = 32;
+
+/// Maximum cameras of a device; a RealSense D435 has two.
+pub const CAMERAS: usize = 4;
 
 /// A device to emulate.
 #[derive(Clone, Debug, PartialEq)]
@@ -59,8 +63,8 @@ pub struct Identity {
 /// What a device does.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Kind {
-    /// A camera with these modes, the first of them its default.
-    Uvc(Vec<Mode>),
+    /// A device of one camera or several, each with these modes, the first of them its default.
+    Uvc(Vec<Vec<Mode>>),
     /// CDC-ACM (`/dev/ttyACM*`) that sends lines at `hz`.
     Acm {
         /// Lines per second.
@@ -135,9 +139,9 @@ pub enum SpecError {
 }
 
 impl DeviceSpec {
-    /// A camera; `mode` adds modes. Without any it has `MJPG-640x480@30`.
+    /// A camera; `mode` adds modes. Without any it has `MJPG-640x480@30`. `also` adds another camera to the device.
     pub fn uvc(vid: u16, pid: u16) -> Self {
-        Self::new(Kind::Uvc(Vec::new()), vid, pid)
+        Self::new(Kind::Uvc(vec![Vec::new()]), vid, pid)
     }
 
     /// A CDC-ACM device sending `hz` lines per second.
@@ -231,13 +235,28 @@ impl DeviceSpec {
         self
     }
 
-    /// Adds a camera mode. Ignored by other kinds.
+    /// Adds a mode to the last camera. Ignored by other kinds.
     #[must_use]
     pub fn mode(mut self, format: Format, width: u16, height: u16, fps: &[u32]) -> Self {
-        if let Kind::Uvc(modes) = &mut self.kind {
+        if let Kind::Uvc(cameras) = &mut self.kind
+            && let Some(modes) = cameras.last_mut()
+        {
             modes.push(Mode { format, width, height, fps: fps.to_vec() });
         }
         self
+    }
+
+    /// Adds another camera with this mode, a capture node of its own; `mode` adds modes to it. Ignored by other kinds.
+    ///
+    /// # Panics
+    /// When the device has as many cameras as it can have: the caller is a test.
+    #[must_use]
+    pub fn also(mut self, format: Format, width: u16, height: u16, fps: &[u32]) -> Self {
+        if let Kind::Uvc(cameras) = &mut self.kind {
+            assert!(cameras.len() < CAMERAS, "a device has at most {CAMERAS} cameras");
+            cameras.push(Vec::new());
+        }
+        self.mode(format, width, height, fps)
     }
 
     fn new(kind: Kind, vid: u16, pid: u16) -> Self {
@@ -285,6 +304,7 @@ impl FromStr for DeviceSpec {
             let wrong = |expected| SpecError::Value { key: key.into(), value: value.into(), expected };
             let hex = || u16::from_str_radix(value, 16).map_err(|_| wrong("four hexadecimal digits"));
             let string = || unescaped(value).ok_or_else(|| wrong("text, with %25 for a per cent sign"));
+            let mode = || parse_mode(value).ok_or_else(|| wrong("FORMAT-WxH@FPS[/FPS..], FORMAT MJPG, YUYV or Z16"));
             match (key, &mut spec.kind) {
                 ("port", _) => {
                     let port = value.parse().ok().filter(|port| *port < PORTS);
@@ -296,11 +316,11 @@ impl FromStr for DeviceSpec {
                 ("product", _) => spec.identity.product = string()?,
                 ("manufacturer", _) => spec.identity.manufacturer = string()?,
                 ("feed", _) => spec.feed = string()?,
-                ("mode", Kind::Uvc(modes)) if modes.len() < MODES => {
-                    modes.push(
-                        parse_mode(value).ok_or_else(|| wrong("FORMAT-WxH@FPS[/FPS..], FORMAT MJPG, YUYV or Z16"))?,
-                    );
-                }
+                ("mode", Kind::Uvc(cameras)) => match cameras.last_mut() {
+                    Some(modes) if modes.len() < MODES => modes.push(mode()?),
+                    _ => return Err(unknown()),
+                },
+                ("also", Kind::Uvc(cameras)) if cameras.len() < CAMERAS => cameras.push(vec![mode()?]),
                 ("motor", Kind::Can { motors, .. }) if motors.len() < MODES => {
                     let expected = "SLAVE/MASTER/TYPE, ids in hexadecimal, such as 5/15/DMH3510";
                     motors.push(MotorSpec::parse(value).ok_or_else(|| wrong(expected))?);
@@ -372,6 +392,13 @@ impl fmt::Display for Format {
     }
 }
 
+impl fmt::Display for Mode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let rates: Vec<String> = self.fps.iter().map(u32::to_string).collect();
+        write!(f, "{}-{}x{}@{}", self.format, self.width, self.height, rates.join("/"))
+    }
+}
+
 impl fmt::Display for DeviceSpec {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Identity { vid, pid, .. } = self.identity;
@@ -389,9 +416,9 @@ impl fmt::Display for DeviceSpec {
             write!(f, ",feed={}", escaped(&self.feed))?;
         }
         match &self.kind {
-            Kind::Uvc(modes) => modes.iter().try_for_each(|mode| {
-                let rates: Vec<String> = mode.fps.iter().map(u32::to_string).collect();
-                write!(f, ",mode={}-{}x{}@{}", mode.format, mode.width, mode.height, rates.join("/"))
+            Kind::Uvc(cameras) => cameras.iter().enumerate().try_for_each(|(place, modes)| {
+                let keys = std::iter::once(if place == 0 { "mode" } else { "also" }).chain(std::iter::repeat("mode"));
+                keys.zip(modes).try_for_each(|(key, mode)| write!(f, ",{key}={mode}"))
             }),
             Kind::Acm { hz } | Kind::Ftdi { hz } => write!(f, ",hz={hz}"),
             Kind::Can { motors, .. } => motors.iter().try_for_each(|motor| write!(f, ",motor={motor}")),

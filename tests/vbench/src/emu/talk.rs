@@ -75,7 +75,7 @@ impl State {
                 let length = replies.len() - at - HEADER_LEN;
                 replies[at..at + HEADER_LEN].copy_from_slice(&wire::submit_reply(transfer.seq, Status::Ok, length));
                 queue.pop_front();
-                self.sent += 1;
+                self.counts[usize::from(endpoint)].sent += 1;
             }
         }
         if !replies.is_empty() {

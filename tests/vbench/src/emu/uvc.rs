@@ -1,4 +1,4 @@
-//! A USB Video Class 1.0 camera with one bulk endpoint.
+//! A USB Video Class 1.0 camera with one bulk endpoint: one function of a device, with an interface association.
 //!
 //! Bulk, because `vhci_hcd` completes bulk transfers as they arrive, while isochronous ones would need a schedule that
 //! a loaded machine cannot keep; above the endpoint `uvcvideo` treats both alike.
@@ -6,16 +6,18 @@
 
 use std::time::Duration;
 
-use super::descriptor::{Answer, CS_INTERFACE, Configuration, DeviceClass, Setup};
+use super::descriptor::{Answer, CS_INTERFACE, Configuration, Setup};
 use super::frame::{self, FrameId};
-use super::function::{DATA_IN, Live};
+use super::function::DATA_IN;
+use super::source::{Live, Source};
 use super::spec::{Format, Mode};
 
 /// A payload fills one of `uvcvideo`'s bulk transfers, which have at most 32 packets of 512 bytes.
 const PAYLOAD: u32 = 16 * 1024;
 const PAYLOAD_HEADER: u8 = 2;
 const PROBE_LEN: usize = 26;
-const VS_INTERFACE: u16 = 1;
+/// Each camera of a device has a control and a streaming interface, in this order.
+const INTERFACES: u8 = 2;
 /// The processing unit, of the control interface.
 const PROCESSING_UNIT: u8 = 3;
 /// Interval unit of the class: 100 ns.
@@ -27,6 +29,9 @@ const GUID_Z16: [u8; 16] = [b'Z', b'1', b'6', b' ', 0, 0, 0x10, 0, 0x80, 0, 0, 0
 
 /// The pictures of one size, encoded once and shared by all cameras of that size.
 pub type Pictures = std::sync::Arc<Vec<Vec<u8>>>;
+
+/// The modes of a camera, the first of them its default, with the pictures of each that is compressed.
+pub type Content = Vec<(Mode, Pictures)>;
 
 /// A control of the processing unit: its selector (UVC 1.0, table A-13) and its range. What it is set to is kept, and
 /// does not change the pictures.
@@ -49,6 +54,8 @@ const CONTROLS: [Control; 2] = [control(2, -64, 64, 0), control(3, 0, 95, 32)];
 /// A camera.
 #[derive(Debug)]
 pub struct Uvc {
+    /// Which of its device's cameras it is, counted from 0.
+    place: u8,
     controls: [Control; 2],
     formats: Vec<FormatGroup>,
     probe: Selection,
@@ -76,10 +83,11 @@ struct Selection {
 }
 
 impl Uvc {
-    /// A camera with these modes, grouped by format in order of first appearance; its first frame has number `first`.
-    pub fn new(modes: Vec<(Mode, Pictures)>, first: u32) -> Self {
+    /// A camera with these modes, grouped by format in order of first appearance: the one with this place (counted from 0)
+    /// in its device. Its first frame has number `first`.
+    pub fn new(content: Content, place: u8, first: u32) -> Self {
         let mut formats: Vec<FormatGroup> = Vec::new();
-        for (mode, pictures) in modes {
+        for (mode, pictures) in content {
             match formats.iter_mut().find(|group| group.format == mode.format) {
                 Some(group) => group.modes.push((mode, pictures)),
                 None => formats.push(FormatGroup { format: mode.format, modes: vec![(mode, pictures)] }),
@@ -87,6 +95,7 @@ impl Uvc {
         }
         let default = Selection { format: 0, mode: 0, interval: interval(formats[0].modes[0].0.fps[0]) };
         Self {
+            place,
             controls: CONTROLS,
             formats,
             probe: default,
@@ -99,49 +108,68 @@ impl Uvc {
         }
     }
 
-    /// Miscellaneous device with an interface association, like every UVC camera.
-    pub fn class(&self) -> DeviceClass {
-        DeviceClass { class: [0xef, 2, 1], release: 0x0100 }
+    /// Address of its endpoint.
+    pub fn address(&self) -> u8 {
+        DATA_IN + self.place
     }
 
-    /// One camera terminal, one processing unit, one output terminal, one streaming interface.
-    pub fn configuration(&self) -> Vec<u8> {
+    /// Whether this interface is one of its two.
+    pub fn has_interface(&self, number: u8) -> bool {
+        (self.control_interface()..=self.streaming_interface()).contains(&number)
+    }
+
+    fn control_interface(&self) -> u8 {
+        self.place * INTERFACES
+    }
+
+    fn streaming_interface(&self) -> u8 {
+        self.control_interface() + 1
+    }
+
+    /// Appends its descriptors: one camera terminal, one processing unit, one output terminal, one streaming interface.
+    pub fn describe(&self, out: &mut Configuration) {
+        let (control, streaming) = (self.control_interface(), self.streaming_interface());
+        let clock = 48_000_000u32.to_le_bytes();
+        let control_total = 13 + 18 + 11 + 9;
+        out.push(&[11, control, INTERFACES, 0x0e, 3, 0, 2])
+            .interface(control, 0, [0x0e, 1, 0])
+            .push(&[&[CS_INTERFACE, 1, 0x00, 0x01, control_total, 0], &clock[..], &[1, streaming]].concat())
+            .push(&[CS_INTERFACE, 2, 1, 0x01, 0x02, 0, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0])
+            // Bits 0 and 1: brightness and contrast.
+            .push(&[CS_INTERFACE, 5, PROCESSING_UNIT, 1, 0, 0, 2, 0b11, 0, 0])
+            .push(&[CS_INTERFACE, 3, 2, 0x01, 0x01, 0, PROCESSING_UNIT, 0])
+            .interface(streaming, 1, [0x0e, 2, 0]);
+        self.describe_formats(out);
+        out.bulk(self.address());
+    }
+
+    /// The header of the streaming interface, and the formats whose length it contains.
+    fn describe_formats(&self, out: &mut Configuration) {
         let mut formats = Configuration::default();
         for (index, group) in (1u8..).zip(&self.formats) {
             group.describe(index, &mut formats);
         }
         let formats = formats.into_body();
-        let count = u8::try_from(self.formats.len()).expect("two formats exist");
+        let count = u8::try_from(self.formats.len()).expect("three formats exist");
         let header_len = 13 + u16::from(count);
         let total = (header_len + u16::try_from(formats.len()).expect("a few dozen modes")).to_le_bytes();
-        let mut header = vec![CS_INTERFACE, 1, count, total[0], total[1], DATA_IN, 0, 2, 0, 0, 0, 1];
+        let mut header = vec![CS_INTERFACE, 1, count, total[0], total[1], self.address(), 0, 2, 0, 0, 0, 1];
         header.resize(usize::from(header_len) - 1, 0);
-
-        let clock = 48_000_000u32.to_le_bytes();
-        let control_total = 13 + 18 + 11 + 9;
-        Configuration::default()
-            .push(&[11, 0, 2, 0x0e, 3, 0, 2])
-            .interface(0, 0, [0x0e, 1, 0])
-            .push(&[CS_INTERFACE, 1, 0x00, 0x01, control_total, 0, clock[0], clock[1], clock[2], clock[3], 1, 1])
-            .push(&[CS_INTERFACE, 2, 1, 0x01, 0x02, 0, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0])
-            // Bits 0 and 1: brightness and contrast.
-            .push(&[CS_INTERFACE, 5, PROCESSING_UNIT, 1, 0, 0, 2, 0b11, 0, 0])
-            .push(&[CS_INTERFACE, 3, 2, 0x01, 0x01, 0, PROCESSING_UNIT, 0])
-            .interface(1, 1, [0x0e, 2, 0])
-            .push(&header)
-            .append(&formats)
-            .bulk(DATA_IN)
-            .finish()
+        out.push(&header).append(&formats);
     }
 
     /// Probe and commit, and the controls of the processing unit.
     pub fn control(&mut self, setup: Setup, data: &[u8]) -> Answer {
         let selector = setup.value >> 8;
-        if setup.kind & 0x7f == 0x21 && setup.index == u16::from_be_bytes([PROCESSING_UNIT, 0]) {
+        let [interface, entity] = setup.index.to_le_bytes();
+        if setup.kind & 0x7f != 0x21 {
+            return Answer::Stall;
+        }
+        if (entity, interface) == (PROCESSING_UNIT, self.control_interface()) {
             let control = self.controls.iter_mut().find(|control| control.selector == selector);
             return control.map_or(Answer::Stall, |control| control.answer(setup.request, data));
         }
-        if setup.kind & 0x7f != 0x21 || setup.index & 0xff != VS_INTERFACE || !(1..=2).contains(&selector) {
+        if interface != self.streaming_interface() || !(1..=2).contains(&selector) {
             return Answer::Stall;
         }
         let is_commit = selector == 2;
@@ -166,42 +194,6 @@ impl Uvc {
     /// The stream has ended.
     pub fn stop(&mut self) {
         self.stream = None;
-    }
-
-    /// The running stream and its frame period.
-    pub fn live(&self) -> Option<Live> {
-        let period = Duration::from_nanos(u64::from(self.committed.interval) * 100);
-        self.stream.map(|stream| Live { stream, period })
-    }
-
-    /// Writes the next frame over `out`.
-    pub fn frame(&mut self, sent_ns: u64, out: &mut Vec<u8>) {
-        let (mode, pictures) = self.mode(self.committed);
-        let id = FrameId { number: self.next_frame, sent_ns };
-        let place = self.next_frame.wrapping_sub(self.first_frame) as usize;
-        match mode.format {
-            Format::Mjpg => frame::stamp_jpeg(&pictures[place % pictures.len()], id, out),
-            // As many bytes, of which the first are its identity.
-            Format::Yuyv | Format::Z16 => frame::stamp_yuyv(mode.width, mode.height, id, frame::light(), out),
-        }
-    }
-
-    /// The frame was sent completely: the next one gets the next number.
-    pub fn sent(&mut self) {
-        self.next_frame = self.next_frame.wrapping_add(1);
-        self.payload_parity ^= 1;
-    }
-
-    /// Appends the payload that continues `frame` at `at` to `out`; returns where the next one continues.
-    pub fn payload(&self, frame: &[u8], at: usize, room: usize, out: &mut Vec<u8>) -> usize {
-        const END_OF_HEADER: u8 = 0x80;
-        const END_OF_FRAME: u8 = 0x02;
-        let room = room.min(PAYLOAD as usize).saturating_sub(usize::from(PAYLOAD_HEADER)).max(1);
-        let end = frame.len().min(at + room);
-        let last = if end == frame.len() { END_OF_FRAME } else { 0 };
-        out.extend_from_slice(&[PAYLOAD_HEADER, END_OF_HEADER | last | self.payload_parity]);
-        out.extend_from_slice(&frame[at..end]);
-        end
     }
 
     fn mode(&self, selection: Selection) -> &(Mode, Pictures) {
@@ -231,6 +223,40 @@ impl Uvc {
         bytes[18..22].copy_from_slice(&frame_bytes(&self.mode(selection).0).to_le_bytes());
         bytes[22..26].copy_from_slice(&PAYLOAD.to_le_bytes());
         bytes
+    }
+}
+
+impl Source for Uvc {
+    fn live(&self) -> Option<Live> {
+        let period = Duration::from_nanos(u64::from(self.committed.interval) * 100);
+        self.stream.map(|stream| Live { stream, period })
+    }
+
+    fn produce(&self, sent_ns: u64, out: &mut Vec<u8>) {
+        let (mode, pictures) = self.mode(self.committed);
+        let id = FrameId { number: self.next_frame, sent_ns };
+        let place = self.next_frame.wrapping_sub(self.first_frame) as usize;
+        match mode.format {
+            Format::Mjpg => frame::stamp_jpeg(&pictures[place % pictures.len()], id, out),
+            // As many bytes, of which the first are its identity.
+            Format::Yuyv | Format::Z16 => frame::stamp_yuyv(mode.width, mode.height, id, frame::light(), out),
+        }
+    }
+
+    fn packet(&self, frame: &[u8], at: usize, room: usize, out: &mut Vec<u8>) -> usize {
+        const END_OF_HEADER: u8 = 0x80;
+        const END_OF_FRAME: u8 = 0x02;
+        let room = room.min(PAYLOAD as usize).saturating_sub(usize::from(PAYLOAD_HEADER)).max(1);
+        let end = frame.len().min(at + room);
+        let last = if end == frame.len() { END_OF_FRAME } else { 0 };
+        out.extend_from_slice(&[PAYLOAD_HEADER, END_OF_HEADER | last | self.payload_parity]);
+        out.extend_from_slice(&frame[at..end]);
+        end
+    }
+
+    fn sent(&mut self) {
+        self.next_frame = self.next_frame.wrapping_add(1);
+        self.payload_parity ^= 1;
     }
 }
 
@@ -322,12 +348,15 @@ mod tests {
                 mode(Format::Mjpg, 320, 240, &[30]),
             ],
             0,
+            0,
         )
     }
 
     #[test]
     fn configuration_lengths_add_up() {
-        let bytes = camera().configuration();
+        let mut configuration = Configuration::default();
+        camera().describe(&mut configuration);
+        let bytes = configuration.finish();
         check_configuration(&bytes);
         // The streaming header's own wTotalLength spans from it to the endpoint.
         let at = bytes.windows(4).position(|w| w == [15, CS_INTERFACE, 1, 2]).unwrap();
@@ -373,11 +402,11 @@ mod tests {
     fn payloads_put_the_frame_together_again() {
         let mut camera = camera();
         let mut frame = Vec::new();
-        camera.frame(7, &mut frame);
+        camera.produce(7, &mut frame);
         let (mut at, mut whole, mut packets) = (0, Vec::new(), 0);
         while at < frame.len() {
             let mut packet = Vec::new();
-            at = camera.payload(&frame, at, 512, &mut packet);
+            at = camera.packet(&frame, at, 512, &mut packet);
             assert!(packet.len() <= 512);
             assert_eq!(packet[1] & 0x02 != 0, at == frame.len());
             whole.extend_from_slice(&packet[2..]);
@@ -387,7 +416,7 @@ mod tests {
         assert_eq!(whole, frame);
         assert_eq!(frame::identity(&frame), Some(FrameId { number: 0, sent_ns: 7 }));
         camera.sent();
-        camera.frame(8, &mut frame);
+        camera.produce(8, &mut frame);
         assert_eq!(frame::identity(&frame).map(|id| id.number), Some(1));
     }
 }

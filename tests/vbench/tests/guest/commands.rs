@@ -2,10 +2,8 @@
 //! wish that a camera cannot fulfil.
 
 use vbench::check::{assert_accounted, assert_lines, ended};
-use vbench::emu::frame::identity;
 use vbench::emu::spec::{DeviceSpec, Format};
-use vbench::proto;
-use vbench::recording::Message;
+use vbench::recording::Picture;
 use vbench::scenario::Scenario;
 
 const REGISTRY: &str = r#"
@@ -183,18 +181,15 @@ fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported(
     assert!(outcome.file("held.txt").contains("error"), "{}", outcome.file("held.txt"));
 
     let episode = outcome.episode().unwrap_or_else(|error| panic!("{error}"));
-    // foxglove.RawImage: data is field 6.
-    let number = |message: &Message| identity(proto::bytes(&message.data, 6)).map(|id| u64::from(id.number));
-    let pictures: Vec<u64> = episode.topic("/rapid/camera/raw").filter_map(number).collect();
+    let number = |picture: Picture<'_>| picture.id.map(|id| u64::from(id.number));
+    let pictures: Vec<u64> = episode.pictures("/rapid/camera/raw").filter_map(number).collect();
     assert_eq!(pictures.len(), episode.topic("/rapid/camera/raw").count(), "some pictures carry no number");
     assert_accounted(&episode, "/rapid/camera/raw", pictures);
     assert_lines(&episode, "/rapid/force");
-    // Distances: `encoding` is field 4.
-    let depths: Vec<&Message> = episode.topic("/rapid/camera/depth").collect();
+    let depths: Vec<Picture<'_>> = episode.pictures("/rapid/camera/depth").collect();
     assert!(depths.len() > 10, "{}", depths.len());
-    assert!(depths.iter().all(|message| proto::bytes(&message.data, 4) == b"16UC1"));
-    assert!(depths.iter().all(|message| proto::bytes(&message.data, 6).len() == 2 * 64 * 48));
-    let numbers: Vec<u64> = depths.iter().filter_map(|message| number(message)).collect();
+    assert!(depths.iter().all(|picture| picture.encoding == b"16UC1" && picture.data.len() == 2 * 64 * 48));
+    let numbers: Vec<u64> = depths.iter().copied().filter_map(number).collect();
     assert_eq!(numbers.len(), depths.len(), "some have no number");
     assert_accounted(&episode, "/rapid/camera/depth", numbers);
     assert_eq!(episode.topic("/rapid/camera/wide").count(), 0);

@@ -19,5 +19,6 @@ mod motors;
 mod policy;
 mod scenarios;
 mod service;
+mod streams;
 mod strings;
 mod unprivileged;

@@ -62,7 +62,7 @@ exit 0
     assert!(nodes.lines().any(|found| found == "video2  046d:0825 :capture:"), "{nodes}");
 
     // The second stream of the first camera is the silent one.
-    let (mjpg, yuyv) = (outcome.streams(0), outcome.streams(1));
+    let (mjpg, yuyv) = (outcome.streams(0, 1), outcome.streams(1, 1));
     for (name, format, fps, stream) in [
         ("mjpg.json", "MJPG", 30.0, mjpg[0]),
         ("yuyv.json", "YUYV", 15.0, yuyv[0]),

@@ -1,7 +1,7 @@
 //! The unit that `rapid artifacts --install` writes, under a real systemd: installed as a user would, a user of its group
 //! lets it record a camera, a CAN bus and a device on the network, over a restart, an unplug, a kill and a hang.
 
-use vbench::check::{assert_whole, play};
+use vbench::check::{assert_whole, is_of_the_machine, play};
 use vbench::emu::can::adapter::Protocol;
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, can, lan, registry, without_limits_of_time};
@@ -209,10 +209,6 @@ fn rights(outcome: &Outcome) {
     );
 }
 
-/// What an emulated processor that has others beside it is to blame for; no limit turns these off.
-const OF_THE_MACHINE: &[&str] =
-    &["publications of the mask are not in the file", "events are not in the file", "valid"];
-
 /// One until the restart, one until the kill with the unplug in it, one until the end.
 fn episodes(outcome: &Outcome) {
     let mut files: Vec<_> = std::fs::read_dir(outcome.share.join("out/rec")).expect("the folder").flatten().collect();
@@ -241,7 +237,7 @@ fn episodes(outcome: &Outcome) {
         let is_expected = |reason: &&str| {
             // The second one lost its camera, was killed, and repaired by the next start.
             let of_the_script = reason.starts_with("wrist: ") || reason.starts_with("the file is not whole");
-            (index == 1 && of_the_script) || OF_THE_MACHINE.iter().any(|known| reason.contains(known))
+            (index == 1 && of_the_script) || is_of_the_machine(reason)
         };
         assert!(reasons.iter().all(is_expected), "{verdict}");
         assert!(verdict["verdict"] == "GOOD" || !reasons.is_empty(), "{verdict}");
