@@ -12,7 +12,7 @@ use rapid::headless::{self, HeadlessOptions};
 use rapid::mask::{PhysicalMask, SizedMask};
 use rapid::modality::ModalityId;
 use rapid::registry::{
-    CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
+    CameraSpec, DeviceSpec, IdentitySpec, InferenceSpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
 };
 use rapid::sample::Epoch;
 use rapid::status::session::SessionRequest;
@@ -91,6 +91,7 @@ fn registry(count: u8) -> Registry {
         })
     };
     Registry {
+        inference: InferenceSpec::default(),
         rig: RigSpec {
             name: "bench-1".to_owned(),
             observation_hz: 30.0,

@@ -25,7 +25,7 @@ pub use export::{ExportArgs, Layout, PictureForm};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
 pub use measure::{AblationArgs, Calibration, Count, LatencyArgs};
 #[cfg(feature = "policy")]
-pub use policy::{EvalArgs, PolicyCommand, ShowArgs};
+pub use policy::{EvalArgs, ObserveArgs, PolicyCommand, ShowArgs};
 pub use policy::{InferenceArgs, PolicyArgs, ReplayArgs};
 pub use registry::{RegisterArgs, UnregisterArgs};
 pub use run::{LiveArgs, RunArgs, ShownArgs, TaskArgs, WebArgs};
@@ -338,6 +338,7 @@ pub enum Command {
     Replay(Box<ReplayArgs>),
     /// Show a policy: what it observes and moves, its speed here
     #[cfg(feature = "policy")]
+    #[command(after_long_help = policy::POLICIES)]
     Policy {
         /// What about it.
         #[command(subcommand)]

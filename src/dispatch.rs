@@ -26,8 +26,6 @@ use self::registry::{
 };
 use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-#[cfg(feature = "policy")]
-use crate::cli::PolicyCommand;
 use crate::cli::{Calibration, Cli, Command, Global, LatencyArgs, LevelArg, PolicyArgs, RunArgs, SessionCommand};
 use crate::commands::devices::Formats;
 use crate::commands::inspect::InspectFailure;
@@ -199,7 +197,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             Ok(commands::ablation::ablation(&registry, global.config.as_deref(), &args, format, out)?)
         }
         #[cfg(feature = "policy")]
-        Command::Policy { what: PolicyCommand::Show(args) } => policy::show(global, &args, format, out),
+        Command::Policy { what } => policy::about(global, &what, format, out),
         #[cfg(feature = "policy")]
         Command::Eval(args) => policy::eval(args, format),
         Command::Replay(args) if args.infer.is_some() => policy::compare(*args, format),
@@ -558,7 +556,7 @@ failures! {
     #[cfg(feature = "policy")]
     commands::eval::EvalError: |error| argument_code(matches!(error, commands::eval::EvalError::Bundle(_)));
     #[cfg(feature = "policy")]
-    commands::policy::ShowError: |error| argument_code(matches!(error, commands::policy::ShowError::Bundle(_)));
+    commands::policy::ShowError: |error| argument_code(error.is_bad_argument());
     #[cfg(feature = "policy")]
     CompareFailure: |error| argument_code(matches!(
         error,

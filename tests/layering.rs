@@ -160,6 +160,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("unicode_segmentation", &["text"]),
     ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
+    ("zip", &["commands/policy"]),
     ("zstd", &["episode", "policy/library"]),
     ("zune_jpeg", &["calibration/brightness", "pixels"]),
 ];

@@ -18,6 +18,12 @@ use crate::registry::{InferenceSpec, Provider};
 const POLICY: &str = "Policy options";
 
 #[cfg(feature = "policy")]
+pub(super) const POLICIES: &str = "\
+Examples:
+  rapid policy show --sim task
+  rapid policy observe episodes/20260101_sort_001.mcap --to chunk.npz";
+
+#[cfg(feature = "policy")]
 pub(super) const EVAL: &str = "\
 Conditions: full (all sensors), no-tactile (without the tactile sensor), hot-unplug (it is unplugged after \
 the touch, before the ways to the bins part), hot-replug (it is unplugged on the way to the block, and \
@@ -117,6 +123,34 @@ pub enum PolicyCommand {
     #[command(after_long_help = "Examples:\n  rapid policy show\n  rapid policy show models/tactile-id --sim task\n  \
         rapid policy show POLICY --threads 4 --json")]
     Show(ShowArgs),
+    /// Write what a recorded chunk of actions was computed from, as arrays of `NumPy`
+    ///
+    /// The observations by their keys, the mask, the noise, and the recorded chunk (`recorded`): with the graphs of the policy
+    /// they are all that is needed to compute it again (examples/recompute.py).
+    #[command(after_long_help = "Examples:\n  rapid policy observe episodes/20260101_sort_001.mcap\n  \
+        rapid policy observe EPISODE POLICY --chunk 12 --to chunk.npz")]
+    Observe(ObserveArgs),
+}
+
+/// Which chunk is written where.
+#[cfg(feature = "policy")]
+#[derive(Debug, Clone, Args)]
+pub struct ObserveArgs {
+    /// Episode that the policy recorded
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// Folder of the policy [default: the one built into rapid]
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub bundle: Option<PathBuf>,
+    /// Which of its chunks, from 0
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub chunk: usize,
+    /// File to write [default: that of the episode, with .npz]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub to: Option<PathBuf>,
+    /// How inference runs.
+    #[command(flatten)]
+    pub inference: InferenceArgs,
 }
 
 /// Which policy is shown.

@@ -1,18 +1,22 @@
-//! `rapid policy show`: what a policy observes and does, whether it suits the rig, and how long a chunk takes on this machine.
+//! `rapid policy`: what a policy observes and does, whether it suits the rig, how long a chunk takes on this machine; and what a
+//! recorded chunk was computed from.
 
+use std::fs::File;
 use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde_json::{Value, json};
 
 use super::Format;
-use crate::cli::ShowArgs;
+use crate::cli::{ObserveArgs, ShowArgs};
+use crate::compare::{self, ChunkInputs, CompareError};
 use crate::policy::bundle::{Bundle, BundleErrors, ObservationInput, ObservationSpec, WhenAbsent};
 use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
 use crate::policy::pace::{Pace, PaceVerdict};
 use crate::policy::sampler::{Computing, PolicyError};
-use crate::registry::Registry;
+use crate::registry::{InferenceSpec, Registry};
 use crate::text;
 
 /// Why a policy cannot be shown.
@@ -27,9 +31,126 @@ pub enum ShowError {
     /// The graphs.
     #[error(transparent)]
     Policy(#[from] PolicyError),
+    /// The episode.
+    #[error(transparent)]
+    Compare(#[from] CompareError),
+    /// It has no such chunk, or not all that it was computed from.
+    #[error(
+        "{}: there is no chunk {number} in it whose samples are all there: it has chunks only if a policy ran, and the \
+         first ones may be from before its beginning; name another with --chunk",
+        file.display()
+    )]
+    NoChunk {
+        /// The episode.
+        file: PathBuf,
+        /// The number.
+        number: usize,
+    },
+    /// The file of arrays.
+    #[error("{}: {source}", file.display())]
+    Arrays {
+        /// Its path.
+        file: PathBuf,
+        /// What is wrong.
+        source: ArraysError,
+    },
     /// The output.
     #[error("output: {0}")]
     Output(#[from] io::Error),
+}
+
+impl ShowError {
+    /// The fix is another argument.
+    pub const fn is_bad_argument(&self) -> bool {
+        matches!(self, Self::Bundle(_) | Self::Compare(_) | Self::NoChunk { .. })
+    }
+}
+
+/// Writes what a recorded chunk was computed from to a file of arrays.
+///
+/// # Errors
+/// When the policy or the episode cannot be read, the chunk is not there, or the file cannot be written.
+pub fn observe(args: &ObserveArgs, format: Format, out: &mut dyn Write) -> Result<(), ShowError> {
+    let bundle = Bundle::open(args.bundle.as_deref())?;
+    let environment = Environment::open(args.inference.ort_lib.as_deref())?;
+    let computing = args.inference.computing(InferenceSpec::default());
+    let inputs = compare::inputs(&args.file, &bundle, &environment, computing, args.chunk)?;
+    let inputs = inputs.ok_or_else(|| ShowError::NoChunk { file: args.file.clone(), number: args.chunk })?;
+    let to = args.to.clone().unwrap_or_else(|| args.file.with_extension("npz"));
+    let arrays = arrays(inputs, &bundle);
+    write(&to, &arrays).map_err(|source| ShowError::Arrays { file: to.clone(), source })?;
+    match format {
+        Format::Json => {
+            let shapes: serde_json::Map<String, Value> =
+                arrays.iter().map(|array| (array.name.clone(), json!(array.shape))).collect();
+            writeln!(out, "{}", json!({"event": "policy_inputs", "file": to.to_string_lossy(), "arrays": shapes}))?;
+        }
+        Format::Text => {
+            for Array { name, shape, .. } in &arrays {
+                let shape: Vec<String> = shape.iter().map(ToString::to_string).collect();
+                writeln!(out, "{:<12} {}", text::plain(name), shape.join(" x "))?;
+            }
+            writeln!(out, "{}", text::plain(&to.to_string_lossy()))?;
+        }
+    }
+    Ok(())
+}
+
+/// A named array of 32-bit floats.
+struct Array {
+    name: String,
+    shape: Vec<usize>,
+    values: Vec<f32>,
+}
+
+fn arrays(inputs: ChunkInputs, bundle: &Bundle) -> Vec<Array> {
+    let ChunkInputs { observations, mask, noise, step_noise, recorded, tick: _, seed: _ } = inputs;
+    let chunk = [bundle.horizon, bundle.action.len()];
+    let mut arrays: Vec<Array> =
+        observations.into_iter().map(|(name, shape, values)| Array { name, shape, values }).collect();
+    arrays.extend(mask.map(|(name, values)| Array { name, shape: vec![1, values.len()], values }));
+    arrays.push(Array { name: "noise".to_owned(), shape: [&[1], &chunk[..]].concat(), values: noise });
+    if !step_noise.is_empty() {
+        let shape = [&[step_noise.len()], &chunk[..]].concat();
+        arrays.push(Array { name: "step_noise".to_owned(), shape, values: step_noise.concat() });
+    }
+    arrays.push(Array { name: "recorded".to_owned(), shape: chunk.to_vec(), values: recorded });
+    arrays
+}
+
+/// Why there is no file of arrays.
+#[derive(Debug, thiserror::Error)]
+pub enum ArraysError {
+    /// The file.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// Its directory.
+    #[error(transparent)]
+    Zip(#[from] zip::result::ZipError),
+}
+
+/// Writes an `.npz`: a ZIP with one `.npy` for each array
+/// (<https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>, version 1.0).
+fn write(to: &Path, arrays: &[Array]) -> Result<(), ArraysError> {
+    let mut file = zip::ZipWriter::new(File::create(to)?);
+    let stored = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    for Array { name, shape, values } in arrays {
+        file.start_file(format!("{name}.npy"), stored)?;
+        let shape: Vec<String> = shape.iter().map(ToString::to_string).collect();
+        let shape = shape.join(", ");
+        let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape},), }}");
+        // Magic, version and length take 10 bytes, and the numbers begin at a multiple of 64.
+        let padding = 63 - (header.len() + 10) % 64;
+        header.push_str(&" ".repeat(padding));
+        header.push('\n');
+        file.write_all(b"\x93NUMPY\x01\x00")?;
+        file.write_all(&u16::try_from(header.len()).unwrap_or(u16::MAX).to_le_bytes())?;
+        file.write_all(header.as_bytes())?;
+        let numbers: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        file.write_all(&numbers)?;
+    }
+    file.finish()?.sync_all()?;
+    Ok(())
 }
 
 /// Prints a policy, and whether it suits `registry`, if there is one.

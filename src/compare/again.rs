@@ -82,16 +82,41 @@ struct Work<'a> {
     uses: BTreeMap<Key, u32>,
     chunk: Vec<f32>,
     again: Again,
+    /// Chunks that were tried.
+    tried: usize,
+    /// The number of a chunk whose inputs are wanted.
+    wanted: Option<usize>,
+    inputs: Option<ChunkInputs>,
 }
 
+/// What a chunk is computed from, as the graphs take it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ChunkInputs {
+    /// Its tick on the control grid.
+    pub tick: u64,
+    /// The seed of its noise.
+    pub seed: u64,
+    /// The observations by key, each with its shape and its numbers.
+    pub observations: Vec<(String, Vec<usize>, Vec<f32>)>,
+    /// The mask, with the name of the input; `None` if the policy has none.
+    pub mask: Option<(String, Vec<f32>)>,
+    /// The first sample: `[horizon, values of an action]`.
+    pub noise: Vec<f32>,
+    /// The noise of each step of the scheduler that adds some.
+    pub step_noise: Vec<Vec<f32>>,
+    /// The chunk as it was recorded, in the units of the action.
+    pub recorded: Vec<f32>,
+}
+
+/// Computes the chunks again, up to number `wanted` if one is given, whose inputs are returned if it can be computed.
 pub(super) fn compare(
     file: &Path,
     survey: &Survey,
-    bundle: &Bundle,
-    registry: &Registry,
+    (bundle, registry): (&Bundle, &Registry),
     model: &mut Model,
+    wanted: Option<usize>,
     ended: &mut Ended<'_>,
-) -> Result<Again, CompareError> {
+) -> Result<(Again, Option<ChunkInputs>), CompareError> {
     let device = |name: &str| registry.devices.iter().position(|device| device.name == name);
     let topics: BTreeMap<&str, usize> =
         registry.devices.iter().enumerate().map(|(at, device)| (device.topic.as_str(), at)).collect();
@@ -112,6 +137,9 @@ pub(super) fn compare(
         chunk: vec![0.0; model.chunk_len()],
         model,
         again,
+        tried: 0,
+        wanted,
+        inputs: None,
     };
     let mut waiting: VecDeque<&RecordedChunk> = VecDeque::new();
     for chunk in &survey.chunks {
@@ -132,13 +160,13 @@ pub(super) fn compare(
     loop {
         while let Some(chunk) = waiting.front().copied().filter(|chunk| work.is_ready(chunk)) {
             if !ended.advance(total - waiting.len(), total) {
-                return Ok(work.again);
+                return Ok((work.again, None));
             }
             work.compute(chunk);
             waiting.pop_front();
         }
-        if waiting.is_empty() {
-            return Ok(work.again);
+        if waiting.is_empty() || wanted.is_some_and(|wanted| work.tried > wanted) {
+            return Ok((work.again, work.inputs));
         }
         if !reader.advance()? {
             break;
@@ -155,7 +183,7 @@ pub(super) fn compare(
     }
     // The file has changed since the survey.
     work.again.samples_missing += waiting.len() as u64;
-    Ok(work.again)
+    Ok((work.again, work.inputs))
 }
 
 impl Work<'_> {
@@ -204,13 +232,19 @@ impl Work<'_> {
                 }
             }
             match answered {
-                Ok(()) => self.hold_against(chunk),
+                Ok(()) => {
+                    self.hold_against(chunk);
+                    if self.wanted == Some(self.tried) {
+                        self.inputs = Some(self.inputs(chunk));
+                    }
+                }
                 Err(error) => {
                     self.again.failed += 1;
                     self.again.failure = Some(error.to_string());
                 }
             }
         }
+        self.tried += 1;
         for key in self.keys(chunk) {
             let Some(uses) = self.uses.get_mut(&key) else { continue };
             *uses = uses.saturating_sub(1);
@@ -218,6 +252,29 @@ impl Work<'_> {
                 self.uses.remove(&key);
                 self.samples.remove(&key);
             }
+        }
+    }
+
+    /// The inputs of the chunk that was computed last.
+    fn inputs(&self, chunk: &RecordedChunk) -> ChunkInputs {
+        let (bundle, tensors) = (self.bundle, self.model.tensors());
+        let steps = bundle.n_obs_steps;
+        let observations = bundle.observations.iter().enumerate().map(|(at, observation)| {
+            let shape = match &observation.input {
+                ObservationInput::Image(image) => vec![1, steps, 3, image.height, image.width],
+                ObservationInput::Vector(vector) => vec![1, steps, vector.len],
+            };
+            (observation.key.clone(), shape, tensors.values(at).to_vec())
+        });
+        let (noise, step_noise) = self.model.noise(chunk.seed);
+        ChunkInputs {
+            tick: chunk.tick,
+            seed: chunk.seed,
+            observations: observations.collect(),
+            mask: bundle.mask.as_ref().map(|mask| (mask.input.clone(), tensors.mask().to_vec())),
+            noise,
+            step_noise,
+            recorded: chunk.actions.iter().map(|value| value.unwrap_or(f32::NAN)).collect(),
         }
     }
 

@@ -18,7 +18,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-pub use self::again::Again;
+pub use self::again::{Again, ChunkInputs};
 pub use self::beside::Beside;
 pub use self::difference::{AxisDifference, Difference, Spread};
 use self::survey::Survey;
@@ -91,17 +91,8 @@ pub struct Compared {
     pub interrupted: bool,
 }
 
-/// Compares the policy of `bundle` with the episode in `file`. `steps`: denoising steps instead of the bundle's own.
-///
-/// # Errors
-/// When the file cannot be read or holds nothing to compare with, or the policy does not suit it.
-pub fn compare(
-    file: &Path,
-    bundle: &Bundle,
-    environment: &Environment,
-    computing: Computing,
-    watcher: &mut dyn Watcher,
-) -> Result<Compared, CompareError> {
+/// What the file holds, and the registry that it was recorded with, which the policy suits.
+fn examined(file: &Path, bundle: &Bundle) -> Result<(Survey, Registry), CompareError> {
     let name = || file.display().to_string();
     let survey = Survey::read(file)?;
     let registry = survey.registry.as_deref().filter(|text| !text.is_empty());
@@ -117,16 +108,59 @@ pub fn compare(
     if !survey.is_of_a_policy() && survey.actions.is_empty() {
         return Err(CompareError::Nothing(name()));
     }
+    Ok((survey, registry))
+}
+
+/// What chunk `number` of an episode, from 0, was computed from; `None` if the file does not hold all of it.
+///
+/// # Errors
+/// As [`compare`].
+pub fn inputs(
+    file: &Path,
+    bundle: &Bundle,
+    environment: &Environment,
+    computing: Computing,
+    number: usize,
+) -> Result<Option<ChunkInputs>, CompareError> {
+    let (survey, registry) = examined(file, bundle)?;
+    let mut model = Model::load(bundle, environment, computing)?;
+    let mut ended = Ended { watcher: &mut Unwatched, interrupted: false };
+    let (_, inputs) = again::compare(file, &survey, (bundle, &registry), &mut model, Some(number), &mut ended)?;
+    Ok(inputs)
+}
+
+/// Compares the policy of `bundle` with the episode in `file`. `steps`: denoising steps instead of the bundle's own.
+///
+/// # Errors
+/// When the file cannot be read or holds nothing to compare with, or the policy does not suit it.
+pub fn compare(
+    file: &Path,
+    bundle: &Bundle,
+    environment: &Environment,
+    computing: Computing,
+    watcher: &mut dyn Watcher,
+) -> Result<Compared, CompareError> {
+    let (survey, registry) = examined(file, bundle)?;
     let mut model = Model::load(bundle, environment, computing)?;
     let mut ended = Ended { watcher, interrupted: false };
     let comparison = if survey.is_of_a_policy() {
-        Comparison::Again(again::compare(file, &survey, bundle, &registry, &mut model, &mut ended)?)
+        let (again, _) = again::compare(file, &survey, (bundle, &registry), &mut model, None, &mut ended)?;
+        Comparison::Again(again)
     } else {
         Comparison::Beside(beside::compare(file, &survey, bundle, &registry, &mut model, &mut ended)?)
     };
     let interrupted = ended.interrupted;
     let (recorded_policy, recorded_policy_hash) = survey.policy.unzip();
     Ok(Compared { comparison, recorded_policy, recorded_policy_hash, damage: survey.damage, interrupted })
+}
+
+/// Work whose progress is not shown.
+struct Unwatched;
+
+impl Watcher for Unwatched {
+    fn at(&mut self, _: usize, _: usize) -> bool {
+        true
+    }
 }
 
 /// A watcher, and whether it has ended the work.

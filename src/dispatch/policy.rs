@@ -8,7 +8,7 @@ use super::Failure;
 use super::registry::{find_registry, load};
 use super::{block_on, check_writable, is_task, request, rig};
 use crate::app::PolicyOptions;
-use crate::cli::{EvalArgs, Global, PolicyArgs, ReplayArgs, RunArgs, ShowArgs, TaskArgs};
+use crate::cli::{EvalArgs, Global, PolicyArgs, PolicyCommand, ReplayArgs, RunArgs, TaskArgs};
 use crate::commands::{self, Format};
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::horizon::WithoutMask;
@@ -62,8 +62,12 @@ pub(super) fn demonstrate(global: &Global, args: &RunArgs, task: &TaskArgs, form
     interruptible(move |stop| commands::demonstrate::run(registry, &request, trials, format, stop, &mut io::stdout()))
 }
 
-/// Shows a policy beside the rig, if there is one.
-pub(super) fn show(global: &Global, args: &ShowArgs, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
+/// Shows a policy beside the rig, if there is one, or the inputs of a chunk.
+pub(super) fn about(global: &Global, what: &PolicyCommand, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
+    let args = match what {
+        PolicyCommand::Show(args) => args,
+        PolicyCommand::Observe(args) => return Ok(commands::policy::observe(args, format, out)?),
+    };
     let registry = match find_registry(global) {
         _ if global.sim.is_some() => Some(rig(global, 0)?.0),
         Some(path) => Some(load(&path)?),

@@ -98,6 +98,16 @@ impl Model {
         Ok(times[REHEARSALS / 2])
     }
 
+    /// The tensors of the last observation.
+    pub const fn tensors(&self) -> &ObservationTensors {
+        &self.tensors
+    }
+
+    /// The noise of a seed: the first sample of a chunk, and that of each step that adds some.
+    pub fn noise(&self, seed: u64) -> (Vec<f32>, Vec<Vec<f32>>) {
+        self.sampler.noise(seed)
+    }
+
     /// Values of a chunk.
     pub fn chunk_len(&self) -> usize {
         self.sampler.chunk_len()

@@ -108,6 +108,19 @@ impl Sampler {
         self.scheduler.timesteps().count()
     }
 
+    /// The noise of a seed, as [`Self::chunk`] draws it: the first sample, and that of each step that adds some.
+    pub fn noise(&self, seed: u64) -> (Vec<f32>, Vec<Vec<f32>>) {
+        let mut random = Random::new(seed, NOISE);
+        let mut draw = || {
+            let mut noise = vec![0.0; self.noise.len()];
+            random.fill_normal(&mut noise);
+            noise
+        };
+        let first = draw();
+        let steps = (0..self.steps()).filter(|at| self.scheduler.wants_noise(*at)).map(|_| draw());
+        (first, steps.collect())
+    }
+
     /// Writes a chunk, action by action, in the units of the action. The noise is the seed's.
     ///
     /// # Errors

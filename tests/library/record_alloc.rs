@@ -134,6 +134,7 @@ async fn only_chunks_allocate() {
         expect: Vec::new(),
     };
     let registry = Arc::new(Registry {
+        inference: rapid::registry::InferenceSpec::default(),
         rig,
         devices: vec![device],
         modules: Vec::new(),

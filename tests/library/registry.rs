@@ -15,9 +15,9 @@ use rapid::points::PacketFormat;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
     BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Form, Framing, Hook, InputSpec, JointsSpec,
-    LanFind, LanPicture, LanProtocol, LineOff, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE,
-    Parse, PhoneStream, PointsSpec, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop, StopSpec, VerdictSpec,
-    WatchSpec,
+    LanFind, LanPicture, LanProtocol, LineOff, Loaded, ModuleSpec, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens,
+    POOL_SPARE, Parse, PhoneStream, PointsSpec, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop, StopSpec,
+    VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -96,10 +96,16 @@ fn the_old_name_of_the_table_of_a_serial_line_causes_a_warning() {
 #[test]
 fn modules_are_parsed_and_mounted_by_name() {
     let modules = valid("modules").registry.modules;
-    let [get, soft, pinch] = modules.as_slice() else { panic!("three modules") };
+    let [get, soft, pinch, angled] = modules.as_slice() else { panic!("four modules") };
     assert_eq!((get.mount.to_string().as_str(), get.devices.as_slice()), ("tip", &["tactile_tip".to_owned()][..]));
     assert_eq!(soft.tags[1], ("material".to_owned(), "tpu".to_owned()));
     assert_eq!((pinch.devices.len(), pinch.tags.len()), (0, 0));
+    let place =
+        |module: &ModuleSpec| module.transforms.first().map(|place| (place.sensor.clone(), place.parent.clone()));
+    let names = |sensor: &str, parent: &str| Some((sensor.to_owned(), parent.to_owned()));
+    assert_eq!([place(get), place(angled)], [names("tactile_tip", "gripper"), names("cam_wrist", "flange")]);
+    let length: f64 = angled.transforms[0].rotation.iter().map(|part| part * part).sum();
+    assert!((length - 1.0).abs() < 1e-12, "of calibrations, which are rounded");
     let mounted = |names: &[&str]| {
         let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
         rapid::registry::mounted(&modules, &names).map(|found| found.len()).map_err(|error| error.to_string())

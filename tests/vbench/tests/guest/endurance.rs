@@ -64,6 +64,8 @@ fn ninety_cycles_leave_a_correct_mask_and_nothing_else() {
 const SCRIPT: &str = r#"
 # The threads of the pool that opens devices end when they have been idle for some seconds.
 rest() { wait_for 60 is $threads held task || fail "$(held task) threads instead of $threads"; }
+# Nothing of the start is left: a thread of the pool ends after ten seconds without work.
+steady() { threads=$(held task); sleep 11; is $threads held task; }
 # agreed MASK: this is plugged once the emulator has done its commands, and rapid reports it soon after.
 agreed() {
   emu_done 120
@@ -75,13 +77,11 @@ agreed() {
 }
 # One arena: what the allocator keeps for each thread that ever was is none of what a cycle loses.
 export MALLOC_ARENA_MAX=1
-# One arena: what the allocator keeps for each thread that ever was is none of what a cycle loses.
-export MALLOC_ARENA_MAX=1
 rapid_start --headless --record --duration 10m --out $out/rec --config /tmp/bench/devices.toml --json
 await_rapid 60 '"event":"recording"' || fail 'not recording'
 wait_for 30 test -e /dev/shm/rapid_hardware_mask.json
+wait_for 60 steady || fail 'the threads of the start do not end'
 sample idle
-threads=$(held task)
 emu plug 0 1 2
 agreed 0x07
 emu unplug 1
