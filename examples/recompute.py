@@ -38,7 +38,6 @@ def recompute(policy, arrays):
         noise = denoiser.run(None, inputs)[0]
         now, before = alphas[at], alphas[at - stride] if at >= stride else 1.0 if schedule["set_alpha_to_one"] else alphas[0]
         clean = np.clip((sample - np.sqrt(1 - now) * noise) / np.sqrt(now), -clip, clip)
-        noise = (sample - np.sqrt(now) * clean) / np.sqrt(1 - now)
         sample = (np.sqrt(before) * clean + np.sqrt(1 - before) * noise).astype(np.float32)
     chunk = sample[0]
     for part in described["action"]["normalization"]:

@@ -7,6 +7,8 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 readonly server=github.com/versity/versitygw/cmd/versitygw@v1.8.0
+# Of the version of zenoh that examples/remote has.
+readonly router=1.10.2
 cache=${XDG_CACHE_HOME:-$HOME/.cache}/rapid/fleet
 sudo=
 [[ $(id -u) == 0 ]] || sudo=sudo
@@ -38,8 +40,12 @@ python=$(scripts/venv.sh venv-fleet models/requirements-fleet.txt --no-deps)
 remote=(--locked --manifest-path examples/remote/Cargo.toml --target-dir "$cache/remote")
 cargo test "${remote[@]}"
 cargo build "${remote[@]}"
+if [[ $("$cache/bin/zenohd" --version 2>/dev/null) != *"$router"* ]]; then
+  echo "fleet: building the router of zenoh, once" >&2
+  cargo install zenohd --version "$router" --locked --no-default-features --root "$cache" --target-dir "$cache/zenohd"
+fi
 if [[ -n ${RAPID_BIN:-} && -e /dev/net/tun ]]; then
-  $sudo "$python" tests/fleet/remote.py "$RAPID_BIN" "$cache/remote/debug/rapid-remote"
+  $sudo "$python" tests/fleet/remote.py "$RAPID_BIN" "$cache/remote/debug/rapid-remote" "$cache/bin/zenohd"
 else
   echo "fleet: SKIPPED: sensors of another computer: no program is built, or no /dev/net/tun" >&2
 fi
