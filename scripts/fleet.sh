@@ -42,7 +42,7 @@ cargo test "${remote[@]}"
 cargo build "${remote[@]}"
 if [[ $("$cache/bin/zenohd" --version 2>/dev/null) != *"$router"* ]]; then
   echo "fleet: building the router of zenoh, once" >&2
-  cargo install zenohd --version "$router" --locked --no-default-features --root "$cache" --target-dir "$cache/zenohd"
+  cargo install zenohd --version "$router" --locked --root "$cache" --target-dir "$cache/zenohd"
 fi
 if [[ -n ${RAPID_BIN:-} && -e /dev/net/tun ]]; then
   $sudo "$python" tests/fleet/remote.py "$RAPID_BIN" "$cache/remote/debug/rapid-remote" "$cache/bin/zenohd"
