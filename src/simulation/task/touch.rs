@@ -201,8 +201,8 @@ mod tests {
         found
     }
 
-    /// The share of the second half of the blocks that the best threshold of the first half tells apart.
-    fn told_apart(of: &[(f64, bool)]) -> f64 {
+    /// The share of the second half of the blocks that the best threshold of the first half separates.
+    fn separated(of: &[(f64, bool)]) -> f64 {
         let (learn, test) = of.split_at(of.len() / 2);
         let right = |set: &[(f64, bool)], threshold: f64, above: bool| {
             set.iter().filter(|(value, texture)| ((*value > threshold) == above) == *texture).count()
@@ -224,10 +224,10 @@ mod tests {
             .collect();
         for statistic in 0..blocks[0].0.len() {
             let of: Vec<(f64, bool)> = blocks.iter().map(|(values, texture)| (values[statistic], *texture)).collect();
-            let share = told_apart(&of);
-            assert!(share < 0.6, "statistic {statistic} tells {share:.2} of the blocks apart");
+            let share = separated(&of);
+            assert!(share < 0.6, "statistic {statistic} separates {share:.2} of the blocks");
         }
-        // The check can fail: the mean height of the lattice's points does tell them apart.
+        // The check can fail: the mean height of the lattice's points does separate them.
         let heights: Vec<(f64, bool)> = (0..100)
             .flat_map(|seed| {
                 let touch = Touch::new(seed);
@@ -236,7 +236,7 @@ mod tests {
                     .map(|texture| (touch.relief(texture, at), texture == Texture::Triangular))
             })
             .collect();
-        assert!(told_apart(&heights) > 0.95);
+        assert!(separated(&heights) > 0.95);
     }
 
     #[test]
