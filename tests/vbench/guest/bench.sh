@@ -120,12 +120,12 @@ states() { [ "$(grep -F '"event":"state"' $out/rapid.jsonl | grep -F "\"device\"
 # held fd|task: number of rapid's descriptors or threads.
 held() { ls "/proc/$rapid_pid/$1" | wc -l; }
 
-# sample NAME: rapid's resources, as a line of samples.jsonl. Sizes in KiB; `anon` is private memory, `pss` its share of all.
+# sample NAME [FDS THREADS]: rapid's resources, as a line of samples.jsonl; of descriptors and threads these, if given. Sizes in KiB; `anon` is private memory, `pss` its share of all.
 sample() {
   local rollup status
   rollup=$(cat "/proc/$rapid_pid/smaps_rollup") status=$(cat "/proc/$rapid_pid/status")
   kib() { awk -v key="$2:" '$1 == key { print $2; found = 1 } END { if (!found) print 0 }' <<<"$1"; }
-  echo "{\"sample\":\"$1\",\"fds\":$(held fd),\"threads\":$(held task),\"rss\":$(kib "$status" VmRSS),\"pss\":$(kib "$rollup" Pss),\"anon\":$(kib "$rollup" Pss_Anon),\"shm\":$(du -sk /dev/shm | cut -f1),\"files\":$(find /dev/shm /tmp/iceoryx2 | wc -l)}" >>"$out/samples.jsonl"
+  echo "{\"sample\":\"$1\",\"fds\":${2:-$(held fd)},\"threads\":${3:-$(held task)},\"rss\":$(kib "$status" VmRSS),\"pss\":$(kib "$rollup" Pss),\"anon\":$(kib "$rollup" Pss_Anon),\"shm\":$(du -sk /dev/shm | cut -f1),\"files\":$(find /dev/shm /tmp/iceoryx2 | wc -l)}" >>"$out/samples.jsonl"
 }
 
 fail() { echo "bench: $*"; exit 1; }
