@@ -19,14 +19,12 @@ const WAITING: usize = 64;
 /// Which message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MadeKind {
+    /// None: an episode begins, and the transforms of the one before are no longer valid.
+    Beginning,
     /// A `rapid.Frame`: a tick of the frame index.
     Frame,
-    /// A `foxglove.FrameTransform`: where a sensor of a mounted module sits. The first of an episode replaces those of the
-    /// episode before.
-    Transform {
-        /// It is the first of its episode.
-        first: bool,
-    },
+    /// A `foxglove.FrameTransform`: where a sensor of a mounted module sits.
+    Transform,
 }
 
 /// A message as it was written.

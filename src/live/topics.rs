@@ -36,7 +36,7 @@ pub(super) struct Topics {
     mask: Option<Arc<RawChannel>>,
     observation: Option<Arc<RawChannel>>,
     frame: Option<Arc<RawChannel>>,
-    /// None without a pose, and without the place of a sensor, in the registry.
+    /// None before the first transform: without a pose in the registry, until the place of a sensor is known.
     transforms: Option<Arc<RawChannel>>,
     event: Option<Arc<RawChannel>>,
     log: Option<Arc<RawChannel>>,
@@ -96,9 +96,6 @@ impl Topics {
             left_out: LeftOut::default(),
         };
         registry.devices.iter().for_each(|device| topics.add(device));
-        if topics.transforms.is_none() && registry.modules.iter().any(|module| !module.transforms.is_empty()) {
-            topics.transforms = own(schema::TRANSFORM, TRANSFORM_TOPIC);
-        }
         topics
     }
 
@@ -204,9 +201,11 @@ impl Topics {
                     send(channel, made.message(), made.log_time);
                 }
             }
-            MadeKind::Transform { first } => {
-                if first {
-                    self.places.clear();
+            MadeKind::Beginning => self.places.clear(),
+            MadeKind::Transform => {
+                // Modules may be added during the run.
+                if self.transforms.is_none() {
+                    self.transforms = advertise(&self.context, schema::TRANSFORM, TRANSFORM_TOPIC, &BTreeMap::new());
                 }
                 self.places.push(*made);
                 self.places_sent = Stamp::default();

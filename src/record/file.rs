@@ -260,13 +260,19 @@ impl EpisodeFile {
         begin: Stamp,
     ) -> io::Result<()> {
         let log_time = self.clock.wall_ns(begin);
-        for (number, spec) in (0..).zip(modules.flat_map(|module| &module.transforms)) {
+        self.message.clear();
+        self.show(MadeKind::Beginning, log_time);
+        let mut numbered = (0..).zip(modules.flat_map(|module| &module.transforms)).peekable();
+        if numbered.peek().is_none() {
+            return Ok(());
+        }
+        let channel = add_channel(&mut self.writer, schema::TRANSFORM, TRANSFORM_TOPIC, &BTreeMap::new())?;
+        for (number, spec) in numbered {
             let TransformSpec { sensor, parent, position, rotation } = spec;
-            let channel = add_channel(&mut self.writer, schema::TRANSFORM, TRANSFORM_TOPIC, &BTreeMap::new())?;
             let pose = encode::Pose { position: *position, rotation: *rotation };
             encode::transform(&mut self.message, log_time, [parent, sensor], &pose);
             self.write(channel, number, log_time, begin)?;
-            self.show(MadeKind::Transform { first: number == 0 }, log_time);
+            self.show(MadeKind::Transform, log_time);
         }
         Ok(())
     }

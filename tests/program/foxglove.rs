@@ -365,6 +365,30 @@ fn where_the_sensors_of_the_mounted_modules_sit_is_recorded_and_shown() {
     }
 }
 
+#[test]
+fn where_a_sensor_sat_in_an_earlier_episode_is_shown_no_more() {
+    let place = Place::new();
+    let modules = "[module.angled]\nslot = \"top\"\ndevices = [\"cam_wrist\"]\n[module.straight]\nslot = \"top\"\n\
+        devices = [\"cam_wrist\"]\n[module.angled.transform.cam_wrist]\nposition = [0, 0.5, 0.25]\n";
+    place.write("devices.toml", &[include_str!("../../devices.toml"), modules, LENIENT].concat());
+    let running = start(&place, &["--module", "angled"]);
+    let mut client = Client::connect(&address(&running));
+    client.read_until("transforms", |client| client.count("/tf") > 1);
+    assert!(place.run(&["session", "plan", "--module", "straight"]).status.success());
+    assert!(place.run(&["episode", "next"]).status.success());
+    let frames = client.count("/rapid/frame");
+    client.read_until("frames of the next episode", |client| client.count("/rapid/frame") > frames + 30);
+    let shown = client.count("/tf");
+    client.read_until("three seconds more", |client| client.count("/rapid/frame") > frames + 120);
+    assert_eq!(client.count("/tf"), shown, "the camera is not on that mount any more");
+    running.signal(Signal::INT);
+    let (_, output, errors) = running.end();
+    let episodes = place.episodes("out");
+    let [first, second] = episodes.as_slice() else { panic!("{output} {errors}") };
+    let places = |file: &String| Episode::read(&place.path("out").join(file)).topic("/tf").count();
+    assert_eq!((places(first), places(second)), (1, 0));
+}
+
 #[cfg(feature = "policy")]
 #[test]
 fn actions_of_a_policy_are_shown_as_they_are_recorded() {
