@@ -47,7 +47,7 @@ pub enum ShowError {
         number: usize,
     },
     /// The file of arrays.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {source}{}", file.display(), fix(source))]
     Arrays {
         /// Its path.
         file: PathBuf,
@@ -66,7 +66,15 @@ impl ShowError {
     }
 }
 
-/// Writes what a recorded chunk was computed from to a file of arrays.
+/// What to do about a file that is there already.
+fn fix(error: &ArraysError) -> &'static str {
+    match error {
+        ArraysError::Io(error) if error.kind() == io::ErrorKind::AlreadyExists => "; choose another file with --to",
+        ArraysError::Io(_) | ArraysError::Zip(_) => "",
+    }
+}
+
+/// Writes what a recorded chunk was computed from to a new file of arrays.
 ///
 /// # Errors
 /// When the policy or the episode cannot be read, the chunk is not there, or the file cannot be written.
@@ -104,7 +112,7 @@ struct Array {
 }
 
 fn arrays(inputs: ChunkInputs, bundle: &Bundle) -> Vec<Array> {
-    let ChunkInputs { observations, mask, noise, step_noise, recorded, tick: _, seed: _ } = inputs;
+    let ChunkInputs { observations, mask, noise, step_noise, recorded } = inputs;
     let chunk = [bundle.horizon, bundle.action.len()];
     let mut arrays: Vec<Array> =
         observations.into_iter().map(|(name, shape, values)| Array { name, shape, values }).collect();
@@ -129,10 +137,11 @@ pub enum ArraysError {
     Zip(#[from] zip::result::ZipError),
 }
 
-/// Writes an `.npz`: a ZIP with one `.npy` for each array
+/// Writes a new `.npz`: a ZIP with one `.npy` for each array
 /// (<https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>, version 1.0).
 fn write(to: &Path, arrays: &[Array]) -> Result<(), ArraysError> {
-    let mut file = zip::ZipWriter::new(File::create(to)?);
+    // An episode named by mistake is not overwritten.
+    let mut file = zip::ZipWriter::new(File::create_new(to)?);
     let stored = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     for Array { name, shape, values } in arrays {
         file.start_file(format!("{name}.npy"), stored)?;

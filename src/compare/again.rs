@@ -92,10 +92,6 @@ struct Work<'a> {
 /// What a chunk is computed from, as the graphs take it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChunkInputs {
-    /// Its tick on the control grid.
-    pub tick: u64,
-    /// The seed of its noise.
-    pub seed: u64,
     /// The observations by key, each with its shape and its numbers.
     pub observations: Vec<(String, Vec<usize>, Vec<f32>)>,
     /// The mask, with the name of the input; `None` if the policy has none.
@@ -268,8 +264,6 @@ impl Work<'_> {
         });
         let (noise, step_noise) = self.model.noise(chunk.seed);
         ChunkInputs {
-            tick: chunk.tick,
-            seed: chunk.seed,
             observations: observations.collect(),
             mask: bundle.mask.as_ref().map(|mask| (mask.input.clone(), tensors.mask().to_vec())),
             noise,
