@@ -109,6 +109,10 @@ impl Flight {
         }
         let Self { options: PolicyOptions { live, .. }, inbox, actions, registry, board, .. } = self;
         board.announce(live.bundle.begins(library, live.dry_run));
+        for (modality, time) in live.bundle.held() {
+            let text = format!("policy: while {modality} is absent, its last samples stand in for it, for {time:?}");
+            board.announce(What::Log { level: Level::Info, text });
+        }
         let live = Live::start(live, model, &registry, inbox, actions, Arc::clone(&board))?;
         let ended = live.ended();
         tokio::select! {

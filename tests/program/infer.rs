@@ -314,6 +314,15 @@ fn a_held_sensor_is_observed_as_it_was_and_then_not_at_all() {
     let file = place.path("out").join(&place.files("out")[0]).display().to_string();
     let replayed = place.run(&["--json", "replay", &file, "--infer", BUNDLE, "--tolerance", "1e-5"]);
     assert_eq!(replayed.status.code(), Some(0), "{}", String::from_utf8_lossy(&replayed.stderr));
+    let line = |printed: &[Value]| support::logged(printed, "its last samples stand in for it, for 1s").len();
+    assert_eq!(line(&printed), 2, "of both cameras, at the start");
+
+    // Its inputs go to a new file: an episode that is named by mistake stays.
+    let before = std::fs::read(&file).expect("the episode");
+    let observed = place.run(&["policy", "observe", &file, BUNDLE, "--to", &file]);
+    let error = String::from_utf8_lossy(&observed.stderr).into_owned();
+    assert!(!observed.status.success() && error.contains("choose another file with --to"), "{error}");
+    assert_eq!(std::fs::read(&file).expect("the episode"), before);
 }
 
 #[test]

@@ -69,6 +69,14 @@ impl Bundle {
         self
     }
 
+    /// The modalities whose last samples are held while they are absent, and for how long.
+    pub fn held(&self) -> impl Iterator<Item = (&str, Duration)> {
+        self.observations.iter().filter_map(|observation| match observation.when_absent {
+            WhenAbsent::HoldLast(time) => Some((observation.modality.as_str(), time)),
+            WhenAbsent::Zero => None,
+        })
+    }
+
     /// The first and the last seed of the demonstrations that it was trained on, as far as `training` has them
     /// (`episode_seeds`). Some between them may not have been used.
     pub fn training_seeds(&self) -> Option<[u64; 2]> {
