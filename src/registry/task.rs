@@ -1,12 +1,12 @@
-//! The rig of the simulated task: its registry, and the devices plugged in when a trial begins.
+//! The rigs of the simulated task, with an arm and in a hand: their registries, and the devices plugged in when a trial begins.
 
 use super::scenario::{Scenario, ScenarioDevice};
 use super::spec::Registry;
 use crate::simulation::task::SharedTrial;
 use crate::simulation::{SimSource, TaskPart};
 
-const TEXT: &str = include_str!("task.toml");
-const HANDHELD: &str = include_str!("task_handheld.toml");
+const TEXT: &str = concat!(include_str!("task.toml"), include_str!("task_cameras.toml"));
+const HANDHELD: &str = concat!(include_str!("task_handheld.toml"), include_str!("task_cameras.toml"));
 /// The module of the handheld rig that has no sensor: it is named.
 pub const HANDHELD_MODULE: &str = "handheld_adapter";
 

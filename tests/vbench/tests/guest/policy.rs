@@ -19,7 +19,10 @@ use vbench::scenario::Scenario;
 const BUNDLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/tactile-id");
 /// The rig that `rapid --sim task` simulates, here with real drivers. No driver moves an arm that is read over a serial
 /// line: a program takes the actions.
-const TASK: &str = include_str!("../../../../src/registry/task.toml");
+const TASK: &str = concat!(
+    include_str!("../../../../src/registry/task.toml"),
+    include_str!("../../../../src/registry/task_cameras.toml")
+);
 const MOVER: &str = r#"
 [device.mover]
 vid = "0x1209"
