@@ -342,7 +342,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     Ok((running, conductor))
 }
 
-/// What a run of simulated devices has besides: the board says so, and trials of the task are followed.
+/// What a run of simulated devices has besides: the board has it, and the trials of the task are reported.
 fn simulated(devices: &Devices, board: &Arc<Board>) -> Option<Stage> {
     let Devices::Simulated(scenario) = devices else { return None };
     board.set_simulated();

@@ -1,4 +1,4 @@
-//! The options of a policy, and the grammar of `rapid eval` and `rapid replay`.
+//! The options of a policy, and the grammar of `rapid policy`, `rapid eval` and `rapid replay`.
 
 use std::path::PathBuf;
 use std::time::Duration;

@@ -113,7 +113,7 @@ impl Condition {
     }
 }
 
-/// The hand at the cable: unplugs and plugs in as the condition says, and notes the milestones of the trial.
+/// The hand at the cable: unplugs and plugs in when the condition requires it, and notes the milestones of the trial.
 #[derive(Debug)]
 struct Hand {
     out: Option<When>,

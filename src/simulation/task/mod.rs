@@ -1,5 +1,6 @@
 //! The simulated task: grasp a block, feel its texture, sort it. Its wrist camera, its tactile camera and its arm are
-//! devices like all others; the arm is the actuator.
+//! devices like all others; the arm is the actuator. With the gripper in a hand, a phone and the gripper itself are in place of
+//! the arm.
 //!
 //! Invariant: the samples of its devices are a function of the seed, the actions and the number of the step; the time
 //! and order of reads have no effect.

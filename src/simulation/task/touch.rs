@@ -3,7 +3,7 @@
 //! Both textures are one relief on a triangular lattice, and its inverse: bumps on the points of the lattice, or holes at
 //! them, whose borders are a honeycomb. Heights are equalised (uniform over the plane), so that the inverse has the same
 //! distribution of heights, the same slopes with the other sign, and, because the lattice has no direction, the same
-//! distribution of slopes and the same spectrum. What tells the textures apart is the arrangement alone: no statistic of
+//! distribution of slopes and the same spectrum. What separates the textures is the arrangement alone: no statistic of
 //! single pixels does, and a test shows it.
 //!
 //! Period, rotation, offset, wear, dirt, the place and size of the contact, the lights and the noise are drawn for every
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn no_statistic_of_pixels_tells_the_textures_apart() {
+    fn no_statistic_of_pixels_separates_the_textures() {
         let blocks: Vec<(Vec<f64>, bool)> = (0..300)
             .flat_map(|seed| {
                 let touch = Touch::new(seed);
