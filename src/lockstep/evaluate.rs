@@ -51,11 +51,11 @@ pub enum Condition {
     Full,
     /// The tactile sensor is absent.
     NoTactile,
-    /// It is unplugged 3 to 14 steps after the touch: the texture has been felt, and the ways to the bins have not parted.
+    /// It is unplugged 3 to 14 steps after the touch: the texture has been felt, and the ways to the bins have rarely parted.
     HotUnplug,
     /// It is unplugged at a step of 10 to 24, and plugged in again 2 to 9 steps after the touch, or 45 later at the latest.
     HotReplug,
-    /// It is unplugged at a step of 10 to 24: before the touch. Not in the paper's table.
+    /// It is unplugged at a step of 10 to 24: nearly always before the touch. Not in the paper's table.
     EarlyUnplug,
     /// The wrist camera is absent: nothing shows the block's position. Not in the paper's table.
     NoWrist,
