@@ -261,11 +261,11 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let kind = options.screen;
     let (to_scenario, replugs) = mpsc::unbounded_channel();
     let (to_alignment, to_align) = mpsc::unbounded_channel();
-    let trials = simulated(&options.devices, &board);
+    let (trials, loaded) = (simulated(&options.devices, &board), until_loaded(options.policy.is_some()));
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
         let alignment = alignment(&registry, bus, &board)?.extended_by(to_align);
-        let (discovery, plugged) = discovery::start(options.devices, &registry, replugs)?;
+        let (discovery, plugged) = discovery::start(options.devices, &registry, replugs, loaded.clone())?;
         // The inputs report their first state at once.
         let events = board.events();
         // Until the very end: a device that is being closed may still move.
@@ -273,7 +273,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         let (commands, from_screen) = mpsc::channel(16);
         let attached = Attached::new(Arc::clone(&board), commands.clone());
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration, options.shown);
-        let start = |policy| inference::start(policy, &registry, bus, &board, options.record);
+        let start = |policy| inference::start(policy, &registry, bus, (&board, &loaded), options.record);
         let inference = options.policy.map(start).transpose()?;
         let live = listening.map(|listening| listening.start(bus, &board, (clock, made))).transpose()?;
         Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live))
@@ -318,6 +318,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         is_single,
         duration: options.duration,
         begin_episode: options.record,
+        loaded,
         found: mpsc::unbounded_channel(),
     };
     let running = Running {
@@ -340,6 +341,15 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         requests,
     };
     Ok((running, conductor))
+}
+
+/// Cancelled when the policy is loaded; at once if there is none.
+fn until_loaded(has_policy: bool) -> CancellationToken {
+    let loaded = CancellationToken::new();
+    if !has_policy {
+        loaded.cancel();
+    }
+    loaded
 }
 
 /// What a run of simulated devices has besides: the board has it, and the trials of the task are reported.

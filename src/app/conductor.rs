@@ -10,6 +10,7 @@ use std::time::Duration;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
+use tokio_util::sync::CancellationToken;
 
 use super::collection::{Collection, Found};
 use super::stage::{Stage, join};
@@ -47,6 +48,8 @@ pub(super) struct Conductor {
     pub(super) found: (mpsc::UnboundedSender<Found>, mpsc::UnboundedReceiver<Found>),
     /// An episode is still to begin, as soon as every device delivers samples.
     pub(super) begin_episode: bool,
+    /// The policy is loaded, if there is one: the run's time begins.
+    pub(super) loaded: CancellationToken,
 }
 
 impl Conductor {
@@ -57,19 +60,18 @@ impl Conductor {
 
     /// Returns when the run is to end, with the reason if it is an error.
     pub(super) async fn conduct(&mut self, running: &mut Running) -> Result<(), AppError> {
-        let begun = Instant::now();
+        let mut begun = Instant::now();
+        let mut is_loaded = self.loaded.is_cancelled();
         let mut look = interval(SETTLE_LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let end = match (self.record, self.duration) {
-            (false, Some(duration)) => Some(begun + duration),
-            _ => None,
-        };
+        let length = self.duration.filter(|_| !self.record);
         let mut has_looked = false;
         // How the output ended, once it has no reader.
         let mut output = Ok(());
         let mut bus_lost = pin!(bus::lost());
         loop {
             let due = self.collection.due();
+            let end = length.map(|length| begun + length);
             tokio::select! {
                 biased;
                 () = running.signals.next() => return output,
@@ -108,7 +110,8 @@ impl Conductor {
                 // After the events: the end of its episode explains more.
                 outcome = running.recording.outcome() => return outcome.and(Err(AppError::Panicked("the recorder"))),
                 never = fault::strike("main") => never,
-                _ = look.tick(), if self.begin_episode => {
+                () = self.loaded.cancelled(), if !is_loaded => (is_loaded, begun) = (true, Instant::now()),
+                _ = look.tick(), if is_loaded && self.begin_episode => {
                     if self.has_settled(begun) {
                         self.begin_episode = false;
                         if self.begin_first(running.kind).await? {
@@ -123,8 +126,8 @@ impl Conductor {
                     let begun = self.collection.tick().await;
                     self.tolerate(begun, running.kind)?;
                 }
-                () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return output,
-                () = sleep_until(begun + NONE_AFTER), if !has_looked => {
+                () = sleep_until(end.unwrap_or(begun)), if is_loaded && end.is_some() => return output,
+                () = sleep_until(begun + NONE_AFTER), if is_loaded && !has_looked => {
                     has_looked = true;
                     self.warn_if_none();
                 }

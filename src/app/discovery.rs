@@ -4,6 +4,7 @@ use std::path::Path;
 
 use futures::StreamExt;
 use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
 
 use super::stage::Stage;
 use super::{AppError, Devices};
@@ -21,7 +22,8 @@ const UDEV: &str = "/run/udev/control";
 const DEPTH: usize = 64;
 
 /// Starts to watch; also returns the stream for the rig, which ends when the stage does. `requests` name simulated
-/// devices that are to be unplugged, or plugged in again.
+/// devices that are to be unplugged, or plugged in again. A scenario begins once `loaded` is cancelled: how long a policy
+/// takes to load depends on the machine, and what happens to its sensors must not.
 ///
 /// # Errors
 /// When plug events of this machine cannot be received.
@@ -29,8 +31,9 @@ pub(super) fn start(
     devices: Devices,
     registry: &Registry,
     requests: mpsc::UnboundedReceiver<String>,
+    loaded: CancellationToken,
 ) -> Result<(Stage, HotplugStream), AppError> {
-    let mut source = open(devices, registry, requests)?;
+    let mut source = open(devices, registry, requests, loaded)?;
     let (events, to_rig) = mpsc::channel(DEPTH);
     let stage = Stage::start("discovery", |stop| async move {
         loop {
@@ -54,9 +57,14 @@ fn open(
     devices: Devices,
     registry: &Registry,
     requests: mpsc::UnboundedReceiver<String>,
+    loaded: CancellationToken,
 ) -> Result<HotplugStream, AppError> {
     if let Devices::Simulated(scenario) = devices {
-        return Ok(Box::pin(Script::with_requests(scenario, requests)));
+        let script = async move {
+            loaded.cancelled().await;
+            Script::with_requests(scenario, requests)
+        };
+        return Ok(Box::pin(futures::stream::once(script).flatten()));
     }
     #[cfg(feature = "motors")]
     crate::driver::can::prepare(registry);

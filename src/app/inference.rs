@@ -42,7 +42,8 @@ pub struct PolicyOptions {
 }
 
 /// Starts the stage: it loads the policy and starts it when everything it requires is present; when it is to be
-/// recorded, after the episode has begun, so that the file holds everything it observed.
+/// recorded, after the episode has begun, so that the file holds everything it observed. `loaded` is cancelled when it is
+/// loaded.
 ///
 /// # Errors
 /// When it cannot read the bus.
@@ -50,7 +51,7 @@ pub(super) fn start(
     options: PolicyOptions,
     registry: &Arc<Registry>,
     bus: &Bus,
-    board: &Arc<Board>,
+    (board, loaded): (&Arc<Board>, &CancellationToken),
     is_recorded: bool,
 ) -> Result<Stage, AppError> {
     let flight = Flight {
@@ -59,6 +60,7 @@ pub(super) fn start(
         actions: bus.writer(TopicId::Action),
         registry: Arc::clone(registry),
         board: Arc::clone(board),
+        loaded: loaded.clone(),
         is_recorded,
         options,
     };
@@ -83,6 +85,7 @@ struct Flight {
     actions: Option<Arc<Writer>>,
     registry: Arc<Registry>,
     board: Arc<Board>,
+    loaded: CancellationToken,
     is_recorded: bool,
 }
 
@@ -104,6 +107,7 @@ impl Flight {
             loaded = loaded => loaded.map_err(|_| AppError::Panicked("the policy"))??,
         };
         self.judge(chunk)?;
+        self.loaded.cancel();
         if !self.settled(&stop).await? {
             return Ok(());
         }

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use tokio_util::sync::CancellationToken;
+
 use super::AppError;
 use super::stage::Stage;
 use crate::bus::Bus;
@@ -17,7 +19,7 @@ pub(super) fn start(
     options: PolicyOptions,
     _: &Arc<Registry>,
     _: &Bus,
-    _: &Arc<Board>,
+    _: (&Arc<Board>, &CancellationToken),
     _: bool,
 ) -> Result<Stage, AppError> {
     match options {}

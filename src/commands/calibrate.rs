@@ -172,7 +172,7 @@ async fn observe(
     let mut signals = Signals::listen()?;
     let simulated = if let DeviceNode::Sim(device) = node { Some(Arc::clone(device)) } else { None };
     if let Some(device) = &simulated {
-        device.light.switch(device.begun, false);
+        device.light.install();
     }
     let mut camera = tokio::select! {
         () = signals.next() => return Err(CalibrateError::Interrupted),
@@ -394,11 +394,8 @@ fn play(chosen: &Chosen, name: &str, length: Duration, shared: &Shared) -> Resul
             return Ok(None);
         }
         light.switch(change.lit, &line(name, end, shared))?;
-        let flip = Flip { at: Stamp::now(), lit: change.lit };
-        if let Some(device) = &shared.simulated {
-            device.light.switch(flip.at, flip.lit);
-        }
-        flips.push(flip);
+        let at = shared.simulated.as_ref().map_or_else(Stamp::now, |device| device.light.switch(change.lit));
+        flips.push(Flip { at, lit: change.lit });
     }
     Ok(if wait(&mut light, end, end, name, shared)? { None } else { Some(flips) })
 }

@@ -154,9 +154,18 @@ pub struct SimDevice {
 pub struct SimLight(Mutex<Vec<(Stamp, bool)>>);
 
 impl SimLight {
-    /// It is lit from this moment on, or dark; moments must be in the order of time.
-    pub fn switch(&self, at: Stamp, lit: bool) {
-        self.changes().push((at, lit));
+    /// Puts one in front of the camera, dark.
+    pub fn install(&self) {
+        self.changes().push((Stamp(0), false));
+    }
+
+    /// It is lit from now on, or dark. Returns the moment, which is taken under the lock: a picture of a later moment is
+    /// drawn with this change, however long this thread is suspended.
+    pub fn switch(&self, lit: bool) -> Stamp {
+        let mut changes = self.changes();
+        let now = Stamp::now();
+        changes.push((now, lit));
+        now
     }
 
     /// Whether it was lit at this moment. Dark before the first change.

@@ -146,6 +146,12 @@ impl Pane<'_> {
         rustix::process::Pid::from_raw(pid.trim().parse().expect("a number")).expect("a process")
     }
 
+    /// The name of the program that the terminal belongs to at present.
+    pub(crate) fn program(&self) -> String {
+        let name = self.tmux.run(&["display-message", "-p", "-t", &self.name, "#{pane_current_command}"]);
+        name.expect("a pane").trim().to_owned()
+    }
+
     /// Takes the terminal away, as a connection that breaks does.
     pub(crate) fn hang_up(&self) {
         let _ = self.tmux.run(&["kill-session", "-t", &self.name]);
