@@ -26,6 +26,7 @@ mod live;
 mod reload;
 mod requests;
 mod screen;
+mod settling;
 pub(crate) mod signals;
 mod stage;
 mod streaming;

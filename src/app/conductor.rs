@@ -13,6 +13,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use super::collection::{Collection, Found};
+use super::settling::has_settled;
 use super::stage::{Stage, join};
 use super::{AppError, Request, Running, Screen};
 use crate::bus;
@@ -22,12 +23,7 @@ use crate::sample::Epoch;
 use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 use crate::time::Stamp;
 
-/// An episode requested at the start begins when every attached device delivers samples, and after this time at the
-/// latest.
-const SETTLE_LIMIT: Duration = Duration::from_secs(3);
-/// Devices that are attached at the start are known after this time.
-const SETTLE_LEAST: Duration = Duration::from_millis(100);
-/// Interval of that check.
+/// Interval at which devices that are still opening are looked for.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);
 
 /// If no device is plugged in, this is reported after this time.
@@ -112,7 +108,7 @@ impl Conductor {
                 never = fault::strike("main") => never,
                 () = self.loaded.cancelled(), if !is_loaded => (is_loaded, begun) = (true, Instant::now()),
                 _ = look.tick(), if is_loaded && self.begin_episode => {
-                    if self.has_settled(begun) {
+                    if has_settled(&self.board, begun.elapsed()) {
                         self.begin_episode = false;
                         if self.begin_first(running.kind).await? {
                             return output;
@@ -168,13 +164,6 @@ impl Conductor {
             let text = "no device of the registry is plugged in; `rapid devices` lists what is, and which entry it is";
             self.board.announce(What::Log { level: Level::Warn, text: text.to_owned() });
         }
-    }
-
-    /// Whether every attached device has delivered its first sample.
-    fn has_settled(&self, begun: Instant) -> bool {
-        let waited = begun.elapsed();
-        let opening = self.board.snapshot().devices.iter().any(|device| device.state == SlotState::Opening);
-        waited >= SETTLE_LIMIT || (waited >= SETTLE_LEAST && !opening)
     }
 
     /// In the monitor, a full disk is no reason to exit: it is reported and can be fixed. A run that is to record by

@@ -11,6 +11,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
+use super::settling;
 use super::stage::Stage;
 use crate::bus::{Bus, Inbox, TopicId, Writer};
 use crate::mask::PhysicalMask;
@@ -23,8 +24,6 @@ use crate::policy::sampler::Computing;
 use crate::registry::Registry;
 use crate::status::{Board, Level, What};
 
-/// Devices attached at the start must deliver within this time.
-const SETTLE: Duration = Duration::from_secs(3);
 /// Interval at which the mask is checked for that.
 const LOOK: Duration = Duration::from_millis(5);
 
@@ -145,7 +144,8 @@ impl Flight {
     }
 
     /// Waits until everything required is present, and the episode has begun if the policy is to be recorded; `false`
-    /// if the run is to end before. Unless it is to wait for devices, a missing one is an error after [`SETTLE`].
+    /// if the run is to end before. Unless it is to wait for devices, a missing one is an error after
+    /// [`settling::LIMIT`].
     // `&mut`, because the bus reader cannot be shared between threads.
     async fn settled(&mut self, stop: &CancellationToken) -> Result<bool, AppError> {
         let begun = Instant::now();
@@ -160,12 +160,16 @@ impl Flight {
             }
             let missing = missing(&self.required, self.board.mask());
             if missing.is_empty() {
+                // It does not begin without a sensor that is plugged in and only not open yet.
+                if !settling::has_settled(&self.board, begun.elapsed()) {
+                    continue;
+                }
                 if !self.is_recorded || self.board.is_recording() {
                     return Ok(true);
                 }
                 continue;
             }
-            if begun.elapsed() < SETTLE {
+            if begun.elapsed() < settling::LIMIT {
                 continue;
             }
             if !self.options.wait {
