@@ -86,6 +86,9 @@ pub enum NoAction {
     /// A policy of this process drives the actuator.
     #[error("another program publishes actions while a policy runs here: end one of them")]
     Foreign,
+    /// It is a pose that the arm cannot take.
+    #[error("the arm does not reach the pose that is asked for: it holds")]
+    OutOfReach,
 }
 
 /// Where an actuator reads the action to carry out: the topic of actions.

@@ -34,6 +34,8 @@ pub mod inputs;
 pub mod interlock;
 pub mod interlocks;
 #[cfg(feature = "lan")]
+#[cfg(feature = "motors")]
+pub mod kinematics;
 pub mod link;
 #[cfg(feature = "foxglove")]
 pub mod live;

@@ -7,9 +7,11 @@ use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line};
 use crate::interlock::StopKind;
+#[cfg(feature = "motors")]
+use crate::kinematics::Arm;
 use crate::registry::{
     ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
-    ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, StopSpec, UsbSpec,
+    ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, RegistryErrors, StopSpec, UsbSpec,
 };
 use crate::text;
 
@@ -18,7 +20,7 @@ use crate::text;
 /// # Errors
 /// When `out` cannot be written to.
 pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<CommandStatus> {
-    let loaded = Registry::load(path);
+    let loaded = Registry::load(path).and_then(with_arms);
     let (lines, outcome) = match &loaded {
         Ok(loaded) => (lines(loaded), CommandStatus::Done),
         Err(errors) => (errors.diagnostics.iter().map(Line::Error).collect(), CommandStatus::BadConfiguration),
@@ -47,6 +49,35 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Com
     }
     writeln!(out, "{}: {summary}", text::plain(&path.display().to_string()))?;
     Ok(outcome)
+}
+
+/// The registry, if the description of each of its arms fits its motors.
+#[cfg(feature = "motors")]
+fn with_arms(loaded: Loaded) -> Result<Loaded, RegistryErrors> {
+    let file = loaded.registry.path.as_ref().map(|path| path.display().to_string()).unwrap_or_default();
+    let mistakes = loaded.registry.devices.iter().filter_map(|device| {
+        let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { return None };
+        let error = Arm::open(motors.effector.as_deref()?, &motors.motors).err()?;
+        Some(Diagnostic {
+            file: file.clone(),
+            line: 0,
+            column: 0,
+            entry: Some(format!("device.{}.effector", device.name)),
+            message: text::plain(&error.to_string()).into_owned(),
+            fix: Some(
+                "write the names of its joints as names of the motors, and its links as `frame` and `tip`".to_owned(),
+            ),
+        })
+    });
+    let diagnostics: Vec<_> = mistakes.collect();
+    if diagnostics.is_empty() { Ok(loaded) } else { Err(RegistryErrors { diagnostics }) }
+}
+
+/// Without motors there are no arms.
+#[cfg(not(feature = "motors"))]
+#[expect(clippy::unnecessary_wraps, reason = "the same signature as with motors")]
+fn with_arms(loaded: Loaded) -> Result<Loaded, RegistryErrors> {
+    Ok(loaded)
 }
 
 fn lines(loaded: &Loaded) -> Vec<Line<'_>> {

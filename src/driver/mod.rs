@@ -178,7 +178,7 @@ impl Driver {
             return Ok(Self::Replay(Box::new(replay::Replay::open(Arc::clone(device)).await?)));
         }
         sim::check(spec, device)?;
-        let sim = sim::Sim::open(Arc::clone(device)).await?.with_node(&spec.node);
+        let sim = sim::Sim::open(Arc::clone(device)).await?.with_node(&spec.node)?;
         Ok(Self::Sim(Box::new(sim)))
     }
 

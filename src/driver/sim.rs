@@ -29,7 +29,7 @@ use crate::driver::can::{
 };
 use crate::modality::ModalityKind;
 use crate::provenance::{Format, Negotiated};
-use crate::registry::{CAN_RECORD, DeviceSpec, MOTOR_CHANNELS, NodeSpec};
+use crate::registry::{CAN_RECORD, DeviceSpec, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::simulation::task::{self, PictureError, SharedTrial};
 use crate::simulation::{self, SimDevice, SimSource, TaskPart};
@@ -134,8 +134,10 @@ impl Sim {
 
     /// Configures the device as in `spec`: with the controls that it sets, and no others, for a simulated camera; with
     /// its motors, at their targets; with bytes if it sends those.
-    #[must_use]
-    pub(super) fn with_node(mut self, spec: &NodeSpec) -> Self {
+    ///
+    /// # Errors
+    /// When the description of the arm that its motors move does not fit them.
+    pub(super) fn with_node(mut self, spec: &NodeSpec) -> Result<Self, DriverError> {
         if let (Some(records), Content::Values { seed, .. }) = (Records::of(spec), &self.content) {
             self.content = Content::Records { records, seed: *seed };
             self.payload.reserve(CAN_RECORD);
@@ -144,10 +146,10 @@ impl Sim {
             self.controls = camera.controls.iter().cloned().collect();
         }
         if let NodeSpec::Can(can) = spec {
-            self.joints = Joints::new(can.channels() / MOTOR_CHANNELS);
+            self.joints = Joints::of(can)?;
         }
         self.agreed = Agreed { description: self.description(), negotiated: self.negotiated() };
-        self
+        Ok(self)
     }
 
     /// Sets the action of the arm of the simulated task: one number per axis.

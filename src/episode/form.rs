@@ -7,7 +7,7 @@
 
 use super::encode::{self, Joint, Pose};
 use super::schema::{self, SampleSchema, Schema};
-use crate::registry::{DeviceSpec, Form, JointsSpec, PoseLayout, PoseSpec, Quantity};
+use crate::registry::{DeviceSpec, Form, JointsSpec, POSE_ENDING, PoseLayout, PoseSpec, Quantity, TipForm};
 
 /// The topic of all transforms.
 pub const TRANSFORM_TOPIC: &str = "/tf";
@@ -32,6 +32,7 @@ impl Derived {
     pub const fn of(device: &DeviceSpec) -> &'static [Self] {
         match device.form {
             Some(Form::Pose(_)) => &[Self::Pose, Self::Transform],
+            Some(Form::Joints(JointsSpec { tip: Some(_), .. })) => &[Self::Joints, Self::Pose, Self::Transform],
             Some(Form::Joints(_)) => &[Self::Joints],
             Some(Form::Calibration(_)) => &[Self::Calibration],
             Some(Form::Points(_)) => &[Self::Points],
@@ -44,7 +45,8 @@ impl Derived {
         let ending = device.form.as_ref().map_or("", Form::ending);
         match self {
             Self::Transform => TRANSFORM_TOPIC.to_owned(),
-            Self::Pose | Self::Joints | Self::Calibration | Self::Points => format!("{}{ending}", device.topic),
+            Self::Pose => format!("{}{POSE_ENDING}", device.topic),
+            Self::Joints | Self::Calibration | Self::Points => format!("{}{ending}", device.topic),
         }
     }
 
@@ -87,10 +89,31 @@ impl Derived {
                     Self::Joints | Self::Calibration | Self::Points => return false,
                 }
             }
-            Form::Joints(spec) => encode::joints(out, wall_ns, joints(spec, payload)),
+            Form::Joints(spec) => match (self, &spec.tip) {
+                (Self::Joints, _) => encode::joints(out, wall_ns, joints(spec, payload)),
+                (Self::Pose | Self::Transform, Some(tip)) => {
+                    let Some(pose) = tip_pose(tip, payload.get(8 * spec.end()..).unwrap_or_default()) else {
+                        return false;
+                    };
+                    if self == Self::Pose {
+                        encode::pose(out, wall_ns, &tip.parent, &pose);
+                    } else {
+                        encode::transform(out, wall_ns, [&tip.parent, name], &pose);
+                    }
+                }
+                _ => return false,
+            },
         }
         true
     }
+}
+
+/// The pose of the tip of an arm.
+fn tip_pose(tip: &TipForm, numbers: &[u8]) -> Option<Pose> {
+    let at = |index| number(numbers, index);
+    let rotation = tip.numbers() - 4;
+    let rotation = [at(rotation)?, at(rotation + 1)?, at(rotation + 2)?, at(rotation + 3)?];
+    normalised([at(0)?, at(1)?, at(2)?], rotation)
 }
 
 fn number(payload: &[u8], index: usize) -> Option<f64> {
@@ -105,9 +128,13 @@ fn pose(spec: &PoseSpec, payload: &[u8]) -> Option<Pose> {
         PoseLayout::Columns => matrix(|row, column| at(column * 4 + row))?,
         PoseLayout::Rows => matrix(|row, column| at(row * 4 + column))?,
     };
+    normalised(position, rotation)
+}
+
+fn normalised(position: [f64; 3], rotation: [f64; 4]) -> Option<Pose> {
     let length = rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
-    let is_rotation = length.is_finite() && length > 0.0;
-    is_rotation.then(|| Pose { position, rotation: rotation.map(|part| part / length) })
+    let is_pose = position.iter().all(|number| number.is_finite()) && length.is_finite() && length > 0.0;
+    is_pose.then(|| Pose { position, rotation: rotation.map(|part| part / length) })
 }
 
 /// Position and quaternion `x y z w` of a homogeneous matrix. The largest of the four parts is found first, because the

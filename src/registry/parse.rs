@@ -8,6 +8,7 @@
 
 mod button;
 mod device;
+mod effector;
 mod form;
 mod identity;
 mod input;
@@ -306,8 +307,9 @@ fn check_topics(drafts: &[Draft<'_>]) {
             draft.section.report("topic", message, fix);
         }
         let has_it = |(at, other): &(usize, &Draft<'_>)| {
-            let derived = other.form.as_ref().map(|form| format!("{}{}", other.topic, form.ending()));
-            (*at < index && other.topic == draft.topic) || derived.as_ref() == Some(&draft.topic)
+            let endings = other.form.as_ref().map(|form| [Some(form.ending()), form.further_ending()]);
+            let mut derived = endings.into_iter().flatten().flatten().map(|ending| format!("{}{ending}", other.topic));
+            (*at < index && other.topic == draft.topic) || derived.any(|topic| topic == draft.topic)
         };
         let Some((_, earlier)) = drafts.iter().enumerate().find(has_it) else { continue };
         let message = format!(

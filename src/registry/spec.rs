@@ -22,7 +22,7 @@ use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::points::PacketFormat;
 use crate::sample::{Encoding, SampleHeader};
 
-pub use form::{CalibrationSpec, Form, JointsSpec, PointsSpec, PoseLayout, PoseSpec, Quantity};
+pub use form::{CalibrationSpec, Form, JointsSpec, POSE_ENDING, PointsSpec, PoseLayout, PoseSpec, Quantity, TipForm};
 pub use inference::{InferenceSpec, Provider};
 pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
@@ -33,7 +33,8 @@ pub use lan::{
 };
 pub use module::{ModuleError, ModuleSpec, TransformSpec, mounted};
 pub use motors::{
-    BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
+    BrakeSpec, DamiaoSpec, EffectorSpec, GripperSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop,
+    StopSpec, TipRotation, WatchSpec,
 };
 pub use verdict::{Limits, VerdictSpec};
 
@@ -506,7 +507,9 @@ impl CanSpec {
     pub fn channels(&self) -> usize {
         match &self.protocol {
             CanProtocol::Raw => 0,
-            CanProtocol::Damiao(damiao) => MOTOR_CHANNELS * damiao.motors.len(),
+            CanProtocol::Damiao(damiao) => {
+                MOTOR_CHANNELS * damiao.motors.len() + damiao.effector.as_ref().map_or(0, |effector| effector.numbers())
+            }
         }
     }
 }

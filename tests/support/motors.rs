@@ -230,6 +230,7 @@ pub(crate) fn spec(count: u16) -> DamiaoSpec {
         disable_after: Some(Duration::from_secs(5)),
         timeout: Duration::from_secs(2),
         silent_after: Duration::from_secs(2),
+        effector: None,
         ..motor_spec::bus((1..=count).map(motor).collect())
     }
 }

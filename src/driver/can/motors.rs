@@ -6,6 +6,7 @@
 //! Invariant: whatever ends the driver, the motors are ordered to turn off: see `control_loop`.
 
 mod control_loop;
+mod effector;
 mod powered;
 mod statistics;
 
@@ -18,16 +19,18 @@ use tokio::sync::mpsc;
 use super::claim::Claim;
 use super::guard::Guard;
 use super::link::{Link, LinkError};
-use crate::action::{ActionSource, ActuatorNotice, Order};
+use crate::action::{ActionSource, ActuatorNotice, MAX_ACTION, Order};
 use crate::control::motors::SAMPLE_VALUES;
 use crate::device::DeviceNode;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
+use crate::kinematics::Arm;
 use crate::panics::CONTROL_THREAD;
 use crate::permission::Attended;
 use crate::provenance::{Format, Negotiated};
-use crate::registry::{CanSpec, DamiaoSpec, MAX_MOTORS};
+use crate::registry::{CanSpec, DamiaoSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use control_loop::{ControlLoop, Sample, Shared};
+use effector::Effector;
 use powered::Powered;
 pub use statistics::Punctuality;
 
@@ -45,7 +48,9 @@ pub struct Motors {
     notices: Option<mpsc::Receiver<ActuatorNotice>>,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
-    payload: [u8; MAX_MOTORS * SAMPLE_VALUES * 8],
+    /// The arm that they move, if actions are poses of its tip.
+    effector: Option<Effector>,
+    payload: [u8; MAX_ACTION * 8],
 }
 
 impl Motors {
@@ -56,6 +61,8 @@ impl Motors {
     pub async fn open(spec: &CanSpec, motors: &DamiaoSpec, node: &DeviceNode) -> Result<Self, DriverError> {
         let (can, node, motors) = (spec.clone(), node.clone(), motors.clone());
         unblock(move || {
+            let arm = motors.effector.as_ref().map(|effector| Arm::open(effector, &motors.motors)).transpose();
+            let arm = arm.map_err(|error| DriverError::Fatal(error.to_string()))?;
             let claim = match &node {
                 // Before the interface is brought up, and the first frame.
                 DeviceNode::Net(name) => Some(Claim::take(name).map_err(LinkError::into_driver)?),
@@ -68,7 +75,7 @@ impl Motors {
                     "the motors have no guard: if rapid is killed, they stop by their own time limit alone"
                 );
             });
-            Self::begin(Powered::new(link, &motors, guard.ok(), claim), &motors)
+            Self::begin(Powered::new(link, &motors, guard.ok(), claim), &motors, arm)
         })
         .await
     }
@@ -78,10 +85,12 @@ impl Motors {
     /// # Errors
     /// When the system gives no thread.
     pub fn start(link: Link, spec: &DamiaoSpec) -> Result<Self, DriverError> {
-        Self::begin(Powered::new(link, spec, None, None), spec)
+        let arm = spec.effector.as_ref().map(|effector| Arm::open(effector, &spec.motors)).transpose();
+        let arm = arm.map_err(|error| DriverError::Fatal(error.to_string()))?;
+        Self::begin(Powered::new(link, spec, None, None), spec, arm)
     }
 
-    fn begin(powered: io::Result<Powered>, spec: &DamiaoSpec) -> Result<Self, DriverError> {
+    fn begin(powered: io::Result<Powered>, spec: &DamiaoSpec, arm: Option<Arm>) -> Result<Self, DriverError> {
         let powered =
             powered.map_err(|error| DriverError::Retry(format!("no thread for the motors' brakes: {error}")))?;
         let description = format!("{}, {} motors at {} Hz", powered.description(), spec.motors.len(), spec.hz);
@@ -91,8 +100,8 @@ impl Motors {
         let control_loop = ControlLoop::new(powered, spec, reported, notify, Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || control_loop.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
-        let format =
-            Format::Messages { baud: None, channels: spec.motors.len() * SAMPLE_VALUES, hz: Some(f64::from(spec.hz)) };
+        let channels = spec.motors.len() * SAMPLE_VALUES + arm.as_ref().map_or(0, Arm::numbers);
+        let format = Format::Messages { baud: None, channels, hz: Some(f64::from(spec.hz)) };
         let negotiated = Negotiated { card: Some(description.clone()), format: Some(format), ..Negotiated::default() };
         Ok(Self {
             agreed: Agreed { description, negotiated },
@@ -101,7 +110,8 @@ impl Motors {
             notices: Some(notices),
             shared,
             thread: Some(thread),
-            payload: [0; MAX_MOTORS * SAMPLE_VALUES * 8],
+            effector: arm.map(|arm| Effector::new(arm, spec.motors.len())),
+            payload: [0; MAX_ACTION * 8],
         })
     }
 
@@ -111,7 +121,15 @@ impl Motors {
     /// When the adapter is gone or cannot be used any more.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         let Some(sample) = self.samples.recv().await else { return Err(self.shared.reason()) };
-        let values = sample.values.get(..self.axes * SAMPLE_VALUES).unwrap_or_default();
+        let mut values = [0.0; MAX_ACTION];
+        let mut count = self.axes * SAMPLE_VALUES;
+        if let Some((motors, tip)) = values.split_at_mut_checked(count) {
+            motors.copy_from_slice(sample.values.get(..count).unwrap_or_default());
+            if let Some(effector) = &self.effector {
+                count += effector.look(motors, tip);
+            }
+        }
+        let values = values.get(..count).unwrap_or_default();
         for (place, value) in self.payload.chunks_exact_mut(8).zip(values) {
             place.copy_from_slice(&value.to_le_bytes());
         }
@@ -132,8 +150,16 @@ impl Motors {
         let _ = self.shared.attended.set(Arc::clone(orders));
     }
 
-    /// Follows these actions from now on: a number for each motor, rad or rad/s. Thread `control` waits for them itself.
+    /// Follows these actions from now on: a number for each motor, rad or rad/s, or poses of the tip of an arm. Thread
+    /// `control` waits for them itself.
     pub fn follow(&mut self, actions: Arc<dyn ActionSource>) {
+        let actions = match &mut self.effector {
+            None => actions,
+            Some(effector) => match effector.follow(actions) {
+                Ok(targets) => targets,
+                Err(error) => return tracing::error!(%error, "no thread `effector`: the arm follows no actions"),
+            },
+        };
         // As above.
         let _ = self.shared.actions.set(actions);
     }

@@ -4,8 +4,13 @@ use std::sync::Arc;
 
 use tokio::sync::mpsc;
 
+#[cfg(feature = "motors")]
+use crate::action::MAX_ACTION;
 use crate::action::{ActuatorNotice, Arming, Order};
-use crate::registry::MOTOR_CHANNELS;
+use crate::driver::DriverError;
+#[cfg(feature = "motors")]
+use crate::kinematics::{Arm, Solver};
+use crate::registry::{CanProtocol, CanSpec, MOTOR_CHANNELS};
 
 /// Queue length for notices.
 const NOTICES: usize = 16;
@@ -19,12 +24,31 @@ pub(in crate::driver) struct Joints {
     notices: Option<mpsc::Sender<ActuatorNotice>>,
     /// Names of the emergency stops to which orders refer.
     stops: Arc<[Arc<str>]>,
+    /// The arm that they move, if actions are poses of its tip.
+    #[cfg(feature = "motors")]
+    arm: Option<(Arm, Solver)>,
 }
 
 impl Joints {
     /// `count` motors, disarmed.
     pub(super) fn new(count: usize) -> Self {
         Self { positions: vec![0.0; count], ..Self::default() }
+    }
+
+    /// The motors of an adapter.
+    ///
+    /// # Errors
+    /// When the description of their arm does not fit.
+    pub(super) fn of(can: &CanSpec) -> Result<Self, DriverError> {
+        let CanProtocol::Damiao(motors) = &can.protocol else { return Ok(Self::default()) };
+        let joints = Self::new(motors.motors.len());
+        #[cfg(feature = "motors")]
+        if let Some(effector) = &motors.effector {
+            let arm = Arm::open(effector, &motors.motors).map_err(|error| DriverError::Fatal(error.to_string()))?;
+            let solver = arm.solver();
+            return Ok(Self { arm: Some((arm, solver)), ..joints });
+        }
+        Ok(joints)
     }
 
     /// Number of motors.
@@ -34,6 +58,16 @@ impl Joints {
 
     /// Takes an action; false if it does not fit these motors.
     pub(super) fn command(&mut self, target: &[f64]) -> bool {
+        #[cfg(feature = "motors")]
+        if let Some((_, solver)) = &mut self.arm {
+            if self.is_armed
+                && let Ok(targets) = solver.targets(target, &self.positions)
+            {
+                self.positions.iter_mut().zip(targets).for_each(|(position, target)| *position = target);
+                self.has_moved = true;
+            }
+            return true;
+        }
         if self.positions.is_empty() || self.positions.len() != target.len() {
             return false;
         }
@@ -74,15 +108,33 @@ impl Joints {
         receiver
     }
 
-    /// Writes each position before the motor's other values in a sample, once there was a target.
+    /// Writes each position before the motor's other values in a sample, once there was a target; and behind them the pose
+    /// of the tip of their arm.
     pub(super) fn write(&self, payload: &mut [u8]) {
-        if !self.has_moved {
-            return;
-        }
-        for (motor, position) in payload.chunks_exact_mut(8 * MOTOR_CHANNELS).zip(&self.positions) {
+        let motors = payload.chunks_exact_mut(8 * MOTOR_CHANNELS).zip(&self.positions);
+        for (motor, position) in motors.filter(|_| self.has_moved) {
             if let Some((place, _)) = motor.split_first_chunk_mut() {
                 *place = position.to_le_bytes();
             }
+        }
+        self.write_tip(payload);
+    }
+
+    #[cfg(not(feature = "motors"))]
+    #[expect(clippy::unused_self, reason = "the same as with motors")]
+    fn write_tip(&self, _: &mut [u8]) {}
+
+    #[cfg(feature = "motors")]
+    fn write_tip(&self, payload: &mut [u8]) {
+        let Some((arm, _)) = &self.arm else { return };
+        let (mut motors, mut tip) = ([0.0; MAX_ACTION], [0.0; MAX_ACTION]);
+        let count = self.positions.len() * MOTOR_CHANNELS;
+        for (number, bytes) in motors.iter_mut().zip(payload.as_chunks().0).take(count) {
+            *number = f64::from_le_bytes(*bytes);
+        }
+        arm.state(&motors, &mut tip);
+        for (bytes, number) in payload.as_chunks_mut().0.iter_mut().skip(count).zip(tip).take(arm.numbers()) {
+            *bytes = number.to_le_bytes();
         }
     }
 }

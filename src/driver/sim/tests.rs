@@ -128,7 +128,7 @@ async fn simulated_motors_reach_the_commanded_position() {
     assert!(check(arm, &sends(11)).is_err());
     let twelve = sends(12);
     check(arm, &twelve).unwrap();
-    let mut sim = Sim::open(twelve).await.unwrap().with_node(&arm.node);
+    let mut sim = Sim::open(twelve).await.unwrap().with_node(&arm.node).unwrap();
     assert!(sim.command(&[0.5]).is_err(), "a target is missing");
     sim.joints.order(crate::action::Order::Arm);
     sim.command(&[0.5, -0.25]).unwrap();
@@ -146,7 +146,7 @@ async fn simulated_byte_streams_match_the_real_device() {
         let spec = registry.named(name).unwrap();
         let source = device(SimSource::Serial { channels: 1, hz: 1000, seed: 0x0102_0304 });
         check(spec, &source).unwrap();
-        let mut sim = Sim::open(source).await.unwrap().with_node(&spec.node);
+        let mut sim = Sim::open(source).await.unwrap().with_node(&spec.node).unwrap();
         for _ in 0..3 {
             let sequence = sim.device.sequence.load(std::sync::atomic::Ordering::Relaxed);
             let reading = sim.read().await.unwrap();

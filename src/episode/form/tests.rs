@@ -111,7 +111,7 @@ fn joints_have_the_quantities_that_are_known() {
         .map(str::to_owned)
         .to_vec();
     let quantities = vec![Quantity::Other, Quantity::Effort, Quantity::Position];
-    let form = Form::Joints(JointsSpec { names: names.clone(), quantities });
+    let form = Form::Joints(JointsSpec { names: names.clone(), quantities, tip: None });
     let numbers = [9.0, 1.0, 0.0, 9.0, f64::NAN, -2.0, 9.0, 3.0, 4.0];
     let states = message(Derived::Joints, &form, &numbers).unwrap();
     let joints = states.get_field_by_name("joints").unwrap().as_list().unwrap().to_vec();

@@ -89,9 +89,11 @@ impl Panels {
                     json!({ "visible": true, "decayTime": TURN_S, "colorMode": "colormap",
                         "colorField": "intensity", "colorMap": "turbo" }),
                 ),
-                Form::Joints(_) | Form::Calibration(_) => return None,
+                Form::Joints(joints) => (joints.tip.as_ref()?.parent.clone(), json!({ "visible": true })),
+                Form::Calibration(_) => return None,
             };
-            Some((format!("{}{}", device.topic, form.ending()), frame, settings))
+            let ending = form.further_ending().unwrap_or(form.ending());
+            Some((format!("{}{ending}", device.topic), frame, settings))
         };
         let shown: Vec<_> = registry.devices.iter().filter_map(shown).collect();
         let (_, frame, _) = shown.first()?;

@@ -6,6 +6,7 @@
 use std::path::Path;
 use std::time::Duration;
 
+use super::effector::{self, EFFECTOR};
 use super::identity::name_problem;
 use super::program::{self, For, Programs};
 use super::verdict::{VerdictTable, Whose};
@@ -27,8 +28,21 @@ const PROCESS: &str = "process";
 /// Keys that state which device an entry identifies.
 pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
 const KEYS: [&str; 9] = [NODE, "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
-const TABLES: [&str; 12] =
-    ["camera", "tty", "can", "lan", "process", "verdict", "action", "pose", "joints", "calibration", "points", STREAM];
+const TABLES: [&str; 13] = [
+    "camera",
+    "tty",
+    "can",
+    "lan",
+    "process",
+    "verdict",
+    "action",
+    "pose",
+    "joints",
+    "calibration",
+    "points",
+    EFFECTOR,
+    STREAM,
+];
 /// The further streams of a camera.
 const STREAM: &str = "stream";
 const NODE: &str = "node";
@@ -210,7 +224,7 @@ fn draft<'a>(
     programs: Programs<'_>,
 ) -> Draft<'a> {
     let mut heartbeat = None;
-    let settings = match kind {
+    let mut settings = match kind {
         Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section))),
         Some(Kind::Serial) => node::serial(&section).map(NodeSpec::Serial),
         Some(Kind::Can) => node::can(&section).map(NodeSpec::Can),
@@ -228,6 +242,15 @@ fn draft<'a>(
     if kind.is_some_and(|kind| kind != Kind::Can) && section.has("can") {
         let message = format!("only a CAN adapter has a table [{}]", section.child("can"));
         section.report("can", message, "remove the table, or write node = \"can\"");
+    }
+    match &mut settings {
+        Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => {
+            damiao.effector = effector::read(&section, damiao, programs).map(Box::new);
+        }
+        Some(_) if section.has(EFFECTOR) => {
+            section.report(EFFECTOR, "only motors move an arm", "remove the table, or write protocol = \"damiao\"");
+        }
+        _ => {}
     }
     let topic = topic(&section).unwrap_or_else(|| default_topic(kind, name));
     let bit = section.integer("bit", 0..=HIGHEST_BIT);

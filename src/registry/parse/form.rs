@@ -6,7 +6,7 @@ use crate::points::PacketFormat;
 use crate::registry::section::Section;
 use crate::registry::spec::{
     CalibrationSpec, CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PointsSpec,
-    PoseLayout, PoseSpec, Quantity,
+    PoseLayout, PoseSpec, Quantity, TipForm,
 };
 
 const POSE: &str = "pose";
@@ -75,6 +75,10 @@ fn of_node(node: &NodeSpec) -> Option<Form> {
         NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. }) => Some(Form::Joints(JointsSpec {
             names: damiao.motors.iter().map(|motor| motor.name.clone()).collect(),
             quantities: OF_A_MOTOR.to_vec(),
+            tip: damiao.effector.as_ref().map(|effector| TipForm {
+                parent: effector.frame.clone().unwrap_or_else(|| WORLD.to_owned()),
+                has_opening: effector.gripper.is_some(),
+            }),
         })),
         NodeSpec::Lan(LanSpec { protocol: LanProtocol::Iphone { stream: PhoneStream::Pose, .. }, .. }) => {
             Some(Form::Pose(PoseSpec { layout: PoseLayout::Columns, parent: WORLD.to_owned() }))
@@ -186,7 +190,7 @@ fn joints(table: &Section<'_>) -> Option<JointsSpec> {
     if let Some((_, name)) = twice {
         return table.refuse("names", format!("joint {name:?} is in the list twice"), "name it once");
     }
-    Some(JointsSpec { names, quantities })
+    Some(JointsSpec { names, quantities, tip: None })
 }
 
 fn quantities(table: &Section<'_>) -> Option<Vec<Quantity>> {

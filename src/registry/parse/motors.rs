@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::effector;
 use super::input::{LEVELS, gpio_line};
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::Section;
@@ -75,6 +76,7 @@ pub(super) fn damiao(table: &Section<'_>) -> Option<DamiaoSpec> {
         disable_after,
         timeout: timeout.unwrap_or(ms(100).max(least)),
         silent_after: silent_after.unwrap_or(ms(40)),
+        effector: None,
     })
 }
 
@@ -362,8 +364,8 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)]) {
     }
 }
 
-/// The axes of the entry's actions. They are derived from its motors, whose limits are applied: an additional
-/// table would have no effect.
+/// The axes of the entry's actions. They are derived from its motors, whose limits are applied, or from the tip of their
+/// arm: an additional table would have no effect.
 pub(super) fn axes(damiao: &DamiaoSpec, section: &Section<'_>) -> ActionSpec {
     if section.has("action") {
         let message = format!("motors take no table [{}]: their axes follow from them", section.child("action"));
@@ -372,6 +374,9 @@ pub(super) fn axes(damiao: &DamiaoSpec, section: &Section<'_>) -> ActionSpec {
             section.child("can")
         );
         section.report("action", message, fix);
+    }
+    if let Some(effector) = &damiao.effector {
+        return effector::axes(effector);
     }
     let range = |motor: &MotorSpec| match motor.mode {
         MotorMode::Velocity => ("rad/s", [-motor.velocity, motor.velocity]),

@@ -50,6 +50,14 @@ impl For {
 type Wrong = (String, String);
 
 impl Programs<'_> {
+    /// The path of a file that the registry names: relative to its own.
+    pub(super) fn file(self, name: &str) -> PathBuf {
+        match self {
+            Self::Beside(registry) => registry.parent().unwrap_or(Path::new("")).join(name),
+            Self::Nowhere => PathBuf::from(name),
+        }
+    }
+
     /// Whether this is a registry whose programs will not be run, such as that of an episode.
     pub(super) const fn are_nowhere(self) -> bool {
         matches!(self, Self::Nowhere)

@@ -5,6 +5,9 @@
 
 use crate::points::PacketFormat;
 
+/// The end of the topic of poses.
+pub const POSE_ENDING: &str = "/pose";
+
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Form {
@@ -64,6 +67,31 @@ pub struct JointsSpec {
     pub names: Vec<String>,
     /// What the numbers of each are, in order; none but [`Quantity::Other`] twice.
     pub quantities: Vec<Quantity>,
+    /// The pose of the tip of their arm, if its numbers follow those of the joints.
+    pub tip: Option<TipForm>,
+}
+
+impl JointsSpec {
+    /// The index of the first number after those of the joints.
+    pub fn end(&self) -> usize {
+        self.names.len().saturating_mul(self.quantities.len())
+    }
+}
+
+/// The pose of the tip of an arm: position, opening of the gripper if it has one, quaternion `x y z w`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TipForm {
+    /// The frame in which it is given, default `world`.
+    pub parent: String,
+    /// The opening is there.
+    pub has_opening: bool,
+}
+
+impl TipForm {
+    /// How many numbers it has.
+    pub const fn numbers(&self) -> usize {
+        7 + if self.has_opening { 1 } else { 0 }
+    }
 }
 
 /// What a number of a joint is.
@@ -99,7 +127,7 @@ impl Form {
     pub fn numbers(&self) -> usize {
         match self {
             Self::Pose(pose) => pose.layout.numbers(),
-            Self::Joints(joints) => joints.names.len().saturating_mul(joints.quantities.len()),
+            Self::Joints(joints) => joints.end().saturating_add(joints.tip.as_ref().map_or(0, TipForm::numbers)),
             Self::Calibration(_) | Self::Points(_) => 0,
         }
     }
@@ -107,10 +135,18 @@ impl Form {
     /// The end of the topic with its messages, after the topic of the device.
     pub const fn ending(&self) -> &'static str {
         match self {
-            Self::Pose(_) => "/pose",
+            Self::Pose(_) => POSE_ENDING,
             Self::Joints(_) => "/joints",
             Self::Calibration(_) => "/calibration",
             Self::Points(_) => "/points",
+        }
+    }
+
+    /// That of another topic with messages of the same samples.
+    pub const fn further_ending(&self) -> Option<&'static str> {
+        match self {
+            Self::Joints(JointsSpec { tip: Some(_), .. }) => Some(POSE_ENDING),
+            _ => None,
         }
     }
 }

@@ -27,6 +27,68 @@ pub struct DamiaoSpec {
     /// A motor that leaves frames unanswered for this long is silent, default 40 ms: with two cycles at 200 Hz it is
     /// reported within 50 ms.
     pub silent_after: Duration,
+    /// The arm that the motors are the joints of, if actions are poses of its tip.
+    pub effector: Option<Box<EffectorSpec>>,
+}
+
+/// `[device.NAME.effector]`: an arm whose actions are poses of its tip, and whose samples end with that pose.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EffectorSpec {
+    /// The description of the arm, a URDF file. Each of its joints between `frame` and `tip` that moves has the name of a
+    /// motor.
+    pub urdf: PathBuf,
+    /// The link in whose frame poses are given; `None` is the root of the description.
+    pub frame: Option<String>,
+    /// The link whose pose is commanded and reported.
+    pub tip: String,
+    /// How the tip is turned.
+    pub rotation: TipRotation,
+    /// The angle about the z axis of `frame` is whatever the arm makes of it: an arm of five joints has no choice.
+    pub free_yaw: bool,
+    /// What opens and closes at the tip.
+    pub gripper: Option<GripperSpec>,
+    /// Lowest position that is commanded, m: x, y, z in `frame`.
+    pub min: [f64; 3],
+    /// Highest position that is commanded, each above the lowest.
+    pub max: [f64; 3],
+}
+
+impl EffectorSpec {
+    /// Numbers of a sample after those of the motors: position, opening if there is a gripper, quaternion `x y z w`.
+    pub const fn numbers(&self) -> usize {
+        7 + if self.gripper.is_some() { 1 } else { 0 }
+    }
+
+    /// Coordinates of the tip that are commanded: as many joints are needed.
+    pub const fn commanded(&self) -> usize {
+        match self.rotation {
+            TipRotation::Free => 3,
+            TipRotation::Commanded | TipRotation::Held(_) if self.free_yaw => 5,
+            TipRotation::Commanded | TipRotation::Held(_) => 6,
+        }
+    }
+}
+
+/// How the tip of an arm is turned.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum TipRotation {
+    /// As the action says: it has a quaternion `x y z w` after the position.
+    Commanded,
+    /// In any way.
+    Free,
+    /// Always so: a quaternion `x y z w` of length 1.
+    Held([f64; 4]),
+}
+
+/// The gripper at the tip of an arm: a motor, and its positions at the opening 0 and 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GripperSpec {
+    /// Its index in [`DamiaoSpec::motors`].
+    pub motor: usize,
+    /// Closed: opening 0, rad; within the position of the motor.
+    pub closed: f64,
+    /// Open: opening 1, rad; likewise, and not the same.
+    pub open: f64,
 }
 
 /// One motor.

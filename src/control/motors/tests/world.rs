@@ -203,6 +203,7 @@ pub(super) fn spec(motors: Vec<MotorSpec>) -> DamiaoSpec {
         disable_after: Some(Duration::from_secs(1)),
         timeout: Duration::from_millis(400),
         silent_after: Duration::from_millis(40),
+        effector: None,
     }
 }
 

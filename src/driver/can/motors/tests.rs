@@ -49,6 +49,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         timeout: Duration::from_millis(400),
         // A busy machine is slower than a bus.
         silent_after: Duration::from_secs(2),
+        effector: None,
     }
 }
 

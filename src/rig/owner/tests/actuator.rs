@@ -34,6 +34,7 @@ fn arm() -> Registry {
         disable_after: Some(Duration::from_secs(1)),
         timeout: Duration::from_millis(100),
         silent_after: Duration::from_millis(40),
+        effector: None,
     };
     let mut registry = registry(Duration::from_millis(100), Duration::from_secs(10));
     registry.devices.truncate(1);

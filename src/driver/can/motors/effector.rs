@@ -1,0 +1,240 @@
+//! Thread `effector`: turns actions, which are poses of the tip of an arm, into targets of its motors.
+//!
+//! It takes actions where the motors would, and thread `control` takes the targets from it ([`Targets`]). The solver needs
+//! up to a millisecond, allocates and locks, which thread `control` must not.
+//!
+//! Invariant: an action whose pose the arm does not reach gives no target: without one in time the motors hold. It is
+//! counted and reported.
+
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec};
+
+use crate::action::{ActionSource, MAX_ACTION, NoAction};
+use crate::bell::Bell;
+use crate::kinematics::{Arm, Solver};
+use crate::registry::{MAX_MOTORS, MOTOR_CHANNELS};
+use crate::time::Stamp;
+
+/// The longest time that an action without a notification waits.
+const LOOK: Duration = Duration::from_millis(10);
+/// Without a target for this long the motors may be elsewhere: the next one is sought from where they are.
+const CONTINUES: Duration = Duration::from_secs(1);
+
+/// The arm of a bus of motors.
+#[derive(Debug)]
+pub(super) struct Effector {
+    arm: Arm,
+    motors: usize,
+    latest: Arc<Latest>,
+    thread: Option<(Arc<AtomicBool>, JoinHandle<()>)>,
+}
+
+/// Where the motors were at the last sample.
+#[derive(Debug, Default)]
+struct Latest {
+    positions: [AtomicU64; MAX_MOTORS],
+    is_known: AtomicBool,
+}
+
+impl Effector {
+    /// For so many motors.
+    pub(super) fn new(arm: Arm, motors: usize) -> Self {
+        Self { arm, motors, latest: Arc::default(), thread: None }
+    }
+
+    /// Takes the state of the motors, and writes the numbers of the tip that follow it in a sample. Returns how many.
+    pub(super) fn look(&self, motors: &[f64], tip: &mut [f64]) -> usize {
+        for (place, position) in self.latest.positions.iter().zip(motors.iter().step_by(MOTOR_CHANNELS)) {
+            place.store(position.to_bits(), Ordering::Relaxed);
+        }
+        self.latest.is_known.store(true, Ordering::Release);
+        self.arm.state(motors, tip);
+        self.arm.numbers()
+    }
+
+    /// Starts the thread; returns where thread `control` takes its targets.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub(super) fn follow(&mut self, actions: Arc<dyn ActionSource>) -> std::io::Result<Arc<dyn ActionSource>> {
+        self.stop();
+        let (targets, stop) = (Arc::new(Targets::new(self.motors)), Arc::<AtomicBool>::default());
+        let worker = Worker {
+            solver: self.arm.solver(),
+            motors: self.motors,
+            actions,
+            latest: Arc::clone(&self.latest),
+            targets: Arc::clone(&targets),
+            stop: Arc::clone(&stop),
+        };
+        let thread = std::thread::Builder::new().name("effector".to_owned()).spawn(move || worker.run())?;
+        self.thread = Some((stop, thread));
+        Ok(targets)
+    }
+
+    fn stop(&mut self) {
+        if let Some((stop, thread)) = self.thread.take() {
+            stop.store(true, Ordering::Release);
+            // Its panic has been reported; the motors hold without its targets.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Drop for Effector {
+    /// Waits for the action that is being solved, some 10 ms at most.
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+/// The thread.
+struct Worker {
+    solver: Solver,
+    motors: usize,
+    actions: Arc<dyn ActionSource>,
+    latest: Arc<Latest>,
+    targets: Arc<Targets>,
+    stop: Arc<AtomicBool>,
+}
+
+impl Worker {
+    fn run(mut self) {
+        let mut last: Option<(Stamp, [f64; MAX_MOTORS])> = None;
+        let (mut solved, mut held) = (0_u64, 0_u64);
+        while !self.stop.load(Ordering::Acquire) {
+            let mut action = [0.0; MAX_ACTION];
+            match self.actions.newest(&mut action) {
+                Ok(None) => self.wait(),
+                Ok(Some((action, tick))) => {
+                    let now = Stamp::now();
+                    let from = match last {
+                        Some((at, targets)) if now.since(at) < CONTINUES => Some(targets),
+                        _ => self.where_they_are(),
+                    };
+                    // Before the first sample the motors have no position.
+                    let Some(from) = from else { continue };
+                    if let Ok(targets) = self.solver.targets(action, &from) {
+                        solved += 1;
+                        last = Some((now, targets));
+                        self.targets.give(tick, targets.get(..self.motors).unwrap_or_default());
+                    } else {
+                        held += 1;
+                        self.targets.refuse(NoAction::OutOfReach);
+                    }
+                }
+                Err(refused) => self.targets.refuse(refused),
+            }
+        }
+        if solved + held > 0 {
+            tracing::info!("thread `effector`: {solved} poses reached, {held} out of reach");
+        }
+    }
+
+    /// Until an action may have arrived.
+    fn wait(&self) {
+        let Some(bell) = self.actions.bell() else { return std::thread::sleep(LOOK) };
+        // So short a time has this form; an interrupted wait is repeated.
+        let limit = Timespec::try_from(LOOK).unwrap_or_default();
+        let _ = rustix::event::poll(&mut [PollFd::new(&bell, PollFlags::IN)], Some(&limit));
+    }
+
+    fn where_they_are(&self) -> Option<[f64; MAX_MOTORS]> {
+        let is_known = self.latest.is_known.load(Ordering::Acquire);
+        is_known
+            .then(|| self.latest.positions.each_ref().map(|position| f64::from_bits(position.load(Ordering::Relaxed))))
+    }
+}
+
+/// The newest target, from thread `effector` to thread `control`: a seqlock, so that neither waits for the other.
+#[derive(Debug)]
+struct Targets {
+    motors: usize,
+    /// Odd while it is written.
+    version: AtomicU32,
+    /// The version that was taken last.
+    taken: AtomicU32,
+    tick: AtomicU64,
+    positions: [AtomicU64; MAX_MOTORS],
+    /// Which refusal, if it is not a target: 1 + its place in [`REFUSALS`].
+    refused: AtomicU32,
+    bell: Bell,
+}
+
+const REFUSALS: [NoAction; 3] = [NoAction::NoNumbers, NoAction::Foreign, NoAction::OutOfReach];
+
+impl Targets {
+    fn new(motors: usize) -> Self {
+        Self {
+            motors,
+            version: AtomicU32::new(0),
+            taken: AtomicU32::new(0),
+            tick: AtomicU64::new(0),
+            positions: Default::default(),
+            refused: AtomicU32::new(0),
+            bell: Bell::default(),
+        }
+    }
+
+    /// Only thread `effector` calls this.
+    fn give(&self, tick: Stamp, targets: &[f64]) {
+        self.write(|| {
+            self.refused.store(0, Ordering::Relaxed);
+            self.tick.store(tick.0, Ordering::Relaxed);
+            for (place, target) in self.positions.iter().zip(targets) {
+                place.store(target.to_bits(), Ordering::Relaxed);
+            }
+        });
+    }
+
+    /// Likewise.
+    fn refuse(&self, refused: NoAction) {
+        let place = REFUSALS.iter().position(|known| *known == refused).unwrap_or_default();
+        self.write(|| self.refused.store(u32::try_from(place).unwrap_or_default() + 1, Ordering::Relaxed));
+    }
+
+    fn write(&self, values: impl FnOnce()) {
+        self.version.fetch_add(1, Ordering::Relaxed);
+        fence(Ordering::Release);
+        values();
+        self.version.fetch_add(1, Ordering::Release);
+        self.bell.ring();
+    }
+}
+
+impl ActionSource for Targets {
+    fn bell(&self) -> Option<BorrowedFd<'_>> {
+        self.bell.descriptor()
+    }
+
+    fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
+        self.bell.silence();
+        let version = self.version.load(Ordering::Acquire);
+        // One that is being written rings when it is whole.
+        if version % 2 == 1 || version == self.taken.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
+        for (place, position) in action.iter_mut().zip(&self.positions) {
+            *place = f64::from_bits(position.load(Ordering::Relaxed));
+        }
+        let (tick, refused) = (self.tick.load(Ordering::Relaxed), self.refused.load(Ordering::Relaxed));
+        fence(Ordering::Acquire);
+        if self.version.load(Ordering::Relaxed) != version {
+            return Ok(None);
+        }
+        self.taken.store(version, Ordering::Relaxed);
+        let refused = usize::try_from(refused).ok().and_then(|place| place.checked_sub(1));
+        match refused.and_then(|place| REFUSALS.get(place)) {
+            Some(refused) => Err(*refused),
+            None => Ok(action.get(..self.motors).map(|targets| (targets, Stamp(tick)))),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

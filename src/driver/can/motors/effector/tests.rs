@@ -1,0 +1,129 @@
+use std::collections::VecDeque;
+use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
+
+use super::*;
+use crate::registry::{CanProtocol, CanSpec, NodeSpec, Registry};
+
+/// The arm of the tests, as `tests/arm/devices.toml` declares it.
+fn effector() -> Effector {
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/arm");
+    let registry = Registry::load(&folder.join("devices.toml")).unwrap_or_else(|error| panic!("{error}")).registry;
+    let arm = registry.named("arm").expect("an arm");
+    let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &arm.node else { panic!("{arm:?}") };
+    let arm = Arm::open(motors.effector.as_deref().expect("an effector"), &motors.motors).expect("it fits");
+    Effector::new(arm, motors.motors.len())
+}
+
+/// Actions in the order in which they are given; without a bell.
+#[derive(Debug, Default)]
+struct Given(Mutex<VecDeque<Result<(Vec<f64>, Stamp), NoAction>>>);
+
+impl Given {
+    fn add(&self, action: Result<(Vec<f64>, Stamp), NoAction>) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push_back(action);
+    }
+}
+
+impl ActionSource for Given {
+    fn bell(&self) -> Option<BorrowedFd<'_>> {
+        None
+    }
+
+    fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
+        let Some(given) = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop_front() else { return Ok(None) };
+        let (numbers, tick) = given?;
+        action[..numbers.len()].copy_from_slice(&numbers);
+        Ok(Some((&action[..numbers.len()], tick)))
+    }
+}
+
+/// The next target, or why there is none.
+fn next(targets: &Arc<dyn ActionSource>) -> Result<(Vec<f64>, Stamp), NoAction> {
+    let begun = Instant::now();
+    loop {
+        let mut action = [0.0; MAX_ACTION];
+        if let Some((found, tick)) = targets.newest(&mut action)? {
+            return Ok((found.to_vec(), tick));
+        }
+        assert!(begun.elapsed() < Duration::from_mins(3), "no target");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Numbers of the motors, at a pose with the tool downwards.
+fn folded() -> Vec<f64> {
+    let positions = [0.1, 0.8, 1.2, std::f64::consts::PI - 2.0, 0.3, 0.5];
+    positions.iter().flat_map(|position| [*position, 0.0, 0.0, 0.0, 0.0, 0.0]).collect()
+}
+
+#[test]
+fn poses_become_targets_with_their_ticks_and_what_is_out_of_reach_none() {
+    let mut effector = effector();
+    let mut tip = [0.0; 8];
+    assert_eq!(effector.look(&folded(), &mut tip), 8);
+    let actions = Arc::<Given>::default();
+    let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
+    let pose = |by: f64| vec![tip[0] + by, tip[1], tip[2], 1.0];
+    actions.add(Ok((pose(0.0), Stamp(7))));
+    let (found, tick) = next(&targets).expect("a target");
+    assert_eq!((found.len(), tick), (6, Stamp(7)));
+    for (found, wanted) in found.iter().zip(folded().iter().step_by(MOTOR_CHANNELS)).take(4) {
+        assert!((found - wanted).abs() < 0.01, "{found} {wanted}");
+    }
+    assert!((found[5] - 1.2).abs() < 1e-9, "open: {found:?}");
+    // Nothing is given twice.
+    assert!(matches!(targets.newest(&mut [0.0; MAX_ACTION]), Ok(None)));
+    for (given, wanted) in [
+        (Ok((pose(9.0), Stamp(8))), None),
+        (Ok((vec![0.0; 2], Stamp(8))), Some(NoAction::OutOfReach)),
+        (Err(NoAction::Foreign), Some(NoAction::Foreign)),
+        (Err(NoAction::NoNumbers), Some(NoAction::NoNumbers)),
+    ] {
+        actions.add(given);
+        // The box of positions holds the first of them where the arm may or may not reach.
+        let found = next(&targets);
+        assert!(wanted.is_none() || found == Err(wanted.expect("a refusal")), "{found:?}");
+    }
+    actions.add(Ok((pose(0.02), Stamp(9))));
+    assert_eq!(next(&targets).expect("a target").1, Stamp(9));
+    drop(effector);
+}
+
+#[test]
+fn before_the_first_sample_there_is_no_target() {
+    let mut effector = effector();
+    let actions = Arc::<Given>::default();
+    let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
+    actions.add(Ok((vec![0.4, 0.0, 0.4, 1.0], Stamp(1))));
+    let begun = Instant::now();
+    while !actions.0.lock().unwrap_or_else(PoisonError::into_inner).is_empty() {
+        assert!(begun.elapsed() < Duration::from_mins(3), "it is not taken");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    drop(effector);
+    assert!(matches!(targets.newest(&mut [0.0; MAX_ACTION]), Ok(None)));
+}
+
+/// A reader never sees half of one target and half of another.
+#[test]
+fn a_target_is_read_whole_or_not_at_all() {
+    let targets = Arc::new(Targets::new(6));
+    let writer = std::thread::spawn({
+        let targets = Arc::clone(&targets);
+        move || {
+            for round in 1..200_000_u32 {
+                targets.give(Stamp(u64::from(round)), &[f64::from(round); 6]);
+            }
+        }
+    });
+    let mut last = 0.0;
+    while !writer.is_finished() {
+        let mut action = [0.0; MAX_ACTION];
+        let Ok(Some((found, tick))) = targets.newest(&mut action) else { continue };
+        assert!(found.iter().all(|number| *number == found[0]), "{found:?}");
+        assert!(found[0] > last && tick == Stamp(found[0] as u64), "{found:?} {tick:?}");
+        last = found[0];
+    }
+    writer.join().expect("no panic");
+}

@@ -1,0 +1,200 @@
+//! Poses against another computation of them, and targets against poses.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::registry::{
+    CanProtocol, CanSpec, DamiaoSpec, EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, NodeSpec, Registry, TipRotation,
+};
+
+const URDF: &str = include_str!("../../tests/arm/arm.urdf");
+const JOINTS: [&str; 5] = ["waist", "lift", "elbow", "pitch", "roll"];
+
+/// A registry with the arm of the tests; `more` are further keys of its table.
+fn motors(more: &str) -> DamiaoSpec {
+    let motor = |(at, name): (usize, &str)| {
+        let slave = at + 1;
+        format!("{{ name = \"{name}\", slave = {slave}, type = \"DM4310\", kp = 20, kd = 1, position = [-3, 3] }}")
+    };
+    let list: Vec<_> = JOINTS.into_iter().chain(["jaw"]).enumerate().map(motor).collect();
+    let text = format!(
+        "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\nprotocol = \"damiao\"\n\
+         motors = [{}]\n[device.arm.effector]\nurdf = \"arm.urdf\"\ntip = \"tool\"\nmin = [-2, -2, 0]\nmax = [2, 2, 2]\n\
+         gripper = \"jaw\"\nclosed = 0.0\nopen = 1.0\n{more}\n",
+        list.join(", ")
+    );
+    let registry = Registry::parse(&text, None).unwrap_or_else(|error| panic!("{error}")).registry;
+    match registry.devices.into_iter().next().expect("a device").node {
+        NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) => motors,
+        node => panic!("{node:?}"),
+    }
+}
+
+fn arm(more: &str) -> Arm {
+    let motors = motors(more);
+    Arm::of(motors.effector.as_deref().expect("an effector"), &motors.motors, URDF).expect("it fits")
+}
+
+/// A sample of the motors at these positions.
+fn sample(positions: &[f64]) -> Vec<f64> {
+    positions.iter().flat_map(|position| [*position, 0.0, 0.0, 0.0, 0.0, 0.0]).collect()
+}
+
+fn state(arm: &Arm, positions: &[f64]) -> [f64; 8] {
+    let mut out = [0.0; 8];
+    assert_eq!(arm.numbers(), out.len());
+    arm.state(&sample(positions), &mut out);
+    out
+}
+
+fn distance(one: &[f64], other: &[f64]) -> f64 {
+    one.iter().zip(other).map(|(one, other)| (one - other).powi(2)).sum::<f64>().sqrt()
+}
+
+const DOWN: &str = "rotation = [0, 1, 0, 0]\nyaw = \"free\"";
+
+#[test]
+fn a_straight_arm_is_as_long_as_its_links() {
+    let found = state(&arm(DOWN), &[0.0, 0.0, 0.0, 0.0, 0.0, 0.5]);
+    let wanted = [-0.2, 0.0, 0.3 + 0.75 + 0.65 + 0.08 + 0.12, 0.5, 0.0, 0.0, 0.0, 1.0];
+    assert!(distance(&found, &wanted) < 1e-12, "{found:?}");
+    // A quarter turn of the lift about y lays it along x.
+    let quarter = std::f64::consts::FRAC_PI_2;
+    let found = state(&arm(DOWN), &[0.0, quarter, 0.0, 0.0, 0.0, 0.0]);
+    assert!(distance(&found[..3], &[1.4, 0.0, 0.3]) < 1e-12, "{found:?}");
+    // And a quarter turn of the waist along y.
+    let found = state(&arm(DOWN), &[quarter, quarter, 0.0, 0.0, 0.0, 0.0]);
+    assert!(distance(&found[..3], &[-0.2, 1.6, 0.3]) < 1e-12, "{found:?}");
+}
+
+#[test]
+fn a_frame_other_than_the_root_is_where_poses_are_given() {
+    let found = state(&arm("frame = \"base\""), &[0.0; 6]);
+    assert!(found[0].abs() < 1e-12, "{found:?}");
+}
+
+proptest! {
+    #[test]
+    fn poses_are_those_of_the_crate(positions in proptest::array::uniform5(-2.5..2.5_f64)) {
+        let arm = arm("");
+        let robot = urdf_rs::read_from_string(URDF).unwrap();
+        let chain = k::Chain::<f64>::from(&robot);
+        let serial = k::SerialChain::from_end(chain.find("tool").unwrap());
+        serial.set_joint_positions(&positions).unwrap();
+        let wanted = serial.end_transform();
+        let found = state(&arm, &[&positions[..], &[0.0]].concat());
+        prop_assert!(distance(&found[..3], wanted.translation.vector.as_slice()) < 1e-9);
+        let same = found[4..].iter().zip(wanted.rotation.coords.as_slice()).map(|(one, other)| one * other).sum::<f64>();
+        prop_assert!((same.abs() - 1.0).abs() < 1e-9, "{found:?} {wanted:?}");
+    }
+
+    /// What the motors are ordered to is where the tip was asked to be, for every pose that the arm has near by.
+    #[test]
+    fn targets_lead_to_the_pose(
+        waist in -2.5..2.5_f64, lift in 0.3..1.2_f64, elbow in 0.5..1.9_f64, roll in -2.0..2.0_f64, by in proptest::array::uniform5(-0.1..0.1_f64), opening in 0.0..1.0_f64,
+    ) {
+        let arm = arm(DOWN);
+        // The tool points down.
+        let pitch = std::f64::consts::PI - lift - elbow;
+        prop_assume!(pitch.abs() < 2.5);
+        let there = [waist, lift, elbow, pitch, roll, 0.0];
+        let wanted = state(&arm, &there);
+        let mut from = [0.0; MAX_MOTORS];
+        for (place, (position, by)) in from.iter_mut().zip(there.iter().zip(by)) {
+            *place = position + by;
+        }
+        let action = [wanted[0], wanted[1], wanted[2], opening];
+        let targets = arm.solver().targets(&action, &from).expect("it is there");
+        let found = state(&arm, &targets[..6]);
+        prop_assert!(distance(&found[..3], &wanted[..3]) < 2e-4, "{found:?} {wanted:?}");
+        prop_assert!((found[3] - opening).abs() < 1e-9);
+        // The z axis of the tool, which points down.
+        let [x, y, ..] = [found[4], found[5]];
+        prop_assert!(1.0 - 2.0 * (x * x + y * y) < -0.999, "{found:?}");
+        // And near where they were.
+        prop_assert!(distance(&targets[..5], &from[..5]) < 1.0, "{targets:?} {from:?}");
+    }
+
+    /// No action and no state of the motors gives a target that is not finite or beyond the limits.
+    #[test]
+    fn targets_are_within_the_limits_or_none(
+        action in proptest::collection::vec(proptest::num::f64::ANY, 0..9),
+        from in proptest::array::uniform6(proptest::num::f64::ANY),
+        kind in 0..3_usize,
+    ) {
+        let arm = arm(["", DOWN, "rotation = \"commanded\"\nyaw = \"free\""][kind]);
+        let mut places = [0.0; MAX_MOTORS];
+        places[..6].copy_from_slice(&from);
+        if let Ok(targets) = arm.solver().targets(&action, &places) {
+            prop_assert!(targets[..5].iter().all(|target| (-3.0..=3.0).contains(target)), "{targets:?}");
+            prop_assert!((0.0..=1.0).contains(&targets[5]), "{targets:?}");
+        }
+    }
+}
+
+#[test]
+fn what_is_out_of_reach_or_singular_gives_no_target() {
+    let arm = arm(DOWN);
+    let mut from = [0.0; MAX_MOTORS];
+    from[..6].copy_from_slice(&[0.0, 0.8, 1.2, 1.14, 0.0, 0.0]);
+    let far = [1.9, 1.9, 1.9, 0.0];
+    assert_eq!(arm.solver().targets(&far, &from), Err(OutOfReach));
+    // Straight up, every joint but the waist and the roll only turns the tip in one plane.
+    let straight = [0.0; MAX_MOTORS];
+    assert_eq!(arm.solver().targets(&[-0.2, 0.4, 1.0, 0.0], &straight), Err(OutOfReach));
+    assert_eq!(arm.solver().targets(&[f64::NAN, 0.4, 1.0, 0.0], &from), Err(OutOfReach));
+    assert_eq!(arm.solver().targets(&[0.4, 0.4, 1.0], &from), Err(OutOfReach), "an action without an opening");
+}
+
+#[test]
+fn a_description_that_does_not_fit_is_refused_by_name() {
+    let motors = motors(DOWN);
+    let effector = motors.effector.as_deref().expect("an effector");
+    let refused = |spec: &EffectorSpec, urdf: &str| Arm::of(spec, &motors.motors, urdf).expect_err(urdf).to_string();
+    let with = |tip: &str, frame: Option<&str>| EffectorSpec {
+        tip: tip.to_owned(),
+        frame: frame.map(str::to_owned),
+        ..effector.clone()
+    };
+    let swapped = |from: &str, to: &str| {
+        assert!(URDF.contains(from), "{from}");
+        URDF.replacen(from, to, 1)
+    };
+    for (spec, urdf, words) in [
+        (effector.clone(), "<robot".to_owned(), "not a robot description"),
+        (effector.clone(), String::new(), "not a robot description"),
+        (with("hand", None), URDF.to_owned(), "no link \"hand\""),
+        (with("tool", Some("floor")), URDF.to_owned(), "no link \"floor\""),
+        (with("base", Some("tool")), URDF.to_owned(), "link \"base\" is not attached to link \"tool\""),
+        (with("wrist", None), URDF.to_owned(), "motor \"roll\" is no joint"),
+        (with("finger", None), URDF.to_owned(), "joint \"jaw\" moves the tip, and no motor"),
+        (effector.clone(), swapped("name=\"elbow\" type", "name=\"ellbow\" type"), "joint \"ellbow\" moves the tip"),
+        (effector.clone(), swapped("<axis xyz=\"0 1 0\"/>", "<axis xyz=\"0 0 0\"/>"), "joint \"lift\" has an axis"),
+        (effector.clone(), swapped("lower=\"-2.5\"", "lower=\"NaN\""), "joint \"lift\" has an axis"),
+        (effector.clone(), swapped("lower=\"-2.5\"", "lower=\"9\""), "joint \"lift\" has an axis"),
+        (
+            effector.clone(),
+            swapped("lower=\"-2.5\" upper=\"2.5\"", "lower=\"4\" upper=\"5\""),
+            "no position of joint \"lift\"",
+        ),
+        (
+            effector.clone(),
+            swapped("\"lift\" type=\"revolute\"", "\"lift\" type=\"floating\""),
+            "joint \"lift\" is neither",
+        ),
+        (
+            effector.clone(),
+            swapped("<parent link=\"table\"/>", "<parent link=\"tool\"/>"),
+            "is not attached to link \"the root\"",
+        ),
+    ] {
+        let found = refused(&spec, &urdf);
+        assert!(found.starts_with("arm.urdf: ") && found.contains(words), "{words}: {found}");
+    }
+    let mimic = swapped("<axis xyz=\"0 1 0\"/>", "<axis xyz=\"0 1 0\"/><mimic joint=\"waist\"/>");
+    assert!(refused(effector, &mimic).contains("joint \"lift\" mimics another"));
+    let absent = Arm::open(effector, &motors.motors).expect_err("there is no such file here").to_string();
+    assert!(absent.starts_with("arm.urdf: "), "{absent}");
+    assert_eq!(effector.rotation, TipRotation::Held([0.0, 1.0, 0.0, 0.0]));
+    assert_eq!(MOTOR_CHANNELS * 6 + effector.numbers(), 44);
+}
