@@ -23,7 +23,7 @@ pub(super) fn read(section: &Section<'_>, damiao: &DamiaoSpec, programs: Program
     table.need("max", "write max = [x, y, z]: the highest position of the tip, m");
     for motor in damiao.motors.iter().filter(|motor| motor.mode == MotorMode::Velocity) {
         let message = format!("motor {} is driven at a velocity, and poses are made of positions", motor.name);
-        section.report(EFFECTOR, message, "write mode = \"mit\" or \"position_velocity\" for it");
+        section.report(EFFECTOR, message, "write mode = \"mit\" or mode = \"position\" for it");
     }
     let free_yaw = table.choice("yaw", &[("commanded", false), ("free", true)]).unwrap_or(false);
     let rotation = if table.has("rotation") { rotation(&table)? } else { TipRotation::Free };

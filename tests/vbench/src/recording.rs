@@ -168,6 +168,11 @@ impl Recording {
         self.topic(topic).map(|message| proto::doubles(&message.data, 2)).collect()
     }
 
+    /// The same, each with its log time.
+    pub fn timed_rows(&self, topic: &str) -> Vec<(u64, Vec<f64>)> {
+        self.topic(topic).map(|message| (message.log_time, proto::doubles(&message.data, 2))).collect()
+    }
+
     /// The frame numbers of a camera topic whose frames were captured in this span of the wall clock.
     pub fn numbers(&self, topic: &str, span: impl RangeBounds<u64>) -> Vec<u64> {
         let within = self.frames(topic).into_iter().filter(|frame| span.contains(&frame.log_time));

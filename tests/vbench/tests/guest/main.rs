@@ -4,6 +4,7 @@
 
 mod accidents;
 mod adapters;
+mod arm;
 mod brake;
 mod buses;
 mod buttons;

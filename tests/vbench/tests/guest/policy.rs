@@ -35,17 +35,17 @@ kind = "scalars"
 channels = 2
 [device.mover.action]
 "#;
-const WRIST: &str = "/rapid/camera/wrist";
-const TACTILE: &str = "/rapid/camera/tactile";
+pub(crate) const WRIST: &str = "/rapid/camera/wrist";
+pub(crate) const TACTILE: &str = "/rapid/camera/tactile";
 const ARM: &str = "/rapid/serial/arm";
 const BITS: [(u32, &str); 4] = [(0, "cam_wrist"), (TACTILE_BIT, "tactile_tip"), (2, "arm"), (3, "mover")];
 const TACTILE_BIT: u32 = 1;
 /// Emulated processors take up to some seconds for a chunk. At the policy's own 10 Hz its actions would be over by then;
 /// at this rate they last, and a chunk is computed in the same way.
-const CONTROL_HZ: f64 = 2.0;
+pub(crate) const CONTROL_HZ: f64 = 2.0;
 const TICK_NS: u64 = 500_000_000;
 /// Of a busy guest.
-const OLDEST_OBSERVATION_MS: u64 = 2_000;
+pub(crate) const OLDEST_OBSERVATION_MS: u64 = 2_000;
 const DENOISING_STEPS: &str = "2";
 /// The same arithmetic in other instructions.
 const TOLERANCE: f64 = 1e-4;
@@ -237,7 +237,7 @@ fn assert_fed(episode: &Recording, topic: &str, device: usize, pictures: &[Vec<u
 fn scenario(demonstration: &Recording, feeds: &[(&str, Vec<Vec<u8>>); 2]) -> Scenario {
     let camera = |pid, serial| DeviceSpec::uvc(0x1209, pid).serial(serial).mode(Format::Mjpg, 96, 96, &[10]);
     let line = |row: &Vec<f64>| row.iter().map(f64::to_string).collect::<Vec<_>>().join(",") + "\n";
-    let mut scenario = Scenario::new("policy")
+    let scenario = Scenario::new("policy")
         .device(camera(0x7a01, "WRIST").feed("/tmp/bench/wrist"))
         .device(camera(0x7a02, "TACTILE").feed("/tmp/bench/tactile"))
         .device(DeviceSpec::acm(0x1209, 0x7a03, 10.0).serial("ARM").feed("/tmp/bench/arm"))
@@ -250,29 +250,35 @@ fn scenario(demonstration: &Recording, feeds: &[(&str, Vec<Vec<u8>>); 2]) -> Sce
         .file("steps", DENOISING_STEPS)
         .limit(Duration::from_secs(480))
         .script(SCRIPT);
-    for name in ["policy.json", "encoder.onnx", "denoiser.onnx"] {
+    bundle(scenario, |policy| {
+        policy["control_hz"] = CONTROL_HZ.into();
+        policy["action"]["actuator"] = "mover".into();
+        policy["max_observation_age_ms"] = OLDEST_OBSERVATION_MS.into();
+    })
+}
+
+/// The scenario with the policy of the repository in its folder `bundle`, changed like this.
+pub(crate) fn bundle(scenario: Scenario, change: impl Fn(&mut Value)) -> Scenario {
+    ["policy.json", "encoder.onnx", "denoiser.onnx"].into_iter().fold(scenario, |scenario, name| {
         let file = Path::new(BUNDLE).join(name);
         let mut contents = std::fs::read(&file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
         if name == "policy.json" {
             let mut policy: Value = serde_json::from_slice(&contents).expect("JSON");
-            policy["control_hz"] = CONTROL_HZ.into();
-            policy["action"]["actuator"] = "mover".into();
-            policy["max_observation_age_ms"] = OLDEST_OBSERVATION_MS.into();
+            change(&mut policy);
             contents = policy.to_string().into();
         }
-        scenario = scenario.file(&format!("bundle/{name}"), contents);
-    }
-    scenario
+        scenario.file(&format!("bundle/{name}"), contents)
+    })
 }
 
-fn pictures(recording: &Recording, topic: &str) -> Vec<Vec<u8>> {
+pub(crate) fn pictures(recording: &Recording, topic: &str) -> Vec<Vec<u8>> {
     let pictures: Vec<_> = recording.topic(topic).map(|message| proto::bytes(&message.data, 2).to_vec()).collect();
     assert!(pictures.len() > 50, "{topic}: {} pictures in the demonstration", pictures.len());
     pictures
 }
 
 /// A demonstration of the simulated task, recorded here and now.
-fn demonstration() -> Recording {
+pub(crate) fn demonstration() -> Recording {
     let folder = std::env::temp_dir().join(format!("vbench-demonstration-{}", std::process::id()));
     let out = folder.to_str().expect("a plain name");
     rapid(&["--sim", "task", "--expert", "--record", "--episodes", "1", "--seed", "1000", "--out", out]);
