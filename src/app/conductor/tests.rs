@@ -87,7 +87,9 @@ impl Bench {
             is_single: true,
             duration,
             begin_episode: record,
+            loaded: CancellationToken::new(),
         };
+        conductor.loaded.cancel();
         let running = Running {
             inference: None,
             live: None,
@@ -151,7 +153,23 @@ async fn until(board: &Board, what: &str, holds: impl Fn(Option<&str>) -> bool) 
 
 /// Lets all other tasks do what they can: the clock of the tests advances when no task has work.
 async fn idle() {
-    tokio::time::sleep(2 * SETTLE_LIMIT).await;
+    tokio::time::sleep(2 * crate::app::settling::LIMIT).await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_time_of_a_run_begins_when_its_policy_is_loaded() {
+    let length = Duration::from_secs(5);
+    let mut bench = Bench::new(false, Some(length), |file| Box::new(file));
+    bench.conductor.loaded = CancellationToken::new();
+    let loaded = bench.conductor.loaded.clone();
+    let begun = Instant::now();
+    let loading = async {
+        tokio::time::sleep(10 * length).await;
+        loaded.cancel();
+    };
+    let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), loading);
+    outcome.unwrap();
+    assert!((11 * length..12 * length).contains(&begun.elapsed()), "{:?}", begun.elapsed());
 }
 
 #[tokio::test(start_paused = true)]
