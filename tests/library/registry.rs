@@ -31,7 +31,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_reported_in_full() {
-    mistakes::check("registry/invalid", "toml", 268, |text| {
+    mistakes::check("registry/invalid", "toml", 285, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });
@@ -246,11 +246,27 @@ fn what_numbers_mean_is_written_or_follows_from_the_device() {
     assert_eq!((camera.distortion.len(), camera.intrinsics[0], camera.intrinsics[5]), (8, 600.5, 240.0));
     let Loaded { registry, .. } = valid("can");
     let motors = registry.devices.iter().find_map(|device| device.form.clone());
-    let Some(Form::Joints(JointsSpec { names, quantities })) = motors else { panic!("motors are joints: {motors:?}") };
+    let Some(Form::Joints(JointsSpec { names, quantities, tip: None })) = motors else { panic!("motors are joints: {motors:?}") };
     assert_eq!((names.len(), quantities), (4, vec![Position, Velocity, Effort, Other, Other, Other]));
     let Loaded { registry, .. } = valid("lan");
     assert_eq!(registry.named("phone_pose").unwrap().form, Some(pose(PoseLayout::Columns, "world")));
     assert_eq!(registry.named("phone").unwrap().form, None, "pictures");
+}
+
+#[test]
+fn the_actions_of_an_arm_are_poses_of_its_tip() {
+    let Loaded { registry, warnings } = valid("effector");
+    assert_eq!(warnings, []);
+    let arm = registry.named("arm").expect("an arm");
+    let action = arm.action.as_ref().expect("actions");
+    assert_eq!(action.names, ["x", "y", "z", "qx", "qy", "qz", "qw", "grip"]);
+    assert_eq!(action.units, ["m", "m", "m", "1", "1", "1", "1", "1"]);
+    assert_eq!(action.min, [-1.0, -1.0, 0.0, -1.0, -1.0, -1.0, -1.0, 0.0]);
+    assert_eq!(action.max, [1.0; 8]);
+    // Six numbers of each of the six motors, and the pose with the opening.
+    assert_eq!((arm.modality().kind, arm.modality().shape), (ModalityKind::Scalars, vec![44]));
+    let Some(Form::Joints(JointsSpec { names, tip: Some(tip), .. })) = &arm.form else { panic!("{:?}", arm.form) };
+    assert_eq!((names.len(), tip.parent.as_str(), tip.has_opening), (6, "base", true));
 }
 
 #[test]
