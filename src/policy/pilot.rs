@@ -68,7 +68,7 @@ impl Pilot {
     /// Observes tick number `number` of the control grid, at `tick`. Returns whether a request to the policy
     /// is due; if so, [`Self::fill`] fills it, and [`ActionQueue::take`] or [`ActionQueue::failed`] must follow.
     pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp) -> bool {
-        let observation_age = self.observer.look(tick, now, self.mask);
+        let observation_age = self.observer.look(number, tick, now, self.mask);
         self.situation = Situation { mask: self.mask, observation_age };
         self.queue.wants_observation(number, self.situation)
     }
