@@ -113,7 +113,7 @@ struct Array {
 
 fn arrays(inputs: ChunkInputs, bundle: &Bundle) -> Vec<Array> {
     let ChunkInputs { observations, mask, noise, step_noise, recorded } = inputs;
-    let chunk = [bundle.horizon, bundle.action.len()];
+    let chunk = [bundle.horizon, bundle.action.outputs()];
     let mut arrays: Vec<Array> =
         observations.into_iter().map(|(name, shape, values)| Array { name, shape, values }).collect();
     arrays.extend(mask.map(|(name, values)| Array { name, shape: vec![1, values.len()], values }));
@@ -122,7 +122,8 @@ fn arrays(inputs: ChunkInputs, bundle: &Bundle) -> Vec<Array> {
         let shape = [&[step_noise.len()], &chunk[..]].concat();
         arrays.push(Array { name: "step_noise".to_owned(), shape, values: step_noise.concat() });
     }
-    arrays.push(Array { name: "recorded".to_owned(), shape: chunk.to_vec(), values: recorded });
+    let executed = vec![bundle.horizon, bundle.action.len()];
+    arrays.push(Array { name: "recorded".to_owned(), shape: executed, values: recorded });
     arrays
 }
 

@@ -32,4 +32,5 @@ pub use spec::{
     MaskSpec, Normalization, ObservationInput, ObservationSpec, Operation, PredictionType, Representation,
     SchedulerKind, SchedulerSpec, SliceNormalization, TimestepSpacing, VectorRotation, VectorSpec, WhenAbsent,
 };
+pub(super) use spec::{POSITION, QUATERNION};
 pub use suits::{Element, GraphShape, TensorShape};
