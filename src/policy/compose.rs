@@ -5,9 +5,9 @@
 //! * `absolute`: the target is A.
 //! * `relative`: T0 A; without a rotation p0 + d.
 //! * `delta`: p + d and D R, with p and R the target of the action before. The action of index `action_start` belongs to
-//!   T0's tick and starts from it: training (`dataset.py`) takes the first pose of a window as the step from that of its
-//!   own tick, and each next one as the step from the target before, which is the pose of its own tick too. Actions
-//!   before `action_start` are past and never executed; T0 stands in their place.
+//!   T0's tick and starts from T0. That is what training learns (`Dataset._actions`): actions up to this index are steps
+//!   from the pose of their own tick, the next ones from the target before. Actions before `action_start` are past and
+//!   never executed; T0 stands in their place.
 //!
 //! What is executed is the position, the quaternion `x y z w` of length 1 if there is a rotation, and the rest of the
 //! output as it is. Of a quaternion and its negative, the same rotation, that nearer to the one before is taken, so that
