@@ -169,7 +169,7 @@ fn composing_a_rotation_does_not_allocate() {
         for step in 0..bundle.n_obs_steps {
             request.cell_mut(arm, step).unwrap().set(&header, &pose);
         }
-        let output: Vec<f32> = (0_u8..10).map(|at| f32::from(at % 3) / 4.0).collect();
+        let output: Vec<f32> = (0_u8..10).map(|at| f32::from(at % 4) / 4.0).collect();
         let output = output[..bundle.action.outputs()].repeat(bundle.horizon);
         let mut actions = vec![0.0; composer.chunk_len()];
         let mut wild = |output: &[f32], request: &Request| composer.compose(request, output, &mut actions);
