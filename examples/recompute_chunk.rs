@@ -15,6 +15,7 @@ use std::path::Path;
 use prost::Message;
 use rapid::mask::PhysicalMask;
 use rapid::policy::bundle::Bundle;
+use rapid::policy::compose::Composer;
 use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::request::Request;
@@ -96,10 +97,14 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
     }
 
-    let mut computed = vec![0.0; model.chunk_len()];
-    let mut noise = computed.clone();
+    let mut output = vec![0.0; model.chunk_len()];
+    let mut noise = output.clone();
     Random::new(chunk.seed, NOISE).fill_normal(&mut noise);
-    model.answer(&request, &mut computed)?;
+    model.answer(&request, &mut output)?;
+    // What the network answers may be relative to a pose in the samples.
+    let composer = Composer::new(&bundle);
+    let mut computed = vec![0.0; composer.chunk_len()];
+    composer.compose(&request, &output, &mut computed)?;
     if computed.len() != chunk.actions.len() {
         return Err("the chunk is of another policy".into());
     }

@@ -65,6 +65,7 @@ pub mod registration;
 pub mod registry;
 pub mod remote;
 pub mod rig;
+pub mod rotation;
 pub mod sample;
 pub mod session;
 pub mod simulation;

@@ -36,6 +36,7 @@ const LAYERS: &[&[&str]] = &[
         "flash",
         "points",
         "remote",
+        "rotation",
     ],
     &[
         "registry",

@@ -18,8 +18,8 @@ MAX_GRAPH_BYTES = 2**31 - 2**20
 
 UMI = (
     "a UMI checkpoint, which is not supported yet: a bundle has fields for what it needs (action.rotation, "
-    'action.representation "relative", observations[].down_sample_steps), but there is no exporter for it and the '
-    "program refuses them. What can be exported is a LeRobot DiffusionPolicy checkpoint"
+    'action.representation "relative", observations[].down_sample_steps), but there is no exporter '
+    "for it. What can be exported is a LeRobot DiffusionPolicy checkpoint"
 )
 
 

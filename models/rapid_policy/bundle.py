@@ -8,7 +8,7 @@ from typing import Any
 
 from .cache import sha256
 from .diffusion import TRAIN_TIMESTEPS
-from .normalize import MinMax
+from .normalize import EXECUTED, MinMax
 from .experiment import Experiment, Observation
 
 FORMAT = "rapid-policy/1"
@@ -46,7 +46,7 @@ def policy_json(spec: Experiment, facts: dict[str, Any], hashes: dict[str, str])
         "max_observation_age_ms": policy.max_observation_age_ms,
         "observations": [_observation(o, ranges) for o in spec.observation],
         "mask": {"input": MASK, "order": order, "absent": "zero_embedding"} if policy.mask_aware else None,
-        "action": _action(spec, ranges["action"]),
+        "action": _action(spec, ranges),
         "scheduler": {
             "type": "DDIM",
             "num_train_timesteps": TRAIN_TIMESTEPS,
@@ -69,9 +69,11 @@ def policy_json(spec: Experiment, facts: dict[str, Any], hashes: dict[str, str])
     }
 
 
-def _action(spec: Experiment, range_: MinMax) -> dict[str, Any]:
-    action, limits = spec.action, range_.widened(LIMIT_MARGIN)
+def _action(spec: Experiment, ranges: dict[str, MinMax]) -> dict[str, Any]:
+    action = spec.action
+    limits = ranges[EXECUTED if action.composed else "action"].widened(LIMIT_MARGIN)
     rotation = {} if action.rotation == "none" else {"rotation": action.rotation}
+    base = {} if action.base is None else {"base": action.base.model_dump(mode="json", exclude_none=True)}
     return {
         "actuator": action.actuator,
         "shape": [spec.action_length],
@@ -79,15 +81,17 @@ def _action(spec: Experiment, range_: MinMax) -> dict[str, Any]:
         "units": list(action.units),
         "representation": action.representation,
         **rotation,
+        **base,
         "limits": {"min": limits.low.round(4).tolist(), "max": limits.high.round(4).tolist()},
-        "normalization": [{"slice": [0, spec.action_length], **range_.to_dict()}],
+        "normalization": [{"slice": [0, spec.action_length], **ranges["action"].to_dict()}],
     }
 
 
 def _observation(o: Observation, ranges: dict[str, MinMax]) -> dict[str, Any]:
     common = {"key": o.key, "kind": o.kind, "modality": o.modality, "required": o.required, "shape": list(o.shape)}
     if o.kind == "vector":
-        return {**common, "slice": list(o.run_slice), "normalization": ranges[o.key].to_dict()}
+        turned = {"rotation": "rotation_6d"} if o.turned else {}
+        return {**common, "slice": list(o.run_slice), **turned, "normalization": ranges[o.key].to_dict()}
     return {
         **common,
         "color": o.color,

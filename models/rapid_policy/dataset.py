@@ -18,8 +18,8 @@ from torch import Tensor
 
 from . import poses
 from .episodes import Episode, picture_source
-from .experiment import POSITION, ROTATIONS, Experiment, Observation, Part
-from .normalize import MinMax
+from .experiment import POSITION, QUATERNION, ROTATIONS, Experiment, Observation, Part
+from .normalize import EXECUTED, MinMax
 
 # The range of the gripper's opening as it was seen, beside those of inputs and actions.
 OPENING = "opening"
@@ -107,7 +107,19 @@ class Dataset:
         low, high = (np.stack([f(s.reshape(-1, s.shape[-1]), axis=0) for s in seen]) for f in (np.min, np.max))
         turns = range(POSITION, POSITION + ROTATIONS[action.rotation]) if action.source == "pose" else ()
         ranges["action"] = MinMax.of("action", np.concatenate([low, high]), turns)
+        if action.composed:
+            turns = range(POSITION, POSITION + QUATERNION) if action.rotation != "none" else ()
+            ranges[EXECUTED] = MinMax.of(EXECUTED, self._executed(used), turns)
         return ranges
+
+    def _executed(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """[T, D] absolute actions as the program executes them; of a rotation anything, its range is known."""
+        targets, turned = self.targets[rows], self.spec.action.rotation != "none"
+        if self.now is not None:
+            positions, rest = targets[:, :16].reshape(-1, 4, 4)[:, :3, 3], targets[:, 16:]
+        else:
+            positions, rest = targets[:, :POSITION], targets[:, POSITION + ROTATIONS[self.spec.action.rotation] :]
+        return np.concatenate([positions, np.zeros((len(targets), QUATERNION * turned)), rest], 1)
 
     def plan(self, random: np.random.Generator, size: int, *, vary: bool = True) -> Plan:
         """`size` windows at random; each has its own shift, brightness, noise and dropout unless `vary` is false."""
@@ -191,7 +203,10 @@ class Dataset:
         if action.representation == "relative":
             wanted = poses.relative(wanted, self.now[tick][:, None], turned)
         elif action.representation == "delta":
-            wanted = poses.delta(wanted, np.concatenate([self.now[done[:, :1]], wanted[:, :-1]], 1))
+            # The program starts from the pose of the newest observation, at `action_start`; so does a window that
+            # begins where its segment does, in which the actions before repeat the first one.
+            start = self.spec.action_start
+            wanted = poses.delta(wanted, np.concatenate([self.now[done[:, : start + 1]], wanted[:, start:-1]], 1))
         return np.concatenate([poses.numbers(wanted, action.rotation), targets[..., 16:]], -1)
 
     def _episode_spans(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -19,6 +19,7 @@ SMALL_MULTIPLE = SMALL_POOL * 4
 TRAIN_TIMESTEPS = 100
 POSITION = 3
 ROTATIONS = {"none": 0, "rotation_6d": 6, "quaternion": 4}
+QUATERNION = 4
 TAKES = {"position": POSITION, "rotation_6d": 6, "quaternion": 4}
 
 
@@ -136,7 +137,11 @@ class Observation(Section):
         [{"modality": "phone", "take": "position"}],
         (),
     )
-    slice: tuple[Column, Column] | None = known("vectors with parts: numbers of the modality at run time", [0, 4], None)
+    slice: tuple[Column, Column] | None = known(
+        "vectors with parts: numbers of the modality at run time; for one rotation_6d, those of the quaternion",
+        [0, 4],
+        None,
+    )
     dropout: Dropout = known("how often it is taken away in training", {"window": 0.3}, Dropout())
     augmentation: Augmentation = known("what is varied in training", {"shift": 4}, Augmentation())
 
@@ -179,7 +184,7 @@ class Observation(Section):
         if self.columns and list(self.columns) != list(range(self.columns[0], self.columns[-1] + 1)):
             fix = "name neighbours in order, or several observations"
             raise mistake("columns", f"{list(self.columns)} is no range, which is all a bundle can take", fix)
-        if self.slice and self.slice[1] - self.slice[0] != self.shape[0]:
+        if self.slice and self.slice[1] - self.slice[0] != self.shape[0] and not self.turned:
             cause = f"{self.slice[1] - self.slice[0]} numbers, where the parts have {self.shape[0]}"
             raise mistake("slice", cause, f"write [{self.slice[0]}, {self.slice[0] + self.shape[0]}], or other parts")
 
@@ -196,6 +201,12 @@ class Observation(Section):
         return self.parts or (Part(modality=self.modality, columns=self.columns),)
 
     @property
+    def turned(self) -> bool:
+        """Vectors: whether the program makes the six numbers of a rotation from the quaternion at run time."""
+        one = [part.take for part in self.parts] == ["rotation_6d"]
+        return one and self.slice is not None and self.slice[1] - self.slice[0] == QUATERNION
+
+    @property
     def run_slice(self) -> tuple[int, int]:
         """Vectors: the numbers of the modality at run time."""
         if self.slice:
@@ -208,6 +219,24 @@ _IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout"}
 _VECTOR_KEYS = {"columns", "parts", "slice"}
 
 
+class Base(Section):
+    """Where the pose is, at run time, that actions are relative to: the one whose samples the episodes have as `pose`."""
+
+    modality: Name = known("of a vector that the policy observes", "arm")
+    position: tuple[Column, Column] = known("which of its numbers are x, y, z, the end not included", [0, 3])
+    rotation: tuple[Column, Column] | None = known(
+        "which are its quaternion x y z w, if the action has a rotation", [3, 7], None
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Base:
+        for key, wanted in (("position", POSITION), ("rotation", QUATERNION)):
+            if (span := getattr(self, key)) and span[1] - span[0] != wanted:
+                fix = f"write [{span[0]}, {span[0] + wanted}]"
+                raise mistake(key, f"{span[1] - span[0]} numbers instead of {wanted}", fix)
+        return self
+
+
 class Action(Section):
     """What the policy does, and where it is in the episodes."""
 
@@ -215,8 +244,8 @@ class Action(Section):
         "where it is recorded: on the topic /action, or as the next pose", "pose", "action", alias="from"
     )
     actuator: Name = known("the device in the registry that is moved", "arm")
-    names: tuple[Name, ...] = known("of each number", ["x", "y", "z", "grip"], min_length=1)
-    units: tuple[str, ...] = known("of each number", ["m", "m", "m", "1"], min_length=1)
+    names: tuple[Name, ...] = known("of each number that is executed", ["x", "y", "z", "grip"], min_length=1)
+    units: tuple[str, ...] = known("of each number that is executed", ["m", "m", "m", "1"], min_length=1)
     columns: tuple[Column, ...] | None = known("numbers of /action that are learned", [0, 1], None, min_length=1)
     pose: Name | None = known("modality with the pose", "phone", None)
     gripper: Name | None = known("modality with the opening", "gripper", None)
@@ -226,7 +255,10 @@ class Action(Section):
         "what a pose is relative to", "relative", "absolute"
     )
     rotation: Literal["none", "rotation_6d", "quaternion"] = known(
-        "how a pose's rotation is given", "rotation_6d", "none"
+        "how a pose's rotation is learned; what is executed has it as a quaternion", "rotation_6d", "none"
+    )
+    base: Base | None = known(
+        "with relative and delta: the pose at run time", {"modality": "arm", "position": [0, 3]}, None
     )
 
     @model_validator(mode="after")
@@ -254,14 +286,45 @@ class Action(Section):
             )
         if self.columns is not None:
             raise mistake("columns", 'of no use with from = "pose"', "remove it")
-        length = POSITION + ROTATIONS[self.rotation] + (self.gripper is not None)
+        self._check_base()
+        turned = self.rotation != "none"
+        length = POSITION + QUATERNION * turned + (self.gripper is not None)
         if len(self.names) != length:
-            what = f"a position ({POSITION}), rotation {self.rotation!r} ({ROTATIONS[self.rotation]})"
+            what = f"a position ({POSITION})" + (f", a quaternion ({QUATERNION})" if turned else "")
             what += " and an opening (1)" if self.gripper else ""
-            raise mistake("names", f"{len(self.names)} names for {length} numbers: {what}", f"give {length} names")
+            cause = f"{len(self.names)} names for {length} numbers that are executed: {what}"
+            raise mistake("names", cause, f"give {length} names")
+
+    def _check_base(self) -> None:
+        if self.representation == "absolute":
+            if self.base is not None:
+                raise mistake("base", "of no use with representation = 'absolute'", "remove it")
+            return
+        place = 'modality = "arm", position = [0, 3]' + (", rotation = [3, 7]" if self.rotation != "none" else "")
+        if self.base is None:
+            cause = f"missing with representation = {self.representation!r}: where the pose is at run time"
+            raise mistake("base", cause, f"add base = {{ {place} }}")
+        if self.base.rotation is None and self.rotation != "none":
+            cause = f"missing with rotation = {self.rotation!r}"
+            raise mistake("base.rotation", cause, f"write base = {{ {place} }}")
+        if self.base.rotation is not None and self.rotation == "none":
+            fix = 'remove it, or write rotation = "rotation_6d"'
+            raise mistake("base.rotation", "of no use with rotation = 'none'", fix)
+
+    @property
+    def outputs(self) -> int:
+        """Numbers that are learned of an action."""
+        if self.source == "action":
+            return len(self.names)
+        return POSITION + ROTATIONS[self.rotation] + (self.gripper is not None)
+
+    @property
+    def composed(self) -> bool:
+        """Whether something else is executed than what is learned."""
+        return self.representation != "absolute" or self.rotation != "none"
 
 
-_POSE_KEYS = {"pose", "gripper", "gripper_column", "gripper_squeeze", "representation", "rotation"}
+_POSE_KEYS = {"pose", "gripper", "gripper_column", "gripper_squeeze", "representation", "rotation", "base"}
 
 
 class Encoder(Section):
@@ -382,6 +445,11 @@ class Experiment(Section):
                 raise mistake(f"observation.{i}.key", f"{o.key!r} is taken", "give each input a name of its own")
         self._check_mask()
         self._check_pictures()
+        base = self.action.base
+        if base and base.modality not in (o.modality for o in self.vectors):
+            known_ones = ", ".join(sorted({o.modality for o in self.vectors})) or "none yet"
+            cause = f"{base.modality!r} is the modality of no vector that is observed"
+            raise mistake("action.base.modality", cause, f"write one of them ({known_ones}), or observe it")
         levels = 2 ** (len(self.denoiser.widths) - 1)
         if self.policy.horizon % levels:
             cause = f"{self.policy.horizon} cannot be halved {len(self.denoiser.widths) - 1} times"
@@ -433,8 +501,8 @@ class Experiment(Section):
 
     @property
     def action_length(self) -> int:
-        """Numbers of an action."""
-        return len(self.action.names)
+        """Numbers of an action, as the networks have it."""
+        return self.action.outputs
 
     @property
     def action_start(self) -> int:

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Name of the range of what is executed, where that differs from what is learned.
+EXECUTED = "executed"
+
 
 @dataclass(frozen=True)
 class MinMax:

@@ -148,15 +148,28 @@ class Bundle(unittest.TestCase):
         two = {**RANGES, "state": {"mode": "min_max", "min": [0, 0], "max": [1, 1]}}
         described = policy_json(spec, {"normalization": two}, {ENCODER: "", DENOISER: ""})
         self.assertEqual([described["observations"][2][key] for key in ("shape", "slice")], [[2], [2, 4]])
-        names = [f"n{i}" for i in range(10)]
-        action = {"representation": "relative", "rotation": "rotation_6d", "names": names, "units": ["1"] * 10}
-        ten = {"mode": "min_max", "min": [-1] * 10, "max": [1] * 10}
+        names = [f"n{i}" for i in range(8)]
+        action = {"representation": "relative", "rotation": "rotation_6d", "names": names, "units": ["1"] * 8}
+        action["base"] = {"modality": "arm", "position": [0, 3], "rotation": [4, 8]}
+        ten, eight = ({"mode": "min_max", "min": [-1] * n, "max": [1] * n} for n in (10, 8))
         spec = experiment("tactile-id", action=action)
-        described = policy_json(spec, {"normalization": {**RANGES, "action": ten}}, {ENCODER: "", DENOISER: ""})
+        ranges = {**RANGES, "action": ten, "executed": eight}
+        described = policy_json(spec, {"normalization": ranges}, {ENCODER: "", DENOISER: ""})
         self.assertEqual(
             [described["action"][key] for key in ("representation", "rotation", "shape")],
             ["relative", "rotation_6d", [10]],
         )
+        self.assertEqual([len(described["action"]["limits"]["min"]), described["action"]["base"]], [8, action["base"]])
+
+    def test_the_program_makes_six_numbers_of_a_quaternion(self):
+        parts = [{"modality": "phone", "take": "rotation_6d"}]
+        six = {"mode": "min_max", "min": [-1] * 6, "max": [1] * 6}
+        for slice_, rotation in (([4, 8], {"rotation": "rotation_6d"}), ([4, 10], {})):
+            spec = observed(experiment("tactile-id"), "state", parts=parts, slice=slice_)
+            described = policy_json(spec, {"normalization": {**RANGES, "state": six}}, {ENCODER: "", DENOISER: ""})
+            state = described["observations"][2]
+            self.assertEqual((state["shape"], state["slice"]), ([6], slice_))
+            self.assertEqual({key: state[key] for key in state if key == "rotation"}, rotation)
 
     def test_a_card_is_written_of_every_experiment(self):
         facts = {

@@ -9,11 +9,14 @@ import written
 from made_up import by_hand, experiment, path
 
 from rapid_policy import poses
+from rapid_policy.bundle import DENOISER, ENCODER, policy_json
 from rapid_policy.dataset import Dataset, unfit
 from rapid_policy.episodes import read_episode, sources
 from rapid_policy.experiment import Experiment
 
-NAMES = {"none": 3, "rotation_6d": 9, "quaternion": 7}
+# Numbers of a pose that are learned, and that are executed.
+LEARNED = {"none": 3, "rotation_6d": 9, "quaternion": 7}
+NAMES = {"none": 3, "rotation_6d": 7, "quaternion": 7}
 
 
 def posed(representation: str, rotation: str) -> Experiment:
@@ -21,6 +24,9 @@ def posed(representation: str, rotation: str) -> Experiment:
     names = [f"n{i}" for i in range(NAMES[rotation] + 1)]
     action = {"representation": representation, "rotation": rotation, "names": names, "units": ["1"] * len(names)}
     action["gripper_squeeze"] = 0.0
+    if representation != "absolute":
+        turned = {} if rotation == "none" else {"rotation": [4, 8]}
+        action["base"] = {"modality": "arm", "position": [0, 3], **turned}
     return experiment("tactile-id", action=action)
 
 
@@ -118,6 +124,13 @@ class Actions(unittest.TestCase):
                         np.testing.assert_allclose(executed[:, :3, :3], expected[:, :3, :3], atol=1e-5)
                     np.testing.assert_allclose(chunk[:, -1], (np.arange(12, 28) % 7) / 7, atol=1e-6)
 
+    def test_the_first_step_of_a_segment_is_the_newest_observations(self):
+        # There is no tick before it: what stands there is of no account, what comes from `action_start` on leads on.
+        wanted, spec = path(self.LENGTH), posed("delta", "rotation_6d")
+        chunk, _ = self.chunk(spec, 0)
+        now = wanted[0, :3, 3]
+        np.testing.assert_allclose(now + chunk[1:, :3].cumsum(0), wanted[1:16, :3, 3], atol=1e-5)
+
     def test_at_the_end_the_hand_stays(self):
         tick = self.LENGTH - 2
         spec = posed("delta", "rotation_6d")
@@ -132,6 +145,29 @@ class Actions(unittest.TestCase):
             _, dataset = self.chunk(posed(representation, "rotation_6d"), 12)
             low, high = dataset.ranges["action"].low, dataset.ranges["action"].high
             self.assertEqual((low[3:9].tolist(), high[3:9].tolist()), ([-1.0] * 6, [1.0] * 6))
+
+    def test_limits_are_of_what_is_executed(self):
+        for representation in ("absolute", "relative", "delta"):
+            for rotation in NAMES:
+                with self.subTest(representation=representation, rotation=rotation):
+                    spec = posed(representation, rotation)
+                    dataset = Dataset(spec, [by_hand(self.LENGTH)])
+                    ranges = {key: value.to_dict() for key, value in dataset.ranges.items()}
+                    action = policy_json(spec, {"normalization": ranges}, {ENCODER: "", DENOISER: ""})["action"]
+                    self.assertEqual(action["shape"], [LEARNED[rotation] + 1])
+                    self.assertEqual(len(action["normalization"][0]["min"]), LEARNED[rotation] + 1)
+                    reached = path(self.LENGTH)[1:, :3, 3]
+                    low, high = (np.array(action["limits"][key]) for key in ("min", "max"))
+                    self.assertEqual((len(low), len(high)), (NAMES[rotation] + 1, NAMES[rotation] + 1))
+                    margin = 0.05 * np.ptp(reached, 0)
+                    np.testing.assert_allclose(low[:3], reached.min(0) - margin, atol=1e-4)
+                    np.testing.assert_allclose(high[:3], reached.max(0) + margin, atol=1e-4)
+                    np.testing.assert_allclose(low[3:-1], -1.1)
+                    np.testing.assert_allclose([low[-1], high[-1]], [-6 / 7 * 0.05, 6 / 7 * 1.05], atol=1e-4)
+                    self.assertEqual("base" in action, representation != "absolute")
+                    if representation != "absolute" and rotation != "none":
+                        base = {"modality": "arm", "position": [0, 3], "rotation": [4, 8]}
+                        self.assertEqual(action["base"], base)
 
     def test_lost_tracking_breaks_the_path(self):
         episode = by_hand(30)

@@ -11,7 +11,10 @@ use serde_json::{Value, json};
 use super::Format;
 use crate::cli::{ObserveArgs, ShowArgs};
 use crate::compare::{self, ChunkInputs, CompareError};
-use crate::policy::bundle::{Bundle, BundleErrors, ObservationInput, ObservationSpec, WhenAbsent};
+use crate::policy::bundle::{
+    ActionRotation, Bundle, BundleAction, BundleErrors, ObservationInput, ObservationSpec, Representation,
+    VectorRotation, VectorSpec, WhenAbsent,
+};
 use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
 use crate::policy::pace::{Pace, PaceVerdict};
@@ -113,7 +116,7 @@ struct Array {
 
 fn arrays(inputs: ChunkInputs, bundle: &Bundle) -> Vec<Array> {
     let ChunkInputs { observations, mask, noise, step_noise, recorded } = inputs;
-    let chunk = [bundle.horizon, bundle.action.len()];
+    let chunk = [bundle.horizon, bundle.action.outputs()];
     let mut arrays: Vec<Array> =
         observations.into_iter().map(|(name, shape, values)| Array { name, shape, values }).collect();
     arrays.extend(mask.map(|(name, values)| Array { name, shape: vec![1, values.len()], values }));
@@ -122,7 +125,8 @@ fn arrays(inputs: ChunkInputs, bundle: &Bundle) -> Vec<Array> {
         let shape = [&[step_noise.len()], &chunk[..]].concat();
         arrays.push(Array { name: "step_noise".to_owned(), shape, values: step_noise.concat() });
     }
-    arrays.push(Array { name: "recorded".to_owned(), shape: chunk.to_vec(), values: recorded });
+    let executed = vec![bundle.horizon, bundle.action.len()];
+    arrays.push(Array { name: "recorded".to_owned(), shape: executed, values: recorded });
     arrays
 }
 
@@ -223,6 +227,7 @@ impl Shown {
                 "key": observation.key, "modality": observation.modality, "kind": kind(observation),
                 "shape": shape(observation), "required": observation.required,
                 "hold_last_ms": held(observation).as_millis(),
+                "down_sample_steps": observation.down_sample_steps,
             })
         });
         let pace = match Pace::of(bundle, *chunk).verdict {
@@ -234,7 +239,9 @@ impl Shown {
             "event": "policy_bundle", "policy": bundle.name, "hash": bundle.hash,
             "folder": bundle.folder.to_string_lossy(), "mask_aware": bundle.mask_aware,
             "observations": observations.collect::<Vec<_>>(), "actuator": bundle.action.actuator,
-            "axes": bundle.action.names, "control_hz": bundle.control_hz, "horizon": bundle.horizon,
+            "axes": bundle.action.names, "representation": bundle.action.representation.word(),
+            "rotation": bundle.action.rotation.map(ActionRotation::word),
+            "base": bundle.action.representation.base().map(|base| &base.modality), "control_hz": bundle.control_hz, "horizon": bundle.horizon,
             "n_action_steps": bundle.n_action_steps, "denoising_steps": self.steps(), "registry": rig,
             "unfit": unfit, "threads": computing.on.threads, "provider": computing.on.provider.word(),
             "library": library, "chunk_ms": chunk.as_secs_f64() * 1e3, "pace": pace,
@@ -251,6 +258,7 @@ impl Shown {
         }
         let action = &bundle.action;
         line("moves", &format!("{}: {}", action.actuator, action.names.join(", ")))?;
+        line("", &represented(action))?;
         let (steps, train) = (self.steps(), bundle.scheduler.num_train_timesteps);
         let (horizon, executed, hz) = (bundle.horizon, bundle.n_action_steps, bundle.control_hz);
         line(
@@ -280,7 +288,28 @@ fn observed(observation: &ObservationSpec, mask_aware: bool) -> String {
         (false, time) => format!("may be absent: the last sample for {} s, then zeros", time.as_secs_f64()),
     };
     let key = if observation.key == observation.modality { String::new() } else { format!(" as {}", observation.key) };
-    format!("{}{key}: {} {}, {when_absent}", observation.modality, kind(observation), shape.join("x"))
+    let turned = match &observation.input {
+        ObservationInput::Vector(VectorSpec { rotation: Some(VectorRotation::Rotation6d), .. }) => " (rotation_6d)",
+        _ => "",
+    };
+    let apart = match observation.down_sample_steps {
+        1 => String::new(),
+        ticks => format!(", a step every {ticks} ticks"),
+    };
+    let kind = kind(observation);
+    format!("{}{key}: {kind} {}{turned}{apart}, {when_absent}", observation.modality, shape.join("x"))
+}
+
+/// What the network's actions are relative to, and how it gives their rotation.
+fn represented(action: &BundleAction) -> String {
+    let base = action.representation.base().map_or(String::new(), |base| match action.representation {
+        Representation::Delta(_) => {
+            format!(" from one target to the next, the first from the pose of {}", base.modality)
+        }
+        _ => format!(" to the pose of {}", base.modality),
+    });
+    let rotation = action.rotation.map_or(String::new(), |rotation| format!(", rotation as {}", rotation.word()));
+    format!("learned as {}{base}{rotation}", action.representation.word())
 }
 
 const fn kind(observation: &ObservationSpec) -> &'static str {

@@ -15,6 +15,7 @@ use super::{CompareError, Ended};
 use crate::episode::decode::{Content, Scratch};
 use crate::episode::reader::{Item, Reader};
 use crate::policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation};
+use crate::policy::compose::Composer;
 use crate::policy::model::Model;
 use crate::policy::request::Request;
 use crate::registry::Registry;
@@ -80,6 +81,10 @@ struct Work<'a> {
     samples: BTreeMap<Key, (SampleHeader, Vec<u8>)>,
     /// How many of the remaining chunks use a sample, for samples in the file.
     uses: BTreeMap<Key, u32>,
+    /// The network's output.
+    output: Vec<f32>,
+    composer: Composer,
+    /// What is executed of it.
     chunk: Vec<f32>,
     again: Again,
     /// Chunks that were tried.
@@ -96,11 +101,11 @@ pub struct ChunkInputs {
     pub observations: Vec<(String, Vec<usize>, Vec<f32>)>,
     /// The mask, with the name of the input; `None` if the policy has none.
     pub mask: Option<(String, Vec<f32>)>,
-    /// The first sample: `[horizon, values of an action]`.
+    /// The first sample: `[horizon, values of an action in the network's output]`.
     pub noise: Vec<f32>,
     /// The noise of each step of the scheduler that adds some.
     pub step_noise: Vec<Vec<f32>>,
-    /// The chunk as it was recorded, in the units of the action.
+    /// The chunk as it was recorded, `[horizon, executed values]`, in the units of the action.
     pub recorded: Vec<f32>,
 }
 
@@ -123,6 +128,7 @@ pub(super) fn compare(
         actions: actions(survey, bundle),
         ..Again::default()
     };
+    let composer = Composer::new(bundle);
     let mut work = Work {
         bundle,
         request: Request::new(bundle),
@@ -130,7 +136,9 @@ pub(super) fn compare(
         references: Reference::all(survey, bundle, registry),
         samples: BTreeMap::new(),
         uses: BTreeMap::new(),
-        chunk: vec![0.0; model.chunk_len()],
+        output: vec![0.0; model.chunk_len()],
+        chunk: vec![0.0; composer.chunk_len()],
+        composer,
         model,
         again,
         tried: 0,
@@ -220,7 +228,7 @@ impl Work<'_> {
             *counter += 1;
             self.take_references(chunk);
         } else {
-            let answered = self.model.answer(&self.request, &mut self.chunk);
+            let answered = self.model.answer(&self.request, &mut self.output);
             let now = if answered.is_ok() { Reference::Known } else { Reference::Lost };
             for (at, reference) in self.references.iter_mut().enumerate() {
                 if uses(reference, &self.request, at, Reference::Next) {
@@ -229,6 +237,8 @@ impl Work<'_> {
             }
             match answered {
                 Ok(()) => {
+                    // One that gives no actions is NaN, in the file too.
+                    let _ = self.composer.compose(&self.request, &self.output, &mut self.chunk);
                     self.hold_against(chunk);
                     if self.wanted == Some(self.tried) {
                         self.inputs = Some(self.inputs(chunk));

@@ -130,7 +130,7 @@ impl Follower<'_> {
         if self.pilot.look(number, stamp, stamp) {
             self.pilot.fill(number, stamp, &mut self.request);
             let refused = match self.model.answer(&self.request, &mut self.chunk) {
-                Ok(()) => self.pilot.queue.take(number, &self.chunk).err().map(|refused| refused.to_string()),
+                Ok(()) => self.pilot.answer(&self.request, &self.chunk).err().map(|refused| refused.to_string()),
                 Err(error) => {
                     self.pilot.queue.failed(number);
                     Some(error.to_string())

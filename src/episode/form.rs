@@ -8,6 +8,7 @@
 use super::encode::{self, Joint, Pose};
 use super::schema::{self, SampleSchema, Schema};
 use crate::registry::{DeviceSpec, Form, JointsSpec, POSE_ENDING, PoseLayout, PoseSpec, Quantity, TipForm};
+use crate::rotation::{self, Quaternion};
 
 /// The topic of all transforms.
 pub const TRANSFORM_TOPIC: &str = "/tf";
@@ -110,10 +111,10 @@ impl Derived {
 
 /// The pose of the tip of an arm.
 fn tip_pose(tip: &TipForm, numbers: &[u8]) -> Option<Pose> {
-    let at = |index| number(numbers, index);
+    let at = |index| number(numbers, index).filter(|number| number.is_finite());
     let rotation = tip.numbers() - 4;
     let rotation = [at(rotation)?, at(rotation + 1)?, at(rotation + 2)?, at(rotation + 3)?];
-    normalised([at(0)?, at(1)?, at(2)?], rotation)
+    Some(Pose { position: [at(0)?, at(1)?, at(2)?], rotation: rotation::normalized(rotation)? })
 }
 
 fn number(payload: &[u8], index: usize) -> Option<f64> {
@@ -128,32 +129,13 @@ fn pose(spec: &PoseSpec, payload: &[u8]) -> Option<Pose> {
         PoseLayout::Columns => matrix(|row, column| at(column * 4 + row))?,
         PoseLayout::Rows => matrix(|row, column| at(row * 4 + column))?,
     };
-    normalised(position, rotation)
+    Some(Pose { position, rotation: rotation::normalized(rotation)? })
 }
 
-fn normalised(position: [f64; 3], rotation: [f64; 4]) -> Option<Pose> {
-    let length = rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
-    let is_pose = position.iter().all(|number| number.is_finite()) && length.is_finite() && length > 0.0;
-    is_pose.then(|| Pose { position, rotation: rotation.map(|part| part / length) })
-}
-
-/// Position and quaternion `x y z w` of a homogeneous matrix. The largest of the four parts is found first, because the
-/// others are divided by it (Shepperd, 1978).
-fn matrix(at: impl Fn(usize, usize) -> Option<f64>) -> Option<([f64; 3], [f64; 4])> {
-    let [xx, yy, zz] = [at(0, 0)?, at(1, 1)?, at(2, 2)?];
-    let [xy, yx] = [at(0, 1)?, at(1, 0)?];
-    let [xz, zx] = [at(0, 2)?, at(2, 0)?];
-    let [yz, zy] = [at(1, 2)?, at(2, 1)?];
-    let trace = xx + yy + zz;
-    let rotation = if trace >= xx && trace >= yy && trace >= zz {
-        [zy - yz, xz - zx, yx - xy, 1.0 + trace]
-    } else if xx >= yy && xx >= zz {
-        [1.0 + xx - yy - zz, yx + xy, xz + zx, zy - yz]
-    } else if yy >= zz {
-        [yx + xy, 1.0 - xx + yy - zz, zy + yz, xz - zx]
-    } else {
-        [xz + zx, zy + yz, 1.0 - xx - yy + zz, yx - xy]
-    };
+/// Position and quaternion of a homogeneous matrix.
+fn matrix(at: impl Fn(usize, usize) -> Option<f64>) -> Option<([f64; 3], Quaternion)> {
+    let row = |row| Some([at(row, 0)?, at(row, 1)?, at(row, 2)?]);
+    let rotation = rotation::of_matrix([row(0)?, row(1)?, row(2)?]);
     Some(([at(0, 3)?, at(1, 3)?, at(2, 3)?], rotation))
 }
 

@@ -356,11 +356,12 @@ impl Bench<'_> {
                 rig.act(number, action, &mut witness);
             }
             rig.step(0.0, &mut witness)?;
-            let skipped = take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
+            let skipped = take(answer, &mut witness.pilot, &request, &chunk, &mut failure);
             if let Some(recorder) = &mut witness.recorder {
                 if let Some(skipped) = skipped {
                     let (devices, latency_ms) = (self.registry.devices.len(), STEP.as_secs_f64() * 1e3);
-                    let what = request.answered(self.bundle, devices, latency_ms, Ok(skipped), &chunk);
+                    let actions = witness.pilot.chunk();
+                    let what = request.answered(self.bundle, devices, latency_ms, Ok(skipped), actions);
                     recorder.event(&Event { stamp: rig.now(), what });
                 }
                 recorder.advance(rig.now());
@@ -397,13 +398,13 @@ impl Bench<'_> {
 fn take(
     answer: Option<Result<(), AnswerError>>,
     pilot: &mut Pilot,
-    asked: u64,
+    asked: &Request,
     chunk: &[f32],
     failure: &mut Option<String>,
 ) -> Option<u64> {
     match answer? {
         Ok(()) => {
-            let taken = pilot.queue.take(asked, chunk);
+            let taken = pilot.answer(asked, chunk);
             if let Err(refused) = &taken {
                 *failure = Some(refused.to_string());
             }
@@ -411,7 +412,7 @@ fn take(
             Some(taken.unwrap_or(0))
         }
         Err(error) => {
-            pilot.queue.failed(asked);
+            pilot.queue.failed(asked.tick);
             *failure = Some(error.to_string());
             None
         }

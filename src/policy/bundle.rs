@@ -3,8 +3,8 @@
 //! `encoder.onnx` takes one input per observation, named by its key (image f32 `[B, To, 3, H, W]`, vector f32
 //! `[B, To, D]`), and the mask (f32 `[B, M]`), and returns `global_cond` (f32 `[B, Dc]`). `denoiser.onnx` takes
 //! `sample` (f32 `[B, Tp, Da]`), `timestep` (i64 `[B]`) and `global_cond`, and returns its prediction (f32
-//! `[B, Tp, Da]`). `B` is 1 or left open. `To` is `n_obs_steps`, `Tp` is `horizon`, `Da` the length of an action,
-//! `M` that of the mask's order.
+//! `[B, Tp, Da]`). `B` is 1 or left open. `To` is `n_obs_steps`, `Tp` is `horizon`, `Da` the length of an action in
+//! this output, `M` that of the mask's order.
 //!
 //! Text -> `read` (no key twice, serde, types of `file` and `spec`) -> `validate` -> [`Bundle`]. It
 //! is then compared with the registry ([`Bundle::check_registry`]) and with the inputs and outputs of the graphs
@@ -13,6 +13,7 @@
 //! Invariant: every check reports all mistakes at once, each with the path of its key and a fix.
 //! Invariant: no later code checks a [`Bundle`] again.
 
+mod action;
 #[cfg(test)]
 pub(crate) mod example;
 mod external;
@@ -27,8 +28,9 @@ mod validate;
 
 pub use files::{Graph, POLICY_FILE};
 pub use spec::{
-    BetaSchedule, Bundle, BundleAction, BundleErrors, ColorOrder, GraphFile, ImageSpec, MaskSpec, Normalization,
-    ObservationInput, ObservationSpec, Operation, PredictionType, SchedulerKind, SchedulerSpec, SliceNormalization,
-    TimestepSpacing, VectorSpec, WhenAbsent,
+    ActionRotation, BasePose, BetaSchedule, Bundle, BundleAction, BundleErrors, ColorOrder, GraphFile, ImageSpec,
+    MaskSpec, Normalization, ObservationInput, ObservationSpec, Operation, PredictionType, Representation,
+    SchedulerKind, SchedulerSpec, SliceNormalization, TimestepSpacing, VectorRotation, VectorSpec, WhenAbsent,
 };
+pub(super) use spec::{POSITION, QUATERNION};
 pub use suits::{Element, GraphShape, TensorShape};

@@ -8,7 +8,8 @@
 //!
 //! Failures and their handling:
 //!
-//! * NaN or infinity anywhere in a chunk, or a wrong number of values: the whole chunk is rejected.
+//! * NaN or infinity anywhere in a chunk, or a wrong number of values: the whole chunk is rejected. Likewise one from
+//!   which no poses follow (see [`compose`](super::compose)).
 //! * A chunk more than one tick late: used from the action of the tick. Too late for any of its
 //!   actions: not used.
 //! * A value beyond the action's limits: the limit is executed.
@@ -124,6 +125,12 @@ pub enum ChunkError {
     /// NaN or infinity.
     #[error("a chunk with values that are no finite numbers")]
     NotFinite,
+    /// A rotation in it is none.
+    #[error("a chunk with a rotation that is none: its rows are zero or parallel, or its quaternion is zero")]
+    NoRotation,
+    /// The pose that its actions are relative to is none.
+    #[error("a chunk relative to a sample that has no pose: it is too short, not finite, or its quaternion is zero")]
+    NoBase,
     /// Its observation precedes the start of the last hold.
     #[error("actions that were decided before the policy had to hold")]
     BeforeHold,
@@ -153,6 +160,8 @@ pub struct Counts {
     pub expired_chunks: u64,
     /// Chunks with NaN or infinity.
     pub not_finite_chunks: u64,
+    /// Chunks from which no poses follow: a rotation is none, or what they are relative to.
+    pub no_pose_chunks: u64,
     /// Chunks of the wrong length.
     pub wrong_length_chunks: u64,
     /// Chunks for an observation that was not requested.
@@ -277,27 +286,17 @@ impl ActionQueue {
         true
     }
 
-    /// The policy's answer to the observation of tick `observed`: `[Tp, Da]`, in the action's units.
+    /// The policy's answer to the observation of tick `observed`: `[Tp, executed values]`, in the action's units.
     /// Returns how many actions were skipped because it came more than one tick late.
     ///
     /// # Errors
     /// Why the chunk is rejected; the previous chunk stays in use.
     pub fn take(&mut self, observed: u64, values: &[f32]) -> Result<u64, ChunkError> {
         let taken = self.check(observed, values);
-        if self.in_flight == Some(observed) {
-            self.in_flight = None;
-        }
+        let skipped = taken.map_err(|reason| self.refuse(observed, reason))?;
+        self.in_flight = None;
         let counts = &mut self.counts;
-        let counter = match taken {
-            Ok(_) => &mut counts.chunks,
-            Err(ChunkError::Unasked) => &mut counts.unasked_chunks,
-            Err(ChunkError::Length) => &mut counts.wrong_length_chunks,
-            Err(ChunkError::NotFinite) => &mut counts.not_finite_chunks,
-            Err(ChunkError::BeforeHold) => &mut counts.before_hold_chunks,
-            Err(ChunkError::Expired) => &mut counts.expired_chunks,
-        };
-        *counter += 1;
-        let skipped = taken?;
+        counts.chunks += 1;
         counts.late_chunks += u64::from(skipped > 0);
         counts.skipped_actions += skipped;
         self.chunk.copy_from_slice(values);
@@ -325,6 +324,26 @@ impl ActionQueue {
         }
         // The action of the observation's own tick is not expected in time.
         Ok(passed.saturating_sub(1))
+    }
+
+    /// The policy's answer to the observation of tick `observed` is not used, for this reason. Returns the reason that
+    /// counts: an answer that was not asked for is nothing else. The previous chunk stays in use.
+    pub fn refuse(&mut self, observed: u64, reason: ChunkError) -> ChunkError {
+        let reason = if self.in_flight == Some(observed) { reason } else { ChunkError::Unasked };
+        let counts = &mut self.counts;
+        let counter = match reason {
+            ChunkError::Unasked => &mut counts.unasked_chunks,
+            ChunkError::Length => &mut counts.wrong_length_chunks,
+            ChunkError::NotFinite => &mut counts.not_finite_chunks,
+            ChunkError::NoRotation | ChunkError::NoBase => &mut counts.no_pose_chunks,
+            ChunkError::BeforeHold => &mut counts.before_hold_chunks,
+            ChunkError::Expired => &mut counts.expired_chunks,
+        };
+        *counter += 1;
+        if reason != ChunkError::Unasked {
+            self.in_flight = None;
+        }
+        reason
     }
 
     /// The policy has no answer to the observation of tick `observed`.

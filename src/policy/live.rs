@@ -265,13 +265,13 @@ impl Control {
         let latency = exchange.done.since(request.stamp);
         match &exchange.outcome {
             Ok(()) => {
-                let answered = self.pilot.queue.take(request.tick, &exchange.chunk);
+                let answered = self.pilot.answer(request, &exchange.chunk);
                 let latency_ms = latency.as_secs_f64() * 1e3;
                 self.last_latency_ms = Some(latency_ms);
                 let us = u64::try_from(latency.as_micros()).unwrap_or(LONGEST_US);
                 self.latencies.saturating_record(us.clamp(1, LONGEST_US));
                 // Also for an unused chunk: its pictures may have become the reference of all later ones.
-                let (bundle, chunk) = (&self.options.bundle, &exchange.chunk);
+                let (bundle, chunk) = (&self.options.bundle, self.pilot.chunk());
                 self.board.announce(request.answered(bundle, self.devices, latency_ms, answered, chunk));
                 if let Err(refused) = answered {
                     self.complain(&format!("policy: not used: {refused}"));
@@ -396,6 +396,7 @@ impl Control {
 const fn unused(counts: &Counts) -> u64 {
     counts.expired_chunks
         + counts.not_finite_chunks
+        + counts.no_pose_chunks
         + counts.wrong_length_chunks
         + counts.unasked_chunks
         + counts.before_hold_chunks

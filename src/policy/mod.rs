@@ -6,11 +6,12 @@
 //! step by step, [`normalize`] maps numbers into the range a network was trained on and back. [`model`] combines them:
 //! requests in, chunks out.
 //!
-//! [`observer`] chooses the samples of a tick and fills a [`request`], [`horizon`] decides which action is executed at
-//! which tick, if any. [`pilot`] combines both and is stepped by a loop on the control grid. [`live`] is that loop in
+//! [`observer`] chooses the samples of a tick and fills a [`request`], [`compose`] makes absolute actions of a chunk,
+//! [`horizon`] decides which action is executed at which tick, if any. [`pilot`] combines them and is stepped by a loop on the control grid. [`live`] is that loop in
 //! real time.
 
 pub mod bundle;
+pub mod compose;
 pub mod graphs;
 pub mod horizon;
 pub mod library;

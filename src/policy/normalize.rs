@@ -43,9 +43,9 @@ impl Normalizer {
         Self { dimensions }
     }
 
-    /// For an action, composed of its slices.
+    /// For an action in the network's output, composed of its slices.
     pub fn of_action(action: &BundleAction) -> Self {
-        let mut dimensions = vec![Dimension::IDENTITY; action.len()];
+        let mut dimensions = vec![Dimension::IDENTITY; action.outputs()];
         for part in &action.normalization {
             fill(dimensions.get_mut(part.slice.clone()).unwrap_or_default(), &part.normalization);
         }

@@ -3,8 +3,9 @@
 //! Invariant: the memory is allocated once, with the length given by the bundle.
 //! Invariant: an absent modality is zeros after normalisation, and its element of the mask is 0.
 
-use super::bundle::{Bundle, ObservationInput, VectorSpec};
+use super::bundle::{Bundle, ObservationInput, VectorRotation, VectorSpec};
 use super::normalize::Normalizer;
+use crate::rotation;
 
 /// Why the numbers of a sample cannot be an observation.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -22,6 +23,9 @@ pub enum VectorError {
         /// The expected numbers, in words.
         wanted: String,
     },
+    /// Numbers that are to be a rotation are none.
+    #[error("observation `{0}` is a rotation, but the quaternion of the sample is none: zero, or not finite")]
+    Rotation(String),
 }
 
 /// The observations of one chunk. An observation is identified by its index in the bundle's list.
@@ -92,6 +96,17 @@ impl ObservationTensors {
                 None => spec.len.to_string(),
             };
             return Err(VectorError::Length { key: tensor.key.clone(), found: sample.len(), wanted });
+        };
+        let rows;
+        let wanted = match (spec.rotation, wanted) {
+            (None, wanted) => wanted,
+            (Some(VectorRotation::Rotation6d), &[x, y, z, w]) => {
+                let rotation = rotation::normalized([x, y, z, w]);
+                rows = rotation::rows(rotation.ok_or_else(|| VectorError::Rotation(tensor.key.clone()))?);
+                rows.as_flattened()
+            }
+            // A checked bundle takes 4 numbers.
+            (Some(VectorRotation::Rotation6d), _) => return Err(VectorError::Rotation(tensor.key.clone())),
         };
         if let Some(place) = tensor.values.chunks_exact_mut(tensor.step.max(1)).nth(step) {
             for (value, number) in place.iter_mut().zip(wanted) {

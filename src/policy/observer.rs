@@ -1,8 +1,10 @@
 //! The observation of a policy at a tick of the control grid: the samples of the last ticks chosen by `sync`.
 //!
-//! Samples are kept unchanged, one copy of each; the choices of as many ticks are remembered as an observation has
-//! steps. A step without its own sample (before the first tick, or before a modality was plugged in) uses the sample of
-//! the next step, as in training. The samples of a modality that has left are shown for as long as the bundle holds them.
+//! Samples are kept unchanged; the choices of as many ticks are remembered as the steps of an observation span. Its
+//! steps are `down_sample_steps` ticks apart. With more than one tick between them a sample may be wanted long after the
+//! newest ones have taken its place: what is chosen is then copied. A step without its own sample (before the first tick,
+//! or before a modality was plugged in) uses the sample of the next step, as in training. A tick that was missed has the
+//! choice of the one before it. The samples of a modality that has left are shown for as long as the bundle holds them.
 //!
 //! Invariant: nothing here allocates once the places of the samples have grown to the largest.
 
@@ -24,15 +26,24 @@ pub struct Observer {
     lanes: Vec<Lane>,
     /// Steps of an observation.
     steps: usize,
+    /// Of the last tick that was observed.
+    number: Option<u64>,
 }
 
 /// One observation of the bundle.
 #[derive(Debug)]
 struct Lane {
     id: Option<ModalityId>,
-    /// The newest samples, each at the index of its ring entry.
+    /// The newest samples, each at the index of its ring entry; behind these, if steps are more than a tick apart,
+    /// copies of the chosen ones, as many as ticks are remembered.
     places: Vec<Place>,
+    /// How many of them are the newest samples.
+    newest: usize,
     next: usize,
+    /// Where the next copy is written, from the first copy on.
+    next_copy: usize,
+    /// Ticks between two steps.
+    apart: usize,
     /// The choices of the last ticks, the newest first.
     chosen: Vec<Option<Chosen>>,
     /// How long those of its last tick stand in for it while it is absent.
@@ -51,12 +62,52 @@ impl Lane {
         let is_held = self.kept_at.is_some_and(|at| tick.since(at) <= self.hold) && !self.hold.is_zero();
         is_held.then_some(self.kept.as_slice())
     }
+
+    /// Makes room for the choice of a tick, `ticks` after the last one.
+    fn advance(&mut self, ticks: u64) {
+        let last = self.chosen.first().copied().flatten();
+        let missed = usize::try_from(ticks).unwrap_or(usize::MAX).clamp(1, self.chosen.len()) - 1;
+        self.chosen.rotate_right(1 + missed);
+        self.chosen.iter_mut().take(1 + missed).for_each(|chosen| *chosen = last);
+        if let Some(newest) = self.chosen.first_mut() {
+            *newest = None;
+        }
+    }
+
+    /// Keeps a chosen sample for as long as its tick is remembered.
+    fn keep(&mut self, chosen: Chosen) -> Chosen {
+        if self.apart == 1 {
+            return chosen;
+        }
+        let (samples, copies) = self.places.split_at_mut(self.newest);
+        let Some(sample) = samples.get(chosen.place) else { return chosen };
+        let (next, ticks) = (self.next_copy, copies.len());
+        let last = (next + ticks - 1) % ticks;
+        let which = |place: &Place| (place.header.seq, place.header.epoch, place.header.capture_ns);
+        // Of a device slower than the grid it is the sample of the tick before.
+        if copies.get(last).is_some_and(|copy| which(copy) == which(sample)) {
+            return Chosen { place: self.newest + last, ..chosen };
+        }
+        if let Some(copy) = copies.get_mut(next) {
+            copy.set(&sample.header, &sample.bytes);
+        }
+        self.next_copy = (next + 1) % ticks;
+        Chosen { place: self.newest + next, ..chosen }
+    }
 }
 
 #[derive(Debug, Clone, Default)]
 struct Place {
     header: SampleHeader,
     bytes: Vec<u8>,
+}
+
+impl Place {
+    fn set(&mut self, header: &SampleHeader, bytes: &[u8]) {
+        self.header = *header;
+        self.bytes.clear();
+        self.bytes.extend_from_slice(bytes);
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -79,22 +130,31 @@ impl Observer {
                 capacity: device.depth,
             })
             .collect();
-        let lanes = devices().zip(&bundle.observations).map(|(device, observation)| Lane {
-            id: device.map(|device| device.id),
-            places: vec![Place::default(); device.map_or(0, |device| device.depth)],
-            next: 0,
-            chosen: vec![None; bundle.n_obs_steps],
-            hold: match observation.when_absent {
-                WhenAbsent::Zero => Duration::ZERO,
-                WhenAbsent::HoldLast(time) => time,
-            },
-            kept: vec![None; bundle.n_obs_steps],
-            kept_at: None,
+        let lanes = devices().zip(&bundle.observations).map(|(device, observation)| {
+            let apart = observation.down_sample_steps;
+            let ticks = (bundle.n_obs_steps - 1) * apart + 1;
+            let newest = device.map_or(0, |device| device.depth);
+            Lane {
+                id: device.map(|device| device.id),
+                places: vec![Place::default(); newest + if apart > 1 { ticks } else { 0 }],
+                newest,
+                next: 0,
+                next_copy: 0,
+                apart,
+                chosen: vec![None; ticks],
+                hold: match observation.when_absent {
+                    WhenAbsent::Zero => Duration::ZERO,
+                    WhenAbsent::HoldLast(time) => time,
+                },
+                kept: vec![None; ticks],
+                kept_at: None,
+            }
         });
         Self {
             lanes: lanes.collect(),
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             steps: bundle.n_obs_steps,
+            number: None,
         }
     }
 
@@ -109,11 +169,9 @@ impl Observer {
         let mut kept = None;
         for lane in self.lanes.iter_mut().filter(|lane| lane.id == Some(id)) {
             let at = lane.next;
-            let Some(place) = lane.places.get_mut(at) else { continue };
-            place.header = *header;
-            place.bytes.clear();
-            place.bytes.extend_from_slice(payload);
-            lane.next = (at + 1) % lane.places.len();
+            let Some(place) = lane.places.get_mut(at).filter(|_| at < lane.newest) else { continue };
+            place.set(header, payload);
+            lane.next = (at + 1) % lane.newest;
             kept = Some(at);
         }
         let Some(keep) = kept else { return };
@@ -130,23 +188,24 @@ impl Observer {
         newest.into_iter().max().map(Stamp)
     }
 
-    /// Observes a tick with the samples known at `now`. Returns the age of the oldest chosen sample of the present
-    /// modalities; `None` if one of them has no sample at all, or none is present.
-    pub fn look(&mut self, tick: Stamp, now: Stamp, mask: PhysicalMask) -> Option<Duration> {
+    /// Observes tick number `number`, at `tick`, with the samples known at `now`; numbers rise. Returns the age of the
+    /// oldest chosen sample of the present modalities; `None` if one of them has no sample at all, or none is present.
+    pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp, mask: PhysicalMask) -> Option<Duration> {
         self.sync.observe(tick, now, mask);
+        let ticks = self.number.replace(number).map_or(1, |last| number.saturating_sub(last));
         let mut oldest = None;
         let mut whole = true;
         for lane in &mut self.lanes {
-            lane.chosen.rotate_right(1);
-            let Some(newest) = lane.chosen.first_mut() else { continue };
-            *newest = None;
+            lane.advance(ticks);
             let Some(slot) = lane.id.and_then(|id| self.sync.observation().slot(id)).filter(|slot| slot.present) else {
                 continue;
             };
             let sample = self.sync.sample(slot);
-            *newest = sample.map(|sample| Chosen { place: sample.keep, seq: sample.seq });
-            whole &= newest.is_some();
-            if newest.is_some() {
+            let chosen = sample.map(|sample| Chosen { place: sample.keep, seq: sample.seq });
+            let chosen = chosen.map(|chosen| lane.keep(chosen));
+            whole &= chosen.is_some();
+            if let Some(newest) = lane.chosen.first_mut().filter(|_| chosen.is_some()) {
+                *newest = chosen;
                 lane.kept.copy_from_slice(&lane.chosen);
                 lane.kept_at = Some(tick);
             }
@@ -166,7 +225,7 @@ impl Observer {
             // From the newest step back: a step without a sample uses that of the following step, and so does one whose
             // sample has been overwritten.
             for (back, step) in (0..self.steps).rev().enumerate() {
-                let kept = shown.get(back).copied().flatten();
+                let kept = shown.get(back * lane.apart).copied().flatten();
                 let kept =
                     kept.filter(|kept| lane.places.get(kept.place).is_some_and(|place| place.header.seq == kept.seq));
                 chosen = kept.or(chosen);
@@ -181,6 +240,7 @@ impl Observer {
     /// Discards all samples.
     pub fn clear(&mut self) {
         self.sync.clear();
+        self.number = None;
         for lane in &mut self.lanes {
             lane.chosen.fill(None);
             lane.kept_at = None;
@@ -191,3 +251,6 @@ impl Observer {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

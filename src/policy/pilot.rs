@@ -1,6 +1,6 @@
 //! A policy in control: its observation at each tick, its requests, and the action of the tick.
 //!
-//! [`Observer`] and [`ActionQueue`] put together, without thread, clock or network: the caller keeps the time, names
+//! [`Observer`], [`Composer`] and [`ActionQueue`] put together, without thread, clock or network: the caller keeps the time, names
 //! the tick, and carries requests to a [`Model`](super::model::Model) and answers back.
 //!
 //! Invariant: an answer belongs to the request that is out; there is one at most.
@@ -8,7 +8,8 @@
 use std::time::Duration;
 
 use super::bundle::Bundle;
-use super::horizon::{ActionQueue, Situation, Step, WithoutMask};
+use super::compose::Composer;
+use super::horizon::{ActionQueue, ChunkError, Situation, Step, WithoutMask};
 use super::observer::Observer;
 use super::request::Request;
 use crate::bus::TopicId;
@@ -26,24 +27,30 @@ pub const FIRST_TICK_AFTER: Duration = Duration::from_millis(10);
 pub struct Pilot {
     /// The observations; takes samples.
     pub observer: Observer,
-    /// The actions; takes the answers to requests.
+    /// The actions; takes what is executed of the answers to requests, see [`Pilot::answer`].
     pub queue: ActionQueue,
     /// The mask published last.
     pub mask: PhysicalMask,
     seed: u64,
     situation: Situation,
+    composer: Composer,
+    /// What the last answer wants executed: `[Tp, executed values]`.
+    chunk: Vec<f32>,
 }
 
 impl Pilot {
     /// A policy without samples. `seed` determines its noise.
     pub fn new(bundle: &Bundle, registry: &Registry, without_mask: WithoutMask, seed: u64) -> Self {
         let mask = PhysicalMask::EMPTY;
+        let composer = Composer::new(bundle);
         Self {
             observer: Observer::new(bundle, registry),
             queue: ActionQueue::new(bundle, registry, without_mask),
             mask,
             seed,
             situation: Situation { mask, observation_age: None },
+            chunk: vec![0.0; composer.chunk_len()],
+            composer,
         }
     }
 
@@ -66,9 +73,9 @@ impl Pilot {
     }
 
     /// Observes tick number `number` of the control grid, at `tick`. Returns whether a request to the policy
-    /// is due; if so, [`Self::fill`] fills it, and [`ActionQueue::take`] or [`ActionQueue::failed`] must follow.
+    /// is due; if so, [`Self::fill`] fills it, and [`Self::answer`] or [`ActionQueue::failed`] must follow.
     pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp) -> bool {
-        let observation_age = self.observer.look(tick, now, self.mask);
+        let observation_age = self.observer.look(number, tick, now, self.mask);
         self.situation = Situation { mask: self.mask, observation_age };
         self.queue.wants_observation(number, self.situation)
     }
@@ -79,6 +86,24 @@ impl Pilot {
         // Each request has its own seed, so that a chunk can be recomputed without the earlier ones.
         request.seed = self.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(number);
         self.observer.fill(request);
+    }
+
+    /// Takes the answer to `request`: the network's output `[Tp, Da]`, denormalised. Returns how many actions were
+    /// skipped because it came more than one tick late.
+    ///
+    /// # Errors
+    /// Why the chunk is not used; the previous one stays in use.
+    pub fn answer(&mut self, request: &Request, output: &[f32]) -> Result<u64, ChunkError> {
+        match self.composer.compose(request, output, &mut self.chunk) {
+            Ok(()) => self.queue.take(request.tick, &self.chunk),
+            Err(reason) => Err(self.queue.refuse(request.tick, reason)),
+        }
+    }
+
+    /// What the last answer wants executed, within no limits yet: `[Tp, executed values]`. NaN throughout if nothing
+    /// follows from it.
+    pub fn chunk(&self) -> &[f32] {
+        &self.chunk
     }
 
     /// The action of tick `number`, after it was observed.

@@ -92,13 +92,13 @@ impl Sampler {
             condition: denoiser.input_index("global_cond")?,
             scheduler: Scheduler::new(&bundle.scheduler, steps)?,
             normalizer: Normalizer::of_action(&bundle.action),
-            noise: vec![0.0; bundle.horizon * bundle.action.len()],
+            noise: vec![0.0; bundle.horizon * bundle.action.outputs()],
             encoder,
             denoiser,
         })
     }
 
-    /// Numbers of a chunk: horizon x values of an action.
+    /// Numbers of a chunk: horizon x values of an action in the network's output.
     pub fn chunk_len(&self) -> usize {
         self.noise.len()
     }
@@ -121,7 +121,8 @@ impl Sampler {
         (first, steps.collect())
     }
 
-    /// Writes a chunk, action by action, in the units of the action. The noise is the seed's.
+    /// Writes a chunk, action by action, denormalised, as the network gives it: see
+    /// [`Composer`](super::compose::Composer) for what is executed. The noise is the seed's.
     ///
     /// # Errors
     /// When onnxruntime fails, the observations are of another bundle, or `out` is not

@@ -22,6 +22,7 @@ mod motor_faults;
 mod motors;
 mod policy;
 mod policy_alloc;
+mod poses;
 mod record_alloc;
 mod registry;
 mod schemas;

@@ -9,9 +9,10 @@
 use std::time::Duration;
 
 use crate::support::allocations::allocations;
-use crate::support::onnx::{ACTION, HORIZON, STEPS, write_bundle};
+use crate::support::onnx::{ACTION, Change, HORIZON, STEPS, write_bundle};
 use rapid::mask::PhysicalMask;
 use rapid::policy::bundle::Bundle;
+use rapid::policy::compose::Composer;
 use rapid::policy::horizon::{ActionQueue, Situation, WithoutMask};
 use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
@@ -34,8 +35,12 @@ const LARGEST: usize = 4000;
 const TICKS: u64 = 400;
 
 fn bundle() -> (tempfile::TempDir, Bundle) {
+    changed_bundle(&[])
+}
+
+fn changed_bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
     let folder = tempfile::tempdir().unwrap();
-    write_bundle(folder.path(), &[]);
+    write_bundle(folder.path(), changes);
     let bundle = Bundle::load(folder.path()).unwrap();
     (folder, bundle)
 }
@@ -120,6 +125,62 @@ fn a_tick_does_not_allocate() {
 }
 
 #[test]
+fn composing_a_chunk_and_steps_far_apart_do_not_allocate() {
+    let relative = r#""representation": "relative", "base": {"modality": "arm", "position": [0, 3]}"#;
+    let (_folder, bundle) = changed_bundle(&[
+        Change { what: r#""representation": "absolute""#, with: relative },
+        Change { what: r#""required": true,"#, with: r#""required": true, "down_sample_steps": 5,"# },
+    ]);
+    assert_eq!(bundle.observations[2].down_sample_steps, 5);
+    let registry = Registry::task();
+    let mut pilot = Pilot::new(&bundle, &registry, WithoutMask::Hold, 0);
+    let mut request = Request::new(&bundle);
+    let output = [0.5; HORIZON * ACTION];
+    let mut tick = |number: u64, large: bool| {
+        samples(&registry, number, large, |device, header, payload| {
+            pilot.observer.push(registry.devices[device].id, header, payload);
+        });
+        pilot.mask = PhysicalMask(0b111);
+        if pilot.look(number, at(number), at(number)) {
+            pilot.fill(number, at(number), &mut request);
+            // Some samples of the arm are too short for a pose.
+            let _ = pilot.answer(&request, &output);
+        }
+        let _ = pilot.step(number);
+    };
+    let begin = warm_up(&registry);
+    (0..begin).for_each(|number| tick(number, true));
+    assert_eq!(allocations(|| (begin..begin + TICKS).for_each(|number| tick(number, false))), 0);
+    let counts = pilot.queue.counts();
+    assert!(counts.chunks > TICKS / 16 && counts.actions > TICKS / 2, "{counts:?}");
+}
+
+#[test]
+fn composing_a_rotation_does_not_allocate() {
+    for name in ["relative", "delta"] {
+        let path = format!("{}/tests/bundle/valid/{name}.json", env!("CARGO_MANIFEST_DIR"));
+        let bundle = Bundle::parse(&std::fs::read_to_string(path).unwrap(), "policy.json").unwrap();
+        let composer = Composer::new(&bundle);
+        let mut request = Request::new(&bundle);
+        let arm = bundle.action.representation.base().unwrap().observation;
+        let header = SampleHeader { encoding: Encoding::F64 as u32, ..SampleHeader::default() };
+        let pose: Vec<u8> = [0.1_f64, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0].into_iter().flat_map(f64::to_le_bytes).collect();
+        request.set_present(arm, true);
+        for step in 0..bundle.n_obs_steps {
+            request.cell_mut(arm, step).unwrap().set(&header, &pose);
+        }
+        let output: Vec<f32> = (0_u8..10).map(|at| f32::from(at % 4) / 4.0).collect();
+        let output = output[..bundle.action.outputs()].repeat(bundle.horizon);
+        let mut actions = vec![0.0; composer.chunk_len()];
+        let mut wild = |output: &[f32], request: &Request| composer.compose(request, output, &mut actions);
+        assert!(wild(&output, &request).is_ok(), "{name}");
+        let zeros = vec![0.0; output.len()];
+        assert_eq!(allocations(|| (0..50).for_each(|_| _ = wild(&output, &request))), 0, "{name}");
+        assert_eq!(allocations(|| (0..50).for_each(|_| _ = wild(&zeros, &request))), 0, "{name}");
+    }
+}
+
+#[test]
 fn keeping_a_sample_does_not_allocate() {
     let (_folder, bundle) = bundle();
     let registry = Registry::task();
@@ -133,7 +194,7 @@ fn keeping_a_sample_does_not_allocate() {
     (0..begin).for_each(|number| push(number, true));
     assert_eq!(allocations(|| (begin..begin + TICKS).for_each(|number| push(number, false))), 0);
     let last = begin + TICKS - 1;
-    assert!(observer.look(at(last), at(last), PhysicalMask(0b111)).is_some(), "nothing was kept");
+    assert!(observer.look(last, at(last), at(last), PhysicalMask(0b111)).is_some(), "nothing was kept");
 }
 
 #[test]

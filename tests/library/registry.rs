@@ -246,7 +246,9 @@ fn what_numbers_mean_is_written_or_follows_from_the_device() {
     assert_eq!((camera.distortion.len(), camera.intrinsics[0], camera.intrinsics[5]), (8, 600.5, 240.0));
     let Loaded { registry, .. } = valid("can");
     let motors = registry.devices.iter().find_map(|device| device.form.clone());
-    let Some(Form::Joints(JointsSpec { names, quantities, tip: None })) = motors else { panic!("motors are joints: {motors:?}") };
+    let Some(Form::Joints(JointsSpec { names, quantities, tip: None })) = motors else {
+        panic!("motors are joints: {motors:?}")
+    };
     assert_eq!((names.len(), quantities), (4, vec![Position, Velocity, Effort, Other, Other, Other]));
     let Loaded { registry, .. } = valid("lan");
     assert_eq!(registry.named("phone_pose").unwrap().form, Some(pose(PoseLayout::Columns, "world")));

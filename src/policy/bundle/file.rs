@@ -8,7 +8,7 @@ use serde::Deserialize;
 use serde::de::{Deserializer, Error, IgnoredAny, IntoDeserializer};
 use serde_json::{Map, Value};
 
-use super::spec::{ColorOrder, Operation, WhenAbsent};
+use super::spec::{ActionRotation, ColorOrder, Operation, VectorRotation, WhenAbsent};
 use crate::text;
 
 /// Maximum number of actions in a chunk, and of values in an action.
@@ -17,6 +17,8 @@ const MAX_ACTION: i64 = 1024;
 type Side = Whole<1, 8192>;
 /// Longest time for which samples of an absent modality are held, ms.
 const LONGEST_HOLD_MS: i64 = 600_000;
+/// Most ticks between two steps of an observation.
+const MAX_DOWN_SAMPLE: i64 = 64;
 /// Maximum length of a vector.
 const MAX_VALUES: i64 = 4096;
 
@@ -76,9 +78,8 @@ pub(super) struct ImageFile {
     pub(super) normalization: Value,
     #[serde(default, deserialize_with = "when_absent")]
     pub(super) when_absent: WhenAbsent,
-    /// Observations are one tick of the control grid apart.
-    #[serde(default, rename = "down_sample_steps")]
-    _down_sample_steps: Option<Whole<1, 1>>,
+    #[serde(default)]
+    pub(super) down_sample_steps: Option<Whole<1, MAX_DOWN_SAMPLE>>,
 }
 
 #[derive(Deserialize)]
@@ -95,12 +96,11 @@ pub(super) struct VectorFile {
     pub(super) normalization: Value,
     #[serde(default, deserialize_with = "when_absent")]
     pub(super) when_absent: WhenAbsent,
-    /// Observations are one tick of the control grid apart.
-    #[serde(default, rename = "down_sample_steps")]
-    _down_sample_steps: Option<Whole<1, 1>>,
+    #[serde(default)]
+    pub(super) down_sample_steps: Option<Whole<1, MAX_DOWN_SAMPLE>>,
     /// Null: values are used unchanged.
-    #[serde(default, rename = "rotation")]
-    _rotation: (),
+    #[serde(default, deserialize_with = "word_or_null")]
+    pub(super) rotation: Option<VectorRotation>,
 }
 
 #[derive(Deserialize)]
@@ -132,21 +132,34 @@ pub(super) struct ActionFile {
     #[serde(deserialize_with = "names")]
     pub(super) units: Vec<String>,
     #[serde(deserialize_with = "word")]
-    pub(super) representation: Representation,
+    pub(super) representation: RepresentationWord,
+    /// Null: values are used unchanged.
+    #[serde(default, deserialize_with = "word_or_null")]
+    pub(super) rotation: Option<ActionRotation>,
+    #[serde(default)]
+    pub(super) base: Option<Value>,
     pub(super) limits: Value,
     pub(super) normalization: Vec<Value>,
-    /// Null: values are used unchanged.
-    #[serde(default, rename = "rotation")]
-    _rotation: (),
 }
 
-/// What the values of an action are relative to. Only absolute ones are executed.
-#[derive(PartialEq, Eq, Deserialize)]
+/// `representation`, without the base.
+#[derive(Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum Representation {
+pub(super) enum RepresentationWord {
     Absolute,
     Relative,
     Delta,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct BaseFile {
+    #[serde(deserialize_with = "name")]
+    pub(super) modality: String,
+    #[serde(deserialize_with = "slice")]
+    pub(super) position: Range<usize>,
+    #[serde(default, deserialize_with = "some_slice")]
+    pub(super) rotation: Option<Range<usize>>,
 }
 
 #[derive(Deserialize)]

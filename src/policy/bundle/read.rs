@@ -382,8 +382,8 @@ const KEYS: &[Key] = keys! {
     "crop": "[height, width] of the middle that is kept after the resize, or null", "[96, 96]";
     "operation": "\"diff_to_reference\" or null", "null";
     "when_absent": "\"zero\" or {\"hold_last_ms\": 1 to 600000}; leave it out for zero", "\"zero\"";
-    "down_sample_steps": "1, or leave it out: observations are one tick of the control grid apart", "1";
-    "rotation": "null, or leave it out: a policy whose values are rotated does not run here", "null";
+    "down_sample_steps": "how many ticks are between two of its steps, 1 to 64; leave it out for 1", "1";
+    "observations.rotation": "\"rotation_6d\" if slice names a quaternion; leave it out for numbers as they are", "null";
     "observations.slice": "[begin, end] of the sample's numbers, end not included; leave it out for all of them", "[0, 1]";
 
     "observations.normalization": "{\"mode\": \"min_max\", \"min\": [..], \"max\": [..]}, or mode \"mean_std\" or \"identity\"", "{}";
@@ -405,7 +405,12 @@ const KEYS: &[Key] = keys! {
     "action.shape": "[how many values, 1 to 1024]", "[1]";
     "names": "a name for each value of an action", "[\"name\"]";
     "units": "the unit of each value of an action, \"1\" for none", "[\"1\"]";
-    "representation": "\"absolute\"", "\"absolute\"";
+    "representation": "\"absolute\", \"relative\" or \"delta\"", "\"absolute\"";
+    "action.rotation": "\"rotation_6d\" or \"quaternion\"; leave it out for actions without a rotation", "null";
+    "action.base": "{\"modality\": .., \"position\": [begin, end], \"rotation\": [begin, end]}: where the pose is that actions are relative to", "{}";
+    "base.modality": "the modality of a required vector observation", "\"modality\"";
+    "base.position": "[begin, end] of the sample's 3 numbers x, y, z, end not included", "[0, 3]";
+    "base.rotation": "[begin, end] of the sample's quaternion x y z w, end not included, if the action has a rotation", "[3, 7]";
     "limits": "{\"min\": [..], \"max\": [..]}, beyond which no action goes", "{}";
     "limits.min": "the smallest values that may be executed, one number per dimension", "[0]";
     "limits.max": "the largest values that may be executed, none below its min", "[1]";

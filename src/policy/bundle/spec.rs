@@ -28,8 +28,8 @@ pub struct Bundle {
     /// `mask_aware`: trained with modalities left out, so that it can run without one. A policy that was not gains
     /// nothing from zeros in place of a missing modality.
     pub mask_aware: bool,
-    /// `n_obs_steps`, To: observations from which a chunk is computed, `1..=64`. Step i of To is tick k - (To - 1) + i
-    /// of the control grid.
+    /// `n_obs_steps`, To: observations from which a chunk is computed, `1..=64`. Step i of To is tick
+    /// k - (To - 1 - i) * N of the control grid, N the `down_sample_steps` of the observation.
     pub n_obs_steps: usize,
     /// `horizon`, Tp: actions in a chunk, `1..=1024`.
     pub horizon: usize,
@@ -109,6 +109,8 @@ pub struct ObservationSpec {
     pub required: bool,
     /// `when_absent`: what stands in for it while its modality is absent.
     pub when_absent: WhenAbsent,
+    /// `down_sample_steps`, N: ticks of the control grid between two of its steps, `1..=64`.
+    pub down_sample_steps: usize,
     /// `kind` and its settings.
     pub input: ObservationInput,
     /// `normalization`, one entry per channel of a picture or per value of a vector.
@@ -160,6 +162,17 @@ pub struct VectorSpec {
     pub len: usize,
     /// `slice`: which numbers of the sample are used, `len` of them. `None` uses all, and the sample has `len`.
     pub slice: Option<Range<usize>>,
+    /// `rotation`: `None` uses them as they are. Otherwise `slice` has the 4 numbers of a quaternion, and `len` is 6.
+    pub rotation: Option<VectorRotation>,
+}
+
+/// What a vector is made of that is a rotation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum VectorRotation {
+    /// The first two rows of its matrix.
+    #[serde(rename = "rotation_6d")]
+    Rotation6d,
 }
 
 /// Order of the channels.
@@ -221,25 +234,33 @@ pub struct MaskSpec {
     pub order: Vec<String>,
 }
 
-/// `action`: the meaning of the denoiser's output after denormalisation.
+/// `action`: the meaning of the denoiser's output after denormalisation, and what is executed.
+///
+/// The network's output for an action has Da values: with a pose its position (3), its rotation (0, 4 or 6) and the rest,
+/// such as a gripper's opening. What is executed is absolute: position, quaternion `x y z w` if there is a rotation, the
+/// rest as it is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BundleAction {
     /// `actuator`: the name of the actuator's entry in `devices.toml`.
     pub actuator: String,
-    /// `names` of the values, Da of them. `shape` is `[Da]`, `1..=1024`.
+    /// `representation`: what the poses of the output are relative to.
+    pub representation: Representation,
+    /// `rotation`: how the output has the rotation of a pose. `None`: it has none.
+    pub rotation: Option<ActionRotation>,
+    /// `names` of the executed values.
     pub names: Vec<String>,
-    /// `units` of the values, Da of them.
+    /// `units` of the executed values, one for each.
     pub units: Vec<String>,
-    /// `limits.min`: no value below is executed, Da of them.
+    /// `limits.min`: no value below is executed, one for each.
     pub min: Vec<f32>,
-    /// `limits.max`: no value above is executed, Da of them, none below its `min`.
+    /// `limits.max`: no value above is executed, one for each, none below its `min`.
     pub max: Vec<f32>,
-    /// `normalization`: ascending slices that cover every value exactly once.
+    /// `normalization` of the output: ascending slices that cover every value exactly once.
     pub normalization: Vec<SliceNormalization>,
 }
 
 impl BundleAction {
-    /// Number of values of one action, Da.
+    /// Number of values of an executed action.
     pub fn len(&self) -> usize {
         self.names.len()
     }
@@ -248,6 +269,88 @@ impl BundleAction {
     pub fn is_empty(&self) -> bool {
         self.names.is_empty()
     }
+
+    /// Number of values of an action in the network's output, Da. `shape` is `[Da]`, `1..=1024`.
+    pub fn outputs(&self) -> usize {
+        self.len() + self.rotation.map_or(0, ActionRotation::numbers) - self.rotation.map_or(0, |_| QUATERNION)
+    }
+}
+
+/// Values of a position.
+pub(in crate::policy) const POSITION: usize = 3;
+/// Values of a quaternion.
+pub(in crate::policy) const QUATERNION: usize = 4;
+
+/// What the poses of the network's output are relative to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Representation {
+    /// Nothing: they are targets. Without a rotation an action need not be a pose.
+    Absolute,
+    /// The pose at the tick of the newest observation, T0: the target is T0 A. Without a rotation it is p0 + d.
+    Relative(BasePose),
+    /// The target before: p + d, and D R. Of the action of the newest observation's tick that is T0.
+    Delta(BasePose),
+}
+
+impl Representation {
+    /// Where T0 is; `None` if the output is absolute.
+    pub const fn base(&self) -> Option<&BasePose> {
+        match self {
+            Self::Absolute => None,
+            Self::Relative(base) | Self::Delta(base) => Some(base),
+        }
+    }
+
+    /// Its name in the file.
+    pub const fn word(&self) -> &'static str {
+        match self {
+            Self::Absolute => "absolute",
+            Self::Relative(_) => "relative",
+            Self::Delta(_) => "delta",
+        }
+    }
+}
+
+/// How the network's output has a rotation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ActionRotation {
+    /// The first two rows of its matrix: 6 values.
+    #[serde(rename = "rotation_6d")]
+    Rotation6d,
+    /// `x y z w`: 4 values.
+    Quaternion,
+}
+
+impl ActionRotation {
+    /// Number of its values.
+    pub const fn numbers(self) -> usize {
+        match self {
+            Self::Rotation6d => 6,
+            Self::Quaternion => QUATERNION,
+        }
+    }
+
+    /// Its name in the file.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Rotation6d => "rotation_6d",
+            Self::Quaternion => "quaternion",
+        }
+    }
+}
+
+/// `action.base`: where the pose T0 is that actions are relative to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BasePose {
+    /// `modality`: whose samples have it. A required vector observation has this modality.
+    pub modality: String,
+    /// The index of the first such observation.
+    pub observation: usize,
+    /// `position`: which numbers of a sample are x, y and z, 3 of them.
+    pub position: Range<usize>,
+    /// `rotation`: which are its quaternion `x y z w`, 4 of them; `None` if the action has no rotation.
+    pub rotation: Option<Range<usize>>,
 }
 
 /// The normalisation of some values of an action.

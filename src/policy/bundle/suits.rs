@@ -4,7 +4,7 @@ use std::fmt;
 
 use super::files::Graph;
 use super::read::Problems;
-use super::spec::{Bundle, BundleErrors, ImageSpec, ObservationInput, VectorSpec};
+use super::spec::{BasePose, Bundle, BundleErrors, ImageSpec, ObservationInput, VectorSpec};
 use crate::modality::ModalityKind;
 use crate::registry::{Registry, did_you_mean};
 
@@ -126,10 +126,19 @@ impl Bundle {
                 }
             }
         }
+        if let Some(base) = self.action.representation.base()
+            && let Some(device) = registry.named(&base.modality)
+        {
+            let modality = device.modality();
+            let channels = modality.shape.first().map_or(0, |channels| *channels as usize);
+            if modality.kind == ModalityKind::Scalars {
+                pose(base, channels, &mut problems);
+            }
+        }
         problems.check()
     }
 
-    /// Checks that its actuator is one of `actuators`, which are given with the number of values of an action.
+    /// Checks that its actuator is one of `actuators`, which are given with the number of values of an executed action.
     ///
     /// # Errors
     /// When it is not, or its actions have another length.
@@ -181,7 +190,7 @@ impl Bundle {
             inputs.push(Wanted::new(&mask.input, Element::F32, &[mask.order.len()]));
         }
         let condition = |len| Wanted { name: Some("global_cond"), element: Element::F32, dims: vec![len] };
-        let actions = [self.horizon, self.action.len()];
+        let actions = [self.horizon, self.action.outputs()];
         compare(Graph::Encoder, encoder, "input", &inputs, &mut problems);
         compare(Graph::Encoder, encoder, "output", &[condition(None)], &mut problems);
         let given = encoder.outputs.iter().find(|output| output.name == "global_cond");
@@ -259,6 +268,18 @@ fn picture(entry: &str, name: &str, image: &ImageSpec, shape: &[u32], problems: 
             wanted[1], wanted[0], wanted[0], wanted[1]
         );
         problems.report(entry, message, fix);
+    }
+}
+
+/// The pose that actions are relative to, in samples of `channels` numbers.
+fn pose(base: &BasePose, channels: usize, problems: &mut Problems) {
+    for (key, range) in [("position", Some(&base.position)), ("rotation", base.rotation.as_ref())] {
+        if let Some(range) = range.filter(|range| range.end > channels) {
+            let name = &base.modality;
+            let message = format!("ends at {}, but \"{name}\" gives {channels} numbers", range.end);
+            let fix = format!("correct it, or channels of \"{name}\" in devices.toml");
+            problems.report(&format!("action.base.{key}"), message, fix);
+        }
     }
 }
 

@@ -124,6 +124,43 @@ fn every_difference_from_the_rig_is_reported() {
     assert!(five[1].starts_with("[observations[2]] wants 4 numbers, but \"arm\" gives 5"), "{}", five[1]);
 }
 
+/// The bundle of relative actions with a rotation; the arm has position and quaternion in its first 7 numbers.
+const RELATIVE: &str = include_str!("../../../tests/bundle/valid/relative.json");
+
+#[test]
+fn a_base_beyond_the_samples_of_its_device_is_reported() {
+    let relative = Bundle::parse(RELATIVE, "policy.json").unwrap_or_else(|errors| panic!("{errors}"));
+    let seven = "node = \"serial\"\n[device.arm.tty]\nchannels = 7";
+    relative.check_registry(&registry(CAM, seven)).unwrap();
+    let two = "node = \"serial\"\n[device.arm.tty]\nchannels = 2";
+    let found = problems(relative.check_registry(&registry(CAM, two)));
+    assert_eq!(
+        found[1..],
+        [
+            "[action.base.position] ends at 3, but \"arm\" gives 2 numbers\n    \
+             fix: correct it, or channels of \"arm\" in devices.toml",
+            "[action.base.rotation] ends at 7, but \"arm\" gives 2 numbers\n    \
+             fix: correct it, or channels of \"arm\" in devices.toml",
+        ]
+    );
+}
+
+#[test]
+fn the_actuator_takes_what_is_executed_and_the_graphs_give_what_was_learned() {
+    let relative = Bundle::parse(RELATIVE, "policy.json").unwrap_or_else(|errors| panic!("{errors}"));
+    assert_eq!((relative.action.len(), relative.action.outputs()), (8, 10));
+    relative.check_actuators(&[("arm", 8)]).unwrap();
+    let refused = problems(relative.check_actuators(&[("arm", 10)]));
+    assert!(refused[0].starts_with("[action] has 8 values, but \"arm\" takes 10"), "{}", refused[0]);
+    let (mut encoder, mut denoiser) = graphs();
+    encoder.inputs[1].dims = vec![None, Some(2), Some(6)];
+    assert_eq!(problems(relative.check_graphs(&encoder, &denoiser)).len(), 2);
+    for tensor in [&mut denoiser.inputs[0], &mut denoiser.outputs[0]] {
+        tensor.dims = vec![None, Some(16), Some(10)];
+    }
+    relative.check_graphs(&encoder, &denoiser).unwrap();
+}
+
 #[test]
 fn the_actuator_must_exist_and_take_the_same_number_of_values() {
     bundle().check_actuators(&[("other", 2), ("arm", 4)]).unwrap();

@@ -1,19 +1,18 @@
 //! Converts the text of `policy.json` to a [`Bundle`], and checks what types cannot express, such as matching lengths.
 
-use std::ops::{Range, RangeInclusive};
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-use super::file::{
-    ActionFile, Graphs, Head, ImageFile, Limits, MaskFile, ObservationFile, Representation, Sliced, VectorFile, Whole,
-};
+use super::action::check_action;
+use super::file::{Graphs, Head, ImageFile, MaskFile, ObservationFile, VectorFile, Whole};
 use super::read::{Problems, Strict, read, read_tagged};
 use super::spec::{
-    Bundle, BundleAction, BundleErrors, ImageSpec, MaskSpec, Normalization, ObservationInput, ObservationSpec,
-    SchedulerSpec, SliceNormalization, TimestepSpacing, VectorSpec, WhenAbsent,
+    Bundle, BundleErrors, ImageSpec, MaskSpec, Normalization, ObservationInput, ObservationSpec, QUATERNION,
+    SchedulerSpec, TimestepSpacing, VectorSpec, WhenAbsent,
 };
 use crate::registry::did_you_mean;
 
@@ -21,6 +20,11 @@ use crate::registry::did_you_mean;
 const FORMAT: &str = "rapid-policy/1";
 /// Channels of every picture.
 const CHANNELS: usize = 3;
+/// Values of a rotation as an observation, the first two rows of its matrix.
+const SIX: usize = 6;
+/// Fixes for an observation that is a rotation.
+const ROTATION_SHAPE: &str = "write \"shape\": [6], the first two rows of the matrix, or leave rotation out";
+const ROTATION_SLICE: &str = "write \"slice\": [begin, end] of the sample's quaternion x y z w, or leave rotation out";
 /// Smaller ones are lost in the 1 - beta of a 32-bit float.
 const BETAS: RangeInclusive<f64> = 1e-6..=0.999;
 
@@ -73,7 +77,8 @@ fn root(value: &Value, problems: &mut Problems) -> Option<Bundle> {
     if let (Some(observations), Some(mask), Some(head)) = (&observations, &mask, &head) {
         check_mask_fits(observations, mask.as_ref(), head.mask_aware, problems);
     }
-    let action = section(value, "action", problems).and_then(|action| check_action(action, problems));
+    let action = section(value, "action", problems);
+    let action = action.and_then(|action| check_action(action, observations.as_deref(), problems));
     let scheduler = section(value, "scheduler", problems);
     if let Some(scheduler) = &scheduler {
         check_scheduler(scheduler, problems);
@@ -115,7 +120,7 @@ fn check_range(entry: &str, number: f64, range: &RangeInclusive<f64>, problems: 
     }
 }
 
-fn check_length(entry: &str, numbers: &[f32], len: usize, problems: &mut Problems) -> bool {
+pub(super) fn check_length(entry: &str, numbers: &[f32], len: usize, problems: &mut Problems) -> bool {
     if numbers.len() != len {
         let plural = if len == 1 { "" } else { "s" };
         problems.wrong(entry, format!("has {} numbers for {len} dimension{plural}", numbers.len()));
@@ -159,25 +164,28 @@ fn observations(value: &Value, problems: &mut Problems) -> Option<Vec<Observatio
 }
 
 fn observation(entry: &str, value: &Value, problems: &mut Problems) -> Option<ObservationSpec> {
-    let (key, modality, required, when_absent, numbers, len, input) = match read_tagged(entry, "kind", value, problems)?
-    {
+    let read = read_tagged(entry, "kind", value, problems)?;
+    let (key, modality, required, when_absent, steps, numbers, len, input) = match read {
         ObservationFile::Image(file) => {
             let input = ObservationInput::Image(check_image(entry, &file, problems));
-            (file.key, file.modality, file.required, file.when_absent, file.normalization, CHANNELS, input)
+            let (when_absent, steps) = (file.when_absent, file.down_sample_steps);
+            (file.key, file.modality, file.required, when_absent, steps, file.normalization, CHANNELS, input)
         }
         ObservationFile::Vector(file) => {
             let vector = check_vector(entry, &file, problems);
             let len = vector.len;
             let input = ObservationInput::Vector(vector);
-            (file.key, file.modality, file.required, file.when_absent, file.normalization, len, input)
+            let (when_absent, steps) = (file.when_absent, file.down_sample_steps);
+            (file.key, file.modality, file.required, when_absent, steps, file.normalization, len, input)
         }
     };
+    let down_sample_steps = steps.map_or(1, Whole::get);
     let normalization = normalization(&format!("{entry}.normalization"), &numbers, Some(len), problems)?;
     if required && when_absent != WhenAbsent::Zero {
         let fix = "leave it out: without what it requires the policy holds";
         problems.report(&format!("{entry}.when_absent"), "the observation is required", fix);
     }
-    Some(ObservationSpec { key, modality, required, when_absent, input, normalization })
+    Some(ObservationSpec { key, modality, required, when_absent, down_sample_steps, input, normalization })
 }
 
 fn check_image(entry: &str, file: &ImageFile, problems: &mut Problems) -> ImageSpec {
@@ -202,15 +210,37 @@ fn check_image(entry: &str, file: &ImageFile, problems: &mut Problems) -> ImageS
 
 fn check_vector(entry: &str, file: &VectorFile, problems: &mut Problems) -> VectorSpec {
     let len = file.shape[0].get();
-    if let Some(slice) = file.slice.as_ref().filter(|slice| slice.len() != len) {
+    if file.rotation.is_some() {
+        if len != SIX {
+            problems.report(
+                &format!("{entry}.shape"),
+                format!("is [{len}], but a rotation has {SIX} values"),
+                ROTATION_SHAPE,
+            );
+        }
+        let named = file.slice.as_ref().map_or(0, ExactSizeIterator::len);
+        if named != QUATERNION {
+            let message = if named == 0 {
+                "is missing".to_owned()
+            } else {
+                format!("names {named} numbers, but a quaternion has {QUATERNION}")
+            };
+            problems.report(&format!("{entry}.slice"), message, ROTATION_SLICE);
+        }
+    } else if let Some(slice) = file.slice.as_ref().filter(|slice| slice.len() != len) {
         let message = format!("[{}, {}] holds {} numbers, shape has {len}", slice.start, slice.end, slice.len());
         problems.wrong(&format!("{entry}.slice"), message);
     }
-    VectorSpec { len, slice: file.slice.clone() }
+    VectorSpec { len, slice: file.slice.clone(), rotation: file.rotation }
 }
 
 /// A normalisation of `len` dimensions, if that is known.
-fn normalization(entry: &str, value: &Value, len: Option<usize>, problems: &mut Problems) -> Option<Normalization> {
+pub(super) fn normalization(
+    entry: &str,
+    value: &Value,
+    len: Option<usize>,
+    problems: &mut Problems,
+) -> Option<Normalization> {
     let found = read_tagged(entry, "mode", value, problems)?;
     let place = |name: &str| format!("{entry}.{name}");
     let fits = |name: &str, numbers: &[f32], problems: &mut Problems| {
@@ -295,58 +325,6 @@ fn check_mask_fits(
             problems.report(&format!("observations[{at}]"), message, fix);
         }
     }
-}
-
-fn check_action(file: ActionFile, problems: &mut Problems) -> Option<BundleAction> {
-    let len = file.shape[0].get();
-    if file.representation != Representation::Absolute {
-        problems.wrong("action.representation", "is not supported: only absolute targets are executed");
-    }
-    for (name, list) in [("names", &file.names), ("units", &file.units)] {
-        if list.len() != len {
-            let message = format!("has {} entries, but an action has {len} values", list.len());
-            problems.wrong(&format!("action.{name}"), message);
-        }
-    }
-    let limits = read("action.limits", &file.limits, problems);
-    let normalization = slices(&file.normalization, len, problems);
-    let Limits { min, max } = limits?;
-    if check_length("action.limits.min", &min, len, problems) & check_length("action.limits.max", &max, len, problems) {
-        for (at, (min, max)) in min.iter().zip(&max).enumerate().filter(|(_, (min, max))| max < min) {
-            problems.wrong(&format!("action.limits.max[{at}]"), format!("{max} is below min[{at}] = {min}"));
-        }
-    }
-    let ActionFile { actuator, names, units, .. } = file;
-    Some(BundleAction { actuator, names, units, min, max, normalization: normalization? })
-}
-
-/// The normalisations of an action of `len` values, ascending.
-fn slices(list: &[Value], len: usize, problems: &mut Problems) -> Option<Vec<SliceNormalization>> {
-    let entry = "action.normalization";
-    let read = |(at, value)| sliced(&format!("{entry}[{at}]"), value, problems);
-    let found: Vec<Option<SliceNormalization>> = list.iter().enumerate().map(read).collect();
-    // The range of a slice that could not be read is unknown.
-    let mut found: Vec<SliceNormalization> = found.into_iter().collect::<Option<_>>()?;
-    for end in found.iter().map(|part| part.slice.end).filter(|end| *end > len) {
-        problems.wrong(entry, format!("covers values up to {end}, but an action has {len}"));
-    }
-    for value in 0..len {
-        match found.iter().filter(|part| part.slice.contains(&value)).count() {
-            0 => problems.wrong(entry, format!("does not cover value {value}")),
-            1 => {}
-            _ => problems.wrong(entry, format!("covers value {value} more than once")),
-        }
-    }
-    found.sort_by_key(|part| part.slice.start);
-    Some(found)
-}
-
-fn sliced(entry: &str, value: &Value, problems: &mut Problems) -> Option<SliceNormalization> {
-    let slice: Option<Range<usize>> = read(entry, value, problems).map(|Sliced { slice }| slice);
-    let mut rest = value.clone();
-    rest.as_object_mut()?.remove("slice");
-    let normalization = normalization(entry, &rest, slice.as_ref().map(ExactSizeIterator::len), problems);
-    Some(SliceNormalization { slice: slice?, normalization: normalization? })
 }
 
 fn check_scheduler(scheduler: &SchedulerSpec, problems: &mut Problems) {

@@ -171,6 +171,23 @@ fn values_beyond_the_limits_are_clamped_and_reported_once_a_chunk() {
 }
 
 #[test]
+fn a_chunk_without_poses_is_refused_and_counted() {
+    let mut queue = queue();
+    assert_eq!(lockstep(&mut queue, 0, FRESH), Ok(1.0));
+    for tick in 1..3 {
+        assert!(lockstep(&mut queue, tick, FRESH).is_ok());
+    }
+    assert!(queue.wants_observation(3, FRESH));
+    assert_eq!(queue.refuse(2, ChunkError::NoBase), ChunkError::Unasked, "another request");
+    assert_eq!(queue.refuse(3, ChunkError::NoRotation), ChunkError::NoRotation);
+    assert_eq!(at(&mut queue, 3, FRESH), Ok(4.0), "the previous chunk continues");
+    assert!(queue.wants_observation(4, FRESH), "at once again");
+    assert_eq!(queue.refuse(4, ChunkError::NoBase), ChunkError::NoBase);
+    assert_eq!((queue.counts().no_pose_chunks, queue.counts().unasked_chunks, queue.counts().chunks), (2, 1, 1));
+    assert_eq!(at(&mut queue, 6, FRESH), Err(HoldReason::Unusable));
+}
+
+#[test]
 fn an_old_observation_requests_no_chunk() {
     let mut queue = queue();
     lockstep(&mut queue, 0, FRESH).unwrap();

@@ -175,7 +175,7 @@ impl Bare {
         }
         let condition = denoiser.input_index("global_cond")?;
         encoder.run(|values| denoiser.write(condition, values))??;
-        let mut noise = vec![0.0; bundle.horizon * bundle.action.len()];
+        let mut noise = vec![0.0; bundle.horizon * bundle.action.outputs()];
         Random::new(SEED, 0).fill_normal(&mut noise);
         denoiser.write(denoiser.input_index("sample")?, &noise)?;
         denoiser.write_integer(denoiser.input_index("timestep")?, 50)?;

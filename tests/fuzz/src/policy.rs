@@ -14,7 +14,7 @@ pub fn bundle(bytes: &[u8]) {
             assert!((1..=bundle.horizon - bundle.action_start).contains(&bundle.n_action_steps));
             assert!(bundle.control_hz.is_finite() && bundle.control_hz > 0.0);
             let covered: usize = bundle.action.normalization.iter().map(|slice| slice.slice.len()).sum();
-            assert_eq!(covered, bundle.action.len());
+            assert_eq!(covered, bundle.action.outputs());
             assert!(bundle.mask_aware <= bundle.mask.is_some(), "a reader that knows the mask reads it");
         }
         Err(errors) => assert!(!errors.diagnostics.is_empty()),
