@@ -92,8 +92,10 @@ def _observation(o: Observation, ranges: dict[str, MinMax]) -> dict[str, Any]:
     if o.kind == "vector":
         turned = {"rotation": "rotation_6d"} if o.turned else {}
         return {**common, "slice": list(o.run_slice), **turned, "normalization": ranges[o.key].to_dict()}
+    held = {"when_absent": o.when_absent.model_dump()} if o.when_absent else {}
     return {
         **common,
+        **held,
         "color": o.color,
         "resize": list(o.resize) if o.resize else None,
         "crop": list(o.crop) if o.crop else None,
@@ -180,7 +182,7 @@ def _absent(spec: Experiment) -> str:
         return "not provided for"
     dropped = []
     for o in spec.images:
-        ways = {"window": o.dropout.window, "replug": o.dropout.replug, "episode": o.dropout.episode}
+        ways = o.dropout.model_dump()
         given = ", ".join(f"{'' if way == 'window' else way + ' '}{share:g}" for way, share in ways.items() if share)
         dropped += [f"`{o.key}` {given}"] if given else []
     return "zeroed after their encoders, by the mask; taken away in training: " + (", ".join(dropped) or "none")

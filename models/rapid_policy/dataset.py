@@ -145,7 +145,23 @@ class Dataset:
         if spec.policy.mask_aware and vary:
             visible = drop(spec, visible, seen, self._episode_spans(tick), random)
         plan["visible"] = visible
+        if vary:
+            self._hold(plan, random)
         return plan
+
+    def _hold(self, plan: Plan, random: np.random.Generator) -> None:
+        """Some windows see a picture as it was before it left: from what has passed since then they are the same."""
+        seen, starts = plan["seen"], self._episode_spans(plan["tick"])[:, :1]
+        for i, o in enumerate(self.spec.images):
+            if not (o.dropout.held and o.when_absent):
+                continue
+            longest = max(1, round(o.when_absent.hold_last_ms / 1e3 * self.spec.policy.control_hz))
+            # Every moment since the episode began is as likely as any other.
+            room = np.minimum(seen[:, :1] - starts, longest)
+            since = np.where(room > 0, random.integers(0, np.maximum(room, 1)) + 1, 0)
+            is_held = (random.random((len(seen), 1)) < o.dropout.held) & plan["visible"][:, :, i].all(1, keepdims=True)
+            is_held &= self.present[seen - np.minimum(since, room)][:, :, i].all(1, keepdims=True)
+            plan[f"since {o.key}"] = np.where(is_held, since, 0)
 
     def gather(self, plan: Plan) -> Batch:
         """The windows of a plan, or of a part of its rows."""
@@ -154,7 +170,7 @@ class Dataset:
             {}, {}, {}, {}, {}, torch.from_numpy(visible[:, -1].astype(np.float32)), self._batch_actions(plan)
         )
         for i, o in enumerate(spec.images):
-            steps, shown = _replugged(plan["seen"], visible[:, :, i])
+            steps, shown = _replugged(plan["seen"] - plan.get(f"since {o.key}", 0), visible[:, :, i])
             batch.shown[o.key] = torch.from_numpy(shown)
             self._pictures(batch, o, plan, steps, shown)
             if (gain := plan.get(f"gain {o.key}")) is not None:

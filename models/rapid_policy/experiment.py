@@ -81,11 +81,18 @@ class Dropout(Section):
     window: Share = known("share of the windows without it", 0.3, 0.0)
     replug: Share = known("share of the windows in the middle of which it is plugged in again", 0.1, 0.0)
     episode: Share = known("share of the windows that see it leave in the middle of their episode", 0.2, 0.0)
+    held: Share = known("share of the windows that see it as it was before it left, with when_absent", 0.2, 0.0)
 
     @property
     def any(self) -> bool:
         """Whether it is ever taken away."""
-        return max(self.window, self.replug, self.episode) > 0
+        return max(self.window, self.replug, self.episode, self.held) > 0
+
+
+class HoldLast(Section):
+    """What stands in for an absent picture at run time: its last ones, for a time; without it, nothing does."""
+
+    hold_last_ms: int = known("for how long, ms", 20000, ge=1, le=600_000)
 
 
 class Augmentation(Section):
@@ -143,6 +150,7 @@ class Observation(Section):
         None,
     )
     dropout: Dropout = known("how often it is taken away in training", {"window": 0.3}, Dropout())
+    when_absent: HoldLast | None = known("what stands in for it while it is absent", {"hold_last_ms": 20000}, None)
     augmentation: Augmentation = known("what is varied in training", {"shift": 4}, Augmentation())
 
     @model_validator(mode="after")
@@ -156,6 +164,11 @@ class Observation(Section):
             self._check_vector()
         if self.required and self.dropout.any:
             raise mistake("dropout", "what is required is never absent", "write required = false, or remove dropout")
+        if self.required and self.when_absent:
+            raise mistake("when_absent", "what is required is never absent", "write required = false, or remove the key")
+        if self.dropout.held and not self.when_absent:
+            fix = "write when_absent = { hold_last_ms = 20000 }"
+            raise mistake("dropout.held", "at run time nothing stands in for it", fix)
         return self
 
     def _check_picture(self) -> None:
@@ -215,7 +228,7 @@ class Observation(Section):
         return begin, begin + self.shape[0]
 
 
-_IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout"}
+_IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout", "when_absent"}
 _VECTOR_KEYS = {"columns", "parts", "slice"}
 
 

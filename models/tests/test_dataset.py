@@ -178,6 +178,29 @@ class Dropout(unittest.TestCase):
         # Where it is back the step before may have been without it.
         self.assertTrue((kept[:, 1, 1] & ~kept[:, 0, 1]).any())
 
+    def test_what_is_held_is_shown_as_it_was_since_the_episode_began(self):
+        held = {"dropout": {"held": 0.5}, "when_absent": {"hold_last_ms": 1000}}
+        dataset = Dataset(observed(plain(), "wrist", **held), [made_up(30), made_up(40)])
+        dataset.windows = dataset.windows[[30 + 25, 30 + 4, 30]]
+        batch, given = drawn(dataset, 6000)
+        self.assertTrue((batch.mask == 1).all())
+        wrist = ((given["wrist"][:, :, 0, 0, 0] + 1) * 127.5).round().int()
+        tick = dataset.ranges["action"].invert(batch.actions.numpy())[:, 1, 0].round().astype(int)
+        pairs = {at: {tuple(row) for row in wrist[torch.from_numpy(tick == at)].tolist()} for at in (25, 4, 0)}
+        # A second is 10 ticks, and nothing of the episode before is shown.
+        self.assertEqual(pairs[25], {(24 - since, 25 - since) for since in range(11)})
+        self.assertEqual(pairs[4], {(3 - since, 4 - since) for since in range(4)})
+        self.assertEqual(pairs[0], {(0, 0)})
+        old = wrist[torch.from_numpy(tick == 25)][:, 1] < 25
+        self.assertAlmostEqual(float(old.float().mean()), 0.5, delta=0.05)
+        # What was not there then is not shown as if it had been.
+        dataset = Dataset(observed(plain(), "wrist", **held), [made_up(30)])
+        dataset.windows = dataset.windows[25:26]
+        dataset.present[15:24, 0] = False
+        _, given = drawn(dataset, 500)
+        wrist = ((given["wrist"][:, :, 0, 0, 0] + 1) * 127.5).round().int()
+        self.assertEqual({tuple(row) for row in wrist.tolist()}, {(24, 25)})
+
     def test_without_dropout_nothing_is_taken(self):
         self.assertTrue(self.masked(plain(), np.ones((100, 2), bool)).all())
 
