@@ -19,7 +19,7 @@ pub struct RunArgs {
     /// Record from the start, into episodes/ (see --out)
     #[arg(long)]
     pub record: bool,
-    /// End after recording (or running) this long: 30s, 5m; the loading of a policy is not counted
+    /// End after recording (or running) this long: 30s, 5m
     #[arg(long, value_name = "TIME", value_parser = duration, hide_short_help = true)]
     pub duration: Option<Duration>,
     /// Folder for episodes

@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::{CommandStatus, Format, json_line};
 use crate::interlock::StopKind;
 #[cfg(feature = "motors")]
-use crate::kinematics::Arm;
+use crate::kinematics::{Arm, ArmError};
 use crate::registry::{
     ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
     ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, RegistryErrors, StopSpec, UsbSpec,

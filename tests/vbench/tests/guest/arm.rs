@@ -182,8 +182,8 @@ fn scenario(demonstration: &Recording) -> Scenario {
         .device(adapter)
         .registry(&registry())
         .file("arm.urdf", urdf)
-        .file("wrist", feed::pack(&pictures(demonstration, WRIST)))
-        .file("tactile", feed::pack(&pictures(demonstration, TACTILE)))
+        .file("wrist", feed::pack(pictures(demonstration, WRIST)))
+        .file("tactile", feed::pack(pictures(demonstration, TACTILE)))
         .file("steps", DENOISING_STEPS)
         .limit(Duration::from_secs(480))
         .script(SCRIPT);
