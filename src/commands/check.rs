@@ -64,13 +64,20 @@ fn with_arms(loaded: Loaded) -> Result<Loaded, RegistryErrors> {
             column: 0,
             entry: Some(format!("device.{}.effector", device.name)),
             message: text::plain(&error.to_string()).into_owned(),
-            fix: Some(
-                "write the names of its joints as names of the motors, and its links as `frame` and `tip`".to_owned(),
-            ),
+            fix: Some(arm_fix(&error).to_owned()),
         })
     });
     let diagnostics: Vec<_> = mistakes.collect();
     if diagnostics.is_empty() { Ok(loaded) } else { Err(RegistryErrors { diagnostics }) }
+}
+
+#[cfg(feature = "motors")]
+const fn arm_fix(error: &ArmError) -> &'static str {
+    match error {
+        ArmError::File { .. } => "write urdf = its path, beginning beside this file",
+        ArmError::Chain { .. } => "write the names of two of its links as `frame` and `tip`",
+        ArmError::Motors { .. } => "give each motor the name of its joint, and write `gripper`",
+    }
 }
 
 /// Without motors there are no arms.

@@ -20,10 +20,10 @@ const CAMERAS: &str = include_str!("../../../../src/registry/task_cameras.toml")
 /// the tool downwards.
 const URDF: &str = include_str!("../../../arm/arm.urdf");
 const ZEROS: [(&str, &str); 4] = [
-    ("<origin xyz=\"-0.2 0 0\" rpy=\"0 0 0\"/>", "<origin xyz=\"-0.2 -1 0\" rpy=\"0 0 1.5707963267948966\"/>"),
+    ("<origin xyz=\"-0.2 0 0\" rpy=\"0 0 0\"/>", "<origin xyz=\"-0.2 -0.9 0\" rpy=\"0 0 1.5707963267948966\"/>"),
     ("<child link=\"upper\"/>", "<child link=\"upper\"/><origin xyz=\"0 0 0\" rpy=\"0 0.8 0\"/>"),
-    ("<origin xyz=\"0 0 0.75\" rpy=\"0 0 0\"/>", "<origin xyz=\"0 0 0.75\" rpy=\"0 1.2 0\"/>"),
-    ("<origin xyz=\"0 0 0.65\" rpy=\"0 0 0\"/>", "<origin xyz=\"0 0 0.65\" rpy=\"0 1.1415926535897932 0\"/>"),
+    ("<origin xyz=\"0 0 0.75\" rpy=\"0 0 0\"/>", "<origin xyz=\"0 0 0.85\" rpy=\"0 1.2 0\"/>"),
+    ("<origin xyz=\"0 0 0.65\" rpy=\"0 0 0\"/>", "<origin xyz=\"0 0 0.75\" rpy=\"0 1.1415926535897932 0\"/>"),
 ];
 const ARM: &str = "/rapid/can/arm";
 const MOTORS: [&str; 6] = ["waist", "lift", "elbow", "pitch", "roll", "jaw"];
