@@ -234,7 +234,7 @@ fn what_numbers_mean_is_written_or_follows_from_the_device() {
     assert_eq!(form("marker"), pose(PoseLayout::Rows, "camera"));
     let joints = |names: &[&str], quantities: &[Quantity]| {
         let names = names.iter().map(|name| (*name).to_owned()).collect();
-        Form::Joints(JointsSpec { names, quantities: quantities.to_vec() })
+        Form::Joints(JointsSpec { names, quantities: quantities.to_vec(), tip: None })
     };
     assert_eq!(form("fingers"), joints(&["left", "right"], &[Position, Other, Effort]));
     assert_eq!(form("encoder"), joints(&["gripper"], &[Position]));

@@ -93,7 +93,9 @@ fn a_policy_moves_an_arm_by_its_tip_without_its_tactile_camera_too() {
         println!("{name}: off {} ms after the kill", ms(off, killed));
     }
     println!("{}", outcome.file("recover.txt"));
-    println!("{}", outcome.file("inspect.json"));
+    let repaired: Value = serde_json::from_str(&outcome.file("inspect.json")).expect("one object");
+    assert_eq!((&repaired["verdict"], &repaired["end"]), (&"SUSPECT".into(), &"finished".into()), "{repaired}");
+    assert!(repaired["recovered"]["lossless"] == "true", "{repaired}");
 
     let episode = episode(&outcome);
     let edges = episode.mask_edges();
