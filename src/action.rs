@@ -87,8 +87,11 @@ pub enum NoAction {
     #[error("another program publishes actions while a policy runs here: end one of them")]
     Foreign,
     /// It is a pose that the arm cannot take.
-    #[error("the arm does not reach the pose that is asked for: it holds")]
+    #[error("the arm does not reach the pose that is asked for, or has no way there: it follows no such action")]
     OutOfReach,
+    /// It is not as long as the actions of the arm.
+    #[error("an action has another number of values than the actions of the arm")]
+    Length,
 }
 
 /// Where an actuator reads the action to carry out: the topic of actions.

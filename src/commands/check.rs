@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::{CommandStatus, Format, json_line};
 use crate::interlock::StopKind;
 #[cfg(feature = "motors")]
-use crate::kinematics::{Arm, ArmError};
+use crate::kinematics::Arm;
 use crate::registry::{
     ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
     ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, RegistryErrors, StopSpec, UsbSpec,
@@ -64,20 +64,11 @@ fn with_arms(loaded: Loaded) -> Result<Loaded, RegistryErrors> {
             column: 0,
             entry: Some(format!("device.{}.effector", device.name)),
             message: text::plain(&error.to_string()).into_owned(),
-            fix: Some(arm_fix(&error).to_owned()),
+            fix: Some(error.fix().to_owned()),
         })
     });
     let diagnostics: Vec<_> = mistakes.collect();
     if diagnostics.is_empty() { Ok(loaded) } else { Err(RegistryErrors { diagnostics }) }
-}
-
-#[cfg(feature = "motors")]
-const fn arm_fix(error: &ArmError) -> &'static str {
-    match error {
-        ArmError::File { .. } => "write urdf = its path, beginning beside this file",
-        ArmError::Chain { .. } => "write the names of two of its links as `frame` and `tip`",
-        ArmError::Motors { .. } => "give each motor the name of its joint, and write `gripper`",
-    }
 }
 
 /// Without motors there are no arms.

@@ -1,19 +1,29 @@
 //! An arm of the registry: what its motors are in the chain, and what its actions mean.
 
-use std::path::PathBuf;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
 
-use k::{Constraints, InverseKinematicsSolver as _, JacobianIkSolver, SerialChain};
+use k::SerialChain;
+use k::nalgebra::{DMatrix, DVector, Isometry3, Quaternion, UnitQuaternion};
 
 use super::chain::{Chain, ChainError, isometry};
+use crate::action::NoAction;
 use crate::registry::{EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, MotorSpec, TipRotation};
 
 /// How near the tip must come to its target: a tenth of what the motors resolve.
 const NEAR_M: f64 = 1e-4;
 const NEAR_RAD: f64 = 1e-3;
-/// Steps of the solver, and which part of the way to the linear solution each takes. What a tip moves within a tick
-/// needs five.
+/// Steps of the solver: what a tip moves within a tick needs three.
 const STEPS: usize = 100;
-const PART: f64 = 0.7;
+/// Damping of a step (Levenberg 1944): directions in which the tip moves by less, m or rad for each rad of the joints, are
+/// hardly taken. Without it a joint that does not matter turns by whatever the rounding says.
+const DAMPING: f64 = 1e-2;
+/// No joint turns further in one step, rad: of several ways to reach a pose the one that leads there is found.
+const FARTHEST_STEP: f64 = 0.3;
+/// No joint turns further for one action, rad: another way to reach the pose, with the elbow on the other side, is not taken.
+const FARTHEST: f64 = 2.0;
+/// A description has some kB.
+const LARGEST_FILE: u64 = 16 << 20;
 
 /// Why the description does not fit the motors.
 #[derive(Debug, thiserror::Error)]
@@ -36,19 +46,39 @@ pub enum ArmError {
     },
     /// A joint without a motor, or a motor without a joint.
     #[error("{}: {message}", file.display())]
-    Motors {
+    Names {
         /// The description.
         file: PathBuf,
         /// Which.
         message: String,
     },
+    /// A joint whose motor must be elsewhere.
+    #[error("{}: no position of joint {joint:?} is also one of its motor ({range:?})", file.display())]
+    Range {
+        /// The description.
+        file: PathBuf,
+        /// The joint.
+        joint: String,
+        /// What its motor may be.
+        range: [f64; 2],
+    },
 }
 
-/// A target that the tip cannot have: too far away, beyond the limits of the joints, or beyond a position from which the
-/// arm has no way there (a singular one).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("the arm does not reach the pose that is asked for, or is stretched so that it has no way there")]
-pub struct OutOfReach;
+impl ArmError {
+    /// What to write in place of it.
+    pub const fn fix(&self) -> &'static str {
+        match self {
+            Self::File { .. } => "write urdf = the path of a description, beginning beside this file",
+            Self::Chain { source: ChainError::NoDescription(_), .. } => "write a URDF file; xacro is expanded first",
+            Self::Chain { source: ChainError::NoLink(_) | ChainError::NotAttached { .. }, .. } => {
+                "write the names of two of its links as `frame` and `tip`"
+            }
+            Self::Chain { .. } => "correct that joint in the description",
+            Self::Names { .. } => "give each motor the name of its joint, and name that of the gripper as `gripper`",
+            Self::Range { .. } => "write limits of the joint and position of the motor that overlap",
+        }
+    }
+}
 
 /// See the module's comment.
 #[derive(Debug, Clone)]
@@ -68,7 +98,7 @@ impl Arm {
     /// When it cannot be read, or has other joints than there are motors.
     pub fn open(spec: &EffectorSpec, motors: &[MotorSpec]) -> Result<Self, ArmError> {
         let file = &spec.urdf;
-        let text = std::fs::read_to_string(file).map_err(|source| ArmError::File { file: file.clone(), source })?;
+        let text = read(file).map_err(|source| ArmError::File { file: file.clone(), source })?;
         Self::of(spec, motors, &text)
     }
 
@@ -79,23 +109,26 @@ impl Arm {
     pub fn of(spec: &EffectorSpec, motors: &[MotorSpec], urdf: &str) -> Result<Self, ArmError> {
         let chain = Chain::read(urdf, spec.frame.as_deref(), &spec.tip);
         let chain = chain.map_err(|source| ArmError::Chain { file: spec.urdf.clone(), source })?;
-        let mismatch = |message: String| ArmError::Motors { file: spec.urdf.clone(), message };
+        let mismatch = |message: String| ArmError::Names { file: spec.urdf.clone(), message };
         let gripper = spec.gripper.map(|gripper| gripper.motor);
         let mut found = Vec::new();
         let mut limits = Vec::new();
         for joint in &chain.joints {
             let motor = motors.iter().enumerate().find(|(_, motor)| motor.name == joint.name);
-            let Some((at, motor)) = motor.filter(|(at, _)| Some(*at) != gripper) else {
-                return Err(mismatch(format!(
-                    "joint {:?} moves the tip, and no motor of [can] has its name",
-                    joint.name
-                )));
+            let Some((at, motor)) = motor else {
+                return Err(mismatch(format!("joint {:?} moves the tip, and no motor has its name", joint.name)));
             };
-            let [low, high] = [joint.limits[0].max(motor.position[0]), joint.limits[1].min(motor.position[1])];
-            if low > high {
-                let message =
-                    format!("no position of joint {:?} is also one of its motor ({:?})", joint.name, motor.position);
+            if Some(at) == gripper {
+                let message = format!("joint {:?} moves the tip, and its motor is the gripper", joint.name);
                 return Err(mismatch(message));
+            }
+            if found.contains(&at) {
+                return Err(mismatch(format!("two joints have the name {:?}", joint.name)));
+            }
+            let [low, high] = [joint.limits[0].max(motor.position[0]), joint.limits[1].min(motor.position[1])];
+            if low >= high {
+                let (file, joint) = (spec.urdf.clone(), joint.name.clone());
+                return Err(ArmError::Range { file, joint, range: motor.position });
             }
             found.push(at);
             limits.push([low, high]);
@@ -129,27 +162,25 @@ impl Arm {
 
     /// What turns actions into targets.
     pub fn solver(&self) -> Solver {
-        let (needs_rotation, has_yaw) = (self.spec.rotation != TipRotation::Free, !self.spec.free_yaw);
-        Solver {
-            serial: self.chain.serial(self.limits.iter().copied()),
-            jacobian: JacobianIkSolver::new(NEAR_M, NEAR_RAD, PART, STEPS),
-            constraints: Constraints {
-                rotation_x: needs_rotation,
-                rotation_y: needs_rotation,
-                rotation_z: needs_rotation && has_yaw,
-                ..Constraints::default()
-            },
-            arm: self.clone(),
-        }
+        Solver { serial: self.chain.serial(), arm: self.clone() }
     }
+}
+
+/// The text of a description.
+fn read(file: &Path) -> std::io::Result<String> {
+    let mut text = String::new();
+    let file = std::fs::File::open(file)?;
+    if !file.metadata()?.is_file() {
+        return Err(std::io::Error::other("it is not a file"));
+    }
+    file.take(LARGEST_FILE).read_to_string(&mut text)?;
+    Ok(text)
 }
 
 /// See [`Arm::solver`].
 pub struct Solver {
     arm: Arm,
     serial: SerialChain<f64>,
-    jacobian: JacobianIkSolver<f64>,
-    constraints: Constraints,
 }
 
 impl std::fmt::Debug for Solver {
@@ -160,40 +191,84 @@ impl std::fmt::Debug for Solver {
 
 impl Solver {
     /// The position of each motor for an action (x, y, z; the quaternion if it is commanded; the opening of the gripper), with
-    /// the motors at `from` at present: of several ways to reach a pose the nearest is taken.
+    /// the motors at `from` at present. A position beyond the box of the registry is moved to its edge.
     ///
     /// # Errors
-    /// When the tip cannot be there; then the motors should stay.
-    pub fn targets(&mut self, action: &[f64], from: &[f64]) -> Result<[f64; MAX_MOTORS], OutOfReach> {
-        let Arm { spec, motors, limits, chain } = &self.arm;
+    /// When the action has another length, or the tip does not get there from where it is: the pose is too far away, beyond the
+    /// limits of the joints, or the arm is stretched so that it has no way there. Then the motors should stay.
+    pub fn targets(&mut self, action: &[f64], from: &[f64]) -> Result<[f64; MAX_MOTORS], NoAction> {
+        let Arm { spec, motors, chain, .. } = &self.arm;
+        let turned = if spec.rotation == TipRotation::Commanded { 4 } else { 0 };
+        if action.len() != 3 + turned + usize::from(spec.gripper.is_some()) {
+            return Err(NoAction::Length);
+        }
         let mut action = action.iter().copied();
-        let mut next = || action.next().filter(|number| number.is_finite()).ok_or(OutOfReach);
+        let mut next = || action.next().filter(|number| number.is_finite()).ok_or(NoAction::OutOfReach);
         let mut place = [next()?, next()?, next()?];
         for (number, (min, max)) in place.iter_mut().zip(spec.min.iter().zip(&spec.max)) {
             *number = number.clamp(*min, *max);
         }
         let start = motors.iter().map(|motor| from.get(*motor).copied().filter(|number| number.is_finite()));
-        let start: Vec<f64> = start.collect::<Option<_>>().ok_or(OutOfReach)?;
+        let start: Vec<f64> = start.collect::<Option<_>>().ok_or(NoAction::OutOfReach)?;
         let turned = match spec.rotation {
             TipRotation::Commanded => [next()?, next()?, next()?, next()?],
             TipRotation::Held(rotation) => rotation,
             TipRotation::Free => chain.pose(start.iter().copied()).1,
         };
-        let target = isometry(place, turned).ok_or(OutOfReach)?;
-        let clamped = start.iter().zip(limits).map(|(number, [low, high])| number.clamp(*low, *high));
-        self.serial.set_joint_positions_unchecked(&clamped.collect::<Vec<_>>());
-        self.jacobian.solve_with_constraints(&self.serial, &target, &self.constraints).map_err(|_| OutOfReach)?;
+        let target = isometry(place, turned).ok_or(NoAction::OutOfReach)?;
+        let gripper = spec.gripper.map(|gripper| Ok((gripper, next()?.clamp(0.0, 1.0)))).transpose()?;
+        let found = self.solve(&target, &start).ok_or(NoAction::OutOfReach)?;
         let mut targets = [0.0; MAX_MOTORS];
-        let found = self.serial.joint_positions();
-        for (motor, position) in motors.iter().zip(&found) {
-            let place = targets.get_mut(*motor).filter(|_| position.is_finite()).ok_or(OutOfReach)?;
-            *place = *position;
+        for (motor, position) in self.arm.motors.iter().zip(&found) {
+            *targets.get_mut(*motor).ok_or(NoAction::OutOfReach)? = *position;
         }
-        if let Some(gripper) = spec.gripper {
-            let opening = next()?.clamp(0.0, 1.0);
-            *targets.get_mut(gripper.motor).ok_or(OutOfReach)? =
-                gripper.closed + opening * (gripper.open - gripper.closed);
+        if let Some((gripper, opening)) = gripper {
+            let place = targets.get_mut(gripper.motor).ok_or(NoAction::OutOfReach)?;
+            *place = gripper.closed + opening * (gripper.open - gripper.closed);
         }
         Ok(targets)
+    }
+
+    /// The joints with the tip at `target`, by damped steps from `start`. `None` if they do not lead there.
+    fn solve(&self, target: &Isometry3<f64>, start: &[f64]) -> Option<Vec<f64>> {
+        let limits = &self.arm.limits;
+        let mut joints: Vec<f64> =
+            start.iter().zip(limits).map(|(joint, [low, high])| joint.clamp(*low, *high)).collect();
+        for _ in 0..STEPS {
+            self.serial.set_joint_positions_unchecked(&joints);
+            let error = self.error(target);
+            let (far, turned) = (error.rows(0, 3).norm(), error.rows(3, error.len() - 3).norm());
+            if far < NEAR_M && turned < NEAR_RAD {
+                let is_near = joints.iter().zip(start).all(|(joint, start)| (joint - start).abs() <= FARTHEST);
+                return is_near.then_some(joints);
+            }
+            let slope = k::jacobian(&self.serial).rows(0, error.len()).into_owned();
+            let across = slope.transpose();
+            let damped = &slope * &across + DMatrix::identity(error.len(), error.len()) * DAMPING.powi(2);
+            let step = across * damped.cholesky()?.solve(&error);
+            let shorter = (FARTHEST_STEP / step.amax()).min(1.0);
+            for ((joint, by), [low, high]) in joints.iter_mut().zip(step.iter()).zip(limits) {
+                *joint = (*joint + by * shorter).clamp(*low, *high);
+            }
+        }
+        None
+    }
+
+    /// From the tip to `target`: m, and rad about x, y and z as far as they are commanded.
+    fn error(&self, target: &Isometry3<f64>) -> DVector<f64> {
+        let tip = self.serial.end_transform();
+        let far = target.translation.vector - tip.translation.vector;
+        let mut turn = target.rotation * tip.rotation.inverse();
+        if self.arm.spec.free_yaw {
+            // Without its part about z, which may be anything.
+            let [_, _, z, w] = *turn.coords.as_ref();
+            let about_z = Quaternion::new(w, 0.0, 0.0, z);
+            if about_z.norm() > 1e-9 {
+                turn = UnitQuaternion::from_quaternion(about_z).inverse() * turn;
+            }
+        }
+        let turn = turn.scaled_axis();
+        let all = [far.x, far.y, far.z, turn.x, turn.y, turn.z];
+        DVector::from_column_slice(all.get(..self.arm.spec.commanded()).unwrap_or(&all))
     }
 }

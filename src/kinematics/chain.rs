@@ -3,6 +3,11 @@
 use k::nalgebra::{Isometry3, Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
 use urdf_rs::{JointType, Robot};
 
+/// No number of an arm is larger, in m or rad: products of larger ones would not be finite.
+const LARGEST: f64 = 1e3;
+/// Elements within elements, at most: a description has six, and its parser calls itself for each.
+const DEEPEST: usize = 64;
+
 /// Why a description has no such chain.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ChainError {
@@ -20,24 +25,18 @@ pub enum ChainError {
         /// The link at the end.
         tip: String,
     },
-    /// A joint whose kind does not have one position.
-    #[error("joint {0:?} is neither fixed, revolute, continuous nor prismatic")]
+    /// A joint whose position is not an angle.
+    #[error("joint {0:?} is neither fixed, revolute nor continuous, and the position of a motor is an angle")]
     Kind(String),
     /// A joint that depends on another.
     #[error("joint {0:?} mimics another, which no motor does")]
     Mimic(String),
-    /// A number that is not finite, an axis of length 0, or limits the wrong way round.
-    #[error("joint {0:?} has an axis, an origin or limits that are none")]
+    /// An axis or an origin that is none.
+    #[error("joint {0:?} has an axis of length 0, or a number that is not finite or beyond 1000")]
     Numbers(String),
-}
-
-/// How a joint moves.
-#[derive(Debug, Clone, Copy)]
-enum Motion {
-    /// About an axis, rad.
-    Turn(Unit<Vector3<f64>>),
-    /// Along an axis, m.
-    Slide(Unit<Vector3<f64>>),
+    /// It has nowhere to go.
+    #[error("joint {0:?} has no range: its <limit> has no lower that is below its upper")]
+    Range(String),
 }
 
 /// A joint that moves.
@@ -46,8 +45,8 @@ pub(super) struct Joint {
     pub(super) name: String,
     /// Where it is at position 0, relative to the joint before it.
     origin: Isometry3<f64>,
-    motion: Motion,
-    /// Its lowest and highest position; infinite without a limit.
+    axis: Unit<Vector3<f64>>,
+    /// Its lowest and highest position, rad; infinite without a limit.
     pub(super) limits: [f64; 2],
 }
 
@@ -65,6 +64,9 @@ impl Chain {
     /// # Errors
     /// When there is no such chain, or it has a joint that no motor can move.
     pub fn read(urdf: &str, frame: Option<&str>, tip: &str) -> Result<Self, ChainError> {
+        if is_deeper_than(urdf, DEEPEST) {
+            return Err(ChainError::NoDescription(format!("more than {DEEPEST} elements within each other")));
+        }
         let robot = urdf_rs::read_from_string(urdf).map_err(|error| ChainError::NoDescription(error.to_string()))?;
         for link in frame.into_iter().chain([tip]) {
             if !robot.links.iter().any(|known| known.name == link) {
@@ -84,30 +86,29 @@ impl Chain {
         let [roll, pitch, yaw] = *joint.origin.rpy;
         let [ax, ay, az] = *joint.axis.xyz;
         let limits = [joint.limit.lower, joint.limit.upper];
-        if ![x, y, z, roll, pitch, yaw, ax, ay, az, limits[0], limits[1]].iter().all(|number| number.is_finite()) {
+        let numbers = [x, y, z, roll, pitch, yaw, ax, ay, az];
+        // Also false of what is not a number.
+        if !numbers.iter().chain(&limits).all(|number| number.abs() <= LARGEST) {
             return Err(ChainError::Numbers(name()));
         }
         let turned = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
         let origin = self.end * Isometry3::from_parts(Translation3::new(x, y, z), turned);
-        let axis = || Unit::try_new(Vector3::new(ax, ay, az), 1e-6).ok_or_else(|| ChainError::Numbers(name()));
-        let motion = match joint.joint_type {
+        let limits = match joint.joint_type {
             JointType::Fixed => {
                 self.end = origin;
                 return Ok(());
             }
-            JointType::Revolute | JointType::Continuous => Motion::Turn(axis()?),
-            JointType::Prismatic => Motion::Slide(axis()?),
+            JointType::Continuous => [f64::NEG_INFINITY, f64::INFINITY],
+            // Without limits both are 0.
+            JointType::Revolute if limits[0] < limits[1] => limits,
+            JointType::Revolute => return Err(ChainError::Range(name())),
             _ => return Err(ChainError::Kind(name())),
         };
         if joint.mimic.is_some() {
             return Err(ChainError::Mimic(name()));
         }
-        let limits = match joint.joint_type {
-            JointType::Continuous => [f64::NEG_INFINITY, f64::INFINITY],
-            _ if limits[0] <= limits[1] => limits,
-            _ => return Err(ChainError::Numbers(name())),
-        };
-        self.joints.push(Joint { name: name(), origin, motion, limits });
+        let axis = Unit::try_new(Vector3::new(ax, ay, az), 1e-6).ok_or_else(|| ChainError::Numbers(name()))?;
+        self.joints.push(Joint { name: name(), origin, axis, limits });
         self.end = Isometry3::identity();
         Ok(())
     }
@@ -117,10 +118,7 @@ impl Chain {
         let mut pose = Isometry3::identity();
         for (joint, position) in self.joints.iter().zip(positions) {
             pose *= joint.origin;
-            match joint.motion {
-                Motion::Turn(axis) => pose *= UnitQuaternion::from_axis_angle(&axis, position),
-                Motion::Slide(axis) => pose *= Translation3::from(axis.into_inner() * position),
-            }
+            pose *= UnitQuaternion::from_axis_angle(&joint.axis, position);
         }
         pose *= self.end;
         let place = pose.translation.vector;
@@ -128,19 +126,16 @@ impl Chain {
         ([place.x, place.y, place.z], [turned.x, turned.y, turned.z, turned.w])
     }
 
-    /// The same chain for the solver, with these limits of its joints.
-    pub(super) fn serial(&self, limits: impl Iterator<Item = [f64; 2]>) -> k::SerialChain<f64> {
+    /// The same chain for the solver.
+    pub(super) fn serial(&self) -> k::SerialChain<f64> {
         let mut last: Option<k::Node<f64>> = None;
         let mut nodes = Vec::new();
-        let moving = self.joints.iter().zip(limits).map(|(joint, [low, high])| {
-            let kind = match joint.motion {
-                Motion::Turn(axis) => k::JointType::Rotational { axis },
-                Motion::Slide(axis) => k::JointType::Linear { axis },
-            };
-            (joint.name.as_str(), joint.origin, kind, Some(k::joint::Range::new(low, high)))
-        });
-        for (name, origin, kind, limits) in moving.chain([("tip", self.end, k::JointType::Fixed, None)]) {
-            let node = k::NodeBuilder::new().name(name).joint_type(kind).limits(limits);
+        let moving = self
+            .joints
+            .iter()
+            .map(|joint| (joint.name.as_str(), joint.origin, k::JointType::Rotational { axis: joint.axis }));
+        for (name, origin, kind) in moving.chain([("tip", self.end, k::JointType::Fixed)]) {
+            let node = k::NodeBuilder::new().name(name).joint_type(kind);
             let node = node.translation(origin.translation).rotation(origin.rotation).into_node();
             if let Some(last) = last.replace(node.clone()) {
                 node.set_parent(&last);
@@ -149,6 +144,23 @@ impl Chain {
         }
         k::SerialChain::new_unchecked(k::Chain::from_nodes(nodes))
     }
+}
+
+/// Whether a text has so many elements within each other. It is no parser: what it takes for elements in comments counts too.
+fn is_deeper_than(text: &str, most: usize) -> bool {
+    let mut depth = 0_usize;
+    for part in text.split('<').skip(1) {
+        match part.as_bytes().first() {
+            Some(b'/') => depth = depth.saturating_sub(1),
+            Some(b'?' | b'!') => {}
+            _ if part.split('>').next().is_some_and(|tag| tag.ends_with('/')) => {}
+            _ => depth += 1,
+        }
+        if depth > most {
+            return true;
+        }
+    }
+    false
 }
 
 /// The joints from `frame` to `tip` in order.
@@ -175,10 +187,11 @@ fn path<'a>(robot: &'a Robot, frame: Option<&str>, tip: &str) -> Result<Vec<&'a 
     Ok(path)
 }
 
-/// A pose for the solver; `None` if the quaternion is none.
+/// A pose for the solver; `None` if the quaternion has not about the length 1, or a number is not finite.
 pub(super) fn isometry(position: [f64; 3], rotation: [f64; 4]) -> Option<Isometry3<f64>> {
-    let [x, y, z, w] = rotation;
-    let turned = Unit::try_new(Quaternion::new(w, x, y, z), 1e-6)?;
-    let [x, y, z] = position;
-    Some(Isometry3::from_parts(Translation3::new(x, y, z), turned))
+    let length = rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
+    let is_pose = (0.5..=2.0).contains(&length) && position.iter().all(|number| number.abs() <= LARGEST);
+    let ([x, y, z], [qx, qy, qz, qw]) = (position, rotation);
+    let turned = UnitQuaternion::from_quaternion(Quaternion::new(qw, qx, qy, qz));
+    is_pose.then(|| Isometry3::from_parts(Translation3::new(x, y, z), turned))
 }

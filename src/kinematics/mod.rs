@@ -5,12 +5,12 @@
 //!
 //! Invariant: nothing in a file causes a panic, and no number that is not finite gets to the motors.
 //! Invariant: [`Arm::state`] does not allocate or lock: it is called for every sample. [`Solver::targets`] does both, and
-//! belongs into a thread of its own.
+//! belongs in a thread of its own.
 
 mod arm;
 mod chain;
 #[cfg(test)]
 mod tests;
 
-pub use arm::{Arm, ArmError, OutOfReach, Solver};
+pub use arm::{Arm, ArmError, Solver};
 pub use chain::{Chain, ChainError};

@@ -3,6 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::action::NoAction::{Length, OutOfReach};
 use crate::registry::{
     CanProtocol, CanSpec, DamiaoSpec, EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, NodeSpec, Registry, TipRotation,
 };
@@ -99,6 +100,8 @@ proptest! {
         prop_assume!(pitch.abs() < 2.5);
         let there = [waist, lift, elbow, pitch, roll, 0.0];
         let wanted = state(&arm, &there);
+        // Below is outside the box of the registry.
+        prop_assume!(wanted[2] > 0.0);
         let mut from = [0.0; MAX_MOTORS];
         for (place, (position, by)) in from.iter_mut().zip(there.iter().zip(by)) {
             *place = position + by;
@@ -132,18 +135,72 @@ proptest! {
     }
 }
 
+/// Motors at these positions.
+fn at(positions: [f64; 6]) -> [f64; MAX_MOTORS] {
+    let mut from = [0.0; MAX_MOTORS];
+    from[..6].copy_from_slice(&positions);
+    from
+}
+
+const FOLDED: [f64; 6] = [0.0, 0.8, 1.2, std::f64::consts::PI - 2.0, 0.0, 0.0];
+
 #[test]
 fn what_is_out_of_reach_or_singular_gives_no_target() {
+    let refused =
+        |arm: &Arm, action: &[f64], from: [f64; 6]| arm.solver().targets(action, &at(from)).expect_err("none");
+    let down = arm(DOWN);
+    assert_eq!(refused(&down, &[1.9, 1.9, 1.9, 0.0], FOLDED), OutOfReach);
+    assert_eq!(refused(&down, &[f64::NAN, 0.4, 1.0, 0.0], FOLDED), OutOfReach);
+    // Straight up it has no way down: every joint would move the tip sideways.
+    assert_eq!(refused(&arm(""), &[-0.2, 0.0, 1.5, 0.0], [0.0; 6]), OutOfReach);
+    // Neither a pose with a quaternion nor positions of the motors are actions of this arm.
+    for action in [&[0.4, 0.4, 1.0][..], &[0.4, 0.4, 1.0, 0.0, 1.0, 0.0, 0.0, 0.5], &[0.1; 6], &[]] {
+        assert_eq!(refused(&down, action, FOLDED), Length, "{action:?}");
+    }
+    let commanded = arm("rotation = \"commanded\"\nyaw = \"free\"");
+    for rotation in [[0.0; 4], [1e200, 0.0, 0.0, 0.0], [f64::INFINITY; 4]] {
+        let action = [&[0.4, 0.0, 0.8][..], &rotation, &[0.5]].concat();
+        assert_eq!(refused(&commanded, &action, FOLDED), OutOfReach, "{rotation:?}");
+    }
+}
+
+/// With the tool downwards the last joint only turns it about z, which is free: it stays as it is, whatever the waist is.
+#[test]
+fn an_arm_that_is_asked_for_one_pose_again_and_again_does_not_move() {
+    let (arm, opening) = (arm(DOWN), 0.5);
+    for waist in [-2.9, -1.5, 0.0, 0.4, 1.5, 2.9] {
+        for roll in [-2.0, 0.0, 1.0] {
+            let mut there = FOLDED;
+            (there[0], there[4]) = (waist, roll);
+            let [x, y, z, ..] = state(&arm, &there);
+            let mut solver = arm.solver();
+            let mut motors = at(there);
+            for _ in 0..200 {
+                motors = solver.targets(&[x, y, z, opening], &motors).expect("it is there");
+            }
+            for (joint, (now, then)) in motors.iter().zip(there).take(5).enumerate() {
+                assert!((now - then).abs() < 0.01, "joint {joint} of {there:?}: {motors:?}");
+            }
+        }
+    }
+}
+
+/// A path of small steps is followed in small steps.
+#[test]
+fn no_joint_jumps_on_a_circle() {
     let arm = arm(DOWN);
-    let mut from = [0.0; MAX_MOTORS];
-    from[..6].copy_from_slice(&[0.0, 0.8, 1.2, 1.14, 0.0, 0.0]);
-    let far = [1.9, 1.9, 1.9, 0.0];
-    assert_eq!(arm.solver().targets(&far, &from), Err(OutOfReach));
-    // Straight up, every joint but the waist and the roll only turns the tip in one plane.
-    let straight = [0.0; MAX_MOTORS];
-    assert_eq!(arm.solver().targets(&[-0.2, 0.4, 1.0, 0.0], &straight), Err(OutOfReach));
-    assert_eq!(arm.solver().targets(&[f64::NAN, 0.4, 1.0, 0.0], &from), Err(OutOfReach));
-    assert_eq!(arm.solver().targets(&[0.4, 0.4, 1.0], &from), Err(OutOfReach), "an action without an opening");
+    let mut solver = arm.solver();
+    let mut motors = at(FOLDED);
+    let [x, y, z, ..] = state(&arm, &FOLDED);
+    for step in 0..200_u32 {
+        let angle = f64::from(step) * std::f64::consts::TAU / 100.0;
+        let action = [x - 0.3 + 0.3 * angle.cos(), y + 0.3 * angle.sin(), z, 0.0];
+        let next = solver.targets(&action, &motors).expect("within reach");
+        let far = next.iter().zip(motors).map(|(next, now)| (next - now).abs()).fold(0.0, f64::max);
+        assert!(far < 0.15, "step {step}: {motors:?} {next:?}");
+        assert!(distance(&state(&arm, &next[..6])[..3], &action[..3]) < 2e-4);
+        motors = next;
+    }
 }
 
 #[test]
@@ -167,11 +224,24 @@ fn a_description_that_does_not_fit_is_refused_by_name() {
         (with("tool", Some("floor")), URDF.to_owned(), "no link \"floor\""),
         (with("base", Some("tool")), URDF.to_owned(), "link \"base\" is not attached to link \"tool\""),
         (with("wrist", None), URDF.to_owned(), "motor \"roll\" is no joint"),
-        (with("finger", None), URDF.to_owned(), "joint \"jaw\" moves the tip, and no motor"),
+        (with("finger", None), URDF.to_owned(), "joint \"jaw\" moves the tip, and its motor is the gripper"),
         (effector.clone(), swapped("name=\"elbow\" type", "name=\"ellbow\" type"), "joint \"ellbow\" moves the tip"),
         (effector.clone(), swapped("<axis xyz=\"0 1 0\"/>", "<axis xyz=\"0 0 0\"/>"), "joint \"lift\" has an axis"),
         (effector.clone(), swapped("lower=\"-2.5\"", "lower=\"NaN\""), "joint \"lift\" has an axis"),
-        (effector.clone(), swapped("lower=\"-2.5\"", "lower=\"9\""), "joint \"lift\" has an axis"),
+        (effector.clone(), swapped("lower=\"-2.5\"", "lower=\"9\""), "joint \"lift\" has no range"),
+        (effector.clone(), swapped("lower=\"-2.5\" upper=\"2.5\" ", ""), "joint \"lift\" has no range"),
+        (effector.clone(), swapped("xyz=\"0 0 0.75\"", "xyz=\"0 0 1e308\""), "joint \"elbow\" has an axis"),
+        (
+            effector.clone(),
+            swapped("\"elbow\" type=\"revolute\"", "\"lift\" type=\"revolute\""),
+            "two joints have the name \"lift\"",
+        ),
+        (
+            effector.clone(),
+            swapped("\"lift\" type=\"revolute\"", "\"lift\" type=\"prismatic\""),
+            "joint \"lift\" is neither",
+        ),
+        (effector.clone(), "<a>".repeat(500_000), "elements within each other"),
         (
             effector.clone(),
             swapped("lower=\"-2.5\" upper=\"2.5\"", "lower=\"4\" upper=\"5\""),

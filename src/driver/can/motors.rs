@@ -121,6 +121,9 @@ impl Motors {
     /// When the adapter is gone or cannot be used any more.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         let Some(sample) = self.samples.recv().await else { return Err(self.shared.reason()) };
+        if self.effector.as_ref().is_some_and(Effector::has_ended) {
+            return Err(DriverError::Retry("thread `effector` panicked; please report this".to_owned()));
+        }
         let mut values = [0.0; MAX_ACTION];
         let mut count = self.axes * SAMPLE_VALUES;
         if let Some((motors, tip)) = values.split_at_mut_checked(count) {

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use tokio::sync::mpsc;
 
-#[cfg(feature = "motors")]
-use crate::action::MAX_ACTION;
 use crate::action::{ActuatorNotice, Arming, Order};
+#[cfg(feature = "motors")]
+use crate::action::{MAX_ACTION, NoAction};
 use crate::driver::DriverError;
 #[cfg(feature = "motors")]
 use crate::kinematics::{Arm, Solver};
@@ -61,13 +61,14 @@ impl Joints {
     pub(super) fn command(&mut self, target: &[f64]) -> bool {
         #[cfg(feature = "motors")]
         if let Some((_, solver)) = &mut self.arm {
+            let targets = solver.targets(target, &self.positions);
             if self.is_armed
-                && let Ok(targets) = solver.targets(target, &self.positions)
+                && let Ok(targets) = targets
             {
                 self.positions.iter_mut().zip(targets).for_each(|(position, target)| *position = target);
                 self.has_moved = true;
             }
-            return true;
+            return targets != Err(NoAction::Length);
         }
         if self.positions.is_empty() || self.positions.len() != target.len() {
             return false;

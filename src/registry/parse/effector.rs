@@ -13,6 +13,9 @@ use crate::registry::spec::{
 pub(super) const EFFECTOR: &str = "effector";
 const KEYS: [&str; 10] = ["urdf", "tip", "frame", "rotation", "yaw", "gripper", "closed", "open", "min", "max"];
 
+/// No arm is larger, m.
+const FARTHEST_M: f64 = 1e3;
+
 /// Reads the table of a bus of motors; `None` without one, or if a problem with it was reported.
 pub(super) fn read(section: &Section<'_>, damiao: &DamiaoSpec, programs: Programs<'_>) -> Option<EffectorSpec> {
     let table = section.table(EFFECTOR)?;
@@ -61,7 +64,7 @@ pub(super) fn read(section: &Section<'_>, damiao: &DamiaoSpec, programs: Program
 }
 
 fn rotation(table: &Section<'_>) -> Option<TipRotation> {
-    const FIX: &str = "write \"commanded\", \"free\", or a quaternion [x, y, z, w]: [1, 0, 0, 0] points downwards";
+    const FIX: &str = "write \"commanded\", \"free\", or a quaternion [x, y, z, w]: [0, 1, 0, 0] points downwards";
     if table.word("rotation").is_some() {
         let words = [("commanded", TipRotation::Commanded), ("free", TipRotation::Free)];
         return table.choice("rotation", &words);
@@ -104,7 +107,7 @@ fn no_gripper(table: &Section<'_>) -> Option<GripperSpec> {
 fn position(table: &Section<'_>, key: &'static str) -> Option<[f64; 3]> {
     let numbers = table.numbers(key)?;
     match <[f64; 3]>::try_from(numbers) {
-        Ok(position) if position.iter().all(|number| number.is_finite()) => Some(position),
+        Ok(position) if position.iter().all(|number| number.abs() <= FARTHEST_M) => Some(position),
         _ => table.refuse(key, "not a position", format!("write {key} = [x, y, z], m")),
     }
 }

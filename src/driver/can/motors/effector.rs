@@ -1,7 +1,8 @@
 //! Thread `effector`: turns actions, which are poses of the tip of an arm, into targets of its motors.
 //!
 //! It takes actions where the motors would, and thread `control` takes the targets from it ([`Targets`]). The solver needs
-//! up to a millisecond, allocates and locks, which thread `control` must not.
+//! a fraction of a millisecond for a pose that is near and some for one that is out of reach, allocates and locks, which
+//! thread `control` must not.
 //!
 //! Invariant: an action whose pose the arm does not reach gives no target: without one in time the motors hold. It is
 //! counted and reported.
@@ -22,8 +23,9 @@ use crate::time::Stamp;
 
 /// The longest time that an action without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);
-/// Without a target for this long the motors may be elsewhere: the next one is sought from where they are.
-const CONTINUES: Duration = Duration::from_secs(1);
+/// Motors nearer to their last target than this, rad, are on their way: the next target is sought from the last one, so that
+/// the arm stays as it is bent. Farther away they do not follow, or were moved by hand: it is sought from where they are.
+const ON_THE_WAY: f64 = 0.3;
 
 /// The arm of a bus of motors.
 #[derive(Debug)]
@@ -77,6 +79,11 @@ impl Effector {
         Ok(targets)
     }
 
+    /// The thread has panicked: no action is followed any more.
+    pub(super) fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_some_and(|(_, thread)| thread.is_finished())
+    }
+
     fn stop(&mut self) {
         if let Some((stop, thread)) = self.thread.take() {
             stop.store(true, Ordering::Release);
@@ -105,35 +112,38 @@ struct Worker {
 
 impl Worker {
     fn run(mut self) {
-        let mut last: Option<(Stamp, [f64; MAX_MOTORS])> = None;
+        let mut last: Option<[f64; MAX_MOTORS]> = None;
         let (mut solved, mut held) = (0_u64, 0_u64);
         while !self.stop.load(Ordering::Acquire) {
             let mut action = [0.0; MAX_ACTION];
             match self.actions.newest(&mut action) {
                 Ok(None) => self.wait(),
                 Ok(Some((action, tick))) => {
-                    let now = Stamp::now();
-                    let from = match last {
-                        Some((at, targets)) if now.since(at) < CONTINUES => Some(targets),
-                        _ => self.where_they_are(),
-                    };
                     // Before the first sample the motors have no position.
-                    let Some(from) = from else { continue };
-                    if let Ok(targets) = self.solver.targets(action, &from) {
-                        solved += 1;
-                        last = Some((now, targets));
-                        self.targets.give(tick, targets.get(..self.motors).unwrap_or_default());
-                    } else {
-                        held += 1;
-                        self.targets.refuse(NoAction::OutOfReach);
+                    let Some(now) = self.where_they_are() else { continue };
+                    let from = last.filter(|last| self.are_on_the_way(last, &now)).unwrap_or(now);
+                    match self.solver.targets(action, &from) {
+                        Ok(targets) => {
+                            solved += 1;
+                            last = Some(targets);
+                            self.targets.give(tick, targets.get(..self.motors).unwrap_or_default());
+                        }
+                        Err(refused) => {
+                            held += 1;
+                            self.targets.refuse(refused);
+                        }
                     }
                 }
                 Err(refused) => self.targets.refuse(refused),
             }
         }
         if solved + held > 0 {
-            tracing::info!("thread `effector`: {solved} poses reached, {held} out of reach");
+            tracing::info!("thread `effector`: {solved} actions followed, {held} not: their poses are out of reach");
         }
+    }
+
+    fn are_on_the_way(&self, last: &[f64; MAX_MOTORS], now: &[f64; MAX_MOTORS]) -> bool {
+        last.iter().zip(now).take(self.motors).all(|(last, now)| (last - now).abs() < ON_THE_WAY)
     }
 
     /// Until an action may have arrived.
@@ -166,7 +176,7 @@ struct Targets {
     bell: Bell,
 }
 
-const REFUSALS: [NoAction; 3] = [NoAction::NoNumbers, NoAction::Foreign, NoAction::OutOfReach];
+const REFUSALS: [NoAction; 4] = [NoAction::NoNumbers, NoAction::Foreign, NoAction::OutOfReach, NoAction::Length];
 
 impl Targets {
     fn new(motors: usize) -> Self {

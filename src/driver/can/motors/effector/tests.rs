@@ -66,7 +66,8 @@ fn poses_become_targets_with_their_ticks_and_what_is_out_of_reach_none() {
     assert_eq!(effector.look(&folded(), &mut tip), 8);
     let actions = Arc::<Given>::default();
     let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
-    let pose = |by: f64| vec![tip[0] + by, tip[1], tip[2], 1.0];
+    let [x, y, z, ..] = tip;
+    let pose = |by: f64| vec![x + by, y, z, 1.0];
     actions.add(Ok((pose(0.0), Stamp(7))));
     let (found, tick) = next(&targets).expect("a target");
     assert_eq!((found.len(), tick), (6, Stamp(7)));
@@ -76,19 +77,26 @@ fn poses_become_targets_with_their_ticks_and_what_is_out_of_reach_none() {
     assert!((found[5] - 1.2).abs() < 1e-9, "open: {found:?}");
     // Nothing is given twice.
     assert!(matches!(targets.newest(&mut [0.0; MAX_ACTION]), Ok(None)));
+    // What the arm does not reach: the far corner of its box.
     for (given, wanted) in [
-        (Ok((pose(9.0), Stamp(8))), None),
-        (Ok((vec![0.0; 2], Stamp(8))), Some(NoAction::OutOfReach)),
-        (Err(NoAction::Foreign), Some(NoAction::Foreign)),
-        (Err(NoAction::NoNumbers), Some(NoAction::NoNumbers)),
+        (Ok((vec![1.0, -1.0, 0.9, 1.0], Stamp(8))), NoAction::OutOfReach),
+        (Ok((vec![0.0; 2], Stamp(8))), NoAction::Length),
+        (Err(NoAction::Foreign), NoAction::Foreign),
+        (Err(NoAction::NoNumbers), NoAction::NoNumbers),
     ] {
         actions.add(given);
-        // The box of positions holds the first of them where the arm may or may not reach.
-        let found = next(&targets);
-        assert!(wanted.is_none() || found == Err(wanted.expect("a refusal")), "{found:?}");
+        assert_eq!(next(&targets), Err(wanted));
     }
     actions.add(Ok((pose(0.02), Stamp(9))));
     assert_eq!(next(&targets).expect("a target").1, Stamp(9));
+    // The motors are moved by hand: the next target is sought from where they are now.
+    let mut moved = folded();
+    moved[4 * MOTOR_CHANNELS] += 1.5;
+    effector.look(&moved, &mut tip);
+    actions.add(Ok((pose(0.0), Stamp(10))));
+    let (found, _) = next(&targets).expect("a target");
+    assert!((found[4] - moved[4 * MOTOR_CHANNELS]).abs() < 0.05, "{found:?}");
+    assert!(!effector.has_ended());
     drop(effector);
 }
 
