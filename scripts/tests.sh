@@ -28,7 +28,7 @@ guest=$(programs "$@" --lib --test guest --test layering | grep /guest-) || { ec
 "$1" build "${@:3}" --example process_node --example publish_action
 # Scenarios with motors. rapid stops motors that answer too late, and on a machine that stands still for a second they do:
 # these run when nothing else does.
-readonly motors=(adapters:: brake:: guard:: motors::)
+readonly motors=(adapters:: arm:: brake:: guard:: motors::)
 # A guest needs the machine's two cores, so they run in sequence. While one runs, the next is prepared.
 bench() {
     printf '     Running %s %s\n' "$guest" "$*"
