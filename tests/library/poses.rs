@@ -118,7 +118,7 @@ fn close(found: &[f32], expected: &[f64]) {
     }
 }
 
-/// The bundle of `folder` and one of these files whose policy.json says otherwise.
+/// The bundle of `folder` and one of these files whose policy.json differs.
 fn check(absolute: &Bundle, other: &Bundle, representation: &str) {
     let (plain, chunk, _) = run(absolute);
     assert_eq!(chunk, plain, "of absolute actions nothing is made");

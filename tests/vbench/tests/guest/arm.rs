@@ -13,7 +13,7 @@ use vbench::outcome::Outcome;
 use vbench::recording::{Recording, falls};
 use vbench::scenario::Scenario;
 
-use crate::policy::{CONTROL_HZ, OLDEST_OBSERVATION_MS, TACTILE, WRIST, bundle, demonstration, pictures};
+use crate::policy::{CHUNKS, CONTROL_HZ, OLDEST_OBSERVATION_MS, TACTILE, WRIST, bundle, demonstration, pictures};
 
 const CAMERAS: &str = include_str!("../../../../src/registry/task_cameras.toml");
 /// The arm of the unit tests, beside its table: straight up it has no way anywhere, so that its motors' zeros are a pose with
@@ -34,9 +34,6 @@ const TACTILE_BIT: u32 = 1;
 const DENOISING_STEPS: &str = "2";
 
 const SCRIPT: &str = r#"
-used() { grep -F '"event":"chunk"' $out/rapid.jsonl | grep -F '"used":true' | grep -cF "\"mask\":\"$1\""; }
-more_than() { [ "$(used "$2")" -gt "$1" ]; }
-await_used() { wait_for 120 more_than "$1" "$2" || fail "$(used "$2") chunks with the mask $2"; }
 # all ACTION: since the last mark every motor has logged this.
 all() { for motor in 1 2 3 4 5 6; do logged $1 "\"motor\":$motor" || return 1; done; }
 begin() {
@@ -187,7 +184,7 @@ fn scenario(demonstration: &Recording) -> Scenario {
         .file("tactile", feed::pack(pictures(demonstration, TACTILE)))
         .file("steps", DENOISING_STEPS)
         .limit(Duration::from_secs(480))
-        .script(SCRIPT);
+        .script(&[CHUNKS, SCRIPT].concat());
     bundle(scenario, |policy| {
         policy["control_hz"] = CONTROL_HZ.into();
         policy["max_observation_age_ms"] = OLDEST_OBSERVATION_MS.into();

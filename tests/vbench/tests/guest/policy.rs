@@ -50,11 +50,15 @@ const DENOISING_STEPS: &str = "2";
 /// The same arithmetic in other instructions.
 const TOLERANCE: f64 = 1e-4;
 
-const SCRIPT: &str = r#"
+/// Functions of scripts that wait for chunks.
+pub(crate) const CHUNKS: &str = r#"
 # used MASK: how many chunks were computed with this mask and used. await_used N MASK: until there are more than N.
 used() { grep -F '"event":"chunk"' $out/rapid.jsonl | grep -F '"used":true' | grep -cF "\"mask\":\"$1\""; }
 more_than() { [ "$(used "$2")" -gt "$1" ]; }
 await_used() { wait_for 120 more_than "$1" "$2" || fail "$(used "$2") chunks with the mask $2"; }
+"#;
+
+const SCRIPT: &str = r#"
 emu plug 0 1 2 3
 wait_for 120 attached 0 1 2 3 || fail 'not attached'
 udevadm settle
@@ -249,7 +253,7 @@ fn scenario(demonstration: &Recording, feeds: &[(&str, Vec<Vec<u8>>); 2]) -> Sce
         .file("arm", feed::pack(demonstration.rows(ARM).iter().map(line)))
         .file("steps", DENOISING_STEPS)
         .limit(Duration::from_secs(480))
-        .script(SCRIPT);
+        .script(&[CHUNKS, SCRIPT].concat());
     bundle(scenario, |policy| {
         policy["control_hz"] = CONTROL_HZ.into();
         policy["action"]["actuator"] = "mover".into();
