@@ -16,7 +16,7 @@ const NEAR_RAD: f64 = 1e-3;
 /// Steps of the solver: what a tip moves within a tick needs three.
 const STEPS: usize = 100;
 /// Damping of a step (Levenberg 1944): directions in which the tip moves by less, m or rad for each rad of the joints, are
-/// hardly taken. Without it a joint that does not matter turns by whatever the rounding says.
+/// hardly taken. Without it a joint that does not move the tip turns by rounding errors.
 const DAMPING: f64 = 1e-2;
 /// No joint turns further in one step, rad: of several ways to reach a pose the one that leads there is found.
 const FARTHEST_STEP: f64 = 0.3;

@@ -1,7 +1,8 @@
 //! A bus of motors: its state as samples, and its commands.
 //!
 //! Thread `control` owns the adapter. It runs the cycles of `MotorBus`, which decides, and waits on the topic of
-//! actions itself; only its samples are read here, on the runtime.
+//! actions itself, or on the targets of thread `effector` if they move an arm by its tip; only its samples are read here,
+//! on the runtime.
 //!
 //! Invariant: whatever ends the driver, the motors are ordered to turn off: see `control_loop`.
 

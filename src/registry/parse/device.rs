@@ -1,7 +1,7 @@
 //! One `[device.NAME]` table.
 //!
-//! Of the devices that `rapid` reads itself, only motors behind a CAN adapter move, and each of them is an axis without
-//! a table `[device.NAME.action]`; a program may move anything.
+//! Of the devices that `rapid` reads itself, only motors behind a CAN adapter move, without a table `[device.NAME.action]`:
+//! each of them is an axis, or the tip of their arm has the axes. A program may move anything.
 
 use std::path::Path;
 use std::time::Duration;

@@ -90,8 +90,13 @@ pub struct TipForm {
 impl TipForm {
     /// How many numbers it has.
     pub const fn numbers(&self) -> usize {
-        7 + if self.has_opening { 1 } else { 0 }
+        tip_numbers(self.has_opening)
     }
+}
+
+/// Numbers of the pose of a tip, with the opening of its gripper or without.
+pub(super) const fn tip_numbers(has_opening: bool) -> usize {
+    7 + if has_opening { 1 } else { 0 }
 }
 
 /// What a number of a joint is.

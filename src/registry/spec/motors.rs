@@ -6,6 +6,8 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use super::form::tip_numbers;
+
 /// Most motors of one bus: an action has an axis each, a sample 6 numbers each.
 pub const MAX_MOTORS: usize = 10;
 
@@ -56,7 +58,7 @@ pub struct EffectorSpec {
 impl EffectorSpec {
     /// Numbers of a sample after those of the motors: position, opening if there is a gripper, quaternion `x y z w`.
     pub const fn numbers(&self) -> usize {
-        7 + if self.gripper.is_some() { 1 } else { 0 }
+        tip_numbers(self.gripper.is_some())
     }
 
     /// Coordinates of the tip that are commanded: as many joints are needed.
@@ -72,7 +74,7 @@ impl EffectorSpec {
 /// How the tip of an arm is turned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum TipRotation {
-    /// As the action says: it has a quaternion `x y z w` after the position.
+    /// As the action has it: a quaternion `x y z w` after the position.
     Commanded,
     /// In any way.
     Free,
