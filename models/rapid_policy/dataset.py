@@ -160,7 +160,7 @@ class Dataset:
             room = np.minimum(seen[:, :1] - starts, longest)
             since = np.where(room > 0, random.integers(0, np.maximum(room, 1)) + 1, 0)
             is_held = (random.random((len(seen), 1)) < o.dropout.held) & plan["visible"][:, :, i].all(1, keepdims=True)
-            is_held &= self.present[seen - np.minimum(since, room)][:, :, i].all(1, keepdims=True)
+            is_held &= self.present[seen - since][:, :, i].all(1, keepdims=True)
             plan[f"since {o.key}"] = np.where(is_held, since, 0)
 
     def gather(self, plan: Plan) -> Batch:
