@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest as _;
 use tungstenite::{Error, Message, WebSocket};
 
-use crate::support::{Episode, MaskMessage, PATIENCE, Place, Running, logged, until};
+use crate::support::{Episode, LENIENT, MaskMessage, PATIENCE, Place, Running, logged, until};
 
 /// A port that is free: the kernel chooses it.
 const ANY: &str = "127.0.0.1:0";
@@ -232,11 +232,6 @@ fn good(place: &Place, running: Running) -> String {
     assert_eq!((&episode["verdict"], &episode["dropped"]), (&json!("GOOD"), &json!(0)), "{episode}");
     format!("out/{}", place.episodes("out")[0])
 }
-
-/// A busy machine is no defect of the program, and a simulated camera that it delays loses pictures: what remains is what the
-/// recorder drops, and damage.
-const LENIENT: &str = "\n[verdict]\nlate = \"off\"\ngap = \"off\"\nclock = \"off\"\nrate = \"off\"\nvalid = \"off\"\n\
-    opening = \"off\"\nfrozen = \"off\"\nlost = \"50%\"\n";
 
 fn lenient_place() -> Place {
     let place = Place::new();

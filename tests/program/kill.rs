@@ -94,7 +94,7 @@ struct Killed {
 
 fn kill(place: &Place, moment: Moment) -> Killed {
     let late = lateness(place.path("."));
-    let running: Running = place.start(&RECORD, "\"event\":\"recording\"");
+    let mut running: Running = place.start(&RECORD, "\"event\":\"recording\"");
     let name = wait_for("partial file", || place.files("out").into_iter().find(|name| name.ends_with(".partial")));
     let partial = place.path("out").join(name);
     let grow = |times: usize| {
@@ -103,6 +103,9 @@ fn kill(place: &Place, moment: Moment) -> Killed {
             wait_for("growth", || (fs::metadata(&partial).expect("partial").len() > before).then_some(()));
         }
     };
+    if !matches!(moment, Moment::AtOnce) {
+        running.wait_for("\"mask\":\"0x07\"");
+    }
     match moment {
         Moment::AtOnce => {}
         Moment::Grown(times) => grow(times),
@@ -134,8 +137,9 @@ fn check(place: &Place, killed: &Killed, repaired: &Path) {
         }
         numbers
     };
+    // A simulated camera that a busy machine reads too late loses pictures.
     for device in Registry::builtin().devices {
-        assert!(!contiguous(&device.topic).is_empty(), "{}", device.name);
+        assert!(episode.topic(&device.topic).count() > 0, "{}", device.name);
     }
     assert!(contiguous("/rapid/frame").first().is_none_or(|first| *first == 0));
     let masks = contiguous("/rapid/mask");

@@ -10,7 +10,7 @@ use std::process::Output;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
-use crate::support::{Episode, FrameMessage, Place, Running, until};
+use crate::support::{Episode, FrameMessage, LENIENT, Place, Running, events, until};
 
 const RIG: &str = include_str!("../../devices.toml");
 
@@ -29,10 +29,6 @@ serial = "SPARE1"
 port = "1-4"
 product = "Spare Camera"
 "#;
-
-/// A busy machine is no defect of the program: what remains are losses and damage.
-const LENIENT: &str = "\n[verdict]\nlate = \"off\"\ngap = \"off\"\nclock = \"off\"\nrate = \"off\"\nvalid = \"off\"\n\
-    opening = \"off\"\nfrozen = \"off\"\n";
 
 const ADD: [&str; 8] = ["register", "--sim", "scenario.toml", "--serial", "SPARE1", "--name", "spare_cam", "--yes"];
 
@@ -86,12 +82,14 @@ fn publications(place: &Place, count: u64) {
     until("the mask is published", || record(place).sequence > sequence + count);
 }
 
-/// The sequence numbers of each topic are without a hole; how many each has.
+/// How many messages each topic has. What rapid itself publishes is without a hole; a simulated device that a busy machine
+/// reads too late loses samples, as a real one does.
 fn contiguous(episode: &Episode) -> BTreeMap<String, usize> {
     let mut last: BTreeMap<&str, u32> = BTreeMap::new();
     let mut counts = BTreeMap::new();
     for message in &episode.messages {
-        if let Some(before) = last.insert(&message.topic, message.sequence) {
+        let before = last.insert(&message.topic, message.sequence);
+        if let Some(before) = before.filter(|_| message.topic.starts_with("/rapid/mask")) {
             assert_eq!(message.sequence, before + 1, "{}", message.topic);
         }
         *counts.entry(message.topic.clone()).or_insert(0) += 1;
@@ -127,6 +125,10 @@ fn an_added_device_streams_while_nothing_else_is_interrupted() {
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
     assert_eq!(code, Some(0), "{output}{errors}");
+    let opened = |device: &str| {
+        events(&output).iter().filter(|event| event["event"] == "opened" && event["device"] == device).count()
+    };
+    assert_eq!(["cam_wrist", "motor_state", "spare_cam"].map(opened), [1; 3], "no device was opened again");
 
     let files = place.episodes("out");
     assert_eq!(files.len(), 2, "{files:?}");

@@ -16,6 +16,11 @@ use std::time::{Duration, Instant};
 /// slow.
 pub(crate) const PATIENCE: Duration = Duration::from_mins(3);
 
+/// Lines of a registry. A busy machine is no defect of the program, and a simulated camera that it delays loses pictures: what
+/// remains is what the recorder drops, and damage.
+pub(crate) const LENIENT: &str = "\n[verdict]\nlate = \"off\"\ngap = \"off\"\nclock = \"off\"\nrate = \"off\"\n\
+    valid = \"off\"\nopening = \"off\"\nfrozen = \"off\"\nlost = \"50%\"\n";
+
 /// Waits for a condition.
 pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();

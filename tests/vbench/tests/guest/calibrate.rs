@@ -23,8 +23,8 @@ serial = "CAM00A1"
 node = "camera"
 bit = 1
 [device.cam_wall.camera]
-width = 640
-height = 480
+width = 160
+height = 120
 fps = 30
 format = "MJPG"
 "#;
@@ -48,7 +48,7 @@ exit 0
 fn a_camera_that_looks_at_the_light_is_measured_and_another_is_refused() {
     let outcome = Scenario::new("calibrate")
         .device(DeviceSpec::uvc(0x2bc5, 0x0501).serial("YUV1").mode(Format::Yuyv, 320, 240, &[15]))
-        .device(DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00A1").mode(Format::Mjpg, 640, 480, &[30]))
+        .device(DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00A1").mode(Format::Mjpg, 160, 120, &[30]))
         .registry(REGISTRY)
         .script(SCRIPT)
         .run()

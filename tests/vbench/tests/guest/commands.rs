@@ -78,7 +78,7 @@ wait_for 30 test -e /dev/rapid/cam_raw -a -e /dev/rapid/force || fail 'no links'
 ls -l /dev/rapid >$out/links
 rapid_start --headless --record --out $out/rec $config --json
 await_rapid 60 '"event":"recording"' || fail 'not recording'
-for device in cam_raw force; do
+for device in cam_raw cam_depth force; do
   wait_for 60 states 1 $device streaming || fail "$device does not stream"
 done
 wait_for 60 states 1 cam_wide failed || fail 'cam_wide does not fail'

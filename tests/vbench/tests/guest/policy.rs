@@ -40,10 +40,12 @@ pub(crate) const TACTILE: &str = "/rapid/camera/tactile";
 const ARM: &str = "/rapid/serial/arm";
 const BITS: [(u32, &str); 4] = [(0, "cam_wrist"), (TACTILE_BIT, "tactile_tip"), (2, "arm"), (3, "mover")];
 const TACTILE_BIT: u32 = 1;
-/// Emulated processors take up to some seconds for a chunk. At the policy's own 10 Hz its actions would be over by then;
-/// at this rate they last, and a chunk is computed in the same way.
-pub(crate) const CONTROL_HZ: f64 = 2.0;
-const TICK_NS: u64 = 500_000_000;
+/// Emulated processors take some seconds for a chunk, and more beside others. At the policy's own 10 Hz its actions would be
+/// over by then; at this rate the 15 of a chunk last for 30 s, and a chunk is computed in the same way.
+pub(crate) const CONTROL_HZ: f64 = 0.5;
+const TICK_NS: u64 = 2_000_000_000;
+/// Chunks nevertheless follow each other as fast as they are computed.
+pub(crate) const ACTION_STEPS: u64 = 2;
 /// Of a busy guest.
 pub(crate) const OLDEST_OBSERVATION_MS: u64 = 2_000;
 const DENOISING_STEPS: &str = "2";
@@ -256,6 +258,7 @@ fn scenario(demonstration: &Recording, feeds: &[(&str, Vec<Vec<u8>>); 2]) -> Sce
         .script(&[CHUNKS, SCRIPT].concat());
     bundle(scenario, |policy| {
         policy["control_hz"] = CONTROL_HZ.into();
+        policy["n_action_steps"] = ACTION_STEPS.into();
         policy["action"]["actuator"] = "mover".into();
         policy["max_observation_age_ms"] = OLDEST_OBSERVATION_MS.into();
     })
