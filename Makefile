@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation texture lerobot-test fleet-test clean
+.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation evaluation texture lerobot-test fleet-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -83,7 +83,7 @@ fleet-test: ## upload to a real S3 server, sensors of another computer, the page
 	RAPID_BIN='$(BUILT)' scripts/fleet.sh
 
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.
-train: setup-build ## record demonstrations, train on them, export models/tactile-id (THREADS=2, MINUTES=)
+train: setup-build ## record demonstrations, train on them, export models/tactile-id (POLICY=, THREADS=2, MINUTES=)
 	cargo build --release --locked
 	scripts/train.sh policy '$(TARGET)/release/rapid'
 
@@ -91,11 +91,15 @@ train: setup-build ## record demonstrations, train on them, export models/tactil
 train-test: ## tests of the Python under models/
 	RAPID_BIN='$(wildcard $(TARGET)/release/rapid)' scripts/train.sh test
 
-ablation: setup-build ## train five configurations of the policy and run each: models/results/ablation.md
+ablation: setup-build ## train five configurations of the policy, three times each, and run them: models/results/ablation.md (JOBS=1)
 	cargo build --release --locked
 	scripts/train.sh ablation '$(TARGET)/release/rapid'
 
-texture: ## what a tactile picture reveals of the texture: models/results/texture.md
+evaluation: setup-build ## run the policies with a sensor that is pulled out: models/results/eval.md
+	cargo build --release --locked
+	scripts/train.sh python evaluation.py --rapid '$(abspath $(TARGET))/release/rapid'
+
+texture: ## what a tactile picture reveals of the texture: models/results/texture.md (ENCODER=resnet18)
 	scripts/train.sh texture
 
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.

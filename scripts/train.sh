@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Trains and measures policies, in its own Python environment.
 #
-#     train.sh policy [RAPID]      demonstrations, training, export to models/tactile-id
+#     train.sh policy [RAPID]      demonstrations, training, export to models/POLICY, default tactile-id
 #     train.sh experiment FILE ARGS...   training as an experiment (*.toml) has it, export; see models/README.md
 #     train.sh ablation RAPID      the contribution of each input of the policy: models/results/ablation.{json,md}
 #     train.sh texture             how well pictures show the texture: models/results/texture.{json,md}
@@ -9,8 +9,8 @@
 #     train.sh python ARGS...      that Python, run in models/
 #
 # RAPID is the program, default target/release/rapid. Demonstrations and checkpoints are in RUNS=models/runs; existing
-# ones are used again: a stopped training continues. EPISODES (240 by hand, 72 with the arm), SEED=1000 of the demonstrations, THREADS=2 and MINUTES
-# of a training.
+# ones are used again: a stopped training continues. EPISODES (240 by hand, 480 with the arm), SEED=1000 of the demonstrations,
+# THREADS=2 and MINUTES of a training; JOBS=1 trainings of the ablation at a time, SEEDS="0 1 2" of them.
 #
 # Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks complete.
 set -euo pipefail
@@ -21,7 +21,7 @@ readonly RUNS
 # The policy learns from a gripper in the hand, the comparisons from an arm.
 case "${1:-}" in
     policy) KIND=(--handheld) NAME=by-hand COUNT=240 ;;
-    *) KIND=() NAME=arm COUNT=72 ;;
+    *) KIND=() NAME=arm COUNT=480 ;;
 esac
 readonly KIND EPISODES="${EPISODES:-$COUNT}" SEED="${SEED:-1000}" THREADS="${THREADS:-2}"
 readonly DEMONSTRATIONS="$RUNS/$NAME-$EPISODES-$SEED"
@@ -76,7 +76,8 @@ demonstrations() {
 }
 
 policy() {
-    learn experiments/tactile-id.toml tactile-id --data "$DEMONSTRATIONS"
+    local name="${POLICY:-tactile-id}"
+    learn "experiments/$name.toml" "$name" --data "$DEMONSTRATIONS"
 }
 
 # The name of the run and of the bundle is that of the file.
@@ -96,12 +97,15 @@ learn() {
 }
 
 texture() {
-    [[ -d $DEMONSTRATIONS ]] || die "no demonstrations: run make train first"
-    in_models texture.py "$DEMONSTRATIONS" --cache "$RUNS/cache" --threads "$THREADS"
+    [[ -d $DEMONSTRATIONS ]] || die "no demonstrations $DEMONSTRATIONS: make ablation records them"
+    in_models texture.py "$DEMONSTRATIONS" --cache "$RUNS/cache" --threads "$THREADS" --encoder "${ENCODER:-small}"
 }
 
 ablation() {
-    in_models ablation.py "$DEMONSTRATIONS" --rapid "$1" --runs "$RUNS/ablation" "${SCHEDULE[@]}"
+    local seeds
+    read -ra seeds <<<"${SEEDS:-0 1 2}"
+    in_models ablation.py "$DEMONSTRATIONS" --rapid "$1" --runs "$RUNS/ablation" --cache "$RUNS/cache" --threads "$THREADS" \
+        --jobs "${JOBS:-1}" --seeds "${seeds[@]}"
 }
 
 main "$@"

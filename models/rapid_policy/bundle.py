@@ -132,8 +132,10 @@ CARD = """\
 in `models/`. The seed fixes the first weights, the order of the windows and the noise. Sums on another processor, or with
 another number of threads, round differently, so that another machine gets weights that differ in detail.
 """
+# The policies that `make train` makes.
+MADE = ("tactile-id", "tactile-id-memory")
 SIMULATED = """
-    make train
+    make train POLICY={name}
 
 which does, one after the other:
 
@@ -143,8 +145,7 @@ which does, one after the other:
 def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
     """Writes the model card, `README.md` of the bundle; every figure in it comes from `facts`."""
     seeds, action = facts["episode_seeds"], spec.action
-    # The one policy that `make train` makes.
-    made = SIMULATED.format(episodes=facts["episodes"], first=seeds[0]) if spec.name == "tactile-id" and seeds else ""
+    made = SIMULATED.format(name=spec.name, episodes=facts["episodes"], first=seeds[0]) if spec.name in MADE and seeds else ""
     card = CARD.format(
         **{
             **facts,
@@ -185,7 +186,9 @@ def _absent(spec: Experiment) -> str:
         ways = o.dropout.model_dump()
         given = ", ".join(f"{'' if way == 'window' else way + ' '}{share:g}" for way, share in ways.items() if share)
         dropped += [f"`{o.key}` {given}"] if given else []
-    return "zeroed after their encoders, by the mask; taken away in training: " + (", ".join(dropped) or "none")
+    held = [f"the last of `{o.key}` for {o.when_absent.hold_last_ms / 1000:g} s" for o in spec.images if o.when_absent]
+    stands = f"{', '.join(held)}; then, and all others, zeroed" if held else "zeroed"
+    return f"{stands} after their encoders, by the mask; taken away in training: " + (", ".join(dropped) or "none")
 
 
 def _tagged(tags: dict[str, dict[str, int]]) -> str:

@@ -47,7 +47,7 @@ class Ours(unittest.TestCase):
 
     def test_folders_are_relative_to_the_file(self):
         (folder,) = experiment().data.folders
-        self.assertEqual(folder, str(EXPERIMENTS.parent / "runs" / "arm-72-1000"))
+        self.assertEqual(folder, str(EXPERIMENTS.parent / "runs" / "arm-480-1000"))
 
     def test_a_checkpoint_brings_its_description_back(self):
         for path in EXPERIMENTS.glob("*.toml"):

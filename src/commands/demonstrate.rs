@@ -67,7 +67,7 @@ pub fn run(
             let report = &demonstration.report;
             let texture = if demonstration.texture == Texture::Triangular { "triangular" } else { "hexagonal" };
             let line = json!({"event": "demonstration", "seed": seed, "texture": texture,
-                "steps": demonstration.steps, "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
+                "size": demonstration.size, "steps": demonstration.steps, "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
             writeln!(out, "{line}")?;
         }
     }

@@ -7,7 +7,7 @@ use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
-use crate::simulation::task::{Expert, Outcome, Texture, Touch, UNSEEN_PERIOD, World};
+use crate::simulation::task::{Expert, Outcome, Size, Texture, Touch, UNSEEN_PERIOD, World};
 use crate::status::Board;
 use crate::time::{Stamp, WallClock};
 
@@ -25,22 +25,29 @@ pub struct Demonstration {
     pub seed: u64,
     /// Texture of the block.
     pub texture: Texture,
+    /// Size of the block.
+    pub size: Size,
     /// Steps recorded.
     pub steps: u32,
     /// The file.
     pub report: EpisodeReport,
 }
 
-/// The seeds of `count` demonstrations from `first` on, the same number of each texture; for an odd count one more of
-/// the texture that comes first. Seeds whose demonstration would fail are skipped, and those whose lattice has the period
+/// The seeds of `count` demonstrations from `first` on, the same number of each texture, and of each of these the same number
+/// of each size; of what does not divide one more of those that come first. Seeds whose demonstration would fail are skipped, and those whose lattice has the period
 /// that is left for evaluation.
 pub fn seeds(first: u64, count: usize) -> impl Iterator<Item = u64> {
-    let mut left = [count.div_ceil(2), count.div_ceil(2)];
+    let half = count.div_ceil(2);
+    // Of each texture: all, and each size.
+    let mut left = [(half, [half.div_ceil(2); 2]); 2];
     let wanted = move |seed: &u64| {
         let world = World::new(*seed);
-        let left = &mut left[usize::from(world.texture == Texture::Hexagonal)];
-        let taken = *left > 0 && Touch::new(*seed).period != UNSEEN_PERIOD && succeeds(world, *seed);
-        *left -= usize::from(taken);
+        let (all, sizes) = &mut left[usize::from(world.texture == Texture::Hexagonal)];
+        let same = &mut sizes[usize::from(world.size == Size::Small)];
+        let wanted = *all > 0 && *same > 0 && Touch::new(*seed).period != UNSEEN_PERIOD;
+        let taken = wanted && succeeds(world, *seed);
+        *all -= usize::from(taken);
+        *same -= usize::from(taken);
         taken
     };
     (first..).filter(wanted).take(count)
@@ -69,14 +76,18 @@ pub fn demonstrate(
     let mut recorder = Stepped::new(Arc::clone(registry), Arc::clone(board), WallClock::now());
     let mut rig = Lockstep::new(registry, Scenario::task(registry, seed), begun, &[])?;
     let mut expert = Expert::new(seed);
-    let texture = rig.trial().lock().world.texture;
+    let (texture, size) = {
+        let trial = rig.trial().lock();
+        (trial.world.texture, trial.world.size)
+    };
     for _ in 0..SETTLE {
         rig.deliver(&mut recorder)?;
         rig.rest(&mut recorder)?;
     }
     let mut request = request.clone();
     let word = if texture == Texture::Triangular { "triangular" } else { "hexagonal" };
-    request.tags.extend([("seed".to_owned(), seed.to_string()), ("texture".to_owned(), word.to_owned())]);
+    let tags = [("seed", seed.to_string()), ("texture", word.to_owned()), ("size", size.word().to_owned())];
+    request.tags.extend(tags.map(|(key, value)| (key.to_owned(), value)));
     recorder.begin(&request, rig.now())?;
     let (mut steps, mut tail) = (0_u32, TAIL);
     while tail > 0 {
@@ -92,5 +103,5 @@ pub fn demonstrate(
         tail -= u32::from(done);
     }
     let report = recorder.finish(rig.now()).ok_or(RecordError::Idle)?;
-    Ok(Demonstration { seed, texture, steps, report })
+    Ok(Demonstration { seed, texture, size, steps, report })
 }

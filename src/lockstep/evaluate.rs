@@ -23,7 +23,7 @@ use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::scenario::{Scenario, ScenarioAction};
 use crate::registry::{Registry, task};
 use crate::sample::SampleHeader;
-use crate::simulation::task::{AXES, Outcome, Texture, Touch, UNSEEN_PERIOD};
+use crate::simulation::task::{AXES, Outcome, Size, Texture, Touch, UNSEEN_PERIOD};
 use crate::status::Event;
 use crate::time::Stamp;
 
@@ -235,6 +235,8 @@ pub struct Trial {
     pub condition: Condition,
     /// Texture of the block: true if triangular.
     pub triangular: bool,
+    /// Size of the block.
+    pub size: Size,
     /// Its lattice has the period that no demonstration shows.
     pub unseen_period: bool,
     /// Step at which the texture was first felt.
@@ -379,6 +381,7 @@ impl Bench<'_> {
             seed,
             condition,
             triangular: trial.world.texture == Texture::Triangular,
+            size: trial.world.size,
             unseen_period: Touch::new(seed).period == UNSEEN_PERIOD,
             touched_at: hand.touched.map(|(tick, _)| tick),
             parted_at: hand.parted,

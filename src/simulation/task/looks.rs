@@ -14,8 +14,6 @@ pub const SIDE_PIXELS: u32 = 96;
 /// The same as `usize`.
 pub const SIDE: usize = SIDE_PIXELS as usize;
 pub(super) const PIXELS: usize = SIDE * SIDE;
-/// Half the block's edge.
-const HALF_EDGE: f64 = 0.12;
 const WRIST_GRAIN: f32 = 0.015;
 
 /// The appearance of one trial, drawn once from its seed.
@@ -99,7 +97,7 @@ impl Looks {
             ([away[0] * scale, -away[1] * scale], scale)
         };
         let (sin, cos) = world.yaw.sin_cos();
-        let half = HALF_EDGE * size;
+        let half = world.size.half_edge() * size;
         let fingers = 14.0 + 14.0 * world.grip;
         picture.clear();
         for (v, row) in row.iter().enumerate() {

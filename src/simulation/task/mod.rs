@@ -17,7 +17,7 @@ use jpeg_encoder::{ColorType, Encoder, EncodingError, SamplingFactor};
 pub use expert::Expert;
 pub use looks::{Looks, SIDE, SIDE_PIXELS};
 pub use touch::{Touch, UNSEEN_PERIOD};
-pub use world::{AXES, AXIS_COUNT, MAX_STEPS, Outcome, STEP_HZ, Texture, World};
+pub use world::{AXES, AXIS_COUNT, MAX_STEPS, Outcome, STEP_HZ, Size, Texture, World};
 
 use super::TaskPart;
 use crate::sample::Encoding;

@@ -13,15 +13,39 @@ fn demonstrate(seed: u64, shake: f64) -> Trial {
 }
 
 #[test]
-fn the_expert_succeeds_at_both_textures() {
-    let mut seen = [0; 2];
+fn the_expert_succeeds_at_both_textures_and_sizes() {
+    let mut seen = [0; 4];
     for seed in 0..200 {
         let trial = demonstrate(seed, 0.006);
         assert_eq!(trial.world.outcome(), Outcome::Success, "seed {seed}");
         assert!((60..200).contains(&trial.world.steps()), "seed {seed}: {} steps", trial.world.steps());
-        seen[usize::from(trial.world.texture == Texture::Hexagonal)] += 1;
+        seen[2 * usize::from(trial.world.texture == Texture::Hexagonal) + usize::from(trial.world.size == Size::Small)] += 1;
     }
-    assert!(seen.into_iter().all(|count| count > 70), "{seen:?}");
+    assert!(seen.into_iter().all(|count| count > 35), "{seen:?}");
+}
+
+/// The widest opening at which a block is held, and the pressure on it of a gripper that closes wholly.
+fn grasp(size: Size) -> (f64, f64) {
+    let (mut trial, mut expert) = (Trial::new(5), Expert::new(5));
+    trial.world.size = size;
+    while !trial.world.held {
+        let target = expert.act(&trial.world);
+        trial.command(target);
+        trial.step(0.0);
+    }
+    let opening = trial.world.grip;
+    for _ in 0..5 {
+        let [x, y, z] = trial.world.position;
+        trial.command([x, y, z, 0.0]);
+        trial.step(0.0);
+    }
+    (opening, trial.world.pressure)
+}
+
+#[test]
+fn a_small_block_is_narrower_and_feels_the_same() {
+    let ((big, hard), (small, same)) = (grasp(Size::Big), grasp(Size::Small));
+    assert!((big, small) == (0.45, 0.3) && (hard - same).abs() < 0.05, "{big} {hard}, {small} {same}");
 }
 
 #[test]

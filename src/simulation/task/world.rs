@@ -1,7 +1,8 @@
 //! The grasp-and-sort task: a block on a table, a gripper, two bins, one step per tenth of a second.
 //!
 //! The block's texture determines its bin: triangular to the left, hexagonal to the front. Only the gel of the tactile
-//! fingertip shows the texture, and only while it is pressed on the block.
+//! fingertip shows the texture, and only while it is pressed on the block. Blocks are big or small, whatever their texture
+//! (paper, ablation: demonstrations with cubes of one size, or of both).
 //!
 //! Lengths are in metres, for a large table with a large block. A world's behaviour follows entirely from its seed and
 //! its actions.
@@ -20,8 +21,8 @@ pub const AXES: usize = AXIS_COUNT as usize;
 pub const MAX_STEPS: u32 = 260;
 /// Maximum distance of the block from the middle of its bin.
 const TOLERANCE: f64 = 0.18;
-/// Opening of the gripper at which it touches the block.
-const BLOCK_WIDTH: f64 = 0.45;
+/// Further closing of the gripper at which it presses its hardest, as a share of the block's width.
+const FULL_PRESS: f64 = 8.0 / 9.0;
 
 const POSITION_MIN: [f64; 3] = [-1.1, -1.0, 0.03];
 const POSITION_MAX: [f64; 3] = [1.0, 1.0, 0.9];
@@ -62,6 +63,42 @@ impl Texture {
     }
 }
 
+/// The size of the block.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Size {
+    /// As wide as the gripper opens by 0.45.
+    Big,
+    /// Two thirds of it.
+    Small,
+}
+
+impl Size {
+    /// Its word in tags and output.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Big => "big",
+            Self::Small => "small",
+        }
+    }
+
+    /// Opening of the gripper at which it touches the block.
+    const fn width(self) -> f64 {
+        match self {
+            Self::Big => 0.45,
+            Self::Small => 0.3,
+        }
+    }
+
+    /// Half of its edge, m.
+    pub(super) const fn half_edge(self) -> f64 {
+        match self {
+            Self::Big => 0.12,
+            Self::Small => 0.08,
+        }
+    }
+}
+
 /// How a trial ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -79,6 +116,8 @@ pub enum Outcome {
 pub struct World {
     /// Texture of the block.
     pub texture: Texture,
+    /// Size of the block.
+    pub size: Size,
     /// Position of the block.
     pub block: [f64; 2],
     /// Rotation of the block, radians.
@@ -102,12 +141,14 @@ impl World {
     pub fn new(seed: u64) -> Self {
         let mut random = Random::new(seed, stream::LAYOUT);
         let texture = if random.below(2) == 0 { Texture::Triangular } else { Texture::Hexagonal };
+        let size = if Random::new(seed, stream::SIZE).below(2) == 0 { Size::Big } else { Size::Small };
         let block = [random.uniform(-0.35, 0.35), random.uniform(-0.5, -0.1)];
         let yaw = random.uniform(-0.25, 0.25);
         let position =
             [random.uniform(-0.15, 0.15), -0.3 + random.uniform(-0.15, 0.15), 0.6 + random.uniform(-0.05, 0.05)];
         Self {
             texture,
+            size,
             block,
             yaw,
             position,
@@ -141,24 +182,23 @@ impl World {
             self.position[axis] = (self.position[axis] + way + miss).clamp(POSITION_MIN[axis], POSITION_MAX[axis]);
         }
         let [x, y, z] = self.position;
-        let wish = action[3].clamp(0.0, 1.0);
+        let (wish, width) = (action[3].clamp(0.0, 1.0), self.size.width());
         let mut grip = self.grip + (wish - self.grip).clamp(-GRIP_STRIDE, GRIP_STRIDE);
         if self.held {
-            if grip > BLOCK_WIDTH + 0.1 {
+            if grip > width + 0.1 {
                 (self.held, self.released, self.pressure) = (false, true, 0.0);
                 self.block = [x, y];
-            } else if wish < BLOCK_WIDTH {
-                grip = grip.max(BLOCK_WIDTH);
+            } else if wish < width {
+                grip = grip.max(width);
             }
-        } else if (self.block[0] - x).abs() < 0.09 && (self.block[1] - y).abs() < 0.09 && z < 0.16 && grip < BLOCK_WIDTH
-        {
+        } else if (self.block[0] - x).abs() < 0.09 && (self.block[1] - y).abs() < 0.09 && z < 0.16 && grip < width {
             (self.held, self.released) = (true, false);
-            grip = BLOCK_WIDTH;
+            grip = width;
         }
         // Drawn at every step, so that later draws do not depend on when the block was held.
         let flutter = f64::from(self.noise.normal()) * 0.01;
         if self.held {
-            let wanted = self.strongest * ((BLOCK_WIDTH - wish) / 0.4).clamp(0.0, 1.0);
+            let wanted = self.strongest * ((width - wish) / (FULL_PRESS * width)).clamp(0.0, 1.0);
             let towards = (wanted - self.pressure).clamp(-PRESS_STRIDE, PRESS_STRIDE);
             self.pressure = (self.pressure + towards + flutter).max(0.0);
             self.block = [x, y];
@@ -216,4 +256,5 @@ pub(super) mod stream {
     pub(in super::super) const TACTILE_NOISE: u64 = 4;
     pub(in super::super) const EXPERT: u64 = 5;
     pub(in super::super) const TOUCH: u64 = 6;
+    pub(in super::super) const SIZE: u64 = 7;
 }

@@ -1,0 +1,93 @@
+"""The ablation: what of it is done again, and what its table says."""
+
+import argparse
+import json
+import tempfile
+import unittest
+from pathlib import Path
+
+from ablation import CONFIGURATIONS, Training, carry_out, counted, markdown, summarize
+from rapid_policy.experiment_file import read_experiment
+
+FACTS = {"episodes": 240, "frames": 25_600, "batch_windows": 64, "iterations": 400, "minutes": 2.0, "final_loss": 0.02}
+FACTS |= {"hardware": "a processor", "torch": "2"}
+
+
+def trial(triangular, outcome, size="big", status="normal"):
+    return {"event": "trial", "triangular": triangular, "outcome": outcome, "size": size, "status": status}
+
+
+class Runs(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+        self.rapid = self.folder / "rapid"
+        self.args = argparse.Namespace(
+            rapid=self.rapid, runs=self.folder, out=self.folder / "results", seeds=[0, 1], trials=4, iterations=400
+        )
+
+    def program(self, trials):
+        """A program that prints these trials and counts how often it is run."""
+        lines = "\n".join(map(json.dumps, [*trials, {"event": "condition"}]))
+        self.rapid.write_text(f"#!/bin/sh\necho run >>{self.folder}/count\ncat <<'END'\n{lines}\nEND\n", encoding="utf-8")
+        self.rapid.chmod(0o755)
+
+    def trained(self, name, seed):
+        configuration = next(c for c in CONFIGURATIONS if c.name == name)
+        training = Training(configuration, seed, self.folder / f"{name}-{seed}")
+        training.bundle.mkdir(parents=True)
+        facts = {"training": FACTS | {"seed": seed}}
+        (training.bundle / "policy.json").write_text(json.dumps(facts), encoding="utf-8")
+        return training
+
+    def test_what_is_evaluated_is_not_evaluated_again(self):
+        self.program([trial(True, "success")])
+        training = self.trained("vision", 0)
+        carry_out(training, self.args)
+        carry_out(training, self.args)
+        self.assertEqual((self.folder / "count").read_text().split(), ["run"])
+        self.assertEqual(len(json.loads(training.trials.read_text())["trials"]), 1)
+
+    def test_an_evaluation_that_fails_leaves_nothing_that_counts(self):
+        self.rapid.write_text("#!/bin/sh\necho '{\"event\":'\n", encoding="utf-8")
+        self.rapid.chmod(0o755)
+        training = self.trained("vision", 0)
+        with self.assertRaises(ValueError):
+            carry_out(training, self.args)
+        self.assertFalse(training.trials.exists())
+
+    def test_the_table_has_all_trials_and_each_training(self):
+        self.program([trial(True, "success"), trial(False, "success", "small")])
+        carry_out(self.trained("vision-diff", 0), self.args)
+        self.program([trial(True, "wrong_bin"), trial(False, "incomplete", "small")])
+        carry_out(self.trained("vision-diff", 1), self.args)
+        summarize(self.args)
+        report = json.loads((self.args.out / "ablation.json").read_text())
+        (row,) = report["configurations"]
+        self.assertEqual((row["trials"], row["success"], row["wrong_bin"], row["incomplete"]), (4, 0.5, 0.25, 0.25))
+        self.assertEqual([t["success"] for t in row["trainings"]], [1.0, 0.0])
+        self.assertEqual(row["success_by_size"], {"big": 0.5, "small": 0.5})
+        text = markdown(report)
+        self.assertIn("0.50 (1.00, 0.00)", text)
+        self.assertIn("about 1 epochs", text)
+        self.assertIn("Not run: vision, vision-mask, tactile-id-arm, vision-diff-big.", text)
+
+
+class Counting(unittest.TestCase):
+    def test_left_is_the_bin_of_the_triangular_ones(self):
+        trials = [trial(True, "success"), trial(False, "wrong_bin"), trial(False, "success"), trial(True, "incomplete")]
+        shares = counted(trials)
+        self.assertEqual((shares["put_left"], shares["success"], shares["triangular"]), (0.5, 0.5, 0.5))
+
+    def test_a_crash_is_no_other_outcome(self):
+        shares = counted([trial(True, "incomplete", status="crash"), trial(True, "success")])
+        self.assertEqual((shares["crash"], shares["incomplete"], shares["success"]), (0.5, 0.0, 0.5))
+
+    def test_every_configuration_is_trained_equally(self):
+        schedules = {read_experiment(c.file).training for c in CONFIGURATIONS}
+        self.assertEqual(len(schedules), 1)
+
+
+if __name__ == "__main__":
+    unittest.main()
