@@ -110,7 +110,8 @@ def bundle_hash(rapid: Path, bundle: str) -> str:
 def row(title: str, line: dict[str, Any]) -> str:
     """Of a table, from what `rapid eval` printed of a condition."""
     low, high = line["interval"]
-    paper = f"{'-' if line['paper_score'] is None else line['paper_score']} {line['paper_status'] or ''}".strip()
+    known = [line["paper_score"], line["paper_status"]]
+    paper = " ".join(str(part) for part in known if part not in (None, "-")) or "-"
     cells = [title, f"{line['score']:.2f}", f"{low:.2f} to {high:.2f}", line["wrong_bin"], line["incomplete"]]
     cells += [line["crash"], line["status"].capitalize(), paper]
     return f"| {' | '.join(map(str, cells))} |"

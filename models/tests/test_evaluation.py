@@ -1,0 +1,69 @@
+"""The evaluation: whose output it takes, and what it does not run again."""
+
+import argparse
+import json
+import tempfile
+import unittest
+from pathlib import Path
+
+from evaluation import RUNS, TITLES, EvaluationError, evaluate, row
+
+HELD = next(run for run in RUNS if run.name == "held")
+
+
+def condition(name, **changed):
+    line = {"event": "condition", "condition": name, "score": 0.5, "interval": [0.1, 0.9], "wrong_bin": 1, "incomplete": 0}
+    return line | {"crash": 0, "status": "normal", "paper_score": None, "paper_status": "-", "policy_hash": "ours"} | changed
+
+
+class Output(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+        self.args = argparse.Namespace(rapid=self.folder / "rapid", runs=self.folder, trials=2)
+        self.lines = [
+            line
+            for name in HELD.conditions
+            for line in [*({"event": "trial", "condition": name} for _ in range(2)), condition(name)]
+        ]
+        self.program(self.lines)
+
+    def program(self, lines):
+        """A program that evaluates with this output, counts how often it does, and shows the policy `ours`."""
+        text = "\n".join(map(json.dumps, lines))
+        self.args.rapid.write_text(
+            f"#!/bin/sh\nif [ $1 = policy ]; then echo '{{\"hash\": \"ours\"}}'; exit; fi\n"
+            f"echo run >>{self.folder}/count\ncat <<'END'\n{text}\nEND\n",
+            encoding="utf-8",
+        )
+        self.args.rapid.chmod(0o755)
+
+    def test_what_was_printed_is_not_run_again(self):
+        self.assertEqual(evaluate(HELD, self.args), self.lines)
+        self.assertEqual(evaluate(HELD, self.args), self.lines)
+        self.assertEqual((self.folder / "count").read_text().split(), ["run"])
+
+    def test_output_of_another_policy_or_of_another_run_is_refused(self):
+        other = [line | {"policy_hash": "theirs"} if line["event"] == "condition" else line for line in self.lines]
+        for wrong, reason in ((other, "of another policy"), (self.lines[:-1], "not the conditions and trials")):
+            (self.folder / "held.jsonl").write_text("\n".join(map(json.dumps, wrong)), encoding="utf-8")
+            with self.assertRaisesRegex(EvaluationError, reason):
+                evaluate(HELD, self.args)
+
+    def test_every_condition_has_a_title(self):
+        self.assertTrue(all(name in TITLES for run in RUNS for name in run.conditions))
+
+
+class Row(unittest.TestCase):
+    def test_what_the_paper_has(self):
+        ends = [
+            row("x", condition("full", paper_score=0.92, paper_status="Normal")).split("|")[-2].strip(),
+            row("x", condition("full", paper_status="Crash")).split("|")[-2].strip(),
+            row("x", condition("full")).split("|")[-2].strip(),
+        ]
+        self.assertEqual(ends, ["0.92 Normal", "Crash", "-"])
+
+
+if __name__ == "__main__":
+    unittest.main()
