@@ -99,8 +99,9 @@ evaluation: setup-build ## run the policies with a sensor that is pulled out: mo
 	cargo build --release --locked
 	scripts/train.sh python evaluation.py --rapid '$(abspath $(TARGET))/release/rapid'
 
-texture: ## what a tactile picture reveals of the texture: models/results/texture.md (ENCODER=resnet18)
-	scripts/train.sh texture
+texture: setup-build ## what a tactile picture reveals of the texture: models/results/texture.md (ENCODER=resnet18)
+	cargo build --release --locked
+	scripts/train.sh texture '$(TARGET)/release/rapid'
 
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
 lerobot-test: ## the exports from and to LeRobot, against LeRobot (fetches 8 GB of Python packages once)

@@ -1,21 +1,25 @@
 #!/usr/bin/env python3
 """Measures what each input of the policy is worth: trains five configurations, each with several seeds, and runs each.
 
-    ablation.py EPISODES --rapid target/release/rapid [--only NAME]... [--seeds 0 1 2] [--iterations 3900] [--jobs 1]
+    ablation.py EPISODES --rapid ../target/release/rapid [--only NAME]... [--seeds 0 1 2] [--iterations 3900] [--jobs 1]
 
 The configurations are those of the RAPID paper's appendix, each an experiment of `experiments/`, all trained for the same
 number of iterations. Each is exported and evaluated by `rapid eval`, the program that runs policies, with everything plugged
-in. What an earlier run has trained or evaluated is used again, and an interrupted training continues; the results are
-rewritten after every evaluation, with all that are available.
+in. What an earlier run has trained or evaluated in the same way is used again, and an interrupted training continues; what
+was trained in another way is refused. The results are rewritten after every evaluation, with all that are available.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
+import os
+import signal
 import statistics
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -79,24 +83,71 @@ class Training:
         """What `rapid eval` printed of it."""
         return self.folder / "eval.json"
 
+    @property
+    def policy(self) -> str:
+        """SHA-256 of its policy."""
+        return hashlib.sha256((self.bundle / "policy.json").read_bytes()).hexdigest()
+
 
 def main() -> None:
     args = parse()
     chosen = [c for c in CONFIGURATIONS if not args.only or c.name in args.only]
     trainings = [Training(c, seed, args.runs / f"{c.name}-{seed}") for seed in args.seeds for c in chosen]
-    failed = []
-    with ThreadPoolExecutor(args.jobs) as pool:
+    failed = 0
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    pool = ThreadPoolExecutor(args.jobs)
+    try:
         done = {pool.submit(carry_out, training, args): training for training in trainings}
         for future in as_completed(done):
+            training = done[future]
             try:
                 future.result()
-            except (OSError, ValueError, ExperimentError, subprocess.CalledProcessError) as error:
-                training = done[future]
-                failed.append(f"{training.configuration.name}, seed {training.seed}: {error}; see {training.folder}/log.txt")
-                print(f"ablation: {failed[-1]}", file=sys.stderr, flush=True)
-            summarize(args)
+                summarize(args)
+            except (OSError, ValueError, KeyError, ExperimentError, subprocess.CalledProcessError) as error:
+                failed += 1
+                name = f"{training.configuration.name}, seed {training.seed}"
+                print(f"ablation: {name}: {error}; see {training.folder}/log.txt", file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        sys.exit("ablation: interrupted; the same command continues")
+    finally:
+        CHILDREN.end()
+        pool.shutdown(cancel_futures=True)
     if failed:
-        sys.exit(f"ablation: {len(failed)} of {len(trainings)} failed")
+        sys.exit(f"ablation: {failed} of {len(trainings)} failed")
+
+
+class Children:
+    """The programs that run; none starts after the end, which lets a training write its checkpoint."""
+
+    def __init__(self) -> None:
+        self._lock, self._running, self._ended = threading.Lock(), set(), False
+
+    def run(self, command: list[str], **options: Any) -> str | None:
+        """Runs a program to its end; what it printed, if that is asked for.
+
+        Raises `CalledProcessError` if it fails.
+        """
+        with self._lock:
+            if self._ended:
+                raise ValueError("interrupted")
+            child = subprocess.Popen(command, text=True, **options)
+            self._running.add(child)
+        printed, _ = child.communicate()
+        with self._lock:
+            self._running.discard(child)
+        if child.returncode:
+            raise subprocess.CalledProcessError(child.returncode, command[:3])
+        return printed
+
+    def end(self) -> None:
+        """Asks all of them to end."""
+        with self._lock:
+            self._ended = True
+            for child in self._running:
+                child.terminate()
+
+
+CHILDREN = Children()
 
 
 def parse() -> argparse.Namespace:
@@ -121,9 +172,19 @@ def parse() -> argparse.Namespace:
 def carry_out(training: Training, args: argparse.Namespace) -> None:
     """Trains, exports and evaluates, as far as that has not been done."""
     training.folder.mkdir(parents=True, exist_ok=True)
+    asked = {
+        "experiment": training.configuration.file.read_text(encoding="utf-8"),
+        "episodes": str(args.episodes.absolute()),
+        "iterations": args.iterations,
+    }
+    note = training.folder / "asked.json"
+    if not note.exists():
+        note.write_text(json.dumps(asked, indent=2), encoding="utf-8")
+    elif json.loads(note.read_text(encoding="utf-8")) != asked:
+        raise ValueError(f"{training.folder}: of another experiment, other episodes or iterations: delete it")
     if not (training.bundle / "policy.json").exists():
         learn(training, args)
-    if not training.trials.exists():
+    if not is_judged(training, args):
         judge(training, args)
 
 
@@ -134,14 +195,24 @@ def learn(training: Training, args: argparse.Namespace) -> None:
     command += ["--out", str(training.folder.absolute()), "--cache", str(args.cache.absolute())]
     command += ["--iterations", str(args.iterations), "--seed", str(training.seed), "--threads", str(args.threads)]
     command += ["--resume"] if checkpoint.exists() else []
-    logged(training, command)
-    logged(training, ["-m", "rapid_policy.export", str(checkpoint.absolute()), "--out", str(training.bundle.absolute())])
+    logged(training, command, args)
+    export = ["-m", "rapid_policy.export", str(checkpoint.absolute()), "--out", str(training.bundle.absolute())]
+    logged(training, export, args)
 
 
-def logged(training: Training, command: list[str]) -> None:
+def logged(training: Training, command: list[str], args: argparse.Namespace) -> None:
     """Runs a module of this Python; its output is appended to the log of the training."""
     with (training.folder / "log.txt").open("a", encoding="utf-8") as log:
-        subprocess.run([sys.executable, *command], check=True, stdout=log, stderr=log, cwd=MODELS)
+        environment = {**os.environ, "RAPID_BIN": str(args.rapid.absolute())}
+        CHILDREN.run([sys.executable, *command], stdout=log, stderr=log, cwd=MODELS, env=environment)
+
+
+def is_judged(training: Training, args: argparse.Namespace) -> bool:
+    """Whether this very bundle has had as many trials."""
+    if not training.trials.exists():
+        return False
+    record = json.loads(training.trials.read_text(encoding="utf-8"))
+    return record["policy"] == training.policy and len(record["trials"]) == args.trials
 
 
 def judge(training: Training, args: argparse.Namespace) -> None:
@@ -149,13 +220,17 @@ def judge(training: Training, args: argparse.Namespace) -> None:
     options = ["--condition", "full", "--trials", str(args.trials), "--seed", str(FIRST_SEED), "--json"]
     started = time.monotonic()
     command = [str(args.rapid), "eval", str(training.bundle), *options]
-    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    printed = CHILDREN.run(command, stdout=subprocess.PIPE) or ""
     lines = [json.loads(line) for line in printed.splitlines()]
     record = {
         "command": " ".join(["rapid eval BUNDLE", *options]),
+        "policy": training.policy,
         "seconds": round(time.monotonic() - started, 1),
         "trials": [line for line in lines if line["event"] == "trial"],
     }
+    # An interrupted evaluation prints the trials that it had.
+    if len(record["trials"]) != args.trials:
+        raise ValueError(f"{training.bundle}: {len(record['trials'])} of {args.trials} trials")
     partial = training.trials.with_suffix(".partial")
     partial.write_text(json.dumps(record, indent=2), encoding="utf-8")
     partial.rename(training.trials)
@@ -178,7 +253,7 @@ def summarize(args: argparse.Namespace) -> None:
 def summary(configuration: Configuration, args: argparse.Namespace) -> dict[str, Any] | None:
     """One row, of all seeds of its training; none if nothing has been evaluated yet."""
     trainings = [Training(configuration, seed, args.runs / f"{configuration.name}-{seed}") for seed in args.seeds]
-    parts = [part(training) for training in trainings if training.trials.exists()]
+    parts = [part(training) for training in trainings if is_judged(training, args)]
     if not parts:
         return None
     spec: Experiment = read_experiment(configuration.file)
@@ -192,8 +267,6 @@ def summary(configuration: Configuration, args: argparse.Namespace) -> dict[str,
         "mask_aware": spec.policy.mask_aware,
         "trials": len(trials),
         **shares,
-        "interval": results.wilson(round(shares["success"] * len(trials)), len(trials)),
-        "deviation": statistics.stdev(one["success"] for one in parts) if len(parts) > 1 else None,
         "success_by_size": {size: of_size(trials, size) for size in ("big", "small")},
         "paper": configuration.paper,
         "command": parts[0]["command"],
@@ -208,7 +281,7 @@ def of_size(trials: list[dict[str, Any]], size: str) -> float | None:
 
 
 def part(training: Training) -> dict[str, Any]:
-    """What one training came to, with its trials."""
+    """The facts of one training, with its trials."""
     record = json.loads(training.trials.read_text(encoding="utf-8"))
     facts = json.loads((training.bundle / "policy.json").read_text(encoding="utf-8"))["training"]
     kept = ("seed", "episodes", "frames", "batch_windows", "iterations", "minutes", "final_loss", "hardware", "torch")
@@ -231,24 +304,29 @@ def markdown(report: dict[str, Any]) -> str:
     rows = report["configurations"]
     trainings = [training for row in rows for training in row["trainings"]]
     iterations = ", ".join(sorted({f"{t['iterations']:,}" for t in trainings}))
+    seeds = sorted({t["seed"] for t in trainings})
+    partial = [row["name"] for row in rows if len(row["trainings"]) < len(seeds)]
     lines = [
         "# What each input is worth",
         "",
-        f"Five configurations of the policy, each trained for {iterations} iterations with each of the seeds",
-        f"{', '.join(map(str, sorted({t['seed'] for t in trainings})))}, and run by the program (`rapid eval`) with everything"
-        " plugged in: trials with",
-        f"seeds that no demonstration has ({report['first_seed']} and on; {rows[0]['triangular']:.0%} of the blocks triangular; big and"
-        " small ones). Success: the block ends in the bin of",
-        "its texture, of all trials of all trainings, with Wilson's interval; in brackets each training. Incomplete: it ends in no",
-        "bin. Of those in a bin: the share in the right one, which is what the policy knows of the texture. Left: it ends in the",
-        "bin of the triangular ones, whichever it is.",
+        f"Five configurations of the policy, each trained for {iterations} iterations with the seeds {', '.join(map(str, seeds))}, and run by",
+        f"the program (`rapid eval`) with everything plugged in: {rows[0]['trials'] // len(rows[0]['trainings'])} trials of each"
+        f" training, with seeds that no demonstration has",
+        f"({report['first_seed']} and on; {rows[0]['triangular']:.0%} of the blocks triangular; big and small ones). Success: the block ends"
+        " in the bin of its texture, of all",
+        "trials of all trainings; in brackets each training, and the 95 % interval of the lowest and of the highest (Wilson).",
+        "Incomplete: it ends in no bin. Of those in a bin: the share in the right one, which is what the policy knows of the texture.",
+        "Left: it ends in the bin of the triangular ones, whichever it is.",
         "",
+        *([f"Not all trainings are there of: {', '.join(partial)}.", ""] if partial else []),
         "| configuration | data | dropout | success | 95 % | big | small | wrong bin | incomplete | of those in a bin | left"
         " | paper |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        low, high = row["interval"]
+        shares = sorted(t["success"] for t in row["trainings"])
+        each_trials = row["trials"] // len(row["trainings"])
+        ends = [results.wilson(round(share * each_trials), each_trials) for share in (shares[0], shares[-1])]
         binned = row["success"] + row["wrong_bin"]
         each = ", ".join(f"{t['success']:.2f}" for t in row["trainings"])
         cells = [
@@ -256,7 +334,7 @@ def markdown(report: dict[str, Any]) -> str:
             f"{row['data']}, {row['trainings'][0]['episodes']}",
             row["dropout"] or "-",
             f"{row['success']:.2f} ({each})",
-            f"{low:.2f}-{high:.2f}",
+            "; ".join(f"{low:.2f}-{high:.2f}" for low, high in ends),
             *("-" if share is None else f"{share:.2f}" for share in row["success_by_size"].values()),
             f"{row['wrong_bin']:.2f}",
             f"{row['incomplete']:.2f}",
@@ -270,14 +348,14 @@ def markdown(report: dict[str, Any]) -> str:
     minutes = [t["minutes"] for t in trainings]
     lines += [
         "",
-        "Data: the paper's mixture of sizes (`mix`), or big blocks alone (`big`), the same number of demonstrations. `vision-mask`",
+        "Data: the paper's mixture of sizes (`mix`), or big blocks alone (`big`), with the number of demonstrations. `vision-mask`",
         "has one picture to take away, and then only the arm's state is left. Diff: the tactile picture, as difference to the first",
-        "one. The interval is of trials: that trainings differ shows in the brackets. Where a training that has the tactile picture",
-        "is near 0.5, it has not learned yet to use it: see [what its length changes](README.md#seeds-and-the-length-of-training).",
+        "one. A training that has the tactile picture and is near 0.5 has not learned to use it: see",
+        "[what its length changes](README.md#seeds-and-the-length-of-training).",
         "",
         f"The paper trains for 200 epochs of data that it does not count. Here {iterations} iterations of {trainings[0]['batch_windows']} windows are",
         f"{epochs(report)} of these demonstrations. Trained on {', '.join(sorted({t['hardware'] for t in trainings}))}, {min(minutes):.0f} to"
-        f" {max(minutes):.0f} minutes each, several at a time.",
+        f" {max(minutes):.0f} minutes each.",
         "",
         "Made with `make ablation`, which runs",
         "",

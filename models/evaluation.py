@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
-"""Runs the policies with a sensor that is pulled out, and writes what came of it beside the paper's table.
+"""Runs the policies with a sensor that is pulled out, and writes the results beside the paper's table.
 
-    evaluation.py --rapid target/release/rapid [--runs runs/evaluation] [--trials 100]
+    evaluation.py --rapid ../target/release/rapid [--runs runs/evaluation] [--trials 100]
 
-Each run is a `rapid eval`, whose output is kept in RUNS/NAME.jsonl; what is there is not run again. The results,
-`results/eval.jsonl` (the conditions) and `results/eval.md`, are of the policies that are in the repository now: output of
-others is refused.
+Each run is a `rapid eval`, whose output is kept in RUNS/NAME.jsonl, below its command line and the program: what the same
+program has printed for it before is not run again. The results, `results/eval.jsonl` (the conditions) and
+`results/eval.md`, are of the policies that are in the repository now: output of others is refused.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import subprocess
 import sys
@@ -51,7 +52,7 @@ class Run:
 
 RUNS = (
     Run("plain", PLAIN, "absent pictures are zeros, the paper's rule"),
-    Run("held", PLAIN, "the same, the last sample held", ("--hold-last", "20s"), ("hot-unplug", "hot-replug", "early-unplug")),
+    Run("held", PLAIN, "the last sample stands in for the sensor", ("--hold-last", "20s"), ("hot-unplug", "hot-replug", "early-unplug")),
     Run("memory", MEMORY, "trained to remember"),
     Run("static", PLAIN, "a loop with a fixed list", ("--static-config",), ("full", "no-tactile", "hot-unplug", "hot-replug")),
 )  # fmt: skip
@@ -82,21 +83,25 @@ def main() -> None:
 
 def evaluate(run: Run, args: argparse.Namespace) -> list[dict[str, Any]]:
     """The lines of a run, of an earlier one if there is one."""
-    file = args.runs / f"{run.name}.jsonl"
-    if not file.exists():
-        partial = file.with_suffix(".partial")
-        with partial.open("w", encoding="utf-8") as out:
-            command = [str(args.rapid.absolute()), *run.command(args.trials)]
-            subprocess.run(command, check=True, stdout=out, cwd=MODELS)
-        partial.rename(file)
-    lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    file, command = args.runs / f"{run.name}.jsonl", run.command(args.trials)
+    head = {"event": "run", "command": command, "program": hashlib.sha256(args.rapid.read_bytes()).hexdigest()}
+    known = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    if not known or json.loads(known[0]) != head:
+        words = [str(args.rapid.absolute()), *command]
+        printed = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True, cwd=MODELS).stdout
+        known = [json.dumps(head), *printed.splitlines()]
+    lines = [json.loads(line) for line in known[1:]]
     conditions = [line["condition"] for line in lines if line["event"] == "condition"]
     trials = [line for line in lines if line["event"] == "trial"]
+    # An interrupted one prints what it had.
     if conditions != list(run.conditions or TITLES) or len(trials) != args.trials * len(conditions):
-        raise EvaluationError(f"{file}: not the conditions and trials of this run: delete it")
+        raise EvaluationError(f"{run.name}: {len(trials)} trials of {len(conditions)} conditions are not all of them")
     hashes = {line["policy_hash"] for line in lines if line["event"] == "condition"}
     if hashes != {bundle_hash(args.rapid, run.bundle)}:
         raise EvaluationError(f"{file}: of another policy than {run.bundle}: delete it")
+    partial = file.with_suffix(".partial")
+    partial.write_text("".join(line + "\n" for line in known), encoding="utf-8")
+    partial.rename(file)
     return lines
 
 
@@ -107,11 +112,12 @@ def bundle_hash(rapid: Path, bundle: str) -> str:
     return json.loads(printed.splitlines()[0])["hash"]
 
 
-def row(title: str, line: dict[str, Any]) -> str:
-    """Of a table, from what `rapid eval` printed of a condition."""
+def row(title: str, line: dict[str, Any], compares: bool = True) -> str:
+    """Of a table, from what `rapid eval` printed of a condition; `compares`: with the paper's rows."""
     low, high = line["interval"]
     known = [line["paper_score"], line["paper_status"]]
     paper = " ".join(str(part) for part in known if part not in (None, "-")) or "-"
+    paper = paper if compares else "-"
     cells = [title, f"{line['score']:.2f}", f"{low:.2f} to {high:.2f}", line["wrong_bin"], line["incomplete"]]
     cells += [line["crash"], line["status"].capitalize(), paper]
     return f"| {' | '.join(map(str, cells))} |"
@@ -151,12 +157,12 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int) -> str:
         "",
         f"{bundles}, {trials} trials a condition, seeds {FIRST_SEED} to {FIRST_SEED + trials - 1}, which no demonstration has;",
         f"{triangular} of the blocks are triangular, {small} small. A trial counts when the block ends in the bin of its texture;",
-        "Wilson's interval. Seeds for choosing among policies are others (40000 and on).",
+        "Wilson's interval. No policy was chosen by these trials: both are of training seed 0.",
         "",
     ]
     for run in RUNS[:3]:
         lines += [f"## `{run.bundle}`: {run.title}", "", *HEAD]
-        lines += [row(TITLES[name], line) for name, line in conditions[run.name].items()]
+        lines += [row(TITLES[name], line, run.name == "plain") for name, line in conditions[run.name].items()]
         lines.append("")
     low, high = wilson(sorted_unseen, max(1, len(unseen)))
     lines += [

@@ -4,9 +4,9 @@ to the untouched gel, and whether the wrist camera shows it too; and how that de
 
     texture.py EPISODES [--encoder resnet18] [--cache runs/cache] [--out results] [--folds 10] [--iterations 400] [--seed 0]
 
-The classifier is an image encoder of the policy with one additional layer: the small one, or ResNet-18 from scratch, which is
-the paper's. Every episode is tested by a classifier that
-was not trained on it: the episodes are divided into folds, and each fold is tested by one trained on the others.
+The classifier is an image encoder of the policy with one additional layer: the small one, or ResNet-18 from scratch (the
+paper's was trained on other pictures first). Every episode with pictures of a touch is tested by a classifier that was not
+trained on it: the episodes are divided into folds, and each fold is tested by one trained on the others.
 """
 
 from __future__ import annotations
@@ -302,14 +302,16 @@ NETWORKS = {"small": "the image encoder of the policy", "resnet18": "ResNet-18, 
 def markdown(report: dict[str, Any], picture: str) -> str:
     """The same for people."""
     given = "" if report["encoder"] == "small" else f" ENCODER={report['encoder']}"
+    touched = max(row["episodes"] for row in report["inputs"].values())
     lines = [
         "# What a picture shows of the texture",
         "",
         f"A classifier of single pictures ({NETWORKS[report['encoder']]}; {report['parameters']:,} parameters), taken while the",
         f"fingertip is pressed on the block in {report['episodes']} simulated episodes",
-        f"({', '.join(f'{n} {name}' for name, n in report['textures'].items())}). Every episode is",
-        f"tested by a classifier that saw no picture of it: {report['folds']} folds, each classifier trained for",
-        f"{report['iterations']} iterations, seed {report['seed']}.",
+        f"({', '.join(f'{n} {name}' for name, n in report['textures'].items())}). A picture is of a touch if the gel has changed by more",
+        f"than {CONTACT} times its noise; {touched} of the episodes have such pictures, and the others, whose touch is the weakest, are",
+        f"not part of it. Every episode is tested by a classifier that saw no picture of it: {report['folds']} folds, each classifier",
+        f"trained for {report['iterations']} iterations, seed {report['seed']}.",
         "",
         "| input | pictures | accuracy | precision tri / hex | recall tri / hex | episodes by majority | 95 % |",
         "|---|---|---|---|---|---|---|",

@@ -4,13 +4,14 @@
 #     train.sh policy [RAPID]      demonstrations, training, export to models/POLICY, default tactile-id
 #     train.sh experiment FILE ARGS...   training as an experiment (*.toml) has it, export; see models/README.md
 #     train.sh ablation RAPID      the contribution of each input of the policy: models/results/ablation.{json,md}
-#     train.sh texture             how well pictures show the texture: models/results/texture.{json,md}
+#     train.sh texture [RAPID]     how well pictures show the texture: models/results/texture.{json,md}
 #     train.sh test                tests of the Python under models/
 #     train.sh python ARGS...      that Python, run in models/
 #
 # RAPID is the program, default target/release/rapid. Demonstrations and checkpoints are in RUNS=models/runs; existing
-# ones are used again: a stopped training continues. EPISODES (240 by hand, 480 with the arm), SEED=1000 of the demonstrations,
-# THREADS=2 and MINUTES of a training; JOBS=1 trainings of the ablation at a time, SEEDS="0 1 2" of them.
+# ones are used again: a stopped training continues. EPISODES=240 and SEED=1000 of the demonstrations by hand (those with the arm
+# are 480 from 1000 on: the experiments of the ablation say which of them); THREADS=2 of a training, MINUTES of one that is
+# no part of the ablation; POLICY=tactile-id; JOBS=1 trainings of the ablation at a time, SEEDS="0 1 2" of them; ENCODER=small.
 #
 # Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks complete.
 set -euo pipefail
@@ -20,10 +21,10 @@ RUNS="$(realpath -m "${RUNS:-models/runs}")"
 readonly RUNS
 # The policy learns from a gripper in the hand, the comparisons from an arm.
 case "${1:-}" in
-    policy) KIND=(--handheld) NAME=by-hand COUNT=240 ;;
-    *) KIND=() NAME=arm COUNT=480 ;;
+    policy) KIND=(--handheld) NAME=handheld EPISODES="${EPISODES:-240}" SEED="${SEED:-1000}" ;;
+    *) KIND=() NAME=arm EPISODES=480 SEED=1000 ;;
 esac
-readonly KIND EPISODES="${EPISODES:-$COUNT}" SEED="${SEED:-1000}" THREADS="${THREADS:-2}"
+readonly KIND NAME EPISODES SEED THREADS="${THREADS:-2}"
 readonly DEMONSTRATIONS="$RUNS/$NAME-$EPISODES-$SEED"
 
 SCHEDULE=(--threads "$THREADS")
@@ -38,7 +39,7 @@ die() { printf 'train: %s\n' "$*" >&2; exit 1; }
 
 main() {
     local part="${1:-}" rapid=target/release/rapid
-    [[ $part != policy && $part != ablation ]] || rapid="${2:-$rapid}"
+    [[ $part != policy && $part != ablation && $part != texture ]] || rapid="${2:-$rapid}"
     rapid="$(realpath -m -- "$rapid")"
     # The verdict on the episodes before they are used for training.
     [[ $part = test ]] || export RAPID_BIN="${RAPID_BIN:-$rapid}"
@@ -46,7 +47,7 @@ main() {
         policy) environment; demonstrations "$rapid"; policy ;;
         ablation) environment; demonstrations "$rapid"; ablation "$rapid" ;;
         experiment) environment; shift; experiment "$@" ;;
-        texture) environment; texture ;;
+        texture) environment; demonstrations "$rapid"; texture ;;
         test) environment; in_models -m unittest discover -s tests -v ;;
         python) environment; shift; in_models "$@" ;;
         *) die "unknown part '$part': policy, experiment, ablation, texture, test or python" ;;
@@ -72,6 +73,8 @@ demonstrations() {
     rm -rf "$DEMONSTRATIONS.partial"
     mkdir -p "$DEMONSTRATIONS.partial"
     "$rapid" --sim task "${KIND[@]}" --expert --record --episodes "$EPISODES" --out "$DEMONSTRATIONS.partial" --seed "$SEED"
+    # An interrupted one ends well, with those that it had.
+    [[ $(find "$DEMONSTRATIONS.partial" -name '*.mcap' | wc -l) -eq $EPISODES ]] || die "not all demonstrations were recorded"
     mv "$DEMONSTRATIONS.partial" "$DEMONSTRATIONS"
 }
 
@@ -97,7 +100,6 @@ learn() {
 }
 
 texture() {
-    [[ -d $DEMONSTRATIONS ]] || die "no demonstrations $DEMONSTRATIONS: make ablation records them"
     in_models texture.py "$DEMONSTRATIONS" --cache "$RUNS/cache" --threads "$THREADS" --encoder "${ENCODER:-small}"
 }
 

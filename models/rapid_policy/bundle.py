@@ -26,7 +26,10 @@ def encoder_inputs(spec: Experiment) -> list[str]:
 def write_policy(spec: Experiment, facts: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Writes `policy.json` beside the graphs, which exist already. `facts` is the provenance of the weights."""
     policy = policy_json(spec, facts, {name: sha256(folder / name) for name in (ENCODER, DENOISER)})
-    (folder / POLICY).write_text(json.dumps(policy, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    # Last and at once: a bundle that has it is complete.
+    partial = folder / f"{POLICY}.partial"
+    partial.write_text(json.dumps(policy, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    partial.replace(folder / POLICY)
     return policy
 
 

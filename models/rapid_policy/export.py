@@ -41,6 +41,8 @@ def export(state: dict[str, Any], out: Path) -> float:
     names = ["sample", "timestep", "global_cond"]
     write_graph(policy.denoiser, denoiser_example(spec), names, "epsilon", out / DENOISER)
     difference = largest_difference(spec, policy, out)
+    if not difference <= TOLERANCE:
+        raise ValueError(f"{out}: the graphs differ from PyTorch by {difference:.1e}, more than {TOLERANCE}")
     schedule = spec.training
     facts = {
         **state["provenance"],
@@ -157,11 +159,12 @@ def main() -> None:
         sys.exit(f"export: {error}")
     if "final_loss" not in state["provenance"]:
         sys.exit(f"export: {args.checkpoint} belongs to a training that has not ended; continue it with --resume")
-    difference = export(state, args.out)
+    try:
+        difference = export(state, args.out)
+    except ValueError as error:
+        sys.exit(f"export: {error}")
     size = sum(path.stat().st_size for path in args.out.glob("*.onnx")) / 1e6
     print(f"{args.out}: {size:.1f} MB, largest difference to PyTorch {difference:.2e}")
-    if not difference <= TOLERANCE:
-        sys.exit(f"export: the graphs differ from PyTorch by more than {TOLERANCE}")
 
 
 if __name__ == "__main__":

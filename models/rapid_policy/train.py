@@ -329,6 +329,8 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
     run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device)
     if state:
         run.load(state)
+        if args.iterations is not None and args.iterations != run.iterations:
+            raise ValueError(f"{checkpoint} is of a training of {run.iterations} iterations: leave --iterations out")
     if ranks.first:
         shutil.copyfile(args.experiment, args.out / "experiment.toml")
         counts = (

@@ -24,7 +24,8 @@ class Runs(unittest.TestCase):
         self.folder = Path(folder.name)
         self.rapid = self.folder / "rapid"
         self.args = argparse.Namespace(
-            rapid=self.rapid, runs=self.folder, out=self.folder / "results", seeds=[0, 1], trials=4, iterations=400
+            rapid=self.rapid, runs=self.folder, out=self.folder / "results", seeds=[0, 1], trials=2, iterations=400,
+            episodes=self.folder / "episodes",
         )
 
     def program(self, trials):
@@ -42,12 +43,40 @@ class Runs(unittest.TestCase):
         return training
 
     def test_what_is_evaluated_is_not_evaluated_again(self):
-        self.program([trial(True, "success")])
+        self.program([trial(True, "success")] * 2)
         training = self.trained("vision", 0)
         carry_out(training, self.args)
         carry_out(training, self.args)
         self.assertEqual((self.folder / "count").read_text().split(), ["run"])
-        self.assertEqual(len(json.loads(training.trials.read_text())["trials"]), 1)
+        self.assertEqual(len(json.loads(training.trials.read_text())["trials"]), 2)
+
+    def test_another_number_of_trials_or_another_policy_is_evaluated_again(self):
+        self.program([trial(True, "success")] * 2)
+        training = self.trained("vision", 0)
+        carry_out(training, self.args)
+        policy = training.bundle / "policy.json"
+        policy.write_text(policy.read_text() + " ", encoding="utf-8")
+        carry_out(training, self.args)
+        self.args.trials = 3
+        self.program([trial(True, "success")] * 3)
+        carry_out(training, self.args)
+        self.assertEqual((self.folder / "count").read_text().split(), ["run"] * 3)
+
+    def test_other_iterations_or_episodes_are_refused(self):
+        self.program([trial(True, "success")] * 2)
+        training = self.trained("vision", 0)
+        carry_out(training, self.args)
+        for key, other in (("iterations", 500), ("episodes", self.folder / "others")):
+            changed = argparse.Namespace(**{**vars(self.args), key: other})
+            with self.assertRaisesRegex(ValueError, "other episodes or iterations: delete it"):
+                carry_out(training, changed)
+
+    def test_an_interrupted_evaluation_does_not_count(self):
+        self.program([trial(True, "success")])
+        training = self.trained("vision", 0)
+        with self.assertRaisesRegex(ValueError, "1 of 2 trials"):
+            carry_out(training, self.args)
+        self.assertFalse(training.trials.exists())
 
     def test_an_evaluation_that_fails_leaves_nothing_that_counts(self):
         self.rapid.write_text("#!/bin/sh\necho '{\"event\":'\n", encoding="utf-8")

@@ -46,10 +46,19 @@ class Output(unittest.TestCase):
 
     def test_output_of_another_policy_or_of_another_run_is_refused(self):
         other = [line | {"policy_hash": "theirs"} if line["event"] == "condition" else line for line in self.lines]
-        for wrong, reason in ((other, "of another policy"), (self.lines[:-1], "not the conditions and trials")):
-            (self.folder / "held.jsonl").write_text("\n".join(map(json.dumps, wrong)), encoding="utf-8")
+        for wrong, reason in ((other, "of another policy"), (self.lines[:-1], "not all of them"), (self.lines[:1], "not all of them")):
+            self.program(wrong)
             with self.assertRaisesRegex(EvaluationError, reason):
                 evaluate(HELD, self.args)
+            self.assertFalse((self.folder / "held.jsonl").exists())
+
+    def test_another_program_or_another_number_of_trials_is_run_again(self):
+        evaluate(HELD, self.args)
+        self.program([*self.lines, {"event": "more"}])
+        self.assertEqual(evaluate(HELD, self.args)[-1], {"event": "more"})
+        self.args.trials = 3
+        with self.assertRaisesRegex(EvaluationError, "not all of them"):
+            evaluate(HELD, self.args)
 
     def test_every_condition_has_a_title(self):
         self.assertTrue(all(name in TITLES for run in RUNS for name in run.conditions))

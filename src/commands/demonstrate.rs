@@ -32,8 +32,8 @@ pub enum DemonstrateError {
     Output(#[from] io::Error),
 }
 
-/// Records `count` demonstrations on the rig of `registry` from seed `first` on, half of them of each texture, and lists them.
-/// Stops between two of them when `stop` returns true.
+/// Records `count` demonstrations on the rig of `registry` from seed `first` on, half of them of each texture and of each
+/// size, and lists them. Stops between two of them when `stop` returns true.
 ///
 /// # Errors
 /// When one cannot be recorded; those before it are complete.
@@ -66,8 +66,8 @@ pub fn run(
         if format == Format::Json {
             let report = &demonstration.report;
             let texture = if demonstration.texture == Texture::Triangular { "triangular" } else { "hexagonal" };
-            let line = json!({"event": "demonstration", "seed": seed, "texture": texture,
-                "size": demonstration.size, "steps": demonstration.steps, "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
+            let line = json!({"event": "demonstration", "seed": seed, "texture": texture, "size": demonstration.size,
+                "steps": demonstration.steps, "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
             writeln!(out, "{line}")?;
         }
     }

@@ -33,9 +33,9 @@ pub struct Demonstration {
     pub report: EpisodeReport,
 }
 
-/// The seeds of `count` demonstrations from `first` on, the same number of each texture, and of each of these the same number
-/// of each size; of what does not divide one more of those that come first. Seeds whose demonstration would fail are skipped, and those whose lattice has the period
-/// that is left for evaluation.
+/// The seeds of `count` demonstrations from `first` on, the same number of each texture, and of each of these the same
+/// number of each size; what does not divide is made up by those that come first. Seeds whose demonstration would fail are
+/// skipped, and those whose lattice has the period that is left for evaluation.
 pub fn seeds(first: u64, count: usize) -> impl Iterator<Item = u64> {
     let half = count.div_ceil(2);
     // Of each texture: all, and each size.
@@ -104,4 +104,30 @@ pub fn demonstrate(
     }
     let report = recorder.finish(rig.now()).ok_or(RecordError::Idle)?;
     Ok(Demonstration { seed, texture, size, steps, report })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn demonstrations_are_of_both_textures_and_sizes_alike() {
+        for count in (1..=9).chain([40]) {
+            let worlds: Vec<World> = seeds(1000, count).map(World::new).collect();
+            assert_eq!(worlds.len(), count);
+            let of = |texture: Texture, size: Size| {
+                worlds.iter().filter(|world| world.texture == texture && world.size == size).count()
+            };
+            let [triangular, hexagonal] = [Texture::Triangular, Texture::Hexagonal]
+                .map(|texture| [Size::Big, Size::Small].map(|size| of(texture, size)));
+            let all = |sizes: [usize; 2]| sizes[0] + sizes[1];
+            assert!(all(triangular).abs_diff(all(hexagonal)) <= 1, "{count}: {triangular:?}, {hexagonal:?}");
+            // Each may lack what the last texture did not divide.
+            for [big, small] in [triangular, hexagonal] {
+                assert!(big.abs_diff(small) <= 2, "{count}: {triangular:?}, {hexagonal:?}");
+            }
+        }
+        let seeds: Vec<u64> = seeds(1000, 40).collect();
+        assert!(seeds.is_sorted() && seeds.iter().all(|seed| Touch::new(*seed).period != UNSEEN_PERIOD));
+    }
 }

@@ -82,14 +82,14 @@ fn publications(place: &Place, count: u64) {
     until("the mask is published", || record(place).sequence > sequence + count);
 }
 
-/// How many messages each topic has. What rapid itself publishes is without a hole; a simulated device that a busy machine
-/// reads too late loses samples, as a real one does.
+/// How many messages each topic has, whose numbers are without a hole; except for the cameras: a simulated one that a busy
+/// machine reads too late loses pictures, as a real one does.
 fn contiguous(episode: &Episode) -> BTreeMap<String, usize> {
     let mut last: BTreeMap<&str, u32> = BTreeMap::new();
     let mut counts = BTreeMap::new();
     for message in &episode.messages {
         let before = last.insert(&message.topic, message.sequence);
-        if let Some(before) = before.filter(|_| message.topic.starts_with("/rapid/mask")) {
+        if let Some(before) = before.filter(|_| !message.topic.starts_with("/rapid/camera/")) {
             assert_eq!(message.sequence, before + 1, "{}", message.topic);
         }
         *counts.entry(message.topic.clone()).or_insert(0) += 1;

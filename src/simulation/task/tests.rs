@@ -19,7 +19,8 @@ fn the_expert_succeeds_at_both_textures_and_sizes() {
         let trial = demonstrate(seed, 0.006);
         assert_eq!(trial.world.outcome(), Outcome::Success, "seed {seed}");
         assert!((60..200).contains(&trial.world.steps()), "seed {seed}: {} steps", trial.world.steps());
-        seen[2 * usize::from(trial.world.texture == Texture::Hexagonal) + usize::from(trial.world.size == Size::Small)] += 1;
+        seen[2 * usize::from(trial.world.texture == Texture::Hexagonal)
+            + usize::from(trial.world.size == Size::Small)] += 1;
     }
     assert!(seen.into_iter().all(|count| count > 35), "{seen:?}");
 }

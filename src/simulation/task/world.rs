@@ -4,7 +4,7 @@
 //! fingertip shows the texture, and only while it is pressed on the block. Blocks are big or small, whatever their texture
 //! (paper, ablation: demonstrations with cubes of one size, or of both).
 //!
-//! Lengths are in metres, for a large table with a large block. A world's behaviour follows entirely from its seed and
+//! Lengths are in metres, for a large table and blocks of its scale. A world's behaviour follows entirely from its seed and
 //! its actions.
 //!
 //! Invariant: random numbers for the appearance do not affect the dynamics, and the reverse: each has its own stream.

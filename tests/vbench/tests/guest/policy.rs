@@ -44,7 +44,7 @@ const TACTILE_BIT: u32 = 1;
 /// over by then; at this rate the 15 of a chunk last for 30 s, and a chunk is computed in the same way.
 pub(crate) const CONTROL_HZ: f64 = 0.5;
 const TICK_NS: u64 = 2_000_000_000;
-/// Chunks nevertheless follow each other as fast as they are computed.
+/// The next chunk is asked for after so many actions: every 4 s, or as soon as the one before is there.
 pub(crate) const ACTION_STEPS: u64 = 2;
 /// Of a busy guest.
 pub(crate) const OLDEST_OBSERVATION_MS: u64 = 2_000;
