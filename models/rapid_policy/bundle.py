@@ -92,6 +92,7 @@ def _action(spec: Experiment, ranges: dict[str, MinMax]) -> dict[str, Any]:
 
 def _observation(o: Observation, ranges: dict[str, MinMax]) -> dict[str, Any]:
     common = {"key": o.key, "kind": o.kind, "modality": o.modality, "required": o.required, "shape": list(o.shape)}
+    common |= {} if o.down_sample_steps == 1 else {"down_sample_steps": o.down_sample_steps}
     if o.kind == "vector":
         turned = {"rotation": "rotation_6d"} if o.turned else {}
         return {**common, "slice": list(o.run_slice), **turned, "normalization": ranges[o.key].to_dict()}

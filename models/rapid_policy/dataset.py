@@ -63,6 +63,8 @@ class Dataset:
     def __init__(self, spec: Experiment, episodes: Sequence[Episode], ranges: dict[str, MinMax] | None = None) -> None:
         self.spec, self.episodes = spec, list(episodes)
         self.names = {o.key: picture_source(o).name for o in spec.images}
+        # Which of the observations each picture is.
+        self.images = [i for i, o in enumerate(spec.observation) if o.kind == "image"]
         read = [_Rows(spec, e) for e in self.episodes]
         self.starts = np.cumsum([0, *(len(e) for e in self.episodes)])
         self.windows = np.concatenate(
@@ -126,7 +128,9 @@ class Dataset:
         spec = self.spec
         windows = self.windows[random.integers(len(self.windows), size=size)]
         tick = windows[:, 0]
-        seen = np.maximum(tick[:, None] + np.arange(1 - spec.policy.n_obs_steps, 1), windows[:, 1:2])
+        # [B, To, O], each observation with its own distance between steps.
+        apart = np.outer(np.arange(1 - spec.policy.n_obs_steps, 1), [o.down_sample_steps for o in spec.observation])
+        seen = np.maximum(tick[:, None, None] + apart, windows[:, 1:2, None])
         plan: Plan = {"tick": tick, "seen": seen, "done": self._done(windows)}
         pool = spec.encoder.pool
         for o in spec.images:
@@ -139,11 +143,12 @@ class Dataset:
                 plan[f"gain {o.key}"] = gain.astype(np.float32)
         for o in spec.vectors:
             if o.augmentation.noise and vary:
-                noise = random.standard_normal((*seen.shape, *o.shape), np.float32)
+                noise = random.standard_normal((*seen.shape[:2], *o.shape), np.float32)
                 plan[f"noise {o.key}"] = noise * np.float32(o.augmentation.noise)
-        visible = self.present[seen]
+        pictures = seen[..., self.images]
+        visible = self.present[pictures, np.arange(len(self.images))]
         if spec.policy.mask_aware and vary:
-            visible = drop(spec, visible, seen, self._episode_spans(tick), random)
+            visible = drop(spec, visible, pictures, self._episode_spans(tick), random)
         plan["visible"] = visible
         if vary:
             self._hold(plan, random)
@@ -151,16 +156,17 @@ class Dataset:
 
     def _hold(self, plan: Plan, random: np.random.Generator) -> None:
         """Some windows see a picture as it was before it left: from what has passed since then they are the same."""
-        seen, starts = plan["seen"], self._episode_spans(plan["tick"])[:, :1]
+        starts = self._episode_spans(plan["tick"])[:, :1]
         for i, o in enumerate(self.spec.images):
             if not (o.dropout.held and o.when_absent):
                 continue
+            seen = plan["seen"][..., self.images[i]]
             longest = max(1, round(o.when_absent.hold_last_ms / 1e3 * self.spec.policy.control_hz))
             # Every moment since the episode began is as likely as any other.
             room = np.minimum(seen[:, :1] - starts, longest)
             since = np.where(room > 0, random.integers(0, np.maximum(room, 1)) + 1, 0)
             is_held = (random.random((len(seen), 1)) < o.dropout.held) & plan["visible"][:, :, i].all(1, keepdims=True)
-            is_held &= self.present[seen - since][:, :, i].all(1, keepdims=True)
+            is_held &= self.present[seen - since, i].all(1, keepdims=True)
             plan[f"since {o.key}"] = np.where(is_held, since, 0)
 
     def gather(self, plan: Plan) -> Batch:
@@ -170,13 +176,15 @@ class Dataset:
             {}, {}, {}, {}, {}, torch.from_numpy(visible[:, -1].astype(np.float32)), self._batch_actions(plan)
         )
         for i, o in enumerate(spec.images):
-            steps, shown = _replugged(plan["seen"] - plan.get(f"since {o.key}", 0), visible[:, :, i])
+            steps, shown = _replugged(plan["seen"][..., self.images[i]] - plan.get(f"since {o.key}", 0), visible[:, :, i])
             batch.shown[o.key] = torch.from_numpy(shown)
             self._pictures(batch, o, plan, steps, shown)
             if (gain := plan.get(f"gain {o.key}")) is not None:
                 batch.gains[o.key] = torch.from_numpy(gain)
-        for o in spec.vectors:
-            values = self.vectors[o.key][plan["seen"]]
+        for i, o in enumerate(spec.observation):
+            if o.kind == "image":
+                continue
+            values = self.vectors[o.key][plan["seen"][..., i]]
             if (noise := plan.get(f"noise {o.key}")) is not None:
                 values = values + noise
             batch.vectors[o.key] = torch.from_numpy(values)
@@ -257,7 +265,7 @@ def inputs(spec: Experiment, batch: Batch, device: torch.device) -> dict[str, Te
 
 def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArray[np.int64],
          random: np.random.Generator) -> Bools:  # fmt: skip
-    """Takes pictures away at random: bool [B, To, M] of the rows `seen`, in episodes of the rows `spans` [B, 2].
+    """Takes pictures away at random: bool [B, To, M] of the rows `seen` [B, To, M], in episodes of the rows `spans` [B, 2].
 
     Of several that are present at the newest step at least one always remains. A policy with one picture has its
     vectors left.
@@ -266,7 +274,7 @@ def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArr
     kept = there & (random.random(there.shape) >= [o.dropout.window for o in spec.images])
     away = np.zeros_like(present)
     if any(o.dropout.episode for o in spec.images):
-        away = _absences(spec, present.shape, seen, spans, random)
+        away = _absences(spec, seen, spans, random)
         kept &= ~away[:, -1]
     if len(spec.images) > 1:
         # The one that remains in a window that lost all: any present one, with equal probability.
@@ -282,16 +290,15 @@ def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArr
     return out
 
 
-def _absences(spec: Experiment, shape: tuple[int, ...], seen: NDArray[np.int64], spans: NDArray[np.int64],
+def _absences(spec: Experiment, seen: NDArray[np.int64], spans: NDArray[np.int64],
               random: np.random.Generator) -> Bools:  # fmt: skip
     """[B, To, M] where a picture is absent because it left in the middle of the episode, for a time or to its end."""
-    count = (shape[0], shape[2])
+    count = (seen.shape[0], seen.shape[2])
     leaves = random.random(count) < [o.dropout.episode for o in spec.images]
     begin, end = spans[:, :1], spans[:, 1:]
     out = begin + (random.random(count) * (end - begin)).astype(np.int64)
     back = np.where(random.random(count) < 0.5, end, out + 1 + (random.random(count) * (end - out)).astype(np.int64))
-    rows = seen[:, :, None]
-    return leaves[:, None] & (rows >= out[:, None]) & (rows < back[:, None])
+    return leaves[:, None] & (seen >= out[:, None]) & (seen < back[:, None])
 
 
 def _replugged(seen: NDArray[np.int64], visible: Bools) -> tuple[NDArray[np.int64], Bools]:

@@ -131,6 +131,7 @@ class Observation(Section):
     kind: Literal["image", "vector"] = known("what it is", "image")
     modality: Name = known("the device in the registry of the rig that the policy runs on", "cam_wrist")
     required: bool = known("without it the policy does not act; ticks without it are not learned from", True, True)
+    down_sample_steps: int = known("ticks between two of its steps", 3, 1, ge=1, le=64)
     size: Size | None = known("pictures: [height, width] as the camera gives them", [96, 96], None)
     resize: Size | None = known("pictures: [height, width] to which they are resized", [96, 128], None)
     crop: Size | None = known("pictures: [height, width] of the middle that is taken", [96, 96], None)

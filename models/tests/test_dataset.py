@@ -135,6 +135,21 @@ class Pictures(unittest.TestCase):
         self.assertEqual(tuple(given["wrist"].shape), (2, 2, 3, 96, 96))
 
 
+class Apart(unittest.TestCase):
+    def test_steps_are_as_many_ticks_apart_as_the_program_looks_back(self):
+        spec = observed(observed(plain(), "wrist", down_sample_steps=3), "state", down_sample_steps=2)
+        dataset = Dataset(spec, [made_up(30), made_up(30)])
+        dataset.windows = dataset.windows[[10, 30 + 1]]
+        batch, given = drawn(dataset, 200)
+        tick = dataset.ranges["action"].invert(batch.actions.numpy())[:, 1, 0].round().astype(int)
+        wrist = ((given["wrist"][:, :, 0, 0, 0] + 1) * 127.5).round().int()
+        state = np.floor(dataset.ranges["state"].invert(given["state"].numpy())[:, :, 0]).astype(int)
+        seen = {at: ({tuple(r) for r in wrist[tick == at].tolist()}, {tuple(r) for r in state[tick == at].tolist()})
+                for at in set(tick.tolist())}  # fmt: skip
+        # Steps before the beginning of a segment repeat its first one, as at run time.
+        self.assertEqual(seen, {10: ({(7, 10)}, {(8, 10)}), 1: ({(0, 1)}, {(0, 1)})})
+
+
 class Dropout(unittest.TestCase):
     def masked(self, spec: Experiment, present: np.ndarray, steps: int = 2) -> np.ndarray:
         """[B, To, M] of windows at random places of an episode of 100 ticks."""
@@ -143,6 +158,7 @@ class Dropout(unittest.TestCase):
         seen = tick[:, None] + np.arange(1 - steps, 1)
         shape = (count, steps, present.shape[1])
         spans = np.tile([0, 100], (count, 1))
+        seen = np.broadcast_to(seen[:, :, None], shape)
         return drop(spec, np.broadcast_to(present[:, None], shape), seen, spans, np.random.default_rng(0))
 
     def test_dropout_leaves_one_picture_and_brings_none_back(self):

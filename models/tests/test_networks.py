@@ -138,9 +138,11 @@ class Bundle(unittest.TestCase):
         self.assertEqual(limits, {"min": [-1.1, -1.1, -0.05, -0.1], "max": [1.1, 1.1, 1.05, 2.1]})
 
     def test_what_the_program_does_with_pictures_and_actions_is_written(self):
-        spec = observed(experiment(), "wrist", size=None, resize=[120, 160], crop=[96, 96], color="bgr")
+        pictures = {"size": None, "resize": [120, 160], "crop": [96, 96], "color": "bgr", "down_sample_steps": 3}
+        spec = observed(experiment(), "wrist", **pictures)
         described = policy_json(spec, {"normalization": RANGES}, {ENCODER: "", DENOISER: ""})
         wrist = described["observations"][0]
+        self.assertEqual([o.get("down_sample_steps") for o in described["observations"]], [3, None, None])
         self.assertEqual(
             [wrist[key] for key in ("shape", "color", "resize", "crop")], [[3, 96, 96], "bgr", [120, 160], [96, 96]]
         )
