@@ -27,8 +27,9 @@ idle() {
 guest=$(programs "$@" --lib --test guest --test layering | grep /guest-) || { echo "tests.sh: the tests of $package are not built" >&2; exit 1; }
 "$1" build "${@:3}" --example process_node --example publish_action
 # These run when nothing else does. rapid stops motors that answer too late, and on a machine that stands still for a second they
-# do; what a camera's latency is measured by, and what the bench shows of itself, is when samples come.
-readonly alone=(adapters:: arm:: brake:: calibrate:: guard:: motors:: scenarios::bench_shows)
+# do; what a camera's latency is measured by, and what the bench shows of itself, is when samples come; a chunk of the policy
+# takes all of an emulated processor for seconds.
+readonly alone=(adapters:: arm:: brake:: calibrate:: guard:: motors:: policy:: scenarios::bench_shows)
 # A guest needs the machine's two cores, so they run in sequence. While one runs, the next is prepared.
 bench() {
     printf '     Running %s %s\n' "$guest" "$*"
@@ -50,6 +51,8 @@ finish() {
 trap finish EXIT
 code=0
 units=$(programs idle "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
+host=$(rustc -vV | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_')
+export "CARGO_TARGET_${host}_RUNNER=$(realpath "${0%/*}/runner.sh")"
 "$@" --no-fail-fast --exclude vbench || code=1
 for unit in $units; do
     (cd "$package" && "$unit") || { code=1; echo "error: $unit failed"; }

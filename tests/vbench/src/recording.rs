@@ -16,6 +16,8 @@ use crate::proto;
 const MASKS: &str = "/rapid/mask";
 /// Name of the metadata record with the counts.
 const SUMMARY: &str = "rapid/summary";
+/// Name of the metadata record of a repair.
+const RECOVERED: &str = "rapid/recovered";
 
 /// Why a recording could not be read.
 #[derive(Debug, Error)]
@@ -132,6 +134,11 @@ impl Recording {
         let modalities = json("rapid", "modalities");
         let own = modalities.as_array().into_iter().flatten().find(|modality| modality["topic"] == topic);
         let name = own.and_then(|modality| modality["name"].as_str()).unwrap_or_default();
+        if self.metadata.contains_key(RECOVERED) {
+            // What a killed run had counted is gone with it: the numbers of the samples show it, as `rapid inspect` reports.
+            let numbers: Vec<u32> = self.topic(topic).map(|message| message.sequence).collect();
+            return numbers.windows(2).map(|pair| u64::from(pair[1].saturating_sub(pair[0]).saturating_sub(1))).sum();
+        }
         let counted = &json(SUMMARY, "modalities")[name];
         ["lost", "dropped"].iter().filter_map(|fault| counted[*fault].as_u64()).sum()
     }

@@ -111,12 +111,16 @@ udevadm settle
 chrt -f 40 "${{usbemu[@]}}" --beat 2000 $out/beat.bin & watchers=$!
 "${{usbemu[@]}}" --watch-mask >$out/mask.jsonl & watchers+=" $!"
 "${{usbemu[@]}}" --watch-uevents >$out/uevents.jsonl & watchers+=" $!"
-rapid_start --headless --record --duration {seconds}s --out $out/rec --config /tmp/bench/devices.toml --json
+rapid_start --headless --record --out $out/rec --config /tmp/bench/devices.toml --json
 await_rapid 60 '"event":"recording"' || fail 'not recording'
 await_rapid 60 '"event":"state"' '"device":"cam_wrist"' '"state":"streaming"' || fail 'cam_wrist does not stream'
 emu t0
 {}
-rapid_wait
+emu_done {seconds}
+# After the last plug, however slow the machine is.
+wait_for 60 states 2 cam_wrist streaming || fail 'cam_wrist does not stream again'
+wait_for 60 is streaming published cam_wrist || fail 'cam_wrist does not stream in the end'
+rapid_stop
 kill $watchers
 emu unplug 0
 wait_for 30 detached 0 || fail 'still attached'
