@@ -65,9 +65,9 @@ pub fn run(
         good += usize::from(demonstration.report.verdict.grade == Grade::Good);
         if format == Format::Json {
             let report = &demonstration.report;
-            let texture = if demonstration.texture == Texture::Triangular { "triangular" } else { "hexagonal" };
-            let line = json!({"event": "demonstration", "seed": seed, "texture": texture, "size": demonstration.size,
-                "steps": demonstration.steps, "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
+            let line = json!({"event": "demonstration", "seed": seed, "texture": demonstration.texture.word(),
+                "size": demonstration.size.word(), "steps": demonstration.steps,
+                "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
             writeln!(out, "{line}")?;
         }
     }

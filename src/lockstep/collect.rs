@@ -85,8 +85,7 @@ pub fn demonstrate(
         rig.rest(&mut recorder)?;
     }
     let mut request = request.clone();
-    let word = if texture == Texture::Triangular { "triangular" } else { "hexagonal" };
-    let tags = [("seed", seed.to_string()), ("texture", word.to_owned()), ("size", size.word().to_owned())];
+    let tags = [("seed", seed.to_string()), ("texture", texture.word().to_owned()), ("size", size.word().to_owned())];
     request.tags.extend(tags.map(|(key, value)| (key.to_owned(), value)));
     recorder.begin(&request, rig.now())?;
     let (mut steps, mut tail) = (0_u32, TAIL);

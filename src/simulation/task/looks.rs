@@ -90,14 +90,14 @@ impl Looks {
             let y = world.position[1] - offset(pixel) / scale;
             [0.05 * (6.0 * y + p1).sin(), (9.0 * y + p2).sin(), (9.0 * y + p2).cos()]
         });
-        let (middle, size) = if world.held {
+        let (middle, pixels_per_metre) = if world.held {
             ([0.0, 0.0], 150.0)
         } else {
             let away = [world.block[0] - world.position[0], world.block[1] - world.position[1]];
             ([away[0] * scale, -away[1] * scale], scale)
         };
         let (sin, cos) = world.yaw.sin_cos();
-        let half = world.size.half_edge() * size;
+        let half = world.size.half_edge() * pixels_per_metre;
         let fingers = 14.0 + 14.0 * world.grip;
         picture.clear();
         for (v, row) in row.iter().enumerate() {

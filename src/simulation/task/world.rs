@@ -45,6 +45,14 @@ pub enum Texture {
 }
 
 impl Texture {
+    /// Its word in tags and output.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Triangular => "triangular",
+            Self::Hexagonal => "hexagonal",
+        }
+    }
+
     /// Middle of the bin it belongs to.
     pub const fn bin(self) -> [f64; 2] {
         match self {
