@@ -36,8 +36,6 @@ format = "MJPG"
 "#;
 /// Recording with the camera plugged, before the first unplug.
 const IDLE_MS: u64 = 10_000;
-/// Recording after the last plug.
-const MARGIN_MS: u64 = 4_000;
 /// Longer than the cooldown minus the time the kernel takes to create a node, so that no cooldown applies.
 const OUT_MS: u64 = 2_200;
 const IN_MS: u64 = 1_800;
@@ -100,7 +98,7 @@ impl Plan {
     }
 
     fn scenario(&self) -> Scenario {
-        let seconds = (IDLE_MS + self.cycles * (OUT_MS + IN_MS) + MARGIN_MS).div_ceil(1_000);
+        let seconds = (IDLE_MS + self.cycles * (OUT_MS + IN_MS)).div_ceil(1_000);
         let plain_seconds = (self.cycles * (PLAIN_OUT_MS + PLAIN_IN_MS)).div_ceil(1_000) + 30;
         let camera = DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00A1").mode(Format::Mjpg, 640, 480, &[30]);
         let script = format!(
