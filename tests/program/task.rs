@@ -116,6 +116,20 @@ fn seeds_of_the_training_are_not_evaluated_without_a_warning() {
     assert!(warned("1000") && !warned("50000"));
 }
 
+#[test]
+fn the_policy_that_remembers_has_its_last_pictures_after_the_unplug() {
+    let place = Place::new();
+    let bundle = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id-memory");
+    let shown = printed(&place, &["policy", "show", bundle, "--sim", "task"]);
+    let observations = shown[0]["observations"].as_array().expect("observations");
+    assert!(observations.iter().any(|one| one["hold_last_ms"] == 20_000), "{shown:?}");
+    let trials = printed(&place, &["eval", bundle, "--trials", "1", "--condition", "hot-unplug"]);
+    let trial = trials.iter().find(|line| line["event"] == "trial").expect("a trial");
+    assert_eq!((&trial["status"], &trial["failure"]), (&"degraded".into(), &Value::Null), "{trial}");
+    assert!(trial["unplugged_at"].as_u64() > trial["touched_at"].as_u64(), "{trial}");
+    assert!(["big", "small"].contains(&trial["size"].as_str().expect("a size")), "{trial}");
+}
+
 /// Whatever the phases of its sensors are, and wherever between two of their samples an episode begins.
 #[test]
 fn the_frames_of_the_rig_are_valid_whatever_the_phases_are() {
