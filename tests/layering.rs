@@ -127,6 +127,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_cal", &["bus"]),
     ("if_addrs", &["driver/lan", "web"]),
     ("image", &["tui/picture"]),
+    ("indicatif", &["commands/progress"]),
     ("jiff", &["time"]),
     ("jpeg_encoder", &["driver/sim", "simulation/task", "plot", "web"]),
     ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "inputs"]),
