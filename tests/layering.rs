@@ -119,7 +119,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("gpiocdev_uapi", &["gpio"]),
     ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan", "web"]),
-    ("humantime", &["registry", "session", "cli", "commands"]),
+    ("humantime", &["registry/units"]),
     ("hyper", &["driver/lan", "web"]),
     ("hyper_util", &["driver/lan", "web"]),
     ("iceoryx2", &["bus"]),
