@@ -20,6 +20,8 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum, ValueHint};
 
+use crate::registry::units::parse_duration;
+
 #[cfg(feature = "export")]
 pub use export::{ExportArgs, Layout, PictureForm};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
@@ -555,10 +557,10 @@ fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
 
 /// A time in `range`, or else the error `wrong`; `example` shows the notation.
 fn time(text: &str, range: impl RangeBounds<Duration>, wrong: &str, example: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(time) if range.contains(&time) => Ok(time),
-        Ok(_) => Err(wrong.to_owned()),
-        Err(_) => Err(format!("write a number and a unit, for example {example}")),
+    match parse_duration(text) {
+        Some(time) if range.contains(&time) => Ok(time),
+        Some(_) => Err(wrong.to_owned()),
+        None => Err(format!("write a number and a unit, for example {example}")),
     }
 }
 

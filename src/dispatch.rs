@@ -305,10 +305,9 @@ fn no_mask(error: &PresenceError) -> String {
 }
 
 fn recover(paths: Vec<PathBuf>, format: Format) -> Result<(), Failure> {
-    let progress = io::stderr().is_terminal() && format == Format::Text;
     // Files that are already repaired stay repaired.
     let (outcome, written) = until_interrupted("the repair", move |stop| {
-        commands::recover::run(&paths, format, progress, stop, &mut io::stdout(), &mut io::stderr())
+        commands::recover::run(&paths, format, stop, &mut io::stdout(), &mut io::stderr())
     })?;
     if outcome.is_done() { Ok(written?) } else { Err(Failure::printed(argument_code(outcome.is_bad_argument()))) }
 }

@@ -15,7 +15,6 @@ use std::fmt::{Debug, Write as _};
 use std::io::{self, IsTerminal, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{self, SyncSender};
 use std::time::Duration;
 
 use tracing::field::{Field, Visit};
@@ -28,6 +27,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, Registry};
 
 use crate::headless::ERASE_LINE;
+use crate::outlet::Outlet;
 use crate::palette::Palette;
 use crate::panics;
 use crate::status::{Board, Level};
@@ -74,40 +74,35 @@ pub enum LoggingError {
 /// Dropping it waits, for a limited time, until standard error has taken what was logged.
 #[derive(Debug)]
 #[must_use = "dropped at once it waits for nothing"]
-pub struct Log(Option<SyncSender<Piece>>);
+pub struct Log(Option<Arc<Outlet>>);
 
 impl Drop for Log {
     fn drop(&mut self) {
-        let Some(pieces) = self.0.take() else { return };
-        let (done, is_done) = mpsc::channel();
-        // If there is no room for this, the reader is not reading.
-        if pieces.try_send(Piece::Flush(done)).is_ok() {
-            let _ = is_done.recv_timeout(LAST);
+        if let Some(outlet) = &self.0 {
+            outlet.drain(LAST);
         }
     }
 }
 
-/// Messages to the thread `stderr`.
-#[derive(Debug)]
-enum Piece {
-    Line(String),
-    /// Answered when everything before it is written.
-    Flush(mpsc::Sender<()>),
+/// Where a line that cannot be written is lost: there is no place left to report it, and one that finds no room (another
+/// program may have made the terminal non-blocking) is not the end of the log.
+struct Lossy<W>(W);
+
+impl<W: Write> Write for Lossy<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let _ = self.0.write_all(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        let _ = self.0.flush();
+        Ok(())
+    }
 }
 
-/// Starts the thread that writes the log's lines to `out`.
-fn spawn_writer(mut out: impl Write + Send + 'static) -> io::Result<SyncSender<Piece>> {
-    let (sender, pieces) = mpsc::sync_channel(DEPTH);
-    std::thread::Builder::new().name("stderr".to_owned()).spawn(move || {
-        for piece in pieces {
-            // There is no place left to report that the reader is gone, nor that no caller waits.
-            let _ = match piece {
-                Piece::Line(line) => out.write_all(line.as_bytes()),
-                Piece::Flush(done) => done.send(()).map_err(io::Error::other),
-            };
-        }
-    })?;
-    Ok(sender)
+/// The thread that writes the log's lines to `out`.
+fn outlet(out: impl Write + Send + 'static) -> io::Result<Arc<Outlet>> {
+    Ok(Arc::new(Outlet::new("stderr", DEPTH, Lossy(out))?))
 }
 
 /// Sends the program's log to `board` and to standard error. `filter` is the value of `RAPID_LOG`.
@@ -118,13 +113,13 @@ pub fn init(board: Arc<Board>, filter: Option<&str>, stderr: Stderr) -> Result<L
     let chosen = filter.filter(|filter| !filter.is_empty());
     let filter = filter_of(chosen.unwrap_or(DEFAULT))?;
     let least = if chosen.is_some() { LevelFilter::TRACE } else { LevelFilter::WARN };
-    let pieces = match stderr {
+    let outlet = match stderr {
         Stderr::Nothing => None,
-        Stderr::Text | Stderr::Json => Some(spawn_writer(io::stderr())?),
+        Stderr::Text | Stderr::Json => Some(outlet(io::stderr())?),
     };
-    let printed = pieces.clone().map(|pieces| Lines { sink: StderrSink::new(stderr, pieces) }.with_filter(least));
+    let printed = outlet.clone().map(|outlet| Lines { sink: StderrSink::new(stderr, outlet) }.with_filter(least));
     Registry::default().with(filter).with(Lines { sink: board }).with(printed).try_init()?;
-    Ok(Log(pieces))
+    Ok(Log(outlet))
 }
 
 fn filter_of(chosen: &str) -> Result<EnvFilter, ParseError> {
@@ -157,16 +152,16 @@ struct StderrSink {
     palette: Palette,
     /// Erases a progress line on the same terminal.
     before: &'static str,
-    pieces: SyncSender<Piece>,
+    outlet: Arc<Outlet>,
     /// Lines lost for lack of room since the last that was sent.
     lost: AtomicU64,
 }
 
 impl StderrSink {
-    fn new(form: Stderr, pieces: SyncSender<Piece>) -> Self {
+    fn new(form: Stderr, outlet: Arc<Outlet>) -> Self {
         let palette = Palette::of(&io::stderr());
         let shared = form == Stderr::Text && io::stderr().is_terminal() && io::stdout().is_terminal();
-        Self { form, palette, before: if shared { ERASE_LINE } else { "" }, pieces, lost: AtomicU64::new(0) }
+        Self { form, palette, before: if shared { ERASE_LINE } else { "" }, outlet, lost: AtomicU64::new(0) }
     }
 
     fn render(&self, line: &LogLine) -> String {
@@ -189,7 +184,7 @@ impl Sink for StderrSink {
             let report = format!("{lost} lines of the log lost: their reader was behind");
             text.insert_str(0, &self.render(&LogLine { level: Level::Warn, text: report, ..line }));
         }
-        if self.pieces.try_send(Piece::Line(text)).is_err() {
+        if !self.outlet.try_send(text.into_bytes()) {
             self.lost.fetch_add(lost + 1, Ordering::Relaxed);
         }
     }

@@ -1,9 +1,11 @@
-//! Outlet: a terminal or a pipe that may be slow, behind a separate thread.
+//! Outlet: a terminal or a pipe that may be slow, behind a separate thread. The screen, the lines of a run and the log
+//! each have one.
 //!
 //! Invariant: the sender never waits for the reader at the other end longer than it chooses to.
 
 use std::io::{self, Write};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use tokio::sync::{Notify, mpsc, oneshot};
@@ -13,6 +15,9 @@ use tokio::sync::{Notify, mpsc, oneshot};
 pub struct Outlet {
     sender: mpsc::Sender<Vec<u8>>,
     room: Arc<Notify>,
+    /// Pieces accepted, and pieces written; neither decreases.
+    sent: AtomicU64,
+    written: Arc<AtomicU64>,
     ended: oneshot::Receiver<io::Result<()>>,
 }
 
@@ -25,7 +30,8 @@ impl Outlet {
         let (sender, mut pieces) = mpsc::channel::<Vec<u8>>(depth);
         let (report, ended) = oneshot::channel();
         let room = Arc::new(Notify::new());
-        let made = Arc::clone(&room);
+        let written = Arc::new(AtomicU64::new(0));
+        let (made, count) = (Arc::clone(&room), Arc::clone(&written));
         std::thread::Builder::new().name(name.to_owned()).spawn(move || {
             let mut outcome = Ok(());
             while let Some(piece) = pieces.blocking_recv() {
@@ -34,13 +40,14 @@ impl Outlet {
                 if outcome.is_err() {
                     break;
                 }
+                count.fetch_add(1, Ordering::Release);
             }
             // One that waits for room sees that the writer is gone.
             made.notify_one();
             // The receiver may be gone.
             let _ = report.send(outcome);
         })?;
-        Ok(Self { sender, room, ended })
+        Ok(Self { sender, room, sent: AtomicU64::new(0), written, ended })
     }
 
     /// Notified when the writer has taken a piece, or has ended.
@@ -61,12 +68,18 @@ impl Outlet {
     /// Sends a piece if there is room; true if there was.
     #[must_use = "a piece without room is lost"]
     pub fn try_send(&self, piece: Vec<u8>) -> bool {
-        self.sender.try_send(piece).is_ok()
+        self.sender.try_reserve().map(|permit| self.pass(permit, piece)).is_ok()
     }
 
     /// Sends a piece as soon as there is room; false when the other end is gone.
     pub async fn send(&self, piece: Vec<u8>) -> bool {
-        self.sender.send(piece).await.is_ok()
+        self.sender.reserve().await.map(|permit| self.pass(permit, piece)).is_ok()
+    }
+
+    /// Counts a piece before the writer has it: no piece that is written is missing in the count.
+    fn pass(&self, permit: mpsc::Permit<'_, Vec<u8>>, piece: Vec<u8>) {
+        self.sent.fetch_add(1, Ordering::AcqRel);
+        permit.send(piece);
     }
 
     /// Waits until the other end is gone.
@@ -87,12 +100,10 @@ impl Outlet {
         }
     }
 
-    /// The same for callers that cannot await: blocks, at most `within`.
-    pub fn finish_blocking(self, within: Duration) {
-        let Self { sender, mut ended, .. } = self;
-        drop(sender);
-        let deadline = Instant::now() + within;
-        while Instant::now() < deadline && matches!(ended.try_recv(), Err(oneshot::error::TryRecvError::Empty)) {
+    /// Blocks until everything that this thread has sent is written, or the other end is gone, at most `within`.
+    pub fn drain(&self, within: Duration) {
+        let (sent, deadline) = (self.sent.load(Ordering::Acquire), Instant::now() + within);
+        while self.written.load(Ordering::Acquire) < sent && !self.is_closed() && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(2));
         }
     }
@@ -103,7 +114,7 @@ pub fn write_within(out: impl Write + Send + 'static, text: String, within: Dura
     // Without a thread, or with a reader that is gone, there is no place left to report it.
     let Ok(outlet) = Outlet::new("outlet", 1, out) else { return };
     let _ = outlet.try_send(text.into_bytes());
-    outlet.finish_blocking(within);
+    outlet.drain(within);
 }
 
 #[cfg(test)]
@@ -130,6 +141,39 @@ mod tests {
         assert!(!outlet.send(b"y".to_vec()).await);
         let error = outlet.finish(Duration::from_secs(5)).await.unwrap_err();
         assert_eq!(error.kind(), io::ErrorKind::BrokenPipe);
+    }
+
+    #[test]
+    fn a_drained_outlet_has_written_everything_or_lost_its_reader() {
+        let long = Duration::from_secs(3600);
+        let (mut reader, writer) = io::pipe().unwrap();
+        let outlet = Outlet::new("test", 8, writer).unwrap();
+        for piece in ["one ", "two ", "three"] {
+            assert!(outlet.try_send(piece.as_bytes().to_vec()));
+        }
+        outlet.drain(long);
+        // Written before its end, and it can still be used.
+        let mut text = [0; 13];
+        io::Read::read_exact(&mut reader, &mut text).unwrap();
+        assert_eq!(&text, b"one two three");
+        assert!(outlet.try_send(b"four".to_vec()));
+        outlet.drain(long);
+        drop(outlet);
+        let mut text = String::new();
+        io::Read::read_to_string(&mut reader, &mut text).unwrap();
+        assert_eq!(text, "four");
+
+        let outlet = Outlet::new("test", 8, Broken).unwrap();
+        while outlet.try_send(b"x".to_vec()) {
+            std::thread::yield_now();
+        }
+        outlet.drain(long);
+
+        // A reader that takes nothing: the pipe is full, and the wait ends all the same.
+        let (_reader, writer) = io::pipe().unwrap();
+        let outlet = Outlet::new("test", 8, writer).unwrap();
+        assert!(outlet.try_send(vec![0; 1 << 20]));
+        outlet.drain(Duration::from_millis(10));
     }
 
     #[tokio::test]

@@ -1,13 +1,62 @@
-//! The palette: how printed lines highlight words.
+//! The palette: how words are highlighted, in printed lines and in the monitor.
+//!
+//! Invariant: a meaning has its style here and nowhere else. Only the 16 colours that the user's own terminal theme
+//! defines, so that dark and light terminals both read well.
 
 use std::io::IsTerminal;
 
+use anstyle::{AnsiColor, Color, Style};
+
 use crate::status::{Grade, Level, SlotState};
 
-/// Ways to highlight a word.
+/// Something good.
+pub const GOOD: Style = AnsiColor::Green.on_default();
+/// Something that needs attention.
+pub const WARN: Style = AnsiColor::Yellow.on_default();
+/// Something wrong.
+pub const BAD: Style = AnsiColor::Red.on_default().bold();
+/// Something secondary.
+pub const FAINT: Style = Style::new().dimmed();
+/// A name or a heading.
+pub const BOLD: Style = Style::new().bold();
+/// A row of a QR code: white on black, whatever the colours of the terminal are, because a camera reads it.
+pub const CODE: Style =
+    Style::new().fg_color(Some(Color::Ansi(AnsiColor::BrightWhite))).bg_color(Some(Color::Ansi(AnsiColor::Black)));
+
+/// The style of a state.
+pub const fn of_state(state: SlotState) -> Style {
+    match state {
+        SlotState::Streaming => GOOD,
+        SlotState::Opening | SlotState::Backoff => WARN,
+        SlotState::Stalled => AnsiColor::Magenta.on_default(),
+        SlotState::Absent => AnsiColor::Red.on_default(),
+        SlotState::Failed => BAD,
+    }
+}
+
+/// The style of a severity.
+pub const fn of_level(level: Level) -> Style {
+    match level {
+        Level::Debug => FAINT,
+        Level::Info => Style::new(),
+        Level::Warn => WARN,
+        Level::Error => BAD,
+    }
+}
+
+/// The style of a verdict.
+pub const fn of_grade(grade: Grade) -> Style {
+    match grade {
+        Grade::Good => GOOD,
+        Grade::Suspect => WARN,
+        Grade::Bad => BAD,
+    }
+}
+
+/// Whether words are highlighted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Palette {
-    /// ANSI escape sequences, the 16 colours.
+    /// With ANSI escape sequences, the 16 colours.
     Ansi,
     /// No highlighting.
     #[default]
@@ -15,83 +64,63 @@ pub enum Palette {
 }
 
 impl Palette {
-    /// The palette for `out` in the environment of this process.
+    /// The palette for `out` in the environment of this process, by the conventions of <https://no-color.org> and
+    /// <https://bixense.com/clicolors>: `NO_COLOR` takes precedence over `CLICOLOR_FORCE`, that over `CLICOLOR=0`, and
+    /// that over the terminal, which must not be `TERM=dumb` or without a `TERM`.
     pub fn of(out: &impl IsTerminal) -> Self {
-        Self::detect(out.is_terminal(), |name| std::env::var(name).ok())
-    }
-
-    /// The palette for a terminal, or for a file or a pipe. `CLICOLOR_FORCE` and `NO_COLOR` as on
-    /// <https://bixense.com/clicolors> and <https://no-color.org>; `NO_COLOR` takes precedence.
-    pub fn detect(is_terminal: bool, variable: impl Fn(&str) -> Option<String>) -> Self {
-        let set = |name: &str| variable(name).filter(|value| !value.is_empty());
-        let forced = set("CLICOLOR_FORCE").is_some_and(|value| value != "0");
-        let can_show = is_terminal && set("TERM").is_none_or(|term| term != "dumb");
-        if set("NO_COLOR").is_none() && (forced || can_show) { Self::Ansi } else { Self::Plain }
+        let can_show = || out.is_terminal() && anstyle_query::term_supports_ansi_color();
+        let shown = anstyle_query::clicolor_force() || (anstyle_query::clicolor() != Some(false) && can_show());
+        if shown && !anstyle_query::no_color() { Self::Ansi } else { Self::Plain }
     }
 
     /// `text` as something good.
     pub fn good(self, text: &str) -> String {
-        self.wrap("32", text)
+        self.paint(GOOD, text)
     }
 
     /// `text` as something that needs attention.
     pub fn warn(self, text: &str) -> String {
-        self.wrap("33", text)
+        self.paint(WARN, text)
     }
 
     /// `text` as something wrong.
     pub fn bad(self, text: &str) -> String {
-        self.wrap("1;31", text)
+        self.paint(BAD, text)
     }
 
     /// `text` as something secondary.
     pub fn faint(self, text: &str) -> String {
-        self.wrap("2", text)
+        self.paint(FAINT, text)
     }
 
     /// `text` as a name or a heading.
     pub fn bold(self, text: &str) -> String {
-        self.wrap("1", text)
+        self.paint(BOLD, text)
     }
 
-    /// `text` as a row of a QR code: white on black, whatever the colours of the terminal are.
+    /// `text` as a row of a QR code.
     pub fn code(self, text: &str) -> String {
-        self.wrap("97;40", text)
+        self.paint(CODE, text)
     }
 
-    /// `text` in the colour of a state.
+    /// `text` in the style of a state.
     pub fn state(self, state: SlotState, text: &str) -> String {
-        match state {
-            SlotState::Streaming => self.good(text),
-            SlotState::Opening | SlotState::Backoff => self.warn(text),
-            SlotState::Stalled => self.wrap("35", text),
-            SlotState::Absent => self.wrap("31", text),
-            SlotState::Failed => self.bad(text),
-        }
+        self.paint(of_state(state), text)
     }
 
-    /// `text` in the colour of a severity.
+    /// `text` in the style of a severity.
     pub fn level(self, level: Level, text: &str) -> String {
-        match level {
-            Level::Debug => self.faint(text),
-            Level::Info => text.to_owned(),
-            Level::Warn => self.warn(text),
-            Level::Error => self.bad(text),
-        }
+        self.paint(of_level(level), text)
     }
 
-    /// `text` in the colour of a verdict.
+    /// `text` in the style of a verdict.
     pub fn grade(self, grade: Grade, text: &str) -> String {
-        match grade {
-            Grade::Good => self.good(text),
-            Grade::Suspect => self.warn(text),
-            Grade::Bad => self.bad(text),
-        }
+        self.paint(of_grade(grade), text)
     }
 
-    fn wrap(self, code: &str, text: &str) -> String {
+    fn paint(self, style: Style, text: &str) -> String {
         match self {
-            Self::Ansi if !text.is_empty() => format!("\x1b[{code}m{text}\x1b[0m"),
+            Self::Ansi if !text.is_empty() => format!("{style}{text}{style:#}"),
             _ => text.to_owned(),
         }
     }
@@ -101,25 +130,17 @@ impl Palette {
 mod tests {
     use super::*;
 
-    type Environment = &'static [(&'static str, &'static str)];
-
     #[test]
-    fn environment_and_terminal_decide_in_this_order() {
-        let table: [(bool, Environment, Palette); 7] = [
-            (true, &[], Palette::Ansi),
-            (false, &[], Palette::Plain),
-            (true, &[("NO_COLOR", "1")], Palette::Plain),
-            (true, &[("TERM", "dumb")], Palette::Plain),
-            (false, &[("CLICOLOR_FORCE", "1")], Palette::Ansi),
-            (false, &[("CLICOLOR_FORCE", "0")], Palette::Plain),
-            (false, &[("CLICOLOR_FORCE", "1"), ("NO_COLOR", "1")], Palette::Plain),
-        ];
-        for (is_terminal, environment, expected) in table {
-            let variable =
-                |name: &str| environment.iter().find(|(key, _)| *key == name).map(|(_, value)| (*value).to_owned());
-            assert_eq!(Palette::detect(is_terminal, variable), expected, "{is_terminal} {environment:?}");
+    fn words_are_highlighted_only_with_ansi() {
+        for (shown, expected) in [
+            (Palette::Ansi.good("yes"), "\x1b[32myes\x1b[0m"),
+            (Palette::Ansi.bad("no"), "\x1b[1m\x1b[31mno\x1b[0m"),
+            (Palette::Ansi.code("█"), "\x1b[97m\x1b[40m█\x1b[0m"),
+            (Palette::Ansi.level(Level::Info, "line"), "line"),
+            (Palette::Ansi.bad(""), ""),
+            (Palette::Plain.bad("no"), "no"),
+        ] {
+            assert_eq!(shown, expected);
         }
-        assert_eq!(Palette::Ansi.bad("no"), "\x1b[1;31mno\x1b[0m");
-        assert_eq!(Palette::Plain.bad("no"), "no");
     }
 }

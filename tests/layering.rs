@@ -89,7 +89,7 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
 const NARROW: &[(&str, &[&str], &str)] = &[
     (
         "tui",
-        &["status", "registry", "text", "outlet", "panics", "pixels", "qr"],
+        &["status", "registry", "palette", "text", "outlet", "panics", "pixels", "qr"],
         "a screen knows snapshots and commands, no stage",
     ),
     (
@@ -102,6 +102,8 @@ const NARROW: &[(&str, &[&str], &str)] = &[
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).
 const HOMES: &[(&str, &[&str])] = &[
+    ("anstyle", &["palette", "tui/theme"]),
+    ("anstyle_query", &["palette"]),
     ("arrow_array", &["export"]),
     ("arrow_schema", &["export"]),
     ("clap", &["cli", "dispatch", "main", "commands"]),
@@ -117,7 +119,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("gpiocdev_uapi", &["gpio"]),
     ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan", "web"]),
-    ("humantime", &["registry", "session", "cli", "commands"]),
+    ("humantime", &["registry/units"]),
     ("hyper", &["driver/lan", "web"]),
     ("hyper_util", &["driver/lan", "web"]),
     ("iceoryx2", &["bus"]),
@@ -125,6 +127,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_cal", &["bus"]),
     ("if_addrs", &["driver/lan", "web"]),
     ("image", &["tui/picture"]),
+    ("indicatif", &["commands/progress"]),
     ("jiff", &["time"]),
     ("jpeg_encoder", &["driver/sim", "simulation/task", "plot", "web"]),
     ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "inputs"]),
@@ -142,6 +145,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rand_distr", &["random"]),
     ("rand_pcg", &["random"]),
     ("ratatui", &["tui"]),
+    ("ratatui_core", &["tui"]),
     ("ratatui_image", &["tui/picture"]),
     ("rustix", &["time", "bell", ABOVE_NOUNS]),
     ("sd_notify", &["app/watchdog"]),

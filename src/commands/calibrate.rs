@@ -22,6 +22,7 @@ use crate::calibration::{self, Estimate, Flip, Seen, brightness};
 use crate::cli::LatencyArgs;
 use crate::device::{Attachment, DeviceNode};
 use crate::driver::Driver;
+use crate::registry::units::show_duration;
 use crate::registry::{Assigner, Assignment, DeviceSpec, NodeSpec, Registry};
 use crate::simulation::SimDevice;
 use crate::time::Stamp;
@@ -119,7 +120,7 @@ pub async fn latency(
     let (spec, node) = choose(registry, attached, args.device.as_deref())?;
     let light = Chosen::of(args.led.as_deref())?;
     if let (Chosen::Led(led), Format::Text) = (&light, format) {
-        let length = humantime::format_duration(args.duration);
+        let length = show_duration(args.duration);
         writeln!(out, "Flashing {} for {length}; ctrl-C ends.", text::plain(&led.to_string_lossy()))?;
     }
     let (flips, seen) = observe(spec, node, &light, args.duration).await?;

@@ -48,7 +48,7 @@ pub fn run(
     let registry = Arc::new(registry);
     let board = Arc::new(Board::new(&registry));
     let begun = Instant::now();
-    let mut bar = Bar::new("episodes", count, format == Format::Text);
+    let bar = Bar::new("episodes", count, format == Format::Text);
     let (mut done, mut steps, mut triangular, mut good) = (0, 0, 0, 0);
     for seed in collect::seeds(first, count) {
         if stop() {
@@ -71,7 +71,7 @@ pub fn run(
             writeln!(out, "{line}")?;
         }
     }
-    bar.clear();
+    drop(bar);
     if format == Format::Text {
         let (recorded, taken) = (STEP * steps, begun.elapsed());
         let times = recorded.as_secs_f64() / taken.as_secs_f64().max(1e-9);

@@ -78,7 +78,7 @@ pub fn run(args: &EvalArgs, format: Format, stop: &dyn Fn() -> bool, out: &mut d
     let configuration = if args.static_config { Configuration::Static } else { Configuration::Dynamic };
     let mut bench = Bench { bundle: &bundle, registry: &registry, model: &mut model, configuration };
     let begun = Instant::now();
-    let mut bar = Bar::new("trials", args.trials * conditions.len(), format == Format::Text);
+    let bar = Bar::new("trials", args.trials * conditions.len(), format == Format::Text);
     let mut rows: Vec<Row> = Vec::new();
     let mut done = 0;
     'all: for condition in conditions {
@@ -98,7 +98,7 @@ pub fn run(args: &EvalArgs, format: Format, stop: &dyn Fn() -> bool, out: &mut d
             }
         }
     }
-    bar.clear();
+    drop(bar);
     rows.retain(|row| !row.trials.is_empty());
     match format {
         Format::Json => {

@@ -2,67 +2,92 @@
 //!
 //! Every file is read completely, regardless of its recorded summary, so later changes are found.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::io::{IsTerminal, Write, stderr};
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use crate::text;
 
+const UNITS: &str = "{prefix} {bar:20} {pos}/{len}{rate}{left}";
+const BYTES: &str = "{prefix} {bar:20} {done}{left}";
 const EVERY: Duration = Duration::from_millis(100);
 /// How soon a worker notices that there is room for its result.
 const WAIT: Duration = Duration::from_millis(5);
-const BLOCKS: usize = 20;
 
-/// `label ██████·········· 12/72  0:07 left`, redrawn in place; only on a terminal.
+/// `label ██████·········· 12/72  8.6/s  00:07 left` on standard error, redrawn in place and erased when it is dropped.
+///
+/// Only on a terminal that can redraw a line: one with a `TERM` that is not `dumb`.
 #[derive(Debug)]
-pub struct Bar {
-    label: &'static str,
-    total: usize,
-    begun: Instant,
-    drawn: Option<Instant>,
-    shown: bool,
-}
+pub struct Bar(ProgressBar);
 
 impl Bar {
-    /// A line for `total` units of work, if `wanted` and standard error is a terminal.
+    /// A line for `total` units of work, if `wanted`.
     pub fn new(label: &'static str, total: usize, wanted: bool) -> Self {
-        Self { label, total, begun: Instant::now(), drawn: None, shown: wanted && stderr().is_terminal() }
+        Self::on(target(wanted), label.into(), UNITS, total as u64)
+    }
+
+    /// A line for bytes, if `wanted`: `label ██████·········· 1.0 MB of 3.2 MB  00:07 left`.
+    pub fn of_bytes(label: String, wanted: bool) -> Self {
+        Self::on(target(wanted), label.into(), BYTES, 0)
+    }
+
+    fn on(target: ProgressDrawTarget, label: Cow<'static, str>, template: &str, total: u64) -> Self {
+        // The templates are constants, and a test draws them.
+        let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+        let style = style.progress_chars("█·").with_key("done", done).with_key("rate", rate).with_key("left", left);
+        Self(ProgressBar::with_draw_target(Some(total), target).with_style(style).with_prefix(label))
     }
 
     /// Reports that `done` units are done.
-    pub fn at(&mut self, done: usize) {
-        if !self.shown || self.drawn.is_some_and(|drawn| drawn.elapsed() < EVERY) {
-            return;
-        }
-        self.drawn = Some(Instant::now());
-        let _ = write!(stderr(), "\r\x1b[2K{}", line(self.label, done, self.total, self.begun.elapsed()));
-        let _ = stderr().flush();
+    pub fn at(&self, done: usize) {
+        self.0.set_position(done as u64);
     }
 
-    /// Clears the line.
-    pub fn clear(&mut self) {
-        if self.drawn.take().is_some() {
-            let _ = write!(stderr(), "\r\x1b[2K");
+    /// Reports that `done` of `total` are done.
+    pub fn at_of(&self, done: u64, total: u64) {
+        if self.0.length() != Some(total) {
+            self.0.set_length(total);
         }
+        self.0.set_position(done);
+    }
+
+    /// Does what writes to the same terminal, without the line.
+    pub fn aside<T>(&self, write: impl FnOnce() -> T) -> T {
+        self.0.suspend(write)
     }
 }
 
-impl Drop for Bar {
-    fn drop(&mut self) {
-        self.clear();
-    }
+fn target(wanted: bool) -> ProgressDrawTarget {
+    if wanted { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() }
 }
 
-fn line(label: &str, done: usize, total: usize, elapsed: Duration) -> String {
-    let full = (BLOCKS * done).checked_div(total).unwrap_or(BLOCKS).min(BLOCKS);
-    let bar = "█".repeat(full) + &"·".repeat(BLOCKS - full);
-    let left = (done > 0).then(|| elapsed.mul_f64((total.saturating_sub(done)) as f64 / done as f64));
-    let left = left.map(|left| format!("  {} left", text::clock(left))).unwrap_or_default();
-    format!("{label} {bar} {done}/{total}{left}")
+/// Bytes done, of how many.
+fn done(state: &ProgressState, out: &mut dyn fmt::Write) {
+    // Writing to the line that is drawn does not fail; here and below.
+    let _ = write!(out, "{} of {}", text::size(state.pos()), text::size(state.len().unwrap_or_default()));
+}
+
+/// The rate, as soon as it is known.
+fn rate(state: &ProgressState, out: &mut dyn fmt::Write) {
+    let _ = match state.per_sec() {
+        rate if rate >= 1.0 => write!(out, "  {rate:.1}/s"),
+        rate if rate > 0.0 => write!(out, "  {:.1}/min", 60.0 * rate),
+        _ => Ok(()),
+    };
+}
+
+/// The time left, as soon as it is known.
+fn left(state: &ProgressState, out: &mut dyn fmt::Write) {
+    if state.per_sec() > 0.0 {
+        let _ = write!(out, "  {} left", text::clock(state.eta()));
+    }
 }
 
 /// Applies `read` to every file, on all processors, and passes the results to `take`: see [`Work::each`].
@@ -106,7 +131,7 @@ impl Work<'_> {
         mut take: impl FnMut(&I, T) -> Result<(), E>,
     ) -> Result<(), E> {
         let workers = self.workers.clamp(1, items.len().max(1));
-        let mut bar = Bar::new(self.label, self.total, self.total > 1);
+        let bar = Bar::new(self.label, self.total, self.total > 1);
         let (next, taken, ended) = (AtomicUsize::new(0), AtomicUsize::new(0), AtomicBool::new(false));
         thread::scope(|scope| {
             let (done, results) = mpsc::sync_channel(2 * workers);
@@ -140,8 +165,7 @@ impl Work<'_> {
                 let mut outcome = Ok(());
                 while let (Ok(()), Some((item, result))) = (&outcome, items.get(index).zip(early.remove(&index))) {
                     index += 1;
-                    bar.clear();
-                    outcome = take(item, result);
+                    outcome = bar.aside(|| take(item, result));
                     taken.store(index, Ordering::Relaxed);
                 }
                 if outcome.is_err() {
@@ -157,21 +181,84 @@ impl Work<'_> {
 
 #[cfg(test)]
 mod tests {
+    use std::io;
+    use std::sync::{Arc, Mutex};
+
+    use indicatif::TermLike;
+
     use super::*;
+
+    /// The last line that was drawn.
+    #[derive(Debug, Clone, Default)]
+    struct Screen(Arc<Mutex<String>>);
+
+    impl Screen {
+        fn line(&self) -> String {
+            self.0.lock().unwrap().trim_end().to_owned()
+        }
+    }
+
+    impl TermLike for Screen {
+        fn width(&self) -> u16 {
+            80
+        }
+
+        fn move_cursor_up(&self, _: usize) -> io::Result<()> {
+            Ok(())
+        }
+
+        fn move_cursor_down(&self, _: usize) -> io::Result<()> {
+            Ok(())
+        }
+
+        fn move_cursor_right(&self, _: usize) -> io::Result<()> {
+            Ok(())
+        }
+
+        fn move_cursor_left(&self, _: usize) -> io::Result<()> {
+            Ok(())
+        }
+
+        fn write_line(&self, text: &str) -> io::Result<()> {
+            self.write_str(text)
+        }
+
+        fn write_str(&self, text: &str) -> io::Result<()> {
+            self.0.lock().unwrap().push_str(text);
+            Ok(())
+        }
+
+        fn clear_line(&self) -> io::Result<()> {
+            self.0.lock().unwrap().clear();
+            Ok(())
+        }
+
+        fn flush(&self) -> io::Result<()> {
+            Ok(())
+        }
+    }
 
     #[test]
-    fn the_line_shows_progress_and_time_left() {
-        let bar = |done, total| line("trials", done, total, Duration::from_secs(30));
-        assert_eq!(bar(0, 4), "trials ···················· 0/4");
-        assert_eq!(bar(1, 4), "trials █████··············· 1/4  01:30 left");
-        assert_eq!(bar(4, 4), "trials ████████████████████ 4/4  00:00 left");
-        assert_eq!(bar(0, 0), "trials ████████████████████ 0/0");
+    fn the_line_shows_progress_and_is_erased() {
+        let screen = Screen::default();
+        let target = || ProgressDrawTarget::term_like(Box::new(screen.clone()));
+        let bar = Bar::on(target(), "trials".into(), UNITS, 4);
+        bar.at(0);
+        assert_eq!(screen.line(), "trials ···················· 0/4");
+        bar.at(1);
+        let line = screen.line();
+        assert!(line.starts_with("trials █████··············· 1/4  ") && line.ends_with(" left"), "{line}");
+        assert_eq!(bar.aside(|| screen.line()), "");
+        assert!(screen.line().starts_with("trials █████··············· 1/4"), "{}", screen.line());
+        bar.at(4);
+        assert!(screen.line().starts_with("trials ████████████████████ 4/4"), "{}", screen.line());
+        drop(bar);
+        assert_eq!(screen.line(), "");
+        let bar = Bar::on(target(), "a.mcap".into(), BYTES, 0);
+        bar.at_of(1_000_000, 4_000_000);
+        let line = screen.line();
+        assert!(line.starts_with("a.mcap █████··············· 1.0 MB of 4.0 MB"), "{line}");
     }
-}
-
-#[cfg(test)]
-mod episodes_tests {
-    use super::*;
 
     #[test]
     fn results_follow_the_order_of_the_files_until_an_error() {

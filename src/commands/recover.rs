@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use serde::Serialize;
 use serde_json::json;
 
+use super::progress::Bar;
 use super::{Format, json_line};
 use crate::episode::recover::{ProgressFn, RecoverError, Recovered, finished, is_damaged, left_behind, recover};
 use crate::text;
@@ -32,13 +33,12 @@ impl FailureCounts {
 }
 
 /// Repairs every file of `paths` and every unfinished one of a folder among them. Results go to `out`, errors
-/// and, if `progress` is set, the progress to `err`. `stop` interrupts the current file and skips the rest.
+/// to `err`; the progress of text is a line on standard error. `stop` interrupts the current file and skips the rest.
 ///
 /// A closed output leaves no file unrepaired, so its error is returned separately from the outcome.
 pub fn run(
     paths: &[PathBuf],
     format: Format,
-    progress: bool,
     stop: &AtomicBool,
     out: &mut impl Write,
     err: &mut impl Write,
@@ -54,14 +54,14 @@ pub fn run(
         };
         let is_idle = unfinished.is_empty();
         for file in unfinished {
-            match report.with_progress(&file, progress, stop, recover) {
+            match report.with_progress(&file, stop, recover) {
                 Ok(recovered) => report.done(&recovered),
                 Err(error) => report.failed(&file, &error),
             }
         }
         let mut is_sound = true;
         for file in finished {
-            let damaged = report.with_progress(&file, progress, stop, is_damaged);
+            let damaged = report.with_progress(&file, stop, is_damaged);
             is_sound &= matches!(damaged, Ok(false));
             match damaged {
                 Ok(false) => {}
@@ -93,27 +93,22 @@ struct Report<'a, O, E> {
 }
 
 impl<O: Write, E: Write> Report<'_, O, E> {
-    /// Applies `work` to a file, showing its progress if requested, until `stop` interrupts it.
+    /// Applies `work` to a file, showing its progress, until `stop` interrupts it.
     fn with_progress<T>(
         &mut self,
         file: &Path,
-        progress: bool,
         stop: &AtomicBool,
         work: fn(&Path, &mut ProgressFn<'_>) -> Result<T, RecoverError>,
     ) -> Result<T, RecoverError> {
         if stop.load(Ordering::Relaxed) {
             return Err(RecoverError::Interrupted(file.to_owned()));
         }
-        let mut bar = PercentLine { file, shown: None };
+        let bar = Bar::of_bytes(text::plain(&file.display().to_string()).into_owned(), self.format == Format::Text);
         let mut watch = |done, size| {
-            if progress {
-                bar.show(done, size, self.err);
-            }
+            bar.at_of(done, size);
             if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         };
-        let done = work(file, &mut watch);
-        bar.clear(self.err);
-        done
+        work(file, &mut watch)
     }
 
     /// Reports that nothing of this path needs a repair.
@@ -173,31 +168,6 @@ impl<O: Write, E: Write> Report<'_, O, E> {
     }
 }
 
-/// A line that is redrawn whenever the percentage changes.
-struct PercentLine<'a> {
-    file: &'a Path,
-    shown: Option<u64>,
-}
-
-impl PercentLine<'_> {
-    fn show(&mut self, done: u64, size: u64, err: &mut impl Write) {
-        let percent = u128::from(done) * 100 / u128::from(size.max(1));
-        let percent = u64::try_from(percent).unwrap_or(100);
-        if self.shown.replace(percent) != Some(percent) {
-            let file = self.file.display().to_string();
-            let _ = write!(err, "\r\x1b[K{}: {percent} % of {}", text::plain(&file), text::size(size));
-            let _ = err.flush();
-        }
-    }
-
-    fn clear(&mut self, err: &mut impl Write) {
-        if self.shown.take().is_some() {
-            let _ = write!(err, "\r\x1b[K");
-            let _ = err.flush();
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -229,7 +199,7 @@ mod tests {
             std::fs::write(&file, bytes).expect("a file");
             let reported = |path: &Path, format| {
                 let (mut out, mut err) = (Vec::new(), Vec::new());
-                let (outcome, _) = run(&[path.to_owned()], format, false, &AtomicBool::new(false), &mut out, &mut err);
+                let (outcome, _) = run(&[path.to_owned()], format, &AtomicBool::new(false), &mut out, &mut err);
                 let err = String::from_utf8_lossy(&err);
                 assert!(outcome.is_done() && err.is_empty(), "{what}: {outcome:?} {err}");
                 String::from_utf8(out).expect("text")
@@ -255,7 +225,7 @@ mod tests {
         let paths = [file("none.mcap"), folder.path().to_owned()];
         let (stop, mut err) = (AtomicBool::new(false), Vec::new());
         for format in [Format::Text, Format::Json] {
-            let (outcome, written) = run(&paths, format, false, &stop, &mut Closed, &mut err);
+            let (outcome, written) = run(&paths, format, &stop, &mut Closed, &mut err);
             assert!(outcome.is_bad_argument(), "{outcome:?}");
             assert_eq!(written.expect_err("closed").kind(), io::ErrorKind::BrokenPipe);
             assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 0);

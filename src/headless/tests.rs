@@ -227,7 +227,7 @@ fn lines_for_people_have_their_columns() {
 fn colours_follow_the_state_and_nothing_else_is_an_escape() {
     let columns = line::Columns { name: 9, palette: Palette::Ansi };
     let line = columns.line(&event(state("tof", 2, SlotState::Failed, "a\x1b[31mb")), WALL_NS);
-    assert!(line.contains("\x1b[1;31mfailed      \x1b[0m"), "{line:?}");
+    assert!(line.contains("\x1b[1m\x1b[31mfailed      \x1b[0m"), "{line:?}");
     assert!(line.contains("a [31mb"), "{line:?}");
 }
 

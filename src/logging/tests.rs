@@ -71,7 +71,7 @@ fn text_lines_replace_a_progress_line_on_the_same_terminal() {
 
 fn sink_to(form: Stderr, before: &'static str, out: impl Write + Send + 'static) -> StderrSink {
     let palette = crate::palette::Palette::Plain;
-    StderrSink { form, palette, before, pieces: spawn_writer(out).unwrap(), lost: AtomicU64::new(0) }
+    StderrSink { form, palette, before, outlet: outlet(out).unwrap(), lost: AtomicU64::new(0) }
 }
 
 #[test]
@@ -95,6 +95,49 @@ fn a_stalled_reader_blocks_no_writer_and_is_informed_of_lost_lines() {
     let text = reading.join().unwrap().unwrap();
     assert!(text.contains("lines of the log lost: their reader was behind"));
     assert!(text.ends_with("last\n"));
+}
+
+#[test]
+fn what_was_logged_is_written_when_the_log_is_dropped_though_the_subscriber_keeps_its_end() {
+    let (mut reader, writer) = io::pipe().unwrap();
+    let sink = sink_to(Stderr::Text, "", writer);
+    let log = Log(Some(Arc::clone(&sink.outlet)));
+    // Fits into a pipe, so that nothing waits for the reader.
+    for number in 0..100 {
+        sink.take(LogLine { wall_ns: 0, level: Level::Warn, text: format!("line {number}") });
+    }
+    drop(log);
+    let mut text = [0; 4096];
+    let count = io::Read::read(&mut reader, &mut text).unwrap();
+    let text = String::from_utf8_lossy(&text[..count]);
+    assert_eq!((text.lines().count(), text.ends_with("line 99\n")), (100, true), "{text}");
+}
+
+/// A terminal that another program has made non-blocking.
+#[test]
+fn a_line_without_room_is_not_the_end_of_the_log() {
+    struct Full(Arc<Mutex<Vec<u8>>>, bool);
+    impl Write for Full {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            if std::mem::replace(&mut self.1, false) {
+                return Err(io::ErrorKind::WouldBlock.into());
+            }
+            self.0.lock().unwrap().extend_from_slice(bytes);
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+    let written = Arc::default();
+    let sink = sink_to(Stderr::Text, "", Full(Arc::clone(&written), true));
+    for text in ["one", "two"] {
+        sink.take(LogLine { wall_ns: 0, level: Level::Warn, text: text.to_owned() });
+    }
+    sink.outlet.drain(Duration::from_secs(3600));
+    let text = String::from_utf8(written.lock().unwrap().clone()).unwrap();
+    assert!(!text.contains("one") && text.ends_with("two\n"), "{text:?}");
 }
 
 #[test]

@@ -1,9 +1,9 @@
 //! Durations and sizes as people write them: a number and a unit.
+//!
+//! Invariant: one grammar of durations, in registries, scenarios, journals and on the command line: humantime's. What is
+//! shown can be read again, and is the same.
 
 use std::time::Duration;
-
-const DURATIONS: [(&str, f64); 7] =
-    [("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3), ("s", 1.0), ("min", 60.0), ("m", 60.0), ("h", 3600.0)];
 
 const SIZES: [(&str, u64); 9] = [
     ("B", 1),
@@ -17,14 +17,27 @@ const SIZES: [(&str, u64); 9] = [
     ("TiB", 1 << 40),
 ];
 
-/// `25ms`, `1.5s`, `2 min`. `None` without a unit, or when it is not a duration.
+/// `25ms`, `1.5s`, `2 min`, `1h 30min`: numbers, whole or decimal, each with its unit, from `ns` to years; only `0` needs
+/// no unit. `None` when the text is no duration, not a whole number of ns, or longer than 2^64 ns (584 years).
 pub fn parse_duration(text: &str) -> Option<Duration> {
-    let (number, unit) = split(text)?;
-    let (_, seconds) = DURATIONS.into_iter().find(|(name, _)| *name == unit)?;
-    // Rounded to whole ns: 0.025 s is not exactly representable.
-    let nanoseconds = (number * seconds * 1e9).round();
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within 0..=1e18")]
-    (0.0..=1e18).contains(&nanoseconds).then(|| Duration::from_nanos(nanoseconds as u64))
+    let total = terms(text).try_fold(Duration::ZERO, |sum, term| {
+        // Term by term: humantime 2.4 panics where a later one carries beyond its largest sum of seconds.
+        sum.checked_add(humantime::parse_duration(term).ok()?)
+    })?;
+    u64::try_from(total.as_nanos()).ok().map(Duration::from_nanos)
+}
+
+/// The numbers of a text, each with what follows it up to the next number; at least one.
+fn terms(text: &str) -> impl Iterator<Item = &str> {
+    let mut rest = Some(text.trim());
+    std::iter::from_fn(move || {
+        let all = rest.take()?;
+        let unit = all.find(char::is_alphabetic).unwrap_or(all.len());
+        let end = all[unit..].find(|c: char| c.is_ascii_digit()).map(|at| unit + at);
+        let (term, others) = end.map_or((all, None), |end| (&all[..end], Some(&all[end..])));
+        rest = others;
+        Some(term)
+    })
 }
 
 /// `512MiB`, `64 KiB`, `2MB`. `None` without a unit, or when it is not a size.
@@ -84,14 +97,35 @@ mod tests {
             ("2 min", Some(Duration::from_mins(2))),
             ("0s", Some(Duration::ZERO)),
             ("250us", Some(Duration::from_micros(250))),
+            ("0.5 ms", Some(Duration::from_micros(500))),
+            (" 0.000000001s ", Some(Duration::from_nanos(1))),
+            ("1h 30min", Some(Duration::from_mins(90))),
+            ("1h30m0.5s", Some(Duration::from_millis(5_400_500))),
+            ("7d", Some(Duration::from_hours(168))),
+            ("0", Some(Duration::ZERO)),
+            ("18446744073709551615ns", Some(Duration::from_nanos(u64::MAX))),
+            ("18446744073709551616ns", None),
+            ("18446744073709551615ns 1ns", None),
+            ("584years 10months", None),
+            ("18446744073709551615s 1000ms", None),
+            ("0.5ns", None),
             ("25", None),
+            ("1h 30", None),
             ("", None),
+            (" ", None),
             ("ms", None),
             ("-5ms", None),
+            ("5ms -1ms", None),
             ("1..5s", None),
+            (".5s", None),
             ("5 lightyears", None),
+            ("5 ms s", None),
             ("999999999999999999h", None),
             ("1e3s", None),
+            ("NaN s", None),
+            ("NaN", None),
+            ("inf s", None),
+            ("\u{0661}s", None),
         ] {
             assert_eq!(parse_duration(text), expected, "{text:?}");
         }
@@ -117,8 +151,8 @@ mod tests {
 
     #[test]
     fn formatted_units_can_be_parsed_again() {
-        for ms in [1_u64, 25, 500, 2_000, 60_000, 90_000, 3_600_000] {
-            let duration = Duration::from_millis(ms);
+        for ns in [0, 1, 1_500, 25_000_000, 2_500_000_000, 90_000_000_000, 3_600_000_000_000, u64::MAX - 15, u64::MAX] {
+            let duration = Duration::from_nanos(ns);
             assert_eq!(parse_duration(&show_duration(duration)), Some(duration));
         }
         assert_eq!(show_size(512 << 20), "512MiB");

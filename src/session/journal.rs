@@ -293,17 +293,24 @@ mod span {
 
     use serde::{Deserialize, Deserializer, Serializer, de};
 
+    use crate::registry::units::{parse_duration, show_duration};
+
     #[expect(clippy::ref_option, reason = "serde gives it so")]
     pub(super) fn serialize<S: Serializer>(span: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
         match span {
-            Some(span) => serializer.collect_str(&humantime::format_duration(*span)),
+            Some(span) => serializer.serialize_str(&show_duration(*span)),
             None => serializer.serialize_none(),
         }
     }
 
     pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Duration>, D::Error> {
         let text = Option::<String>::deserialize(deserializer)?;
-        text.map(|text| humantime::parse_duration(&text).map_err(de::Error::custom)).transpose()
+        let read = |text: String| {
+            let wrong =
+                || de::Error::custom(format!("{text:?} is not a duration: write a number and a unit, such as 30s"));
+            parse_duration(&text).ok_or_else(wrong)
+        };
+        text.map(read).transpose()
     }
 }
 

@@ -13,8 +13,9 @@ use ratatui::widgets::{Axis, Chart, Dataset, GraphType};
 use super::lidar::Sweep;
 use super::model::Model;
 use super::picture::Canvas;
-use super::theme::{Colours, Theme};
+use super::theme::Theme;
 use super::{log, view};
+use crate::palette::Palette;
 use crate::status::detail::{Channel, DeviceDetail, Intervals};
 use crate::status::{DeviceStatus, SlotState};
 use crate::text;
@@ -207,8 +208,8 @@ fn draw_plot(
     let margin = ((high - low) * 0.05).max(high.abs().max(low.abs()) * 1e-3).max(1e-6);
     let (low, high) = (low - margin, high + margin);
     let marker = if theme.symbol("u", "a") == "u" { Marker::Braille } else { Marker::Dot };
-    let style = |channel: usize| match (theme.colours, COLOURS.get(channel)) {
-        (Colours::Sixteen, Some(colour)) => Style::new().fg(*colour),
+    let style = |channel: usize| match (theme.palette, COLOURS.get(channel)) {
+        (Palette::Ansi, Some(colour)) => Style::new().fg(*colour),
         _ => Style::new(),
     };
     let datasets = points.iter().enumerate().filter(|(_, points)| !points.is_empty()).map(|(channel, points)| {

@@ -64,9 +64,10 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, page: usize, model: &Model
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tui::theme::{Charset, Colours};
+    use crate::palette::Palette;
+    use crate::tui::theme::Charset;
 
-    const THEME: Theme = Theme { colours: Colours::None, charset: Charset::Unicode };
+    const THEME: Theme = Theme { palette: Palette::Plain, charset: Charset::Unicode };
 
     /// On 80x24 every key is in the help.
     #[test]

@@ -2,12 +2,11 @@
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
-use ratatui::style::{Color, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Paragraph};
 
 use super::model::Model;
-use super::theme::{Charset, Colours, Theme};
+use super::theme::{Charset, Theme};
 use crate::qr;
 
 /// Rows of other links, at most.
@@ -18,14 +17,9 @@ const BORDER: u16 = 2;
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let Some((first, others)) = model.latest().links.split_first() else { return };
     let code = qr::half_blocks(first).filter(|_| theme.charset == Charset::Unicode).unwrap_or_default();
-    // White on black, whatever the colours of the terminal are: a camera reads it.
-    let style = match theme.colours {
-        Colours::Sixteen => Style::new().fg(Color::White).bg(Color::Black),
-        Colours::None => Style::new(),
-    };
     let link = Line::raw(theme.safe(first));
     let columns = |lines: &[Line<'_>]| lines.iter().map(Line::width).max().unwrap_or(0) + usize::from(BORDER);
-    let code: Vec<_> = code.into_iter().map(|row| Line::styled(row, style)).collect();
+    let code: Vec<_> = code.into_iter().map(|row| Line::styled(row, theme.code())).collect();
     let room = usize::from(area.height.saturating_sub(BORDER)).saturating_sub(1);
     // A piece of a code is none.
     let code = if code.len() <= room && columns(&code) <= usize::from(area.width) {

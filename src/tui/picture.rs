@@ -13,8 +13,9 @@ use ratatui_image::picker::{Picker, ProtocolType};
 use ratatui_image::protocol::Protocol;
 use ratatui_image::{FontSize, Image, Resize};
 
-use super::theme::{Colours, Theme};
+use super::theme::Theme;
 use crate::modality::ModalityId;
+use crate::palette::Palette;
 use crate::pixels::{self, Pixels};
 use crate::status::preview::Preview;
 
@@ -165,7 +166,7 @@ impl Canvas {
         if area.is_empty() {
             return;
         }
-        let Some(picker) = self.picker.as_ref().filter(|_| theme.colours != Colours::None) else {
+        let Some(picker) = self.picker.as_ref().filter(|_| theme.palette == Palette::Ansi) else {
             return as_text(frame, area, picture);
         };
         let size = Size::new(area.width, area.height);
@@ -275,7 +276,7 @@ mod tests {
                 canvas.begin_frame();
                 let draw = |frame: &mut Frame<'_>| {
                     if let Some(x) = x {
-                        canvas.draw(frame, Rect::new(x, 0, 10, 5), &picture, Theme::detect(|_| None));
+                        canvas.draw(frame, Rect::new(x, 0, 10, 5), &picture, Theme::detect(Palette::Ansi, |_| None));
                     }
                 };
                 terminal.draw(draw).unwrap();

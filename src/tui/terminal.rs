@@ -146,7 +146,7 @@ impl Screen {
 impl Drop for Screen {
     fn drop(&mut self) {
         if let Some(outlet) = self.outlet.take() {
-            outlet.finish_blocking(LAST_FRAME);
+            outlet.drain(LAST_FRAME);
         }
         restore();
     }

@@ -21,10 +21,10 @@ use crate::status::{
 };
 use crate::time::Stamp;
 use picture::Canvas;
-use theme::{Charset, Colours};
+use theme::Charset;
 
-const THEME: Theme = Theme { colours: Colours::Sixteen, charset: Charset::Unicode };
-const ASCII: Theme = Theme { colours: Colours::None, charset: Charset::Ascii };
+const THEME: Theme = Theme { palette: Palette::Ansi, charset: Charset::Unicode };
+const ASCII: Theme = Theme { palette: Palette::Plain, charset: Charset::Ascii };
 
 fn press(code: KeyCode) -> Msg {
     Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))

@@ -1,22 +1,14 @@
 //! Colours and symbols, according to what the terminal can show.
 //!
-//! Only the 16 colours that the user's own terminal theme defines, so that dark and light terminals
-//! both read well. Every meaning that has a colour also has a symbol or a word.
+//! The styles are those of [`crate::palette`]; what only the monitor shows is added here. Every meaning that has a colour
+//! also has a symbol or a word.
 
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::symbols::border;
 
+use crate::palette::{self, Palette};
 use crate::status::{Grade, Level, SlotState};
 use crate::text;
-
-/// Can the terminal show colours?
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Colours {
-    /// The 16 colours.
-    Sixteen,
-    /// None (`NO_COLOR`, or a terminal without).
-    None,
-}
 
 /// Can the terminal show characters outside ASCII?
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,23 +22,22 @@ pub enum Charset {
 /// Colours and characters to draw with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Theme {
-    /// Colours.
-    pub colours: Colours,
+    /// Whether there are colours. Without them letters are still bold, faint, underlined or reversed.
+    pub palette: Palette,
     /// Characters.
     pub charset: Charset,
 }
 
 impl Theme {
-    /// The theme for the environment: `NO_COLOR` (<https://no-color.org>), `TERM`, and the locale in
-    /// `LC_ALL`, `LC_CTYPE` or `LANG`, the first that is set.
-    pub fn detect(variable: impl Fn(&str) -> Option<String>) -> Self {
+    /// The theme with `palette` for the environment: `TERM`, and the locale in `LC_ALL`, `LC_CTYPE` or `LANG`, the first
+    /// that is set.
+    pub fn detect(palette: Palette, variable: impl Fn(&str) -> Option<String>) -> Self {
         let set = |name: &str| variable(name).filter(|value| !value.is_empty());
         let term = set("TERM").unwrap_or_default();
-        let colours = if set("NO_COLOR").is_some() || term == "dumb" { Colours::None } else { Colours::Sixteen };
         let locale = ["LC_ALL", "LC_CTYPE", "LANG"].into_iter().find_map(set).unwrap_or_default().to_lowercase();
         // The kernel's own console has a font of 256 or 512 glyphs, without most of our symbols.
         let unicode = (locale.contains("utf-8") || locale.contains("utf8")) && term != "linux" && term != "dumb";
-        Self { colours, charset: if unicode { Charset::Unicode } else { Charset::Ascii } }
+        Self { palette, charset: if unicode { Charset::Unicode } else { Charset::Ascii } }
     }
 
     /// The same meaning in Unicode or ASCII.
@@ -76,56 +67,55 @@ impl Theme {
         text::left(&self.safe(foreign), columns, self.ellipsis())
     }
 
-    fn colour(self, colour: Color) -> Style {
-        match self.colours {
-            Colours::Sixteen => Style::new().fg(colour),
-            Colours::None => Style::new(),
+    /// `style` as far as there are colours.
+    fn style(self, style: anstyle::Style) -> Style {
+        match self.palette {
+            Palette::Ansi => style.into(),
+            Palette::Plain => style.fg_color(None).bg_color(None).into(),
         }
     }
 
     /// Labels, rules, secondary text.
     pub fn faint(self) -> Style {
-        Style::new().add_modifier(Modifier::DIM)
+        self.style(palette::FAINT)
     }
 
     /// Names of panels and keys.
     pub fn title(self) -> Style {
-        self.colour(Color::Cyan).add_modifier(Modifier::BOLD)
+        self.style(anstyle::AnsiColor::Cyan.on_default().bold())
     }
 
     /// Something that needs the user's attention.
     pub fn warning(self) -> Style {
-        self.colour(Color::Yellow).add_modifier(Modifier::BOLD)
+        self.style(palette::WARN.bold())
     }
 
     /// Something is wrong.
     pub fn alarm(self) -> Style {
-        self.colour(Color::Red).add_modifier(Modifier::BOLD)
+        self.style(palette::BAD)
     }
 
     /// Everything is in order.
     pub fn good(self) -> Style {
-        self.colour(Color::Green)
+        self.style(palette::GOOD)
+    }
+
+    /// A row of a QR code.
+    pub fn code(self) -> Style {
+        self.style(palette::CODE)
     }
 
     /// A verdict.
     pub fn grade(self, grade: Grade) -> Style {
         match grade {
-            Grade::Good => self.good(),
             Grade::Suspect => self.warning(),
-            Grade::Bad => self.alarm(),
+            Grade::Good | Grade::Bad => self.style(palette::of_grade(grade)),
         }
     }
 
     /// A state of a slot.
     pub fn state(self, state: SlotState) -> Style {
-        match state {
-            SlotState::Streaming => self.colour(Color::Green),
-            SlotState::Opening | SlotState::Backoff => self.colour(Color::Yellow),
-            SlotState::Stalled => self.colour(Color::Magenta),
-            SlotState::Absent => self.colour(Color::Red),
-            SlotState::Failed => self.alarm(),
-        }
+        self.style(palette::of_state(state))
     }
 
     /// The symbol of a state, one column.
@@ -147,24 +137,19 @@ impl Theme {
             (true, Edge::None) => Some(Color::Green),
             (false, Edge::None) => None,
         };
-        match (filled, self.colours) {
+        match (filled, self.palette) {
             (None, _) => self.faint(),
-            (Some(colour), Colours::Sixteen) => Style::new().fg(Color::Black).bg(colour),
-            (Some(_), Colours::None) if edge == Edge::Recent && !present => {
+            (Some(colour), Palette::Ansi) => Style::new().fg(Color::Black).bg(colour),
+            (Some(_), Palette::Plain) if edge == Edge::Recent && !present => {
                 Style::new().add_modifier(Modifier::UNDERLINED)
             }
-            (Some(_), Colours::None) => Style::new().add_modifier(Modifier::REVERSED),
+            (Some(_), Palette::Plain) => Style::new().add_modifier(Modifier::REVERSED),
         }
     }
 
     /// A line of the log.
     pub fn level(self, level: Level) -> Style {
-        match level {
-            Level::Debug => self.faint(),
-            Level::Info => Style::new(),
-            Level::Warn => self.colour(Color::Yellow),
-            Level::Error => self.alarm(),
-        }
+        self.style(palette::of_level(level))
     }
 
     /// Lines of a box.
@@ -202,24 +187,32 @@ mod tests {
 
     #[test]
     fn the_environment_decides() {
-        use {
-            Charset::{Ascii, Unicode},
-            Colours::{None, Sixteen},
-        };
-        let table: [(Environment, Colours, Charset); 7] = [
-            (&[], Sixteen, Ascii),
-            (&[("LANG", "en_US.UTF-8"), ("TERM", "xterm")], Sixteen, Unicode),
-            (&[("LANG", "C.utf8")], Sixteen, Unicode),
-            (&[("LANG", "en_US.UTF-8"), ("LC_ALL", "C")], Sixteen, Ascii),
-            (&[("LANG", "en_US.UTF-8"), ("NO_COLOR", "1")], None, Unicode),
-            (&[("LANG", "en_US.UTF-8"), ("NO_COLOR", "")], Sixteen, Unicode),
-            (&[("LANG", "en_US.UTF-8"), ("TERM", "linux")], Sixteen, Ascii),
+        use Charset::{Ascii, Unicode};
+        let table: [(Environment, Charset); 6] = [
+            (&[], Ascii),
+            (&[("LANG", "en_US.UTF-8"), ("TERM", "xterm")], Unicode),
+            (&[("LANG", "C.utf8")], Unicode),
+            (&[("LANG", "en_US.UTF-8"), ("LC_ALL", "C")], Ascii),
+            (&[("LANG", "en_US.UTF-8"), ("TERM", "linux")], Ascii),
+            (&[("LANG", "en_US.UTF-8"), ("TERM", "dumb")], Ascii),
         ];
-        for (environment, colours, charset) in table {
-            let theme = Theme::detect(|name| {
-                environment.iter().find(|(key, _)| *key == name).map(|(_, value)| (*value).to_owned())
-            });
-            assert_eq!(theme, Theme { colours, charset }, "{environment:?}");
+        for (environment, charset) in table {
+            let variable =
+                |name: &str| environment.iter().find(|(key, _)| *key == name).map(|(_, value)| (*value).to_owned());
+            for palette in [Palette::Ansi, Palette::Plain] {
+                assert_eq!(Theme::detect(palette, variable), Theme { palette, charset }, "{environment:?}");
+            }
         }
+    }
+
+    #[test]
+    fn without_colours_the_other_differences_stay() {
+        let [coloured, plain] =
+            [Palette::Ansi, Palette::Plain].map(|palette| Theme { palette, charset: Charset::Ascii });
+        let bold = Style::new().add_modifier(Modifier::BOLD);
+        assert_eq!((coloured.alarm(), plain.alarm()), (bold.fg(Color::Red), bold));
+        assert_eq!((coloured.code(), plain.code()), (Style::new().fg(Color::White).bg(Color::Black), Style::new()));
+        let absent = SlotState::Absent;
+        assert_eq!((coloured.state(absent), plain.state(absent)), (Style::new().fg(Color::Red), Style::new()));
     }
 }

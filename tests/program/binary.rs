@@ -1,5 +1,6 @@
 //! The binary as a user runs it: signals, bad input, exit codes, on simulated devices.
 
+use crate::support::terminal::OnTerminal;
 use crate::support::{self, Episode, Place, events};
 use rustix::process::Signal;
 
@@ -209,5 +210,35 @@ fn help_and_completions_are_printed() {
         let output = place.run(&["completions", shell]);
         assert_eq!(output.status.code(), Some(0));
         assert!(text(&output.stdout).contains("inspect"), "{shell}");
+    }
+}
+
+/// The error of `rapid mask` without a run, on a terminal.
+#[test]
+fn the_environment_and_the_terminal_decide_about_colours() {
+    let place = Place::new();
+    let coloured = "\x1b[1m\x1b[31merror:\x1b[0m";
+    let forced = ("CLICOLOR_FORCE", "1");
+    let table: [(&[(&str, &str)], bool, bool); 7] = [
+        (&[], true, false),
+        (&[("NO_COLOR", "1")], false, false),
+        (&[("NO_COLOR", "")], true, false),
+        (&[("CLICOLOR", "0")], false, false),
+        (&[("TERM", "dumb")], false, false),
+        (&[forced, ("CLICOLOR", "0"), ("TERM", "dumb")], true, true),
+        (&[forced, ("NO_COLOR", "1")], false, false),
+    ];
+    for (environment, on_terminal, in_pipe) in table {
+        let shown = OnTerminal::start_in(&place, &["mask"], environment).read_to_end();
+        assert_eq!(
+            (shown.contains("error:"), shown.contains(coloured)),
+            (true, on_terminal),
+            "{environment:?}: {shown:?}"
+        );
+        let mut command = place.command(&["mask"]);
+        command.env_remove("NO_COLOR").env_remove("CLICOLOR").env_remove("CLICOLOR_FORCE");
+        let output = command.envs(environment.iter().copied()).output().expect("rapid runs");
+        let shown = text(&output.stderr);
+        assert_eq!((shown.contains("error:"), shown.contains(coloured)), (true, in_pipe), "{environment:?}: {shown:?}");
     }
 }

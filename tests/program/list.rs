@@ -1,6 +1,7 @@
 //! `rapid list`: recorded episodes, filtered and sorted, with what people noted about them.
 
 use crate::support::Place;
+use crate::support::terminal::OnTerminal;
 
 /// The names that `rapid list out WORDS` shows, from its lines and from its JSON.
 fn listed(place: &Place, words: &[&str]) -> Vec<String> {
@@ -83,4 +84,21 @@ fn episodes_are_listed_by_what_is_in_them_and_what_was_noted() {
     let mistyped = place.run(&["list", "uot"]);
     assert_eq!((mistyped.status.code(), mistyped.stdout.len()), (Some(2), 0), "{mistyped:?}");
     assert!(String::from_utf8_lossy(&mistyped.stderr).contains("uot: "), "{mistyped:?}");
+}
+
+#[test]
+fn progress_is_shown_on_a_terminal_alone_and_erased() {
+    let place = Place::new();
+    std::fs::create_dir(place.path("out")).expect("folder");
+    for name in ["a", "b", "c"] {
+        place.write(&format!("out/{name}.mcap"), "not an episode");
+    }
+    let shown = OnTerminal::start_in(&place, &["list", "out"], &[]).read_to_end();
+    let (progress, rest) = shown.rsplit_once("\x1b[2K").expect("a line was erased");
+    assert!(progress.contains("episodes ···················· 0/3"), "{shown:?}");
+    assert!(rest.contains("3 cannot be read") && !rest.contains("episodes █"), "{shown:?}");
+    let shown = OnTerminal::start_in(&place, &["list", "out"], &[("TERM", "dumb")]).read_to_end();
+    assert!(shown.contains("3 cannot be read") && !shown.contains('\x1b'), "{shown:?}");
+    let output = place.run(&["list", "out"]);
+    assert!(output.stderr.is_empty() && !output.stdout.contains(&0x1b), "{output:?}");
 }

@@ -17,6 +17,11 @@ pub(crate) struct OnTerminal {
 impl OnTerminal {
     /// `fault` is the value of `RAPID_FAULT`.
     pub(crate) fn start(place: &Place, arguments: &[&str], fault: &str) -> Self {
+        Self::start_in(place, arguments, &[("RAPID_FAULT", fault)])
+    }
+
+    /// With these variables, and none of those that decide about colours besides them.
+    pub(crate) fn start_in(place: &Place, arguments: &[&str], environment: &[(&str, &str)]) -> Self {
         use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
         grantpt(&master).expect("terminal");
@@ -33,7 +38,10 @@ impl OnTerminal {
             .env("HOME", place.folder.path())
             .env("RAPID_INSTANCE", &place.instance)
             .env("TERM", "xterm")
-            .env("RAPID_FAULT", fault);
+            .env_remove("NO_COLOR")
+            .env_remove("CLICOLOR")
+            .env_remove("CLICOLOR_FORCE")
+            .envs(environment.iter().copied());
         let child = session.stdin(open()).stdout(open()).stderr(open()).spawn().expect("setsid runs rapid");
         Self { master: Some(master), child }
     }
@@ -45,6 +53,21 @@ impl OnTerminal {
         while !String::from_utf8_lossy(&shown).contains(word) {
             let count = file.read(&mut piece).expect("output");
             shown.extend_from_slice(&piece[..count]);
+        }
+        String::from_utf8_lossy(&shown).into_owned()
+    }
+
+    /// Reads the output until the program has ended, and returns it.
+    pub(crate) fn read_to_end(&mut self) -> String {
+        let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
+        let (mut shown, mut piece) = (Vec::new(), [0; 4096]);
+        loop {
+            match file.read(&mut piece) {
+                Ok(count) => shown.extend_from_slice(&piece[..count]),
+                // The other end has been closed, by all who had it.
+                Err(error) if error.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error()) => break,
+                Err(error) => panic!("output: {error}"),
+            }
         }
         String::from_utf8_lossy(&shown).into_owned()
     }

@@ -40,7 +40,20 @@ pub fn scenarios() -> Vec<Vec<u8>> {
 /// Durations and sizes.
 #[must_use]
 pub fn units() -> Vec<Vec<u8>> {
-    let all = ["25ms", "1.5s", "2 min", "0s", "250us", "18446744073709551615ns", "512MiB", "1.5 GiB", "4096B", "9e9h"];
+    let all = [
+        "25ms",
+        "1.5s",
+        "2 min",
+        "1h 30m0.5s",
+        "18446744073709551615s 1000ms",
+        "0s",
+        "250us",
+        "18446744073709551615ns",
+        "512MiB",
+        "1.5 GiB",
+        "4096B",
+        "9e9h",
+    ];
     all.map(|text| text.as_bytes().to_vec()).to_vec()
 }
 
