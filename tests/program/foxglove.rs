@@ -542,6 +542,36 @@ fn a_port_in_use_is_an_error_of_the_start() {
 }
 
 #[test]
+fn an_address_of_the_network_is_served_and_warned_of() {
+    const WARNING: &str = "is not of this machine alone";
+    let place = lenient_place();
+    for (at, control, is_warned) in [("0.0.0.0:0", false, true), ("0.0.0.0:0", true, true), (ANY, true, false)] {
+        let mut options = vec!["--sim", "--headless", "--json", "--out", "out", "--foxglove", at];
+        options.extend(control.then_some("--foxglove-control"));
+        let mut running = place.start(&options, "Foxglove: open connection");
+        if is_warned {
+            running.wait_for(WARNING);
+        }
+        let address = address(&running);
+        let (host, port) = address.rsplit_once(':').expect("a port");
+        assert_eq!(Some(host), at.strip_suffix(":0"));
+        let mut client = Client::connect(&format!("127.0.0.1:{port}"));
+        client.read_until("masks", |client| client.count("/rapid/mask") > 10);
+        let reported = running.reported();
+        let warnings = logged(&reported, WARNING);
+        assert_eq!(warnings.len(), usize::from(is_warned), "{at}: {reported:?}");
+        for warning in warnings {
+            assert!(warning.contains(&address) && warning.contains("there is no password"), "{warning}");
+            assert_eq!(warning.contains("arms motors"), control, "{warning}");
+        }
+        let levels = reported.iter().filter(|event| event["text"].as_str().is_some_and(|text| text.contains(WARNING)));
+        assert!(levels.map(|event| &event["level"]).all(|level| level == "warn"), "{reported:?}");
+        running.signal(Signal::INT);
+        assert_eq!(running.end().0, Some(0));
+    }
+}
+
+#[test]
 fn the_end_of_its_thread_costs_no_episode() {
     let place = lenient_place();
     let order = place.path("now");
