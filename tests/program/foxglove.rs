@@ -14,7 +14,9 @@ use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest as _;
 use tungstenite::{Error, Message, WebSocket};
 
-use crate::support::{Episode, LENIENT, MaskMessage, PATIENCE, Place, Running, logged, until};
+use crate::support::lan::{Packets, RUN, free_ports, lidar_rig, stop};
+use crate::support::{Episode, FrameMessage, LENIENT, MaskMessage, PATIENCE, Place, Running, logged, until};
+use vbench::emu::lan::lidar;
 
 /// A port that is free: the kernel chooses it.
 const ANY: &str = "127.0.0.1:0";
@@ -328,6 +330,102 @@ fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
     let report = place.run(&["inspect", "--json", &file]).stdout;
     let report: Value = serde_json::from_slice(&report).expect("JSON");
     assert_eq!(report["modalities"].as_array().map(Vec::len), Some(4), "{report}");
+}
+
+#[test]
+fn distances_are_shown_as_they_are_recorded_and_observations_name_what_is_recorded() {
+    const DEPTH: &str = "/rapid/camera/wrist/depth";
+    const OBSERVATION: &str = "/rapid/observation";
+    /// Bits and topics of what is plugged in. Bit 1 is not.
+    const PLUGGED: [(u32, &str); 3] = [(0, "/rapid/camera/wrist"), (2, "/rapid/serial/motor"), (3, DEPTH)];
+    let place = Place::new();
+    let depth = "[device.cam_wrist.stream.depth]\nbit = 3\n[device.cam_wrist.stream.depth.camera]\nwidth = 96\n\
+        height = 64\nfps = 30\nformat = \"Z16\"\ndepth_unit = \"100um\"\n";
+    place.write("devices.toml", &[include_str!("../../devices.toml"), depth, LENIENT].concat());
+    let devices = ["cam_wrist", "cam_wrist_depth", "motor_state"].map(|name| format!("[[device]]\nname = {name:?}\n"));
+    place.write("play.toml", &devices.concat());
+    let options = ["--sim", "play.toml", "--headless", "--json", "--record", "--out", "out", "--foxglove", ANY];
+    let running = place.start(&options, "\"event\":\"recording\"");
+    let mut client = Client::connect(&address(&running));
+    client.read_until("messages", |client| [DEPTH, OBSERVATION].iter().all(|topic| client.count(topic) > 90));
+    let file = good(&place, running);
+    client.read();
+    assert!(client.compare(&place, &file)[DEPTH] > 40);
+    let of = |topic: &'static str| {
+        client.received.iter().filter(move |message| client.channels[&message.channel].topic == topic)
+    };
+    for Received { channel, data, .. } in of(DEPTH) {
+        let message = DynamicMessage::decode(client.channels[channel].message.clone(), &data[..]).expect("a picture");
+        let encoding = message.get_field_by_name("encoding").expect("a field").into_owned();
+        assert_eq!(encoding.as_str(), Some("16UC1"));
+    }
+
+    let episode = Episode::read(&place.path(&file));
+    let begin: u64 = episode.value("rapid", "begin_wall_ns").parse().expect("a number");
+    // When the samples of the file were captured, by topic and number, and until when it has all.
+    let recorded: BTreeMap<(&str, u32), u64> =
+        episode.messages.iter().map(|message| ((&*message.topic, message.sequence), message.log_time)).collect();
+    let last_ones = PLUGGED.map(|(_, topic)| episode.topic(topic).map(|message| message.log_time).max());
+    let complete = last_ones.into_iter().min().flatten().expect("samples of each");
+    let masks: Vec<_> = episode.topic("/rapid/mask").collect();
+    let (mut compared, mut last) = (BTreeMap::new(), None);
+    for Received { log_time, data, .. } in of(OBSERVATION) {
+        let observation = <FrameMessage as prost::Message>::decode(&data[..]).expect("an observation");
+        assert!(last.replace(observation.index).is_none_or(|last| last < observation.index), "{last:?}");
+        // Its samples may be older than the file, or newer.
+        if !(begin + 500_000_000..=complete).contains(log_time) {
+            continue;
+        }
+        let published = masks.partition_point(|mask| mask.log_time <= *log_time);
+        let mask = masks[published.checked_sub(1).expect("a mask")].decode::<MaskMessage>();
+        assert_eq!(observation.mask, mask.mask, "at {log_time}");
+        assert_eq!(observation.modalities.len(), 4);
+        for modality in &observation.modalities {
+            let is_set = |bits: u64| bits & (1 << modality.bit) != 0;
+            assert_eq!((modality.present, modality.plugged), (is_set(mask.mask), is_set(mask.plugged)), "{modality:?}");
+            let topic = PLUGGED.iter().find(|(bit, _)| *bit == modality.bit).map(|(_, topic)| *topic);
+            let Some((age, seq)) = modality.age_ns.zip(modality.seq) else {
+                assert!(!modality.valid, "{modality:?} at {log_time}");
+                continue;
+            };
+            let topic = topic.unwrap_or_else(|| panic!("{modality:?} is not plugged in"));
+            let captured = recorded[&(topic, u32::try_from(seq).expect("few"))];
+            assert_eq!(i128::from(captured), i128::from(*log_time) - i128::from(age), "{topic} {seq} at {log_time}");
+            // The window of the registry.
+            assert_eq!(modality.valid, age.unsigned_abs() <= 25_000_000, "{modality:?}");
+            assert_eq!(modality.stale, !modality.valid, "{modality:?}");
+            *compared.entry(topic).or_insert(0) += 1;
+        }
+    }
+    assert!(PLUGGED.iter().all(|(_, topic)| compared.get(topic).is_some_and(|count| *count > 20)), "{compared:?}");
+}
+
+#[test]
+fn points_of_a_lidar_are_shown_as_they_are_recorded() {
+    const POINTS: &str = "/rapid/lan/lidar/points";
+    let (place, [port]) = (Place::new(), free_ports());
+    place.write("devices.toml", &[lidar_rig(port).as_str(), LENIENT].concat());
+    let mut running =
+        place.start(&[&RUN[..], &["--record", "--out", "out", "--foxglove", ANY]].concat(), "\"event\":\"begin\"");
+    running.wait_for("Foxglove: open connection");
+    let mut client = Client::connect(&address(&running));
+    let packets = Packets::send(port, |number| lidar::packet(number, 0).to_vec());
+    client.read_until("points", |client| client.count(POINTS) > 200 && client.count("/rapid/lan/lidar") > 200);
+    packets.end_after_a_hundred();
+    stop(running);
+    client.read();
+    let counts = client.compare(&place, &format!("out/{}", place.episodes("out")[0]));
+    assert!(counts[POINTS] > 100 && counts["/rapid/lan/lidar"] > 100, "{counts:?}");
+    for Received { channel, data, .. } in &client.received {
+        let Channel { topic, message, .. } = &client.channels[channel];
+        if topic == POINTS {
+            let cloud = DynamicMessage::decode(message.clone(), &data[..]).expect("points");
+            let field = |name: &str| cloud.get_field_by_name(name).expect("a field").into_owned();
+            let stride = field("point_stride").as_u32().expect("a number");
+            let points = field("data").as_bytes().expect("bytes").len() / usize::try_from(stride).expect("small");
+            assert!((380..=384).contains(&points), "{points}");
+        }
+    }
 }
 
 #[test]
