@@ -6,17 +6,18 @@
 //!
 //! The protocol is `foxglove.sdk.v1` (<https://github.com/foxglove/ws-protocol>), by the crate `foxglove`.
 //!
-//! Invariant: nothing else waits for this thread: a client that reads slowly, or not at all, loses the oldest of what
-//! waits for it, and holds no more than [`QUEUE_BYTES`].
+//! Invariant: nothing else waits for this thread: a client that reads slowly, or not at all, gets the newest of each topic
+//! when it reads ([`relay`]).
 //! Invariant: nothing is encoded for a topic to which no client subscribes.
 //! Invariant: whatever ends the thread, the run continues.
 
 mod control;
 mod pictures;
+mod relay;
 mod topics;
 
 use std::io;
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Weak, mpsc};
 use std::thread::JoinHandle;
@@ -26,6 +27,7 @@ use foxglove::websocket::{ChannelView, Client, ServerListener, Status};
 use foxglove::{Context, FoxgloveError, WebSocketServerHandle};
 use tokio::sync::broadcast::{self, error::TryRecvError};
 use tokio::sync::{oneshot, watch};
+use tokio::task::JoinHandle as TaskHandle;
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
@@ -42,11 +44,6 @@ use crate::time::{Stamp, WallClock};
 /// Port of a Foxglove server, if none is named.
 const PORT: u16 = 8765;
 
-/// What waits for one client, at most, as far as [`LEAST_QUEUED`] allows it.
-const QUEUE_BYTES: usize = 128 << 20;
-/// Messages that may wait for one client: at least and at most.
-const LEAST_QUEUED: usize = 64;
-const MOST_QUEUED: usize = 1024;
 /// Clients that may subscribe at a time: they hold memory.
 const CLIENTS: usize = 8;
 /// Time between two looks at the bus, with clients and without.
@@ -233,6 +230,9 @@ impl Drop for Live {
 /// The work of the thread.
 struct Server {
     handle: WebSocketServerHandle,
+    /// Connects clients, until `closing`.
+    relay: TaskHandle<()>,
+    closing: CancellationToken,
     topics: Topics,
     reported: Stamp,
 }
@@ -244,25 +244,27 @@ impl Server {
         controls: Option<Controls>,
     ) -> Result<(Self, SocketAddr), LiveError> {
         let LiveOptions { address, .. } = options;
+        let in_use = |source| LiveError::Listen { address, source };
+        let listener = relay::listen(address).await.map_err(in_use)?;
+        let listened = listener.local_addr().map_err(in_use)?;
         let context = Context::new();
         let topics = Topics::advertise(&context, registry);
         let audience = Audience { context: Arc::downgrade(&context), clients: AtomicUsize::new(0) };
         let mut server = context
             .websocket_server()
             .name(format!("rapid {}", registry.rig.name))
-            .bind(address.ip().to_string(), address.port())
-            .message_backlog_size(queued(registry))
+            // Clients reach it through the relay, which reads at once: its queues hold what one turn sends.
+            .bind(Ipv4Addr::LOCALHOST.to_string(), 0)
             .listener(Arc::new(audience));
         if let Some(controls) = controls {
             server = server.services(controls.services()).supported_encodings(["json"]);
             server = server.parameter_handler(Arc::new(controls));
         }
-        let handle = server.start().await.map_err(|error| match error {
-            FoxgloveError::Bind(source) => LiveError::Listen { address, source },
-            other => other.into(),
-        })?;
-        let address = SocketAddr::new(address.ip(), handle.port());
-        Ok((Self { handle, topics, reported: Stamp::now() }, address))
+        let handle = server.start().await?;
+        let closing = CancellationToken::new();
+        let server = SocketAddr::from((Ipv4Addr::LOCALHOST, handle.port()));
+        let relay = tokio::spawn(relay::serve(listener, server, closing.clone()));
+        Ok((Self { handle, relay, closing, topics, reported: Stamp::now() }, listened))
     }
 
     /// Serves until `stop`, or until there will be nothing to serve.
@@ -279,7 +281,13 @@ impl Server {
             () = stop.cancelled() => {}
             () = served => {}
         }
-        let _ = timeout(LAST, self.handle.stop().wait()).await;
+        self.closing.cancel();
+        let ended = async {
+            self.handle.stop().wait().await;
+            // A panic of it is the end too.
+            let _ = self.relay.await;
+        };
+        let _ = timeout(LAST, ended).await;
     }
 
     fn turn(&mut self, feed: &mut Feed) {
@@ -324,12 +332,6 @@ impl Server {
             tracing::warn!(%error, "Foxglove: the bus cannot be read");
         }
     }
-}
-
-/// Messages that may wait for one client.
-fn queued(registry: &Registry) -> usize {
-    let largest = registry.devices.iter().map(|device| device.max_bytes).max().unwrap_or_default();
-    (QUEUE_BYTES / largest.max(1)).clamp(LEAST_QUEUED, MOST_QUEUED)
 }
 
 /// Counts the clients, and refuses the subscriptions of too many.

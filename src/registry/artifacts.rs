@@ -1,6 +1,7 @@
 //! Files generated from the registry: udev rules, module descriptors, systemd units, a layout for Foxglove.
 //!
-//! Pure: what to write, not where or how (`commands::artifacts` writes).
+//! What to write, not where or how (`commands::artifacts` writes). Nothing but the registry decides it, and the current folder
+//! where the registry was named relative to it.
 //!
 //! Invariant: a serial number, which a device chose, can neither add a line to a file nor match
 //! more than itself; where a format cannot express it, a comment in the file states so.

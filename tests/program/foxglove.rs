@@ -14,7 +14,9 @@ use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest as _;
 use tungstenite::{Error, Message, WebSocket};
 
-use crate::support::{Episode, LENIENT, MaskMessage, PATIENCE, Place, Running, logged, until};
+use crate::support::lan::{Packets, RUN, free_ports, lidar_rig, stop};
+use crate::support::{Episode, FrameMessage, LENIENT, MaskMessage, PATIENCE, Place, Running, logged, until};
+use vbench::emu::lan::lidar;
 
 /// A port that is free: the kernel chooses it.
 const ANY: &str = "127.0.0.1:0";
@@ -42,6 +44,8 @@ struct Received {
 /// A client by the protocol's description (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>).
 struct Client {
     socket: WebSocket<TcpStream>,
+    /// The topic to which it subscribes; every one without it.
+    only: Option<&'static str>,
     channels: BTreeMap<u32, Channel>,
     /// Names of the services and their numbers.
     services: BTreeMap<String, u32>,
@@ -54,13 +58,18 @@ struct Client {
 impl Client {
     /// Connects, and subscribes to every topic that is advertised.
     fn connect(address: &str) -> Self {
+        Self::connect_for(address, None)
+    }
+
+    /// Connects, and subscribes to this topic, or to every one.
+    fn connect_for(address: &str, only: Option<&'static str>) -> Self {
         let mut request = format!("ws://{address}").into_client_request().expect("a request");
         request.headers_mut().insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().expect("a header"));
         let stream = TcpStream::connect(address).expect("a connection");
         let (socket, _) = tungstenite::client(request, stream).expect("a handshake");
         socket.get_ref().set_read_timeout(Some(Duration::from_millis(100))).expect("a timeout");
         let (channels, services, received, answers) = Default::default();
-        Self { socket, channels, services, received, answers, is_open: true }
+        Self { socket, only, channels, services, received, answers, is_open: true }
     }
 
     /// Takes what has come.
@@ -111,8 +120,10 @@ impl Client {
                     let schema = text("schemaName");
                     let message = pool.get_message_by_name(&schema).expect("the message of the schema");
                     let id = number(&channel["id"]);
-                    let subscription = json!({ "id": id, "channelId": channel["id"] });
-                    self.send(&json!({ "op": "subscribe", "subscriptions": [subscription] }));
+                    if self.only.is_none_or(|only| channel["topic"] == only) {
+                        let subscription = json!({ "id": id, "channelId": channel["id"] });
+                        self.send(&json!({ "op": "subscribe", "subscriptions": [subscription] }));
+                    }
                     self.channels.insert(id, Channel { topic: text("topic"), schema, descriptors, message });
                 }
             }
@@ -322,6 +333,102 @@ fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
 }
 
 #[test]
+fn distances_are_shown_as_they_are_recorded_and_observations_name_what_is_recorded() {
+    const DEPTH: &str = "/rapid/camera/wrist/depth";
+    const OBSERVATION: &str = "/rapid/observation";
+    /// Bits and topics of what is plugged in. Bit 1 is not.
+    const PLUGGED: [(u32, &str); 3] = [(0, "/rapid/camera/wrist"), (2, "/rapid/serial/motor"), (3, DEPTH)];
+    let place = Place::new();
+    let depth = "[device.cam_wrist.stream.depth]\nbit = 3\n[device.cam_wrist.stream.depth.camera]\nwidth = 96\n\
+        height = 64\nfps = 30\nformat = \"Z16\"\ndepth_unit = \"100um\"\n";
+    place.write("devices.toml", &[include_str!("../../devices.toml"), depth, LENIENT].concat());
+    let devices = ["cam_wrist", "cam_wrist_depth", "motor_state"].map(|name| format!("[[device]]\nname = {name:?}\n"));
+    place.write("play.toml", &devices.concat());
+    let options = ["--sim", "play.toml", "--headless", "--json", "--record", "--out", "out", "--foxglove", ANY];
+    let running = place.start(&options, "\"event\":\"recording\"");
+    let mut client = Client::connect(&address(&running));
+    client.read_until("messages", |client| [DEPTH, OBSERVATION].iter().all(|topic| client.count(topic) > 90));
+    let file = good(&place, running);
+    client.read();
+    assert!(client.compare(&place, &file)[DEPTH] > 40);
+    let of = |topic: &'static str| {
+        client.received.iter().filter(move |message| client.channels[&message.channel].topic == topic)
+    };
+    for Received { channel, data, .. } in of(DEPTH) {
+        let message = DynamicMessage::decode(client.channels[channel].message.clone(), &data[..]).expect("a picture");
+        let encoding = message.get_field_by_name("encoding").expect("a field").into_owned();
+        assert_eq!(encoding.as_str(), Some("16UC1"));
+    }
+
+    let episode = Episode::read(&place.path(&file));
+    let begin: u64 = episode.value("rapid", "begin_wall_ns").parse().expect("a number");
+    // When the samples of the file were captured, by topic and number, and until when it has all.
+    let recorded: BTreeMap<(&str, u32), u64> =
+        episode.messages.iter().map(|message| ((&*message.topic, message.sequence), message.log_time)).collect();
+    let last_ones = PLUGGED.map(|(_, topic)| episode.topic(topic).map(|message| message.log_time).max());
+    let complete = last_ones.into_iter().min().flatten().expect("samples of each");
+    let masks: Vec<_> = episode.topic("/rapid/mask").collect();
+    let (mut compared, mut last) = (BTreeMap::new(), None);
+    for Received { log_time, data, .. } in of(OBSERVATION) {
+        let observation = <FrameMessage as prost::Message>::decode(&data[..]).expect("an observation");
+        assert!(last.replace(observation.index).is_none_or(|last| last < observation.index), "{last:?}");
+        // Its samples may be older than the file, or newer.
+        if !(begin + 500_000_000..=complete).contains(log_time) {
+            continue;
+        }
+        let published = masks.partition_point(|mask| mask.log_time <= *log_time);
+        let mask = masks[published.checked_sub(1).expect("a mask")].decode::<MaskMessage>();
+        assert_eq!(observation.mask, mask.mask, "at {log_time}");
+        assert_eq!(observation.modalities.len(), 4);
+        for modality in &observation.modalities {
+            let is_set = |bits: u64| bits & (1 << modality.bit) != 0;
+            assert_eq!((modality.present, modality.plugged), (is_set(mask.mask), is_set(mask.plugged)), "{modality:?}");
+            let topic = PLUGGED.iter().find(|(bit, _)| *bit == modality.bit).map(|(_, topic)| *topic);
+            let Some((age, seq)) = modality.age_ns.zip(modality.seq) else {
+                assert!(!modality.valid, "{modality:?} at {log_time}");
+                continue;
+            };
+            let topic = topic.unwrap_or_else(|| panic!("{modality:?} is not plugged in"));
+            let captured = recorded[&(topic, u32::try_from(seq).expect("few"))];
+            assert_eq!(i128::from(captured), i128::from(*log_time) - i128::from(age), "{topic} {seq} at {log_time}");
+            // The window of the registry.
+            assert_eq!(modality.valid, age.unsigned_abs() <= 25_000_000, "{modality:?}");
+            assert_eq!(modality.stale, !modality.valid, "{modality:?}");
+            *compared.entry(topic).or_insert(0) += 1;
+        }
+    }
+    assert!(PLUGGED.iter().all(|(_, topic)| compared.get(topic).is_some_and(|count| *count > 20)), "{compared:?}");
+}
+
+#[test]
+fn points_of_a_lidar_are_shown_as_they_are_recorded() {
+    const POINTS: &str = "/rapid/lan/lidar/points";
+    let (place, [port]) = (Place::new(), free_ports());
+    place.write("devices.toml", &[lidar_rig(port).as_str(), LENIENT].concat());
+    let mut running =
+        place.start(&[&RUN[..], &["--record", "--out", "out", "--foxglove", ANY]].concat(), "\"event\":\"begin\"");
+    running.wait_for("Foxglove: open connection");
+    let mut client = Client::connect(&address(&running));
+    let packets = Packets::send(port, |number| lidar::packet(number, 0).to_vec());
+    client.read_until("points", |client| client.count(POINTS) > 200 && client.count("/rapid/lan/lidar") > 200);
+    packets.end_after_a_hundred();
+    stop(running);
+    client.read();
+    let counts = client.compare(&place, &format!("out/{}", place.episodes("out")[0]));
+    assert!(counts[POINTS] > 100 && counts["/rapid/lan/lidar"] > 100, "{counts:?}");
+    for Received { channel, data, .. } in &client.received {
+        let Channel { topic, message, .. } = &client.channels[channel];
+        if topic == POINTS {
+            let cloud = DynamicMessage::decode(message.clone(), &data[..]).expect("points");
+            let field = |name: &str| cloud.get_field_by_name(name).expect("a field").into_owned();
+            let stride = field("point_stride").as_u32().expect("a number");
+            let points = field("data").as_bytes().expect("bytes").len() / usize::try_from(stride).expect("small");
+            assert!((380..=384).contains(&points), "{points}");
+        }
+    }
+}
+
+#[test]
 fn where_the_sensors_of_the_mounted_modules_sit_is_recorded_and_shown() {
     let place = Place::new();
     let modules = "[module.straight]\nslot = \"top\"\ndevices = [\"cam_wrist\"]\n\
@@ -436,7 +543,8 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
     client.read_until("messages", |client| client.count("/rapid/camera/wrist") > 5 && client.count("/rapid/mask") > 50);
     std::thread::sleep(Duration::from_secs(10));
     let log = place.run(&["logs"]).stdout;
-    assert!(String::from_utf8_lossy(&log).contains("outbox for client"), "the log has it");
+    let log = String::from_utf8_lossy(&log);
+    assert!(log.contains("reads slowly: ") && log.contains(" messages were left out for newer ones"), "{log}");
     // What waits for it is bounded, and the newest is in it.
     let resumed = client.received.len();
     let begun = Instant::now();
@@ -458,6 +566,33 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
     let masks: Vec<_> = episode.topic("/rapid/mask").collect();
     assert!(masks.len() > 1000, "{}", masks.len());
     assert!(masks.windows(2).all(|pair| pair[1].sequence == pair[0].sequence + 1));
+}
+
+#[test]
+fn a_client_that_reads_again_gets_the_newest_picture() {
+    const CAMERA: &str = "/rapid/camera/wrist";
+    let place = lenient_place();
+    place.write("scenario.toml", LARGE);
+    let options = ["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out", "--foxglove", ANY];
+    let running = place.start(&options, "\"event\":\"recording\"");
+    // To nothing else: no other messages push pictures out of what waits for it.
+    let mut slow = Client::connect_for(&address(&running), Some(CAMERA));
+    slow.read_until("pictures", |client| client.received.len() > 5);
+    // It reads nothing, while another client gets ten seconds of pictures.
+    let mut other = Client::connect_for(&address(&running), Some(CAMERA));
+    other.read_until("pictures of ten seconds", |client| client.received.len() > 300);
+    let newest = other.received.last().expect("a picture").log_time;
+    slow.read_until("a picture as new", |client| client.received.last().is_some_and(|last| last.log_time >= newest));
+    // First come those that were on their way when it stopped: the kernel holds them. Then there is a hole, and behind it is
+    // what waited for the client: a queue would have hundreds of older pictures.
+    let times: Vec<_> = slow.received.iter().map(|picture| picture.log_time).collect();
+    let holes = times.windows(2).map(|pair| pair[1] - pair[0]).enumerate();
+    let (before, hole) = holes.max_by_key(|(_, hole)| *hole).expect("two pictures");
+    assert!(hole > 1_000_000_000, "it was never stuck: {hole} ns between two pictures");
+    let older = times[before + 1..].iter().filter(|time| **time < newest).count();
+    assert!(older <= 2, "{older} pictures were older than the newest one, of {} behind the hole", times.len() - before);
+    let file = good(&place, running);
+    assert!(slow.compare(&place, &file)[CAMERA] > 5 && other.compare(&place, &file)[CAMERA] > 200);
 }
 
 #[test]
@@ -502,6 +637,36 @@ fn a_port_in_use_is_an_error_of_the_start() {
     let expected = format!("error: --foxglove {address}: Address already in use");
     assert!(errors.starts_with(&expected) && errors.contains("name another port"), "{errors}");
     assert!(place.episodes("out").is_empty() && place.shared_memory().is_empty(), "{:?}", place.shared_memory());
+}
+
+#[test]
+fn an_address_of_the_network_is_served_and_warned_of() {
+    const WARNING: &str = "is not of this machine alone";
+    let place = lenient_place();
+    for (at, control, is_warned) in [("0.0.0.0:0", false, true), ("0.0.0.0:0", true, true), (ANY, true, false)] {
+        let mut options = vec!["--sim", "--headless", "--json", "--out", "out", "--foxglove", at];
+        options.extend(control.then_some("--foxglove-control"));
+        let mut running = place.start(&options, "Foxglove: open connection");
+        if is_warned {
+            running.wait_for(WARNING);
+        }
+        let address = address(&running);
+        let (host, port) = address.rsplit_once(':').expect("a port");
+        assert_eq!(Some(host), at.strip_suffix(":0"));
+        let mut client = Client::connect(&format!("127.0.0.1:{port}"));
+        client.read_until("masks", |client| client.count("/rapid/mask") > 10);
+        let reported = running.reported();
+        let warnings = logged(&reported, WARNING);
+        assert_eq!(warnings.len(), usize::from(is_warned), "{at}: {reported:?}");
+        for warning in warnings {
+            assert!(warning.contains(&address) && warning.contains("there is no password"), "{warning}");
+            assert_eq!(warning.contains("arms motors"), control, "{warning}");
+        }
+        let levels = reported.iter().filter(|event| event["text"].as_str().is_some_and(|text| text.contains(WARNING)));
+        assert!(levels.map(|event| &event["level"]).all(|level| level == "warn"), "{reported:?}");
+        running.signal(Signal::INT);
+        assert_eq!(running.end().0, Some(0));
+    }
 }
 
 #[test]

@@ -4,16 +4,16 @@
 #![expect(clippy::expect_used, reason = "what fails here fails a test")]
 
 use std::io::Write;
-use std::net::{TcpStream, UdpSocket};
+use std::net::TcpStream;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::thread::JoinHandle;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::support::lan::{
-    HEIGHT, RIG, RUN, Server, WIDTH, camera, camera_entry, free_ports, life_of, picture, stop, wait_for,
+    HEIGHT, Packets, RIG, RUN, Server, WIDTH, camera, camera_entry, free_ports, lidar_rig, life_of, picture, stop,
+    wait_for,
 };
-use crate::support::{self, Episode, Place, until};
+use crate::support::{self, Episode, Place};
 use serde_json::Value;
 use vbench::emu::lan::lidar;
 
@@ -43,40 +43,6 @@ fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
     assert_eq!(edges, [0, 1, 0, 1]);
     let pictures: Vec<Vec<u8>> = episode.topic("/rapid/lan/cam").map(support::Message::payload).collect();
     assert_eq!(pictures[0], picture(0), "the picture is as the camera sent it");
-}
-
-/// A sender of packets to a port of this machine, and a stranger who sends there too.
-struct Packets {
-    sends: Arc<AtomicBool>,
-    sent: Arc<AtomicU32>,
-    thread: JoinHandle<()>,
-}
-
-impl Packets {
-    fn send(port: u16, packet: impl Fn(u32) -> Vec<u8> + Send + 'static) -> Self {
-        let (sends, sent) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU32::new(0)));
-        let thread = std::thread::spawn({
-            let (sends, sent) = (Arc::clone(&sends), Arc::clone(&sent));
-            move || {
-                let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
-                let stranger = UdpSocket::bind("127.0.0.9:0").expect("a port");
-                for number in (0..).take_while(|_| sends.load(Ordering::Relaxed)) {
-                    let _ = socket.send_to(&packet(number), ("127.0.0.1", port));
-                    let _ = stranger.send_to(b"not mine", ("127.0.0.1", port));
-                    sent.store(number + 1, Ordering::Relaxed);
-                    std::thread::sleep(Duration::from_millis(2));
-                }
-            }
-        });
-        Self { sends, sent, thread }
-    }
-
-    fn end_after_a_hundred(self) {
-        let before = self.sent.load(Ordering::Relaxed);
-        until("a hundred packets", || self.sent.load(Ordering::Relaxed) > before + 100);
-        self.sends.store(false, Ordering::Relaxed);
-        self.thread.join().expect("no panic");
-    }
 }
 
 #[test]
@@ -121,11 +87,7 @@ struct Cloud {
 #[test]
 fn packets_of_a_lidar_are_recorded_with_their_points() {
     let (place, [port]) = (Place::new(), free_ports());
-    let entry = format!(
-        "{RIG}[device.lidar]\nnode = \"lan\"\nbit = 0\n[device.lidar.lan]\nprotocol = \"udp\"\nhost = \"127.0.0.1\"\n\
-         port = {port}\nlease = \"1s\"\n[device.lidar.points]\nformat = \"velodyne\"\n"
-    );
-    place.write("devices.toml", &entry);
+    place.write("devices.toml", &lidar_rig(port));
     let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
     let packets = Packets::send(port, |number| {
         // Each tenth is none: it is recorded all the same.

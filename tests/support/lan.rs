@@ -1,10 +1,10 @@
-//! Devices on the network: servers on 127.0.0.1, their registry entries, and a run's reports about them.
+//! Devices on the network: servers and senders on 127.0.0.1, their registry entries, and a run's reports about them.
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 
 use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -126,6 +126,48 @@ pub(crate) fn camera_entry(name: &str, bit: u32, port: u16) -> String {
 }
 
 pub(crate) const RIG: &str = "[rig]\ncooldown = \"100ms\"\n";
+
+/// A registry with a LiDAR that sends to this port.
+pub(crate) fn lidar_rig(port: u16) -> String {
+    format!(
+        "{RIG}[device.lidar]\nnode = \"lan\"\nbit = 0\n[device.lidar.lan]\nprotocol = \"udp\"\nhost = \"127.0.0.1\"\n\
+         port = {port}\nlease = \"1s\"\n[device.lidar.points]\nformat = \"velodyne\"\n"
+    )
+}
+
+/// A sender of packets to a port of this machine, and a stranger who sends there too.
+pub(crate) struct Packets {
+    sends: Arc<AtomicBool>,
+    sent: Arc<AtomicU32>,
+    thread: JoinHandle<()>,
+}
+
+impl Packets {
+    pub(crate) fn send(port: u16, packet: impl Fn(u32) -> Vec<u8> + Send + 'static) -> Self {
+        let (sends, sent) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU32::new(0)));
+        let thread = std::thread::spawn({
+            let (sends, sent) = (Arc::clone(&sends), Arc::clone(&sent));
+            move || {
+                let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
+                let stranger = UdpSocket::bind("127.0.0.9:0").expect("a port");
+                for number in (0..).take_while(|_| sends.load(Ordering::Relaxed)) {
+                    let _ = socket.send_to(&packet(number), ("127.0.0.1", port));
+                    let _ = stranger.send_to(b"not mine", ("127.0.0.1", port));
+                    sent.store(number + 1, Ordering::Relaxed);
+                    std::thread::sleep(Duration::from_millis(2));
+                }
+            }
+        });
+        Self { sends, sent, thread }
+    }
+
+    pub(crate) fn end_after_a_hundred(self) {
+        let before = self.sent.load(Ordering::Relaxed);
+        until("a hundred packets", || self.sent.load(Ordering::Relaxed) > before + 100);
+        self.sends.store(false, Ordering::Relaxed);
+        self.thread.join().expect("no panic");
+    }
+}
 
 /// The reports about a device: its states, and the sources of its removals.
 pub(crate) fn life(running: &Running, device: &str) -> Vec<String> {

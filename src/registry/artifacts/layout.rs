@@ -6,6 +6,11 @@
 //!
 //! Invariant: a live connection and a recorded file are shown by the same layout: presence, whose topics differ, has a
 //! tab for each.
+//!
+//! The description of an arm is named by its path on this machine: there the desktop app reads it, elsewhere its path is set
+//! in the panel.
+
+use std::path::Path;
 
 use serde_json::{Map, Value, json};
 
@@ -13,7 +18,7 @@ use crate::action::ACTION_TOPIC;
 use crate::mask::MASK_TOPIC;
 use crate::modality::ModalityKind;
 use crate::observation::OBSERVATION_TOPIC;
-use crate::registry::{DeviceSpec, Form, Quantity, Registry};
+use crate::registry::{CanProtocol, CanSpec, DeviceSpec, Form, NodeSpec, Quantity, Registry};
 
 /// Topics that only files have, and their readers know.
 pub(super) const FRAME_TOPIC: &str = "/rapid/frame";
@@ -77,7 +82,7 @@ impl Panels {
         self.add("Image", &device.name, settings)
     }
 
-    /// Poses and points, if there are any.
+    /// Poses, points and arms, if there are any.
     fn scene(&mut self, registry: &Registry) -> Option<Value> {
         let shown = |device: &DeviceSpec| {
             let form = device.form.as_ref()?;
@@ -97,8 +102,17 @@ impl Panels {
         };
         let shown: Vec<_> = registry.devices.iter().filter_map(shown).collect();
         let (_, frame, _) = shown.first()?;
-        let topics: Map<_, _> = shown.iter().map(|(topic, _, settings)| (topic.clone(), settings.clone())).collect();
-        let settings = json!({ "foxglovePanelTitle": "space", "followTf": frame, "topics": topics });
+        let mut topics: Map<_, _> =
+            shown.iter().map(|(topic, _, settings)| (topic.clone(), settings.clone())).collect();
+        let mut layers = Map::new();
+        for device in &registry.devices {
+            if let (Some(urdf), Some(form)) = (urdf(device), &device.form) {
+                // Their messages move it: the names of its joints are theirs.
+                topics.insert(format!("{}{}", device.topic, form.ending()), json!({ "visible": true }));
+                layers.insert(device.name.clone(), description(&device.name, urdf));
+            }
+        }
+        let settings = json!({ "foxglovePanelTitle": "space", "followTf": frame, "topics": topics, "layers": layers });
         Some(self.add("3D", "space", settings))
     }
 
@@ -132,18 +146,39 @@ impl Panels {
         self.add("Plot", name, settings)
     }
 
-    /// The mask, and which sensors a tick has.
+    /// The mask, and of each sensor whether it runs and whether it is plugged in at a tick: a driver that crashed differs from
+    /// an unplug.
     fn presence(&mut self, registry: &Registry, title: &str, topic: &str) -> Value {
         let state =
             |value: String, label: &str| json!({ "value": value, "label": label, "timestampMethod": "receiveTime" });
         let mask = state(format!("{MASK_TOPIC}.mask"), "mask");
-        let sensors = registry.devices.iter().map(|device| {
-            let value = format!("{topic}.modalities[:]{{bit=={}}}.present", device.id.bit());
-            state(value, &device.name)
+        let sensors = registry.devices.iter().flat_map(|device| {
+            let of = |field| format!("{topic}.modalities[:]{{bit=={}}}.{field}", device.id.bit());
+            [state(of("present"), &device.name), state(of("plugged"), &format!("{} plugged in", device.name))]
         });
         let paths: Vec<_> = [mask].into_iter().chain(sensors).collect();
         self.add("StateTransitions", title, json!({ "paths": paths, "isSynced": true, "showPoints": false }))
     }
+}
+
+/// The description of the arm that a device moves, if it is one.
+fn urdf(device: &DeviceSpec) -> Option<&Path> {
+    let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { return None };
+    motors.effector.as_ref().map(|effector| effector.urdf.as_path())
+}
+
+/// The layer of a 3D panel that draws the description of an arm, as the app's own SDK writes it.
+fn description(name: &str, urdf: &Path) -> Value {
+    // Only an empty path has no absolute form.
+    let path = std::path::absolute(urdf).unwrap_or_else(|_| urdf.to_owned());
+    json!({
+        "instanceId": name,
+        "layerId": "foxglove.Urdf",
+        "label": name,
+        "visible": true,
+        "sourceType": "filePath",
+        "filePath": path.to_string_lossy(),
+    })
 }
 
 /// The numbers in a message of `topic`, with their names.

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use yaml_rust2::{Yaml, YamlLoader};
 
 use super::*;
-use crate::registry::IdentitySpec;
+use crate::registry::{Form, IdentitySpec};
 
 fn text_of(all: &[Artifact], path: &str) -> String {
     all.iter().find(|artifact| artifact.path == Path::new(path)).unwrap().contents.clone()
@@ -47,6 +47,68 @@ fn leaves(layout: &serde_json::Value) -> Vec<&str> {
     }
 }
 
+/// Registries whose samples have a meaning, an arm with a description, and a camera with distances.
+const FORMS: &str = include_str!("../../../tests/registry/valid/forms.toml");
+const EFFECTOR: &str = include_str!("../../../tests/registry/valid/effector.toml");
+const STREAMS: &str = include_str!("../../../tests/registry/valid/streams.toml");
+
+/// The panels of the layout of a registry in a file of this name, by id.
+fn panels_of(text: &str, file: Option<&Path>) -> serde_json::Value {
+    let layout: serde_json::Value =
+        serde_json::from_str(&layout::layout(&Registry::parse(text, file).unwrap().registry)).unwrap();
+    layout["configById"].clone()
+}
+
+#[test]
+fn the_layout_shows_what_samples_mean() {
+    let panels = panels_of(FORMS, None);
+    let paths = |name: &str| -> serde_json::Value {
+        let paths = panels[&format!("Plot!{name}")]["paths"].as_array().unwrap().iter();
+        paths.map(|path| serde_json::json!([path["label"], path["value"]])).collect()
+    };
+    let finger = |index: usize| format!("/rapid/serial/fingers/joints.joints[{index}].position");
+    assert_eq!(paths("fingers"), serde_json::json!([["left", finger(0)], ["right", finger(1)]]));
+    let expected = [["gripper", "/rapid/serial/encoder/joints.joints[0].position"]];
+    assert_eq!(paths("encoder"), serde_json::json!(expected));
+    // A pose is plotted as numbers, and drawn.
+    assert_eq!(paths("tracker").as_array().unwrap().len(), 7);
+    assert_eq!(panels["Image!cam"]["imageMode"]["calibrationTopic"], "/rapid/camera/cam/calibration");
+    let scene = &panels["3D!space"];
+    assert_eq!(scene["followTf"], "world", "the frame of the first pose");
+    let points = serde_json::json!({
+        "visible": true, "decayTime": 0.2, "colorMode": "colormap", "colorField": "intensity", "colorMap": "turbo"
+    });
+    let shown = serde_json::json!({ "visible": true });
+    assert_eq!(
+        scene["topics"],
+        serde_json::json!({
+            "/rapid/serial/tracker/pose": shown, "/rapid/lan/phone/pose": shown, "/rapid/serial/marker/pose": shown,
+            "/rapid/lan/lidar/points": points, "/rapid/lan/scanner/points": points,
+        })
+    );
+    assert_eq!(scene["layers"], serde_json::json!({}));
+    // Without any of these there is no space to show.
+    assert!(panels_of(STREAMS, None).get("3D!space").is_none());
+}
+
+#[test]
+fn the_layout_draws_an_arm_by_its_description() {
+    let panels = panels_of(EFFECTOR, Some(Path::new("/etc/rapid/devices.toml")));
+    let scene = &panels["3D!space"];
+    assert_eq!(scene["followTf"], "base");
+    let shown = serde_json::json!({ "visible": true });
+    assert_eq!(scene["topics"], serde_json::json!({ "/rapid/can/arm/pose": shown, "/rapid/can/arm/joints": shown }));
+    assert_eq!(
+        scene["layers"],
+        serde_json::json!({ "arm": {
+            "instanceId": "arm", "layerId": "foxglove.Urdf", "label": "arm", "visible": true,
+            "sourceType": "filePath", "filePath": "/etc/rapid/arm.urdf",
+        } })
+    );
+    let joints: Vec<_> = panels["Plot!arm"]["paths"].as_array().unwrap().iter().map(|path| &path["label"]).collect();
+    assert_eq!(joints, ["waist", "lift", "elbow", "pitch", "roll", "jaw"]);
+}
+
 #[test]
 fn the_layout_shows_every_device_and_places_every_panel_once() {
     let camera =
@@ -56,6 +118,9 @@ fn the_layout_shows_every_device_and_places_every_panel_once() {
         Registry::builtin(),
         Registry::task(),
         Registry::parse(&many, None).unwrap().registry,
+        Registry::parse(FORMS, None).unwrap().registry,
+        Registry::parse(EFFECTOR, None).unwrap().registry,
+        Registry::parse(STREAMS, None).unwrap().registry,
         Registry::empty(Path::new("devices.toml")),
     ];
     for registry in &registries {
@@ -66,18 +131,27 @@ fn the_layout_shows_every_device_and_places_every_panel_once() {
         placed.extend(tabs.iter().flat_map(|tab| leaves(&tab["layout"])));
         assert_eq!(placed.iter().copied().collect::<BTreeSet<_>>(), panels.keys().map(String::as_str).collect());
         assert_eq!(placed.len(), panels.len());
-        let text = layout.to_string();
         for device in &registry.devices {
-            let present = format!("/rapid/observation.modalities[:]{{bit=={}}}.present", device.id.bit());
-            assert!(text.contains(&present), "{}", device.name);
+            for (tab, topic) in [("Live", "/rapid/observation"), ("Recorded", "/rapid/frame")] {
+                let states = panels[&format!("StateTransitions!{tab}")]["paths"].as_array().unwrap();
+                for (field, label) in
+                    [("present", device.name.clone()), ("plugged", format!("{} plugged in", device.name))]
+                {
+                    let path = format!("{topic}.modalities[:]{{bit=={}}}.{field}", device.id.bit());
+                    assert!(states.iter().any(|state| state["value"] == path && state["label"] == label), "{path}");
+                }
+            }
             match device.modality().kind {
                 ModalityKind::Image | ModalityKind::Depth => {
                     assert_eq!(panels[&format!("Image!{}", device.name)]["imageMode"]["imageTopic"], device.topic);
                 }
                 ModalityKind::Scalars => {
                     let paths = panels[&format!("Plot!{}", device.name)]["paths"].as_array().unwrap();
-                    assert_eq!(paths[0]["value"], format!("{}.values[0]", device.topic));
-                    assert_eq!(paths.len(), usize::try_from(device.modality().shape[0].min(16)).unwrap());
+                    assert!(!paths.is_empty() && paths.len() <= 16, "{}", device.name);
+                    let has_joints = matches!(device.form, Some(Form::Joints(_)));
+                    let expected = if has_joints { "/joints.joints[0]." } else { ".values[0]" };
+                    let first = paths[0]["value"].as_str().unwrap();
+                    assert!(first.starts_with(&format!("{}{expected}", device.topic)), "{first}");
                 }
                 ModalityKind::Bytes => {}
             }
