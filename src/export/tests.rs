@@ -12,6 +12,7 @@ use super::set::{DataSet, SetError, prepare};
 use super::statistics::Column;
 use super::survey::{Content, Stream, Survey};
 use super::table::{Position, Rows, Table};
+use super::verify::verify;
 use super::video::{Encoded, FrameMaker, Shown};
 use crate::action::ACTION_TOPIC;
 use crate::episode::encode;
@@ -35,6 +36,8 @@ struct Recording {
     path: PathBuf,
     writer: mcap::Writer<std::io::BufWriter<File>>,
     message: Vec<u8>,
+    /// The tick at which devices without a sample are plugged in: their drivers do not run. At others they are unplugged.
+    crashed: u32,
 }
 
 impl Recording {
@@ -46,7 +49,7 @@ impl Recording {
         let about = [("modalities", modalities), ("observation_hz", "10"), ("task", "x")];
         let metadata = text_map(about.map(|(key, value)| (key, value.to_owned())));
         writer.write_metadata(&mcap::records::Metadata { name: "rapid".into(), metadata }).unwrap();
-        Self { path, writer, message: Vec::new() }
+        Self { path, writer, message: Vec::new(), crashed: 3 }
     }
 
     fn write(&mut self, schema: (&str, &[u8]), topic: &str, bit: Option<u8>, sequence: u32, at_ms: u64) {
@@ -63,8 +66,7 @@ impl Recording {
         let mut observation = Observation::new(&[0, 4].map(|bit| ModalityId::new(bit).unwrap()));
         for (slot, seq) in observation.slots.iter_mut().zip(named) {
             (slot.present, slot.valid, slot.seq) = (seq.is_some(), seq.is_some(), seq);
-            // Its driver does not run in the fourth tick; without a sample it is otherwise unplugged.
-            slot.plugged = seq.is_some() || number == 3;
+            slot.plugged = seq.is_some() || number == self.crashed;
             observation.mask = PhysicalMask(observation.mask.0 | u64::from(seq.is_some()) << slot.id.bit());
         }
         let at_ms = u64::from(number) * 100;
@@ -192,17 +194,18 @@ fn surveyed(path: &Path, task: &str) -> Survey {
 #[test]
 fn rows_that_were_prepared_for_another_position_are_written_again() {
     let folder = tempfile::tempdir().unwrap();
-    let recorded = |name: &str, value: f64| {
+    let recorded = |name: &str, value: f64, crashed: u32| {
         let folder = folder.path().join(name);
         std::fs::create_dir(&folder).unwrap();
-        let mut recording = Recording::new(&folder);
+        let mut recording = Recording { crashed, ..Recording::new(&folder) };
         for number in 0..3 {
             recording.frame(number, [None, Some(number.into())]);
             recording.numbers(Some(4), number, &[value]);
         }
         recording.end()
     };
-    let (first, second) = (surveyed(&recorded("first", 1.0), "push"), surveyed(&recorded("second", 2.0), "pull"));
+    let (first, second) = (recorded("first", 1.0, 1), recorded("second", 2.0, 1));
+    let (first, second) = (surveyed(&first, "push"), surveyed(&second, "pull"));
     let features = Features {
         fps: first.fps,
         modalities: vec!["cam".to_owned(), "force".to_owned()],
@@ -221,6 +224,14 @@ fn rows_that_were_prepared_for_another_position_are_written_again() {
         let position = *set.positions(others.iter().copied().chain([&second])).last().unwrap();
         let prepared = prepare(&out, &second, &features, position, Encoded::default(), &stop).unwrap();
         assert_eq!(set.append(&second, &features, prepared, &stop).unwrap(), 0);
+        let different = |file: &Path| verify(&set, 0, file, None, &stop).unwrap().differences;
+        assert_eq!(different(&second.file), []);
+        let of_state = different(&first.file);
+        assert!(of_state.len() == 3 && of_state.iter().all(|found| found.feature.as_deref() == Some(STATE)));
+        // At the other tick the camera is plugged in, and its driver does not run.
+        let of_plugged = different(&recorded(&format!("{name} crashed"), 2.0, 2));
+        let of_plugged: Vec<_> = of_plugged.iter().map(|found| (found.frame, found.feature.as_deref())).collect();
+        assert_eq!(of_plugged, [1, 2].map(|frame| (Some(frame), Some(PLUGGED))));
         let files = ["data/chunk-000/file-000.parquet", "meta/tasks.parquet"];
         (position, files.map(|file| std::fs::read(out.join(file)).unwrap()))
     };
