@@ -76,8 +76,8 @@ def write(
     poses: dict[str, str] | None = None,
     late: dict[str, int] | None = None,
 ) -> Path:
-    """Writes an episode: by modality its schema and a sample a tick, or None where it was unplugged, "crash" where its driver did
-    not run, "stall" where it sent nothing.
+    """Writes an episode: by modality its schema and a sample a tick, or None where it was unplugged, "crash" where its
+    driver did not run, "stall" where it sent nothing.
 
     `late`: ticks by which the sample that belongs to a tick was captured after it, with that latency in the metadata.
     """

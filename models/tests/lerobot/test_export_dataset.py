@@ -152,7 +152,8 @@ class ExportedDataSet(Folder):
             names = ("min", "max") if key == "rapid.age" else sorted(ours[key].keys() & merged[key].keys())
             self.assertLessEqual({"min", "max"}, set(names))
             for name in names:
-                np.testing.assert_allclose(merged[key][name], ours[key][name], rtol=1e-6, atol=1e-9, err_msg=f"{key} {name}")
+                found, expected = merged[key][name], ours[key][name]
+                np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=f"{key} {name}")
 
 
 @unittest.skipUnless(shutil.which("ffmpeg"), "skipped: no ffmpeg, which encodes the videos")
