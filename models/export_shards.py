@@ -155,7 +155,9 @@ def shard(folder: str, name: str, files: list[str], rapid: str, words: list[str]
     partial = Path(folder) / f".{name}.{node.replace('/', '.')}.{os.getpid()}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        command = [rapid, "export", *files, "--to", "lerobot", "--out", str(partial), "--json", *words]
+        # A task has one processor.
+        jobs = [] if any(word.split("=")[0] == "--jobs" for word in words) else ["--jobs", "1"]
+        command = [rapid, "export", *files, "--to", "lerobot", "--out", str(partial), "--json", *jobs, *words]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         events = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
         summary = next((event for event in events if event["event"] == "export"), None)

@@ -4,8 +4,8 @@
     rapid export episodes --to lerobot --out blocks
     export_umi.py blocks blocks.zarr.zip --camera cam_wrist --size 224x224 --pose phone_pose --gripper motor_state.0
 
-COLUMNS are numbers of observation.state or action: `arm` (all of that sensor), `arm.3`, `arm.0-5`, `action.0-3`, joined by
-commas. A pose is 6 of them (x y z in metres and a rotation vector), 7 (x y z and a quaternion x y z w), or 16 (a matrix
+COLUMNS are numbers of observation.state or action: `arm` (all of that sensor), `arm.3`, `arm.0-5`, `arm.hip.position` (a name
+in the data set), `action.0-3`, joined by commas. A pose is 6 of them (x y z in metres and a rotation vector), 7 (x y z and a quaternion x y z w), or 16 (a matrix
 4x4, column by column, as phones send it). Each --camera, and each pair of --pose and --gripper, is the next number of UMI:
 camera0_rgb, robot0_eef_pos ...
 
@@ -45,7 +45,7 @@ except ModuleNotFoundError as error:  # --help needs none of them
 else:
     missing = None
 
-MASK, VALID, AGE, TIME = "rapid.mask", "rapid.valid", "rapid.age", "rapid.time_ns"
+MASK, PLUGGED, VALID, AGE, TIME = "rapid.mask", "rapid.plugged", "rapid.valid", "rapid.age", "rapid.time_ns"
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
 # Pictures that are decoded and packed side by side.
 BATCH = 64
@@ -142,7 +142,7 @@ def read_info(folder: Path) -> dict:
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
         version, features = info["codebase_version"], info["features"]
-        for key in (MASK, VALID, AGE, TIME):
+        for key in (MASK, PLUGGED, VALID, AGE, TIME):
             features[key]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Unfit(f"{path}: not a data set that `rapid export --to lerobot` wrote: {error!r}") from error
@@ -199,7 +199,7 @@ def plan(options: argparse.Namespace, features: dict, numbers: dict) -> Buffer:
         if not (equals and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)) or name in (*buffer.arrays, *buffer.pictures):
             raise Unfit(f"--array {text}: not NAME=COLUMNS with a new name of letters, digits and _")
         buffer.arrays[name] = take(columns("--array", of, features), numbers)[rows].astype("f4")
-    for key in (MASK, VALID, AGE):
+    for key in (MASK, PLUGGED, VALID, AGE):
         buffer.arrays[key.replace(".", "_")] = numbers[key][rows]
     buffer.arrays[TIME.replace(".", "_")] = numbers[TIME][rows, 0]
     return buffer
@@ -207,23 +207,36 @@ def plan(options: argparse.Namespace, features: dict, numbers: dict) -> Buffer:
 
 def columns(option: str, text: str, features: dict) -> Columns:
     """COLUMNS of the command line."""
-    known = {name: (STATE, at) for at, name in enumerate(features.get(STATE, {}).get("names") or [])}
-    for at in range(features.get(ACTION, {}).get("shape", [0])[0]):
-        known.setdefault(f"{ACTION}.{at}", (ACTION, at))
+    # By the number in the sample of a sensor, and the names of these for people.
+    known: dict[str, tuple[str, int]] = {}
+    named: dict[str, str] = {}
+    owners: dict[tuple[str, int], str] = {}
+    for key in (STATE, ACTION):
+        feature = features.get(key, {"columns": [], "names": []})
+        for at, (column, name) in enumerate(zip(feature["columns"], feature["names"], strict=True)):
+            if not column.startswith("/"):  # of a topic, which is no sensor
+                known.setdefault(column, (key, at))
+                named.setdefault(name, column)
+                owners[key, at] = column.rpartition(".")[0]
+            if key == ACTION:
+                known.setdefault(f"{ACTION}.{at}", (key, at))
     found: list[str] = []
     for part in text.split(","):
         name, _, which = part.rpartition(".")
         first, _, last = which.partition("-")
         if name and first.isdecimal() and (last or first).isdecimal():
             names = [f"{name}.{at}" for at in range(int(first), int(last or first) + 1)]
+        elif part in named:
+            names = [named[part]]
         else:
             names = [column for column in known if column.rpartition(".")[0] == part]
+            names.sort(key=lambda column: int(column.rpartition(".")[2]))
         unknown = [column for column in names if column not in known] or ([] if names else [part])
         if unknown:
             raise Unfit(f"{option} {text}: no {unknown[0]}; the data set has {', '.join(known) or 'no numbers'}")
         found += names
-    sensors = {name.rpartition(".")[0] for name in found if known[name][0] == STATE}
-    return Columns(text, [known[name] for name in found], sorted(sensors))
+    places = [known[name] for name in found]
+    return Columns(text, places, sorted({owners[place] for place in places if place in owners}))
 
 
 def gripper(text: str, features: dict) -> Columns:
@@ -339,7 +352,7 @@ def write(store, buffer: Buffer, features: dict, files: list[Path], shape: tuple
         meta.array(name, numpy.array(value, "i8"), chunks=(len(value),), compressor=None)
     for name, values in buffer.arrays.items():
         array = data.array(name, values, chunks=values.shape, compressor=packed)
-        if name in ("rapid_mask", "rapid_valid", "rapid_age"):
+        if name in ("rapid_mask", "rapid_plugged", "rapid_valid", "rapid_age"):
             array.attrs["names"] = features[MASK]["names"]
     images = {}
     for name, key in buffer.pictures.items():

@@ -31,7 +31,7 @@ from tqdm import tqdm
 from .episodes import Episode, EpisodeError, Facts, Source, read_episode, read_facts
 from .lerobot_source import split
 
-MAGIC = b"RAPIDCACHE1\n"
+MAGIC = b"RAPIDCACHE2\n"
 ALIGN = 64
 INDEX = "index.jsonl"
 # Maps that are open at a time; each costs address space and no memory.

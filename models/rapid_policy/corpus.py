@@ -8,11 +8,11 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from .cache import Cache, Entry
-from .episodes import Episode, EpisodeError, Facts, episode_files, sources
+from .episodes import ABSENCES, Episode, EpisodeError, Facts, episode_files, picture_source, sources
 from .experiment import Data, Experiment
 from .lerobot_source import split
 from .judgement import JudgementError, judge, program
@@ -31,12 +31,18 @@ class Corpus:
     unwanted: int
     """Files that the filters of the experiment leave out."""
 
+    absences: dict[str, int] = field(default_factory=dict)
+    """Rows without a picture of those that are not required, by the reason."""
+
     def report(self) -> str:
         """For people."""
         lines = [*self.left_out[:SHOWN]]
         if len(self.left_out) > SHOWN:
             lines.append(f"and {len(self.left_out) - SHOWN} more")
         lines += [f"{e.path}: note: {note}" for e in [*self.training, *self.held_out][:SHOWN] for note in e.facts.notes]
+        if any(self.absences.values()):
+            found = ", ".join(f"{count} by {reason}" for reason, count in self.absences.items() if count)
+            lines.append(f"rows without a picture: {found}")
         counts = f"{len(self.training)} episodes to learn from, {len(self.held_out)} held out"
         return "\n".join([*lines, f"{counts}, {len(self.left_out)} left out, {self.unwanted} not asked for"])
 
@@ -69,7 +75,15 @@ def load(spec: Experiment, folders: Sequence[Path], cache_folder: Path, workers:
         first = f"; the first: {left_out[0]}" if left_out else ": check the filters in [data]"
         raise EpisodeError(folders[0], f"no episode that is fit to learn from: {found}{first}")
     training, held_out = divide(spec.data, episodes)
-    return Corpus(training, held_out, left_out, unwanted)
+    return Corpus(training, held_out, left_out, unwanted, _absences(spec, episodes))
+
+
+def _absences(spec: Experiment, episodes: list[Episode]) -> dict[str, int]:
+    names = [picture_source(o).name for o in spec.images if not o.required]
+    return {
+        reason: sum(int(episode.absent(name, reason).sum()) for episode in episodes for name in names)
+        for reason in ABSENCES
+    }
 
 
 def _unfit(spec: Experiment, episode: Episode) -> str | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import poses
-from .episodes import Episode, picture_source
+from .episodes import ABSENCES, Episode, picture_source
 from .experiment import POSITION, QUATERNION, ROTATIONS, Experiment, Observation, Part
 from .normalize import EXECUTED, MinMax
 
@@ -358,6 +358,9 @@ class _Rows:
         for o, present in zip(spec.images, found, strict=True):
             if o.required:
                 self.usable &= present
+            # What an experiment is not to take for an unplugged sensor ends a segment.
+            for reason in set(ABSENCES) - set(spec.data.absences):
+                self.usable &= ~episode.absent(picture_source(o).name, reason)
         # Pictures that are not required: at least one of them must be present.
         if found:
             self.usable &= self.present.any(1)

@@ -27,6 +27,9 @@ from .pixels import FormatError, PixelError, decode, fit
 
 FRAMES = "/rapid/frame"
 ACTIONS = "/action"
+# Why a tick has no sample of a modality: its device is unplugged, or the rig has none; its driver does not run; or it runs,
+# and sends nothing that can be used.
+ABSENCES = ("unplug", "crash", "stall")
 # A message names its sample by the lower half of the 64-bit sequence number.
 SEQUENCE_BITS = 0xFFFF_FFFF
 
@@ -99,7 +102,8 @@ class Episode:
     arrays: Mapping[str, NDArray[Any]]
     """`ticks` i64 [T], number in the frame index; `times` i64 [T], ns of the wall clock; `actions` f64 [T, Da] and `acted`
     bool [T]; for each source `value NAME`, pictures u8 [T, H, W, 3] (red first) or vectors f64 [T, D], `present NAME`
-    bool [T], and of pictures `first NAME` i64 [1], the row of the first one or -1."""
+    bool [T], `plugged NAME` and `running NAME` bool [T], and of pictures `first NAME` i64 [1], the row of the first one or
+    -1."""
     sha256: str = ""
     """Of the file."""
 
@@ -125,6 +129,12 @@ class Episode:
     def present(self, name: str) -> NDArray[np.bool_]:
         """[T] of a source: its bit is set in the mask, and the tick has a sample of it."""
         return self.arrays[f"present {name}"]
+
+    def absent(self, name: str, reason: str) -> NDArray[np.bool_]:
+        """[T] of a source: not present, for one of `ABSENCES`."""
+        plugged, running = self.arrays[f"plugged {name}"], self.arrays[f"running {name}"]
+        reasons = {"unplug": ~plugged, "crash": plugged & ~running, "stall": plugged & running}
+        return ~self.present(name) & reasons[reason]
 
     def first(self, name: str) -> int:
         """The row of the first picture of a source; -1 if there is none."""
@@ -218,6 +228,7 @@ def _read_rows(path: Path, wanted: tuple[Source, ...]) -> Episode:
         }
         for source in wanted:
             found = _of_pictures(path, source, rows) if source.kind == "image" else _of_numbers(path, source, rows)
+            found |= lerobot_source.presence(rows, source.modality, count)
             arrays |= {f"{what} {source.name}": array for what, array in found.items()}
     except EpisodeError:
         raise
@@ -299,7 +310,8 @@ def _assemble(
         stream = streams.get(source.modality)
         chosen = _chosen(stream, frames, messages[stream["topic"]]) if stream else [None] * len(frames)
         read = _pictures if source.kind == "image" else _vectors
-        arrays |= {f"{what} {source.name}": array for what, array in read(path, source, chosen, facts.notes).items()}
+        found = read(path, source, chosen, facts.notes) | _presence(stream, frames)
+        arrays |= {f"{what} {source.name}": array for what, array in found.items()}
     arrays["actions"], arrays["acted"] = _actions(path, facts, frames, messages[ACTIONS])
     return Episode(path, facts, arrays)
 
@@ -322,6 +334,15 @@ def _chosen(stream: dict[str, Any], frames: list[_Message], samples: list[_Messa
         candidates = by_sequence[slot.seq & SEQUENCE_BITS]
         chosen.append(min(candidates, key=lambda m: abs(m.time - captured), default=None))
     return chosen
+
+
+def _presence(stream: dict[str, Any] | None, frames: list[_Message]) -> dict[str, NDArray[np.bool_]]:
+    """[T] whether the device of a modality is plugged in, and whether its bit is set."""
+    slots = [next((s for s in m.body.modalities if stream and s.bit == stream["bit"]), None) for m in frames]
+    running = np.array([slot is not None and slot.present for slot in slots], bool)
+    # Files of earlier versions do not have it: what runs is plugged in, of the rest nothing is known.
+    plugged = np.array([getattr(slot, "plugged", False) for slot in slots], bool)
+    return {"plugged": plugged | running, "running": running}
 
 
 def _pictures(path: Path, source: Source, chosen: list[_Message | None], notes: list[str]) -> dict[str, NDArray[Any]]:

@@ -62,6 +62,9 @@ class Data(Section):
     tags: dict[str, str | tuple[str, ...]] = known("values of a tag that are taken", {"finger": ["soft"]}, {})
     modules: tuple[str, ...] = known("modules that must be mounted", ["handheld_adapter"], ())
     tasks: tuple[str, ...] = known("tasks that are taken", ["place block"], ())
+    absences: tuple[Literal["unplug", "crash", "stall"], ...] = known(
+        "why a picture may be absent in what is learned from", ["unplug"], ("unplug", "crash", "stall")
+    )
     seeds: tuple[int, int] | None = known("first and last value of the tag `seed`", [1000, 1071], None)
     validation: float = known("share of the episodes held out", 0.1, 0.0, ge=0, le=0.5)
     validation_by: Literal["file", "seed"] = known("what decides which are held out", "file", "file")

@@ -1,8 +1,10 @@
 """Episodes of LeRobot data sets v3.0 with pictures, as `rapid export --to lerobot` makes them.
 
 An episode is named `FILE.parquet#INDEX`: a file has several. A modality NAME is the feature `observation.images.NAME`, the
-columns `NAME.0`, `NAME.1` ... of `observation.state`, or the feature `observation.NAME` (so `state` is all of it). Where
-the data set has `rapid.mask` and `rapid.valid` a sample is present if both are 1; in others every sample is.
+columns `NAME.0`, `NAME.1` ... of `observation.state`, or the feature `observation.NAME` (so `state` is all of it). A data
+set of `rapid` lists these in `columns`, beside `names`, which are for people; of others the names count. Where the data set
+has `rapid.mask` and `rapid.valid` a sample is present if both are 1; in others every sample is. `rapid.plugged` is read
+where it is there.
 """
 
 from __future__ import annotations
@@ -58,14 +60,16 @@ def rate(path: Path) -> float:
 
 
 def tables(path: Path) -> dict[str, Any]:
-    """The rows of an episode by feature: arrays, and of pictures a list of bytes. Beside it `names`, by feature."""
+    """The rows of an episode by feature: arrays, and of pictures a list of bytes. Beside it `names` and `columns`, by feature."""
     file, index = split(path)
     described = _described(_folder(path))
     table = _parquet().read_table(file, filters=[("episode_index", "=", index)])
     features = described["features"]
     found = {name: _column(table, name, feature) for name, feature in features.items() if name in table.column_names}
     videos = {name for name, feature in features.items() if feature["dtype"] == "video"}
-    return found | {"names": {name: f.get("names") for name, f in features.items()}, "videos": videos}
+    names = {name: f.get("names") for name, f in features.items()}
+    columns = {name: f.get("columns", f.get("names")) for name, f in features.items()}
+    return found | {"names": names, "columns": columns, "videos": videos}
 
 
 def _column(table: pa.Table, name: str, feature: dict[str, Any]) -> Any:
@@ -97,8 +101,7 @@ def _picture(data: bytes) -> NDArray[np.uint8] | None:
 
 def numbers(rows: dict[str, Any], modality: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
     """Of a sensor [T, D], and [T] where it is present; none if the data set has no such sensor."""
-    names = rows["names"].get("observation.state") or []
-    columns = [i for i, name in enumerate(names) if isinstance(name, str) and name.rpartition(".")[0] == modality]
+    columns = _columns(rows, modality)
     if columns and "observation.state" in rows:
         values = rows["observation.state"][:, columns]
     elif f"observation.{modality}" in rows:
@@ -108,12 +111,38 @@ def numbers(rows: dict[str, Any], modality: str) -> tuple[NDArray[np.float64], N
     return values.astype(np.float64), _present(rows, modality, len(values))
 
 
+def _columns(rows: dict[str, Any], modality: str) -> list[int]:
+    """The places in observation.state of the numbers 0, 1 ... of a sensor."""
+    names = rows["columns"].get("observation.state") or []
+    found = [(name.rpartition("."), i) for i, name in enumerate(names) if isinstance(name, str)]
+    mine = [(number, i) for (owner, _, number), i in found if owner == modality]
+    if not all(number.isdecimal() for number, _ in mine):
+        return [i for _, i in mine]
+    mine = sorted((int(number), i) for number, i in mine)
+    missing = next((at for at, (number, _) in enumerate(mine) if number != at), None)
+    if missing is not None:
+        fix = f"export with --state {modality}, or with its first numbers"
+        raise DatasetError(f"observation.state has {modality}.{mine[-1][0]} without {modality}.{missing}: {fix}")
+    return [i for _, i in mine]
+
+
+def presence(rows: dict[str, Any], modality: str, count: int) -> dict[str, NDArray[np.bool_]]:
+    """[T] whether the device of a sensor is plugged in, and whether its bit is set; in a data set without them both are."""
+    running = _flags(rows, "rapid.mask", modality)
+    running = np.ones(count, bool) if running is None else running
+    plugged = _flags(rows, "rapid.plugged", modality)
+    return {"plugged": running if plugged is None else plugged, "running": running}
+
+
 def _present(rows: dict[str, Any], modality: str, count: int) -> NDArray[np.bool_]:
-    names = rows["names"].get("rapid.mask") or []
-    if modality not in names:
-        return np.ones(count, bool)
-    at = names.index(modality)
-    return (rows["rapid.mask"][:, at] > 0.5) & (rows["rapid.valid"][:, at] > 0.5)
+    mask, valid = _flags(rows, "rapid.mask", modality), _flags(rows, "rapid.valid", modality)
+    return np.ones(count, bool) if mask is None or valid is None else mask & valid
+
+
+def _flags(rows: dict[str, Any], feature: str, modality: str) -> NDArray[np.bool_] | None:
+    """Of a feature with a flag for each sensor; none if it has none for this one."""
+    names = rows["names"].get(feature) or []
+    return rows[feature][:, names.index(modality)] > 0.5 if modality in names else None
 
 
 def _folder(path: Path) -> Path:

@@ -44,6 +44,11 @@ def observed(spec: Experiment, key: str, **values: Any) -> Experiment:
     return Experiment.from_text(json.dumps(described))
 
 
+def presence(length: int, *names: str) -> dict[str, np.ndarray]:
+    """The arrays of modalities that are there in every row."""
+    return {f"{what} {name}": np.ones(length, bool) for name in names for what in ("present", "plugged", "running")}
+
+
 def made_up(length: int, seed: int = 0) -> Episode:
     """An episode in which everything is there; the number of the tick is in every picture and vector."""
     random = np.random.default_rng(seed)
@@ -60,7 +65,7 @@ def made_up(length: int, seed: int = 0) -> Episode:
         "actions": np.repeat(count[:, None] * 1.0, 4, 1),
         "acted": np.ones(length, bool),
     }
-    arrays |= {f"present {name}": np.ones(length, bool) for name in ("cam_wrist", "tactile_tip", "arm")}
+    arrays |= presence(length, "cam_wrist", "tactile_tip", "arm")
     return Episode(Path(f"made-up-{seed}"), Facts(), arrays, f"{seed:064x}")
 
 
@@ -70,11 +75,9 @@ def by_hand(length: int, seed: int = 0, layout: str = "columns") -> Episode:
     poses = path(length, seed)
     numbers = {"columns": poses.transpose(0, 2, 1), "rows": poses}[layout].reshape(length, 16)
     arrays = {name: array for name, array in episode.arrays.items() if not name.endswith(" arm")}
-    arrays |= {
+    arrays |= presence(length, "phone", "gripper") | {
         "value phone": numbers,
-        "present phone": np.ones(length, bool),
         "value gripper": (np.arange(length)[:, None] % 7) / 7.0,
-        "present gripper": np.ones(length, bool),
         "actions": np.zeros((length, 0)),
         "acted": np.zeros(length, bool),
     }

@@ -16,7 +16,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from made_up import experiment, observed
+from made_up import experiment, observed, presence
 
 from rapid_policy import corpus
 from rapid_policy.cache import Cache, write
@@ -77,11 +77,10 @@ def fill(spec, data: Path, folder: Path, args: argparse.Namespace) -> None:
             "actions": random.uniform(0, 1, (args.ticks, 4)),
             "acted": np.ones(args.ticks, bool),
             "value arm": random.uniform(0, 1, (args.ticks, 4)),
-            "present arm": np.ones(args.ticks, bool),
         }
+        arrays |= presence(args.ticks, "arm", "cam_wrist", "tactile_tip")
         for name in ("cam_wrist", "tactile_tip"):
-            arrays |= {f"value {name}": pictures, f"present {name}": np.ones(args.ticks, bool)}
-            arrays[f"first {name}"] = np.zeros(1, np.int64)
+            arrays |= {f"value {name}": pictures, f"first {name}": np.zeros(1, np.int64)}
         content = write(cache.file(entry.sha256), Episode(file, Facts(), arrays, entry.sha256))
         facts = dataclasses.asdict(Facts(observation_hz=10.0, tags={"seed": str(i)}))
         cache.record(dataclasses.replace(entry, error=None, content=content, facts=facts))

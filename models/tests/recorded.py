@@ -48,7 +48,7 @@ def decoder(schema):
 
 
 def read_episode(path: Path) -> list[dict]:
-    """The rows of an episode: by modality the sample, or None; mask, valid, age."""
+    """The rows of an episode: by modality the sample, or None; mask, plugged, valid, age."""
     classes, samples, frames = {}, defaultdict(dict), []
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
@@ -68,13 +68,14 @@ def read_episode(path: Path) -> list[dict]:
     rows = []
     for time_ns, frame in frames:
         slots = {slot.bit: slot for slot in frame.modalities}
-        row = {"time_ns": time_ns, "mask": [], "valid": [], "age": [], "samples": []}
+        row = {"time_ns": time_ns, "mask": [], "plugged": [], "valid": [], "age": [], "samples": []}
         for entry in listed:
             slot = slots[entry["bit"]]
             shown = slot.present and slot.HasField("seq")
             sample = samples[entry["bit"]].get(slot.seq & LOWER) if shown else None
             row["samples"].append(sample)
             row["mask"].append(float(slot.present))
+            row["plugged"].append(float(slot.plugged))
             row["valid"].append(float(slot.valid and sample is not None))
             row["age"].append(slot.age_ns / 1e9 if sample is not None else 0.0)
         rows.append(row)

@@ -15,7 +15,7 @@ from rapid_policy import cache as module
 from rapid_policy import corpus
 from rapid_policy.cache_commands import bench, verify
 from rapid_policy.corpus import Corpus, divide, load
-from rapid_policy.episodes import EpisodeError, read_episode, sources
+from rapid_policy.episodes import ABSENCES, EpisodeError, read_episode, sources
 from rapid_policy.judgement import Judgement
 
 SPEC = experiment("tactile-id")
@@ -128,6 +128,26 @@ class LeftOut(Case):
         self.assertEqual(np.flatnonzero(~episode.present("gripper")).tolist(), [5])
         self.assertIn("cam_wrist: 1 damaged pictures, taken as absent", found.report())
         self.assertIn("gripper: 1 samples with a number that is not finite", found.report())
+
+    def test_a_crash_a_stall_and_an_unplug_are_three_things_also_after_the_cache(self):
+        touches = [written.jpeg(np.zeros((96, 96, 3), np.uint8))] * 20
+        touches[3:6], touches[8:10], touches[15] = [None] * 3, ["crash"] * 2, "stall"
+        samples = {"tactile_tip": ("foxglove.CompressedImage", touches), **self.rest(20)}
+        samples["cam_wrist"] = ("foxglove.CompressedImage", [written.jpeg(np.zeros((96, 96, 3), np.uint8))] * 20)
+        samples["phone"] = ("rapid.Scalars", [{"values": p.T.ravel()} for p in path(20)])
+        file = written.write(self.data / "faulty.mcap", samples)
+        found = self.load()
+        self.assertIn("rows without a picture: 3 by unplug, 2 by crash, 1 by stall", found.report())
+        for episode in (found.training[0], read_episode(file, sources(SPEC))):
+            rows = {reason: np.flatnonzero(episode.absent("tactile_tip", reason)).tolist() for reason in ABSENCES}
+            self.assertEqual(rows, {"unplug": [3, 4, 5], "crash": [8, 9], "stall": [15]})
+        # A file of a version that did not record what is plugged in.
+        with mock.patch.dict(written.SLOT):
+            del written.SLOT[7]
+            touches[8:10] = [None] * 2
+            touches[15] = None
+            old = read_episode(written.write(self.folder / "old.mcap", samples), sources(SPEC))
+        self.assertEqual(np.flatnonzero(old.absent("tactile_tip", "unplug")).tolist(), [3, 4, 5, 8, 9, 15])
 
     def test_if_none_remains_it_is_said(self):
         self.write("bad")

@@ -1,5 +1,6 @@
 """Windows: which ticks are learned from, and what a policy would have been given at each."""
 
+import json
 import unittest
 
 import numpy as np
@@ -60,6 +61,24 @@ class Windows(unittest.TestCase):
         self.assertEqual(float(given["tactile"][absent].abs().max()), 0)
         # Plugged in again at 20: the step before shows what tick 20 shows, the difference of 20 grey levels.
         self.assertAlmostEqual(float(given["tactile"][~absent][:, 0].min()), 20 / 255, places=5)
+
+    def test_what_an_absence_was_decides_whether_it_is_learned_from(self):
+        episode = made_up(40)
+        present = episode.present("tactile_tip")
+        for reason, rows in (("unplug", slice(5, 10)), ("crash", slice(15, 20)), ("stall", slice(25, 30))):
+            present[rows] = False
+            episode.arrays["plugged tactile_tip"][rows] = reason != "unplug"
+            episode.arrays["running tactile_tip"][rows] = reason == "stall"
+            self.assertEqual(np.flatnonzero(episode.absent("tactile_tip", reason)).tolist(), [*range(40)[rows]])
+        for absences, expected in (
+            (["unplug", "crash", "stall"], [(0, 40)]),
+            (["unplug"], [(0, 15), (20, 25), (30, 40)]),
+            ([], [(0, 5), (10, 15), (20, 25), (30, 40)]),
+        ):
+            spec = json.loads(plain().to_text())
+            spec["data"] = {**spec.get("data", {}), "absences": absences}
+            found = segments(Dataset(Experiment.from_text(json.dumps(spec)), [episode]))
+            self.assertEqual(found, expected, absences)
 
     def test_a_window_is_of_its_tick(self):
         dataset = Dataset(plain(), [made_up(40)])

@@ -21,13 +21,38 @@ RAPID = os.environ.get("RAPID_BIN", "")
 class Present(unittest.TestCase):
     def test_with_its_bit_and_a_sample_that_can_be_used(self):
         rows = {
-            "names": {"rapid.mask": ["cam", "arm"]},
+            "names": {key: ["cam", "arm"] for key in ("rapid.mask", "rapid.valid", "rapid.plugged")},
             "rapid.mask": np.array([[1, 1], [0, 1], [1, 1], [0, 1]]),
+            "rapid.plugged": np.array([[1, 1], [0, 1], [1, 1], [1, 1]]),
             "rapid.valid": np.array([[1, 1], [1, 1], [0, 1], [0, 0]]),
         }
         self.assertEqual(lerobot_source._present(rows, "cam", 4).tolist(), [True, False, False, False])
         self.assertEqual(lerobot_source._present(rows, "arm", 4).tolist(), [True, True, True, False])
         self.assertTrue(lerobot_source._present({"names": {}}, "arm", 4).all())
+        found = lerobot_source.presence(rows, "cam", 4)
+        self.assertEqual(found["plugged"].tolist(), [True, False, True, True])
+        self.assertEqual(found["running"].tolist(), [True, False, True, False])
+        # An earlier version's, and another program's.
+        del rows["names"]["rapid.plugged"]
+        self.assertEqual(lerobot_source.presence(rows, "cam", 4)["plugged"].tolist(), [True, False, True, False])
+        self.assertTrue(all(flags.all() for flags in lerobot_source.presence({"names": {}}, "arm", 4).values()))
+
+
+class Columns(unittest.TestCase):
+    def numbers(self, columns: list[str], modality: str) -> list[float]:
+        rows = {"names": {}, "columns": {"observation.state": columns}, "observation.state": np.arange(9.0)[None, :]}
+        return lerobot_source.numbers(rows, modality)[0][0].tolist()
+
+    def test_numbers_are_in_the_order_of_the_sensor(self):
+        columns = ["arm.1", "hand.0", "arm.0", "arm.2"]
+        self.assertEqual(self.numbers(columns, "arm"), [2, 0, 3])
+        self.assertEqual(self.numbers(columns, "hand"), [1])
+        # Those of other programs are in the order of the columns.
+        self.assertEqual(self.numbers(["arm.b", "arm.a"], "arm"), [0, 1])
+
+    def test_a_number_that_was_left_out_is_named(self):
+        with self.assertRaisesRegex(lerobot_source.DatasetError, "arm.2 without arm.1: export with --state arm"):
+            self.numbers(["arm.0", "arm.2"], "arm")
 
 
 @unittest.skipUnless(RAPID, "RAPID_BIN names no program: DATA SETS OF LEROBOT ARE NOT TESTED")

@@ -67,7 +67,7 @@ def jpeg(pixels: np.ndarray, kind: str = "JPEG") -> dict:
 
 def write(
     path: Path,
-    samples: dict[str, tuple[str, list[dict | None]]],
+    samples: dict[str, tuple[str, list[dict | str | None]]],
     *,
     hz: float = 10,
     actions: np.ndarray | None = None,
@@ -76,7 +76,8 @@ def write(
     poses: dict[str, str] | None = None,
     late: dict[str, int] | None = None,
 ) -> Path:
-    """Writes an episode: by modality its schema and a sample a tick, or None where it was absent.
+    """Writes an episode: by modality its schema and a sample a tick, or None where it was unplugged, "crash" where its
+    driver did not run, "stall" where it sent nothing.
 
     `late`: ticks by which the sample that belongs to a tick was captured after it, with that latency in the metadata.
     """
@@ -127,10 +128,14 @@ def write(
                 if tick >= len(rows) or rows[tick] is None:
                     slots.append({"bit": bit})
                     continue
+                if isinstance(rows[tick], str):
+                    slots.append({"bit": bit, "plugged": True, "present": rows[tick] == "stall"})
+                    continue
                 # Numbers begin where each modality likes, as those of a device that ran before the episode.
                 sequence = 1000 * (bit + 1) + tick
                 send(f"/{name}", kind, (tick + late.get(name, 0)) * period, sequence, **rows[tick])
-                slots.append({"bit": bit, "valid": True, "present": True, "seq": sequence, "age_ns": 0})
+                flags = {"valid", "present", "plugged"} & {field for field, _ in SLOT.values()}
+                slots.append({"bit": bit, "seq": sequence, "age_ns": 0} | dict.fromkeys(flags, True))
             send("/rapid/frame", "rapid.Frame", tick * period, tick, index=tick, modalities=slots)
             if actions is not None:
                 send("/action", "rapid.Scalars", tick * period, tick, values=actions[tick])

@@ -2,7 +2,7 @@ use super::*;
 use crate::action::{ActionSource, MAX_ACTION, NoAction};
 use crate::modality::ModalityId;
 use crate::registry::{
-    DeviceSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
+    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
 };
 use crate::sample::Encoding;
 use std::time::Duration;
@@ -11,6 +11,7 @@ pub(super) fn registry(depth: usize) -> Registry {
     let id = ModalityId::new(3).expect("below 64");
     Registry {
         inference: InferenceSpec::default(),
+        export: ExportSpec::default(),
         rig: RigSpec {
             name: "test".into(),
             observation_hz: 30.0,

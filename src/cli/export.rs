@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum, ValueHint};
 pub(super) const EXPORT: &str = "\
 A row is a tick of the frame index (/rapid/frame), with the sample of each sensor that belongs to it: pictures as \
 observation.images.NAME, JPEGs byte for byte and others as PNG, or with --pictures av1 as a video; numbers as observation.state; /action as action; and \
-rapid.mask, rapid.valid, rapid.age, rapid.time_ns. What is absent is black or zero, with its mask.
+rapid.mask, rapid.plugged, rapid.valid, rapid.age, rapid.time_ns. What is absent is black or zero, with its mask.
 
 Episodes that DIR has already are skipped, new ones are appended. An episode that does not fit is left out and named; so \
 is one that is BAD. Interrupted, DIR has the episodes so far, and the same command continues.
@@ -17,7 +17,7 @@ Examples:
   rapid export episodes --to lerobot --out place-block --verify
   rapid export episodes --to lerobot --out small --pictures av1
   rapid export monday tuesday/*.mcap --to lerobot --out both --state motor_state,force
-  rapid export episodes --to lerobot --out own --state force --action motor_state
+  rapid export episodes --to lerobot --out own --state arm.position,phone --action phone,grip.0
   rapid export $(cat training.txt) --to lerobot --out good        # of `rapid list`
 
 Exit code: 0 if DIR has at least one of the episodes, otherwise 1; 1 also if --verify finds a difference or it is \
@@ -38,18 +38,23 @@ pub struct ExportArgs {
     /// Also those that are BAD
     #[arg(long)]
     pub include_bad: bool,
-    /// Sensors whose numbers are observation.state, in this order [default: all, by bit; or as in DIR]
-    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    /// Numbers of observation.state: NAME, NAME.0, NAME.0-5, NAME.position [default: as in DIR, else as in the episode's
+    /// registry, else all]
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
     pub state: Vec<String>,
-    /// Sensor whose numbers are action [default: the topic /action; or as in DIR]
-    #[arg(long, value_name = "NAME")]
-    pub action: Option<String>,
+    /// Numbers of action, of the same tick, likewise; /action is that topic [default: as in DIR, else as in the episode's
+    /// registry, else /action]
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
+    pub action: Vec<String>,
     /// Pictures as the camera's own JPEGs, or as videos that ffmpeg encodes: jpeg, av1 or h264 [default: jpeg; or as in DIR]
     #[arg(long, value_name = "FORM", hide_possible_values = true)]
     pub pictures: Option<PictureForm>,
     /// Program that encodes and decodes videos [default: ffmpeg on the PATH]
     #[arg(long, value_name = "PROGRAM", value_hint = ValueHint::ExecutablePath)]
     pub ffmpeg: Option<PathBuf>,
+    /// Episodes worked on at a time; the result is the same [default: as the processors are enough for]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    pub jobs: Option<u16>,
     /// Read DIR back and compare it with the episodes, bit for bit; frames of a video within what an encoder loses
     #[arg(long)]
     pub verify: bool,

@@ -1,7 +1,7 @@
 //! `rapid export`: episodes become a data set, or are appended to one.
 //!
-//! Episodes are surveyed in parallel, and so are their videos encoded; rows are written one episode after the other, because
-//! each has its number in the whole set.
+//! Episodes are surveyed in parallel, and so are their videos and rows written, each for the number that it has in the set if
+//! all before it fit; names are given one episode after the other.
 //!
 //! Invariant: an episode that cannot be exported is named with the reason, and the others are exported nevertheless.
 
@@ -13,13 +13,13 @@ use std::thread;
 
 use serde::Serialize;
 
-use super::progress::{self, Work};
+use super::progress::Work;
 use super::{Format, json_line};
 use crate::cli::{ExportArgs, PictureForm};
 use crate::episode::sha256;
 use crate::export::{
-    self, Choice, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Refusal, SetError,
-    Survey, Verified,
+    self, Choice, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal,
+    SetError, Survey, Verified,
 };
 use crate::record::inspect::{self, ReadError};
 use crate::status::Grade;
@@ -157,10 +157,10 @@ pub fn export(
     let found = found(&files, args, &set, stop, &mut report)?;
     let mut sources = found.already;
     let fitting = fitting(found.new, args, pictures, &set, &mut report)?;
-    append(&fitting, &mut set, ffmpeg.as_ref(), stop, &mut report, &mut sources)?;
+    append(&fitting, args.jobs, &mut set, ffmpeg.as_ref(), stop, &mut report, &mut sources)?;
     interrupted(&set, stop)?;
     if args.verify {
-        verify(&set, &sources, ffmpeg.as_ref(), stop, &mut report)?;
+        verify(&set, args.jobs, &sources, ffmpeg.as_ref(), stop, &mut report)?;
         interrupted(&set, stop)?;
     }
     report.summary.episodes = set.episodes();
@@ -180,9 +180,17 @@ fn pictures(form: PictureForm) -> Pictures {
     }
 }
 
-/// Appends episodes, in their order; their videos are encoded before, of as many at a time as the processors are enough for.
+/// How many episodes are worked on at a time, `each` of which keeps so many processors busy.
+fn workers(jobs: Option<u16>, each: usize) -> usize {
+    let processors = thread::available_parallelism().map_or(1, usize::from);
+    jobs.map_or_else(|| processors.div_ceil(each.max(1)), usize::from)
+}
+
+/// Appends episodes, in their order; their videos and rows are written before, of as many at a time as the processors are
+/// enough for.
 fn append(
     fitting: &[(Survey, Features)],
+    jobs: Option<u16>,
     set: &mut DataSet,
     ffmpeg: Option<&Ffmpeg>,
     stop: &AtomicBool,
@@ -191,27 +199,31 @@ fn append(
 ) -> Result<(), ExportError> {
     let Some((_, features)) = fitting.first() else { return Ok(()) };
     let cameras = features.videos_per_episode();
-    if cameras > 0 {
-        set.prepare_videos(features)?;
-    }
+    set.begin(features)?;
+    let positions = set.positions(fitting.iter().map(|(episode, _)| episode));
+    let items: Vec<(&(Survey, Features), Position)> = fitting.iter().zip(positions).collect();
     let (folder, failed, frames) = (set.folder().to_owned(), AtomicBool::new(false), AtomicUsize::new(0));
-    let encode = |(episode, features): &(Survey, Features)| match ffmpeg {
-        _ if stop.load(Ordering::Relaxed) => Err(SetError::Refused(Refusal::Interrupted)),
-        None => {
-            frames.fetch_add(episode.rows, Ordering::Relaxed);
-            Ok(Encoded::default())
+    let prepare = |((episode, features), position): &(&(Survey, Features), Position)| {
+        if stop.load(Ordering::Relaxed) {
+            return Err(SetError::Refused(Refusal::Interrupted));
         }
-        Some(ffmpeg) => export::encode(&folder, episode, features, ffmpeg, Ends { stop, failed: &failed }, &frames),
+        let ends = Ends { stop, failed: &failed };
+        let encode = |ffmpeg| export::encode(&folder, episode, features, ffmpeg, ends, &frames);
+        let encoded = ffmpeg.map_or_else(|| Ok(Encoded::default()), encode)?;
+        let prepared = export::prepare(&folder, episode, features, *position, encoded, stop)?;
+        if ffmpeg.is_none() {
+            frames.fetch_add(episode.rows, Ordering::Relaxed);
+        }
+        Ok(prepared)
     };
-    let processors = thread::available_parallelism().map_or(1, usize::from);
     let work = Work {
         label: "exporting",
-        workers: processors.div_ceil(cameras.max(1)),
+        workers: workers(jobs, cameras),
         total: fitting.iter().map(|(episode, _)| episode.rows * cameras.max(1)).sum(),
         done: Some(&frames),
     };
-    work.each(fitting, encode, |(episode, features), encoded| {
-        let appended = encoded.and_then(|encoded| set.append(episode, features, encoded, stop));
+    work.each(&items, prepare, |((episode, features), _), prepared| {
+        let appended = prepared.and_then(|prepared| set.append(episode, features, prepared, stop));
         let taken = match appended {
             Ok(number) => {
                 sources.insert(number, episode.file.clone());
@@ -263,14 +275,15 @@ fn found(
         }
     };
     let mut found = Found { already: BTreeMap::new(), new: Vec::new() };
-    progress::each(
+    let work = Work { label: "episodes", workers: workers(args.jobs, 1), total: files.len(), done: None };
+    work.each(
         files,
         |file| read(file),
         |file, read| {
             match read {
                 Ok(Read::Already(number)) => {
                     report.already(file, number)?;
-                    found.already.insert(number, file.to_owned());
+                    found.already.insert(number, file.clone());
                 }
                 Ok(Read::New(survey)) => match found.new.iter().find(|other| other.sha256 == survey.sha256) {
                     Some(other) => {
@@ -300,16 +313,15 @@ fn fitting(
     for episode in &episodes {
         known.learn(episode);
     }
-    let of_set = set.features().map(Features::choice).unwrap_or_default();
-    let choice = Choice {
-        state: if args.state.is_empty() { of_set.state } else { args.state.clone() },
-        action: args.action.clone().or(of_set.action),
-        pictures,
-    };
+    let of_user = Choice { state: args.state.clone(), action: args.action.clone() };
     let mut common = set.features().cloned();
     let mut fitting = Vec::new();
     for episode in episodes {
-        let features = Features::of(&episode, &choice, &known)
+        let choice = match &common {
+            Some(common) => of_user.or(common.choice()),
+            None => of_user.or(&episode.export.clone().into()),
+        };
+        let features = Features::of(&episode, &choice, pictures, &known)
             .and_then(|features| common.get_or_insert_with(|| features.clone()).check(&features).map(|()| features));
         match features {
             Ok(features) => fitting.push((episode, features)),
@@ -321,6 +333,7 @@ fn fitting(
 
 fn verify(
     set: &DataSet,
+    jobs: Option<u16>,
     sources: &BTreeMap<usize, PathBuf>,
     ffmpeg: Option<&Ffmpeg>,
     stop: &AtomicBool,
@@ -330,7 +343,8 @@ fn verify(
     let numbers: BTreeMap<&Path, usize> = sources.iter().map(|(number, file)| (file.as_path(), *number)).collect();
     let number = |file: &Path| numbers.get(file).copied().unwrap_or_default();
     report.summary.verified = Some(0);
-    progress::each(
+    let work = Work { label: "episodes", workers: workers(jobs, 1), total: files.len(), done: None };
+    work.each(
         &files,
         |file| export::verify(set, number(file), file, ffmpeg, stop),
         |file, verified| {

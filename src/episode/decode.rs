@@ -57,6 +57,9 @@ pub(crate) struct Sample<'a> {
 pub(crate) struct FrameSlot {
     pub(crate) id: ModalityId,
     pub(crate) present: bool,
+    /// Its device is plugged in, whether it runs or not: set wherever `present` is, also in files of versions that did not
+    /// record it.
+    pub(crate) plugged: bool,
     /// A sample lies within the window.
     pub(crate) valid: bool,
     /// Present without such a sample.
@@ -127,7 +130,8 @@ fn frame<'a>(message: &[u8], slots: &'a mut Vec<FrameSlot>) -> Option<&'a [Frame
 }
 
 fn frame_slot(message: &[u8]) -> Option<FrameSlot> {
-    let (mut bit, mut present, mut valid, mut stale, mut age_ns, mut seq) = (0, false, false, false, 0, None);
+    let (mut bit, mut present, mut plugged, mut valid, mut stale) = (0, false, false, false, false);
+    let (mut age_ns, mut seq) = (0, None);
     for field in whole_protobuf(message) {
         match field? {
             (1, value) => bit = value.number(),
@@ -136,10 +140,12 @@ fn frame_slot(message: &[u8]) -> Option<FrameSlot> {
             (4, value) => age_ns = value.zigzag(),
             (5, value) => seq = Some(value.number()),
             (6, value) => present = value.number() != 0,
+            (7, value) => plugged = value.number() != 0,
             _ => {}
         }
     }
-    Some(FrameSlot { id: ModalityId::new(u8::try_from(bit).ok()?)?, present, valid, stale, age_ns, seq })
+    let id = ModalityId::new(u8::try_from(bit).ok()?)?;
+    Some(FrameSlot { id, present, plugged: plugged || present, valid, stale, age_ns, seq })
 }
 
 fn event(message: &[u8]) -> Option<EventText<'_>> {

@@ -44,6 +44,8 @@ pub(crate) struct Channel {
     /// The modality it belongs to: its bit and its name.
     pub(crate) bit: Option<ModalityId>,
     pub(crate) modality: Option<String>,
+    /// Of the topic of actions: the names of the axes, a list in JSON.
+    pub(crate) names: Option<String>,
     pub(crate) kind: Kind,
 }
 
@@ -169,8 +171,8 @@ impl Channel {
             _ => Kind::Other,
         };
         let bit = metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
-        let modality = metadata.remove("modality");
-        Self { id, topic: topic.to_owned(), schema, bit, modality, kind }
+        let (modality, names) = (metadata.remove("modality"), metadata.remove("names"));
+        Self { id, topic: topic.to_owned(), schema, bit, modality, names, kind }
     }
 }
 

@@ -4,8 +4,9 @@
 //! is not valid.
 
 use std::borrow::Cow;
+use std::rc::Rc;
 
-use super::features::{Actions, Features};
+use super::features::{Axis, Features, Origin};
 use super::picture::{self, Pictures};
 use super::rows::{Payload, Refusal, Row};
 use super::survey::{is_usable, narrow};
@@ -22,6 +23,7 @@ pub(super) struct Cells<'a> {
     pub(super) action: Vec<f32>,
     /// By modality, 0 or 1.
     pub(super) mask: Vec<f32>,
+    pub(super) plugged: Vec<f32>,
     pub(super) valid: Vec<f32>,
     /// By modality, seconds; 0 without a sample.
     pub(super) age: Vec<f64>,
@@ -53,35 +55,34 @@ impl<'f> CellMaker<'f> {
     where
         'f: 'a,
     {
-        let usable = |place: usize| -> Option<&'a Payload> {
+        let usable = |(place, sample): (usize, &'a Option<Rc<Payload>>)| -> Option<&'a Payload> {
             let kind = self.kinds.get(place)?;
-            let payload = row.samples.get(place)?.as_deref().filter(|payload| is_usable(*kind, payload));
+            let payload = sample.as_deref().filter(|payload| is_usable(*kind, payload));
             payload.filter(|_| !self.damaged.contains(&(place, row.number)))
         };
-        let vector = |place: usize, length: usize, into: &mut Vec<f32>| {
-            let end = into.len() + length;
-            if let Some(Payload::Numbers(numbers)) = usable(place) {
-                into.extend(numbers.iter().take(length).map(|number| narrow(*number)));
-            }
-            into.resize(end, 0.0);
+        // By modality.
+        let usable: Vec<Option<&'a Payload>> = row.samples.iter().enumerate().map(usable).collect();
+        let sample = |place: usize| usable.get(place).copied().flatten();
+        let number = |axis: &Axis| {
+            let numbers: &[f64] = match (axis.origin, axis.origin.modality().and_then(sample)) {
+                (Origin::Topic, _) => row.action,
+                (Origin::Modality(_), Some(Payload::Numbers(numbers))) => numbers,
+                (Origin::Modality(_), _) => &[],
+            };
+            numbers.get(axis.at).map_or(0.0, |number| narrow(*number))
         };
         let mut cells = Cells { time_ns: i64::try_from(row.time_ns).unwrap_or(i64::MAX), ..Cells::default() };
-        for (place, length) in &self.features.state {
-            vector(*place, *length, &mut cells.state);
-        }
-        match self.features.actions {
-            Actions::Absent => {}
-            Actions::Topic(_) => cells.action.extend(row.action.iter().map(|value| narrow(*value))),
-            Actions::Modality(place, length) => vector(place, length, &mut cells.action),
-        }
+        cells.state.extend(self.features.state.iter().map(number));
+        cells.action.extend(self.features.action.iter().map(number));
         for (place, slot) in row.slots.iter().enumerate() {
             let flag = |is_set: bool| f32::from(u8::from(is_set));
-            let has_sample = usable(place).is_some();
+            let has_sample = sample(place).is_some();
             cells.mask.push(flag(slot.present));
+            cells.plugged.push(flag(slot.plugged));
             cells.valid.push(flag(slot.valid && has_sample));
             cells.age.push(if has_sample { slot.age_ns as f64 / 1e9 } else { 0.0 });
         }
-        let pictures: Vec<_> = self.features.cameras.iter().map(|(place, _)| usable(*place)).collect();
+        let pictures: Vec<_> = self.features.cameras.iter().map(|(place, _)| sample(*place)).collect();
         for (payload, black) in pictures.into_iter().zip(&self.black) {
             cells.pictures.push(match payload {
                 Some(payload) => {

@@ -1,17 +1,20 @@
 //! The features of a data set: what all of its episodes have in common, and `info.json` contains.
 //!
-//! The modalities of `rapid.mask`, `rapid.valid` and `rapid.age` are those of the registry, ascending by bit, also those
-//! whose samples are not exported. A feature whose name begins with `observation.` is an input of a policy in LeRobot;
-//! those three are none.
+//! The modalities of `rapid.mask`, `rapid.plugged`, `rapid.valid` and `rapid.age` are those of the registry, ascending by
+//! bit, also those whose samples are not exported. A feature whose name begins with `observation.` is an input of a policy in
+//! LeRobot; those four are none.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
 use super::picture::{Codec, Pictures, Shape};
 use super::rows::Refusal;
 use super::statistics::Column;
-use super::survey::{Content, Survey};
+use super::survey::{Content, LONGEST, Survey};
+use crate::action::ACTION_TOPIC;
+use crate::registry::ExportSpec;
+use crate::registry::columns::{self, ColumnError, Vector};
 
 /// Feature of the vectors.
 pub(super) const STATE: &str = "observation.state";
@@ -20,47 +23,67 @@ pub(super) const ACTION: &str = "action";
 /// What the feature of a camera begins with.
 pub(super) const IMAGES: &str = "observation.images.";
 pub(super) const MASK: &str = "rapid.mask";
+pub(super) const PLUGGED: &str = "rapid.plugged";
 pub(super) const VALID: &str = "rapid.valid";
 pub(super) const AGE: &str = "rapid.age";
 pub(super) const TIME: &str = "rapid.time_ns";
+/// Of the state and the action: the parts of the choice that they follow from.
+const CHOSEN: &str = "chosen";
 /// What every data set of LeRobot has, as 64-bit integers but for the first, which is f32 and seconds.
 pub(super) const OWN: [&str; 5] = ["timestamp", "frame_index", "episode_index", "index", "task_index"];
 
-/// Which columns the user chose.
+/// Which columns the user chose, in the grammar of [`columns`].
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Choice {
-    /// Modalities of [`STATE`], in this order; all vectors without a choice.
+    /// Those of [`STATE`], in this order; all numbers of all sensors without a choice.
     pub state: Vec<String>,
-    /// The modality of [`ACTION`]; without one the topic `/action`.
-    pub action: Option<String>,
-    /// How the data set has its pictures.
-    pub pictures: Pictures,
+    /// Those of [`ACTION`], in this order; without a choice those of the topic `/action`.
+    pub action: Vec<String>,
 }
 
-/// A name that an episode has nothing for.
-#[derive(Debug, thiserror::Error)]
-pub enum ChoiceError {
-    /// It is no modality that consists of numbers.
-    #[error("{name:?} is no sensor of numbers; of this episode they are {}", if known.is_empty() { "none" } else { known })]
-    Unknown {
-        /// The name.
-        name: String,
-        /// The names that can be chosen.
-        known: String,
-    },
-    /// It is named twice.
-    #[error("{0:?} is chosen twice")]
-    Twice(String),
+impl Choice {
+    /// This one, where it chooses anything, otherwise `other`.
+    #[must_use]
+    pub fn or(&self, other: &Self) -> Self {
+        let of = |mine: &Vec<String>, other: &Vec<String>| if mine.is_empty() { other.clone() } else { mine.clone() };
+        Self { state: of(&self.state, &other.state), action: of(&self.action, &other.action) }
+    }
 }
 
-/// Where the actions come from.
+impl From<ExportSpec> for Choice {
+    fn from(ExportSpec { state, action }: ExportSpec) -> Self {
+        Self { state, action }
+    }
+}
+
+/// Where the numbers of a column come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Actions {
-    Absent,
-    /// The topic of actions, and its axes.
-    Topic(usize),
-    /// A modality, by its place among all, and its length.
-    Modality(usize, usize),
+pub(super) enum Origin {
+    /// The topic of actions.
+    Topic,
+    /// A modality, by its place among all.
+    Modality(usize),
+}
+
+impl Origin {
+    /// The modality, if it is one.
+    pub(super) const fn modality(self) -> Option<usize> {
+        match self {
+            Self::Topic => None,
+            Self::Modality(place) => Some(place),
+        }
+    }
+}
+
+/// A column of the state or of the action.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Axis {
+    pub(super) origin: Origin,
+    /// The place of its number in a sample of the modality, or in an action.
+    pub(super) at: usize,
+    /// Its name in the data set: that of the modality, a dot and the name or the place of the number; of the topic of
+    /// actions the name of the axis alone.
+    pub(super) name: String,
 }
 
 /// See the module's comment.
@@ -72,9 +95,10 @@ pub struct Features {
     /// Cameras: their place among the modalities.
     pub(super) cameras: Vec<(usize, Shape)>,
     pub(super) pictures: Pictures,
-    /// The vectors of the state: place and length.
-    pub(super) state: Vec<(usize, usize)>,
-    pub(super) actions: Actions,
+    pub(super) state: Vec<Axis>,
+    pub(super) action: Vec<Axis>,
+    /// The choice that they follow from: of an episode whose sensors have other lengths other columns follow from it.
+    pub(super) choice: Choice,
 }
 
 /// A feature as `info.json` describes it.
@@ -84,8 +108,9 @@ pub(super) struct Feature {
     pub(super) dtype: &'static str,
     pub(super) shape: Vec<u32>,
     names: Value,
-    /// Of a video: as `lerobot.datasets.video_utils.get_video_info` has it.
-    info: Option<Value>,
+    /// Further keys. Of the state and the action: where each column comes from, as `NAME.0` or `/action.0`, and what was
+    /// chosen. Of a video: as `lerobot.datasets.video_utils.get_video_info` has it.
+    further: Vec<(&'static str, Value)>,
 }
 
 impl Features {
@@ -94,23 +119,24 @@ impl Features {
     ///
     /// # Errors
     /// When a name chosen is not in the episode, or the shape of a sensor's samples is not known.
-    pub fn of(episode: &Survey, choice: &Choice, known: &Known) -> Result<Self, Refusal> {
+    pub fn of(episode: &Survey, choice: &Choice, pictures: Pictures, known: &Known) -> Result<Self, Refusal> {
         let mut features = Self {
             fps: episode.fps,
             modalities: episode.streams.iter().map(|stream| stream.name.clone()).collect(),
             cameras: Vec::new(),
-            pictures: choice.pictures,
+            pictures,
             state: Vec::new(),
-            actions: Actions::Absent,
+            action: Vec::new(),
+            choice: choice.clone(),
         };
-        let mut vectors = Vec::new();
+        let (mut vectors, mut origins) = (Vec::new(), Vec::new());
         for (place, stream) in episode.streams.iter().enumerate() {
             let name = &stream.name;
             match stream.content {
                 Content::Camera { found, declared } => {
                     let shape = found.or_else(|| known.shape(name)).or(declared);
                     let mut shape = shape.ok_or_else(|| Refusal::NoSize(name.clone()))?;
-                    if let Pictures::Video(_) = choice.pictures {
+                    if let Pictures::Video(_) = pictures {
                         if shape.width % 2 + shape.height % 2 > 0 {
                             return Err(Refusal::OddSize { name: name.clone(), shape: shape.to_string() });
                         }
@@ -120,31 +146,31 @@ impl Features {
                     features.cameras.push((place, shape));
                 }
                 Content::Vector { found, declared } => {
-                    let length = found.or_else(|| known.length(name)).or(declared);
-                    vectors.push((place, name, length));
+                    // What a data set has may be a part of the numbers.
+                    let length = found.or_else(|| known.length(name).max(declared));
+                    vectors.push(Vector { name: name.clone(), length, names: stream.names.clone() });
+                    origins.push(Origin::Modality(place));
                 }
                 Content::Bytes => {}
             }
         }
-        let named = |name: &String| {
-            let found = vectors.iter().find(|(_, known, _)| *known == name);
-            let known = || vectors.iter().map(|(_, name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
-            let (place, _, length) =
-                found.ok_or_else(|| ChoiceError::Unknown { name: name.clone(), known: known() })?;
-            Ok::<_, Refusal>((*place, length.ok_or_else(|| Refusal::NoSize(name.clone()))?))
-        };
-        features.actions = match (&choice.action, episode.action_length()) {
-            (Some(name), _) => named(name).map(|(place, length)| Actions::Modality(place, length))?,
-            (None, Some(length)) => Actions::Topic(length),
-            (None, None) => Actions::Absent,
-        };
-        let mut seen = BTreeSet::new();
-        if let Some(twice) = choice.state.iter().find(|name| !seen.insert(*name)) {
-            return Err(ChoiceError::Twice(twice.clone()).into());
+        let Choice { state, action } = &mut features.choice;
+        if state.is_empty() {
+            *state = vectors.iter().map(|vector| vector.name.clone()).collect();
         }
-        let all: Vec<String> = vectors.iter().map(|(_, name, _)| (*name).clone()).collect();
-        let chosen = if choice.state.is_empty() { &all } else { &choice.state };
-        features.state = chosen.iter().map(named).collect::<Result<_, _>>()?;
+        features.state = axes(state, &vectors, &origins)?;
+        if let Some(length) = episode.action_length() {
+            vectors.push(Vector {
+                name: ACTION_TOPIC.to_owned(),
+                length: Some(length),
+                names: episode.action_names.clone(),
+            });
+            origins.push(Origin::Topic);
+            if action.is_empty() {
+                action.push(ACTION_TOPIC.to_owned());
+            }
+        }
+        features.action = axes(action, &vectors, &origins)?;
         Ok(features)
     }
 
@@ -152,40 +178,32 @@ impl Features {
     pub(super) fn all(&self) -> Vec<Feature> {
         let feature = |key: &str, dtype, shape: Vec<u32>, names| {
             let key = key.to_owned();
-            Feature { key, dtype, shape, names, info: None }
+            Feature { key, dtype, shape, names, further: Vec::new() }
         };
         let wide = |length: usize| vec![u32::try_from(length).unwrap_or(u32::MAX)];
-        let name = |place: usize| self.modalities.get(place).map_or("", String::as_str);
-        let numbered = |place, length| (0..length).map(move |at| format!("{}.{at}", name(place)));
         let mut all: Vec<Feature> = self
             .cameras
             .iter()
             .map(|(place, Shape { height, width, channels })| {
                 let shape = vec![*height, *width, (*channels).into()];
-                let (dtype, info) = match self.pictures {
-                    Pictures::Files => ("image", None),
-                    Pictures::Video(codec) => ("video", Some(self.video_info(codec, *height, *width))),
+                let (dtype, further) = match self.pictures {
+                    Pictures::Files => ("image", Vec::new()),
+                    Pictures::Video(codec) => ("video", vec![("info", self.video_info(codec, *height, *width))]),
                 };
                 let names = json!(["height", "width", "channels"]);
-                Feature { info, ..feature(&self.camera_key(*place), dtype, shape, names) }
+                Feature { further, ..feature(&self.camera_key(*place), dtype, shape, names) }
             })
             .collect();
-        let state: Vec<String> = self.state.iter().flat_map(|(place, length)| numbered(*place, *length)).collect();
-        if !state.is_empty() {
-            all.push(feature(STATE, "float32", wide(state.len()), json!(state)));
-        }
-        match self.actions {
-            Actions::Absent => {}
-            Actions::Topic(length) => {
-                let axes: Vec<String> = (0..length).map(|axis| axis.to_string()).collect();
-                all.push(feature(ACTION, "float32", wide(length), json!(axes)));
-            }
-            Actions::Modality(place, length) => {
-                let columns: Vec<String> = numbered(place, length).collect();
-                all.push(feature(ACTION, "float32", wide(length), json!(columns)));
+        let Choice { state, action } = &self.choice;
+        for (key, axes, chosen) in [(STATE, &self.state, state), (ACTION, &self.action, action)] {
+            if !axes.is_empty() {
+                let names: Vec<&str> = axes.iter().map(|axis| axis.name.as_str()).collect();
+                let columns: Vec<String> = axes.iter().map(|axis| self.column(axis)).collect();
+                let further = vec![("columns", json!(columns)), (CHOSEN, json!(chosen))];
+                all.push(Feature { further, ..feature(key, "float32", wide(axes.len()), json!(names)) });
             }
         }
-        for (key, dtype) in [(MASK, "float32"), (VALID, "float32"), (AGE, "float64")] {
+        for (key, dtype) in [(MASK, "float32"), (PLUGGED, "float32"), (VALID, "float32"), (AGE, "float64")] {
             all.push(feature(key, dtype, wide(self.modalities.len()), json!(self.modalities)));
         }
         all.push(feature(TIME, "int64", vec![1], Value::Null));
@@ -193,6 +211,15 @@ impl Features {
             all.push(feature(key, if key == "timestamp" { "float32" } else { "int64" }, vec![1], Value::Null));
         }
         all
+    }
+
+    /// Where a column comes from.
+    fn column(&self, axis: &Axis) -> String {
+        let origin = match axis.origin {
+            Origin::Topic => ACTION_TOPIC,
+            Origin::Modality(place) => self.modalities.get(place).map_or("", String::as_str),
+        };
+        format!("{origin}.{}", axis.at)
     }
 
     /// The feature of a camera.
@@ -226,10 +253,10 @@ impl Features {
     /// The value of `features` in `info.json`.
     pub(super) fn json(&self) -> Value {
         let of = |feature: Feature| {
-            let Feature { key, dtype, shape, names, info } = feature;
+            let Feature { key, dtype, shape, names, further } = feature;
             let mut value = json!({ "dtype": dtype, "shape": shape, "names": names });
-            if let Some(info) = info {
-                value["info"] = info;
+            for (key, further) in further {
+                value[key] = further;
             }
             (key, value)
         };
@@ -239,11 +266,11 @@ impl Features {
     /// Those of a data set, from its `info.json`; `None` if it is not one that this module describes.
     pub(super) fn of_set(info: &Value) -> Option<Self> {
         let features = info.get("features")?.as_object()?;
-        let names = |key: &str| -> Option<Vec<String>> {
-            let names = features.get(key)?.get("names")?.as_array()?;
-            names.iter().map(|name| name.as_str().map(str::to_owned)).collect()
+        let texts = |key: &str, of: &str| -> Option<Vec<String>> {
+            let texts = features.get(key)?.get(of)?.as_array()?;
+            texts.iter().map(|text| text.as_str().map(str::to_owned)).collect()
         };
-        let modalities = names(MASK)?;
+        let modalities = texts(MASK, "names")?;
         let place = |name: &str| modalities.iter().position(|modality| modality == name);
         let mut cameras = Vec::new();
         let mut pictures = Pictures::Files;
@@ -257,35 +284,32 @@ impl Features {
                 pictures = Pictures::Video(Codec::ALL.into_iter().find(|known| known.name() == codec)?);
             }
         }
-        let mut state: Vec<(usize, usize)> = Vec::new();
-        for name in names(STATE).unwrap_or_default() {
-            let at = place(name.rsplit_once('.')?.0)?;
-            match state.last_mut() {
-                Some((last, length)) if *last == at => *length += 1,
-                _ => state.push((at, 1)),
+        let axis = |(name, column): (String, String)| {
+            let (origin, at) = column.rsplit_once('.')?;
+            let origin = if origin == ACTION_TOPIC { Origin::Topic } else { Origin::Modality(place(origin)?) };
+            // A longer vector is in no episode.
+            let at = at.parse().ok().filter(|at| *at < LONGEST)?;
+            Some(Axis { origin, at, name })
+        };
+        let axes = |key: &str| -> Option<Vec<Axis>> {
+            if !features.contains_key(key) {
+                return Some(Vec::new());
             }
-        }
-        let actions = match names(ACTION).as_deref() {
-            None | Some([]) => Actions::Absent,
-            Some([first, rest @ ..]) => match first.rsplit_once('.') {
-                Some((modality, _)) => Actions::Modality(place(modality)?, rest.len() + 1),
-                None => Actions::Topic(rest.len() + 1),
-            },
+            texts(key, "names")?.into_iter().zip(texts(key, "columns")?).map(axis).collect()
+        };
+        let (state, action) = (axes(STATE)?, axes(ACTION)?);
+        let choice = Choice {
+            state: texts(STATE, CHOSEN).unwrap_or_default(),
+            action: texts(ACTION, CHOSEN).unwrap_or_default(),
         };
         let fps = u32::try_from(info.get("fps")?.as_u64()?).ok()?;
-        let found = Self { fps, modalities, cameras, pictures, state, actions };
+        let found = Self { fps, modalities, cameras, pictures, state, action, choice };
         (found.json() == Value::Object(features.clone())).then_some(found)
     }
 
     /// The choice that leads to these features.
-    pub fn choice(&self) -> Choice {
-        let name = |place: usize| self.modalities.get(place).cloned().unwrap_or_default();
-        let action = match self.actions {
-            Actions::Modality(place, _) => Some(name(place)),
-            Actions::Absent | Actions::Topic(_) => None,
-        };
-        let state = self.state.iter().map(|(place, _)| name(*place)).collect();
-        Choice { state, action, pictures: self.pictures }
+    pub fn choice(&self) -> &Choice {
+        &self.choice
     }
 
     /// Why an episode with the features `other` does not belong to a set with these.
@@ -297,8 +321,15 @@ impl Features {
             let (found, expected) = (other.fps, self.fps);
             return Err(Refusal::Different(format!("{found} frames a second, and {expected} in the data set")));
         }
-        let (mine, theirs) = (self.json(), other.json());
-        let (Value::Object(mine), Value::Object(theirs)) = (&mine, &theirs) else { return Ok(()) };
+        let compared = |features: &Self| match features.json() {
+            Value::Object(mut features) => {
+                // Several choices lead to the same columns.
+                features.values_mut().filter_map(Value::as_object_mut).for_each(|feature| drop(feature.remove(CHOSEN)));
+                features
+            }
+            _ => Map::new(),
+        };
+        let (mine, theirs) = (&compared(self), &compared(other));
         let described = |features: &Map<String, Value>, key: &str| match features.get(key) {
             None => "absent".to_owned(),
             Some(feature) => format!("{} {}", feature["shape"], feature["names"]),
@@ -316,24 +347,31 @@ impl Features {
     pub(super) fn statistics(&self, episode: &Survey) -> Vec<(String, Vec<Column>)> {
         let stream = |place: usize| episode.streams.get(place);
         // Of a modality without a usable sample the columns have no rows.
-        let columns = |place: usize, length: usize| {
-            let mut columns = stream(place).map(|stream| stream.columns.clone()).unwrap_or_default();
-            columns.resize(length, Column::default());
-            columns
+        let axes = |axes: &[Axis]| {
+            let column = |axis: &Axis| {
+                let columns = match axis.origin {
+                    Origin::Topic => episode.action.as_ref(),
+                    Origin::Modality(place) => stream(place).map(|stream| &stream.columns),
+                };
+                columns.and_then(|columns| columns.get(axis.at)).copied().unwrap_or_default()
+            };
+            axes.iter().map(column).collect()
         };
         // In a video a grey picture has three equal channels.
         let channels = |place: usize, count: usize| {
             let found = stream(place).map(|stream| stream.columns.as_slice()).unwrap_or_default();
-            if let [grey] = found { vec![*grey; count] } else { columns(place, count) }
+            if let [grey] = found {
+                return vec![*grey; count];
+            }
+            let mut columns = found.to_vec();
+            columns.resize(count, Column::default());
+            columns
         };
         let of = |key: &str| match key {
-            STATE => self.state.iter().flat_map(|(place, length)| columns(*place, *length)).collect(),
-            ACTION => match self.actions {
-                Actions::Absent => Vec::new(),
-                Actions::Topic(_) => episode.action.clone().unwrap_or_default(),
-                Actions::Modality(place, length) => columns(place, length),
-            },
+            STATE => axes(&self.state),
+            ACTION => axes(&self.action),
             MASK => episode.streams.iter().map(|stream| stream.present).collect(),
+            PLUGGED => episode.streams.iter().map(|stream| stream.plugged).collect(),
             VALID => episode.streams.iter().map(|stream| stream.valid).collect(),
             AGE => episode.streams.iter().map(|stream| stream.age).collect(),
             TIME => vec![episode.time_ns],
@@ -347,6 +385,25 @@ impl Features {
         let keys = self.all().into_iter().map(|feature| feature.key).filter(|key| !OWN.contains(&key.as_str()));
         keys.map(|key| (key.clone(), of(&key))).collect()
     }
+}
+
+/// The columns that `parts` name.
+fn axes(parts: &[String], vectors: &[Vector], origins: &[Origin]) -> Result<Vec<Axis>, Refusal> {
+    let axis = |(place, at): (usize, usize)| {
+        let (vector, origin) = (vectors.get(place)?, *origins.get(place)?);
+        let name = match (vector.named().and_then(|names| names.get(at)), origin) {
+            (Some(name), Origin::Topic) => name.clone(),
+            (None, Origin::Topic) => format!("{ACTION}.{at}"),
+            (Some(name), Origin::Modality(_)) => format!("{}.{name}", vector.name),
+            (None, Origin::Modality(_)) => format!("{}.{at}", vector.name),
+        };
+        Some(Axis { origin, at, name })
+    };
+    let chosen = columns::choose(parts, vectors).map_err(|error| match error {
+        ColumnError::NoLength(name) => Refusal::NoSize(name),
+        error => error.into(),
+    })?;
+    Ok(chosen.into_iter().filter_map(axis).collect())
 }
 
 /// Shapes of samples, from episodes that have them.
@@ -368,18 +425,21 @@ impl Known {
         }
     }
 
-    /// What a data set has.
+    /// What a data set has. Of a vector the columns up to the last that it has.
     pub fn of(features: &Features) -> Self {
         let name = |place: usize| features.modalities.get(place).cloned().unwrap_or_default();
         let camera =
             |(place, shape): &(usize, Shape)| (name(*place), Content::Camera { found: Some(*shape), declared: None });
-        let vector =
-            |(place, length): &(usize, usize)| (name(*place), Content::Vector { found: Some(*length), declared: None });
-        let action = match features.actions {
-            Actions::Modality(place, length) => Some((place, length)),
-            Actions::Absent | Actions::Topic(_) => None,
-        };
-        let vectors = features.state.iter().chain(&action).map(vector);
+        let mut lengths: BTreeMap<usize, usize> = BTreeMap::new();
+        for axis in features.state.iter().chain(&features.action) {
+            if let Some(place) = axis.origin.modality() {
+                let length = lengths.entry(place).or_default();
+                *length = axis.at.saturating_add(1).max(*length);
+            }
+        }
+        let vectors = lengths
+            .into_iter()
+            .map(|(place, length)| (name(place), Content::Vector { found: Some(length), declared: None }));
         Self(features.cameras.iter().map(camera).chain(vectors).collect())
     }
 
@@ -410,15 +470,33 @@ mod tests {
             modalities: ["cam", "arm", "force", "raw"].map(str::to_owned).into(),
             cameras: vec![(0, Shape { height: 480, width: 640, channels: 3 })],
             pictures: Pictures::Files,
-            state: vec![(2, 1), (1, 3)],
-            actions: Actions::Topic(2),
+            state: vec![axis(2, 0, "force.0"), axis(1, 1, "arm.y"), axis(1, 0, "arm.x")],
+            action: ["x", "grip"].into_iter().enumerate().map(|(at, name)| topic(at, name)).collect(),
+            choice: choice(&["force", "arm.1", "arm.0"], &["/action"]),
         }
+    }
+
+    fn choice(state: &[&str], action: &[&str]) -> Choice {
+        let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect();
+        Choice { state: texts(state), action: texts(action) }
+    }
+
+    fn axis(place: usize, at: usize, name: &str) -> Axis {
+        Axis { origin: Origin::Modality(place), at, name: name.to_owned() }
+    }
+
+    fn topic(at: usize, name: &str) -> Axis {
+        Axis { origin: Origin::Topic, at, name: name.to_owned() }
     }
 
     #[test]
     fn features_are_read_back_from_what_is_written() {
-        for actions in [Actions::Absent, Actions::Topic(2), Actions::Modality(1, 3)] {
-            let features = Features { actions, ..features() };
+        let both = vec![axis(1, 7, "arm.grip"), topic(1, "y")];
+        let sent = vec![topic(0, "action.0")];
+        let both = (both, vec!["arm.7", "/action.y"]);
+        for (action, chosen) in [(Vec::new(), Vec::new()), (sent, vec!["/action"]), both] {
+            let chosen = chosen.as_slice();
+            let features = Features { action, choice: choice(&["force", "arm.1", "arm.0"], chosen), ..features() };
             let info = json!({ "fps": 30, "features": features.json() });
             assert_eq!(Features::of_set(&info), Some(features));
         }
@@ -430,18 +508,16 @@ mod tests {
         let mut info = json!({ "fps": 30, "features": features().json() });
         info["features"]["observation.state"]["shape"] = json!([5]);
         assert_eq!(Features::of_set(&info), None, "of another program");
-        assert_eq!(
-            features().choice(),
-            Choice { state: vec!["force".to_owned(), "arm".to_owned()], ..Choice::default() }
-        );
     }
 
     fn episode(contents: &[(&str, Content)]) -> Survey {
         let stream = |(name, content): &(&str, Content)| Stream {
             name: (*name).to_owned(),
             content: *content,
+            names: Vec::new(),
             columns: Vec::new(),
             present: Column::default(),
+            plugged: Column::default(),
             valid: Column::default(),
             age: Column::default(),
         };
@@ -454,6 +530,8 @@ mod tests {
             unusable: 0,
             fps: 30,
             task: String::new(),
+            export: ExportSpec::default(),
+            action_names: Vec::new(),
             streams: contents.iter().map(stream).collect(),
             action: None,
             time_ns: Column::default(),
@@ -466,7 +544,9 @@ mod tests {
         let shape = |height| Shape::new(height, 640, 3);
         let camera = |found, declared| ("cam", Content::Camera { found, declared });
         let arm = ("arm", Content::Vector { found: Some(3), declared: None });
-        let of = |content, known: &Known| Features::of(&episode(&[content, arm]), &Choice::default(), known);
+        let of = |content, known: &Known| {
+            Features::of(&episode(&[content, arm]), &Choice::default(), Pictures::Files, known)
+        };
         let height = |found: Result<Features, Refusal>| found.map(|features| features.cameras[0].1.height);
         let mut known = Known::default();
         assert_eq!(height(of(camera(shape(480), shape(240)), &known)).unwrap(), 480);
@@ -475,40 +555,59 @@ mod tests {
         assert!(refused.starts_with("cam: no usable sample to know the size of"), "{refused}");
         known.learn(&episode(&[camera(shape(720), None), arm]));
         assert_eq!(height(of(camera(None, shape(240)), &known)).unwrap(), 720);
-        assert_eq!(Known::of(&features()).length("arm"), Some(3));
+        assert_eq!(Known::of(&features()).length("arm"), Some(2));
     }
 
     #[test]
     fn columns_are_chosen_by_name_and_in_that_order() {
         let vector = |name, length| (name, Content::Vector { found: Some(length), declared: None });
-        let episode = episode(&[vector("arm", 3), ("raw", Content::Bytes), vector("force", 1)]);
-        let of = |state: &[&str], action: Option<&str>| {
-            let choice = Choice {
-                state: state.iter().map(|name| (*name).to_owned()).collect(),
-                action: action.map(str::to_owned),
-                ..Choice::default()
-            };
-            Features::of(&episode, &choice, &Known::default()).map_err(|refusal| refusal.to_string())
+        let mut episode = episode(&[vector("arm", 3), ("raw", Content::Bytes), vector("force", 1)]);
+        episode.streams[0].names = ["hip.position", "hip.velocity", "tip.x"].map(str::to_owned).into();
+        let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
+        let of = |episode: &Survey, state: &[&str], action: &[&str]| {
+            let found = Features::of(episode, &choice(state, action), Pictures::Files, &Known::default());
+            found.map_err(|refusal| refusal.to_string())
         };
-        assert_eq!(of(&[], None).unwrap().state, [(0, 3), (2, 1)]);
-        let chosen = of(&["force", "arm"], Some("arm")).unwrap();
-        assert_eq!((chosen.state.as_slice(), chosen.actions), (&[(2, 1), (0, 3)][..], Actions::Modality(0, 3)));
-        let unknown = of(&["raw"], None).unwrap_err();
-        assert_eq!(unknown, "\"raw\" is no sensor of numbers; of this episode they are arm, force");
-        assert!(of(&[], Some("legs")).is_err());
-        assert_eq!(of(&["arm", "arm"], None).unwrap_err(), "\"arm\" is chosen twice");
+        let arm = [axis(0, 0, "arm.hip.position"), axis(0, 1, "arm.hip.velocity"), axis(0, 2, "arm.tip.x")];
+        let whole = of(&episode, &[], &[]).unwrap();
+        assert_eq!((&whole.state[..3], &whole.state[3..]), (&arm[..], &[axis(2, 0, "force.0")][..]));
+        assert_eq!((whole.action.len(), &whole.choice), (0, &choice(&["arm", "force"], &[])));
+        let joined = of(&episode, &["force", "arm.position"], &["arm.tip", "arm.0"]).unwrap();
+        assert_eq!(joined.state, [axis(2, 0, "force.0"), arm[0].clone()]);
+        assert_eq!(joined.action, [arm[2].clone(), arm[0].clone()]);
+        assert_eq!(of(&episode, &["raw"], &[]).unwrap_err(), "\"raw\" is no sensor of numbers; those are arm, force");
+        assert!(of(&episode, &[], &["/action"]).unwrap_err().contains("those are arm, force"));
+        assert!(
+            of(&episode, &["arm.3"], &[]).unwrap_err().contains("arm has no column \"3\"; it has 0-2: hip.position")
+        );
+        assert_eq!(of(&episode, &["arm", "arm.1"], &[]).unwrap_err(), "\"arm.1\" is chosen twice");
+        // Actions have the names of their channel, and are no state.
+        episode.action = Some(vec![Column::default(); 2]);
+        assert_eq!(of(&episode, &[], &[]).unwrap().action, [topic(0, "action.0"), topic(1, "action.1")]);
+        episode.action_names = texts(&["x", "grip"]);
+        let chosen = of(&episode, &[], &["/action.grip", "force"]).unwrap().action;
+        assert_eq!(chosen, [topic(1, "grip"), axis(2, 0, "force.0")]);
+        assert!(of(&episode, &["/action"], &[]).unwrap_err().contains("those are arm, force"));
+    }
+
+    #[test]
+    fn a_choice_is_that_of_the_user_then_that_of_another_by_feature() {
+        assert_eq!(choice(&["a"], &[]).or(&choice(&["b"], &["c"])), choice(&["a"], &["c"]));
+        assert_eq!(choice(&[], &[]).or(&choice(&[], &[])), Choice::default());
     }
 
     #[test]
     fn a_difference_is_named() {
         let refused = |other: &Features| features().check(other).unwrap_err().to_string();
         assert!(features().check(&features()).is_ok());
+        let otherwise = choice(&["force.0", "arm.1", "arm.0"], &["/action.0-1"]);
+        assert!(features().check(&Features { choice: otherwise, ..features() }).is_ok());
         assert_eq!(refused(&Features { fps: 20, ..features() }), "20 frames a second, and 30 in the data set");
         let mut wide = features();
         wide.cameras[0].1.width = 1280;
         let text = refused(&wide);
         assert!(text.starts_with("observation.images.cam is [480,1280,3]") && text.contains("[480,640,3]"), "{text}");
-        let text = refused(&Features { actions: Actions::Absent, ..features() });
+        let text = refused(&Features { action: Vec::new(), ..features() });
         assert!(text.starts_with("action is absent, and [2]"), "{text}");
     }
 }

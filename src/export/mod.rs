@@ -11,7 +11,10 @@
 //! Invariant: a picture in JPEG is copied byte for byte, and what is absent has its mask.
 //! Invariant: an episode is in the set once its file in `meta/episodes` has its name, and everything of it is complete
 //! by then; a program that is killed leaves files without a name in the set, and the next one removes them.
-//! Invariant: memory holds what is between a sample and its frame, and one group of rows.
+//! Invariant: an episode's rows depend on nothing but the episode, the features and its position in the set, so that it makes
+//! no difference how many are prepared at a time.
+//! Invariant: memory holds, of each episode that is being prepared, what is between a sample and its frame, and one group
+//! of rows.
 
 mod cells;
 mod features;
@@ -28,11 +31,12 @@ mod tests;
 mod verify;
 mod video;
 
-pub use features::{Choice, ChoiceError, Features, Known};
+pub use features::{Choice, Features, Known};
 pub use ffmpeg::{Ffmpeg, FfmpegError};
 pub use picture::{Codec, Pictures};
 pub use rows::Refusal;
-pub use set::{DataSet, SetError};
+pub use set::{DataSet, Prepared, SetError, prepare};
 pub use survey::{Survey, survey};
+pub use table::Position;
 pub use verify::{Difference, Verified, verify};
 pub use video::{Encoded, Ends, encode};

@@ -16,10 +16,13 @@ use crate::episode::decode::{Content, FrameSlot, Kind, Sample, Scratch};
 use crate::episode::reader::{Item, Message, Reader};
 use crate::episode::{ABOUT, FRAME_TOPIC, ReadError};
 use crate::modality::{ModalityId, ModalityKind};
+use crate::registry::columns::ColumnError;
 use crate::sample::Encoding;
 
 /// Bytes of samples that may wait for their frame: a minute of four cameras, where a second is usual.
 const MOST_WAITING: usize = 1 << 30;
+/// No registry is longer; the text of a hostile file may be.
+const LONGEST_REGISTRY: usize = 1 << 20;
 
 /// Why an episode, or the rest of it, is not exported. Without the name of the file.
 #[derive(Debug, thiserror::Error)]
@@ -108,7 +111,7 @@ pub enum Refusal {
     Different(String),
     /// What was requested is not in it.
     #[error(transparent)]
-    Choice(#[from] super::ChoiceError),
+    Choice(#[from] ColumnError),
     /// The frames do not follow their samples.
     #[error("more than {} MiB of samples before the frames that name them", MOST_WAITING >> 20)]
     Order,
@@ -147,6 +150,8 @@ pub(super) struct Listed {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Slot {
     pub(super) present: bool,
+    /// Its device is plugged in, whether it runs or not.
+    pub(super) plugged: bool,
     pub(super) valid: bool,
     pub(super) age_ns: i64,
     /// The sample that belongs to the tick: its place among those of its modality in the file.
@@ -212,6 +217,10 @@ pub(super) struct Index {
     /// Of each row, one for each modality.
     slots: Vec<Slot>,
     actions: Actions,
+    /// The text of the registry that it was recorded with; empty if it carries none.
+    pub(super) registry: String,
+    /// The names of the axes of an action, as its channel lists them; empty if it does not.
+    pub(super) action_names: Vec<String>,
 }
 
 /// What was sent to the actuator.
@@ -306,13 +315,26 @@ impl Index {
             }
         }
         actions.sort();
+        let of_actions = reader.channels().find(|channel| channel.topic == ACTION_TOPIC);
+        let action_names = of_actions.and_then(|channel| serde_json::from_str(channel.names.as_deref()?).ok());
+        let registry = reader.about("registry").filter(|text| text.len() <= LONGEST_REGISTRY);
+        let registry = registry.unwrap_or_default().to_owned();
         let modalities = modalities(reader.about("modalities"))?;
         let fps = rate(reader.about("observation_hz"))?;
         let task = reader.about("task").unwrap_or_default().to_owned();
         check_ticks(&frames)?;
         let slots = chosen(&modalities, &frames, &samples);
         let ticks = frames.iter().map(|frame| frame.time_ns).collect();
-        Ok(Self { fps, task, modalities, ticks, slots, actions })
+        Ok(Self {
+            fps,
+            task,
+            modalities,
+            ticks,
+            slots,
+            actions,
+            registry,
+            action_names: action_names.unwrap_or_default(),
+        })
     }
 
     /// The modalities at a row.
@@ -413,7 +435,7 @@ fn chosen(modalities: &[Listed], frames: &[Frame], samples: &BTreeMap<ModalityId
         .collect();
     let slot = |frame: &Frame, modality: &Listed| {
         let found = frame.slots.iter().find(|slot| slot.id == modality.bit)?;
-        let FrameSlot { present, valid, age_ns, seq, .. } = *found;
+        let FrameSlot { present, plugged, valid, age_ns, seq, .. } = *found;
         #[expect(clippy::cast_possible_truncation, reason = "a message has the lower 32 bits of a number")]
         let named = seq.filter(|_| present).map(|seq| seq as u32);
         let candidates = named.and_then(|number| by_number.get(&modality.bit)?.get(&number));
@@ -422,6 +444,7 @@ fn chosen(modalities: &[Listed], frames: &[Frame], samples: &BTreeMap<ModalityId
         let sample = candidates.and_then(|candidates| candidates.iter().min_by_key(nearest)).map(|(place, _)| *place);
         Some(Slot {
             present,
+            plugged,
             valid: valid && sample.is_some(),
             age_ns: if sample.is_some() { age_ns } else { 0 },
             sample,
@@ -531,7 +554,7 @@ mod tests {
 
     fn frame(number: u32, time_ns: u64, seq: Option<u64>, present: bool) -> Frame {
         let id = ModalityId::new(3).unwrap();
-        let slot = FrameSlot { id, present, valid: present, stale: false, age_ns: 10, seq };
+        let slot = FrameSlot { id, present, plugged: number != 2, valid: present, stale: false, age_ns: 10, seq };
         Frame { number, time_ns, slots: vec![slot] }
     }
 
@@ -556,6 +579,8 @@ mod tests {
             frame(5, 600, None, true),
         ];
         let slots = chosen(&modalities, &frames, &samples);
+        let plugged: Vec<bool> = slots.iter().step_by(2).map(|slot| slot.plugged).collect();
+        assert_eq!(plugged, [true, true, false, true, true, true]);
         let found: Vec<_> = slots.iter().step_by(2).map(|slot| (slot.present, slot.valid, slot.sample)).collect();
         let there = |sample| (true, true, Some(sample));
         let without = (true, false, None);

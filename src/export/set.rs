@@ -17,7 +17,7 @@ use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use arrow_array::builder::{Float64Builder, Int64Builder, ListBuilder, StringBuilder};
 use arrow_array::cast::AsArray;
@@ -157,7 +157,8 @@ impl DataSet {
             .map_err(|source| SetError::Io { path: info.clone(), source })?;
         let value: Value = serde_json::from_str(&text).map_err(|error| foreign(&error.to_string()))?;
         let features = Features::of_set(&value);
-        set.features = Some(features.ok_or_else(|| foreign("not the features of a data set of rapid"))?);
+        set.features =
+            Some(features.ok_or_else(|| foreign("not the features of a data set of this version of rapid"))?);
         set.read_tasks()?;
         while let Some(entry) = set.read_entry()? {
             merge(&mut set.statistics, &entry.statistics);
@@ -217,13 +218,29 @@ impl DataSet {
         }
     }
 
-    /// Prepares the encoding of videos in it: what a program left that was killed is removed.
+    /// Begins to append: what a program left that was killed is removed.
     ///
     /// # Errors
     /// When it cannot be created, or another program writes to it.
-    pub fn prepare_videos(&mut self, features: &Features) -> Result<(), SetError> {
+    pub fn begin(&mut self, features: &Features) -> Result<(), SetError> {
         self.lock(Missing::All)?;
+        // Episodes that were prepared are the next ones.
+        let next = self.entries.len() as u64;
+        let data = [next, next.saturating_add(CHUNK)].map(|episode| self.data_path(episode));
+        data.iter().filter_map(|path| path.parent()).try_for_each(files::remove_temporary)?;
         features.videos().try_for_each(|(key, _)| files::remove_temporary(&self.folder.join(VIDEOS).join(key)))
+    }
+
+    /// Where these episodes will be if all of them are appended, in this order.
+    pub fn positions<'e>(&self, episodes: impl IntoIterator<Item = &'e Survey>) -> Vec<Position> {
+        let (mut tasks, mut next, mut first) = (self.tasks.clone(), self.entries.len() as u64, self.rows());
+        let position = |episode: &Survey| {
+            let task = task_number(&mut tasks, episode.task());
+            let position = Position { episode: next, first, task };
+            (next, first) = (next.saturating_add(1), first.saturating_add(episode.rows as u64));
+            position
+        };
+        episodes.into_iter().map(position).collect()
     }
 
     /// How many episodes it has.
@@ -246,29 +263,53 @@ impl DataSet {
         self.entries.iter().position(|entry| entry.sha256 == sha256)
     }
 
-    /// Appends an episode with its videos, and returns its number. Its features are those of the set, or become them.
+    /// Appends an episode, and returns its number. Its features are those of the set, or become them. If the episodes before
+    /// it were not all appended, its rows are written again.
     ///
     /// # Errors
-    /// When a file cannot be written, or the episode has changed since it was surveyed. The set is then as it was.
+    /// When a file cannot be written, the episode has changed since it was surveyed, or `stop` is set. The set is then as it
+    /// was.
     pub fn append(
         &mut self,
         episode: &Survey,
         features: &Features,
-        Encoded { videos, damaged }: Encoded,
+        prepared: Prepared,
         stop: &AtomicBool,
     ) -> Result<usize, SetError> {
         self.lock(Missing::All)?;
-        let number = self.entries.len();
-        let known = self.tasks.iter().position(|task| task == episode.task());
-        let task = known.unwrap_or(self.tasks.len()) as u64;
+        if stop.load(Ordering::Relaxed) {
+            return Err(Refusal::Interrupted.into());
+        }
+        let (number, tasks) = (self.entries.len(), self.tasks.len());
+        let task = task_number(&mut self.tasks, episode.task());
         let position = Position { episode: number as u64, first: self.rows(), task };
-        let rows = self.write_rows(episode, features, position, damaged, stop)?;
+        let appended = self.append_at(position, episode, features, prepared, stop);
+        if appended.is_err() {
+            self.tasks.truncate(tasks);
+        }
+        appended.map(|()| number)
+    }
+
+    fn append_at(
+        &mut self,
+        position: Position,
+        episode: &Survey,
+        features: &Features,
+        Prepared { position: expected, rows, encoded: Encoded { videos, damaged } }: Prepared,
+        stop: &AtomicBool,
+    ) -> Result<(), SetError> {
+        let rows = if expected == position {
+            rows
+        } else {
+            drop(rows);
+            write_rows(&self.folder, episode, features, position, damaged, stop)?
+        };
         for (video, (key, _)) in videos.into_iter().zip(features.videos()) {
             video.keep(&self.folder.join(files::video(&key, position.episode)))?;
         }
         rows.keep(&self.data_path(position.episode))?;
-        if known.is_none() {
-            self.tasks.push(episode.task().to_owned());
+        let is_new = self.entries.iter().all(|entry| entry.task != position.task);
+        if is_new {
             self.write_tasks()?;
         }
         let entry = Entry {
@@ -276,43 +317,18 @@ impl DataSet {
             sha256: episode.sha256.clone(),
             first: position.first,
             rows: episode.rows as u64,
-            task,
+            task: position.task,
             statistics: statistics(episode, features, position),
         };
         self.write_entry(&entry, episode, features, position)?;
         self.features.get_or_insert_with(|| features.clone());
         merge(&mut self.statistics, &entry.statistics);
         self.entries.push(entry);
-        self.publish()?;
-        Ok(number)
-    }
-
-    fn write_rows(
-        &self,
-        episode: &Survey,
-        features: &Features,
-        position: Position,
-        damaged: Damaged,
-        stop: &AtomicBool,
-    ) -> Result<NewFile, SetError> {
-        let path = self.data_path(position.episode);
-        let new = NewFile::create(&path)?;
-        let wrong = |source| SetError::Parquet { path: path.clone(), source };
-        let mut table = Table::new(new.again()?, features, position).map_err(wrong)?;
-        let mut maker = CellMaker::new(features, episode.kinds.clone())?;
-        maker.damaged = damaged;
-        let index = Index::read(&episode.file, stop)?;
-        index.rows(&episode.file, stop, |row| table.push(&maker.cells(row)?).map_err(wrong))?;
-        table.finish().map_err(wrong)?;
-        // The statistics, and the name by which it is found again, are those of the survey.
-        if sha256(&episode.file).map_err(Refusal::from)? != episode.sha256 {
-            return Err(Refusal::Changed.into());
-        }
-        Ok(new)
+        self.publish()
     }
 
     pub(super) fn data_path(&self, episode: u64) -> PathBuf {
-        self.folder.join(numbered("data", episode, "parquet"))
+        data_path(&self.folder, episode)
     }
 
     /// The videos of an episode, in the order of the cameras.
@@ -504,6 +520,68 @@ impl DataSet {
         }
         Ok(())
     }
+}
+
+fn data_path(folder: &Path, episode: u64) -> PathBuf {
+    folder.join(numbered("data", episode, "parquet"))
+}
+
+/// The number of a task, which is added if it is new.
+fn task_number(tasks: &mut Vec<String>, task: &str) -> u64 {
+    let known = tasks.iter().position(|known| known == task);
+    known.unwrap_or_else(|| {
+        tasks.push(task.to_owned());
+        tasks.len() - 1
+    }) as u64
+}
+
+/// An episode that only lacks its names in the set: its videos, and its rows as they are at one position.
+#[derive(Debug)]
+pub struct Prepared {
+    position: Position,
+    rows: NewFile,
+    encoded: Encoded,
+}
+
+/// Writes the rows of an episode for the data set in `folder`, as they are at `position`. Several may be prepared at a time,
+/// after [`DataSet::begin`], each for a position of its own.
+///
+/// # Errors
+/// When a file cannot be written, or the episode has changed since it was surveyed; also when `stop` is set.
+pub fn prepare(
+    folder: &Path,
+    episode: &Survey,
+    features: &Features,
+    position: Position,
+    encoded: Encoded,
+    stop: &AtomicBool,
+) -> Result<Prepared, SetError> {
+    let rows = write_rows(folder, episode, features, position, encoded.damaged.clone(), stop)?;
+    Ok(Prepared { position, rows, encoded })
+}
+
+fn write_rows(
+    folder: &Path,
+    episode: &Survey,
+    features: &Features,
+    position: Position,
+    damaged: Damaged,
+    stop: &AtomicBool,
+) -> Result<NewFile, SetError> {
+    let path = data_path(folder, position.episode);
+    let new = NewFile::create(&path)?;
+    let wrong = |source| SetError::Parquet { path: path.clone(), source };
+    let mut table = Table::new(new.again()?, features, position).map_err(wrong)?;
+    let mut maker = CellMaker::new(features, episode.kinds.clone())?;
+    maker.damaged = damaged;
+    let index = Index::read(&episode.file, stop)?;
+    index.rows(&episode.file, stop, |row| table.push(&maker.cells(row)?).map_err(wrong))?;
+    table.finish().map_err(wrong)?;
+    // The statistics, and the name by which it is found again, are those of the survey.
+    if sha256(&episode.file).map_err(Refusal::from)? != episode.sha256 {
+        return Err(Refusal::Changed.into());
+    }
+    Ok(new)
 }
 
 /// The statistics of an episode, with those of the columns that every data set has.

@@ -11,11 +11,12 @@ use crate::episode::record_iter::FileEnd;
 use crate::modality::ModalityKind;
 use crate::pixels::{CHANNELS, Picture, Pixels};
 use crate::record::inspect::{self, Inspection, Judgement};
+use crate::registry::{ExportSpec, Form, Registry};
 use crate::status::{Grade, Verdict};
 use crate::text;
 
 /// Numbers that a registry may declare of a sample; what a file claims may be anything.
-const LONGEST: usize = 1 << 16;
+pub(super) const LONGEST: usize = 1 << 16;
 /// Of a picture with more pixels along a side, every n-th of each row and column counts for the statistics, so that
 /// about 150 are left, as in `lerobot.datasets.compute_stats.auto_downsample_height_width`.
 const WIDE: u32 = 300;
@@ -41,6 +42,10 @@ pub struct Survey {
     pub(super) task: String,
     /// Ascending by bit.
     pub(super) streams: Vec<Stream>,
+    /// What `[export]` of its registry chooses; nothing where the registry cannot be read any more.
+    pub export: ExportSpec,
+    /// The names of the axes of an action, if its channel has them.
+    pub(super) action_names: Vec<String>,
     /// By axis; `None` without actions.
     pub(super) action: Option<Vec<Column>>,
     pub(super) time_ns: Column,
@@ -53,9 +58,12 @@ pub struct Survey {
 pub(super) struct Stream {
     pub(super) name: String,
     pub(super) content: Content,
+    /// Of numbers that its registry names: their names.
+    pub(super) names: Vec<String>,
     /// A picture's channels or a vector's columns, over the valid rows.
     pub(super) columns: Vec<Column>,
     pub(super) present: Column,
+    pub(super) plugged: Column,
     pub(super) valid: Column,
     pub(super) age: Column,
 }
@@ -86,6 +94,12 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
     index.rows(path, stop, |row| found.take(row))?;
     let Found { gatherers, time_ns: mut times, actions, unusable, .. } = found;
     let rows = index.ticks.len();
+    // What an earlier version wrote may not be read any more: its numbers have no names then.
+    let registry = Registry::parse(&index.registry, None).ok().map(|loaded| loaded.registry);
+    let named = |gatherer: Gatherer| {
+        let form = registry.as_ref().and_then(|registry| registry.named(&gatherer.name)?.form.as_ref());
+        Stream { names: form.map(Form::names).unwrap_or_default(), ..gatherer.stream(rows) }
+    };
     Ok(Survey {
         file: path.to_owned(),
         bytes: inspection.bytes,
@@ -95,7 +109,9 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         unusable,
         fps: index.fps,
         task: index.task.clone(),
-        streams: gatherers.into_iter().map(|gatherer| gatherer.stream(rows)).collect(),
+        streams: gatherers.into_iter().map(named).collect(),
+        export: registry.as_ref().map(|registry| registry.export.clone()).unwrap_or_default(),
+        action_names: index.action_names.clone(),
         action: index.action_length().map(|_| columns(actions)),
         time_ns: Column::of(&mut times),
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
@@ -152,6 +168,7 @@ impl Found {
             };
             self.unusable += u64::from(sample.is_some() && !is_usable);
             gatherer.present += u64::from(slot.present);
+            gatherer.plugged += u64::from(slot.plugged);
             if slot.valid && is_usable {
                 gatherer.ages.push(slot.age_ns as f64 / 1e9);
             }
@@ -199,6 +216,7 @@ struct Gatherer {
     kind: ModalityKind,
     content: Content,
     present: u64,
+    plugged: u64,
     ages: Vec<f64>,
     /// By column, of the valid rows.
     numbers: Vec<Vec<f64>>,
@@ -230,6 +248,7 @@ impl Gatherer {
             kind: modality.kind,
             content,
             present: 0,
+            plugged: 0,
             ages: Vec::new(),
             numbers: Vec::new(),
             levels: [[0; 256]; CHANNELS],
@@ -306,8 +325,10 @@ impl Gatherer {
         Stream {
             name: self.name,
             content: self.content,
+            names: Vec::new(),
             columns,
             present: Column::of_flags(self.present, rows),
+            plugged: Column::of_flags(self.plugged, rows),
             valid: Column::of_flags(valid, rows),
             age: Column::of(&mut self.ages),
         }

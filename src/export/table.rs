@@ -22,7 +22,7 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 
 use super::cells::Cells;
-use super::features::{ACTION, AGE, Feature, Features, MASK, OWN, STATE, TIME, VALID};
+use super::features::{ACTION, AGE, Feature, Features, MASK, OWN, PLUGGED, STATE, TIME, VALID};
 
 /// Bytes of pictures, and rows, of a group of rows: a reader loads a group at once.
 const GROUP: (usize, usize) = (32 << 20, 1000);
@@ -34,7 +34,7 @@ pub(super) const CREATED_BY: &str = concat!("rapid ", env!("CARGO_PKG_VERSION"))
 
 /// Where an episode is in a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Position {
+pub struct Position {
     pub(super) episode: u64,
     /// Its first row, counted over all episodes.
     pub(super) first: u64,
@@ -74,6 +74,7 @@ struct Columns {
     state: Vec<f32>,
     action: Vec<f32>,
     mask: Vec<f32>,
+    plugged: Vec<f32>,
     valid: Vec<f32>,
     age: Vec<f64>,
     time_ns: Vec<i64>,
@@ -116,6 +117,7 @@ impl Table {
         columns.state.extend(&cells.state);
         columns.action.extend(&cells.action);
         columns.mask.extend(&cells.mask);
+        columns.plugged.extend(&cells.plugged);
         columns.valid.extend(&cells.valid);
         columns.age.extend(&cells.age);
         columns.time_ns.push(cells.time_ns);
@@ -154,6 +156,7 @@ impl Table {
                 STATE => listed(feature, floats(&mut columns.state))?,
                 ACTION => listed(feature, floats(&mut columns.action))?,
                 MASK => listed(feature, floats(&mut columns.mask))?,
+                PLUGGED => listed(feature, floats(&mut columns.plugged))?,
                 VALID => listed(feature, floats(&mut columns.valid))?,
                 AGE => listed(feature, Arc::new(Float64Array::from(std::mem::take(&mut columns.age))))?,
                 TIME => Arc::new(Int64Array::from(std::mem::take(&mut columns.time_ns))),

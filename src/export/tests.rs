@@ -5,20 +5,26 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use super::cells::CellMaker;
-use super::features::{Actions, Features, MASK, STATE, VALID};
+use super::features::{Axis, Choice, Features, MASK, Origin, PLUGGED, STATE, VALID};
 use super::picture::{Codec, Pictures, Shape};
-use super::rows::{Index, Refusal, Row};
+use super::rows::{Index, Listed, Refusal, Row};
+use super::set::{DataSet, SetError, prepare};
+use super::statistics::Column;
+use super::survey::{Content, Stream, Survey};
 use super::table::{Position, Rows, Table};
-use super::video::{FrameMaker, Shown};
+use super::verify::verify;
+use super::video::{Encoded, FrameMaker, Shown};
 use crate::action::ACTION_TOPIC;
 use crate::episode::encode;
 use crate::episode::schema::{FRAME, SampleSchema};
-use crate::episode::{FRAME_TOPIC, text_map};
+use crate::episode::{FRAME_TOPIC, sha256, text_map};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::observation::Observation;
 use crate::pixels::{Picture, Pixels};
+use crate::registry::ExportSpec;
 use crate::sample::{Encoding, SampleHeader};
+use crate::status::Grade;
 
 const BEGIN: u64 = 1_700_000_000_000_000_000;
 const GREY: [u8; 8] = [0, 30, 60, 90, 120, 150, 180, 255];
@@ -30,6 +36,8 @@ struct Recording {
     path: PathBuf,
     writer: mcap::Writer<std::io::BufWriter<File>>,
     message: Vec<u8>,
+    /// The tick at which devices without a sample are plugged in: their drivers do not run. At others they are unplugged.
+    crashed: u32,
 }
 
 impl Recording {
@@ -41,7 +49,7 @@ impl Recording {
         let about = [("modalities", modalities), ("observation_hz", "10"), ("task", "x")];
         let metadata = text_map(about.map(|(key, value)| (key, value.to_owned())));
         writer.write_metadata(&mcap::records::Metadata { name: "rapid".into(), metadata }).unwrap();
-        Self { path, writer, message: Vec::new() }
+        Self { path, writer, message: Vec::new(), crashed: 3 }
     }
 
     fn write(&mut self, schema: (&str, &[u8]), topic: &str, bit: Option<u8>, sequence: u32, at_ms: u64) {
@@ -58,6 +66,7 @@ impl Recording {
         let mut observation = Observation::new(&[0, 4].map(|bit| ModalityId::new(bit).unwrap()));
         for (slot, seq) in observation.slots.iter_mut().zip(named) {
             (slot.present, slot.valid, slot.seq) = (seq.is_some(), seq.is_some(), seq);
+            slot.plugged = seq.is_some() || number == self.crashed;
             observation.mask = PhysicalMask(observation.mask.0 | u64::from(seq.is_some()) << slot.id.bit());
         }
         let at_ms = u64::from(number) * 100;
@@ -110,7 +119,8 @@ fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
         cameras: vec![(0, shape)],
         pictures: Pictures::Video(Codec::Av1),
         state: Vec::new(),
-        actions: Actions::Absent,
+        action: Vec::new(),
+        choice: Choice::default(),
     };
     let kinds = index.modalities.iter().map(|modality| modality.kind).collect();
     let (mut frames, mut maker) = (FrameMaker::default(), CellMaker::new(&features, kinds).unwrap());
@@ -132,6 +142,10 @@ fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
     assert_eq!(found, expected);
 }
 
+fn axis(origin: Origin, at: usize) -> Axis {
+    Axis { origin, at, name: String::new() }
+}
+
 fn rgb(encoding: Encoding, bytes: &[u8]) -> Vec<u8> {
     let mut pixels = Pixels::default();
     pixels.decode(&Picture { encoding, width: 4, height: 2, bytes }).unwrap();
@@ -143,6 +157,94 @@ fn decoded(file: &[u8]) -> Vec<u8> {
     let mut values = vec![0; reader.output_buffer_size().unwrap()];
     reader.next_frame(&mut values).unwrap();
     values
+}
+
+/// Of an episode without statistics.
+fn surveyed(path: &Path, task: &str) -> Survey {
+    let index = Index::read(path, &AtomicBool::new(false)).unwrap();
+    let none = Column::default();
+    let stream = |listed: &Listed| Stream {
+        name: listed.name.clone(),
+        content: Content::Bytes,
+        names: Vec::new(),
+        columns: Vec::new(),
+        present: none,
+        plugged: none,
+        valid: none,
+        age: none,
+    };
+    Survey {
+        file: path.to_owned(),
+        bytes: 0,
+        sha256: sha256(path).unwrap(),
+        grade: Grade::Good,
+        rows: index.ticks.len(),
+        unusable: 0,
+        fps: index.fps,
+        task: task.to_owned(),
+        streams: index.modalities.iter().map(stream).collect(),
+        export: ExportSpec::default(),
+        action_names: Vec::new(),
+        action: None,
+        time_ns: none,
+        kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
+    }
+}
+
+#[test]
+fn rows_that_were_prepared_for_another_position_are_written_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let recorded = |name: &str, value: f64, crashed: u32| {
+        let folder = folder.path().join(name);
+        std::fs::create_dir(&folder).unwrap();
+        let mut recording = Recording { crashed, ..Recording::new(&folder) };
+        for number in 0..3 {
+            recording.frame(number, [None, Some(number.into())]);
+            recording.numbers(Some(4), number, &[value]);
+        }
+        recording.end()
+    };
+    let (first, second) = (recorded("first", 1.0, 1), recorded("second", 2.0, 1));
+    let (first, second) = (surveyed(&first, "push"), surveyed(&second, "pull"));
+    let features = Features {
+        fps: first.fps,
+        modalities: vec!["cam".to_owned(), "force".to_owned()],
+        cameras: Vec::new(),
+        pictures: Pictures::Files,
+        state: vec![axis(Origin::Modality(1), 0)],
+        action: Vec::new(),
+        choice: Choice::default(),
+    };
+    let stop = AtomicBool::new(false);
+    // Of the second episode alone, prepared for its position behind others.
+    let appended = |name: &str, others: &[&Survey]| {
+        let out = folder.path().join(name);
+        let mut set = DataSet::open(&out).unwrap();
+        set.begin(&features).unwrap();
+        let position = *set.positions(others.iter().copied().chain([&second])).last().unwrap();
+        let prepared = prepare(&out, &second, &features, position, Encoded::default(), &stop).unwrap();
+        assert_eq!(set.append(&second, &features, prepared, &stop).unwrap(), 0);
+        let different = |file: &Path| verify(&set, 0, file, None, &stop).unwrap().differences;
+        assert_eq!(different(&second.file), []);
+        let of_state = different(&first.file);
+        assert!(of_state.len() == 3 && of_state.iter().all(|found| found.feature.as_deref() == Some(STATE)));
+        // At the other tick the camera is plugged in, and its driver does not run.
+        let of_plugged = different(&recorded(&format!("{name} crashed"), 2.0, 2));
+        let of_plugged: Vec<_> = of_plugged.iter().map(|found| (found.frame, found.feature.as_deref())).collect();
+        assert_eq!(of_plugged, [1, 2].map(|frame| (Some(frame), Some(PLUGGED))));
+        let files = ["data/chunk-000/file-000.parquet", "meta/tasks.parquet"];
+        (position, files.map(|file| std::fs::read(out.join(file)).unwrap()))
+    };
+    let ((position, again), (first_position, once)) = (appended("again", &[&first]), appended("once", &[]));
+    assert_eq!(position, Position { episode: 1, first: 3, task: 1 });
+    assert_eq!(first_position, Position { episode: 0, first: 0, task: 0 });
+    assert!(again == once, "they differ");
+    let mut set = DataSet::open(&folder.path().join("stopped")).unwrap();
+    let prepared = prepare(set.folder(), &first, &features, first_position, Encoded::default(), &stop).unwrap();
+    stop.store(true, std::sync::atomic::Ordering::Relaxed);
+    let refused = set.append(&first, &features, prepared, &stop);
+    assert!(matches!(refused, Err(SetError::Refused(Refusal::Interrupted))), "{refused:?}");
+    assert_eq!(set.episodes(), 0);
 }
 
 #[test]
@@ -169,9 +271,10 @@ fn raw_pictures_lose_nothing_and_what_cannot_be_used_is_black_and_not_valid() {
         fps: index.fps,
         modalities: vec!["cam".to_owned(), "force".to_owned()],
         cameras: vec![(0, Shape::new(2, 4, 3).unwrap())],
-        state: vec![(1, 1)],
+        state: vec![axis(Origin::Modality(1), 0)],
         pictures: Pictures::Files,
-        actions: Actions::Topic(2),
+        action: vec![axis(Origin::Topic, 1), axis(Origin::Modality(1), 0), axis(Origin::Topic, 0)],
+        choice: Choice::default(),
     };
     let kinds = index.modalities.iter().map(|modality| modality.kind).collect();
     let mut maker = CellMaker::new(&features, kinds).unwrap();
@@ -197,10 +300,12 @@ fn raw_pictures_lose_nothing_and_what_cannot_be_used_is_black_and_not_valid() {
     for (number, (picture, force, mask, valid)) in (0_i64..).zip(expected) {
         let row = rows.advance().unwrap().expect("a row");
         assert_eq!(decoded(row.picture(CAMERA).unwrap()), picture, "{number}");
+        let plugged = if number == 4 { vec![1.0, 0.0] } else { vec![1.0, 1.0] };
+        assert_eq!(row.numbers(PLUGGED).unwrap(), plugged, "{number}");
         // A feature of one number is a plain column.
         assert_eq!(row.numbers(STATE).unwrap(), [force], "{number}");
         assert_eq!((row.numbers(MASK).unwrap(), row.numbers(VALID).unwrap()), (mask.into(), valid.into()), "{number}");
-        assert_eq!(row.numbers("action").unwrap(), [1.0, 2.0]);
+        assert_eq!(row.numbers("action").unwrap(), [2.0, force, 1.0], "{number}");
         let own = ["episode_index", "frame_index", "index", "task_index"].map(|key| row.integer(key).unwrap());
         assert_eq!(own, [3, number, 70 + number, 1]);
     }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::cells::{CellMaker, Cells};
-use super::features::{ACTION, AGE, Features, MASK, OWN, STATE, TIME, VALID};
+use super::features::{ACTION, AGE, Features, MASK, OWN, PLUGGED, STATE, TIME, VALID};
 use super::ffmpeg::{Ffmpeg, FfmpegError, Running};
 use super::rows::{Index, Row};
 use super::set::{DataSet, SetError};
@@ -202,6 +202,7 @@ impl Found<'_> {
             (STATE, wide(&cells.state)),
             (ACTION, wide(&cells.action)),
             (MASK, wide(&cells.mask)),
+            (PLUGGED, wide(&cells.plugged)),
             (VALID, wide(&cells.valid)),
             (AGE, cells.age.clone()),
             (OWN[0], vec![timestamp(row, features.fps).into()]),

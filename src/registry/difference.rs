@@ -25,10 +25,13 @@ impl Difference {
     /// From the registry of a run to a new one.
     pub fn between(running: &Registry, new: &Registry) -> Self {
         let mut found = Self::default();
-        let Registry { rig, inference, devices, modules, stops, buttons, path: _, text: _ } = running;
+        let Registry { rig, inference, export, devices, modules, stops, buttons, path: _, text: _ } = running;
         found.rig(rig, &new.rig);
         if *inference != new.inference {
             found.needs_restart.push("[inference]: it changed, and is read at the start".to_owned());
+        }
+        if *export != new.export {
+            found.needs_restart.push("[export]: it changed, and episodes have the registry of the start".to_owned());
         }
         for device in devices {
             match new.named(&device.name) {

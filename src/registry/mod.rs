@@ -8,6 +8,7 @@ pub mod ablation;
 pub mod artifacts;
 pub mod candidate;
 pub mod catalogue;
+pub mod columns;
 mod diagnostic;
 mod difference;
 pub mod edit;
@@ -30,11 +31,12 @@ pub use parse::{BUILTIN, Loaded, like_a_name, name_problem};
 pub use section::read_file;
 pub use spec::{
     ActionSpec, Bound, BrakeSpec, ButtonAction, ButtonSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CalibrationSpec,
-    CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, EffectorSpec, FieldInput, Form, Framing,
-    GpioInput, GripperSpec, Hook, Hooks, IdentitySpec, InferenceSpec, InputSpec, InterlockSpec, JointsSpec, KeyInput,
-    LanFind, LanPicture, LanProtocol, LanSpec, Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS, MAX_MOTORS,
-    MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount,
-    NodeSpec, Opens, POOL_SPARE, POSE_ENDING, PREVIEW_DECODER, Parse, PhoneStream, PixelFormat, PointsSpec, PoseLayout,
-    PoseSpec, Probe, ProcessSpec, Provider, Quantity, Registry, RemoteSamples, RigSpec, SLCAN_BITRATES, SerialSpec,
-    Stop, StopSpec, TipForm, TipRotation, TransformSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale, mounted, own_side,
+    CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, EffectorSpec, ExportSpec, FieldInput, Form,
+    Framing, GpioInput, GripperSpec, Hook, Hooks, IdentitySpec, InferenceSpec, InputSpec, InterlockSpec, JointsSpec,
+    KeyInput, LanFind, LanPicture, LanProtocol, LanSpec, Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS,
+    MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec,
+    Mount, NodeSpec, Opens, POOL_SPARE, POSE_ENDING, PREVIEW_DECODER, Parse, PhoneStream, PixelFormat, PointsSpec,
+    PoseLayout, PoseSpec, Probe, ProcessSpec, Provider, Quantity, Registry, RemoteSamples, RigSpec, SLCAN_BITRATES,
+    SerialSpec, Stop, StopSpec, TipForm, TipRotation, TransformSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale,
+    mounted, own_side,
 };

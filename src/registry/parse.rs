@@ -9,6 +9,7 @@
 mod button;
 mod device;
 mod effector;
+mod export;
 mod form;
 mod identity;
 mod input;
@@ -26,8 +27,8 @@ use std::time::Duration;
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
 use super::section::{Section, file_label, read, read_file};
 use super::spec::{
-    DeviceSpec, IdentitySpec, InferenceSpec, NodeSpec, POOL_SPARE, Provider, RESERVED_BYTES, Registry, RigSpec,
-    SAMPLE_OVERHEAD,
+    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, POOL_SPARE, Provider, RESERVED_BYTES, Registry,
+    RigSpec, SAMPLE_OVERHEAD,
 };
 use super::trust::distrust;
 use super::units::{show_duration, show_size};
@@ -103,10 +104,11 @@ impl Registry {
     /// A rig without entries, to which they are added while it runs; `path` is the file that they are written to.
     pub fn empty(path: &Path) -> Self {
         let (devices, modules, stops, buttons) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        let inference = InferenceSpec::default();
+        let (inference, export) = (InferenceSpec::default(), ExportSpec::default());
         Self {
             rig: rig(None),
             inference,
+            export,
             devices,
             modules,
             stops,
@@ -119,7 +121,7 @@ impl Registry {
 
 /// The content of the tables of the text.
 fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Registry, RegistryErrors> {
-    root.allow(&["rig", "inference", "verdict", "device", "module", "stop", "button"]);
+    root.allow(&["rig", "inference", "export", "verdict", "device", "module", "stop", "button"]);
     let section = root.table("rig");
     let mut rig = rig(section.as_ref());
     let inference = root.table("inference").map(|section| inference(&section)).unwrap_or_default();
@@ -144,6 +146,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     let modules = module::modules(root, &drafts);
     let stops = interlock::interlocks(root, &drafts);
     let buttons = button::buttons(root, &drafts, &stops);
+    let export = root.table("export").map(|section| export::read(&section, &drafts)).unwrap_or_default();
     root.check()?;
 
     let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict, rig.sync_window)).collect();
@@ -156,7 +159,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
             lan.keep_free(rig.disk_reserve);
         }
     }
-    Ok(Registry { rig, inference, devices, modules, stops, buttons, path: None, text: String::new() })
+    Ok(Registry { rig, inference, export, devices, modules, stops, buttons, path: None, text: String::new() })
 }
 
 fn rig(section: Option<&Section<'_>>) -> RigSpec {

@@ -4,6 +4,7 @@
 //! unique; no two entries of one kind of node identify the same unit; `Registry::devices` is in
 //! ascending order of bit.
 
+mod export;
 mod form;
 mod inference;
 mod input;
@@ -22,6 +23,7 @@ use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::points::PacketFormat;
 use crate::sample::{Encoding, SampleHeader};
 
+pub use export::ExportSpec;
 pub use form::{CalibrationSpec, Form, JointsSpec, POSE_ENDING, PointsSpec, PoseLayout, PoseSpec, Quantity, TipForm};
 pub use inference::{InferenceSpec, Provider};
 pub use input::{
@@ -59,6 +61,8 @@ pub struct Registry {
     pub rig: RigSpec,
     /// The `[inference]` table.
     pub inference: InferenceSpec,
+    /// The `[export]` table.
+    pub export: ExportSpec,
     /// One entry per modality, ascending by bit, at least one, at most 64.
     pub devices: Vec<DeviceSpec>,
     /// The modules that can be mounted, in the order of the file.

@@ -31,7 +31,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_reported_in_full() {
-    mistakes::check("registry/invalid", "toml", 285, |text| {
+    mistakes::check("registry/invalid", "toml", 293, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });
@@ -79,6 +79,29 @@ fn defaults_match_the_documentation() {
         "devices.toml:1:9: [device.cam] no bit given, it gets bit 0: another entry above it would move it\n    \
          fix: pin it with bit = 0; a policy is trained on bit positions"
     );
+}
+
+#[test]
+fn the_columns_of_an_export_are_parsed_and_its_numbers_have_names() {
+    let Loaded { registry, warnings } = valid("export");
+    assert_eq!(warnings, []);
+    assert_eq!(registry.export.state, ["arm.position", "tracker", "counter"]);
+    assert_eq!(registry.export.action, ["/action.x", "arm.1-1"]);
+    let names = |registry: &Registry, at: usize| registry.devices[at].form.as_ref().map(Form::names);
+    let named = |names: &[&str]| Some(names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>());
+    assert_eq!(names(&registry, 0), named(&["hip.position", "hip.velocity", "knee.position", "knee.velocity"]));
+    assert_eq!(names(&registry, 1), named(&["x", "y", "z", "qx", "qy", "qz", "qw"]));
+    let none = valid("minimal").registry;
+    assert_eq!((none.export.state.len(), none.export.action.len(), names(&none, 0)), (0, 0, None));
+    // In every registry as many names as numbers, none twice.
+    for path in files("valid") {
+        let loaded = Registry::parse(&mistakes::read(&path), Some(&path)).unwrap();
+        for form in loaded.registry.devices.iter().filter_map(|device| device.form.as_ref()) {
+            let names = form.names();
+            assert_eq!(names.len(), form.numbers(), "{}", path.display());
+            assert_eq!(names.iter().collect::<BTreeSet<_>>().len(), names.len(), "{names:?}");
+        }
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use arrow_array::cast::AsArray;
@@ -12,6 +12,7 @@ use arrow_array::{ArrayRef, RecordBatch};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use rapid::cli::{ExportArgs, Layout};
 use rapid::commands::{self, Format};
+use rapid::registry::BUILTIN;
 use serde_json::Value;
 
 use crate::support::{Episode, Place};
@@ -55,10 +56,24 @@ fn record(place: &Place, out: &str, duration: &str, words: &[&str]) -> String {
 }
 
 /// The rows of a table.
-fn rows(place: &Place, name: &str) -> Vec<RecordBatch> {
+pub(crate) fn rows(place: &Place, name: &str) -> Vec<RecordBatch> {
     let file = File::open(place.path(name)).expect("the table");
     let reader = ParquetRecordBatchReaderBuilder::try_new(file).expect("Parquet").build().expect("Parquet");
     reader.collect::<Result<_, _>>().expect("rows")
+}
+
+/// Of each row, the numbers of a feature.
+pub(crate) fn numbers(place: &Place, name: &str, feature: &str) -> Vec<Vec<f32>> {
+    let of_row = |batch: &RecordBatch| {
+        let column = batch.column_by_name(feature).expect("a column");
+        let row = |at| {
+            // One number is a plain column.
+            let row = column.as_fixed_size_list_opt().map_or_else(|| column.slice(at, 1), |lists| lists.value(at));
+            row.as_primitive::<Float32Type>().values().to_vec()
+        };
+        (0..batch.num_rows()).map(row).collect::<Vec<_>>()
+    };
+    rows(place, name).iter().flat_map(of_row).collect()
 }
 
 /// Mask, valid modalities, the file of a picture.
@@ -122,6 +137,11 @@ fn an_unplugged_sensor_is_black_with_its_mask_and_a_changed_byte_is_found() {
     let first = wrist.iter().position(|(.., picture)| picture.starts_with(JPEG)).expect("a picture");
     assert!(wrist[..first].iter().all(|(_, valid, _)| !valid[0]));
     assert!(wrist[first..].iter().all(|(mask, _, picture)| mask[0] && picture.starts_with(JPEG)));
+    // What is present is plugged in; the tactile camera is neither for a time.
+    let [masks, plugged] = ["rapid.mask", "rapid.plugged"].map(|feature| numbers(&place, DATA, feature));
+    assert!(masks.iter().flatten().zip(plugged.iter().flatten()).all(|(mask, plugged)| mask <= plugged));
+    let is_unplugged = |row: &Vec<f32>| row.iter().map(|flag| *flag > 0.5).eq([true, false, true]);
+    assert!(plugged.iter().any(is_unplugged), "{plugged:?}");
     // Over the valid rows alone: the black ones would be the least.
     let statistics = json(&place, "set/meta/stats.json");
     let count = statistics["observation.images.tactile_tip"]["count"][0].as_u64().expect("a count");
@@ -218,7 +238,7 @@ fn nothing_left(place: &Place, short: &str, slow: &str) {
     };
     let unknown = state(&["--state", "cam_wrist"]);
     let text = String::from_utf8_lossy(&unknown.stderr).into_owned();
-    assert!(text.contains("\"cam_wrist\" is no sensor of numbers; of this episode they are motor_state"), "{text}");
+    assert!(text.contains("\"cam_wrist\" is no sensor of numbers; those are motor_state"), "{text}");
     assert!(text.contains("error: nothing exported: none of 1 episode"), "{text}");
     assert_eq!((unknown.status.code(), place.path("other").exists()), (Some(1), false));
     let as_action = state(&["--state", "motor_state", "--action", "motor_state"]);
@@ -235,6 +255,88 @@ fn nothing_left(place: &Place, short: &str, slow: &str) {
     let foreign = place.run(&["export", slow, "--to", "lerobot", "--out", "out"]);
     assert_eq!(foreign.status.code(), Some(2), "{foreign:?}");
     assert!(String::from_utf8_lossy(&foreign.stderr).contains("--out takes a new folder"), "{foreign:?}");
+}
+
+/// All files of a folder with their contents, by their path in it.
+fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let (mut found, mut folders) = (BTreeMap::new(), vec![folder.to_owned()]);
+    while let Some(next) = folders.pop() {
+        for entry in std::fs::read_dir(&next).expect("a folder").flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let bytes = std::fs::read(&path).expect("a file");
+                found.insert(path.strip_prefix(folder).expect("below it").to_owned(), bytes);
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn one_worker_and_several_write_the_same_bytes() {
+    let place = Place::new();
+    for task in ["push", "pull", "push", "lift"] {
+        record(&place, "out", "1s", &["--sim", "--task", task]);
+    }
+    let exported = |set: &str, jobs: &str| {
+        let common = ["export", "out", "--to", "lerobot", "--include-bad", "--verify", "--out", set, "--jobs", jobs];
+        let output = place.run(&common);
+        assert_eq!(output.status.code(), Some(0), "{output:?}");
+        contents(&place.path(set))
+    };
+    let (one, several) = (exported("one", "1"), exported("several", "4"));
+    assert_eq!(one.keys().collect::<Vec<_>>(), several.keys().collect::<Vec<_>>());
+    assert_eq!(one.keys().filter(|path| path.starts_with("data")).count(), 4);
+    for (path, bytes) in &one {
+        assert!(several[path] == *bytes, "{} differs", path.display());
+    }
+}
+
+#[test]
+fn columns_are_chosen_by_the_registry_of_the_episode_and_by_options() {
+    let place = Place::new();
+    let joints = "[device.motor_state.joints]\nnames = [\"hip\", \"knee\", \"ankle\"]\n";
+    let chosen = "[export]\nstate = [\"motor_state.knee\", \"motor_state.0\"]\naction = [\"motor_state.2\"]\n";
+    place.write("devices.toml", &format!("{BUILTIN}\n{joints}{chosen}"));
+    let first = record(&place, "out", "1500ms", &["--sim", "--config", "devices.toml"]);
+    // It is the episode's registry that counts, and not what the file holds now.
+    place.write("devices.toml", BUILTIN);
+    let (objects, code) = export(&place, &[&first, "--include-bad", "--verify"]);
+    assert_eq!((code, &of(&objects, "export")[0]["differences"]), (0, &0.into()), "{objects:?}");
+    let [state, action] =
+        ["observation.state", "action"].map(|key| json(&place, "set/meta/info.json")["features"][key].clone());
+    assert_eq!(state["names"], serde_json::json!(["motor_state.knee.position", "motor_state.hip.position"]));
+    assert_eq!(state["columns"], serde_json::json!(["motor_state.1", "motor_state.0"]));
+    assert_eq!(state["chosen"], serde_json::json!(["motor_state.knee", "motor_state.0"]));
+    assert_eq!(
+        (&action["names"][0], &action["shape"]),
+        (&"motor_state.ankle.position".into(), &serde_json::json!([1]))
+    );
+
+    // Options come before the registry; the numbers are the same ones, of the same tick.
+    let words = ["export", first.as_str(), "--to", "lerobot", "--include-bad", "--verify", "--out", "other"];
+    let output =
+        place.run(&[&words[..], &["--state", "motor_state", "--action", "motor_state.1-2,motor_state.hip"]].concat());
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let other = "other/data/chunk-000/file-000.parquet";
+    let all = numbers(&place, other, "observation.state");
+    let picked = |picked: &[usize]| -> Vec<Vec<f32>> {
+        all.iter().map(|row| picked.iter().map(|at| row[*at]).collect()).collect()
+    };
+    assert!(all.iter().flatten().any(|number| *number != 0.0));
+    assert_eq!(numbers(&place, DATA, "observation.state"), picked(&[1, 0]));
+    assert_eq!(numbers(&place, DATA, "action"), picked(&[2]));
+    assert_eq!(numbers(&place, other, "action"), picked(&[1, 2, 0]));
+    let statistics = [json(&place, "set/meta/stats.json"), json(&place, "other/meta/stats.json")];
+    assert_eq!(statistics[0]["observation.state"]["mean"][0], statistics[1]["observation.state"]["mean"][1]);
+
+    // An episode without these names does not fit, and names what it has.
+    let second = record(&place, "out", "1500ms", &["--sim"]);
+    let (objects, _) = export(&place, &[&first, &second, "--include-bad"]);
+    let outcome = outcomes(&objects)[second.rsplit('/').next().expect("a name")].clone();
+    assert_eq!(outcome, "left_out: \"motor_state.knee\": motor_state has no column \"knee\"; it has 0-2");
 }
 
 /// Sets a flag as soon as an episode is exported.
@@ -266,9 +368,10 @@ fn an_interrupted_export_has_the_episodes_so_far() {
         out: place.path("set"),
         include_bad: true,
         state: Vec::new(),
-        action: None,
+        action: Vec::new(),
         pictures: None,
         ffmpeg: None,
+        jobs: None,
         verify: true,
     };
     let stop = AtomicBool::new(true);

@@ -223,6 +223,72 @@ fn every_frame_tells_a_crash_from_an_unplug() {
 }
 
 #[test]
+fn a_crash_a_stall_and_an_unplug_are_three_things_in_every_frame_and_in_a_data_set() {
+    // Present, plugged and valid.
+    const RUNNING: [bool; 3] = [true, true, true];
+    const CRASHED: [bool; 3] = [false, true, false];
+    const STALLED: [bool; 3] = [true, true, false];
+    const UNPLUGGED: [bool; 3] = [false, false, false];
+    let place = Place::new();
+    let entry = |name: &str, bit: usize, args: &str, more: &str| {
+        format!(
+            "[device.{name}]\nvid = \"2e8a\"\npid = \"000a\"\nserial = \"C{bit}\"\nnode = \"{}\"\nbit = {bit}\n\
+             [device.{name}.process]\nargs = [\"--rate\", \"100\", {args}, \"20\"]\nkind = \"scalars\"\nchannels = 2\n{more}\n",
+            program().display()
+        )
+    };
+    let crashing = entry("crashing", 0, "\"--crash-after\"", "");
+    let stalling = entry("stalling", 1, "\"--silent-after\"", "heartbeat = \"200ms\"");
+    place.write("devices.toml", &format!("[rig]\ncooldown = \"200ms\"\n{crashing}{stalling}"));
+    let scenario = "[[device]]\nname = \"crashing\"\n[[device]]\nname = \"stalling\"\n\
+                    [[event]]\nat = \"4s\"\nunplug = \"crashing\"\n[[event]]\nat = \"4200ms\"\nunplug = \"stalling\"\n";
+    let output = place.run(&[&sim(&place, scenario)[..], &["--record", "--out", "out", "--duration", "6s"]].concat());
+    let text = String::from_utf8_lossy(&output.stdout);
+    let episode = Episode::read(&place.path("out").join(&place.episodes("out")[0]));
+    let frames = episode.frames();
+    // By frame.
+    let shown = |bit: usize| -> Vec<[bool; 3]> {
+        let of = |frame: &support::FrameMessage| {
+            let slot = &frame.modalities[bit];
+            [slot.present, slot.plugged, slot.valid]
+        };
+        frames.iter().map(|(_, frame)| of(frame)).collect()
+    };
+    let longest = |shown: &[[bool; 3]], wanted: [bool; 3]| {
+        shown.chunk_by(|one, next| one == next).filter(|run| run[0] == wanted).map(<[_]>::len).max().unwrap_or(0)
+    };
+    let (crashing, stalling) = (shown(0), shown(1));
+    for shown in [&crashing, &stalling] {
+        assert!(shown.contains(&RUNNING) && shown.contains(&CRASHED), "{shown:?} {text}");
+        assert!(shown.iter().all(|flags| [RUNNING, CRASHED, STALLED, UNPLUGGED].contains(flags)), "{shown:?}");
+        // Unplugged to the end, and at no crash and no stall before.
+        let unplugged = shown.iter().rposition(|flags| *flags != UNPLUGGED).map_or(0, |last| last + 1);
+        assert!(unplugged < shown.len(), "{shown:?} {text}");
+        let plugged = shown.iter().position(|flags| flags[1]).expect("plugged in");
+        assert!(shown[plugged..unplugged].iter().all(|flags| flags[1]), "{shown:?}");
+    }
+    // Silent for five heartbeats with its bit set before it is ended: 30 ticks, of which one or the other is at an edge.
+    assert!(longest(&stalling, STALLED) >= 10, "{stalling:?} {text}");
+
+    let words = ["export", "out", "--to", "lerobot", "--out", "set", "--include-bad", "--verify"];
+    let output = place.run(&words);
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let data = "set/data/chunk-000/file-000.parquet";
+    let [mask, plugged, valid] =
+        ["rapid.mask", "rapid.plugged", "rapid.valid"].map(|feature| crate::export::numbers(&place, data, feature));
+    for (bit, shown) in [crashing, stalling].iter().enumerate() {
+        let of = |rows: &[Vec<f32>]| rows.iter().map(|row| row[bit] > 0.5).collect::<Vec<_>>();
+        let found: Vec<[bool; 3]> = of(&mask)
+            .into_iter()
+            .zip(of(&plugged))
+            .zip(of(&valid))
+            .map(|((mask, plugged), valid)| [mask, plugged, valid])
+            .collect();
+        assert_eq!(&found, shown);
+    }
+}
+
+#[test]
 fn a_program_that_floods_its_output_is_thinned_and_its_samples_are_whole() {
     let place = Place::new();
     registry(&place, ", \"--flood-stderr\"", "");

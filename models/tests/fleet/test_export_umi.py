@@ -70,7 +70,7 @@ class Buffer(Folder):
         rows = [by_time[int(time)] for time in data["rapid_time_ns"][:]]
         # The motor is there from the beginning to the end, or the pose would have a gap.
         self.assertEqual(rows, [row for row in self.rows if row["valid"][2]])
-        for name in ("mask", "valid", "age"):
+        for name in ("mask", "plugged", "valid", "age"):
             self.assertEqual(data[f"rapid_{name}"][:].tolist(), [row[name] for row in rows])
         self.assertEqual(data["rapid_mask"].attrs["names"], [*CAMERAS, "motor_state"])
         motor = np.array([row["samples"][2].values for row in rows], "f4")

@@ -64,6 +64,7 @@ class ExportedDataSet(Folder):
         absent = 0
         for found, expected in zip(table, self.rows, strict=True):
             self.assertEqual(found["rapid.mask"], expected["mask"])
+            self.assertEqual(found["rapid.plugged"], expected["plugged"])
             self.assertEqual(found["rapid.valid"], expected["valid"])
             self.assertEqual(found["rapid.age"], expected["age"])
             self.assertEqual(found["rapid.time_ns"], expected["time_ns"])
@@ -133,11 +134,26 @@ class ExportedDataSet(Folder):
         aggregate_datasets(["rapid/one", "rapid/two"], "rapid/both", roots=roots, aggr_root=folder / "both")
         both = LeRobotDataset("rapid/both", root=folder / "both")
         self.assertEqual((both.num_episodes, len(both)), (2, len(self.rows)))
-        for at in range(0, len(both), 17):
+        self.assertEqual(both.features, self.data.features)
+        for at in range(len(both)):
             merged, ours = both[at], self.data[at]
+            self.assertEqual(merged.keys(), ours.keys())
             for key in ours:
                 if isinstance(ours[key], torch.Tensor):
-                    torch.testing.assert_close(merged[key], ours[key], msg=key)
+                    self.assertTrue(torch.equal(merged[key], ours[key]), f"frame {at}, {key}")
+                else:
+                    self.assertEqual(merged[key], ours[key], f"frame {at}, {key}")
+        # LeRobot merges the statistics of the numbers that it gives anew as they were before.
+        merged, ours = both.meta.stats, self.data.meta.stats
+        anew = {"episode_index", "index", "task_index"}
+        self.assertEqual(merged.keys(), ours.keys())
+        for key in sorted(ours.keys() - anew):
+            # Of ages, each sensor has its own count of rows, of which LeRobot knows the largest: it weighs by that.
+            names = ("min", "max") if key == "rapid.age" else sorted(ours[key].keys() & merged[key].keys())
+            self.assertLessEqual({"min", "max"}, set(names))
+            for name in names:
+                found, expected = merged[key][name], ours[key][name]
+                np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=f"{key} {name}")
 
 
 @unittest.skipUnless(shutil.which("ffmpeg"), "skipped: no ffmpeg, which encodes the videos")
@@ -215,7 +231,15 @@ class ExportedActions(unittest.TestCase):
             expected = [action for path in sorted((folder / "out").glob("*.mcap")) for action in read_actions(path)]
             found = [data[at]["action"].tolist() for at in range(len(data))]
             self.assertEqual(found, np.array(expected, np.float32).tolist())
+            self.assertEqual(data.features["action"]["names"], action_names(next((folder / "out").glob("*.mcap"))))
             np.testing.assert_allclose(data.meta.stats["action"]["mean"], np.mean(found, axis=0), atol=1e-6)
+
+
+def action_names(path: Path) -> list[str]:
+    """The axes of an action, as the channel lists them."""
+    with path.open("rb") as file:
+        channels = make_reader(file).get_summary().channels.values()
+        return json.loads(next(channel.metadata["names"] for channel in channels if channel.topic == "/action"))
 
 
 def read_actions(path: Path) -> list[list[float]]:

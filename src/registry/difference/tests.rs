@@ -88,6 +88,7 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
         ),
         ("the rig", RIG.replace("\"1s\"", "\"2s\"").replace("bench", "bank"), &[], &["[rig]: name, cooldown changed"]),
         ("an expectation", RIG.replace("cooldown", "expect = [\"cam\"]\ncooldown"), &[], &["[rig]: expect changed"]),
+        ("an export", with("[export]\nstate = [\"tof\"]"), &[], &["[export]: it changed"]),
         ("a module", RIG.replace("soft_tip", "hard_tip"), &[], &["[module]: soft_tip removed"]),
         ("a new module", with("[module.hard]\nslot = \"front\""), &[], &[]),
         (

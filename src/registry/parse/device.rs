@@ -13,6 +13,7 @@ use super::verdict::{VerdictTable, Whose};
 use super::{form, identity, lan, motors, node, verdict};
 use crate::action::MAX_ACTION;
 use crate::modality::{ModalityId, ModalityKind};
+use crate::registry::columns::Vector;
 use crate::registry::section::Section;
 use crate::registry::spec::VerdictSpec;
 use crate::registry::spec::{
@@ -91,6 +92,18 @@ pub(super) struct Draft<'a> {
 }
 
 impl<'d> Draft<'d> {
+    /// Its numbers, if it sends any; of an entry with a problem, which is reported, without a length.
+    pub(super) fn vector(&self) -> Option<Vector> {
+        let shape = match &self.node {
+            Some(node) if node.modality_kind() != ModalityKind::Scalars => return None,
+            Some(node) => node.shape(),
+            None => Vec::new(),
+        };
+        let length = shape.first().and_then(|length| usize::try_from(*length).ok()).filter(|length| *length > 0);
+        let names = self.form.as_ref().map(Form::names).unwrap_or_default();
+        Some(Vector { name: self.name.clone(), length, names })
+    }
+
     /// The entry, with the settings of `[verdict]` and `[rig]`; `None` only if a problem with it was reported.
     pub(super) fn finish(self, rig: &VerdictTable, sync_window: Duration) -> Option<(Section<'d>, DeviceSpec)> {
         let node = self.node?;

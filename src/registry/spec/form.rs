@@ -137,6 +137,39 @@ impl Form {
         }
     }
 
+    /// The names of the numbers of a sample, in order: `x`, `qw`, `m03` (row 0, column 3), `shoulder.position`, `tip.x`; of
+    /// a quantity without a name its place among those of the joint, as `shoulder.3`. None of pictures and packets.
+    pub fn names(&self) -> Vec<String> {
+        const POSE: [&str; 7] = ["x", "y", "z", "qx", "qy", "qz", "qw"];
+        let matrix = |by_column: bool| {
+            let cell = move |at: usize| if by_column { (at % 4, at / 4) } else { (at / 4, at % 4) };
+            (0..16).map(cell).map(|(row, column)| format!("m{row}{column}")).collect()
+        };
+        match self {
+            Self::Pose(pose) => match pose.layout {
+                PoseLayout::Columns => matrix(true),
+                PoseLayout::Rows => matrix(false),
+                PoseLayout::Quaternion => POSE.map(str::to_owned).into(),
+            },
+            Self::Joints(joints) => {
+                let word = |(at, quantity): (usize, &Quantity)| match quantity {
+                    Quantity::Position => "position".to_owned(),
+                    Quantity::Velocity => "velocity".to_owned(),
+                    Quantity::Effort => "effort".to_owned(),
+                    Quantity::Other => at.to_string(),
+                };
+                let words: Vec<String> = joints.quantities.iter().enumerate().map(word).collect();
+                let of_joint = |joint: &String| words.iter().map(|word| format!("{joint}.{word}")).collect::<Vec<_>>();
+                let [x, y, z, rotation @ ..] = POSE;
+                let opening = joints.tip.iter().filter(|tip| tip.has_opening).map(|_| "opening");
+                let tip = [x, y, z].into_iter().chain(opening).chain(rotation).map(|name| format!("tip.{name}"));
+                let tip = tip.filter(|_| joints.tip.is_some());
+                joints.names.iter().flat_map(of_joint).chain(tip).collect()
+            }
+            Self::Calibration(_) | Self::Points(_) => Vec::new(),
+        }
+    }
+
     /// The end of the topic with its messages, after the topic of the device.
     pub const fn ending(&self) -> &'static str {
         match self {

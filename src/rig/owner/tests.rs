@@ -15,8 +15,8 @@ use crate::device::{DeviceNode, UsbIdentity};
 use crate::hotplug::{HotplugError, HotplugEvent};
 use crate::provenance::UnplugSource;
 use crate::registry::{
-    Framing, IdentitySpec, InferenceSpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec,
-    WhenStale,
+    ExportSpec, Framing, IdentitySpec, InferenceSpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec,
+    SerialSpec, UsbSpec, WhenStale,
 };
 use crate::rig::presence::{Claim, read_mask};
 use crate::simulation::{SimDevice, SimSource};
@@ -54,6 +54,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
     };
     Registry {
         inference: InferenceSpec::default(),
+        export: ExportSpec::default(),
         rig: RigSpec {
             name: "test".into(),
             observation_hz: 30.0,
