@@ -22,7 +22,7 @@ if [[ ! -x $cache/versitygw ]]; then
   echo "fleet: building the S3 server of the test, once" >&2
   GOBIN=$cache go install "$server"
 fi
-python3 tests/fleet/upload.py udev/rapid-upload.service "$cache/versitygw"
+python3 tests/fleet/upload.py udev/rapid-upload.service udev/rapid-upload-check.service "$cache/versitygw"
 
 if [[ -n ${RAPID_BIN:-} ]]; then
   if ! command -v chromium >/dev/null; then
