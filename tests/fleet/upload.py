@@ -173,7 +173,7 @@ def changes(copy, check, read_back, variables, rig):
     seen = [run(command, variables, check=False).returncode != 0 for command in (copy, check)]
     assert flipped.read_bytes() == changed, "the upload replaced a copy"
     ended = run(read_back, variables, check=False)
-    assert ended.returncode != 0 and flipped.name in ended.stderr and longer.name not in ended.stderr, ended
+    assert ended.returncode != 0 and ended.stdout.split() == [flipped.name], ended
     noticed = "failed as well" if any(seen) else "did not see it"
     print(f"a changed byte fails the check that reads it back (the upload {noticed})")
 

@@ -44,8 +44,9 @@ pub(super) fn check_service() -> String {
     format!(
         r"{HEADER}
 # Reads the copies of all episodes that are still here, and compares every byte: see rapid-upload.service for the first start.
-# A copy that differs, or is missing after a day, makes this unit fail, and the journal names it. `rapid inspect` shows
-# whether the episode here is whole. If it is, delete the copy, and rapid-upload.service copies it again:
+# A copy that differs, or is missing after a day, makes this unit fail, and the journal names it (of one that differs rclone
+# prints the name alone). `rapid inspect` shows whether the episode here is whole. If it is, delete the copy, and
+# rapid-upload.service copies it again:
 #   rclone --config /etc/rapid/rclone.conf deletefile lab:episodes/rig-1/NAME.mcap
 [Unit]
 Description=rapid: copies in the store read back
@@ -54,7 +55,7 @@ Wants=network-online.target
 After=network-online.target
 
 [Service]
-{BEFORE}ExecStart=/usr/bin/flock ${{EPISODES}}/{LOCK} /usr/bin/rclone check ${{EPISODES}} ${{STORE}} {EPISODES} --min-age=1d --one-way --download
+{BEFORE}ExecStart=/usr/bin/flock ${{EPISODES}}/{LOCK} /usr/bin/rclone check ${{EPISODES}} ${{STORE}} {EPISODES} --min-age=1d --one-way --download --differ=-
 {AFTER}"
     )
 }
@@ -127,5 +128,5 @@ const SESSIONS: &str = "--max-depth 1 --include=session*.toml --include=session*
 const REMOVE: &str = r#"[ -n "$${REMOVE_AFTER:-}" ] || exit 0; \
   exec 9>>"$$EPISODES/.upload.lock"; flock --nonblock 9 || exit 0; equal=$$(mktemp); \
   rclone check "$$EPISODES" "$$STORE" --max-depth 1 --include=*.mcap --min-age "$$REMOVE_AFTER" --one-way --download \
-    --match "$$equal" || differs=yes; \
+    --match "$$equal" --differ=- || differs=yes; \
   while IFS= read -r name; do rm -v -- "$$EPISODES/$$name"; done <"$$equal"; rm "$$equal"; [ -z "$${differs:-}" ]"#;
