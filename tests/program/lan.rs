@@ -46,6 +46,39 @@ fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
     assert_eq!(pictures[0], picture(0), "the picture is as the camera sent it");
 }
 
+#[test]
+fn entries_that_are_added_while_the_rig_runs_are_searched_for() {
+    let (place, [first, second]) = (Place::new(), free_ports());
+    // Without anything on the network at the start.
+    let tof = "[device.tof]\nvid = \"1209\"\npid = \"0001\"\nnode = \"serial\"\nbit = 5\ntty = { channels = 1 }\n";
+    let small = |name: &str, bit: u32, port: u16| {
+        let own = "node = \"lan\"\nmax_bytes = \"64KiB\"\ndepth = 8\n";
+        camera_entry(name, bit, port).replace("node = \"lan\"\n", own)
+    };
+    let (cam, late) = (small("cam", 0, first), small("late", 1, second));
+    place.write("devices.toml", &format!("{RIG}{tof}"));
+    let running = place.start(&RUN, "begin");
+    let reload = |text: &str, added: &str| {
+        place.write("devices.toml", text);
+        let output = place.run(&["reload"]);
+        let answer = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+        assert!(output.status.success() && answer.contains(added), "{answer}");
+    };
+    let _first = Server::start(first, camera);
+    reload(&format!("{RIG}{tof}{cam}"), "[device.cam] as bit 0");
+    wait_for(&running, "cam", "streaming", 1);
+    reload(&format!("{RIG}{tof}{cam}{late}"), "[device.late] as bit 1");
+    let server = Server::start(second, camera);
+    wait_for(&running, "late", "streaming", 1);
+    drop(server);
+    wait_for(&running, "late", "by lease", 1);
+    let _second = Server::start(second, camera);
+    wait_for(&running, "late", "streaming", 2);
+    let reported = stop(running);
+    let opened = reported.iter().filter(|event| event["event"] == "opened" && event["device"] == "cam").count();
+    assert_eq!(opened, 1, "the other one was not interrupted: {:?}", life_of(&reported, "cam"));
+}
+
 /// A sender of packets to a port of this machine, and a stranger who sends there too.
 struct Packets {
     sends: Arc<AtomicBool>,
