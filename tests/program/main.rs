@@ -33,6 +33,7 @@ mod list;
 mod many_devices;
 mod modules;
 mod nodes;
+mod observe;
 mod plot;
 mod process;
 mod provenance;
