@@ -34,6 +34,7 @@ mod many_devices;
 mod modules;
 mod nodes;
 mod observe;
+mod old_files;
 mod plot;
 mod process;
 mod provenance;
