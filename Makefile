@@ -23,7 +23,7 @@ TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' R
 TESTS := cargo test --locked --workspace
 # What `make quick` runs, and the tests of the program that it leaves out: those that wait for long, or need Python or C.
 QUICK := --lib --test layering --test library --test memory --test guard --test short
-SLOW := calibrate docs ends export hooks infer json kill lan many_devices nodes process python scenarios screen second_run shared_memory stops task verdict web
+SLOW := calibrate docs ends export hooks infer json kill lan many_devices nodes observe process python scenarios screen second_run shared_memory stops task verdict web
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | sed 's/[$$](SLOW)/$(SLOW)/' | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
@@ -79,8 +79,10 @@ fuzz: ## feed every reader of untrusted bytes with generated ones, each for FUZZ
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
 
-fleet-test: ## upload to a real S3 server, sensors of another computer, the page in Chromium, Ray, UMI, Rerun, with breaks (fetches 2 GB once; needs root)
-	RAPID_BIN='$(BUILT)' scripts/fleet.sh
+# The program is built as the tests build it, so that it is there after `make test`.
+fleet-test: setup-build ## upload to a real S3 server, sensors of another computer, the page in Chromium, Ray, UMI, Rerun, with breaks (fetches 2 GB once; needs root); fails if a part is skipped (FLEET_MAY_SKIP=1 permits it)
+	$(if $(RAPID_BIN),,$(TESTED) cargo build --locked --workspace --bin rapid)
+	RAPID_BIN='$(or $(RAPID_BIN),$(TARGET)/debug/rapid)' scripts/fleet.sh
 
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.
 train: setup-build ## record demonstrations, train on them, export models/tactile-id (POLICY=, THREADS=2, MINUTES=)

@@ -260,13 +260,13 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let (modules, mountable) = watch::channel(registry.modules.clone());
     let collection = Collection::new(recorder, episode, options.plan, is_kept, (&board, mountable))?;
     let kind = options.screen;
-    let (to_scenario, replugs) = mpsc::unbounded_channel();
+    let ((to_scenario, replugs), (to_discovery, added)) = (mpsc::unbounded_channel(), mpsc::unbounded_channel());
     let (to_alignment, to_align) = mpsc::unbounded_channel();
     let (trials, loaded) = (simulated(&options.devices, &board), until_loaded(options.policy.is_some()));
     let others = || {
         // Before the screen: errors up to here appear on an ordinary terminal.
         let alignment = alignment(&registry, bus, &board)?.extended_by(to_align);
-        let (discovery, plugged) = discovery::start(options.devices, &registry, replugs, loaded.clone())?;
+        let (discovery, plugged) = discovery::start(options.devices, &registry, replugs, added, loaded.clone())?;
         // The inputs report their first state at once.
         let events = board.events();
         // Until the very end: a device that is being closed may still move.
@@ -297,6 +297,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         bus: bus.membership(),
         board: Arc::clone(&board),
         rig: to_rig.clone(),
+        discovery: to_discovery,
         recorder: to_recorder,
         alignment: to_alignment,
         live: to_live,
@@ -306,11 +307,8 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     requests::sorted(to_conductor, from_screen, (arrivals, attached), to_rig, to_registry, to_scenario);
     let mask_ended = presence.ended();
     let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
-    let streaming = Streaming::start(
-        rig.obeying(&permission).tapped(&[watched.taps(), buttons.taps()].concat()),
-        plugged,
-        rig_commands,
-    );
+    let taps = [watched.taps(), buttons.taps()].concat();
+    let streaming = Streaming::start(rig.obeying(&permission).tapped(&taps), plugged, rig_commands);
     let conductor = Conductor {
         events: board.events(),
         board,

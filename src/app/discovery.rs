@@ -1,6 +1,11 @@
 //! Stage discovery: devices plugged in and unplugged, on this machine, on the network or in a scenario.
+//!
+//! Invariant: an entry that is added during the run is searched for on the network from then on, and no other search is
+//! interrupted by that.
 
 use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
 
 use futures::StreamExt;
 use tokio::sync::mpsc;
@@ -14,7 +19,7 @@ use crate::hotplug::HotplugStream;
 use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
 use crate::hotplug::udev::{Ask, UdevMonitor};
-use crate::registry::Registry;
+use crate::registry::{DeviceSpec, Registry};
 
 /// Created by udev's daemon when it starts.
 const UDEV: &str = "/run/udev/control";
@@ -22,8 +27,8 @@ const UDEV: &str = "/run/udev/control";
 const DEPTH: usize = 64;
 
 /// Starts to watch; also returns the stream for the rig, which ends when the stage does. `requests` name simulated
-/// devices that are to be unplugged, or plugged in again. A scenario begins once `loaded` is cancelled: how long a policy
-/// takes to load depends on the machine, and what happens to its sensors must not.
+/// devices that are to be unplugged, or plugged in again; `added` are entries that the run takes over. A scenario begins once
+/// `loaded` is cancelled: how long a policy takes to load depends on the machine, and what happens to its sensors must not.
 ///
 /// # Errors
 /// When plug events of this machine cannot be received.
@@ -31,8 +36,10 @@ pub(super) fn start(
     devices: Devices,
     registry: &Registry,
     requests: mpsc::UnboundedReceiver<String>,
+    mut added: mpsc::UnboundedReceiver<Vec<Arc<DeviceSpec>>>,
     loaded: CancellationToken,
 ) -> Result<(Stage, HotplugStream), AppError> {
+    let (is_real, cooldown) = (matches!(devices, Devices::Machine), registry.rig.cooldown);
     let mut source = open(devices, registry, requests, loaded)?;
     let (events, to_rig) = mpsc::channel(DEPTH);
     let stage = Stage::start("discovery", |stop| async move {
@@ -41,6 +48,11 @@ pub(super) fn start(
                 biased;
                 () = stop.cancelled() => return Ok(()),
                 event = source.next() => event,
+                // A scenario has its devices from the start.
+                Some(added) = added.recv(), if is_real => {
+                    source = with_lan(source, added.iter().map(Arc::as_ref), cooldown);
+                    continue;
+                }
             };
             let Some(event) = event else { return Ok(()) };
             // An error ends the rig, which reports it; no reader is left once the rig has ended.
@@ -72,9 +84,20 @@ fn open(
         tracing::warn!("no udev runs here ({UDEV} is missing): USB devices are not detected; start systemd-udevd");
     }
     let machine = UdevMonitor::open(Ask::of(registry, camera::formats))?;
+    Ok(with_lan(Box::pin(machine), &registry.devices, registry.rig.cooldown))
+}
+
+/// Events of the network beside those of `source`, if any of these entries is found there.
+fn with_lan<'a>(
+    source: HotplugStream,
+    devices: impl IntoIterator<Item = &'a DeviceSpec>,
+    cooldown: Duration,
+) -> HotplugStream {
     #[cfg(feature = "lan")]
-    if let Some(lan) = LanMonitor::open(registry) {
-        return Ok(Box::pin(futures::stream::select(machine, lan)));
+    if let Some(lan) = LanMonitor::open(devices, cooldown) {
+        return Box::pin(futures::stream::select(source, lan));
     }
-    Ok(Box::pin(machine))
+    #[cfg(not(feature = "lan"))]
+    let _ = (devices, cooldown);
+    source
 }

@@ -3,7 +3,7 @@
 //! 1. The file is read and compared with the registry of the run ([`Difference`]); whatever else differs refuses it all.
 //! 2. The topics are opened, their memory is reserved, and recorder and synchronisation subscribe: no sample is missed.
 //! 3. The board, the recorder, the synchronisation and the rig get the entries, in this order. The rig attaches devices
-//!    that are plugged in already.
+//!    that are plugged in already; then discovery searches for those that are found on the network.
 //!
 //! A policy and the interlocks keep the registry that they were started with.
 //!
@@ -40,6 +40,8 @@ pub(super) struct Reload {
     pub(super) bus: Membership,
     pub(super) board: Arc<Board>,
     pub(super) rig: mpsc::Sender<RigCommand>,
+    /// Searches for what is on the network.
+    pub(super) discovery: mpsc::UnboundedSender<Vec<Arc<DeviceSpec>>>,
     pub(super) recorder: std::sync::mpsc::Sender<RecorderAddition>,
     pub(super) alignment: mpsc::UnboundedSender<(Arc<DeviceSpec>, Subscription)>,
     /// The Foxglove server, if there is one.
@@ -132,9 +134,12 @@ impl Reload {
         self.board.announce(What::Log { level: Level::Info, text: format!("registry: added {names}{episode}") });
         // A stage that is gone has ended with the run, or ends it.
         let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(&registry), subscription: None });
+        let devices = opened.iter().map(|opened| Arc::clone(&opened.device)).collect();
         for opened in opened {
             self.add(opened, &registry).await?;
         }
+        // After the rig has the entries: what is found belongs to one of them.
+        let _ = self.discovery.send(devices);
         self.modules.send_replace(registry.modules.clone());
         self.registry = registry;
         Ok(format!("added {names}{episode}"))

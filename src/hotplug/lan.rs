@@ -31,7 +31,7 @@ use self::mdns::Browser;
 use self::probe::Question;
 use self::watch::Watch;
 use super::{HotplugError, HotplugEvent};
-use crate::registry::{LanFind, NodeSpec, Probe, Registry};
+use crate::registry::{DeviceSpec, LanFind, NodeSpec, Probe};
 
 /// Queue length for events; the rig reads them at once.
 const DEPTH: usize = 64;
@@ -45,20 +45,21 @@ pub struct LanMonitor {
 }
 
 impl LanMonitor {
-    /// Starts searching for the entries of devices on the network; `None` if there are none.
-    pub fn open(registry: &Registry) -> Option<Self> {
+    /// Starts searching for those of these entries that are found on the network; `None` if there are none. `cooldown` is that
+    /// of the rig. Two monitors of one service may give one device to both, unless each entry names its instance.
+    pub fn open<'a>(devices: impl IntoIterator<Item = &'a DeviceSpec>, cooldown: Duration) -> Option<Self> {
         let (report, events) = mpsc::channel(DEPTH);
         let mut tasks = JoinSet::new();
         let mut announced: Vec<(&str, Vec<mdns::Wanted>)> = Vec::new();
         let mut phones = Vec::new();
-        for spec in &registry.devices {
+        for spec in devices {
             let NodeSpec::Lan(lan) = &spec.node else { continue };
             let watch = || Watch::new(&spec.name, lan.lease, report.clone());
             match &lan.find {
                 LanFind::Adapter { .. } => {}
                 LanFind::Host { host, probe, port } => {
                     // While the driver waits for the end of a cooldown, no packets are received.
-                    let grace = if *probe == Probe::Udp { registry.rig.cooldown } else { Duration::ZERO };
+                    let grace = if *probe == Probe::Udp { cooldown } else { Duration::ZERO };
                     let question = match lan.request() {
                         Some(request) => Question::Remote(request),
                         None => (*probe).into(),

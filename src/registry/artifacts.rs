@@ -57,6 +57,8 @@ pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
         artifact("rapid.service".into(), unit(registry), ArtifactKind::Unit),
         artifact("rapid-upload.service".into(), upload::service(), ArtifactKind::Unit),
         artifact("rapid-upload.timer".into(), upload::timer(), ArtifactKind::Unit),
+        artifact("rapid-upload-check.service".into(), upload::check_service(), ArtifactKind::Unit),
+        artifact("rapid-upload-check.timer".into(), upload::check_timer(), ArtifactKind::Unit),
         artifact("foxglove.json".into(), layout::layout(registry), ArtifactKind::Layout),
     ];
     for device in &registry.devices {

@@ -243,6 +243,15 @@ mod tests {
             assert_eq!(registry.modules.len(), 1);
             assert_eq!(registry.devices.len(), 1 + descriptor.sensors.len());
         }
+        // The mounts differ in where their camera looks; both give its pictures.
+        let mounts = ["wrist_mount", "wrist_mount_angled"].map(|name| named(name).unwrap());
+        assert_ne!(mounts[0].transforms, mounts[1].transforms);
+        for mount in mounts {
+            let [(placed, _)] = mount.transforms.as_slice() else { panic!("{mount:?}") };
+            let [(sensor, keys)] = mount.sensors.as_slice() else { panic!("{mount:?}") };
+            assert_eq!((placed, &mount.devices), (sensor, &vec![sensor.clone()]));
+            assert!(keys.contains(&("lan.stream".to_owned(), Setting::Text("preview".to_owned()))), "{keys:?}");
+        }
         let error = named("tip_sofd").unwrap_err().to_string();
         assert!(error.contains("did you mean \"tip_soft\"?"), "{error}");
     }

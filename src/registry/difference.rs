@@ -7,7 +7,8 @@
 //! [`Difference::needs_restart`].
 
 use super::spec::{
-    ActionSpec, ButtonSpec, DeviceSpec, Hooks, IdentitySpec, InterlockSpec, ModuleSpec, NodeSpec, Registry, RigSpec,
+    ActionSpec, ButtonSpec, DeviceSpec, Hooks, IdentitySpec, InterlockSpec, LanFind, LanSpec, ModuleSpec, NodeSpec,
+    Registry, RigSpec,
 };
 
 /// See the module's comment.
@@ -179,15 +180,33 @@ fn obstacle(device: &DeviceSpec, running: &Registry, new: &Registry) -> Option<S
         return Some("its hooks need what a run sets up for programs at its start".to_owned());
     }
     match device.node {
-        NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
+        NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Lan(_) => {}
         NodeSpec::Process(_) => {
             return Some("its program needs what a run sets up for programs at its start".to_owned());
         }
         NodeSpec::Can(_) => return Some("its interface is brought up at the start".to_owned()),
-        NodeSpec::Lan(_) => return Some("what is searched for on the network is fixed at the start".to_owned()),
+    }
+    if let Some(other) = running.devices.iter().find(|other| compete(device, other)) {
+        let why = format!("a device of its service may belong to [device.{}], which this run searches for", other.name);
+        return Some(format!("{why}; write the `instance` of each in [device.NAME.lan], or restart rapid"));
     }
     let weaker = running.devices.iter().find(|other| takes_from(device, other))?;
     Some(format!("it would take a unit that may be attached as [device.{}]", weaker.name))
+}
+
+/// Whether both are found by the same announced service, and one of them accepts any instance of it: who gets which is decided
+/// among all entries of a service, at the start of a search.
+fn compete(device: &DeviceSpec, other: &DeviceSpec) -> bool {
+    let announced = |device: &DeviceSpec| match &device.node {
+        NodeSpec::Lan(LanSpec { find: LanFind::Mdns { service, instance }, .. }) => {
+            Some((service.clone(), instance.is_some()))
+        }
+        _ => None,
+    };
+    let (Some((own, is_named)), Some((theirs, is_other_named))) = (announced(device), announced(other)) else {
+        return false;
+    };
+    own.eq_ignore_ascii_case(&theirs) && !(is_named && is_other_named)
 }
 
 /// Whether a unit that `other` accepts may belong to `device` alone, by the rules of `identity`.

@@ -316,7 +316,10 @@ fn put(device: &mut Table, key: &str, setting: &Setting) -> Result<(), EditError
     }
     let mut table = device;
     for part in parts {
-        let item = table.entry(part).or_insert_with(|| Item::Table(Table::new()));
+        let mut inner = Table::new();
+        // Its line is written only if it has values of its own.
+        inner.set_implicit(true);
+        let item = table.entry(part).or_insert(Item::Table(inner));
         table = item.as_table_mut().ok_or_else(|| refused("its parent is not a table"))?;
     }
     if table.contains_table(last) {

@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
-"""Runs the commands of rapid-upload.service against a real S3 server on this machine.
+"""Runs the commands of rapid-upload.service and rapid-upload-check.service against a real S3 server on this machine.
 
-    upload.py UNIT VERSITYGW
+    upload.py UNIT CHECK_UNIT VERSITYGW
 
-UNIT is the file that `rapid artifacts` writes, VERSITYGW the server (https://github.com/versity/versitygw), which keeps
-objects as files. A break in the middle, a byte that changes in the store, and an episode that is being written are
-shown. Needs rclone and Python 3.10.
+The units are the files that `rapid artifacts` writes, VERSITYGW the server (https://github.com/versity/versitygw), which
+keeps objects as files. A break in the middle, a copy that changes or disappears in the store, and an episode that is being
+written are shown. Needs rclone and Python 3.10.
 """
 
+import fcntl
 import os
 import re
 import shlex
@@ -19,13 +20,15 @@ import time
 from pathlib import Path
 
 MIB = 1 << 20
+# Older than what the check leaves out because it may be on its way.
+COPIED = time.time() - 2 * 86400
 
 
-def commands(unit):
+def commands(unit, count):
     """The commands of a unit, as systemd reads them: continued lines joined, `$$` is `$`."""
     text = Path(unit).read_text(encoding="utf-8").replace("\\\n", " ")
     lines = [line.removeprefix("ExecStart=") for line in text.splitlines() if line.startswith("ExecStart=")]
-    assert len(lines) == 4, lines
+    assert len(lines) == count, lines
     return [shlex.split(line) for line in lines]
 
 
@@ -68,8 +71,9 @@ def run(command, variables, check=True):
     return ended
 
 
-def main(unit, server):
-    sessions, copy, check, remove = commands(unit)
+def main(unit, check_unit, server):
+    sessions, copy, check, remove = commands(unit, 4)
+    (read_back,) = commands(check_unit, 1)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         store, episodes = Store(place, server), place / "episodes"
@@ -83,11 +87,18 @@ def main(unit, server):
             assert store.names() == expected, store.names()
             print("resumed: all that is finished is there, and nothing that is being written")
 
+            run(read_back, variables)
             assert run(remove, variables).stdout == "" and len(list(episodes.glob("*.mcap"))) == 3
             print("without REMOVE_AFTER nothing is removed")
-            damage(store.folder / "episodes/rig-1/a_002.mcap")
+            disappears(copy, read_back, variables, store.folder / "episodes/rig-1/a_003.mcap")
+            changes(copy, check, read_back, variables, store.folder / "episodes/rig-1")
+            at_once = variables | {"REMOVE_AFTER": "0s"}
+            with (episodes / ".upload.lock").open("a", encoding="utf-8") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                assert run(remove, at_once).stdout == "" and len(list(episodes.glob("*.mcap"))) == 3
+            print("while copies are read back nothing is removed")
             (episodes / "a_004.mcap").write_bytes(os.urandom(MIB))
-            ended = run(remove, variables | {"REMOVE_AFTER": "0s"}, check=False)
+            ended = run(remove, at_once, check=False)
             left = sorted(path.name for path in episodes.glob("*.mcap*"))
             assert left == ["a_002.mcap", "a_004.mcap", "a_005.mcap.partial"] and ended.returncode != 0, (left, ended)
             print("removed: what was read back and is equal; not: what changed in the store, or is not there")
@@ -101,7 +112,9 @@ def configure(place, store, episodes):
     """Episodes, and where they go."""
     episodes.mkdir()
     for number in range(1, 4):
-        (episodes / f"a_{number:03}.mcap").write_bytes(os.urandom(12 * MIB))
+        path = episodes / f"a_{number:03}.mcap"
+        path.write_bytes(os.urandom(12 * MIB))
+        os.utime(path, (COPIED, COPIED))
     (episodes / "a_005.mcap.partial").write_bytes(os.urandom(MIB))
     for name in ("session.toml", "session-2026.toml", "session-2026.md"):
         (episodes / name).write_text("x", encoding="utf-8")
@@ -130,6 +143,41 @@ def breaks_off(copy, variables, store):
     print(f"killed with {len(there)} of 3 episodes in the store, whole")
 
 
+def disappears(copy, read_back, variables, there):
+    """A copy that is gone: the check names it, and the next start of the upload makes it again."""
+    before = there.read_bytes()
+    there.unlink()
+    ended = run(read_back, variables, check=False)
+    assert ended.returncode != 0 and there.name in ended.stderr, ended
+    run(copy, variables)
+    assert there.read_bytes() == before
+    run(read_back, variables)
+    print("a copy that disappeared is reported, and made again from the episode here")
+
+
+def changes(copy, check, read_back, variables, rig):
+    """Copies that differ: of another length for the upload, in a byte for the check; none is replaced."""
+    longer = rig / "a_001.mcap"
+    whole = longer.read_bytes()
+    with longer.open("ab") as file:
+        file.write(b"x")
+    for command in (copy, check):
+        ended = run(command, variables, check=False)
+        assert ended.returncode != 0 and longer.name in ended.stderr, ended
+    assert longer.read_bytes() == whole + b"x", "the upload replaced a copy"
+    os.truncate(longer, len(whole))
+    flipped = rig / "a_002.mcap"
+    damage(flipped)
+    changed = flipped.read_bytes()
+    # The store keeps the checksum of what it received: these two may not see it, and must not hide it.
+    seen = [run(command, variables, check=False).returncode != 0 for command in (copy, check)]
+    assert flipped.read_bytes() == changed, "the upload replaced a copy"
+    ended = run(read_back, variables, check=False)
+    assert ended.returncode != 0 and ended.stdout.split() == [flipped.name], ended
+    noticed = "failed as well" if any(seen) else "did not see it"
+    print(f"a changed byte fails the check that reads it back (the upload {noticed})")
+
+
 def names_are_taken(copy, variables, store, episodes):
     """An episode of a name that the store has already: the one there stays, and the others are copied."""
     there = store.folder / "episodes/rig-1/a_001.mcap"
@@ -150,6 +198,6 @@ def damage(path):
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
+    if len(sys.argv) != 4:
         sys.exit(__doc__)
     main(*sys.argv[1:])

@@ -224,3 +224,38 @@ fn printed_by(output: &Output, printed: &mut String) -> String {
     printed.push_str(&lines);
     lines
 }
+
+/// The SHA-256 of a file by coreutils.
+fn by_sha256sum(path: &Path) -> String {
+    let output = Command::new("sha256sum").arg(path).output().expect("sha256sum");
+    let text = String::from_utf8(output.stdout).expect("text");
+    text.split(' ').next().expect("a hash").to_owned()
+}
+
+#[test]
+fn the_hash_of_a_file_is_that_of_sha256sum() {
+    let place = Place::new();
+    let record = ["--sim", "--headless", "--json", "--record", "--duration", "2s", "--out", "out"];
+    let recorded = place.run(&record);
+    assert_eq!(recorded.status.code(), crate::support::recorded_code(&String::from_utf8_lossy(&recorded.stdout)));
+    let [episode] = place.episodes("out").try_into().expect("one episode");
+    let path = place.path("out").join(&episode);
+    let bytes = std::fs::read(&path).expect("the episode");
+    assert!(bytes.len() > 256 << 10, "several pieces are read: {}", bytes.len());
+    // A file that differs in its last byte, and one that is no episode at all.
+    std::fs::write(place.path("out/other.mcap"), [&bytes[..bytes.len() - 1], b"x"].concat()).expect("a file");
+    std::fs::write(place.path("out/text.mcap"), "no episode").expect("a file");
+    let one = place.run(&["inspect", &format!("out/{episode}"), "--json"]);
+    let one: serde_json::Value = serde_json::from_slice(&one.stdout).expect("JSON");
+    assert_eq!(one["sha256"].as_str(), Some(by_sha256sum(&path).as_str()), "{one}");
+    let listed = lines(&place.run(&["inspect", "out", "--json"]));
+    let listed: Vec<serde_json::Value> = listed.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    assert_eq!(listed.len(), 3, "{listed:?}");
+    for line in &listed {
+        let file = Path::new(line["file"].as_str().expect("a path"));
+        let expected = by_sha256sum(&place.path("out").join(file.file_name().expect("a name")));
+        assert_eq!(line["sha256"].as_str(), Some(expected.as_str()), "{line}");
+    }
+    let hashes: BTreeSet<_> = listed.iter().map(|line| line["sha256"].to_string()).collect();
+    assert_eq!(hashes.len(), 3);
+}

@@ -3,6 +3,7 @@
 
 #![expect(clippy::expect_used, reason = "what fails here fails a test")]
 
+use std::f64::consts::FRAC_1_SQRT_2;
 use std::io::Write;
 use std::net::TcpStream;
 use std::sync::Arc;
@@ -43,6 +44,39 @@ fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
     assert_eq!(edges, [0, 1, 0, 1]);
     let pictures: Vec<Vec<u8>> = episode.topic("/rapid/lan/cam").map(support::Message::payload).collect();
     assert_eq!(pictures[0], picture(0), "the picture is as the camera sent it");
+}
+
+#[test]
+fn entries_that_are_added_while_the_rig_runs_are_searched_for() {
+    let (place, [first, second]) = (Place::new(), free_ports());
+    // Without anything on the network at the start.
+    let tof = "[device.tof]\nvid = \"1209\"\npid = \"0001\"\nnode = \"serial\"\nbit = 5\ntty = { channels = 1 }\n";
+    let small = |name: &str, bit: u32, port: u16| {
+        let own = "node = \"lan\"\nmax_bytes = \"64KiB\"\ndepth = 8\n";
+        camera_entry(name, bit, port).replace("node = \"lan\"\n", own)
+    };
+    let (cam, late) = (small("cam", 0, first), small("late", 1, second));
+    place.write("devices.toml", &format!("{RIG}{tof}"));
+    let running = place.start(&RUN, "begin");
+    let reload = |text: &str, added: &str| {
+        place.write("devices.toml", text);
+        let output = place.run(&["reload"]);
+        let answer = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+        assert!(output.status.success() && answer.contains(added), "{answer}");
+    };
+    let _first = Server::start(first, camera);
+    reload(&format!("{RIG}{tof}{cam}"), "[device.cam] as bit 0");
+    wait_for(&running, "cam", "streaming", 1);
+    reload(&format!("{RIG}{tof}{cam}{late}"), "[device.late] as bit 1");
+    let server = Server::start(second, camera);
+    wait_for(&running, "late", "streaming", 1);
+    drop(server);
+    wait_for(&running, "late", "by lease", 1);
+    let _second = Server::start(second, camera);
+    wait_for(&running, "late", "streaming", 2);
+    let reported = stop(running);
+    let opened = reported.iter().filter(|event| event["event"] == "opened" && event["device"] == "cam").count();
+    assert_eq!(opened, 1, "the other one was not interrupted: {:?}", life_of(&reported, "cam"));
 }
 
 #[test]
@@ -118,6 +152,11 @@ fn packets_of_a_lidar_are_recorded_with_their_points() {
     }
 }
 
+/// The pose that a phone sends: a homogeneous matrix, column by column, as ARKit has it. Turned by 90 degrees about z.
+const POSE: [f32; 16] = [0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.25, -1.5, 3.0, 1.0];
+/// The same as a position and a quaternion `x y z w`.
+const PLACE: ([f64; 3], [f64; 4]) = ([0.25, -1.5, 3.0], [0.0, 0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2]);
+
 /// A phone: connects, names its session, sends frames; connects again when that ends.
 fn phone(port: u16, sends: &AtomicBool) {
     while sends.load(Ordering::Relaxed) {
@@ -133,7 +172,7 @@ fn phone(port: u16, sends: &AtomicBool) {
         while goes && sends.load(Ordering::Relaxed) {
             let picture = picture(number);
             let mut frame = u32::try_from(picture.len()).expect("short").to_le_bytes().to_vec();
-            frame.extend((0_u8..16).flat_map(|index| (f32::from(index) / 2.0).to_le_bytes()));
+            frame.extend(POSE.iter().flat_map(|number| number.to_le_bytes()));
             frame.extend(begun.elapsed().as_secs_f64().to_le_bytes());
             frame.extend(1.7e9_f64.to_le_bytes());
             frame.extend(picture);
@@ -141,6 +180,90 @@ fn phone(port: u16, sends: &AtomicBool) {
             number += 1;
             std::thread::sleep(Duration::from_millis(30));
         }
+    }
+}
+
+/// `foxglove.Vector3`.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Vector {
+    #[prost(double, tag = "1")]
+    x: f64,
+    #[prost(double, tag = "2")]
+    y: f64,
+    #[prost(double, tag = "3")]
+    z: f64,
+}
+
+/// `foxglove.Quaternion`.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Quaternion {
+    #[prost(double, tag = "1")]
+    x: f64,
+    #[prost(double, tag = "2")]
+    y: f64,
+    #[prost(double, tag = "3")]
+    z: f64,
+    #[prost(double, tag = "4")]
+    w: f64,
+}
+
+/// `foxglove.Pose`.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Pose {
+    #[prost(message, optional, tag = "1")]
+    position: Option<Vector>,
+    #[prost(message, optional, tag = "2")]
+    orientation: Option<Quaternion>,
+}
+
+/// `foxglove.PoseInFrame`.
+#[derive(Clone, PartialEq, prost::Message)]
+struct PoseInFrame {
+    #[prost(string, tag = "2")]
+    frame_id: String,
+    #[prost(message, optional, tag = "3")]
+    pose: Option<Pose>,
+}
+
+/// `foxglove.FrameTransform`.
+#[derive(Clone, PartialEq, prost::Message)]
+struct FrameTransform {
+    #[prost(string, tag = "2")]
+    parent: String,
+    #[prost(string, tag = "3")]
+    child: String,
+    #[prost(message, optional, tag = "4")]
+    translation: Option<Vector>,
+    #[prost(message, optional, tag = "5")]
+    rotation: Option<Quaternion>,
+}
+
+#[track_caller]
+fn is_the_place(position: Option<Vector>, rotation: Option<Quaternion>) {
+    let (Vector { x, y, z }, turned) = (position.expect("a position"), rotation.expect("a rotation"));
+    let found = [x, y, z, turned.x, turned.y, turned.z, turned.w];
+    let expected = PLACE.0.into_iter().chain(PLACE.1);
+    assert!(found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-9), "{found:?}");
+}
+
+/// Each sample has its pose and its transform, of its time and number.
+fn check_poses(episode: &Episode) {
+    let of = |topic: &str| -> Vec<_> { episode.messages.iter().filter(|message| message.topic == topic).collect() };
+    let (samples, poses, transforms) = (of("/rapid/lan/phone"), of("/rapid/lan/phone/pose"), of("/tf"));
+    assert!(!samples.is_empty() && samples.len() == poses.len() && samples.len() == transforms.len());
+    assert_eq!(episode.schemas["/rapid/lan/phone/pose"], "foxglove.PoseInFrame");
+    assert_eq!(episode.schemas["/tf"], "foxglove.FrameTransform");
+    for ((sample, pose), transform) in samples.into_iter().zip(poses).zip(transforms) {
+        for derived in [pose, transform] {
+            assert_eq!((derived.log_time, derived.sequence), (sample.log_time, sample.sequence));
+        }
+        let PoseInFrame { frame_id, pose } = pose.decode();
+        let Pose { position, orientation } = pose.expect("a pose");
+        assert_eq!(frame_id, "world");
+        is_the_place(position, orientation);
+        let FrameTransform { parent, child, translation, rotation } = transform.decode();
+        assert_eq!([parent, child], ["world", "phone"]);
+        is_the_place(translation, rotation);
     }
 }
 
@@ -171,11 +294,16 @@ fn a_phone_connects_and_sends_pictures_with_poses() {
         let first = episode.topic("/rapid/lan/phone").next().expect("a sample").payload();
         if stream == "pose" {
             let numbers: Vec<f64> = first.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect();
-            assert_eq!(numbers, (0..16).map(|index| f64::from(index) / 2.0).collect::<Vec<_>>());
+            assert_eq!(numbers, POSE.map(f64::from).to_vec());
+            check_poses(&episode);
         } else {
             let length = usize::from(u16::from_be_bytes([first[4], first[5]]));
             let reported: Value = serde_json::from_slice(&first[6..4 + length]).expect("a comment in JSON");
-            assert_eq!((reported["pose"][3].as_f64(), reported["wall_clock"].as_f64()), (Some(1.5), Some(1.7e9)));
+            assert_eq!((reported["pose"][13].as_f64(), reported["wall_clock"].as_f64()), (Some(-1.5), Some(1.7e9)));
+            assert!(
+                !episode.channels.iter().any(|topic| topic == "/tf" || topic.ends_with("/pose")),
+                "no topic of its own"
+            );
             assert_eq!([&first[..2], &first[4 + length..]].concat(), picture(0), "the picture is as it was");
         }
     }

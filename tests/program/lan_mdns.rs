@@ -101,3 +101,24 @@ fn an_announced_device_leaves_by_goodbye_and_by_lease() {
     let attached = reported.iter().find(|event| event["event"] == "attach").expect("attached");
     assert_eq!(attached["instance"], "cam one");
 }
+
+#[test]
+fn an_announced_device_is_found_when_its_entry_comes_later() {
+    if let Err(error) = multicast_works() {
+        eprintln!("NOT CHECKED: multicast does not work on this machine ({error}), so nothing is found by mDNS");
+        return;
+    }
+    let (place, [port]) = (Place::new(), free_ports());
+    let service = format!("_rl{}._tcp", std::process::id());
+    let entry = camera_entry("cam", 0, port).replace("host = \"127.0.0.1\"", &format!("mdns = {service:?}"));
+    let tof = "[device.tof]\nvid = \"1209\"\npid = \"0001\"\nnode = \"serial\"\nbit = 5\ntty = { channels = 1 }\n";
+    place.write("devices.toml", &format!("{RIG}{tof}"));
+    let _server = Server::start_at(SocketAddr::from(([0; 4], port)), camera);
+    let _responder = Responder::start(&service, port);
+    let running = place.start(&RUN, "begin");
+    place.write("devices.toml", &format!("{RIG}{tof}{entry}"));
+    let output = place.run(&["reload"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    wait_for(&running, "cam", "streaming", 1);
+    stop(running);
+}

@@ -33,6 +33,8 @@ mod list;
 mod many_devices;
 mod modules;
 mod nodes;
+mod observe;
+mod old_files;
 mod plot;
 mod process;
 mod provenance;

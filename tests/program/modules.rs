@@ -61,6 +61,44 @@ fn a_type_of_module_is_taken_up_and_mounted_while_the_rig_runs() {
 }
 
 #[test]
+fn a_type_of_ones_own_is_mounted_while_the_rig_runs() {
+    let place = Place::new();
+    place.write("devices.toml", include_str!("../../devices.toml"));
+    place.write("scenario.toml", SCENARIO);
+    let running =
+        place.start(&["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out"], "streaming");
+    // Written during the run: the run never read it.
+    let tip = ok(&place, &["modules", "tip_tactile"]).replace("tip_tactile", "tip_thermal");
+    let tip = tip.replace("finger=tactile", "finger=thermal");
+    let transform = "[module.tip_thermal.transform.tip_thermal]\nposition = [0.0, 0.012, 0.09]\n";
+    place.write("thermal.toml", &format!("{tip}\n{transform}"));
+    let sim = ["--sim", "scenario.toml", "--serial", "SPARE1"];
+    ok(&place, &[&["register", "--module", "./thermal.toml"][..], &sim].concat());
+    let taken = ok(&place, &["reload"]);
+    assert!(taken.contains("[device.tip_thermal] as bit 3") && taken.contains("[module.tip_thermal]"), "{taken}");
+    until("the fingertip", || ok(&place, &["mask"]).contains("0x09"));
+    ok(&place, &["episode", "next"]);
+    ok(&place, &["episode", "stop"]);
+    drop(running);
+    let files: Vec<_> = place.episodes("out").into_iter().filter(|name| name.ends_with("mcap")).collect();
+    let [before, with] = files.as_slice() else { panic!("{files:?}") };
+    let modules = |episode: &Episode| -> Value {
+        let text = episode.value("rapid", "configuration");
+        serde_json::from_str::<Value>(text).expect("JSON")["modules"].clone()
+    };
+    let (before, with) = (Episode::read(&place.path("out").join(before)), Episode::read(&place.path("out").join(with)));
+    assert_eq!((modules(&before), modules(&with)), (serde_json::json!([]), serde_json::json!(["tip_thermal"])));
+    assert!(with.value("rapid", "tags").contains("thermal") && !before.value("rapid", "tags").contains("thermal"));
+    assert!(with.channels.iter().any(|topic| topic == "/rapid/camera/tip_thermal"), "{:?}", with.channels);
+    // Where its sensor sits is in the episode, at its position.
+    let place_of: Vec<_> = with.topic("/tf").collect();
+    let [transform] = place_of.as_slice() else { panic!("{} transforms", place_of.len()) };
+    let bytes = 0.012_f64.to_le_bytes();
+    assert!(transform.data.windows(8).any(|part| part == bytes), "{:?}", transform.data);
+    assert_eq!(before.topic("/tf").count(), 0);
+}
+
+#[test]
 fn the_catalogue_is_listed_and_a_file_describes_a_type_of_ones_own() {
     let place = Place::new();
     let rig = include_str!("../../devices.toml");
@@ -75,6 +113,12 @@ fn the_catalogue_is_listed_and_a_file_describes_a_type_of_ones_own() {
     ok(&place, &["register", "--module", "wrist_mount_angled"]);
     ok(&place, &["check"]);
     assert!(ok(&place, &["modules"]).contains("* wrist_mount_angled"));
+    // Each mount has its own place of the camera, and the camera gives pictures.
+    let text = std::fs::read_to_string(place.path("devices.toml")).expect("a file");
+    for table in ["[module.wrist_mount.transform.gopro]", "[module.wrist_mount_angled.transform.gopro]"] {
+        assert!(text.contains(table), "{}", &text[rig.len()..]);
+    }
+    assert!(text.contains("stream = \"preview\"") && text.contains("rotation = ["), "{}", &text[rig.len()..]);
     // A type of one's own, and twice.
     let tip = ok(&place, &["modules", "tip_tactile"]).replace("tip_tactile", "tip_thermal").replace("320", "160");
     place.write("thermal.toml", &tip);

@@ -7,8 +7,10 @@ pub(crate) mod lan;
 pub(crate) mod terminal;
 pub(crate) mod tmux;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
@@ -261,6 +263,8 @@ pub(crate) struct Episode {
     pub(crate) metadata: Vec<mcap::records::Metadata>,
     /// Topics that have a channel, with or without messages.
     pub(crate) channels: Vec<String>,
+    /// The names of the schemas of these topics.
+    pub(crate) schemas: BTreeMap<String, String>,
     pub(crate) messages: Vec<Message>,
 }
 
@@ -292,7 +296,11 @@ impl Episode {
         let metadata =
             summary.metadata_indexes.iter().map(|index| mcap::read::metadata(&bytes, index).expect("metadata"));
         let channels = summary.channels.values().map(|channel| channel.topic.clone()).collect();
-        Self { metadata: metadata.collect(), channels, messages }
+        let schema = |channel: &Arc<mcap::Channel<'_>>| {
+            Some((channel.topic.clone(), channel.schema.as_ref().map(|schema| schema.name.clone())?))
+        };
+        let schemas = summary.channels.values().filter_map(schema).collect();
+        Self { metadata: metadata.collect(), channels, schemas, messages }
     }
 
     pub(crate) fn topic<'a>(&'a self, topic: &'a str) -> impl Iterator<Item = &'a Message> {

@@ -13,7 +13,7 @@ from recorded import PROGRAM, rapid
 RERUN = os.environ.get("RERUN")
 
 
-@unittest.skipUnless(PROGRAM and RERUN, "skipped: no program in $RAPID_BIN, or no $RERUN")
+@unittest.skipUnless(PROGRAM and RERUN, "no program in $RAPID_BIN, or no $RERUN")
 class Rerun(unittest.TestCase):
     def test_it_has_nothing_to_object_to(self) -> None:
         with tempfile.TemporaryDirectory() as temporary:

@@ -69,6 +69,8 @@ fn an_installation_puts_each_file_where_it_is_read() {
         "etc/systemd/system/rapid.service",
         "etc/systemd/system/rapid-upload.service",
         "etc/systemd/system/rapid-upload.timer",
+        "etc/systemd/system/rapid-upload-check.service",
+        "etc/systemd/system/rapid-upload-check.timer",
         "etc/rapid/descriptors/cam_wrist.yaml",
         "etc/rapid/descriptors/motor_state.yaml",
         "etc/rapid/foxglove.json",

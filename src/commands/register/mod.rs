@@ -323,7 +323,7 @@ fn commit(
         if !args.dry_run {
             let is_taken_over = |entry: &NewEntry| {
                 let node = parsed.registry.named(&entry.name).map(|device| &device.node);
-                matches!(node, Some(NodeSpec::Camera(_) | NodeSpec::Serial(_)))
+                matches!(node, Some(NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Lan(_)))
             };
             if entries.iter().all(is_taken_over) {
                 writeln!(out, "a running rapid takes it over: rapid reload")?;

@@ -1,7 +1,8 @@
-//! The units that bring finished episodes to a store (any that rclone knows: S3, SFTP, a disk).
+//! The units that bring finished episodes to a store (any that rclone knows: S3, SFTP, a disk), and read back what is there.
 //!
 //! Invariant: what is being written is not touched: its name ends in `.partial` until it is closed.
 //! Invariant: nothing is removed here unless a time is set for it, and the copy in the store was read back and is equal.
+//! Invariant: nothing is removed while copies are read back: both hold the lock `.upload.lock` in the folder of the episodes.
 
 use super::HEADER;
 
@@ -14,9 +15,9 @@ pub(super) fn service() -> String {
 #   rclone config --config /etc/rapid/rclone.conf                   # names a store, such as lab
 #   echo 'STORE=lab:episodes/rig-1' >/etc/rapid/upload.conf
 #   chown root:rapid /etc/rapid/rclone.conf; chmod 640 /etc/rapid/rclone.conf
-#   systemctl enable --now rapid-upload.timer
+#   systemctl enable --now rapid-upload.timer rapid-upload-check.timer
 # REMOVE_AFTER=7d in upload.conf also removes episodes of that age here, once their copies were read back and are equal.
-# Without it nothing is removed.
+# Without it nothing is removed. RCLONE_BWLIMIT=2M in upload.conf leaves the rest of the network to others.
 [Unit]
 Description=rapid: finished episodes to the store
 ConditionPathExists=/etc/rapid/upload.conf
@@ -24,27 +25,55 @@ Wants=network-online.target
 After=network-online.target
 
 [Service]
-Type=oneshot
-User=rapid
-UMask=0027
-Environment=EPISODES=/var/lib/rapid
-Environment=RCLONE_CONFIG=/etc/rapid/rclone.conf
-EnvironmentFile=/etc/rapid/upload.conf
-# A file that was copied is known by its checksum, and a break costs the file that was being copied. What is being written,
+{BEFORE}# A file that was copied is known by its checksum, and a break costs the file that was being copied. What is being written,
 # or waits to be repaired, is called *.mcap.partial. An episode in the store is never replaced: another of its name is an
 # error here.
 ExecStart=/usr/bin/rclone copy ${{EPISODES}} ${{STORE}} {SESSIONS} --checksum
 ExecStart=/usr/bin/rclone copy ${{EPISODES}} ${{STORE}} {EPISODES} --checksum --immutable
+# By size and by the checksum that the store keeps: a byte that changes in the store behind that checksum is found by
+# rapid-upload-check.service, which reads the copies.
 ExecStart=/usr/bin/rclone check ${{EPISODES}} ${{STORE}} {EPISODES} --one-way
 ExecStart=/bin/sh -euc '{REMOVE}'
-Nice=10
-IOSchedulingClass=idle
-PrivateTmp=yes
-ProtectSystem=strict
-ProtectHome=yes
-ReadWritePaths=/var/lib/rapid
-NoNewPrivileges=yes
-CapabilityBoundingSet=
+{AFTER}"
+    )
+}
+
+/// The unit that reads back every copy whose episode is still here, and fails if one differs. An episode of less than a day may
+/// be on its way to the store.
+pub(super) fn check_service() -> String {
+    format!(
+        r"{HEADER}
+# Reads the copies of all episodes that are still here, and compares every byte: see rapid-upload.service for the first start.
+# A copy that differs, or is missing after a day, makes this unit fail, and the journal names it (of one that differs rclone
+# prints the name alone). `rapid inspect` shows whether the episode here is whole. If it is, delete the copy, and
+# rapid-upload.service copies it again:
+#   rclone --config /etc/rapid/rclone.conf deletefile lab:episodes/rig-1/NAME.mcap
+[Unit]
+Description=rapid: copies in the store read back
+ConditionPathExists=/etc/rapid/upload.conf
+Wants=network-online.target
+After=network-online.target
+
+[Service]
+{BEFORE}ExecStart=/usr/bin/flock ${{EPISODES}}/{LOCK} /usr/bin/rclone check ${{EPISODES}} ${{STORE}} {EPISODES} --min-age=1d --one-way --download --differ=-
+{AFTER}"
+    )
+}
+
+/// The timer of the unit that reads back.
+pub(super) fn check_timer() -> String {
+    format!(
+        "{HEADER}
+[Unit]
+Description=rapid: copies in the store read back, every week
+
+[Timer]
+OnCalendar=weekly
+RandomizedDelaySec=1d
+Persistent=yes
+
+[Install]
+WantedBy=timers.target
 "
     )
 }
@@ -67,13 +96,37 @@ WantedBy=timers.target
     )
 }
 
+/// What both units begin their `[Service]` with: whose, and between what.
+const BEFORE: &str = "\
+Type=oneshot
+User=rapid
+UMask=0027
+Environment=EPISODES=/var/lib/rapid
+Environment=RCLONE_CONFIG=/etc/rapid/rclone.conf
+EnvironmentFile=/etc/rapid/upload.conf
+";
+/// And what they end it with: behind the recorder, and without rights.
+const AFTER: &str = "\
+Nice=10
+IOSchedulingClass=idle
+PrivateTmp=yes
+ProtectSystem=strict
+ProtectHome=yes
+ReadWritePaths=/var/lib/rapid
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+";
+/// Held while copies are read back, and while episodes are removed.
+const LOCK: &str = ".upload.lock";
 /// Finished episodes.
 const EPISODES: &str = "--max-depth 1 --include=*.mcap";
 /// The files of sessions, of which one may change at any moment.
 const SESSIONS: &str = "--max-depth 1 --include=session*.toml --include=session*.md";
 
-/// Only what rclone lists as equal after reading both sides is removed; `$$` is a `$` of the shell.
-const REMOVE: &str = r#"[ -n "$${REMOVE_AFTER:-}" ] || exit 0; equal=$$(mktemp); \
+/// Only what rclone lists as equal after reading both sides is removed; `$$` is a `$` of the shell. While copies are read back
+/// it is left to a later start.
+const REMOVE: &str = r#"[ -n "$${REMOVE_AFTER:-}" ] || exit 0; \
+  exec 9>>"$$EPISODES/.upload.lock"; flock --nonblock 9 || exit 0; equal=$$(mktemp); \
   rclone check "$$EPISODES" "$$STORE" --max-depth 1 --include=*.mcap --min-age "$$REMOVE_AFTER" --one-way --download \
-    --match "$$equal" || differs=yes; \
+    --match "$$equal" --differ=- || differs=yes; \
   while IFS= read -r name; do rm -v -- "$$EPISODES/$$name"; done <"$$equal"; rm "$$equal"; [ -z "$${differs:-}" ]"#;

@@ -141,3 +141,41 @@ fn only_an_added_entry_at_a_free_bit_is_taken_over() {
         }
     }
 }
+
+#[test]
+fn what_is_on_the_network_is_taken_over_and_what_is_on_a_can_bus_is_not() {
+    let at_an_address = "node = \"lan\"\nbit = 3\n[device.spare.lan]\nprotocol = \"mjpeg\"\nhost = \"192.168.1.9\"";
+    let behind_an_adapter = "node = \"lan\"\nbit = 3\n[device.spare.lan]\nprotocol = \"gopro\"";
+    for (text, refusal) in [
+        (with(&format!("[device.spare]\n{at_an_address}")), None),
+        (spare(behind_an_adapter), None),
+        (spare("node = \"can\"\nbit = 3"), Some("[device.spare]: its interface is brought up at the start")),
+    ] {
+        let Difference { added, needs_restart, .. } = Difference::between(&parsed(RIG), &parsed(&text));
+        assert_eq!(added.len(), usize::from(refusal.is_none()), "{text}: {needs_restart:?}");
+        assert_eq!(needs_restart.first().map(String::as_str), refusal, "{text}");
+    }
+}
+
+#[test]
+fn an_announced_device_is_taken_over_unless_two_entries_may_mean_it() {
+    let entry = |name: &str, bit: u8, keys: &str| {
+        format!("\n[device.{name}]\nnode = \"lan\"\nbit = {bit}\n[device.{name}.lan]\nprotocol = \"mjpeg\"\n{keys}\n")
+    };
+    let service = "mdns = \"_cam._tcp\"";
+    let (one, two) = (format!("{service}\ninstance = \"one\""), format!("{service}\ninstance = \"two\""));
+    for (first, second, is_taken) in [
+        (one.as_str(), two.as_str(), true),
+        (one.as_str(), service, false),
+        (service, two.as_str(), false),
+        (service, "mdns = \"_other._tcp\"", true),
+    ] {
+        let running = parsed(&with(&entry("here", 4, first)));
+        let new = parsed(&with(&[entry("here", 4, first), entry("spare", 5, second)].concat()));
+        let Difference { added, needs_restart, .. } = Difference::between(&running, &new);
+        assert_eq!(added.len(), usize::from(is_taken), "{first} and {second}: {needs_restart:?}");
+        let words = "[device.spare]: a device of its service may belong to [device.here]";
+        assert_eq!(needs_restart.iter().any(|line| line.starts_with(words)), !is_taken, "{needs_restart:?}");
+        assert!(is_taken || needs_restart[0].contains("write the `instance` of each"), "{needs_restart:?}");
+    }
+}
