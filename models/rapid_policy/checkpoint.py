@@ -52,6 +52,8 @@ class Run:
             "optimizer": self.optimizer.state_dict(),
             "random": json.dumps(self.random_state or self.random.bit_generator.state),
             "torch_random": torch.get_rng_state(),
+            # Of dropout on a GPU.
+            "cuda_random": torch.cuda.get_rng_state() if torch.cuda.is_initialized() else None,
             "provenance": {**self.provenance, **facts},
             "iterations": self.iterations,
             "iteration": self.iteration,
@@ -70,6 +72,8 @@ class Run:
         self.optimizer.load_state_dict(state["optimizer"])
         self.random.bit_generator.state = self.random_state = json.loads(state["random"])
         torch.set_rng_state(state["torch_random"])
+        if state.get("cuda_random") is not None and torch.cuda.is_initialized():
+            torch.cuda.set_rng_state(state["cuda_random"])
         self.iterations, self.iteration, self.seconds = state["iterations"], state["iteration"], state["seconds"]
         self.losses, self.validation = state["losses"], state["validation"]
 
@@ -89,7 +93,8 @@ def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: di
     policy = policy.to(device)
     facts = {**provenance, "windows": windows, "normalization": {key: value.to_dict() for key, value in ranges.items()}}
     iterations = schedule.iterations or max(1, round((schedule.epochs or 1) * windows / schedule.windows))
-    average, random = copy.deepcopy(policy).requires_grad_(False), np.random.default_rng(schedule.seed)
+    # For measuring: dropout would make its losses, and the random numbers behind them, others each time.
+    average, random = copy.deepcopy(policy).requires_grad_(False).eval(), np.random.default_rng(schedule.seed)
     return Run(spec, policy, average, optimizer(schedule, policy), random, facts, iterations)
 
 

@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 import torch
 import written
-from made_up import MODELS, Experiment, made_up, path, small
+from made_up import MODELS, Experiment, by_hand, made_up, path, small
 
 from rapid_policy import progress
 from rapid_policy import train as module
@@ -75,6 +75,33 @@ class Learning(Case):
                 final = Trainer(run, dataset, self.folder).train()
                 self.assertLess(final, 0.8 * sum(run.losses[:20]) / 20)
                 self.assertTrue((self.folder / "loss.png").stat().st_size > 0)
+
+    def test_the_loss_of_a_transformer_falls(self):
+        spec = small("transformer", iterations=250)
+        dataset = Dataset(spec, [by_hand(40)])
+        run = start(spec, dataset)
+        final = Trainer(run, dataset, self.folder).train()
+        self.assertLess(final, 0.8 * sum(run.losses[:20]) / 20)
+
+    def test_dropout_is_resumed_and_measures_nothing(self):
+        spec = small("transformer", iterations=6, validate_every=2)
+        dataset = Dataset(spec, [by_hand(40)])
+        held_out = Dataset(spec, [by_hand(30, 1)], dataset.ranges)
+        through = start(spec, dataset)
+        Trainer(through, dataset, self.folder).train()
+        stopped = start(spec, dataset)
+        with (
+            mock.patch.object(module.Progress, "step", side_effect=[None, None, KeyboardInterrupt]),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            Trainer(stopped, dataset, self.folder, held_out=held_out).train()
+        resumed = start(spec, dataset)
+        resumed.load(read_checkpoint(self.folder / CHECKPOINT))
+        trainer = Trainer(resumed, dataset, self.folder, held_out=held_out)
+        trainer.train()
+        self.assertEqual(resumed.losses, through.losses)
+        trainer._validate(mock.Mock())
+        self.assertEqual(resumed.validation[-1][1], resumed.validation[-2][1])
 
     def test_epochs_are_iterations(self):
         spec = small(epochs=3, windows=8)
