@@ -14,7 +14,7 @@ import torch
 from .experiment import Experiment, Training
 from .model import Policy
 
-CHECKPOINT, BEST = "checkpoint.pt", "best.pt"
+CHECKPOINT, BEST, BEST_SUCCESS = "checkpoint.pt", "best.pt", "best-success.pt"
 
 
 @dataclass
@@ -34,6 +34,8 @@ class Run:
     losses: list[float] = field(default_factory=list)
     validation: list[tuple[int, float]] = field(default_factory=list)
     """Iteration and loss on the episodes that are held out."""
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    """What `trials` has found: iteration, success, score and interval."""
     random_state: dict[str, Any] | None = None
     """Of `random` behind the last batch that was learned from: the feed is ahead."""
 
@@ -60,6 +62,7 @@ class Run:
             "seconds": self.seconds,
             "losses": self.losses,
             "validation": self.validation,
+            "evaluations": self.evaluations,
         }
         partial = path.with_suffix(".partial")
         torch.save(state, partial)
@@ -76,11 +79,18 @@ class Run:
             torch.cuda.set_rng_state(state["cuda_random"])
         self.iterations, self.iteration, self.seconds = state["iterations"], state["iteration"], state["seconds"]
         self.losses, self.validation = state["losses"], state["validation"]
+        # Older checkpoints have none.
+        self.evaluations = state.get("evaluations", [])
 
     @property
     def best(self) -> float:
         """The lowest loss on the episodes that are held out."""
         return min((loss for _, loss in self.validation), default=float("inf"))
+
+    @property
+    def best_success(self) -> float:
+        """The highest share of trials that succeeded."""
+        return max((found["score"] for found in self.evaluations), default=0.0)
 
 
 def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: dict[str, Any], device: Any) -> Run:

@@ -19,7 +19,7 @@ from made_up import MODELS, Experiment, by_hand, made_up, path, small
 
 from rapid_policy import progress
 from rapid_policy import train as module
-from rapid_policy.checkpoint import BEST, CHECKPOINT, Run, begin, read_checkpoint
+from rapid_policy.checkpoint import BEST, BEST_SUCCESS, CHECKPOINT, Run, begin, read_checkpoint
 from rapid_policy.dataset import Dataset
 from rapid_policy.train import Stopped, Trainer
 
@@ -325,6 +325,22 @@ class CommandLine(Case):
         weights = [torch.cat([w.flatten() for w in state["policy"].values()]) for state in (one, two)]
         self.assertLess(float((weights[0] - weights[1]).abs().mean()), 2e-5)
         self.assertEqual(two["provenance"]["hardware"], "2 processes, each 1 CPU thread")
+
+    def test_the_first_of_two_processes_evaluates(self):
+        line = {"event": "condition", "condition": "full", "success": 1, "trials": 2, "score": 0.5, "interval": [0.1, 0.9]}
+        rapid, calls = self.folder / "evaluates", self.folder / "calls"
+        rapid.write_text(
+            f'#!/bin/sh\nif [ $1 = inspect ]; then exec {self.judge} "$@"; fi\n'
+            f'echo "$@" >>{calls}\necho \'{json.dumps(line)}\'\n'
+        )
+        rapid.chmod(0o755)
+        launch = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
+        evaluated = ("--rapid", str(rapid), "--evaluate-every", "10", "--evaluate-trials", "2")
+        done = self.run_train(*self.words("run", "--device", "cpu", *evaluated), launch=launch)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertIn("tactile-id: 10/10 success 0.50 (0.10 to 0.90), 1 of 2 trials, the best", done.stdout)
+        self.assertEqual(len(calls.read_text().splitlines()), 1)
+        self.assertEqual(read_checkpoint(self.folder / "run" / BEST_SUCCESS)["iteration"], 10)
 
     def test_a_run_is_resumed_and_exported(self):
         first = self.run_train(*self.words("run"), RAPID_BIN=str(self.judge))
