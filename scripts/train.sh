@@ -11,7 +11,8 @@
 # RAPID is the program, default target/release/rapid. Demonstrations and checkpoints are in RUNS=models/runs; existing
 # ones are used again: a stopped training continues. EPISODES=240 and SEED=1000 of the demonstrations by hand (those with the arm
 # are 480 from 1000 on: the experiments of the ablation say which of them); THREADS=2 of a training, MINUTES of one that is
-# no part of the ablation; POLICY=tactile-id; JOBS=1 trainings of the ablation at a time, SEEDS="0 1 2" of them; ENCODER=small.
+# no part of the ablation, EVALUATE iterations between two evaluations of one; POLICY=tactile-id; JOBS=1 trainings of the
+# ablation at a time, SEEDS="0 1 2" of them; ENCODER=small.
 #
 # Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks complete.
 set -euo pipefail
@@ -29,6 +30,8 @@ readonly DEMONSTRATIONS="$RUNS/$NAME-$EPISODES-$SEED"
 
 SCHEDULE=(--threads "$THREADS")
 [[ -z ${MINUTES:-} ]] || SCHEDULE+=(--minutes "$MINUTES")
+# By the program in RAPID_BIN.
+[[ -z ${EVALUATE:-} ]] || SCHEDULE+=(--evaluate-every "$EVALUATE")
 readonly SCHEDULE
 
 # Threads that spin while waiting slow down everything else on the machine.

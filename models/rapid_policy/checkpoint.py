@@ -14,7 +14,7 @@ import torch
 from .experiment import Experiment, Training
 from .model import Policy
 
-CHECKPOINT, BEST = "checkpoint.pt", "best.pt"
+CHECKPOINT, BEST, BEST_SUCCESS = "checkpoint.pt", "best.pt", "best-success.pt"
 
 
 @dataclass
@@ -34,6 +34,8 @@ class Run:
     losses: list[float] = field(default_factory=list)
     validation: list[tuple[int, float]] = field(default_factory=list)
     """Iteration and loss on the episodes that are held out."""
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    """What `trials` has found: iteration, success, score and interval."""
     random_state: dict[str, Any] | None = None
     """Of `random` behind the last batch that was learned from: the feed is ahead."""
 
@@ -52,12 +54,15 @@ class Run:
             "optimizer": self.optimizer.state_dict(),
             "random": json.dumps(self.random_state or self.random.bit_generator.state),
             "torch_random": torch.get_rng_state(),
+            # Of dropout on a GPU.
+            "cuda_random": torch.cuda.get_rng_state() if torch.cuda.is_initialized() else None,
             "provenance": {**self.provenance, **facts},
             "iterations": self.iterations,
             "iteration": self.iteration,
             "seconds": self.seconds,
             "losses": self.losses,
             "validation": self.validation,
+            "evaluations": self.evaluations,
         }
         partial = path.with_suffix(".partial")
         torch.save(state, partial)
@@ -70,13 +75,22 @@ class Run:
         self.optimizer.load_state_dict(state["optimizer"])
         self.random.bit_generator.state = self.random_state = json.loads(state["random"])
         torch.set_rng_state(state["torch_random"])
+        if state.get("cuda_random") is not None and torch.cuda.is_initialized():
+            torch.cuda.set_rng_state(state["cuda_random"])
         self.iterations, self.iteration, self.seconds = state["iterations"], state["iteration"], state["seconds"]
         self.losses, self.validation = state["losses"], state["validation"]
+        # Older checkpoints have none.
+        self.evaluations = state.get("evaluations", [])
 
     @property
     def best(self) -> float:
         """The lowest loss on the episodes that are held out."""
         return min((loss for _, loss in self.validation), default=float("inf"))
+
+    @property
+    def best_success(self) -> float:
+        """The highest share of trials that succeeded."""
+        return max((found["score"] for found in self.evaluations), default=0.0)
 
 
 def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: dict[str, Any], device: Any) -> Run:
@@ -89,7 +103,8 @@ def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: di
     policy = policy.to(device)
     facts = {**provenance, "windows": windows, "normalization": {key: value.to_dict() for key, value in ranges.items()}}
     iterations = schedule.iterations or max(1, round((schedule.epochs or 1) * windows / schedule.windows))
-    average, random = copy.deepcopy(policy).requires_grad_(False), np.random.default_rng(schedule.seed)
+    # For measuring: dropout would make its losses, and the random numbers behind them, others each time.
+    average, random = copy.deepcopy(policy).requires_grad_(False).eval(), np.random.default_rng(schedule.seed)
     return Run(spec, policy, average, optimizer(schedule, policy), random, facts, iterations)
 
 

@@ -367,18 +367,46 @@ class Encoder(Section):
 
 
 class Denoiser(Section):
-    """The U-Net."""
+    """The network that predicts the noise in actions."""
 
+    type: Literal["unet", "transformer"] = known("which", "transformer", "unet")
     widths: tuple[Annotated[int, Field(ge=8, le=4096, multiple_of=8)], ...] = known(
-        "channels of each level", [32, 64, 128], (32, 64, 128), min_length=1, max_length=6
+        "unet: channels of each level", [32, 64, 128], (32, 64, 128), min_length=1, max_length=6
     )
-    kernel: int = known("of its convolutions", 5, 5, ge=1, le=15)
+    kernel: int = known("unet: of its convolutions", 5, 5, ge=1, le=15)
+    layers: int = known("transformer: one behind the other", 4, 4, ge=1, le=48)
+    heads: int = known("transformer: of the attention in a layer", 4, 4, ge=1, le=64)
+    width: int = known("transformer: length of a token", 128, 128, ge=8, le=4096)
+    dropout: Share = known("transformer: share of the values that are dropped in training", 0.1, 0.1)
 
     @model_validator(mode="after")
     def _check(self) -> Denoiser:
+        for key in sorted(self.model_fields_set):
+            if not self._is_of_type(key):
+                fix = f'remove it, or write type = "{_TYPE_OF_KEY[key]}"'
+                raise mistake(key, f"of no use with type = {self.type!r}", fix)
         if self.kernel % 2 == 0:
             raise mistake("kernel", f"{self.kernel} is even", f"write {self.kernel + 1}")
+        if self.width % self.heads:
+            cause = f"{self.heads} do not divide the width {self.width}"
+            raise mistake("heads", cause, "write a divisor of the width")
         return self
+
+    @property
+    def halvings(self) -> int:
+        """How often the horizon is halved."""
+        return len(self.widths) - 1 if self.type == "unet" else 0
+
+    def sizes(self) -> dict[str, Any]:
+        """The keys of its type, with what they are."""
+        return {key: value for key, value in self.model_dump(mode="json").items() if self._is_of_type(key)}
+
+    def _is_of_type(self, key: str) -> bool:
+        return _TYPE_OF_KEY.get(key, self.type) == self.type
+
+
+_TYPE_OF_KEY = dict.fromkeys(("widths", "kernel"), "unet")
+_TYPE_OF_KEY |= dict.fromkeys(("layers", "heads", "width", "dropout"), "transformer")
 
 
 class Horizon(Section):
@@ -451,7 +479,7 @@ class Experiment(Section):
     observation: tuple[Observation, ...] = known("an input of the policy", {}, min_length=1)
     action: Action = known("what it does", {"actuator": "arm"})
     encoder: Encoder = known("the network that sees", {}, Encoder())
-    denoiser: Denoiser = known("the U-Net", {}, Denoiser())
+    denoiser: Denoiser = known("the network that predicts the noise", {}, Denoiser())
     training: Training = known("the schedule", {"iterations": 3900})
 
     @model_validator(mode="after")
@@ -467,9 +495,9 @@ class Experiment(Section):
             known_ones = ", ".join(sorted({o.modality for o in self.vectors})) or "none yet"
             cause = f"{base.modality!r} is the modality of no vector that is observed"
             raise mistake("action.base.modality", cause, f"write one of them ({known_ones}), or observe it")
-        levels = 2 ** (len(self.denoiser.widths) - 1)
+        levels = 2**self.denoiser.halvings
         if self.policy.horizon % levels:
-            cause = f"{self.policy.horizon} cannot be halved {len(self.denoiser.widths) - 1} times"
+            cause = f"{self.policy.horizon} cannot be halved {self.denoiser.halvings} times"
             raise mistake("policy.horizon", cause, f"write a multiple of {levels}, or fewer widths of the denoiser")
         return self
 

@@ -66,7 +66,7 @@ def _network(spec: Experiment) -> dict[str, Any]:
     encoder = spec.encoder.model_dump(mode="json")
     if spec.encoder.weights:
         encoder["weights"] = Path(spec.encoder.weights).name
-    return {"encoder": encoder, "denoiser": spec.denoiser.model_dump(mode="json")}
+    return {"encoder": encoder, "denoiser": spec.denoiser.sizes()}
 
 
 def encoder_example(spec: Experiment, batch: int = 2, mask: tuple[int, ...] | None = None) -> tuple[Tensor, ...]:

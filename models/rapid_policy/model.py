@@ -1,7 +1,7 @@
 """The two networks: a mask-aware encoder of observations, and the denoiser of action sequences.
 
-The denoiser is the one-dimensional U-Net of Diffusion Policy (Chi et al., 2023) at a size that one processor core runs
-ten times in a control period.
+The denoiser is one of Diffusion Policy's (Chi et al., 2023), the one-dimensional U-Net or the transformer, at a size that
+one processor core runs ten times in a control period. Both have the same inputs and output.
 """
 
 from __future__ import annotations
@@ -150,18 +150,30 @@ class ResidualBlock(nn.Module):
         return self.second(scale * self.first(x) + shift) + self.skip(x)
 
 
-class Denoiser(nn.Module):
-    """Sample [B, Tp, Da], timestep i64 [B], global_cond [B, Dc] -> the noise predicted in the sample [B, Tp, Da]."""
+class StepEmbedding(nn.Sequential):
+    """Diffusion step i64 [B] -> [B, outputs]"""
 
-    STEP_FEATURES = 64
+    FEATURES = 64
 
-    def __init__(self, actions: int, condition: int, widths: tuple[int, ...], kernel: int = 5) -> None:
-        super().__init__()
-        d = self.STEP_FEATURES
+    def __init__(self, outputs: int) -> None:
+        d = self.FEATURES
+        super().__init__(nn.Linear(d, 4 * d), nn.Mish(), nn.Linear(4 * d, outputs))
         frequencies = torch.exp(torch.arange(d // 2) * -(math.log(10_000) / (d // 2 - 1)))
         self.register_buffer("frequencies", frequencies, persistent=False)
-        self.step = nn.Sequential(nn.Linear(d, 4 * d), nn.Mish(), nn.Linear(4 * d, d))
-        c = condition + d
+
+    def forward(self, timestep: Tensor) -> Tensor:
+        phase = timestep[:, None].float() * self.frequencies[None]
+        return super().forward(torch.cat([phase.sin(), phase.cos()], -1))
+
+
+class UNetDenoiser(nn.Module):
+    """Sample [B, Tp, Da], timestep i64 [B], global_cond [B, Dc] -> the noise predicted in the sample [B, Tp, Da]."""
+
+    def __init__(self, spec: Experiment) -> None:
+        super().__init__()
+        actions, widths, kernel = spec.action_length, spec.denoiser.widths, spec.denoiser.kernel
+        self.step = StepEmbedding(StepEmbedding.FEATURES)
+        c = spec.condition + StepEmbedding.FEATURES
         levels = list(zip((actions, *widths[:-1]), widths, strict=True))
         self.down = nn.ModuleList(
             nn.ModuleList([ResidualBlock(i, o, c, kernel), ResidualBlock(o, o, c, kernel), shrink])
@@ -179,8 +191,7 @@ class Denoiser(nn.Module):
         self.out = nn.Sequential(ConvBlock(widths[0], widths[0], kernel), nn.Conv1d(widths[0], actions, 1))
 
     def forward(self, sample: Tensor, timestep: Tensor, global_cond: Tensor) -> Tensor:
-        phase = timestep[:, None].float() * self.frequencies[None]
-        c = torch.cat([self.step(torch.cat([phase.sin(), phase.cos()], -1)), global_cond], -1)
+        c = torch.cat([self.step(timestep), global_cond], -1)
         x, kept = sample.transpose(1, 2), []
         for first, second, shrink in self.down:
             x = second(first(x, c), c)
@@ -193,6 +204,42 @@ class Denoiser(nn.Module):
         return self.out(x).transpose(1, 2)
 
 
+class TransformerDenoiser(nn.Module):
+    """The same by attention: a token for each action, which sees all others, the diffusion step and each observation step.
+
+    What a bundle calls `global_cond` is the observation steps, one behind the other.
+    """
+
+    def __init__(self, spec: Experiment) -> None:
+        super().__init__()
+        sizes, self.steps = spec.denoiser, spec.policy.n_obs_steps
+        width = sizes.width
+        self.actions = nn.Linear(spec.action_length, width)
+        self.observation = nn.Linear(spec.condition // self.steps, width)
+        self.step = StepEmbedding(width)
+        self.action_places = nn.Parameter(0.02 * torch.randn(spec.policy.horizon, width))
+        self.seen_places = nn.Parameter(0.02 * torch.randn(1 + self.steps, width))
+        # Not nn.TransformerDecoder: its layers would begin with equal weights.
+        self.layers = nn.ModuleList(
+            nn.TransformerDecoderLayer(
+                width, sizes.heads, 4 * width, sizes.dropout, "gelu", batch_first=True, norm_first=True
+            )
+            for _ in range(sizes.layers)
+        )
+        self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, spec.action_length))
+
+    def forward(self, sample: Tensor, timestep: Tensor, global_cond: Tensor) -> Tensor:
+        observations = self.observation(global_cond.unflatten(1, (self.steps, -1)))
+        seen = torch.cat([self.step(timestep)[:, None], observations], 1) + self.seen_places
+        x = self.actions(sample) + self.action_places
+        for layer in self.layers:
+            x = layer(x, seen)
+        return self.out(x)
+
+
+DENOISERS = {"unet": UNetDenoiser, "transformer": TransformerDenoiser}
+
+
 class Policy(nn.Module):
     """Both networks, for training."""
 
@@ -200,7 +247,7 @@ class Policy(nn.Module):
         super().__init__()
         self.spec = spec
         self.encoder = ObservationEncoder(spec)
-        self.denoiser = Denoiser(spec.action_length, spec.condition, spec.denoiser.widths, spec.denoiser.kernel)
+        self.denoiser = DENOISERS[spec.denoiser.type](spec)
 
     def start_from(self, weights: Path) -> None:
         """The image encoders begin with torchvision's weights."""

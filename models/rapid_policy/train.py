@@ -1,11 +1,13 @@
 """Trains a policy as an experiment describes it.
 
     python -m rapid_policy.train EXPERIMENT.toml [--data FOLDER...] --out RUN [--resume]
+    python -m rapid_policy.train EXPERIMENT.toml --out RUN --rapid PROGRAM --evaluate-every 500 --evaluate-trials 20
     torchrun --nproc-per-node 2 -m rapid_policy.train EXPERIMENT.toml --out RUN
 
 Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` continues), RUN/best.pt (of the
-lowest loss on held-out episodes, if there are any), curves for TensorBoard and RUN/loss.png. SIGTERM and SIGINT end it
-after the present iteration, with a checkpoint.
+lowest loss on held-out episodes, if there are any), RUN/best-success.pt (of the most trials that succeeded, with
+--evaluate-every), curves for TensorBoard and RUN/loss.png. SIGTERM and SIGINT end it after the present iteration, with a
+checkpoint.
 """
 
 from __future__ import annotations
@@ -13,13 +15,14 @@ from __future__ import annotations
 import argparse
 import hashlib
 import math
+import os
 import platform
 import shutil
 import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +31,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .checkpoint import BEST, CHECKPOINT, Run, begin, read_checkpoint
+from .checkpoint import BEST, BEST_SUCCESS, CHECKPOINT, Run, begin, read_checkpoint
 from .corpus import Corpus, load
 from .dataset import Batch, Dataset, inputs
 from .diffusion import TRAIN_TIMESTEPS, add_noise, alphas_cumprod
@@ -36,9 +39,11 @@ from .episodes import Episode, EpisodeError
 from .experiment import Experiment
 from .experiment_file import ExperimentError, read_experiment
 from .feed import Feed
+from .judgement import JudgementError, program
 from .model import Policy, parameters
 from .progress import BOARD_EVERY, Board, Progress, plot, recent
 from .ranks import Ranks, join
+from .trials import CONDITION, FIRST_SEED, MOST, Trials, check_seeds
 
 # Batches of a measurement on held-out episodes, at most.
 VALIDATION_BATCHES = 16
@@ -78,8 +83,9 @@ class Trainer:
     """A run, what it learns from, and where it writes."""
 
     def __init__(self, run: Run, dataset: Dataset, out: Path, *, held_out: Dataset | None = None,
-                 ranks: Ranks | None = None, workers: int = 0, minutes: float = math.inf) -> None:  # fmt: skip
-        self.run, self.dataset, self.out, self.held_out = run, dataset, out, held_out
+                 ranks: Ranks | None = None, workers: int = 0, minutes: float = math.inf,
+                 trials: Trials | None = None) -> None:  # fmt: skip
+        self.run, self.dataset, self.out, self.held_out, self.trials = run, dataset, out, held_out, trials
         self.ranks = ranks or Ranks(device=next(run.policy.parameters()).device)
         self.workers = workers
         self.minutes = min(minutes, run.schedule.minutes or math.inf)
@@ -100,7 +106,11 @@ class Trainer:
         try:
             self._iterate(feed, progress, board)
             run.provenance["final_loss"] = recent(run.losses)
+            if self.trials:
+                self._evaluate_last(board)
         finally:
+            if self.trials:
+                self.trials.end()
             for number, handler in before.items():
                 signal.signal(number, handler)
             feed.close()
@@ -111,6 +121,13 @@ class Trainer:
         if first:
             plot(run.losses, run.spec.name, self.out / "loss.png", run.validation)
         return run.provenance["final_loss"]
+
+    def _evaluate_last(self, board: Board) -> None:
+        # It takes a while, in which nothing of the training can be lost any more.
+        self.run.save(self.out / CHECKPOINT)
+        self.trials.finish(board, lambda: self.stopping)
+        if self.stopping:
+            raise Stopped
 
     def _stop(self, *_: Any) -> None:
         self.stopping = True
@@ -140,6 +157,8 @@ class Trainer:
                 board.add(run.iteration, loss=loss, learning_rate=rate)
             if self.held_out and (run.iteration % schedule.validate_every == 0 or run.iteration == run.iterations):
                 self._validate(board)
+            if self.trials:
+                self.trials.step(board)
             if time.monotonic() - saved >= 60 * schedule.checkpoint_minutes:
                 run.save(self.out / CHECKPOINT)
                 saved = time.monotonic()
@@ -282,7 +301,33 @@ def parse() -> argparse.Namespace:
     add("--workers", type=int, default=1, help="threads that read ahead, and processes that decode")
     add("--device", default="auto", help="auto, cpu, cuda")
     add("--resume", action="store_true", help="continue from the checkpoint in --out")
+    add("--rapid", metavar="PROGRAM", help="gives the verdicts and evaluates (default: RAPID_BIN, or rapid of the PATH)")
+    add(
+        "--evaluate-every",
+        type=whole(10**9),
+        metavar="N",
+        help="run the averaged weights in `rapid eval` every N iterations and at the end, beside the training; the best"
+        f" are in RUN/{BEST_SUCCESS} (default: never)",
+    )
+    add(
+        "--evaluate-trials",
+        type=whole(MOST),
+        default=20,
+        metavar="N",
+        help=f"of the simulated task, condition {CONDITION}, seeds from {FIRST_SEED} on, which no result is reported of (20)",
+    )
     return parser.parse_args()
+
+
+def whole(most: int) -> Callable[[str], int]:
+    """Reads a number from 1 to `most`."""
+
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and 1 <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text}: write a number from 1 to {most}")
+        return int(text)
+
+    return read
 
 
 def with_options(spec: Experiment, args: argparse.Namespace) -> Experiment:
@@ -312,6 +357,9 @@ def open_corpus(spec: Experiment, args: argparse.Namespace, ranks: Ranks) -> Cor
 def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
     """All that a training needs, from the command line."""
     spec = with_options(read_experiment(args.experiment), args)
+    if args.rapid:
+        os.environ["RAPID_BIN"] = args.rapid
+    rapid = program() if args.evaluate_every else None
     args.out.mkdir(parents=True, exist_ok=True)
     checkpoint = args.out / CHECKPOINT
     state = read_checkpoint(checkpoint) if args.resume else None
@@ -326,6 +374,8 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
     facts |= {"hardware": hardware(ranks.device, ranks.world), "held_out": len(corpus.held_out)}
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
         raise ValueError(f"{checkpoint} was trained on other episodes than these")
+    if rapid:
+        check_seeds(facts["episode_seeds"], args.evaluate_trials)
     run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device)
     if state:
         run.load(state)
@@ -337,7 +387,9 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
             f"{len(corpus.training)} episodes, {len(dataset.windows)} windows, {parameters([run.policy]):,} parameters"
         )
         print(f"{spec.name}: {counts}", flush=True)
-    return Trainer(run, dataset, args.out, held_out=held_out, ranks=ranks, workers=args.workers, minutes=args.minutes)
+    trials = Trials(run, args.out, rapid, args.evaluate_every, args.evaluate_trials) if rapid and ranks.first else None
+    options = {"workers": args.workers, "minutes": args.minutes, "trials": trials}
+    return Trainer(run, dataset, args.out, held_out=held_out, ranks=ranks, **options)
 
 
 def command(args: argparse.Namespace, spec: Experiment) -> str:
@@ -363,7 +415,7 @@ def main() -> None:
             print(
                 f"final loss {final:.4f} after {run.iteration} iterations, {run.seconds / 60:.1f} min: {args.out / CHECKPOINT}"
             )
-    except (OSError, EpisodeError, ExperimentError, ValueError) as error:
+    except (OSError, EpisodeError, ExperimentError, JudgementError, ValueError) as error:
         lines = str(error).splitlines()
         sys.exit("\n".join(f"train: {line}" for line in lines))
     finally:

@@ -28,7 +28,8 @@ def experiment(name: str = "tactile-id-arm", **tables: dict[str, Any]) -> Experi
 
 def small(name: str = "tactile-id-arm", **training: Any) -> Experiment:
     """The same with small networks."""
-    sizes = {"encoder": {"width": 8, "features": 8, "keypoints": 4}, "denoiser": {"widths": [8, 16]}}
+    denoiser = {"layers": 2, "heads": 2, "width": 32} if name == "transformer" else {"widths": [8, 16]}
+    sizes = {"encoder": {"width": 8, "features": 8, "keypoints": 4}, "denoiser": denoiser}
     training = {"iterations": 8, "windows": 4, "warmup": 2, **training}
     if "epochs" in training:
         training["iterations"] = None

@@ -3,13 +3,14 @@
 The first lines of a file in `experiments/` are the messages about it, without the name of the file.
 """
 
+import json
 import tempfile
 import unittest
 from pathlib import Path
 
 from made_up import EXPERIMENTS, experiment, small
 
-from rapid_policy.experiment import Experiment
+from rapid_policy.experiment import Denoiser, Experiment
 from rapid_policy.experiment_file import ExperimentError, read_experiment
 
 MISTAKES = Path(__file__).parent / "experiments"
@@ -48,6 +49,18 @@ class Ours(unittest.TestCase):
     def test_folders_are_relative_to_the_file(self):
         (folder,) = experiment().data.folders
         self.assertEqual(folder, str(EXPERIMENTS.parent / "runs" / "arm-480-1000"))
+
+    def test_a_transformer_takes_any_horizon_and_has_defaults(self):
+        described = json.loads(experiment("transformer", policy={"horizon": 15}).to_text())
+        described["denoiser"] = {"type": "transformer"}
+        denoiser = Experiment.from_text(json.dumps(described)).denoiser
+        sizes = {"type": "transformer", "layers": 4, "heads": 4, "width": 128, "dropout": 0.1}
+        self.assertEqual(denoiser.sizes(), sizes)
+
+    def test_what_is_written_of_a_denoiser_is_read_again(self):
+        for sizes in ({}, {"widths": [8, 16]}, {"type": "transformer"}, {"type": "transformer", "width": 64}):
+            denoiser = Denoiser.model_validate_json(json.dumps(sizes))
+            self.assertEqual(Denoiser.model_validate_json(json.dumps(denoiser.sizes())), denoiser)
 
     def test_a_checkpoint_brings_its_description_back(self):
         for path in EXPERIMENTS.glob("*.toml"):

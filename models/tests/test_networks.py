@@ -1,19 +1,23 @@
 """The networks: what the mask hides, and that a bundle's graphs hold the whole policy."""
 
 import json
+import os
+import subprocess
 import tempfile
 import unittest
 from pathlib import Path
+from typing import Any
 
 import torch
-from made_up import Experiment, experiment, observed
+from made_up import Experiment, experiment, observed, small
 
-from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json, write_card
+from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json, write_card, write_policy
 from rapid_policy.export import _network, denoiser_example, encoder_example, largest_difference, write_graph
 from rapid_policy.model import Policy
 from rapid_policy.resnet import ResNet18
 from rapid_policy.weights import load_policy
 
+RAPID = os.environ.get("RAPID_BIN")
 RANGES = {
     "state": {"mode": "min_max", "min": [0, 0, 0, 0], "max": [1, 1, 1, 1]},
     "action": {"mode": "min_max", "min": [-1, -1, 0, 0], "max": [1, 1, 1, 2]},
@@ -28,6 +32,14 @@ def random_policy(spec: Experiment) -> Policy:
         for weight in policy.parameters():
             weight.add_(torch.randn_like(weight) * 0.05)
     return policy
+
+
+def write(policy: Policy, folder: Path) -> dict[str, Any]:
+    """A bundle without its card; the content of its `policy.json`."""
+    spec, inputs = policy.spec, ["sample", "timestep", "global_cond"]
+    write_graph(policy.encoder, encoder_example(spec), encoder_inputs(spec), "global_cond", folder / ENCODER)
+    write_graph(policy.denoiser, denoiser_example(spec), inputs, "epsilon", folder / DENOISER)
+    return write_policy(spec, {"normalization": RANGES, "network": _network(spec)}, folder)
 
 
 class Mask(unittest.TestCase):
@@ -100,6 +112,24 @@ class Encoders(unittest.TestCase):
         torch.testing.assert_close(trunk.bn1(x), norm(x))
 
 
+class Transformer(unittest.TestCase):
+    def test_every_action_sees_the_others_the_step_and_each_observation(self):
+        spec = small("transformer")
+        denoiser = random_policy(spec).denoiser
+        inputs = denoiser_example(spec, 1)
+        with torch.no_grad():
+            plain = denoiser(*inputs)
+            for name, at in (("another action", (0, 0, 3)), ("the step", (1, 0)), ("an observation", (2, 0, -1))):
+                changed = [x.clone() for x in inputs]
+                changed[at[0]][at[1:]] += 1
+                moved = (denoiser(*changed) - plain).abs().amax(-1)
+                self.assertGreater(float(moved.min()), 1e-5, name)
+
+    def test_its_layers_begin_with_other_weights(self):
+        one, other = Policy(small("transformer")).denoiser.layers
+        self.assertFalse(torch.equal(one.linear1.weight, other.linear1.weight))
+
+
 class Bundle(unittest.TestCase):
     def test_graphs_equal_pytorch_and_hold_its_weights(self):
         sizes = {
@@ -112,18 +142,14 @@ class Bundle(unittest.TestCase):
             ("shared", experiment(encoder={"shared": True})),
             ("resnet18", experiment(**sizes)),
             ("by hand", experiment("tactile-id")),
+            ("transformer", experiment("transformer", policy={"horizon": 14, "n_obs_steps": 3})),
         ):
             with self.subTest(name), tempfile.TemporaryDirectory() as folder_name:
                 folder = Path(folder_name)
                 policy = random_policy(spec)
-                write_graph(policy.encoder, encoder_example(spec), encoder_inputs(spec), "c", folder / ENCODER)
-                inputs = ["sample", "timestep", "global_cond"]
-                write_graph(policy.denoiser, denoiser_example(spec), inputs, "e", folder / DENOISER)
-                self.assertLess(largest_difference(spec, policy, folder), 2e-4)
-                facts = {"normalization": RANGES, "network": _network(spec)}
-                described = policy_json(spec, facts, {ENCODER: "", DENOISER: ""})
+                described = write(policy, folder)
+                self.assertLess(largest_difference(spec, policy, folder), 1e-4 if name == "transformer" else 2e-4)
                 self.assertEqual(described["mask"] is None, not spec.policy.mask_aware)
-                (folder / "policy.json").write_text(json.dumps(described))
                 again = load_policy(folder)
                 for key, weight in policy.state_dict().items():
                     self.assertTrue(torch.equal(weight, again.state_dict()[key]), key)
@@ -185,6 +211,23 @@ class Bundle(unittest.TestCase):
                 card = (Path(name) / "README.md").read_text(encoding="utf-8")
                 self.assertIn("2 episodes (1 a, 1 b), 20 ticks", card)
                 self.assertEqual("the next pose of `phone`" in card, experiment_name == "tactile-id")
+
+
+@unittest.skipUnless(RAPID, "skipped: no program in $RAPID_BIN")
+class Program(unittest.TestCase):
+    def rapid(self, *words: str) -> list[dict[str, Any]]:
+        """The lines that the program prints."""
+        done = subprocess.run([RAPID, *words, "--json"], capture_output=True, text=True, check=False)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        return [json.loads(line) for line in done.stdout.splitlines()]
+
+    def test_a_transformer_runs_in_the_program(self):
+        with tempfile.TemporaryDirectory() as folder:
+            write(random_policy(experiment("transformer")), Path(folder))
+            shown = self.rapid("policy", "show", folder, "--sim", "task")[0]
+            trial, condition = self.rapid("eval", folder, "--trials", "1", "--condition", "full")
+        self.assertEqual((shown["policy"], shown["hash"]), ("transformer", condition["policy_hash"]))
+        self.assertEqual(trial["status"], "normal")
 
 
 if __name__ == "__main__":

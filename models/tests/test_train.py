@@ -15,11 +15,11 @@ from unittest import mock
 import numpy as np
 import torch
 import written
-from made_up import MODELS, Experiment, made_up, path, small
+from made_up import MODELS, Experiment, by_hand, made_up, path, small
 
 from rapid_policy import progress
 from rapid_policy import train as module
-from rapid_policy.checkpoint import BEST, CHECKPOINT, Run, begin, read_checkpoint
+from rapid_policy.checkpoint import BEST, BEST_SUCCESS, CHECKPOINT, Run, begin, read_checkpoint
 from rapid_policy.dataset import Dataset
 from rapid_policy.train import Stopped, Trainer
 
@@ -75,6 +75,33 @@ class Learning(Case):
                 final = Trainer(run, dataset, self.folder).train()
                 self.assertLess(final, 0.8 * sum(run.losses[:20]) / 20)
                 self.assertTrue((self.folder / "loss.png").stat().st_size > 0)
+
+    def test_the_loss_of_a_transformer_falls(self):
+        spec = small("transformer", iterations=250)
+        dataset = Dataset(spec, [by_hand(40)])
+        run = start(spec, dataset)
+        final = Trainer(run, dataset, self.folder).train()
+        self.assertLess(final, 0.8 * sum(run.losses[:20]) / 20)
+
+    def test_dropout_is_resumed_and_measures_nothing(self):
+        spec = small("transformer", iterations=6, validate_every=2)
+        dataset = Dataset(spec, [by_hand(40)])
+        held_out = Dataset(spec, [by_hand(30, 1)], dataset.ranges)
+        through = start(spec, dataset)
+        Trainer(through, dataset, self.folder).train()
+        stopped = start(spec, dataset)
+        with (
+            mock.patch.object(module.Progress, "step", side_effect=[None, None, KeyboardInterrupt]),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            Trainer(stopped, dataset, self.folder, held_out=held_out).train()
+        resumed = start(spec, dataset)
+        resumed.load(read_checkpoint(self.folder / CHECKPOINT))
+        trainer = Trainer(resumed, dataset, self.folder, held_out=held_out)
+        trainer.train()
+        self.assertEqual(resumed.losses, through.losses)
+        trainer._validate(mock.Mock())
+        self.assertEqual(resumed.validation[-1][1], resumed.validation[-2][1])
 
     def test_epochs_are_iterations(self):
         spec = small(epochs=3, windows=8)
@@ -298,6 +325,22 @@ class CommandLine(Case):
         weights = [torch.cat([w.flatten() for w in state["policy"].values()]) for state in (one, two)]
         self.assertLess(float((weights[0] - weights[1]).abs().mean()), 2e-5)
         self.assertEqual(two["provenance"]["hardware"], "2 processes, each 1 CPU thread")
+
+    def test_the_first_of_two_processes_evaluates(self):
+        line = {"event": "condition", "condition": "full", "success": 1, "trials": 2, "score": 0.5, "interval": [0.1, 0.9]}
+        rapid, calls = self.folder / "evaluates", self.folder / "calls"
+        rapid.write_text(
+            f'#!/bin/sh\nif [ $1 = inspect ]; then exec {self.judge} "$@"; fi\n'
+            f'echo "$@" >>{calls}\necho \'{json.dumps(line)}\'\n'
+        )
+        rapid.chmod(0o755)
+        launch = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
+        evaluated = ("--rapid", str(rapid), "--evaluate-every", "10", "--evaluate-trials", "2")
+        done = self.run_train(*self.words("run", "--device", "cpu", *evaluated), launch=launch)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertIn("tactile-id: 10/10 success 0.50 (0.10 to 0.90), 1 of 2 trials, the best", done.stdout)
+        self.assertEqual(len(calls.read_text().splitlines()), 1)
+        self.assertEqual(read_checkpoint(self.folder / "run" / BEST_SUCCESS)["iteration"], 10)
 
     def test_a_run_is_resumed_and_exported(self):
         first = self.run_train(*self.words("run"), RAPID_BIN=str(self.judge))
