@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation evaluation texture lerobot-test fleet-test clean
+.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation evaluation texture lerobot-loop lerobot-test fleet-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -105,8 +105,13 @@ texture: setup-build ## what a tactile picture reveals of the texture: models/re
 	cargo build --release --locked
 	scripts/train.sh texture '$(TARGET)/release/rapid'
 
+lerobot-loop: setup-build ## what LeRobot's own loop does when a camera fails: models/results/lerobot-loop.md
+	cargo build --release --locked
+	python=$$(scripts/venv.sh venv-lerobot models/requirements-lerobot.txt --no-deps); \
+	"$$python" models/lerobot_loop.py --rapid '$(TARGET)/release/rapid'
+
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
-lerobot-test: ## the exports from and to LeRobot, against LeRobot (fetches 8 GB of Python packages once)
+lerobot-test: ## the exports from and to LeRobot, against LeRobot, and its own loop (fetches 8 GB of Python packages once)
 	python=$$(scripts/venv.sh venv-lerobot models/requirements-lerobot.txt --no-deps); \
 	RAPID_BIN='$(BUILT)' "$$python" -m unittest discover -s models/tests/lerobot -v
 

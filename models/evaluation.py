@@ -185,7 +185,7 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int) -> str:
         "## A loop with a fixed list of sensors",
         "",
         f"The weights of `{PLAIN}` without mask, in a loop that reads every sensor that was there at the start and fails when a read has",
-        "no sample within 200 ms, as LeRobot's cameras do (`async_read`):",
+        "no sample within 200 ms, as LeRobot's cameras do (`async_read`; [its own loop](lerobot-loop.md) beside it):",
         "",
         *HEAD,
         *(row(TITLES[name], line) for name, line in conditions["static"].items()),
