@@ -54,6 +54,7 @@ pub(crate) struct Sample<'a> {
 
 /// One modality in a tick of the frame index.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(clippy::struct_excessive_bools, reason = "they are the message's")]
 pub(crate) struct FrameSlot {
     pub(crate) id: ModalityId,
     pub(crate) present: bool,

@@ -284,7 +284,7 @@ impl Features {
                 pictures = Pictures::Video(Codec::ALL.into_iter().find(|known| known.name() == codec)?);
             }
         }
-        let axis = |(name, column): (String, String)| {
+        let read = |(name, column): (String, String)| {
             let (origin, at) = column.rsplit_once('.')?;
             let origin = if origin == ACTION_TOPIC { Origin::Topic } else { Origin::Modality(place(origin)?) };
             // A longer vector is in no episode.
@@ -295,7 +295,7 @@ impl Features {
             if !features.contains_key(key) {
                 return Some(Vec::new());
             }
-            texts(key, "names")?.into_iter().zip(texts(key, "columns")?).map(axis).collect()
+            texts(key, "names")?.into_iter().zip(texts(key, "columns")?).map(read).collect()
         };
         let (state, action) = (axes(STATE)?, axes(ACTION)?);
         let choice = Choice {

@@ -176,6 +176,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
     };
     Board::new(&Registry {
         inference: crate::registry::InferenceSpec::default(),
+        export: crate::registry::ExportSpec::default(),
         rig: RigSpec {
             name: "bench-1".to_owned(),
             observation_hz: 30.0,

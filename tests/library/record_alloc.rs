@@ -135,6 +135,7 @@ async fn only_chunks_allocate() {
     };
     let registry = Arc::new(Registry {
         inference: rapid::registry::InferenceSpec::default(),
+        export: rapid::registry::ExportSpec::default(),
         rig,
         devices: vec![device],
         modules: Vec::new(),
