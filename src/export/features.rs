@@ -291,13 +291,13 @@ impl Features {
             let at = at.parse().ok().filter(|at| *at < LONGEST)?;
             Some(Axis { origin, at, name })
         };
-        let axes = |key: &str| -> Option<Vec<Axis>> {
+        let read_all = |key: &str| -> Option<Vec<Axis>> {
             if !features.contains_key(key) {
                 return Some(Vec::new());
             }
             texts(key, "names")?.into_iter().zip(texts(key, "columns")?).map(read).collect()
         };
-        let (state, action) = (axes(STATE)?, axes(ACTION)?);
+        let (state, action) = (read_all(STATE)?, read_all(ACTION)?);
         let choice = Choice {
             state: texts(STATE, CHOSEN).unwrap_or_default(),
             action: texts(ACTION, CHOSEN).unwrap_or_default(),

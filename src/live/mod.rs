@@ -68,7 +68,7 @@ pub struct LiveOptions {
 /// Why there is no server.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
-    /// The address cannot be listened on.
+    /// The address cannot be bound on.
     #[error("--foxglove {address}: {source}{}", fix(source))]
     Listen {
         /// The address.
@@ -128,7 +128,7 @@ pub struct Live {
     stop: CancellationToken,
     ended: CancellationToken,
     board: Arc<Board>,
-    /// Its address is the one that is listened on.
+    /// Its address is the one that is bound on.
     options: LiveOptions,
 }
 
@@ -246,7 +246,7 @@ impl Server {
         let LiveOptions { address, .. } = options;
         let in_use = |source| LiveError::Listen { address, source };
         let listener = relay::listen(address).await.map_err(in_use)?;
-        let listened = listener.local_addr().map_err(in_use)?;
+        let bound = listener.local_addr().map_err(in_use)?;
         let context = Context::new();
         let topics = Topics::advertise(&context, registry);
         let audience = Audience { context: Arc::downgrade(&context), clients: AtomicUsize::new(0) };
@@ -264,7 +264,7 @@ impl Server {
         let closing = CancellationToken::new();
         let server = SocketAddr::from((Ipv4Addr::LOCALHOST, handle.port()));
         let relay = tokio::spawn(relay::serve(listener, server, closing.clone()));
-        Ok((Self { handle, relay, closing, topics, reported: Stamp::now() }, listened))
+        Ok((Self { handle, relay, closing, topics, reported: Stamp::now() }, bound))
     }
 
     /// Serves until `stop`, or until there will be nothing to serve.

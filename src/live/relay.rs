@@ -80,14 +80,14 @@ async fn relay(client: TcpStream, address: SocketAddr, server: SocketAddr) -> io
     // When the client has closed its half, so is the server's.
     let mut forward = pin!(async move { tokio::io::copy(&mut requests, &mut asked).await });
     let (mut frames, mut waiting) = (Frames::default(), Waiting::default());
-    let (mut writing, mut written) = (Vec::new(), 0);
+    let (mut pending, mut written) = (Vec::new(), 0);
     let (mut is_asked, mut is_fed, mut reported) = (true, true, Stamp::default());
-    while is_fed || written < writing.len() {
+    while is_fed || written < pending.len() {
         frames.received.reserve(READ_BYTES);
         tokio::select! {
             // First: nothing is left out for a client whose connection takes it.
             biased;
-            count = replies.write(&writing[written..]), if written < writing.len() => written += count?,
+            count = replies.write(&pending[written..]), if written < pending.len() => written += count?,
             count = sent.read_buf(&mut frames.received), if is_fed => {
                 is_fed = count.is_ok_and(|count| count > 0);
                 while let Some((topic, frame)) = frames.next() {
@@ -99,10 +99,10 @@ async fn relay(client: TcpStream, address: SocketAddr, server: SocketAddr) -> io
                 is_asked = false;
             }
         }
-        if written == writing.len()
+        if written == pending.len()
             && let Some(frame) = waiting.pop()
         {
-            (writing, written) = (frame, 0);
+            (pending, written) = (frame, 0);
         }
         if waiting.left_out > 0 && Stamp::now().since(reported) >= REPORT_EVERY {
             reported = Stamp::now();
