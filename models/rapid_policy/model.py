@@ -153,11 +153,11 @@ class ResidualBlock(nn.Module):
 class Denoiser(nn.Module):
     """Sample [B, Tp, Da], timestep i64 [B], global_cond [B, Dc] -> the noise predicted in the sample [B, Tp, Da]."""
 
-    STEP_FEATURES = 64
-
-    def __init__(self, actions: int, condition: int, widths: tuple[int, ...], kernel: int = 5) -> None:
+    def __init__(
+        self, actions: int, condition: int, widths: tuple[int, ...], kernel: int = 5, step_features: int = 64
+    ) -> None:
         super().__init__()
-        d = self.STEP_FEATURES
+        d = step_features
         frequencies = torch.exp(torch.arange(d // 2) * -(math.log(10_000) / (d // 2 - 1)))
         self.register_buffer("frequencies", frequencies, persistent=False)
         self.step = nn.Sequential(nn.Linear(d, 4 * d), nn.Mish(), nn.Linear(4 * d, d))
