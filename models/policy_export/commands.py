@@ -10,7 +10,10 @@ from . import Unsupported, bundle
 
 
 def write(
-    out: Path, make: Callable[[Path], dict], verify: Callable[[Path], dict[str, float]], card: Callable[[dict, Path], None]
+    out: Path,
+    make: Callable[[Path], dict],
+    verify: Callable[[Path], dict[str, float]],
+    card: Callable[[dict, Path], None],
 ) -> dict:
     """Fills a folder beside `out`, and gives it that name once it is verified; on an error nothing is left.
 
