@@ -12,14 +12,13 @@ import argparse
 import contextlib
 import json
 import os
-import shutil
 import sys
-import tempfile
 from pathlib import Path
 
 import commandline
-from lerobot_export import Unsupported
-from lerobot_export import config as checkpoint_config
+from policy_export import Unsupported, commands
+from policy_export.commands import count, pair, positive, words
+from policy_export.lerobot import config as checkpoint_config
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -89,15 +88,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def export(options: argparse.Namespace) -> None:
-    if options.out.exists():
-        raise Unsupported(f"{options.out}: exists already: name another folder, or remove it")
+    commands.is_new(options.out)
     config = checkpoint_config.read(options.path)
     settings = rig(options, config)
 
     # Importing LeRobot and torch takes seconds, and a refusal needs neither.
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     try:
-        from lerobot_export import bundle, checkpoint, graphs, verify
+        from policy_export.lerobot import bundle, checkpoint, graphs, verify
     except ModuleNotFoundError as error:
         raise Unsupported(
             f"{sys.executable} has no {error.name}: use a Python environment with what is in "
@@ -108,40 +106,24 @@ def export(options: argparse.Namespace) -> None:
     names = bundle.input_names(config)
     with contextlib.redirect_stdout(sys.stderr):  # LeRobot prints when it loads
         loaded = checkpoint.load(config, options.scheduler, options.steps)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{options.out.name}.", dir=options.out.parent))
-    try:
-        partial.chmod(0o755)
-        files = graphs.export(loaded.policy, config, names, settings.mask_aware, partial)
-        policy = bundle.write_policy(loaded, settings, files, partial)
-        found = verify.verify(loaded, partial)
-        policy["training"]["verification"] = found
-        bundle.save(policy, partial)
-        bundle.write_card(policy, partial)
-        partial.rename(options.out)
-    except BaseException:
-        shutil.rmtree(partial)
-        raise
-    for part, difference in found.items():
-        print(f"largest difference from LeRobot, {part}: {difference:.2e}")
-    print(f"{options.out}: {policy['scheduler']['type']}, {policy['scheduler']['num_inference_steps']} steps")
+
+    def make(folder: Path) -> dict:
+        files = graphs.export(loaded.policy, config, names, settings.mask_aware, folder)
+        return bundle.policy(loaded, settings, files, folder)
+
+    made = commands.write(options.out, make, lambda folder: verify.verify(loaded, folder), bundle.write_card)
+    commands.report(options.out, made, "LeRobot")
 
 
 def rig(options: argparse.Namespace, config: checkpoint_config.Config) -> dict:
     """What the command line and the data state about the rig, checked against the checkpoint."""
-    modalities = {key: key.rsplit(".", 1)[-1] for key in config.keys}
-    for key, name in options.modality:
-        if key not in modalities:
-            raise Unsupported(f"--modality {key}={name}: the checkpoint's observations are {', '.join(modalities)}")
-        modalities[key] = name
+    modalities = commands.modalities(config.keys, options.modality, lambda key: key.rsplit(".", 1)[-1])
     for key in options.required:
         if key not in config.cameras or not options.mask_aware:
             raise Unsupported(
                 f"--required {key}: goes with --mask-aware, and the cameras are {', '.join(config.cameras)}"
             )
-    cameras = [modalities[key] for key in config.cameras]
-    if len(set(cameras)) < len(cameras):
-        raise Unsupported(f"--modality: two cameras cannot both be {cameras[0]}")
+    commands.apart([modalities[key] for key in config.cameras])
 
     data = dataset(options.dataset) if options.dataset else {}
     hz = options.hz or data.get("hz")
@@ -179,31 +161,6 @@ def dataset(folder: Path) -> dict:
     # Either a list, or lists by group: {"motors": [...]}.
     found["names"] = [name for group in names.values() for name in group] if isinstance(names, dict) else names
     return found
-
-
-def pair(text: str) -> tuple[str, str]:
-    key, equals, name = text.partition("=")
-    if not (key and equals and name):
-        raise argparse.ArgumentTypeError(f"'{text}' is not KEY=NAME")
-    return key, name
-
-
-def words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",")]
-
-
-def count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not above 0")
-    return value
-
-
-def positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not above 0")
-    return value
 
 
 if __name__ == "__main__":

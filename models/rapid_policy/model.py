@@ -150,13 +150,13 @@ class ResidualBlock(nn.Module):
         return self.second(scale * self.first(x) + shift) + self.skip(x)
 
 
+STEP_FEATURES = 64
+
+
 class StepEmbedding(nn.Sequential):
-    """Diffusion step i64 [B] -> [B, outputs]"""
+    """Diffusion step i64 [B] -> [B, outputs], by way of `d` frequencies"""
 
-    FEATURES = 64
-
-    def __init__(self, outputs: int) -> None:
-        d = self.FEATURES
+    def __init__(self, outputs: int, d: int = STEP_FEATURES) -> None:
         super().__init__(nn.Linear(d, 4 * d), nn.Mish(), nn.Linear(4 * d, outputs))
         frequencies = torch.exp(torch.arange(d // 2) * -(math.log(10_000) / (d // 2 - 1)))
         self.register_buffer("frequencies", frequencies, persistent=False)
@@ -169,11 +169,12 @@ class StepEmbedding(nn.Sequential):
 class UNetDenoiser(nn.Module):
     """Sample [B, Tp, Da], timestep i64 [B], global_cond [B, Dc] -> the noise predicted in the sample [B, Tp, Da]."""
 
-    def __init__(self, spec: Experiment) -> None:
+    def __init__(
+        self, actions: int, condition: int, widths: tuple[int, ...], kernel: int, step_features: int = STEP_FEATURES
+    ) -> None:
         super().__init__()
-        actions, widths, kernel = spec.action_length, spec.denoiser.widths, spec.denoiser.kernel
-        self.step = StepEmbedding(StepEmbedding.FEATURES)
-        c = spec.condition + StepEmbedding.FEATURES
+        self.step = StepEmbedding(step_features, step_features)
+        c = condition + step_features
         levels = list(zip((actions, *widths[:-1]), widths, strict=True))
         self.down = nn.ModuleList(
             nn.ModuleList([ResidualBlock(i, o, c, kernel), ResidualBlock(o, o, c, kernel), shrink])
@@ -189,6 +190,11 @@ class UNetDenoiser(nn.Module):
             for i, o in reversed(levels[1:])
         )
         self.out = nn.Sequential(ConvBlock(widths[0], widths[0], kernel), nn.Conv1d(widths[0], actions, 1))
+
+    @classmethod
+    def of(cls, spec: Experiment) -> UNetDenoiser:
+        """That of an experiment."""
+        return cls(spec.action_length, spec.condition, spec.denoiser.widths, spec.denoiser.kernel)
 
     def forward(self, sample: Tensor, timestep: Tensor, global_cond: Tensor) -> Tensor:
         c = torch.cat([self.step(timestep), global_cond], -1)
@@ -237,7 +243,7 @@ class TransformerDenoiser(nn.Module):
         return self.out(x)
 
 
-DENOISERS = {"unet": UNetDenoiser, "transformer": TransformerDenoiser}
+DENOISERS = {"unet": UNetDenoiser.of, "transformer": TransformerDenoiser}
 
 
 class Policy(nn.Module):

@@ -31,7 +31,8 @@ class FrozenNorm(nn.Module):
         return x * scale[:, None, None].to(x.dtype) + shift[:, None, None].to(x.dtype)
 
 
-def _norm(channels: int, frozen: bool) -> nn.Module:
+def norm(channels: int, frozen: bool) -> nn.Module:
+    """Of a convolution's output."""
     return FrozenNorm(channels) if frozen else nn.GroupNorm(channels // 16, channels)
 
 
@@ -41,12 +42,12 @@ class Block(nn.Module):
     def __init__(self, inputs: int, outputs: int, stride: int, frozen: bool) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
-        self.bn1 = _norm(outputs, frozen)
+        self.bn1 = norm(outputs, frozen)
         self.conv2 = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
-        self.bn2 = _norm(outputs, frozen)
+        self.bn2 = norm(outputs, frozen)
         self.downsample = None
         if stride != 1 or inputs != outputs:
-            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), _norm(outputs, frozen))
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), norm(outputs, frozen))
 
     def forward(self, x: Tensor) -> Tensor:
         skipped = x if self.downsample is None else self.downsample(x)
@@ -59,7 +60,7 @@ class ResNet18(nn.Module):
     def __init__(self, frozen: bool) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, CHANNELS[0], 7, 2, 3, bias=False)
-        self.bn1 = _norm(CHANNELS[0], frozen)
+        self.bn1 = norm(CHANNELS[0], frozen)
         self.maxpool = nn.MaxPool2d(3, 2, 1)
         for i, (inputs, outputs) in enumerate(zip((CHANNELS[0], *CHANNELS), CHANNELS, strict=False), 1):
             blocks = [Block(inputs, outputs, 1 if i == 1 else 2, frozen), Block(outputs, outputs, 1, frozen)]

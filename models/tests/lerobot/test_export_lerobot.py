@@ -9,9 +9,11 @@ import numpy as np
 import onnx
 from lerobot_checkpoints import ACTION, ACTION_LEN, STATE, STATE_LEN, TOP, WRIST, Case, Temporary, run, write
 
-from lerobot_export import checkpoint as loading
-from lerobot_export import config as checkpoint_config
-from lerobot_export import runtime, verify
+from policy_export import runtime
+from policy_export.lerobot import checkpoint as loading
+from policy_export.lerobot import config as checkpoint_config
+from policy_export.lerobot import verify
+from policy_export.verify import Mismatch
 
 CASES = {
     "one camera, LeRobot's defaults": Case(),
@@ -225,14 +227,14 @@ class Verification(Temporary):
             with self.subTest(what):
                 (self.bundle / "policy.json").write_text(whole)
                 self.edit(self.bundle / "policy.json", mistake)
-                with self.assertRaises(verify.Mismatch):
+                with self.assertRaises(Mismatch):
                     verify.verify(checkpoint, self.bundle)
         (self.bundle / "policy.json").write_text(whole)
         with self.subTest("cameras swapped in the graph"):
             model = onnx.load(self.bundle / "encoder.onnx")
             swap(model)
             onnx.save(model, self.bundle / "encoder.onnx")
-            with self.assertRaisesRegex(verify.Mismatch, "differs from LeRobot in encoder"):
+            with self.assertRaisesRegex(Mismatch, "differs from LeRobot in encoder"):
                 verify.verify(checkpoint, self.bundle)
 
     def test_nothing_is_left_of_a_bundle_that_differs(self):

@@ -112,7 +112,7 @@ class Refusals(Temporary):
                     file = self.source / name
                     file.parent.mkdir(parents=True, exist_ok=True)
                     file.write_text(text)
-                self.refused(["a UMI checkpoint, which is not supported yet", "down_sample_steps", "rotation"])
+                self.refused(["a checkpoint of UMI", "export_umi_policy.py"])
         done = run(self.folder / "latest.ckpt", self.bundle, "--hz", 10)
         self.assertIn("UMI", done.complaint)
 

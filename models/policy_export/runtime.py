@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
+from rapid_policy import poses
+
 
 class Bundle:
     """A bundle that can be run."""
@@ -43,9 +45,10 @@ class Bundle:
         noise: np.ndarray,
         fresh_noise: Callable[[], np.ndarray],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The actions to execute for pictures of bytes [B, To, 3, H, W] and vectors [B, To, D], by key.
+        """The actions for samples by key: pictures of bytes [B, To, 3, H, W] and vectors [B, To, D].
 
-        Returns them as the denoiser left them and in their units. `fresh_noise` is drawn from by DDPM alone.
+        Returns them as the denoiser left them and in their units; see `compose` for what is executed. `fresh_noise` is
+        drawn from by DDPM alone.
         """
         inputs = {}
         for spec in self.spec["observations"]:
@@ -53,19 +56,51 @@ class Bundle:
             if spec["kind"] == "image":
                 value = normalize(value / np.float32(255), spec["normalization"], (-1, 1, 1))
             else:
-                value = normalize(value, spec["normalization"], (-1,))
+                value = normalize(vector(spec, value), spec["normalization"], (-1,))
             if mask is not None and spec["modality"] in self.spec["mask"]["order"]:
                 present = mask[:, self.spec["mask"]["order"].index(spec["modality"])] > 0.5
                 value = np.where(present.reshape(-1, *[1] * (value.ndim - 1)), value, np.float32(0))
             inputs[spec["key"]] = value
         condition = self.condition(inputs, mask)
-        x = noise
-        for t, at, at_previous in steps(self.spec["scheduler"]):
-            output = self.predict(x, np.full(len(x), t, np.int64), condition)
-            x = step(self.spec["scheduler"], output, x, at, at_previous, fresh_noise if t > 0 else None)
+        x = sample(self.spec["scheduler"], lambda x, t: self.predict(x, t, condition), noise, fresh_noise)
         begin = self.spec["action_start"]
         x = x[:, begin : begin + self.spec["n_action_steps"]]
         return x, denormalize(x, self.spec["action"]["normalization"])
+
+    def compose(self, actions: np.ndarray, newest: np.ndarray) -> np.ndarray:
+        """What is executed of actions [n, Da] in their units: poses with `rotation_6d` that are absolute, or relative
+        to the pose in `newest`, a sample of the base's modality."""
+        spec = self.spec["action"]
+        assert spec["rotation"] == "rotation_6d" and spec["representation"] in ("absolute", "relative")
+        targets = np.tile(np.eye(4), (len(actions), 1, 1))
+        x = actions[:, 3:6] / np.linalg.norm(actions[:, 3:6], axis=1, keepdims=True)
+        y = actions[:, 6:9] - (x * actions[:, 6:9]).sum(1, keepdims=True) * x
+        y /= np.linalg.norm(y, axis=1, keepdims=True)
+        targets[:, :3, :3], targets[:, :3, 3] = np.stack([x, y, np.cross(x, y)], 1), actions[:, :3]
+        if spec["representation"] == "relative":
+            pose = np.concatenate([newest[slice(*spec["base"][part])] for part in ("position", "rotation")])
+            targets = poses.matrices(pose[None], "quaternion")[0] @ targets
+        return np.concatenate([poses.numbers(targets, "quaternion"), actions[:, 9:]], 1)
+
+
+def vector(spec: dict, value: np.ndarray) -> np.ndarray:
+    """The numbers of a sample that are observed."""
+    begin, end = spec.get("slice") or (0, value.shape[-1])
+    value = value[..., begin:end]
+    if spec.get("rotation") is None:
+        return value
+    places = np.zeros((value.size // 4, 3))
+    found = poses.matrices(np.concatenate([places, value.reshape(-1, 4)], 1), "quaternion")[0]
+    return poses.rotation_6d(found[:, :3, :3]).reshape(*value.shape[:-1], 6).astype(np.float32)
+
+
+def sample(spec: dict, predict: Callable, noise: np.ndarray, fresh_noise: Callable[[], np.ndarray]) -> np.ndarray:
+    """All steps of the scheduler, from `noise` on."""
+    x = noise
+    for t, at, at_previous in steps(spec):
+        output = predict(x, np.full(len(x), t, np.int64))
+        x = step(spec, output, x, at, at_previous, fresh_noise if t > 0 else None)
+    return x
 
 
 def normalize(value: np.ndarray, spec: dict, shape: tuple) -> np.ndarray:

@@ -1,17 +1,13 @@
-"""Writes policy.json and README.md of a bundle."""
+"""policy.json and README.md of a bundle."""
 
-import hashlib
-import json
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
-from . import Unsupported
+from .. import Unsupported, bundle
+from ..bundle import CONDITION, FORMAT, MASK
 from .checkpoint import Checkpoint
 from .config import Config
-from .graphs import CONDITION, MASK
-
-FORMAT = "rapid-policy/1"
 
 
 @dataclass
@@ -46,8 +42,8 @@ def input_names(config: Config) -> dict[str, str]:
     return names
 
 
-def write_policy(checkpoint: Checkpoint, options: Options, graphs: dict[str, str], folder: Path) -> dict:
-    """Writes policy.json beside the graphs it names, and returns its contents."""
+def policy(checkpoint: Checkpoint, options: Options, graphs: dict[str, str], folder: Path) -> dict:
+    """The contents of policy.json beside `graphs`, whose files are in `folder`."""
     config, names = checkpoint.config, input_names(checkpoint.config)
     observations = []
     for key in config.keys:
@@ -69,7 +65,7 @@ def write_policy(checkpoint: Checkpoint, options: Options, graphs: dict[str, str
     if options.mask_aware:
         order = [options.modalities[key] for key in config.cameras]
         mask = {"input": MASK, "order": order, "absent": "zero_embedding"}
-    policy = {
+    return {
         "format": FORMAT,
         "name": options.name,
         "mask_aware": options.mask_aware,
@@ -92,45 +88,22 @@ def write_policy(checkpoint: Checkpoint, options: Options, graphs: dict[str, str
             "normalization": checkpoint.action_normalization(),
         },
         "scheduler": checkpoint.scheduler(),
-        "graphs": {name: {"file": file, "sha256": sha256(folder / file)} for name, file in graphs.items()},
+        "graphs": bundle.graphs(graphs, folder),
         "training": provenance(config),
     }
-    save(policy, folder)
-    return policy
 
 
 def provenance(config: Config) -> dict:
     weights = config.folder / "model.safetensors"
     return {
         "source": "LeRobot DiffusionPolicy checkpoint",
-        "weights_sha256": sha256(weights),
+        "weights_sha256": bundle.sha256(weights),
         "exported_with": {name: version(name) for name in ("lerobot", "torch", "onnx")},
         "config": config.raw,
     }
 
 
-def save(policy: dict, folder: Path) -> None:
-    text = json.dumps(policy, indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "policy.json").write_text(text + "\n", encoding="utf-8")
-
-
-def sha256(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 def write_card(policy: dict, folder: Path) -> None:
-    """README.md: the model card, derived from policy.json."""
-    action, scheduler, training = policy["action"], policy["scheduler"], policy["training"]
-    rows = []
-    for spec in policy["observations"]:
-        what = f"{spec['kind']} {' x '.join(str(n) for n in spec['shape'])}"
-        need = "required" if spec["required"] else "may be absent"
-        rows.append(f"| `{spec['key']}` | `{spec['modality']}` | {what} | {spec['normalization']['mode']} | {need} |")
-    executed = f"{policy['n_action_steps']} of them, from number {policy['action_start']} on"
-    values = ", ".join(f"`{name}` [{unit}]" for name, unit in zip(action["names"], action["units"], strict=True))
-    steps = f"{scheduler['num_inference_steps']} of {scheduler['num_train_timesteps']} steps"
-    differences = ", ".join(f"{name} {value:.1e}" for name, value in training["verification"].items())
     if policy["mask_aware"]:
         mask = (
             "Mask-aware by request: an absent camera's embedding is replaced by zeros. That serves only a policy that "
@@ -138,23 +111,5 @@ def write_card(policy: dict, folder: Path) -> None:
         )
     else:
         mask = "Not mask-aware: every observation is required."
-    (folder / "README.md").write_text(
-        f"""# {policy["name"]}
-
-A LeRobot DiffusionPolicy, exported by `models/export_lerobot.py`. `policy.json` has every number below.
-
-| observation | modality | what | normalisation | presence |
-|---|---|---|---|---|
-{chr(10).join(rows)}
-
-{policy["n_obs_steps"]} observations at {policy["control_hz"]:g} Hz give {policy["horizon"]} actions. {executed},
-are executed by `{action["actuator"]}`, within the range of the training data: {values}.
-{mask}
-
-Scheduler: {scheduler["type"]}, {steps}, {scheduler["beta_schedule"]}, predicts {scheduler["prediction_type"]}.
-
-Weights: SHA-256 `{training["weights_sha256"]}`. Largest difference from LeRobot at export, over random
-observations: {differences}. How well the policy does its task was not measured.
-""",
-        encoding="utf-8",
-    )
+    notes = f"Actions stay within the range of the training data. {mask}"
+    bundle.write_card(policy, "LeRobot DiffusionPolicy", "export_lerobot.py", notes, folder)

@@ -18,8 +18,9 @@ from lerobot.processor.converters import (
 )
 from safetensors import SafetensorError
 
-from . import Unsupported
-from .config import ACTION_KEY, MAX_GRAPH_BYTES, Config
+from .. import Unsupported
+from ..bundle import decimals, fits, mean_std
+from .config import ACTION_KEY, Config
 
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 # The steps of LeRobot's own DiffusionPolicy. Any other step would silently be missing from the bundle.
@@ -148,8 +149,7 @@ def load(config: Config, scheduler: str | None, steps: int | None) -> Checkpoint
     except (OSError, RuntimeError, ValueError, SafetensorError) as error:
         raise Unsupported(f"{folder}: the weights do not fit config.json: {shorten(str(error), 400)}") from error
     for name, module in (("down_dims", policy.diffusion.unet), ("vision_backbone", policy.diffusion.rgb_encoder)):
-        if (size := 4 * sum(p.numel() for p in module.parameters())) > MAX_GRAPH_BYTES:
-            raise Unsupported(f"{folder / 'config.json'}: {name}: {size} bytes of weights do not fit one ONNX file")
+        fits(f"{folder / 'config.json'}: {name}", 4 * sum(p.numel() for p in module.parameters()))
     return Checkpoint(config, policy.eval(), pre, post)
 
 
@@ -210,13 +210,3 @@ def statistic(step, file: Path, key: str, name: str, size: int) -> np.ndarray:
     for dimension in np.flatnonzero(~np.isfinite(values)):
         raise Unsupported(f"{file}: {name} of {key}, dimension {dimension}: {values[dimension]}")
     return values
-
-
-def mean_std(begin: int, mean: np.ndarray, std: np.ndarray) -> dict:
-    values = {"mean": decimals(mean), "std": decimals(std), "eps": 0.0}
-    return {"slice": [begin, begin + len(mean)], "mode": "mean_std", **values}
-
-
-def decimals(values: np.ndarray) -> list[float]:
-    """The shortest decimals that parse to these 32-bit floats."""
-    return [float(str(np.float32(value))) for value in values]

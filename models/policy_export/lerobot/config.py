@@ -7,20 +7,14 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import Unsupported
+from .. import Unsupported
 
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 MAX_CAMERAS = 2
 BETA_SCHEDULES = ("squaredcos_cap_v2", "linear", "scaled_linear")
-# One protobuf file holds at most 2 GiB, and a graph of a bundle is one file.
-MAX_GRAPH_BYTES = 2**31 - 2**20
 
-UMI = (
-    "a UMI checkpoint, which is not supported yet: a bundle has fields for what it needs (action.rotation, "
-    'action.representation "relative", observations[].down_sample_steps), but there is no exporter '
-    "for it. What can be exported is a LeRobot DiffusionPolicy checkpoint"
-)
+UMI = "a checkpoint of UMI or diffusion_policy: export_umi_policy.py exports it, from its file *.ckpt"
 
 
 @dataclass(frozen=True)

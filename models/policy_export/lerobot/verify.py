@@ -11,26 +11,14 @@ import numpy as np
 import torch
 from lerobot.utils.constants import OBS_IMAGES
 
-from . import Unsupported
+from ..runtime import Bundle
+from ..verify import SEED, judge, largest, normal
 from .checkpoint import Checkpoint
 from .config import STATE_KEY
-from .runtime import Bundle
-
-# For numbers around 1: normalised observations, features, normalised actions.
-TOLERANCE = 1e-4
-SEED = 20
-
-
-class Mismatch(Unsupported):
-    """The bundle computes something else than LeRobot."""
 
 
 def verify(checkpoint: Checkpoint, folder: Path) -> dict[str, float]:
-    """The largest difference of each part, none above `TOLERANCE`.
-
-    # Errors
-    `Mismatch`, with all figures, if one is.
-    """
+    """The largest difference of each part, judged."""
     bundle, random = Bundle(folder), np.random.default_rng(SEED)
     with torch.no_grad():
         found = {
@@ -38,13 +26,7 @@ def verify(checkpoint: Checkpoint, folder: Path) -> dict[str, float]:
             "denoiser": max(denoiser(checkpoint, bundle, random, batch) for batch in (1, 3)),
             **end_to_end(checkpoint, bundle, random),
         }
-    # A NaN difference compares as false with everything.
-    if wrong := [name for name, difference in found.items() if not difference <= TOLERANCE]:
-        figures = ", ".join(f"{name} {difference:.2e}" for name, difference in found.items())
-        raise Mismatch(
-            f"the bundle differs from LeRobot in {', '.join(wrong)}: {figures}; at most {TOLERANCE} is allowed"
-        )
-    return found
+    return judge(found, "LeRobot")
 
 
 def encoder(checkpoint: Checkpoint, bundle: Bundle, random, batch: int) -> float:
@@ -163,12 +145,3 @@ def states(checkpoint: Checkpoint, bundle: Bundle, random, shape: tuple) -> np.n
     if spec["mode"] == "mean_std":
         return random.normal(spec["mean"], spec["std"], shape).astype(np.float32)
     return normal(random, *shape)
-
-
-def normal(random, *shape: int) -> np.ndarray:
-    return random.standard_normal(shape, dtype=np.float32)
-
-
-def largest(worst: float, difference: np.ndarray) -> float:
-    """The larger value; NaN if either is NaN."""
-    return float(np.maximum(worst, np.abs(difference).max()))
