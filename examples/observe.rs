@@ -10,6 +10,7 @@
 
 use std::collections::VecDeque;
 use std::error::Error;
+use std::fmt::Write as _;
 use std::time::Duration;
 
 use iceoryx2::port::subscriber::Subscriber;
@@ -87,12 +88,8 @@ fn main() -> Result<(), Box<dyn Error>> {
             topic.receive()?;
             let Array { state, age, values } = topic.array(&observation, &mut pixels)?;
             let age = age.map_or_else(|| "no sample".to_owned(), |age| format!("{age:.1} ms"));
-            line += &format!(
-                "; {}: {state}, {age}, {}, {}",
-                topic.name,
-                shown(&topic.shape),
-                summary(&topic.shape, &values)
-            );
+            let (shape, summary) = (shown(&topic.shape), summary(&topic.shape, &values));
+            write!(line, "; {}: {state}, {age}, {shape}, {summary}", topic.name)?;
         }
         println!("{line}");
         left -= 1;

@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn a_drained_outlet_has_written_everything_or_lost_its_reader() {
-        let long = Duration::from_secs(3600);
+        let long = Duration::from_hours(1);
         let (mut reader, writer) = io::pipe().unwrap();
         let outlet = Outlet::new("test", 8, writer).unwrap();
         for piece in ["one ", "two ", "three"] {

@@ -216,10 +216,11 @@ fn help_and_completions_are_printed() {
 /// The error of `rapid mask` without a run, on a terminal.
 #[test]
 fn the_environment_and_the_terminal_decide_about_colours() {
+    type Row<'a> = (&'a [(&'a str, &'a str)], bool, bool);
     let place = Place::new();
     let coloured = "\x1b[1m\x1b[31merror:\x1b[0m";
     let forced = ("CLICOLOR_FORCE", "1");
-    let table: [(&[(&str, &str)], bool, bool); 7] = [
+    let table: [Row<'_>; 7] = [
         (&[], true, false),
         (&[("NO_COLOR", "1")], false, false),
         (&[("NO_COLOR", "")], true, false),
