@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use rapid::mask::PhysicalMask;
 use rapid::modality::ModalityId;
+use rapid::palette::Palette;
 use rapid::registry::Registry;
 use rapid::sample::{Epoch, SampleHeader};
 use rapid::status::{Board, Level, SlotState, Snapshot};
@@ -98,7 +99,7 @@ impl Monitor {
         let set = |name: &str| (name == "LC_ALL").then(|| "C.UTF-8".to_owned());
         let (sink, lanes) = (Sink::default(), Feed::full_load()?.lanes.to_vec());
         let (model, terminal) = (Model::new(board.snapshot()), terminal(&sink)?);
-        let (canvas, theme) = (Canvas::detect(|_| None, None, || false), Theme::detect(set));
+        let (canvas, theme) = (Canvas::detect(|_| None, None, || false), Theme::detect(Palette::Ansi, set));
         let mut monitor = Self { board, ids, lanes, now, model, terminal, sink, canvas, theme };
         (0..LOGGED).for_each(|number| monitor.log(number));
         monitor.model.update(Msg::Size(SIZE.0, SIZE.1));
