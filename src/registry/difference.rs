@@ -190,7 +190,7 @@ fn obstacle(device: &DeviceSpec, running: &Registry, new: &Registry) -> Option<S
         // Without one in the running entry: it would have to get it, and a run does not change an entry that it has.
         let is_named = announced(other).is_some_and(|(_, instance)| instance.is_some());
         let another = format!("write another `instance` in [device.{}.lan], or ", device.name);
-        return Some(format!("{why}; {}restart rapid", if is_named { &another } else { "" }));
+        return Some(format!("{why}; {}restart rapid", if is_named { another.as_str() } else { "" }));
     }
     let weaker = running.devices.iter().find(|other| takes_from(device, other))?;
     Some(format!("it would take a unit that may be attached as [device.{}]", weaker.name))

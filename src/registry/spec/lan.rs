@@ -155,7 +155,7 @@ impl LanFind {
     /// The service that announces it, and the instance if only one is to match; both without regard to case.
     pub(in crate::registry) fn announced(&self) -> Option<(&str, Option<&str>)> {
         match self {
-            Self::Mdns { service, instance } => Some((service, instance.as_deref())),
+            Self::Mdns { service, instance } => Some((service.as_str(), instance.as_deref())),
             Self::Adapter { .. } | Self::Host { .. } => None,
         }
     }
