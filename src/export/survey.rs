@@ -42,8 +42,10 @@ pub struct Survey {
     pub(super) task: String,
     /// Ascending by bit.
     pub(super) streams: Vec<Stream>,
-    /// What `[export]` of its registry chooses; nothing where the registry cannot be read any more.
+    /// What `[export]` of its registry chooses; nothing where that cannot be read.
     pub export: ExportSpec,
+    /// Why the registry in the episode cannot be read, if it cannot: then nothing chooses columns, and numbers have no names.
+    pub unread_registry: Option<String>,
     /// The names of the axes of an action, if its channel has them.
     pub(super) action_names: Vec<String>,
     /// By axis; `None` without actions.
@@ -94,8 +96,11 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
     index.rows(path, stop, |row| found.take(row))?;
     let Found { gatherers, time_ns: mut times, actions, unusable, .. } = found;
     let rows = index.ticks.len();
-    // What an earlier version wrote may not be read any more: its numbers have no names then.
-    let registry = Registry::parse(&index.registry, None).ok().map(|loaded| loaded.registry);
+    // What an earlier version wrote may not be read any more: its numbers have no names then. An episode may carry none.
+    let (registry, unread_registry) = match Registry::parse(&index.registry, None) {
+        Ok(loaded) => (Some(loaded.registry), None),
+        Err(errors) => (None, Some(errors.to_string()).filter(|_| !index.registry.is_empty())),
+    };
     let named = |gatherer: Gatherer| {
         let form = registry.as_ref().and_then(|registry| registry.named(&gatherer.name)?.form.as_ref());
         Stream { names: form.map(Form::names).unwrap_or_default(), ..gatherer.stream(rows) }
@@ -111,6 +116,7 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         task: index.task.clone(),
         streams: gatherers.into_iter().map(named).collect(),
         export: registry.as_ref().map(|registry| registry.export.clone()).unwrap_or_default(),
+        unread_registry,
         action_names: index.action_names.clone(),
         action: index.action_length().map(|_| columns(actions)),
         time_ns: Column::of(&mut times),
