@@ -96,11 +96,7 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
     index.rows(path, stop, |row| found.take(row))?;
     let Found { gatherers, time_ns: mut times, actions, unusable, .. } = found;
     let rows = index.ticks.len();
-    // What an earlier version wrote may not be read any more: its numbers have no names then. An episode may carry none.
-    let (registry, unread_registry) = match Registry::parse(&index.registry, None) {
-        Ok(loaded) => (Some(loaded.registry), None),
-        Err(errors) => (None, Some(errors.to_string()).filter(|_| !index.registry.is_empty())),
-    };
+    let (registry, unread_registry) = registry_of(&index.registry);
     let named = |gatherer: Gatherer| {
         let form = registry.as_ref().and_then(|registry| registry.named(&gatherer.name)?.form.as_ref());
         Stream { names: form.map(Form::names).unwrap_or_default(), ..gatherer.stream(rows) }
@@ -122,6 +118,18 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         time_ns: Column::of(&mut times),
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
     })
+}
+
+/// The registry in an episode, or why it cannot be read; neither if the episode carries none. What an earlier version wrote
+/// may not be read any more.
+fn registry_of(text: &str) -> (Option<Registry>, Option<String>) {
+    if text.is_empty() {
+        return (None, None);
+    }
+    match Registry::parse(text, None) {
+        Ok(loaded) => (Some(loaded.registry), None),
+        Err(errors) => (None, Some(errors.to_string())),
+    }
 }
 
 /// The verdict, of a whole file.
@@ -350,5 +358,20 @@ impl Survey {
     /// The task in words: LeRobot needs one.
     pub(super) fn task(&self) -> &str {
         if self.task.is_empty() { "episode" } else { &self.task }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn why_a_registry_in_an_episode_cannot_be_read_is_reported() {
+        let (registry, reason) = registry_of(crate::registry::BUILTIN);
+        assert_eq!((registry.is_some(), reason), (true, None));
+        let (registry, reason) = registry_of("[rig]\nobservation_hertz = 30\n");
+        assert!(registry.is_none() && reason.is_some_and(|reason| reason.contains("observation_hertz")));
+        let (registry, reason) = registry_of("");
+        assert!(registry.is_none() && reason.is_none());
     }
 }
