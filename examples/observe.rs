@@ -1,4 +1,4 @@
-//! Prints the observations of a running `rapid`: of each tick an array of fixed shape for every topic, whatever is plugged.
+//! Prints the observations of a running `rapid`: of each tick an array of fixed shape for every topic, whatever is plugged in.
 //!
 //!     observe 5 /rapid/camera/wrist=480x640x3 /rapid/serial/motor=3
 //!

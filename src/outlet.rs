@@ -169,7 +169,7 @@ mod tests {
         }
         outlet.drain(long);
 
-        // A reader that takes nothing: the pipe is full, and the wait ends all the same.
+        // A reader that takes nothing: the pipe is full, and the wait ends nevertheless.
         let (_reader, writer) = io::pipe().unwrap();
         let outlet = Outlet::new("test", 8, writer).unwrap();
         assert!(outlet.try_send(vec![0; 1 << 20]));

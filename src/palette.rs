@@ -69,7 +69,9 @@ impl Palette {
     /// that over the terminal, which must not be `TERM=dumb` or without a `TERM`.
     pub fn of(out: &impl IsTerminal) -> Self {
         let can_show = || out.is_terminal() && anstyle_query::term_supports_ansi_color();
-        let shown = anstyle_query::clicolor_force() || (anstyle_query::clicolor() != Some(false) && can_show());
+        // anstyle-query takes `0` as a request too.
+        let is_forced = std::env::var_os("CLICOLOR_FORCE").is_some_and(|value| !value.is_empty() && value != "0");
+        let shown = is_forced || (anstyle_query::clicolor() != Some(false) && can_show());
         if shown && !anstyle_query::no_color() { Self::Ansi } else { Self::Plain }
     }
 

@@ -52,7 +52,7 @@ pub struct ExportArgs {
     /// Program that encodes and decodes videos [default: ffmpeg on the PATH]
     #[arg(long, value_name = "PROGRAM", value_hint = ValueHint::ExecutablePath)]
     pub ffmpeg: Option<PathBuf>,
-    /// Episodes worked on at a time; the result is the same [default: as the processors are enough for]
+    /// Episodes worked on at a time; the result is the same [default: as many as keep the processors busy]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub jobs: Option<u16>,
     /// Read DIR back and compare it with the episodes, bit for bit; frames of a video within what an encoder loses

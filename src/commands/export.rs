@@ -186,8 +186,8 @@ fn workers(jobs: Option<u16>, each: usize) -> usize {
     jobs.map_or_else(|| processors.div_ceil(each.max(1)), usize::from)
 }
 
-/// Appends episodes, in their order; their videos and rows are written before, of as many at a time as the processors are
-/// enough for.
+/// Appends episodes, in their order; their videos and rows are written before, of as many at a time as [`workers`]
+/// gives.
 fn append(
     fitting: &[(Survey, Features)],
     jobs: Option<u16>,
@@ -199,7 +199,7 @@ fn append(
 ) -> Result<(), ExportError> {
     let Some((_, features)) = fitting.first() else { return Ok(()) };
     let cameras = features.videos_per_episode();
-    set.begin(features)?;
+    set.begin()?;
     let positions = set.positions(fitting.iter().map(|(episode, _)| episode));
     let items: Vec<(&(Survey, Features), Position)> = fitting.iter().zip(positions).collect();
     let (folder, failed, frames) = (set.folder().to_owned(), AtomicBool::new(false), AtomicUsize::new(0));
@@ -290,7 +290,10 @@ fn found(
                         let same = format!("the same as {}", other.file.display());
                         report.left_out(file, &Refusal::Different(same))?;
                     }
-                    None => found.new.push(*survey),
+                    None => {
+                        report.unread_registry(&survey)?;
+                        found.new.push(*survey);
+                    }
                 },
                 Err(Refusal::Interrupted) => {}
                 Err(refusal) => report.left_out(file, &refusal)?,
@@ -396,6 +399,17 @@ impl Report<'_> {
                 reason: None,
             },
         )
+    }
+
+    /// Warns of an episode whose registry cannot be read; it is exported nevertheless.
+    fn unread_registry(&mut self, episode: &Survey) -> io::Result<()> {
+        let Some(reason) = &episode.unread_registry else { return Ok(()) };
+        let line = format!(
+            "warning: {}: the registry in it cannot be read: its [export] and the names of its numbers do not apply; \
+             choose columns with --state and --action. {reason}",
+            episode.file.display()
+        );
+        writeln!(self.err, "{}", text::plain(&line))
     }
 
     fn already(&mut self, file: &Path, number: usize) -> io::Result<()> {

@@ -169,6 +169,8 @@ impl Features {
             if action.is_empty() {
                 action.push(ACTION_TOPIC.to_owned());
             }
+        } else if action.iter().any(|part| part.split('.').next() == Some(ACTION_TOPIC)) {
+            return Err(Refusal::NoActions);
         }
         features.action = axes(action, &vectors, &origins)?;
         Ok(features)
@@ -531,6 +533,7 @@ mod tests {
             fps: 30,
             task: String::new(),
             export: ExportSpec::default(),
+            unread_registry: None,
             action_names: Vec::new(),
             streams: contents.iter().map(stream).collect(),
             action: None,
@@ -576,7 +579,10 @@ mod tests {
         assert_eq!(joined.state, [axis(2, 0, "force.0"), arm[0].clone()]);
         assert_eq!(joined.action, [arm[2].clone(), arm[0].clone()]);
         assert_eq!(of(&episode, &["raw"], &[]).unwrap_err(), "\"raw\" is no sensor of numbers; those are arm, force");
-        assert!(of(&episode, &[], &["/action"]).unwrap_err().contains("those are arm, force"));
+        for chosen in ["/action", "/action.0"] {
+            let refused = of(&episode, &[], &["arm", chosen]).unwrap_err();
+            assert!(refused.starts_with("no action was sent in this episode"), "{refused}");
+        }
         assert!(
             of(&episode, &["arm.3"], &[]).unwrap_err().contains("arm has no column \"3\"; it has 0-2: hip.position")
         );

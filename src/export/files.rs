@@ -4,7 +4,7 @@
 //! `.*.tmp`, and the next one removes it.
 
 use std::ffi::OsStr;
-use std::fs::File;
+use std::fs::{DirEntry, File};
 use std::path::Path;
 
 use arrow_array::RecordBatch;
@@ -13,6 +13,7 @@ use parquet::arrow::ArrowWriter;
 use parquet::errors::ParquetError;
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
 
+use super::features::IMAGES;
 use super::set::SetError;
 use super::table::CREATED_BY;
 use crate::folder::{Folder, Links, Missing, Sync};
@@ -63,8 +64,18 @@ pub(super) fn write_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>)
     write(path, &written.map_err(|source| SetError::Parquet { path: path.to_owned(), source })?)
 }
 
-/// Removes what a program left in this folder that was killed.
-pub(super) fn remove_temporary(folder: &Path) -> Result<(), SetError> {
+/// Removes what programs that were killed left in this data set, whichever episodes they worked on.
+pub(super) fn remove_leftovers(set: &Path) -> Result<(), SetError> {
+    // A user's own folders are not touched.
+    for (folder, prefix) in [("data", "chunk-"), (VIDEOS, IMAGES)] {
+        let Ok(entries) = std::fs::read_dir(set.join(folder)) else { continue };
+        let is_ours = |entry: &DirEntry| entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes());
+        entries.flatten().filter(is_ours).try_for_each(|entry| remove_temporary(&entry.path()))?;
+    }
+    Ok(())
+}
+
+fn remove_temporary(folder: &Path) -> Result<(), SetError> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
     for entry in entries.flatten() {
         let name = entry.file_name();

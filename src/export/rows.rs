@@ -112,6 +112,11 @@ pub enum Refusal {
     /// What was requested is not in it.
     #[error(transparent)]
     Choice(#[from] ColumnError),
+    /// The topic of actions was requested, and has no message.
+    #[error(
+        "no action was sent in this episode, and {ACTION_TOPIC} is chosen: --action takes numbers of a sensor instead"
+    )]
+    NoActions,
     /// The frames do not follow their samples.
     #[error("more than {} MiB of samples before the frames that name them", MOST_WAITING >> 20)]
     Order,

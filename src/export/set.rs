@@ -131,7 +131,7 @@ pub struct DataSet {
 
 impl DataSet {
     /// Opens the data set in `folder`, or prepares a new one: a folder that does not exist is created with the first
-    /// episode.
+    /// episode. What a program left that was killed is removed.
     ///
     /// # Errors
     /// When the folder holds anything else, or another program writes to it.
@@ -150,7 +150,9 @@ impl DataSet {
         set.lock(Missing::Refused)?;
         let info = folder.join("meta/info.json");
         if !info.exists() {
-            return set.unnamed();
+            let set = set.unnamed()?;
+            files::remove_leftovers(folder)?;
+            return Ok(set);
         }
         let foreign = |problem: &str| SetError::Foreign { path: info.clone(), problem: problem.to_owned() };
         let text = crate::folder::read_text(&info, LARGEST_JSON)
@@ -159,6 +161,7 @@ impl DataSet {
         let features = Features::of_set(&value);
         set.features =
             Some(features.ok_or_else(|| foreign("not the features of a data set of this version of rapid"))?);
+        files::remove_leftovers(folder)?;
         set.read_tasks()?;
         while let Some(entry) = set.read_entry()? {
             merge(&mut set.statistics, &entry.statistics);
@@ -218,17 +221,12 @@ impl DataSet {
         }
     }
 
-    /// Begins to append: what a program left that was killed is removed.
+    /// Begins to append: locks the set, which is created if there is none.
     ///
     /// # Errors
     /// When it cannot be created, or another program writes to it.
-    pub fn begin(&mut self, features: &Features) -> Result<(), SetError> {
-        self.lock(Missing::All)?;
-        // Episodes that were prepared are the next ones.
-        let next = self.entries.len() as u64;
-        let data = [next, next.saturating_add(CHUNK)].map(|episode| self.data_path(episode));
-        data.iter().filter_map(|path| path.parent()).try_for_each(files::remove_temporary)?;
-        features.videos().try_for_each(|(key, _)| files::remove_temporary(&self.folder.join(VIDEOS).join(key)))
+    pub fn begin(&mut self) -> Result<(), SetError> {
+        self.lock(Missing::All)
     }
 
     /// Where these episodes will be if all of them are appended, in this order.

@@ -42,8 +42,10 @@ pub struct Survey {
     pub(super) task: String,
     /// Ascending by bit.
     pub(super) streams: Vec<Stream>,
-    /// What `[export]` of its registry chooses; nothing where the registry cannot be read any more.
+    /// What `[export]` of its registry chooses; nothing where that cannot be read.
     pub export: ExportSpec,
+    /// Why the registry in the episode cannot be read, if it cannot: then nothing chooses columns, and numbers have no names.
+    pub unread_registry: Option<String>,
     /// The names of the axes of an action, if its channel has them.
     pub(super) action_names: Vec<String>,
     /// By axis; `None` without actions.
@@ -94,8 +96,7 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
     index.rows(path, stop, |row| found.take(row))?;
     let Found { gatherers, time_ns: mut times, actions, unusable, .. } = found;
     let rows = index.ticks.len();
-    // What an earlier version wrote may not be read any more: its numbers have no names then.
-    let registry = Registry::parse(&index.registry, None).ok().map(|loaded| loaded.registry);
+    let (registry, unread_registry) = registry_of(&index.registry);
     let named = |gatherer: Gatherer| {
         let form = registry.as_ref().and_then(|registry| registry.named(&gatherer.name)?.form.as_ref());
         Stream { names: form.map(Form::names).unwrap_or_default(), ..gatherer.stream(rows) }
@@ -111,11 +112,24 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         task: index.task.clone(),
         streams: gatherers.into_iter().map(named).collect(),
         export: registry.as_ref().map(|registry| registry.export.clone()).unwrap_or_default(),
+        unread_registry,
         action_names: index.action_names.clone(),
         action: index.action_length().map(|_| columns(actions)),
         time_ns: Column::of(&mut times),
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
     })
+}
+
+/// The registry in an episode, or why it cannot be read; neither if the episode carries none. What an earlier version wrote
+/// may not be read any more.
+fn registry_of(text: &str) -> (Option<Registry>, Option<String>) {
+    if text.is_empty() {
+        return (None, None);
+    }
+    match Registry::parse(text, None) {
+        Ok(loaded) => (Some(loaded.registry), None),
+        Err(errors) => (None, Some(errors.to_string())),
+    }
 }
 
 /// The verdict, of a whole file.
@@ -344,5 +358,20 @@ impl Survey {
     /// The task in words: LeRobot needs one.
     pub(super) fn task(&self) -> &str {
         if self.task.is_empty() { "episode" } else { &self.task }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn why_a_registry_in_an_episode_cannot_be_read_is_reported() {
+        let (registry, reason) = registry_of(crate::registry::BUILTIN);
+        assert_eq!((registry.is_some(), reason), (true, None));
+        let (registry, reason) = registry_of("[rig]\nobservation_hertz = 30\n");
+        assert!(registry.is_none() && reason.is_some_and(|reason| reason.contains("observation_hertz")));
+        let (registry, reason) = registry_of("");
+        assert!(registry.is_none() && reason.is_none());
     }
 }

@@ -184,6 +184,7 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         task: task.to_owned(),
         streams: index.modalities.iter().map(stream).collect(),
         export: ExportSpec::default(),
+        unread_registry: None,
         action_names: Vec::new(),
         action: None,
         time_ns: none,
@@ -220,7 +221,7 @@ fn rows_that_were_prepared_for_another_position_are_written_again() {
     let appended = |name: &str, others: &[&Survey]| {
         let out = folder.path().join(name);
         let mut set = DataSet::open(&out).unwrap();
-        set.begin(&features).unwrap();
+        set.begin().unwrap();
         let position = *set.positions(others.iter().copied().chain([&second])).last().unwrap();
         let prepared = prepare(&out, &second, &features, position, Encoded::default(), &stop).unwrap();
         assert_eq!(set.append(&second, &features, prepared, &stop).unwrap(), 0);
@@ -245,6 +246,33 @@ fn rows_that_were_prepared_for_another_position_are_written_again() {
     let refused = set.append(&first, &features, prepared, &stop);
     assert!(matches!(refused, Err(SetError::Refused(Refusal::Interrupted))), "{refused:?}");
     assert_eq!(set.episodes(), 0);
+}
+
+#[test]
+fn what_a_killed_export_left_is_removed_when_the_set_is_opened() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |file: &str| {
+        let path = folder.path().join(file);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, "rows").unwrap();
+        path
+    };
+    let left = [
+        "data/chunk-000/.file-003.parquet.tmp",
+        "data/chunk-012/.file-000.parquet.tmp",
+        "videos/observation.images.cam/.file-003.mp4.tmp",
+    ]
+    .map(write);
+    let kept = ["data/mine/.notes.tmp", "data/chunk-000/notes.tmp", "videos/mine/.notes.tmp"].map(write);
+    // Nothing is appended.
+    drop(DataSet::open(folder.path()).unwrap());
+    assert_eq!(left.map(|path| path.exists()), [false; 3]);
+    assert_eq!(kept.map(|path| path.exists()), [true; 3]);
+    // A folder of something else is left as it is.
+    let other = write("data/chunk-000/.file-003.parquet.tmp");
+    write("notes.txt");
+    DataSet::open(folder.path()).unwrap_err();
+    assert!(other.exists());
 }
 
 #[test]

@@ -68,7 +68,7 @@ pub struct LiveOptions {
 /// Why there is no server.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
-    /// The address cannot be bound on.
+    /// The address cannot be listened on.
     #[error("--foxglove {address}: {source}{}", fix(source))]
     Listen {
         /// The address.
@@ -128,7 +128,7 @@ pub struct Live {
     stop: CancellationToken,
     ended: CancellationToken,
     board: Arc<Board>,
-    /// Its address is the one that is bound on.
+    /// Its address is the one that is listened on.
     options: LiveOptions,
 }
 
@@ -263,7 +263,7 @@ impl Server {
         let handle = server.start().await?;
         let closing = CancellationToken::new();
         let server = SocketAddr::from((Ipv4Addr::LOCALHOST, handle.port()));
-        let relay = tokio::spawn(relay::serve(listener, server, closing.clone()));
+        let relay = tokio::spawn(relay::serve(listener, server, relay::LIMIT, closing.clone()));
         Ok((Self { handle, relay, closing, topics, reported: Stamp::now() }, bound))
     }
 
@@ -284,7 +284,7 @@ impl Server {
         self.closing.cancel();
         let ended = async {
             self.handle.stop().wait().await;
-            // A panic of it is the end too.
+            // It has also ended if it panicked.
             let _ = self.relay.await;
         };
         let _ = timeout(LAST, ended).await;

@@ -8,33 +8,49 @@
 //! larger; the oldest are left out. So a picture of half of that or more waits alone until a newer one replaces it, and a
 //! topic of small messages is complete unless its client stays behind for as long as these take to be as many.
 //! Invariant: what is no message of a topic (channels, answers of services) is never left out: a client that leaves more
-//! than [`OTHER_BYTES`] of it unread is disconnected.
+//! than [`OTHER_BYTES`] of it unread is disconnected, and so is one for which more than [`CLIENT_BYTES`] wait altogether.
+//! Invariant: a connection without a handshake ends after [`LIMIT`], and so does one whose server has ended.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::net::SocketAddr;
 use std::pin::pin;
+use std::time::Duration;
 
-use rustix::net::sockopt::set_socket_send_buffer_size;
+use rustix::net::sockopt::{
+    set_socket_keepalive, set_socket_send_buffer_size, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl,
+};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
-use tokio::time::sleep;
+use tokio::time::{Instant, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::{IDLE_TURN, REPORT_EVERY};
+use crate::text;
 use crate::time::Stamp;
 
 /// What waits of one topic for one client: three seconds of the mask, the newest picture of most cameras.
 const TOPIC_BYTES: usize = 64 << 10;
-/// What waits for one client that belongs to no topic.
+/// What waits for one client that belongs to no topic, with [`FRAME_COST`].
 const OTHER_BYTES: usize = 16 << 20;
+/// What waits for one client altogether, with [`FRAME_COST`]: a picture of each of many cameras.
+const CLIENT_BYTES: usize = 64 << 20;
+/// What a frame that waits costs beyond its bytes, at most: its places in the queues, and the allocator's own.
+const FRAME_COST: usize = 256;
 /// What the kernel holds of one connection, beyond what waits here: it is sent whatever its age.
 const KERNEL_BYTES: usize = 256 << 10;
 /// What is read at a time, at least.
 const READ_BYTES: usize = 64 << 10;
 /// Connections at a time: more are closed at once.
 const CONNECTIONS: usize = 32;
+/// Time for a client's handshake, and for what it has not read yet when the server has ended.
+pub(super) const LIMIT: Duration = Duration::from_secs(10);
+/// A client's machine that is silent for this long is asked whether it is there, and after so many times without an answer
+/// the connection ends.
+const SILENCE: Duration = Duration::from_secs(30);
+const PROBE_EVERY: Duration = Duration::from_secs(5);
+const PROBES: u32 = 6;
 
 /// A listener for clients.
 ///
@@ -42,13 +58,17 @@ const CONNECTIONS: usize = 32;
 /// When the address is in use or none of this machine.
 pub(super) async fn listen(address: SocketAddr) -> io::Result<TcpListener> {
     let listener = TcpListener::bind(address).await?;
-    // Its connections inherit it.
+    // Its connections inherit them.
     set_socket_send_buffer_size(&listener, KERNEL_BYTES)?;
+    set_socket_keepalive(&listener, true)?;
+    set_tcp_keepidle(&listener, SILENCE)?;
+    set_tcp_keepintvl(&listener, PROBE_EVERY)?;
+    set_tcp_keepcnt(&listener, PROBES)?;
     Ok(listener)
 }
 
-/// Connects clients to `server` until `stop`; then until the last connection has ended.
-pub(super) async fn serve(listener: TcpListener, server: SocketAddr, stop: CancellationToken) {
+/// Connects clients to `server` until `stop`; then until the last connection has ended. `limit` is [`LIMIT`].
+pub(super) async fn serve(listener: TcpListener, server: SocketAddr, limit: Duration, stop: CancellationToken) {
     let mut relays = JoinSet::new();
     loop {
         tokio::select! {
@@ -57,13 +77,13 @@ pub(super) async fn serve(listener: TcpListener, server: SocketAddr, stop: Cance
             accepted = listener.accept() => match accepted {
                 Ok((client, address)) if relays.len() < CONNECTIONS => {
                     relays.spawn(async move {
-                        if let Err(error) = relay(client, address, server).await {
+                        if let Err(error) = relay(client, address, server, limit).await {
                             tracing::info!(%error, "Foxglove: the connection of client {address} has ended");
                         }
                     });
                 }
                 Ok((_, address)) => tracing::info!("Foxglove: {CONNECTIONS} connections at a time: {address} is refused"),
-                // The process has no descriptor left: others may be closed.
+                // The process has no descriptor left: others may end soon.
                 Err(_) => sleep(IDLE_TURN).await,
             },
         }
@@ -72,16 +92,38 @@ pub(super) async fn serve(listener: TcpListener, server: SocketAddr, stop: Cance
     while relays.join_next().await.is_some() {}
 }
 
-/// One client, until it or the server ends the connection.
-async fn relay(client: TcpStream, address: SocketAddr, server: SocketAddr) -> io::Result<()> {
+/// One client, until it or the server ends the connection, or a limit does.
+async fn relay(client: TcpStream, address: SocketAddr, server: SocketAddr, limit: Duration) -> io::Result<()> {
     client.set_nodelay(true)?;
+    let connected = timeout(limit, TcpStream::connect(server)).await.unwrap_or_else(|elapsed| Err(elapsed.into()));
+    let server = connected.inspect_err(|error| {
+        tracing::warn!(
+            %error,
+            "Foxglove: client {address} is closed: no connection to {server}, where the library listens on this \
+             machine; a service with IPAddressDeny= needs IPAddressAllow=localhost, whatever the address of --foxglove"
+        );
+    })?;
+    let mut waiting = Waiting::default();
+    let ended = exchange(client, address, server, limit, &mut waiting).await;
+    waiting.report(address);
+    ended
+}
+
+async fn exchange(
+    client: TcpStream,
+    address: SocketAddr,
+    server: TcpStream,
+    limit: Duration,
+    waiting: &mut Waiting,
+) -> io::Result<()> {
     let (mut requests, mut replies) = client.into_split();
-    let (mut sent, mut asked) = TcpStream::connect(server).await?.into_split();
+    let (mut sent, mut asked) = server.into_split();
     // When the client has closed its half, so is the server's.
     let mut forward = pin!(async move { tokio::io::copy(&mut requests, &mut asked).await });
-    let (mut frames, mut waiting) = (Frames::default(), Waiting::default());
+    let mut overdue = pin!(sleep(limit));
+    let mut frames = Frames::default();
     let (mut pending, mut written) = (Vec::new(), 0);
-    let (mut is_asked, mut is_fed, mut reported) = (true, true, Stamp::default());
+    let (mut is_asked, mut is_fed, mut reported) = (true, true, Stamp::now());
     while is_fed || written < pending.len() {
         frames.received.reserve(READ_BYTES);
         tokio::select! {
@@ -90,13 +132,18 @@ async fn relay(client: TcpStream, address: SocketAddr, server: SocketAddr) -> io
             count = replies.write(&pending[written..]), if written < pending.len() => written += count?,
             count = sent.read_buf(&mut frames.received), if is_fed => {
                 is_fed = count.is_ok_and(|count| count > 0);
+                if !is_fed {
+                    overdue.as_mut().reset(Instant::now() + limit);
+                }
                 while let Some((topic, frame)) = frames.next() {
                     waiting.push(topic, frame)?;
                 }
             }
-            copied = &mut forward, if is_asked => {
-                copied?;
-                is_asked = false;
+            // An error ends the requests alone: what still waits is sent, unless that fails too.
+            _ = &mut forward, if is_asked => is_asked = false,
+            () = &mut overdue, if !is_fed || frames.stage == Stage::Response => {
+                let why = if is_fed { "no handshake" } else { "the server has ended, and the rest is not read" };
+                return Err(io::Error::new(io::ErrorKind::TimedOut, why));
             }
         }
         if written == pending.len()
@@ -104,26 +151,26 @@ async fn relay(client: TcpStream, address: SocketAddr, server: SocketAddr) -> io
         {
             (pending, written) = (frame, 0);
         }
-        if waiting.left_out > 0 && Stamp::now().since(reported) >= REPORT_EVERY {
+        if Stamp::now().since(reported) >= REPORT_EVERY {
             reported = Stamp::now();
-            let count = std::mem::take(&mut waiting.left_out);
-            tracing::info!("Foxglove: client {address} reads slowly: {count} messages were left out for newer ones");
+            waiting.report(address);
         }
     }
     Ok(())
 }
 
-/// Of whom a frame is a message: the number that a client gave to its subscription of a topic. `None` is every other frame.
+/// The number that a client gave to its subscription of a topic, of a frame with a message for it. `None` is every other
+/// frame.
 type Topic = Option<u32>;
 
-/// What was received of the server, until it is whole.
+/// What was received from the server, until it is whole.
 #[derive(Debug, Default)]
 struct Frames {
     received: Vec<u8>,
     stage: Stage,
 }
 
-#[derive(Debug, Default, Clone, Copy)]
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 enum Stage {
     /// The response to the client's request comes first.
     #[default]
@@ -179,9 +226,11 @@ fn frame(bytes: &[u8]) -> Option<(Topic, usize)> {
 #[derive(Debug, Default)]
 struct Waiting {
     topics: BTreeMap<Topic, Track>,
+    /// Bytes of all frames, each with [`FRAME_COST`].
+    cost: usize,
     /// Frames that have come.
     count: u64,
-    /// Frames that were left out.
+    /// Frames that were left out, and not reported yet.
     left_out: u64,
 }
 
@@ -193,24 +242,38 @@ struct Track {
 }
 
 impl Waiting {
-    /// Adds a frame, and leaves out what must give way.
+    /// Adds a frame, and leaves out older ones of its topic that are too much with it.
     ///
     /// # Errors
-    /// When it belongs to no topic, and there is too much of that.
+    /// When there is too much that is never left out, or too much altogether. The client has to be disconnected then.
     fn push(&mut self, topic: Topic, frame: Vec<u8>) -> io::Result<()> {
         let track = self.topics.entry(topic).or_default();
-        if topic.is_none() && track.bytes + frame.len() > OTHER_BYTES {
-            return Err(io::Error::other("it sends requests and does not read the answers"));
-        }
         while topic.is_some() && track.bytes + frame.len() > TOPIC_BYTES {
             let Some((_, oldest)) = track.frames.pop_front() else { break };
             track.bytes -= oldest.len();
+            self.cost -= oldest.len() + FRAME_COST;
             self.left_out += 1;
         }
         track.bytes += frame.len();
+        self.cost += frame.len() + FRAME_COST;
         track.frames.push_back((self.count, frame));
         self.count += 1;
+        if topic.is_none() && track.bytes + track.frames.len() * FRAME_COST > OTHER_BYTES {
+            return Err(io::Error::other("it sends requests and does not read the answers"));
+        }
+        if self.cost > CLIENT_BYTES {
+            return Err(io::Error::other("it subscribes to more than it reads"));
+        }
         Ok(())
+    }
+
+    /// Reports what was left out since the last report.
+    fn report(&mut self, address: SocketAddr) {
+        let left_out = std::mem::take(&mut self.left_out);
+        if left_out > 0 {
+            let which = text::counted(left_out, "message");
+            tracing::info!("Foxglove: client {address} reads slowly: {which} left out for newer ones");
+        }
     }
 
     /// Takes the oldest frame.
@@ -220,6 +283,7 @@ impl Waiting {
         let track = self.topics.get_mut(&topic)?;
         let (_, frame) = track.frames.pop_front()?;
         track.bytes -= frame.len();
+        self.cost -= frame.len() + FRAME_COST;
         if track.frames.is_empty() {
             self.topics.remove(&topic);
         }
@@ -293,7 +357,7 @@ mod tests {
         assert_eq!(waiting.left_out, left_out);
         let popped: Vec<_> = std::iter::from_fn(|| waiting.pop()).collect();
         assert!(popped == expected, "{} frames", popped.len());
-        assert!(waiting.topics.is_empty());
+        assert!(waiting.topics.is_empty() && waiting.cost == 0);
     }
 
     #[test]
@@ -308,5 +372,68 @@ mod tests {
         let answer = of(None, &vec![0; 1 << 20]);
         let fits = (0..100).take_while(|_| waiting.push(None, answer.clone()).is_ok()).count();
         assert_eq!(fits, 15, "their heads count too");
+    }
+
+    #[test]
+    fn neither_many_subscriptions_nor_tiny_frames_get_around_the_limits() {
+        let fits = |frames: &mut dyn Iterator<Item = (Topic, Vec<u8>)>| {
+            let mut waiting = Waiting::default();
+            frames.take_while(|(topic, frame)| waiting.push(*topic, frame.clone()).is_ok()).count()
+        };
+        let picture = of(Some(0), &vec![0; 200_000]);
+        let pictures = fits(&mut (0..10_000).map(|id| (Some(id), picture.clone())));
+        assert_eq!(pictures, CLIENT_BYTES / (picture.len() + FRAME_COST));
+        let message = of(Some(0), &[]);
+        let messages = fits(&mut (0..1_000_000).map(|id| (Some(id), message.clone())));
+        assert_eq!(messages, CLIENT_BYTES / (message.len() + FRAME_COST));
+        let pongs = fits(&mut std::iter::repeat_n((None, vec![0x8a, 0]), 1_000_000));
+        assert_eq!(pongs, OTHER_BYTES / (2 + FRAME_COST));
+    }
+
+    /// Of a test whose clock is moved.
+    const HOUR: Duration = Duration::from_hours(1);
+
+    /// A client, the server's end of its connection, and the relay between them.
+    async fn connected() -> (TcpStream, TcpStream, tokio::task::JoinHandle<io::Result<()>>) {
+        let front = listen(([127, 0, 0, 1], 0).into()).await.unwrap();
+        let back = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let client = TcpStream::connect(front.local_addr().unwrap()).await.unwrap();
+        let (accepted, address) = front.accept().await.unwrap();
+        let relay = tokio::spawn(relay(accepted, address, back.local_addr().unwrap(), HOUR));
+        let (server, _) = back.accept().await.unwrap();
+        (client, server, relay)
+    }
+
+    #[tokio::test]
+    async fn a_connection_without_a_handshake_ends_and_no_other() {
+        let (mut client, mut server, relay) = connected().await;
+        let greeting = b"HTTP/1.1 101 Switching Protocols\r\n\r\n";
+        server.write_all(greeting).await.unwrap();
+        client.read_exact(&mut vec![0; greeting.len()]).await.unwrap();
+        let (silent, _server, silent_relay) = connected().await;
+        // From here on the clock moves to the next limit whenever nothing else happens.
+        tokio::time::pause();
+        let error = silent_relay.await.unwrap().unwrap_err();
+        assert_eq!((error.kind(), error.to_string().as_str()), (io::ErrorKind::TimedOut, "no handshake"));
+        drop(silent);
+        tokio::time::advance(2 * HOUR).await;
+        let frame = of(Some(1), &[7]);
+        server.write_all(&frame).await.unwrap();
+        let mut received = vec![0; frame.len()];
+        client.read_exact(&mut received).await.unwrap();
+        assert_eq!(received, frame);
+        drop(server);
+        relay.await.unwrap().unwrap();
+    }
+
+    #[tokio::test]
+    async fn a_client_that_does_not_read_the_rest_is_closed() {
+        let (client, mut server, relay) = connected().await;
+        let picture = of(Some(1), &vec![0; 16 << 20]);
+        server.write_all(&[&b"HTTP/1.1 101 Switching Protocols\r\n\r\n"[..], &picture].concat()).await.unwrap();
+        drop(server);
+        tokio::time::pause();
+        assert_eq!(relay.await.unwrap().unwrap_err().kind(), io::ErrorKind::TimedOut);
+        drop(client);
     }
 }

@@ -43,6 +43,14 @@ pub enum ColumnError {
         /// Its columns.
         known: String,
     },
+    /// The number of a column is also the name of something else.
+    #[error("{text:?} is ambiguous, a place and a part of {names}: write the place as a range (`3-3` for 3), or these")]
+    Ambiguous {
+        /// As it was written.
+        text: String,
+        /// What it names, by names.
+        names: String,
+    },
     /// How many columns the vector has is not known.
     #[error("{0}: how many numbers it has is not known")]
     NoLength(String),
@@ -57,11 +65,31 @@ impl Vector {
         Some(self.names.as_slice()).filter(|names| Some(names.len()) == self.length && !names.is_empty())
     }
 
-    /// The columns that `which` names, ascending; none if it names none.
-    fn columns(&self, which: &str, length: usize) -> Vec<usize> {
-        if let Some((first, last)) = range(which) {
-            return if first <= last && last < length { (first..=last).collect() } else { Vec::new() };
+    /// The columns that `which` names, by place or by name, ascending. `text` is what was written.
+    fn columns(&self, text: &str, which: &str, length: usize) -> Result<Vec<usize>, ColumnError> {
+        let named = self.by_name(which);
+        let columns = match range(which) {
+            Some((first, last)) if first <= last && last < length => {
+                let placed: Vec<usize> = (first..=last).collect();
+                // A joint may be called `1`.
+                if !named.is_empty() && named != placed {
+                    let of = |at: &usize| Some(format!("{}.{}", self.name, self.names.get(*at)?));
+                    let names: Vec<String> = named.iter().filter_map(of).collect();
+                    return Err(ColumnError::Ambiguous { text: text.to_owned(), names: names.join(", ") });
+                }
+                placed
+            }
+            _ => named,
+        };
+        if columns.is_empty() {
+            let (text, name, which) = (text.to_owned(), self.name.clone(), which.to_owned());
+            return Err(ColumnError::NoColumn { text, name, which, known: self.known(length) });
         }
+        Ok(columns)
+    }
+
+    /// The columns of this name, or of which it is the joint or the quantity, ascending.
+    fn by_name(&self, which: &str) -> Vec<usize> {
         let names = self.named().unwrap_or_default();
         if let Some(at) = names.iter().position(|name| name == which) {
             return vec![at];
@@ -107,11 +135,7 @@ pub fn choose(parts: &[String], vectors: &[Vector]) -> Result<Vec<(usize, usize)
             known: vectors.iter().map(|vector| vector.name.as_str()).collect::<Vec<_>>().join(", "),
         })?;
         let length = vector.length.ok_or_else(|| ColumnError::NoLength(name.to_owned()))?;
-        let columns = which.map_or_else(|| (0..length).collect(), |which| vector.columns(which, length));
-        if let (Some(which), []) = (which, columns.as_slice()) {
-            let (text, name, which) = (text.clone(), name.to_owned(), which.to_owned());
-            return Err(ColumnError::NoColumn { text, name, which, known: vector.known(length) });
-        }
+        let columns = which.map_or_else(|| Ok((0..length).collect()), |which| vector.columns(text, which, length))?;
         for column in columns {
             if !seen.insert((place, column)) {
                 return Err(ColumnError::Twice(format!("{name}.{column}")));
@@ -166,5 +190,25 @@ mod tests {
         assert_eq!(refused(&["force.x"]), "\"force.x\": force has no column \"x\"; it has 0-1");
         assert_eq!(refused(&["leg.1-2", "leg.position"]), "\"leg.2\" is chosen twice");
         assert_eq!(refused(&["late.0"]), "late: how many numbers it has is not known");
+    }
+
+    #[test]
+    fn a_name_that_is_also_a_place_is_refused() {
+        let of = |names: &[&str], which: &str| {
+            let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+            let vector = Vector { name: "leg".to_owned(), length: Some(names.len()), names };
+            choose(&[format!("leg.{which}")], &[vector]).map_err(|error| error.to_string())
+        };
+        let joints = ["1.position", "1.velocity", "2.position", "2.velocity"];
+        let fix = "write the place as a range (`3-3` for 3), or these";
+        let ambiguous = format!("\"leg.1\" is ambiguous, a place and a part of leg.1.position, leg.1.velocity: {fix}");
+        assert_eq!(of(&joints, "1"), Err(ambiguous));
+        assert_eq!(of(&joints, "1-1").unwrap(), [(0, 1)]);
+        assert_eq!(of(&joints, "1.position").unwrap(), [(0, 0)]);
+        assert_eq!(of(&joints, "3").unwrap(), [(0, 3)]);
+        // Both are the same column, or there is no such place.
+        assert_eq!(of(&["0", "1"], "1").unwrap(), [(0, 1)]);
+        assert_eq!(of(&["7.position", "7.velocity"], "7").unwrap(), [(0, 0), (0, 1)]);
+        assert!(of(&["1", "0"], "1").unwrap_err().contains("a part of leg.1:"));
     }
 }

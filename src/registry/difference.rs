@@ -7,8 +7,7 @@
 //! [`Difference::needs_restart`].
 
 use super::spec::{
-    ActionSpec, ButtonSpec, DeviceSpec, Hooks, IdentitySpec, InterlockSpec, LanFind, LanSpec, ModuleSpec, NodeSpec,
-    Registry, RigSpec,
+    ActionSpec, ButtonSpec, DeviceSpec, Hooks, IdentitySpec, InterlockSpec, ModuleSpec, NodeSpec, Registry, RigSpec,
 };
 
 /// See the module's comment.
@@ -188,25 +187,28 @@ fn obstacle(device: &DeviceSpec, running: &Registry, new: &Registry) -> Option<S
     }
     if let Some(other) = running.devices.iter().find(|other| compete(device, other)) {
         let why = format!("a device of its service may belong to [device.{}], which this run searches for", other.name);
-        return Some(format!("{why}; write the `instance` of each in [device.NAME.lan], or restart rapid"));
+        // Without one in the running entry: it would have to get it, and a run does not change an entry that it has.
+        let is_named = announced(other).is_some_and(|(_, instance)| instance.is_some());
+        let another = format!("write another `instance` in [device.{}.lan], or ", device.name);
+        return Some(format!("{why}; {}restart rapid", if is_named { another.as_str() } else { "" }));
     }
     let weaker = running.devices.iter().find(|other| takes_from(device, other))?;
     Some(format!("it would take a unit that may be attached as [device.{}]", weaker.name))
 }
 
-/// Whether both are found by the same announced service, and one of them accepts any instance of it: who gets which is decided
-/// among all entries of a service, at the start of a search.
+/// Whether both are found by the same announced service, and not by two instances of it: a search assigns the instances of a
+/// service to all its entries when it starts.
 fn compete(device: &DeviceSpec, other: &DeviceSpec) -> bool {
-    let announced = |device: &DeviceSpec| match &device.node {
-        NodeSpec::Lan(LanSpec { find: LanFind::Mdns { service, instance }, .. }) => {
-            Some((service.clone(), instance.is_some()))
-        }
+    let (Some((own, mine)), Some((theirs, another))) = (announced(device), announced(other)) else { return false };
+    let differ = mine.zip(another).is_some_and(|(mine, another)| !mine.eq_ignore_ascii_case(another));
+    own.eq_ignore_ascii_case(theirs) && !differ
+}
+
+fn announced(device: &DeviceSpec) -> Option<(&str, Option<&str>)> {
+    match &device.node {
+        NodeSpec::Lan(lan) => lan.find.announced(),
         _ => None,
-    };
-    let (Some((own, is_named)), Some((theirs, is_other_named))) = (announced(device), announced(other)) else {
-        return false;
-    };
-    own.eq_ignore_ascii_case(&theirs) && !(is_named && is_other_named)
+    }
 }
 
 /// Whether a unit that `other` accepts may belong to `device` alone, by the rules of `identity`.

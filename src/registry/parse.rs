@@ -138,6 +138,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     check_actuators(&drafts);
     lan::check_ports(&drafts);
     lan::check_gopros(&drafts);
+    lan::check_instances(&drafts);
     assign_bits(&mut drafts);
     node::warn_of_old_names(&drafts);
     warn_of_unused_ports(&drafts);

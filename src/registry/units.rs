@@ -1,7 +1,7 @@
 //! Durations and sizes as people write them: a number and a unit.
 //!
-//! Invariant: one grammar of durations, in registries, scenarios, journals and on the command line: humantime's. What is
-//! shown can be read again, and is the same.
+//! Invariant: one grammar of durations, in registries, scenarios, journals and on the command line, with humantime's units.
+//! What is shown can be read again, and is the same.
 
 use std::time::Duration;
 
@@ -18,13 +18,36 @@ const SIZES: [(&str, u64); 9] = [
 ];
 
 /// `25ms`, `1.5s`, `2 min`, `1h 30min`: numbers, whole or decimal, each with its unit, from `ns` to years; only `0` needs
-/// no unit. `None` when the text is no duration, not a whole number of ns, or longer than 2^64 ns (584 years).
+/// no unit. Each is rounded to whole ns. `None` when the text is no duration, or longer than 2^64 ns (584 years).
 pub fn parse_duration(text: &str) -> Option<Duration> {
-    let total = terms(text).try_fold(Duration::ZERO, |sum, term| {
-        // Term by term: humantime 2.4 panics where a later one carries beyond its largest sum of seconds.
-        sum.checked_add(humantime::parse_duration(term).ok()?)
-    })?;
-    u64::try_from(total.as_nanos()).ok().map(Duration::from_nanos)
+    let total = terms(text).try_fold(0_u128, |sum, term| sum.checked_add(nanoseconds(term)?))?;
+    u64::try_from(total).ok().map(Duration::from_nanos)
+}
+
+/// A number and its unit, in ns. What is behind the point may be any number of digits, and before it none: episodes carry
+/// registries with `.5s` and `16.6666667ms`, which humantime refuses, and it reads `1 5s` as 15 s.
+fn nanoseconds(term: &str) -> Option<u128> {
+    /// Digits behind the point that count: of a year the last is less than a ns.
+    const DIGITS: usize = 18;
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let (number, unit) = term.split_at(term.find(char::is_alphabetic).unwrap_or(term.len()));
+    let (number, unit) = (number.trim(), unit.trim());
+    if (number, unit) == ("0", "") {
+        return Some(0);
+    }
+    let (whole, fraction) = match number.split_once('.') {
+        Some(("", fraction)) => ("0", fraction),
+        Some(parts) => parts,
+        None => (number, "0"),
+    };
+    if !is_number(whole) || !is_number(fraction) {
+        return None;
+    }
+    let unit = humantime::parse_duration(&format!("1{unit}")).ok()?.as_nanos();
+    let part = fraction.get(..DIGITS).unwrap_or(fraction).parse::<u128>().ok()? * unit;
+    let scale = 10_u128.pow(u32::try_from(fraction.len().min(DIGITS)).ok()?);
+    let part = (part + scale / 2) / scale;
+    whole.parse::<u128>().ok()?.checked_mul(unit)?.checked_add(part)
 }
 
 /// The numbers of a text, each with what follows it up to the next number; at least one.
@@ -33,7 +56,7 @@ fn terms(text: &str) -> impl Iterator<Item = &str> {
     std::iter::from_fn(move || {
         let all = rest.take()?;
         let unit = all.find(char::is_alphabetic).unwrap_or(all.len());
-        let end = all[unit..].find(|c: char| c.is_ascii_digit()).map(|at| unit + at);
+        let end = all[unit..].find(|c: char| c.is_ascii_digit() || c == '.').map(|at| unit + at);
         let (term, others) = end.map_or((all, None), |end| (&all[..end], Some(&all[end..])));
         rest = others;
         Some(term)
@@ -108,7 +131,20 @@ mod tests {
             ("18446744073709551615ns 1ns", None),
             ("584years 10months", None),
             ("18446744073709551615s 1000ms", None),
-            ("0.5ns", None),
+            ("0.5ns", Some(Duration::from_nanos(1))),
+            ("0.49ns", Some(Duration::ZERO)),
+            (".5s", Some(Duration::from_millis(500))),
+            ("1s .5ms", Some(Duration::from_micros(1_000_500))),
+            ("16.6666667ms", Some(Duration::from_nanos(16_666_667))),
+            ("0.3333333333333333333333333333333333333333333s", Some(Duration::from_nanos(333_333_333))),
+            ("0.0001h", Some(Duration::from_millis(360))),
+            ("1.5y", Some(Duration::from_secs(47_336_400))),
+            ("1 5s", None),
+            ("1. 5s", None),
+            ("1.5 5s", None),
+            ("1.s", None),
+            (".s", None),
+            ("1.5.5s", None),
             ("25", None),
             ("1h 30", None),
             ("", None),
@@ -117,7 +153,6 @@ mod tests {
             ("-5ms", None),
             ("5ms -1ms", None),
             ("1..5s", None),
-            (".5s", None),
             ("5 lightyears", None),
             ("5 ms s", None),
             ("999999999999999999h", None),

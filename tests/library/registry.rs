@@ -31,7 +31,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_reported_in_full() {
-    mistakes::check("registry/invalid", "toml", 293, |text| {
+    mistakes::check("registry/invalid", "toml", 318, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });

@@ -220,7 +220,7 @@ fn the_environment_and_the_terminal_decide_about_colours() {
     let place = Place::new();
     let coloured = "\x1b[1m\x1b[31merror:\x1b[0m";
     let forced = ("CLICOLOR_FORCE", "1");
-    let table: [Row<'_>; 7] = [
+    let table: [Row<'_>; 9] = [
         (&[], true, false),
         (&[("NO_COLOR", "1")], false, false),
         (&[("NO_COLOR", "")], true, false),
@@ -228,6 +228,8 @@ fn the_environment_and_the_terminal_decide_about_colours() {
         (&[("TERM", "dumb")], false, false),
         (&[forced, ("CLICOLOR", "0"), ("TERM", "dumb")], true, true),
         (&[forced, ("NO_COLOR", "1")], false, false),
+        (&[("CLICOLOR_FORCE", "0")], true, false),
+        (&[("CLICOLOR_FORCE", "0"), ("CLICOLOR", "0")], false, false),
     ];
     for (environment, on_terminal, in_pipe) in table {
         let shown = OnTerminal::start_in(&place, &["mask"], environment).read_to_end();

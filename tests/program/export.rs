@@ -301,7 +301,7 @@ fn columns_are_chosen_by_the_registry_of_the_episode_and_by_options() {
     let chosen = "[export]\nstate = [\"motor_state.knee\", \"motor_state.0\"]\naction = [\"motor_state.2\"]\n";
     place.write("devices.toml", &format!("{BUILTIN}\n{joints}{chosen}"));
     let first = record(&place, "out", "1500ms", &["--sim", "--config", "devices.toml"]);
-    // It is the episode's registry that counts, and not what the file holds now.
+    // The registry in the episode is used, and not what the file holds now.
     place.write("devices.toml", BUILTIN);
     let (objects, code) = export(&place, &[&first, "--include-bad", "--verify"]);
     assert_eq!((code, &of(&objects, "export")[0]["differences"]), (0, &0.into()), "{objects:?}");

@@ -61,7 +61,7 @@ fn a_type_of_module_is_taken_up_and_mounted_while_the_rig_runs() {
 }
 
 #[test]
-fn a_type_of_ones_own_is_mounted_while_the_rig_runs() {
+fn a_type_of_the_user_is_mounted_while_the_rig_runs() {
     let place = Place::new();
     place.write("devices.toml", include_str!("../../devices.toml"));
     place.write("scenario.toml", SCENARIO);
@@ -99,7 +99,7 @@ fn a_type_of_ones_own_is_mounted_while_the_rig_runs() {
 }
 
 #[test]
-fn the_catalogue_is_listed_and_a_file_describes_a_type_of_ones_own() {
+fn the_catalogue_is_listed_and_a_file_describes_a_type_of_the_user() {
     let place = Place::new();
     let rig = include_str!("../../devices.toml");
     place.write("devices.toml", rig);

@@ -13,7 +13,7 @@ fn old() -> PathBuf {
 }
 
 /// What a command prints on that file, with `--json`.
-fn ask(place: &Place, words: &[&str]) -> Vec<Value> {
+fn printed(place: &Place, words: &[&str]) -> Vec<Value> {
     let output = place.run(&[words, &["--json"]].concat());
     assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
     events(&String::from_utf8_lossy(&output.stdout))
@@ -23,12 +23,12 @@ fn ask(place: &Place, words: &[&str]) -> Vec<Value> {
 fn the_file_is_of_the_format_before_plugged() {
     let bytes = std::fs::read(old()).expect("the file");
     let summary = mcap::Summary::read(&bytes).expect("a whole file").expect("a summary");
-    let knows = |name: &str, field: &[u8]| {
+    let has_field = |name: &str, field: &[u8]| {
         let schema = summary.schemas.values().find(|schema| schema.name == name).expect("its schema");
         schema.data.windows(field.len()).any(|part| part == field)
     };
-    assert!(knows("rapid.Frame", b"present") && knows("rapid.Mask", b"mask"));
-    assert!(!knows("rapid.Frame", b"plugged") && !knows("rapid.Mask", b"plugged"));
+    assert!(has_field("rapid.Frame", b"present") && has_field("rapid.Mask", b"mask"));
+    assert!(!has_field("rapid.Frame", b"plugged") && !has_field("rapid.Mask", b"plugged"));
     let episode = Episode::read(&old());
     let frames = episode.frames();
     assert_eq!(frames.len(), 18);
@@ -42,7 +42,7 @@ fn the_file_is_of_the_format_before_plugged() {
 fn an_old_file_is_inspected_listed_and_needs_no_repair() {
     let place = Place::new();
     let file = old().display().to_string();
-    let report = ask(&place, &["inspect", &file]);
+    let report = printed(&place, &["inspect", &file]);
     let [report] = report.as_slice() else { panic!("{report:?}") };
     assert_eq!((&report["verdict"], &report["recorded_verdict"]), (&"GOOD".into(), &"GOOD".into()), "{report}");
     assert_eq!(
@@ -60,9 +60,9 @@ fn an_old_file_is_inspected_listed_and_needs_no_repair() {
     // By the events, which the frames did not have.
     assert!((1.37..1.39).contains(&cam["quality"]["plugged"].as_f64().expect("a number")), "{cam}");
     assert_eq!((cam["quality"]["lost"].as_u64(), motor["quality"]["clock_uncertainty"].as_f64()), (Some(0), None));
-    let listed = ask(&place, &["list", &file]);
+    let listed = printed(&place, &["list", &file]);
     assert_eq!((&listed[0]["verdict"], &listed[0]["end"]), (&"GOOD".into(), &"finished".into()), "{listed:?}");
-    assert_eq!(ask(&place, &["recover", &file])[0]["outcome"], "whole");
+    assert_eq!(printed(&place, &["recover", &file])[0]["outcome"], "whole");
 }
 
 #[test]
@@ -95,14 +95,14 @@ fn an_old_file_is_exported_and_the_export_is_verified() {
     let place = Place::new();
     let file = old().display().to_string();
     let export = ["export", &file, "--to", "lerobot", "--out", "set"];
-    let done = ask(&place, &export);
+    let done = printed(&place, &export);
     let total = done.last().expect("a line");
     assert_eq!(
         (&total["exported"], &total["frames"], &total["left_out"]),
         (&1.into(), &18.into(), &0.into()),
         "{done:?}"
     );
-    let verified = ask(&place, &[&export[..], &["--verify"]].concat());
+    let verified = printed(&place, &[&export[..], &["--verify"]].concat());
     let total = verified.last().expect("a line");
     assert_eq!((&total["verified"], &total["differences"]), (&18.into(), &0.into()), "{verified:?}");
 }

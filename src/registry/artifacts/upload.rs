@@ -96,7 +96,7 @@ WantedBy=timers.target
     )
 }
 
-/// What both units begin their `[Service]` with: whose, and between what.
+/// What both units begin their `[Service]` with: the user, the folder of episodes and the configuration of the store.
 const BEFORE: &str = "\
 Type=oneshot
 User=rapid
@@ -105,7 +105,7 @@ Environment=EPISODES=/var/lib/rapid
 Environment=RCLONE_CONFIG=/etc/rapid/rclone.conf
 EnvironmentFile=/etc/rapid/upload.conf
 ";
-/// And what they end it with: behind the recorder, and without rights.
+/// What both units end it with: a lower priority than the recorder, and no privileges.
 const AFTER: &str = "\
 Nice=10
 IOSchedulingClass=idle

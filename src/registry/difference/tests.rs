@@ -1,6 +1,7 @@
 //! The difference, as data: a text, what is changed in it, and what a run makes of that.
 
 use super::*;
+use crate::registry::spec::LanFind;
 
 const RIG: &str = r#"
 [rig]
@@ -176,6 +177,22 @@ fn an_announced_device_is_taken_over_unless_two_entries_may_mean_it() {
         assert_eq!(added.len(), usize::from(is_taken), "{first} and {second}: {needs_restart:?}");
         let words = "[device.spare]: a device of its service may belong to [device.here]";
         assert_eq!(needs_restart.iter().any(|line| line.starts_with(words)), !is_taken, "{needs_restart:?}");
-        assert!(is_taken || needs_restart[0].contains("write the `instance` of each"), "{needs_restart:?}");
+        // An instance helps where the entry of the run has one: that entry stays as it is.
+        let advice =
+            if first == one { "; write another `instance` in [device.spare.lan], or restart" } else { "for; restart" };
+        assert!(is_taken || needs_restart[0].contains(advice), "{needs_restart:?}");
+    }
+    // A file with the same instance in two entries is refused; what a run takes over does not depend on that.
+    let text = [entry("here", 4, &one), entry("spare", 5, &two)].concat();
+    let running = parsed(&with(&entry("here", 4, &one)));
+    for (instance, is_taken) in [("two", true), ("one", false), ("ONE", false)] {
+        let mut new = parsed(&with(&text));
+        for device in new.devices.iter_mut().filter(|device| device.name == "spare") {
+            if let NodeSpec::Lan(lan) = &mut device.node {
+                lan.find = LanFind::Mdns { service: "_CAM._tcp".to_owned(), instance: Some(instance.to_owned()) };
+            }
+        }
+        let Difference { added, needs_restart, .. } = Difference::between(&running, &new);
+        assert_eq!(added.len(), usize::from(is_taken), "{instance}: {needs_restart:?}");
     }
 }

@@ -256,6 +256,22 @@ pub(super) fn check_gopros(drafts: &[Draft<'_>]) {
     }
 }
 
+/// An announced instance belongs to one entry: another that names it would never have a device.
+pub(super) fn check_instances(drafts: &[Draft<'_>]) {
+    let named = |draft: &Draft<'_>| {
+        let (service, instance) = draft.lan()?.find.announced()?;
+        Some((service.to_ascii_lowercase(), instance?.to_ascii_lowercase()))
+    };
+    for (index, draft) in drafts.iter().enumerate() {
+        let Some(own) = named(draft) else { continue };
+        let Some(earlier) = drafts.iter().take(index).find(|other| named(other).as_ref() == Some(&own)) else {
+            continue;
+        };
+        let message = format!("its mdns and instance are those of [{}] already", earlier.section.entry);
+        draft.section.report("lan", message, "write the instance of another device, or remove one of the entries");
+    }
+}
+
 /// Exactly one way: the USB identity of the entry, `mdns`, or `host`.
 fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanFind> {
     let is_usb = IDENTITY_KEYS.iter().any(|key| section.has(key));

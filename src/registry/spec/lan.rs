@@ -152,6 +152,14 @@ impl LanFind {
         matches!(self, Self::Adapter { .. })
     }
 
+    /// The service that announces it, and the instance if only one is to match; both without regard to case.
+    pub(in crate::registry) fn announced(&self) -> Option<(&str, Option<&str>)> {
+        match self {
+            Self::Mdns { service, instance } => Some((service.as_str(), instance.as_deref())),
+            Self::Adapter { .. } | Self::Host { .. } => None,
+        }
+    }
+
     /// Whether sockets of IPv4, and whether those of IPv6, are opened for such a device. Behind an adapter without a
     /// `host` the addresses are IPv4; mDNS uses both.
     pub const fn families(&self) -> [bool; 2] {
