@@ -12,7 +12,8 @@ use rapid::headless::{self, HeadlessOptions};
 use rapid::mask::{PhysicalMask, SizedMask};
 use rapid::modality::ModalityId;
 use rapid::registry::{
-    CameraSpec, DeviceSpec, IdentitySpec, InferenceSpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
+    CameraSpec, DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec,
+    WhenStale,
 };
 use rapid::sample::Epoch;
 use rapid::status::session::SessionRequest;
@@ -92,6 +93,7 @@ fn registry(count: u8) -> Registry {
     };
     Registry {
         inference: InferenceSpec::default(),
+        export: ExportSpec::default(),
         rig: RigSpec {
             name: "bench-1".to_owned(),
             observation_hz: 30.0,

@@ -285,16 +285,15 @@ fn found(
                     report.already(file, number)?;
                     found.already.insert(number, file.clone());
                 }
-                Ok(Read::New(survey)) => match found.new.iter().find(|other| other.sha256 == survey.sha256) {
-                    Some(other) => {
+                Ok(Read::New(survey)) => {
+                    if let Some(other) = found.new.iter().find(|other| other.sha256 == survey.sha256) {
                         let same = format!("the same as {}", other.file.display());
                         report.left_out(file, &Refusal::Different(same))?;
-                    }
-                    None => {
+                    } else {
                         report.unread_registry(&survey)?;
                         found.new.push(*survey);
                     }
-                },
+                }
                 Err(Refusal::Interrupted) => {}
                 Err(refusal) => report.left_out(file, &refusal)?,
             }

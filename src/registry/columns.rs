@@ -74,8 +74,8 @@ impl Vector {
                 // A joint may be called `1`.
                 if !named.is_empty() && named != placed {
                     let of = |at: &usize| Some(format!("{}.{}", self.name, self.names.get(*at)?));
-                    let names: Vec<String> = named.iter().filter_map(of).collect();
-                    return Err(ColumnError::Ambiguous { text: text.to_owned(), names: names.join(", ") });
+                    let ambiguous: Vec<String> = named.iter().filter_map(of).collect();
+                    return Err(ColumnError::Ambiguous { text: text.to_owned(), names: ambiguous.join(", ") });
                 }
                 placed
             }
