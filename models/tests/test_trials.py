@@ -40,7 +40,7 @@ with calls.open("a") as file:
     file.write(json.dumps(sys.argv[1:]) + "\\n")
 answer = json.loads((here / "answers").read_text())[number]
 if answer["wait"]:
-    if answer["wait"] == "for ever":
+    if answer["wait"] == "without end":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     (here / "waiting").touch()
     while True:
@@ -193,7 +193,7 @@ class Kept(Case):
         self.assertEqual([e["iteration"] for e in self.run_.evaluations], [10, 27])
 
     def test_the_child_ends_with_the_training(self):
-        for wait in ("for the end", "for ever"):
+        for wait in ("for the end", "without end"):
             with self.subTest(wait):
                 for name in ("calls", "waiting"):
                     (self.folder / name).unlink(missing_ok=True)
@@ -204,9 +204,9 @@ class Kept(Case):
                 child = trials._child
                 self.addCleanup(child.kill)
                 until(lambda: (self.folder / "waiting").exists())
-                with mock.patch.object(module, "PATIENCE", 0.1 if wait == "for ever" else 1000):
+                with mock.patch.object(module, "PATIENCE", 0.1 if wait == "without end" else 1000):
                     trials.end()
-                self.assertEqual(child.returncode, -signal.SIGKILL if wait == "for ever" else -signal.SIGTERM)
+                self.assertEqual(child.returncode, -signal.SIGKILL if wait == "without end" else -signal.SIGTERM)
                 self.assertFalse((self.out / "evaluation").exists())
                 trials.end()
 
