@@ -136,7 +136,7 @@ class Source(threading.Thread):
             self.send(pipe)
 
     def send(self, pipe: Any) -> None:
-        """Sends pictures until the camera fails; without end where it does not, or has been away. It is back once it has sent one."""
+        """Sends pictures until the camera fails; without end where it does not, or has been away. It is back once one is sent."""
         fails = self.event is not None and self.log.failed_at is None
         while not (fails and self.log.due.is_set()):
             pipe.write(next(self.pictures))

@@ -40,7 +40,8 @@ class Present(unittest.TestCase):
         for modality, there in (("arm", True), ("cam", True), ("tactile", False)):
             found = lerobot_source.presence(theirs, modality, 4)
             # What is not in the data set is unplugged, which is no stall.
-            self.assertEqual({name: flags.tolist() for name, flags in found.items()}, dict.fromkeys(("plugged", "running"), [there] * 4))
+            for name in ("plugged", "running"):
+                self.assertEqual(found[name].tolist(), [there] * 4, (modality, name))
 
 
 class Columns(unittest.TestCase):

@@ -166,8 +166,8 @@ def changes(upload, read_back, variables, rig):
     ended = run(read_back, variables, check=False)
     assert ended.returncode != 0 and ended.stdout.split() == [flipped.name], ended
     # As the head of the unit says.
-    moved = [shutil.which("rclone"), "moveto", "--ignore-checksum", *(f"{variables['STORE']}/{flipped.name}{end}" for end in ("", ".aside"))]
-    run(moved, variables)
+    name = f"{variables['STORE']}/{flipped.name}"
+    run([shutil.which("rclone"), "moveto", "--ignore-checksum", name, f"{name}.aside"], variables)
     run(upload, variables)
     run(read_back, variables)
     assert (rig / "a_002.mcap.aside").read_bytes() == changed
