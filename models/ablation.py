@@ -2,11 +2,13 @@
 """Measures what each input of the policy is worth: trains five configurations, each with several seeds, and runs each.
 
     ablation.py EPISODES --rapid ../target/release/rapid [--only NAME]... [--seeds 0 1 2] [--iterations 3900] [--jobs 1]
+        [--name ablation]
 
 The configurations are those of the RAPID paper's appendix, each an experiment of `experiments/`, all trained for the same
 number of iterations. Each is exported and evaluated by `rapid eval`, the program that runs policies, with everything plugged
 in. What an earlier run has trained or evaluated in the same way is used again, and an interrupted training continues; what
-was trained in another way is refused. The results are rewritten after every evaluation, with all that are available.
+was trained in another way is refused: --name gives such a table other files and runs. The results are rewritten after every
+evaluation, with all that are available.
 """
 
 from __future__ import annotations
@@ -34,6 +36,8 @@ from rapid_policy.experiment_file import ExperimentError, read_experiment
 
 MODELS = Path(__file__).parent
 FIRST_SEED = 50_000
+# Of `make ablation`.
+NAME, SEEDS, TRIALS, ITERATIONS = "ablation", [0, 1, 2], 100, 3900
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,7 @@ class Training:
 
 def main() -> None:
     args = parse()
+    args.runs = args.runs or Path("runs") / args.name
     chosen = [c for c in CONFIGURATIONS if not args.only or c.name in args.only]
     trainings = [Training(c, seed, args.runs / f"{c.name}-{seed}") for seed in args.seeds for c in chosen]
     failed = 0
@@ -157,13 +162,14 @@ def parse() -> argparse.Namespace:
     add = parser.add_argument
     add("episodes", type=Path, help="`rapid --sim task --expert --record --episodes 480 --seed 1000`")
     add("--rapid", type=Path, required=True, help="the program")
-    add("--runs", type=Path, default=Path("runs/ablation"), help="checkpoints and bundles")
+    add("--name", default=NAME, help="of the results, and of the folder of checkpoints and bundles without --runs")
+    add("--runs", type=Path, help="checkpoints and bundles (default: runs/NAME)")
     add("--cache", type=Path, default=Path("runs/cache"), help="decoded episodes")
     add("--out", type=Path, default=MODELS / "results")
     add("--only", action="append", choices=names, help="this configuration; may be repeated")
-    add("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the trainings")
-    add("--trials", type=int, default=100)
-    add("--iterations", type=int, default=3900, help="of each training")
+    add("--seeds", type=int, nargs="+", default=SEEDS, help="of the trainings")
+    add("--trials", type=int, default=TRIALS)
+    add("--iterations", type=int, default=ITERATIONS, help="of each training")
     add("--jobs", type=int, default=1, help="trainings at a time")
     add("--threads", type=int, default=2, help="of the CPU, for each")
     return parser.parse_args()
@@ -241,13 +247,21 @@ def summarize(args: argparse.Namespace) -> None:
     rows = [row for c in CONFIGURATIONS if (row := summary(c, args)) is not None]
     if not rows:
         return
-    seeds = " ".join(map(str, args.seeds))
     report = {
-        "command": f"ablation.py EPISODES --rapid RAPID --trials {args.trials} --iterations {args.iterations} --seeds {seeds}",
+        "command": command(args.name, args.seeds, args.trials, args.iterations, [row["name"] for row in rows]),
         "first_seed": FIRST_SEED,
         "configurations": rows,
     }
-    results.write(args.out, "ablation", report, markdown(report))
+    results.write(args.out, args.name, report, markdown(report))
+
+
+def command(name: str, seeds: list[int], trials: int, iterations: int, chosen: list[str]) -> str:
+    """What makes a table of the configurations `chosen`."""
+    words = [f"ablation.py EPISODES --rapid RAPID --trials {trials} --iterations {iterations}"]
+    words += [f"--seeds {' '.join(map(str, seeds))}"]
+    words += [f"--only {one}" for one in chosen if len(chosen) < len(CONFIGURATIONS)]
+    words += [f"--name {name}"] if name != NAME else []
+    return " ".join(words)
 
 
 def summary(configuration: Configuration, args: argparse.Namespace) -> dict[str, Any] | None:
@@ -306,10 +320,12 @@ def markdown(report: dict[str, Any]) -> str:
     iterations = ", ".join(sorted({f"{t['iterations']:,}" for t in trainings}))
     seeds = sorted({t["seed"] for t in trainings})
     partial = [row["name"] for row in rows if len(row["trainings"]) < len(seeds)]
+    made_by_default = command(NAME, SEEDS, TRIALS, ITERATIONS, [c.name for c in CONFIGURATIONS])
+    count = ("One configuration", *(f"{number} configurations" for number in ("Two", "Three", "Four", "Five")))[len(rows) - 1]
     lines = [
         "# What each input is worth",
         "",
-        f"Five configurations of the policy, each trained for {iterations} iterations with the seeds {', '.join(map(str, seeds))}, and run by",
+        f"{count} of the policy, each trained for {iterations} iterations with the seeds {', '.join(map(str, seeds))}, and run by",
         f"the program (`rapid eval`) with everything plugged in: {rows[0]['trials'] // len(rows[0]['trainings'])} trials of each"
         f" training, with seeds that no demonstration has",
         f"({report['first_seed']} and on; {rows[0]['triangular']:.0%} of the blocks triangular; big and small ones). Success: the block ends"
@@ -357,7 +373,7 @@ def markdown(report: dict[str, Any]) -> str:
         f"{epochs(report)} of these demonstrations. Trained on {', '.join(sorted({t['hardware'] for t in trainings}))}, {min(minutes):.0f} to"
         f" {max(minutes):.0f} minutes each.",
         "",
-        "Made with `make ablation`, which runs",
+        "Made with `make ablation`, which runs" if report["command"] == made_by_default else "Made with",
         "",
         f"    python {report['command']}",
         "",

@@ -142,10 +142,13 @@ def read_info(folder: Path) -> dict:
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
         version, features = info["codebase_version"], info["features"]
-        for key in (MASK, PLUGGED, VALID, AGE, TIME):
+        for key in (MASK, VALID, AGE, TIME):
             features[key]
+        earlier = PLUGGED not in features
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Unfit(f"{path}: not a data set that `rapid export --to lerobot` wrote: {error!r}") from error
+    if earlier:
+        raise Unfit(f"{path}: no {PLUGGED}: exported by an earlier version: export again")
     if version != "v3.0" or info.get("video_path"):
         raise Unfit(f"{path}: version {version}, video_path {info.get('video_path')}: only v3.0 without videos is read")
     return features
@@ -224,10 +227,10 @@ def columns(option: str, text: str, features: dict) -> Columns:
     for part in text.split(","):
         name, _, which = part.rpartition(".")
         first, _, last = which.partition("-")
-        if name and first.isdecimal() and (last or first).isdecimal():
-            names = [f"{name}.{at}" for at in range(int(first), int(last or first) + 1)]
-        elif part in named:
+        if part in named and part not in known:
             names = [named[part]]
+        elif name and first.isdecimal() and (last or first).isdecimal():
+            names = [f"{name}.{at}" for at in range(int(first), int(last or first) + 1)]
         else:
             names = [column for column in known if column.rpartition(".")[0] == part]
             names.sort(key=lambda column: int(column.rpartition(".")[2]))

@@ -75,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
         "--start-rotation", metavar="X,Y,Z,W", type=numbers(4), help="the gripper's quaternion when a run begins"
     )
     start.add_argument(
-        "--start-columns", metavar="COLUMNS", type=columns(4), help="4 numbers of a sensor that tells it all the time"
+        "--start-columns", metavar="COLUMNS", type=columns(4), help="4 numbers of a sensor that gives it all the time"
     )
     add("--scheduler", choices=["DDIM", "DDPM"], help="run with this scheduler instead of cfg.policy.noise_scheduler's")
     add("--steps", type=count, metavar="N", help="run this many steps instead of cfg.policy.num_inference_steps")
@@ -115,10 +115,7 @@ def scheduled(options: argparse.Namespace, config: checkpoint_config.Config) -> 
     """With the scheduler and the number of steps that the command line wants."""
     wanted = {"type": options.scheduler, "num_inference_steps": options.steps}
     scheduler = config.scheduler | {key: value for key, value in wanted.items() if value is not None}
-    steps, total = scheduler["num_inference_steps"], scheduler["num_train_timesteps"]
-    if steps > total:
-        raise Unsupported(f"{config.file}: {steps} inference steps: num_train_timesteps is {total}")
-    return dataclasses.replace(config, scheduler=scheduler)
+    return dataclasses.replace(config, scheduler=checkpoint_config.visited(config.file, scheduler))
 
 
 def settings(options: argparse.Namespace, config: checkpoint_config.Config, kind: type) -> dict:
@@ -144,23 +141,23 @@ def settings(options: argparse.Namespace, config: checkpoint_config.Config, kind
 
 
 def begun(options: argparse.Namespace, config: checkpoint_config.Config, kind: type) -> dict:
-    """How the gripper is turned when a run begins, as a matrix, or where it is told."""
+    """How the gripper is turned when a run begins, as a matrix, or which numbers of a sensor give it."""
     import numpy as np
 
     from rapid_policy import poses
 
-    key, rotation, told = checkpoint_config.SINCE_START, options.start_rotation, options.start_columns
-    needed, given = key in config.numbers, rotation is not None or told is not None
+    key, rotation, named = checkpoint_config.SINCE_START, options.start_rotation, options.start_columns
+    needed, given = key in config.numbers, rotation is not None or named is not None
     if needed and not given:
         raise Unsupported(
             f"{config.file}: cfg.policy.shape_meta.obs.{key}: how the gripper has turned since the run began; a bundle "
-            "does not remember that: give its rotation then with --start-rotation, or a sensor that tells it with "
+            "does not remember that: give its rotation then with --start-rotation, or a sensor that gives it with "
             "--start-columns"
         )
     if given and not needed:
         raise Unsupported(f"--start-rotation, --start-columns: {config.file} does not observe {key}")
     if rotation is None:
-        return {"start_columns": kind(*told) if told else None}
+        return {"start_columns": kind(*named) if named else None}
     found, right = poses.matrices(np.array([[0.0, 0.0, 0.0, *rotation]]), "quaternion")
     if not right[0]:
         raise Unsupported(f"--start-rotation {rotation}: a quaternion x y z w has the length 1")
@@ -185,7 +182,10 @@ def numbers(length: int):
     """The form of an option: `length` finite numbers, joined by commas."""
 
     def read(text: str) -> list[float]:
-        found = [float(word) for word in text.split(",")]
+        try:
+            found = [float(word) for word in text.split(",")]
+        except ValueError:
+            found = []
         if len(found) != length or not all(abs(number) < float("inf") for number in found):
             raise argparse.ArgumentTypeError(f"'{text}' is not {length} numbers, joined by commas")
         return found

@@ -158,7 +158,7 @@ LeRobot's: the loop, `predict_action`, the policy and its processors, the data s
 
 Ours:
 
-- the motors: each is at once where it was told to be;
+- the motors: each is at its goal at once;
 - what OpenCV opens: a named pipe with the JPEGs of the episode in place of a device. To unplug closes it: OpenCV's reads
   fail, as they do, by its source, when V4L2 answers ENODEV. No real camera was pulled out;
 - the camera's rate and size, which are not set: OpenCV sets those of devices only;

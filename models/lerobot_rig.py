@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
-# Otherwise FFmpeg reads seconds of pictures before it says that a stream is open, and holds one back for each thread.
+# Otherwise FFmpeg reads seconds of pictures before it reports a stream as open, and holds one back for each thread.
 os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "probesize;32|threads;1"
 
 import lerobot
@@ -64,7 +64,7 @@ class Event:
     """What the camera does: its reads fail, as those of a device that is pulled out, or it is open and sends nothing."""
 
     closes: bool
-    # Until it is there again: so long, or until the loop was given its last picture again that often. Neither: it stays away.
+    # Until it is back: seconds, or how many times the loop was given its last picture again. Without either it stays away.
     away_s: float | None = None
     old: int = 0
 
@@ -117,7 +117,11 @@ class Source(threading.Thread):
         try:
             self.play()
         except BrokenPipeError:
-            pass  # The loop has let the camera go.
+            pass  # The loop has closed the camera.
+        finally:
+            # No picture will come that `again` could wait for.
+            if self.event is not None:
+                self.log.returned.set()
 
     def play(self) -> None:
         with self.path.open("wb", buffering=0) as pipe:
@@ -132,25 +136,26 @@ class Source(threading.Thread):
             self.send(pipe)
 
     def send(self, pipe: Any) -> None:
-        """Sends pictures until the camera fails; for ever where it does not, or has been away."""
+        """Sends pictures until the camera fails; without end where it does not, or has been away. It is back once one is sent."""
         fails = self.event is not None and self.log.failed_at is None
         while not (fails and self.log.due.is_set()):
             pipe.write(next(self.pictures))
+            if self.event is not None and self.log.failed_at is not None and self.log.back_at is None:
+                self.log.back_at = time.perf_counter()
+                self.log.returned.set()
             time.sleep(1 / CAMERA_HZ)
 
     def wait(self) -> None:
-        """Ends when the camera is back; not at all if it stays away."""
+        """Ends when the camera is to be back; not at all if it stays away."""
         if self.event.old:
             with self.log.observed:
                 self.log.observed.wait_for(lambda: self.log.old() >= self.event.old)
         else:
             threading.Event().wait(self.event.away_s)
-        self.log.back_at = time.perf_counter()
-        self.log.returned.set()
 
 
 class Motors:
-    """In place of a bus of servos: each is at once where it was told to be. Ends the episode after ACTIONS actions."""
+    """In place of a bus of servos: each is at its goal at once. Ends the episode after ACTIONS actions."""
 
     is_connected = False
     is_calibrated = True

@@ -30,7 +30,11 @@ skip() { # NAME REASON
 }
 report() {
   local status=$?
-  [[ -z $part ]] || table+=("FAILED   $part; what follows it did not run")
+  if [[ -n $part ]]; then
+    table+=("FAILED   $part; what follows it did not run")
+  elif [[ $status != 0 ]]; then
+    table+=("FAILED   the preparation of the next part; what follows did not run")
+  fi
   [[ ${#table[@]} == 0 ]] || printf 'fleet: %s\n' "${table[@]}" >&2
   if [[ $status == 0 && $skipped != 0 && ${FLEET_MAY_SKIP:-} != 1 ]]; then
     printf 'fleet: skipped: %s, which is a failure: FLEET_MAY_SKIP=1 permits it\n' "$skipped" >&2

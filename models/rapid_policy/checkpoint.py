@@ -35,7 +35,7 @@ class Run:
     validation: list[tuple[int, float]] = field(default_factory=list)
     """Iteration and loss on the episodes that are held out."""
     evaluations: list[dict[str, Any]] = field(default_factory=list)
-    """What `trials` has found: iteration, success, score and interval."""
+    """What `trials` has found: iteration, trials, success, score and interval."""
     random_state: dict[str, Any] | None = None
     """Of `random` behind the last batch that was learned from: the feed is ahead."""
 

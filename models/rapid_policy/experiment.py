@@ -570,8 +570,9 @@ class Experiment(Section):
         return Experiment.model_validate_json(text)
 
     def learns_the_same(self, other: Experiment) -> str | None:
-        """The table in which `other` describes other weights; none if a training of one continues the other's."""
+        """Where `other` describes other weights; none if a training of one continues the other's."""
         for table in ("policy", "observation", "action", "encoder", "denoiser"):
             if getattr(self, table) != getattr(other, table):
                 return table
-        return None
+        # What is learned from decides the ranges that inputs are normalised by.
+        return "data.absences" if set(self.data.absences) != set(other.data.absences) else None

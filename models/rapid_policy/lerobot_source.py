@@ -127,11 +127,17 @@ def _columns(rows: dict[str, Any], modality: str) -> list[int]:
 
 
 def presence(rows: dict[str, Any], modality: str, count: int) -> dict[str, NDArray[np.bool_]]:
-    """[T] whether the device of a sensor is plugged in, and whether its bit is set; in a data set without them both are."""
+    """[T] whether the device of a sensor is plugged in, and whether its bit is set. In a data set that does not record them
+    both are, of each sensor that it has."""
     running = _flags(rows, "rapid.mask", modality)
-    running = np.ones(count, bool) if running is None else running
+    running = np.full(count, _has(rows, modality)) if running is None else running
     plugged = _flags(rows, "rapid.plugged", modality)
     return {"plugged": running if plugged is None else plugged, "running": running}
+
+
+def _has(rows: dict[str, Any], modality: str) -> bool:
+    """Whether the data set has the sensor."""
+    return bool({f"observation.images.{modality}", f"observation.{modality}"} & rows.keys() or _columns(rows, modality))
 
 
 def _present(rows: dict[str, Any], modality: str, count: int) -> NDArray[np.bool_]:

@@ -6,8 +6,8 @@
 
 Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` continues), RUN/best.pt (of the
 lowest loss on held-out episodes, if there are any), RUN/best-success.pt (of the most trials that succeeded, with
---evaluate-every), curves for TensorBoard and RUN/loss.png. SIGTERM and SIGINT end it after the present iteration, with a
-checkpoint.
+--evaluate-every), curves for TensorBoard and RUN/loss.png. SIGTERM, SIGINT and SIGHUP end it after the present iteration,
+with a checkpoint.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from .judgement import JudgementError, program
 from .model import Policy, parameters
 from .progress import BOARD_EVERY, Board, Progress, plot, recent
 from .ranks import Ranks, join
-from .trials import CONDITION, FIRST_SEED, MOST, Trials, check_seeds
+from .trials import CONDITION, FIRST_SEED, MOST, Trials, check_count, check_seeds
 
 # Batches of a measurement on held-out episodes, at most.
 VALIDATION_BATCHES = 16
@@ -217,7 +217,7 @@ def _signals() -> list[signal.Signals]:
     import threading
 
     main = threading.current_thread() is threading.main_thread()
-    return [signal.SIGTERM, signal.SIGINT] if main else []
+    return [signal.SIGTERM, signal.SIGINT, signal.SIGHUP] if main else []
 
 
 def _set_rate(run: Run, done: float) -> float:
@@ -379,6 +379,8 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
     run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device)
     if state:
         run.load(state)
+        if rapid:
+            check_count(checkpoint, run.evaluations, args.evaluate_trials)
         if args.iterations is not None and args.iterations != run.iterations:
             raise ValueError(f"{checkpoint} is of a training of {run.iterations} iterations: leave --iterations out")
     if ranks.first:

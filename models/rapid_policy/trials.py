@@ -1,17 +1,20 @@
-"""Trials of a training's weights in the program while it goes on: `rapid eval` on the simulated task.
+"""Trials of a training's weights in the program while it continues: `rapid eval` on the simulated task.
 
 Owns RUN/evaluation and the child process that works there, of which there is one at most: it exports a copy of the
-checkpoint and then becomes the program. The training does not wait for it and draws no random number for it; it outlives
-the child's failure, and the child does not outlive the training. Weights are chosen by these trials, so their seeds are
-none of those that results are reported of.
+checkpoint and then becomes the program. The training does not wait for it and draws no random number for it. It outlives
+the child's failure. It ends the child when it ends, after SIGHUP, SIGINT and SIGTERM too; when it is killed, the kernel
+kills the child, which asks for that. Weights are chosen by these trials, so their seeds are none of those that results are
+reported of, and the scores that are compared are of as many trials.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -30,6 +33,8 @@ CONDITION = "full"
 PATIENCE = 10.0
 # Seconds until a wait for the child notices a signal to the training.
 NOTICE = 0.2
+# Of prctl(2): the signal that a process gets when its parent ends; it outlasts execve.
+PR_SET_PDEATHSIG = 1
 MODELS = Path(__file__).parents[1]
 
 
@@ -99,7 +104,7 @@ class Trials:
             self._report(error)
 
     def _command(self) -> list[str]:
-        exporting = [str(self._folder / CHECKPOINT), str(self._folder / "bundle")]
+        exporting = [str(os.getpid()), str(self._folder / CHECKPOINT), str(self._folder / "bundle")]
         return [sys.executable, "-m", "rapid_policy.trials", *exporting, *self._evaluation()]
 
     def _evaluation(self) -> list[str]:
@@ -140,7 +145,7 @@ class Trials:
         if found.get("trials") != self._count:
             raise ValueError(f"{self._rapid} eval printed no result of {self._count} trials: is it this version?")
         low, high = map(float, found["interval"])
-        return {"success": int(found["success"]), "score": float(found["score"]), "interval": [low, high]}
+        return {"trials": self._count, "success": int(found["success"]), "score": float(found["score"]), "interval": [low, high]}
 
     def _report(self, error: Exception) -> None:
         where = f"see {self._folder / 'log.txt'}; the training continues"
@@ -156,13 +161,32 @@ def check_seeds(demonstrated: list[int] | None, count: int) -> None:
         raise ValueError(f"{cause} ({demonstrated[0]} to {demonstrated[1]}): {fix}")
 
 
+def check_count(checkpoint: Path, evaluations: list[dict[str, Any]], count: int) -> None:
+    """Scores of few trials vary more, so that the best of them would stay the best."""
+    # Older checkpoints do not state it.
+    others = {found["trials"] for found in evaluations if "trials" in found} - {count}
+    if others:
+        cause = f"--evaluate-trials {count}: the scores in {checkpoint} are of {min(others)} trials and not comparable"
+        raise ValueError(f"{cause}: write --evaluate-trials {min(others)}, or use another --out")
+
+
+def end_with(parent: int) -> None:
+    """Has the kernel kill this process when `parent`, which started it, ends. Ends it if that has happened already."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL):
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    if os.getppid() != parent:
+        sys.exit("trials: the training has ended")
+
+
 def main() -> None:
     """The child: exports the checkpoint and becomes the program."""
+    parent, checkpoint, bundle, *command = sys.argv[1:]
+    end_with(int(parent))
     import torch
 
     from .export import export
 
-    checkpoint, bundle, *command = sys.argv[1:]
     # The training goes first.
     os.nice(10)
     torch.set_num_threads(1)

@@ -6,7 +6,7 @@ import tempfile
 import unittest
 from pathlib import Path
 
-from ablation import CONFIGURATIONS, Training, carry_out, counted, markdown, summarize
+from ablation import CONFIGURATIONS, MODELS, Training, carry_out, counted, markdown, summarize
 from rapid_policy.experiment_file import read_experiment
 
 FACTS = {"episodes": 240, "frames": 25_600, "batch_windows": 64, "iterations": 400, "minutes": 2.0, "final_loss": 0.02}
@@ -25,7 +25,7 @@ class Runs(unittest.TestCase):
         self.rapid = self.folder / "rapid"
         self.args = argparse.Namespace(
             rapid=self.rapid, runs=self.folder, out=self.folder / "results", seeds=[0, 1], trials=2, iterations=400,
-            episodes=self.folder / "episodes",
+            episodes=self.folder / "episodes", name="ablation",
         )
 
     def program(self, trials):
@@ -101,6 +101,29 @@ class Runs(unittest.TestCase):
         self.assertIn("0.50 (1.00, 0.00)", text)
         self.assertIn("about 1 epochs", text)
         self.assertIn("Not run: vision, vision-mask, tactile-id-arm, vision-diff-big.", text)
+        self.assertIn("\nOne configuration of the policy, each trained for 400 iterations", text)
+        words = "ablation.py EPISODES --rapid RAPID --trials 2 --iterations 400 --seeds 0 1 --only vision-diff"
+        self.assertIn(f"Made with\n\n    python {words}\n", text)
+
+    def test_another_table_has_other_files(self):
+        self.program([trial(True, "success")] * 2)
+        carry_out(self.trained("vision", 0), self.args)
+        summarize(self.args)
+        first = (self.args.out / "ablation.md").read_text()
+        self.args.name = "ablation-400"
+        summarize(self.args)
+        self.assertEqual((self.args.out / "ablation.md").read_text(), first)
+        report = json.loads((self.args.out / "ablation-400.json").read_text())
+        self.assertTrue(report["command"].endswith("--only vision --name ablation-400"), report["command"])
+
+
+class Pages(unittest.TestCase):
+    def test_those_in_the_repository_are_of_their_figures(self):
+        for name, made in (("ablation", "Made with `make ablation`, which runs\n"), ("ablation-8000", "Made with\n")):
+            report = json.loads((MODELS / "results" / f"{name}.json").read_text(encoding="utf-8"))
+            text = markdown(report)
+            self.assertEqual((MODELS / "results" / f"{name}.md").read_text(encoding="utf-8"), text)
+            self.assertIn(made, text)
 
 
 class Counting(unittest.TestCase):

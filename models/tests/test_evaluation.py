@@ -6,7 +6,7 @@ import tempfile
 import unittest
 from pathlib import Path
 
-from evaluation import RUNS, TITLES, EvaluationError, evaluate, row
+from evaluation import MODELS, RUNS, TITLES, EvaluationError, evaluate, markdown, row
 
 HELD = next(run for run in RUNS if run.name == "held")
 
@@ -72,6 +72,24 @@ class Row(unittest.TestCase):
             row("x", condition("full")).split("|")[-2].strip(),
         ]
         self.assertEqual(ends, ["0.92 Normal", "Crash", "-"])
+
+
+class Page(unittest.TestCase):
+    def test_that_in_the_repository_is_what_is_printed(self):
+        """The lines of the trials are not kept: these have the figures that the page has of them."""
+        results = MODELS / "results"
+        lines = [json.loads(line) for line in (results / "eval.jsonl").read_text(encoding="utf-8").splitlines()]
+        printed = {run.name: [line for line in lines if line["run"] == run.name] for run in RUNS}
+        touched, parted = ([first] + [median] * 98 + [last] for first, median, last in ((20, 33, 52), (35, 58, 78)))
+        for name in TITLES:
+            unplugged = {"hot-unplug": [58, *[34] * 99], "early-unplug": [10] * 100}.get(name, [None] * 100)
+            for i in range(100):
+                trial = {"event": "trial", "condition": name, "triangular": i < 51, "size": "small" if i < 54 else "big"}
+                trial |= {"unseen_period": i < 22, "outcome": "success" if i else "wrong_bin"}
+                at = {"touched_at": touched[i], "parted_at": parted[i], "unplugged_at": unplugged[i]}
+                printed["plain"].append(trial | at)
+        printed["static"].append({"event": "trial", "failure": "tactile_tip: no sample within 200ms"})
+        self.assertEqual((results / "eval.md").read_text(encoding="utf-8"), markdown(printed, 100))
 
 
 if __name__ == "__main__":

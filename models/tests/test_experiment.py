@@ -69,6 +69,7 @@ class Ours(unittest.TestCase):
             self.assertEqual(again, spec)
             self.assertIsNone(spec.learns_the_same(again))
         self.assertEqual(experiment().learns_the_same(small()), "encoder")
+        self.assertEqual(experiment(data={"absences": ["unplug"]}).learns_the_same(experiment()), "data.absences")
 
 
 if __name__ == "__main__":

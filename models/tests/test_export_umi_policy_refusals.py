@@ -7,15 +7,17 @@ import io
 import math
 import unittest
 from typing import Any
+from unittest import mock
 
 import torch
 from umi_checkpoints import RIG, Temporary, golden, run, weights, write
 
 import export_umi_policy
+from policy_export.umi import networks
 
 BEGIN = "--start-rotation=0,0,0,1"
 SHAPES = "cfg.policy.shape_meta"
-# A mistake in the configuration, and words of what is said of it: the key first.
+# A mistake in the configuration, and words of the message about it: the key first.
 MISTAKES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "another policy": (
         lambda cfg: cfg["policy"].update(_target_="diffusion_policy.policy.diffusion_unet_image_policy.Policy"),
@@ -159,12 +161,83 @@ MISTAKES: dict[str, tuple[Any, tuple[str, ...]]] = {
         lambda cfg: cfg["policy"]["shape_meta"]["action"].update(horizon="${task.action_horizon}"),
         (f"{SHAPES}.action.horizon", "whole number"),
     ),
+    "timesteps that the training has not": (
+        lambda cfg: cfg["policy"].update(num_inference_steps=5) or schedule(cfg).update(steps_offset=10),
+        ("cfg.policy.noise_scheduler.steps_offset", "10 is not from 0 to 9"),
+    ),
+    "timesteps before the first": (
+        lambda cfg: schedule(cfg).update(steps_offset=-1),
+        ("cfg.policy.noise_scheduler.steps_offset", "-1 is not from 0 to 4"),
+    ),
+    "more timesteps than a bundle has": (
+        lambda cfg: schedule(cfg).update(num_train_timesteps=10**9),
+        ("cfg.policy.noise_scheduler.num_train_timesteps", "more than 10000"),
+    ),
+    "too few features of a timestep": (
+        lambda cfg: cfg["policy"].update(diffusion_step_embed_dim=2),
+        ("cfg.policy.diffusion_step_embed_dim", "2 is not an even number from 4"),
+    ),
+    "odd features of a timestep": (
+        lambda cfg: cfg["policy"].update(diffusion_step_embed_dim=5),
+        ("cfg.policy.diffusion_step_embed_dim", "5 is not an even number from 4"),
+    ),
+    "an even kernel": (
+        lambda cfg: cfg["policy"].update(kernel_size=4),
+        ("cfg.policy.kernel_size", "4 is even"),
+    ),
+    "a side in words": (
+        lambda cfg: obs(cfg)["camera0_rgb"].update(shape=[3, "a", "a"]),
+        (f"{SHAPES}.obs.camera0_rgb.shape", "[3, 'a', 'a']"),
+    ),
+    "pictures without an end": (
+        lambda cfg: obs(cfg)["camera0_rgb"].update(shape=[3, 10**6, 10**6]),
+        (f"{SHAPES}.obs.camera0_rgb.shape", "from 1 to 2048"),
+    ),
+    "patches of nothing": (
+        lambda cfg: cfg["policy"]["obs_encoder"].update(model_name="vit_tiny_patch0_64"),
+        ("cfg.policy.obs_encoder.model_name", "patches of 0"),
+    ),
+    "a crop of nothing": (
+        lambda cfg: cfg["policy"]["obs_encoder"]["transforms"][0].update(ratio=0.001),
+        ("cfg.policy.obs_encoder.transforms[0].ratio", "0.001 leaves nothing"),
+    ),
+    "pictures alone": (
+        lambda cfg: alone(cfg),
+        (f"{SHAPES}.obs", "pictures alone (ignore_by_policy)"),
+    ),
+    "more actions than a bundle has": (
+        lambda cfg: cfg["policy"]["shape_meta"]["action"].update(horizon=10**6),
+        (f"{SHAPES}.action.horizon", "1000000 is more than 1024"),
+    ),
+    "more steps than a bundle has": (
+        lambda cfg: obs(cfg)["camera0_rgb"].update(horizon=10**6),
+        (f"{SHAPES}.obs.camera0_rgb.horizon", "1000000 is more than 64"),
+    ),
+    "a number without an end": (
+        lambda cfg: obs(cfg)["camera0_rgb"].update(down_sample_steps=10**400),
+        (f"{SHAPES}.obs.camera0_rgb.down_sample_steps", "is not from"),
+    ),
+    "widths without an end": (
+        lambda cfg: cfg["policy"].update(down_dims=[8_000_000, 8_000_000]),
+        ("cfg.policy.down_dims", "at most 65536"),
+    ),
     "no configuration of the task": (lambda cfg: cfg.pop("task"), ("cfg.task: missing",)),
 }
 
 
 def obs(cfg: dict[str, Any]) -> dict[str, Any]:
     return cfg["policy"]["shape_meta"]["obs"]
+
+
+def schedule(cfg: dict[str, Any]) -> dict[str, Any]:
+    return cfg["policy"]["noise_scheduler"]
+
+
+def alone(cfg: dict[str, Any]) -> None:
+    cfg["task"]["pose_repr"].update(obs_pose_repr="abs", action_pose_repr="abs")
+    for key, one in obs(cfg).items():
+        if key != "camera0_rgb":
+            one.update(ignore_by_policy=True)
 
 
 class Refusals(Temporary):
@@ -182,6 +255,33 @@ class Refusals(Temporary):
             with self.subTest(what):
                 write(self.file, self.changed(mistake), ema_model={})
                 self.refused(str(self.file), *words)
+
+    def test_a_configuration_that_names_a_value_many_times(self) -> None:
+        nested: Any = "x"
+        for _ in range(60):
+            nested = [nested, nested]
+        torch.save({"cfg": {"policy": nested}, "state_dicts": {}}, self.file)
+        self.refused(f"{self.file}: cfg: more than 100000 values")
+
+    def test_networks_larger_than_the_weights(self) -> None:
+        case = golden("resnet")
+        state = weights(case["layout"], case["normalizer"])
+        write(self.file, self.changed(lambda cfg: cfg["policy"].update(down_dims=[65536, 65536])), ema_model=state)
+        self.refused("cfg.policy.down_dims", "bytes of weights do not fit one ONNX file")
+        # Refused before the networks have memory.
+        write(self.file, self.changed(lambda cfg: cfg["policy"].update(down_dims=[1024, 2048])), ema_model=state)
+        with mock.patch.object(networks.nn.Module, "load_state_dict", side_effect=AssertionError):
+            devices: list[str] = []
+            made = networks.UNetDenoiser
+
+            def noted(*arguments: Any) -> torch.nn.Module:
+                network = made(*arguments)
+                devices.append(next(network.parameters()).device.type)
+                return network
+
+            with mock.patch.object(networks, "UNetDenoiser", noted):
+                self.refused("by cfg.policy it is")
+        self.assertEqual(devices, ["meta"])
 
     def test_which_weights(self) -> None:
         write(self.file, golden("resnet")["cfg"], model={})
@@ -239,6 +339,7 @@ class Refusals(Temporary):
             ("--pose=arm.0-5", "'arm.0-5' is not 7 numbers"),
             ("--gripper=arm.7-8", "'arm.7-8' is not 1 numbers"),
             ("--low=0,0", "'0,0' is not 3 numbers"),
+            ("--low=a,b,c", "'a,b,c' is not 3 numbers, joined by commas"),
             ("--high=0,0,inf", "'0,0,inf' is not 3 numbers"),
             ("--picture=640", "'640' is not WIDTHxHEIGHT"),
         ):

@@ -35,7 +35,13 @@ class Present(unittest.TestCase):
         # An earlier version's, and another program's.
         del rows["names"]["rapid.plugged"]
         self.assertEqual(lerobot_source.presence(rows, "cam", 4)["plugged"].tolist(), [True, False, True, False])
-        self.assertTrue(all(flags.all() for flags in lerobot_source.presence({"names": {}}, "arm", 4).values()))
+        theirs = {"names": {}, "columns": {"observation.state": ["arm.0"]}, "observation.state": np.zeros((4, 1))}
+        theirs["observation.images.cam"] = [b""] * 4
+        for modality, there in (("arm", True), ("cam", True), ("tactile", False)):
+            found = lerobot_source.presence(theirs, modality, 4)
+            # What is not in the data set is unplugged, which is no stall.
+            for name in ("plugged", "running"):
+                self.assertEqual(found[name].tolist(), [there] * 4, (modality, name))
 
 
 class Columns(unittest.TestCase):
@@ -61,7 +67,8 @@ class Exported(unittest.TestCase):
     def setUpClass(cls):
         temporary = tempfile.TemporaryDirectory()
         cls.addClassCleanup(temporary.cleanup)
-        cls.folder, cls.spec = Path(temporary.name), experiment()
+        # A data set has no tags: the experiment's seeds would choose none of its episodes.
+        cls.folder, cls.spec = Path(temporary.name), experiment(data={"seeds": None})
         cls.episodes, cls.rows = cls.folder / "episodes", cls.folder / "rows"
         for words in (
             ("--sim", "task", "--expert", "--record", "--episodes", "2", "--seed", "1000", "--out", cls.episodes),
@@ -85,6 +92,8 @@ class Exported(unittest.TestCase):
 
     def test_a_training_takes_them(self):
         cache = self.folder / "cache"
+        with self.assertRaisesRegex(EpisodeError, "0 left out, 2 not asked for: check the filters in .data.$"):
+            load(experiment(), [self.rows], cache)
         found = load(self.spec, [self.rows], cache)
         self.assertEqual((len(found.training), found.left_out), (2, []))
         self.assertNotEqual(found.training[0].sha256, found.training[1].sha256)

@@ -340,6 +340,9 @@ class CommandLine(Case):
         self.assertEqual(done.returncode, 0, done.stderr)
         self.assertIn("tactile-id: 10/10 success 0.50 (0.10 to 0.90), 1 of 2 trials, the best", done.stdout)
         self.assertEqual(len(calls.read_text().splitlines()), 1)
+        other = ("--rapid", str(rapid), "--evaluate-every", "10", "--evaluate-trials", "3", "--resume")
+        refused = self.run_train(*self.words("run", "--device", "cpu", *other))
+        self.assertRegex(refused.stderr, "(?m)^train: --evaluate-trials 3: .*: write --evaluate-trials 2, or use another --out$")
         self.assertEqual(read_checkpoint(self.folder / "run" / BEST_SUCCESS)["iteration"], 10)
 
     def test_a_run_is_resumed_and_exported(self):
@@ -352,6 +355,10 @@ class CommandLine(Case):
         self.experiment.write_text(self.experiment.read_text().replace("[8, 16]", "[8, 8]"))
         changed = self.run_train(*self.words("run", "--resume"), RAPID_BIN=str(self.judge))
         self.assertRegex(changed.stderr, "train: .*small.toml: denoiser: not as in .*checkpoint.pt: use another --out")
+        text = self.experiment.read_text().replace("[8, 8]", "[8, 16]")
+        self.experiment.write_text(text.replace("[data]\n", '[data]\nabsences = ["unplug"]\n'))
+        changed = self.run_train(*self.words("run", "--resume"), RAPID_BIN=str(self.judge))
+        self.assertRegex(changed.stderr, "train: .*small.toml: data.absences: not as in .*checkpoint.pt: use another --out")
         from rapid_policy.export import export
 
         export(read_checkpoint(self.folder / "run" / CHECKPOINT), self.folder / "bundle")

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import unittest
@@ -22,7 +23,7 @@ from rapid_policy.checkpoint import BEST_SUCCESS, CHECKPOINT, Run, begin, read_c
 from rapid_policy.dataset import Dataset
 from rapid_policy.progress import Progress
 from rapid_policy.train import Stopped, Trainer, parse, prepare, provenance
-from rapid_policy.trials import FIRST_SEED, MOST, Trials, check_seeds
+from rapid_policy.trials import FIRST_SEED, MOST, Trials, check_count, check_seeds
 from rapid_policy.weights import load_policy
 
 RAPID = os.environ.get("RAPID_BIN")
@@ -39,7 +40,7 @@ with calls.open("a") as file:
     file.write(json.dumps(sys.argv[1:]) + "\\n")
 answer = json.loads((here / "answers").read_text())[number]
 if answer["wait"]:
-    if answer["wait"] == "for ever":
+    if answer["wait"] == "without end":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     (here / "waiting").touch()
     while True:
@@ -118,8 +119,8 @@ class Kept(Case):
     def test_the_best_is_kept_and_of_equals_the_later(self):
         self.answers(*(answer(condition(success)) for success in (5, 12, 12, 9)))
         self.evaluate(self.trials(self.run_), 10, 20, 30, 40)
-        found = [(e["iteration"], e["success"]) for e in self.run_.evaluations]
-        self.assertEqual(found, [(10, 5), (20, 12), (30, 12), (40, 9)])
+        found = [(e["iteration"], e["success"], e["trials"]) for e in self.run_.evaluations]
+        self.assertEqual(found, [(10, 5, 20), (20, 12, 20), (30, 12, 20), (40, 9, 20)])
         best = read_checkpoint(self.out / BEST_SUCCESS)
         self.assertEqual(best["iteration"], 30)
         facts = {"condition": "full", "trials": 20, "first_seed": FIRST_SEED}
@@ -192,7 +193,7 @@ class Kept(Case):
         self.assertEqual([e["iteration"] for e in self.run_.evaluations], [10, 27])
 
     def test_the_child_ends_with_the_training(self):
-        for wait in ("for the end", "for ever"):
+        for wait in ("for the end", "without end"):
             with self.subTest(wait):
                 for name in ("calls", "waiting"):
                     (self.folder / name).unlink(missing_ok=True)
@@ -203,11 +204,48 @@ class Kept(Case):
                 child = trials._child
                 self.addCleanup(child.kill)
                 until(lambda: (self.folder / "waiting").exists())
-                with mock.patch.object(module, "PATIENCE", 0.1 if wait == "for ever" else 1000):
+                with mock.patch.object(module, "PATIENCE", 0.1 if wait == "without end" else 1000):
                     trials.end()
-                self.assertEqual(child.returncode, -signal.SIGKILL if wait == "for ever" else -signal.SIGTERM)
+                self.assertEqual(child.returncode, -signal.SIGKILL if wait == "without end" else -signal.SIGTERM)
                 self.assertFalse((self.out / "evaluation").exists())
                 trials.end()
+
+    def test_the_child_ends_with_a_training_that_is_killed(self):
+        child = self.folder / "child"
+        code = (
+            "import os, sys\nfrom rapid_policy import trials\n"
+            "if not os.fork():\n"
+            "    trials.end_with(int(sys.argv[1]) or os.getppid())\n"
+            f"    os.execv('/bin/sh', ['sh', '-c', 'echo $$ >{child}.new; mv {child}.new {child}; while :; do sleep 1; done'])\n"
+            "os.wait()\n"
+        )
+
+        def start(parent: str) -> subprocess.Popen:
+            words = [sys.executable, "-c", code, parent]
+            started = subprocess.Popen(words, cwd=MODELS, stderr=subprocess.PIPE, text=True, start_new_session=True)
+            self.addCleanup(started.stderr.close)
+            self.addCleanup(started.wait)
+            self.addCleanup(end, started)
+            return started
+
+        def end(started: subprocess.Popen):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(started.pid, signal.SIGKILL)
+
+        def gone() -> bool:
+            try:
+                return (Path("/proc") / child.read_text().strip() / "stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+            except (FileNotFoundError, ProcessLookupError):
+                return True
+
+        training = start("0")
+        until(child.exists)
+        self.assertFalse(gone())
+        training.kill()
+        until(gone)
+        # It ended before the child asked for that.
+        late = start(str(os.getpid()))
+        self.assertIn("the training has ended", late.communicate()[1])
 
 
 def until(holds):
@@ -226,6 +264,14 @@ class Seeds(unittest.TestCase):
         for seeds in ([FIRST_SEED, FIRST_SEED], [0, 10**9], [FIRST_SEED + 19, 10**9]):
             with self.assertRaisesRegex(ValueError, "^40000 to 40019: seeds of trials that were demonstrated"):
                 check_seeds(seeds, 20)
+
+    def test_scores_of_other_numbers_of_trials_are_refused(self):
+        # The first is of an older version.
+        evaluations = [{"iteration": 10, "score": 1.0}, {"iteration": 20, "score": 1.0, "trials": 2}]
+        check_count(Path("run/checkpoint.pt"), evaluations, 2)
+        fix = "write --evaluate-trials 2, or use another --out"
+        with self.assertRaisesRegex(ValueError, f"^--evaluate-trials 20: .* run/checkpoint.pt are of 2 trials .*: {fix}$"):
+            check_count(Path("run/checkpoint.pt"), evaluations, 20)
 
     def test_more_trials_than_there_are_seeds_are_refused(self):
         trials, every = "--evaluate-trials", "--evaluate-every"
@@ -281,7 +327,7 @@ class Training(Case):
                         children.append(trials._child)
                         # Whatever happens, it does not outlive the test.
                         self.addCleanup(trials._child.kill)
-                        os.kill(os.getpid(), signal.SIGTERM)
+                        os.kill(os.getpid(), signal.SIGTERM if moment == 4 else signal.SIGHUP)
 
                 with mock.patch.object(Progress, "step", side_effect=step), self.assertRaises(Stopped):
                     Trainer(run, self.dataset, self.out, trials=trials).train()

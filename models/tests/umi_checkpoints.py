@@ -117,7 +117,7 @@ def write(file: Path, cfg: dict[str, Any], **state_dicts: dict[str, torch.Tensor
 
 
 def run(*arguments: Any) -> SimpleNamespace:
-    """The command as a user gives it: status, what it printed, what it complained of."""
+    """The command as a user gives it: status, what it printed, its errors."""
     out, complaint = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(complaint):
         status = export_umi_policy.main([str(argument) for argument in arguments])

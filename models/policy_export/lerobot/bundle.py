@@ -107,7 +107,7 @@ def write_card(policy: dict, folder: Path) -> None:
     if policy["mask_aware"]:
         mask = (
             "Mask-aware by request: an absent camera's embedding is replaced by zeros. That serves only a policy that "
-            "was trained with cameras left out in the same way; nothing in the checkpoint tells whether this one was."
+            "was trained with cameras left out in the same way; nothing in the checkpoint states whether this one was."
         )
     else:
         mask = "Not mask-aware: every observation is required."

@@ -32,11 +32,13 @@ def make(name: str, side: int, downsample: int, group_norm: bool) -> tuple[nn.Mo
     if architecture in CONVNEXTS and downsample == 32:
         channels, depths = CONVNEXTS[architecture]
         return convnext(channels, depths), channels[-1]
-    if found := re.fullmatch(r"vit_([a-z]+)_patch(\d+)(_clip)?_(\d+)", architecture):
+    if found := re.fullmatch(r"vit_([a-z]+)_patch(\d{1,4})(_clip)?_(\d{1,4})", architecture):
         size, patch, clip, expected = found[1], int(found[2]), bool(found[3]), int(found[4])
         if size in VITS and (not clip or size in ("base", "large")):
             if expected != side:
                 raise ValueError(f"takes pictures of {expected}, but those of shape_meta have {side}")
+            if not 1 <= patch <= side:
+                raise ValueError(f"divides pictures of {side} in patches of {patch}")
             width, depth, heads = VITS[size]
             return ViT(side, patch, width, depth, heads, clip), width
     if architecture in (*RESNETS, *CONVNEXTS):

@@ -5,8 +5,10 @@ Invariant: the pickle may hold tensors, plain data and containers of OmegaConf. 
 their place. Any other class or function is refused by name, before anything of it is called.
 """
 
+import itertools
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,14 @@ import torch
 from torch import Tensor
 
 from .. import Unsupported
+
+
+# Of a configuration. UMI's have about a thousand.
+MOST_VALUES = 100_000
+
+
+class TooLarge(Exception):
+    """A configuration of more than `MOST_VALUES`."""
 
 
 class Record:
@@ -56,7 +66,9 @@ def read(file: Path) -> tuple[dict, dict[str, dict[str, Tensor]]]:
     if not isinstance(payload, dict) or not {"cfg", "state_dicts"} <= set(payload):
         raise Unsupported(f"{file}: no cfg and state_dicts in it: not a checkpoint of UMI's training")
     try:
-        cfg = plain(payload["cfg"])
+        cfg = plain(payload["cfg"], itertools.count(1))
+    except TooLarge as error:
+        raise Unsupported(f"{file}: cfg: more than {MOST_VALUES} values, counted where each is used") from error
     except (AttributeError, KeyError, TypeError, RecursionError) as error:
         raise Unsupported(f"{file}: cfg: not a configuration of OmegaConf: {error!r}") from error
     if not isinstance(cfg, dict):
@@ -65,26 +77,28 @@ def read(file: Path) -> tuple[dict, dict[str, dict[str, Tensor]]]:
 
 
 def reason(error: Exception) -> str:
-    """What torch.load complains of, in one line."""
+    """The error of torch.load in one line."""
     text = str(error)
     if found := re.search(r"GLOBAL (\S+)", text):
         return (
-            f"its pickle wants to use {found[1].rstrip('.')}, which is no plain data, and running a checkpoint's code "
+            f"its pickle uses {found[1].rstrip('.')}, which is no plain data, and running a checkpoint's code "
             "is not safe: save it again with cfg and state_dicts alone"
         )
     lines = text.rpartition("WeightsUnpickler error:")[2].split("\n")
     return f"not a file of torch.save: {next((line.strip() for line in lines if line.strip()), repr(error))}"
 
 
-def plain(value: Any) -> Any:
-    """Configurations as dicts and lists."""
+def plain(value: Any, used: Iterator[int]) -> Any:
+    """Configurations as dicts and lists. `used` counts their values: a pickle of a few bytes may name one value many times."""
+    if next(used) > MOST_VALUES:
+        raise TooLarge
     if isinstance(value, Record):
         state = value.state
-        return plain(state["_content"] if "_content" in state else state["_val"])
+        return plain(state["_content"] if "_content" in state else state["_val"], used)
     if isinstance(value, dict):
-        return {str(plain(key)): plain(item) for key, item in value.items()}
+        return {str(plain(key, used)): plain(item, used) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [plain(item, used) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)  # JSON has no such numbers
     if not isinstance(value, (str, int, float, type(None))):

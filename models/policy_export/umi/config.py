@@ -14,8 +14,13 @@ SINCE_START = "robot0_eef_rot_axis_angle_wrt_start"
 # Numbers of each observation that is no picture.
 LENGTHS = {POSITION: 3, ROTATION: 6, SINCE_START: 6, WIDTH: 1}
 ACTION_LEN = 10
-# Largest distance of two observation steps, in ticks, that a bundle may state.
+# Largest distance of two observation steps, in ticks, and what else a bundle may state at most.
 MOST_APART = 64
+MOST_STEPS, MOST_ACTIONS, MOST_TIMESTEPS = 64, 1024, 10_000
+# Larger pictures, widths and kernels are of no network that is known here.
+MOST_SIDE, MOST_WIDTH, MOST_KERNEL = 2048, 65_536, 63
+# Whole numbers from there on are no floats.
+MOST_WHOLE = 2**53
 POLICY = "diffusion_policy.policy.diffusion_unet_timm_policy.DiffusionUnetTimmPolicy"
 ENCODER = "diffusion_policy.model.vision.timm_obs_encoder.TimmObsEncoder"
 AGGREGATIONS = ("avg", "max", "soft_attention", "spatial_embedding", "attention_pool_2d")
@@ -112,7 +117,7 @@ class Config:
 
 
 class Keys:
-    """A table of the configuration, which names file and key in what it complains of."""
+    """A table of the configuration, whose errors name file and key."""
 
     def __init__(self, file: Path, table: Any, path: str = "cfg"):
         self.file, self.path = file, path
@@ -132,11 +137,15 @@ class Keys:
         if type(value) is not kind and not (kind is float and type(value) is int):
             words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", list: "a list"}
             raise self.wrong(key, f"{value!r} is not {words[kind]}")
+        if type(value) is int and abs(value) > MOST_WHOLE:
+            raise self.wrong(key, f"is not from -{MOST_WHOLE} to {MOST_WHOLE}")
         return value
 
-    def count(self, key: str, default: Any = None) -> int:
+    def count(self, key: str, default: Any = None, most: int = MOST_WHOLE) -> int:
         if (value := self.get(key, int, default)) < 1:
             raise self.wrong(key, f"{value} is not above 0")
+        if value > most:
+            raise self.wrong(key, f"{value} is more than {most}")
         return value
 
     def must(self, key: str, expected: Any, default: Any, why: str) -> None:
@@ -163,11 +172,14 @@ def read(file: Path, cfg: dict) -> Config:
     action.must("shape", [ACTION_LEN], None, "position, rotation_6d and width of one robot; a bundle moves one arm")
     action.must("rotation_rep", "rotation_6d", "rotation_6d", "an action has the first two rows of the matrix")
     action.must("latency_steps", 0, 0, "the first action is of the tick of the newest observation")
-    every, horizon = action.count("down_sample_steps"), action.count("horizon")
+    every, horizon = action.count("down_sample_steps"), action.count("horizon", most=MOST_ACTIONS)
     n_action_steps = root.count("n_action_steps", 8)
     if n_action_steps > horizon:
         raise root.wrong("n_action_steps", f"{n_action_steps} is more than the horizon of {horizon}")
     cameras, numbers, pose, side = observations(shapes.below("obs"), every)
+    relative = representation(root)
+    if not (numbers or relative):
+        raise shapes.wrong("obs", "the policy sees pictures alone (ignore_by_policy), and actions relative to no pose")
     return Config(
         file=file,
         raw=cfg,
@@ -175,13 +187,13 @@ def read(file: Path, cfg: dict) -> Config:
         numbers=numbers,
         pose=pose,
         side=side,
-        relative=representation(root),
+        relative=relative,
         horizon=horizon,
         n_action_steps=n_action_steps,
         vision=vision(policy.below("obs_encoder"), side),
         widths=widths(policy, horizon),
-        kernel=policy.count("kernel_size", 5),
-        step_features=policy.count("diffusion_step_embed_dim", 256),
+        kernel=kernel(policy),
+        step_features=step_features(policy),
         scheduler=scheduler(policy),
         weights="ema_model" if root.below("training").get("use_ema", bool) else "model",
     )
@@ -194,8 +206,10 @@ def observations(found: Keys, every: int) -> tuple[dict[str, Observation], dict[
         one = found.below(key)
         kind, shape = one.get("type", str, "low_dim"), one.get("shape", list)
         if kind == "rgb":
-            if len(shape) != 3 or shape[0] != 3 or shape[1] != shape[2]:
-                raise one.wrong("shape", f"{shape} is not [3, side, side]")
+            # True is an int to Python.
+            whole = len(shape) == 3 and all(type(length) is int for length in shape)
+            if not whole or shape[0] != 3 or shape[1] != shape[2] or not 1 <= shape[1] <= MOST_SIDE:
+                raise one.wrong("shape", f"{shape} is not [3, side, side] with a side from 1 to {MOST_SIDE}")
             cameras[key] = seen(one, every)
             sides.add(shape[1])
             continue
@@ -229,7 +243,7 @@ def seen(one: Keys, every: int) -> Observation:
             "latency_steps",
             f"{latency}: it was trained with observations of different times; those of a bundle are of the same tick",
         )
-    steps, rows = one.count("horizon"), one.get("down_sample_steps", float)
+    steps, rows = one.count("horizon", most=MOST_STEPS), one.get("down_sample_steps", float)
     apart = 1 if steps == 1 else rows / every
     if apart not in range(1, MOST_APART + 1):
         raise one.wrong(
@@ -298,16 +312,31 @@ def crop(found: Keys, side: int) -> int | None:
             raise one.wrong("_target_", f"{one.table['_target_']} is not known to be without effect in the mean")
     if not steps:
         raise found.wrong("transforms", "is empty: UMI's encoder expects RandomCrop first, or null")
-    return int(side * ratio)
+    if not (kept := int(side * ratio)):
+        raise Unsupported(f"{found.file}: {found.path}.transforms[0].ratio: {ratio} leaves nothing of pictures of {side}")
+    return kept
 
 
 def widths(policy: Keys, horizon: int) -> tuple[int, ...]:
     found = policy.get("down_dims", list, [256, 512, 1024])
-    if not found or not all(type(width) is int and width > 0 and width % 8 == 0 for width in found):
-        raise policy.wrong("down_dims", f"{found!r} are not multiples of 8")
+    if not found or not all(type(width) is int and 0 < width <= MOST_WIDTH and width % 8 == 0 for width in found):
+        raise policy.wrong("down_dims", f"{found!r} are not multiples of 8, at most {MOST_WIDTH}")
     if horizon % 2 ** (len(found) - 1):
         raise policy.wrong("down_dims", f"{len(found)} levels halve a horizon of {horizon} unevenly")
     return tuple(found)
+
+
+def kernel(policy: Keys) -> int:
+    if (found := policy.count("kernel_size", 5, MOST_KERNEL)) % 2 == 0:
+        raise policy.wrong("kernel_size", f"{found} is even: actions would not keep their number")
+    return found
+
+
+def step_features(policy: Keys) -> int:
+    found = policy.count("diffusion_step_embed_dim", 256, MOST_WIDTH)
+    if found < 4 or found % 2:
+        raise policy.wrong("diffusion_step_embed_dim", f"{found} is not an even number from 4")
+    return found
 
 
 def scheduler(policy: Keys) -> dict:
@@ -323,6 +352,18 @@ def scheduler(policy: Keys) -> dict:
     for key, names in CHOICES.items():
         if settings[key] not in names:
             raise found.wrong(key, f"{settings[key]!r} is not supported: {', '.join(names)} are")
-    total = found.count("num_train_timesteps", SCHEDULER["num_train_timesteps"])
+    total = found.count("num_train_timesteps", SCHEDULER["num_train_timesteps"], MOST_TIMESTEPS)
     steps = total if policy.table.get("num_inference_steps") is None else policy.count("num_inference_steps")
     return {"type": kind.removesuffix("Scheduler"), **settings, "num_inference_steps": steps}
+
+
+def visited(file: Path, scheduler: dict) -> dict:
+    """`scheduler`, all of whose timesteps are among those of the training."""
+    steps, total, offset = (scheduler[key] for key in ("num_inference_steps", "num_train_timesteps", "steps_offset"))
+    if steps > total:
+        raise Unsupported(f"{file}: {steps} inference steps: num_train_timesteps is {total}")
+    largest = total - 1 - (steps - 1) * (total // steps)
+    if not 0 <= offset <= largest:
+        key = "cfg.policy.noise_scheduler.steps_offset"
+        raise Unsupported(f"{file}: {key}: {offset} is not from 0 to {largest}, as {steps} of {total} timesteps leave")
+    return scheduler

@@ -30,7 +30,7 @@ RENAMED = [
     (r"\.film\.", ".cond_encoder."),
     (r"\.skip\.", ".residual_conv."),
 ]
-# What has no effect on what is computed: counters of batch statistics, and what tells UMI its device.
+# What has no effect on what is computed: counters of batch statistics, and what holds UMI's device.
 WITHOUT_EFFECT = re.compile(r"num_batches_tracked$|_dummy_variable$")
 NORMALIZER = "normalizer.params_dict."
 
@@ -130,19 +130,27 @@ class Policy(nn.Module):
     def __init__(self, config: Config, state: dict[str, Tensor]) -> None:
         super().__init__()
         self.config = config
-        self.obs_encoder = ObservationEncoder(config)
-        condition = sum(seen.steps for seen in config.cameras.values()) * self.obs_encoder.width
-        condition += sum(seen.steps * LENGTHS[key] for key, seen in config.numbers.items())
-        self.model = UNetDenoiser(ACTION_LEN, condition, config.widths, config.kernel, config.step_features)
+        # Without memory first: the sizes are those that the configuration states, whatever the file has.
+        with torch.device("meta"):
+            self._make()
         for name, module in (("obs_encoder.model_name", self.obs_encoder), ("down_dims", self.model)):
             fits(f"{config.file}: cfg.policy.{name}", 4 * sum(p.numel() for p in module.parameters()))
-        self._load(state)
+        found = self._placed(state)
+        self._make()
+        self.load_state_dict(found)
         lengths = {key: 3 for key in config.cameras} | {key: LENGTHS[key] for key in config.numbers}
         lengths["action"] = ACTION_LEN
         self.normalizer = {key: linear(config, state, key, length) for key, length in lengths.items()}
 
-    def _load(self, state: dict[str, Tensor]) -> None:
-        """Every weight of the checkpoint has its place here, and every place its weight."""
+    def _make(self) -> None:
+        config = self.config
+        self.obs_encoder = ObservationEncoder(config)
+        condition = sum(seen.steps for seen in config.cameras.values()) * self.obs_encoder.width
+        condition += sum(seen.steps * LENGTHS[key] for key, seen in config.numbers.items())
+        self.model = UNetDenoiser(ACTION_LEN, condition, config.widths, config.kernel, config.step_features)
+
+    def _placed(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The weights by their names here: every weight of the checkpoint has its place, and every place its weight."""
         names = {original(name): name for name in self.state_dict()}
         found = {k: v for k, v in state.items() if not k.startswith(NORMALIZER) and not WITHOUT_EFFECT.search(k)}
         entry = f"{self.config.file}: state_dicts.{self.config.weights}"
@@ -156,7 +164,7 @@ class Policy(nn.Module):
             wanted = own[names[name]]
             if value.shape != wanted.shape:
                 raise Unsupported(f"{entry}.{name}: {list(value.shape)}, by cfg.policy it is {list(wanted.shape)}")
-        self.load_state_dict({names[name]: value.float() for name, value in found.items()})
+        return {names[name]: value.float() for name, value in found.items()}
 
 
 def original(name: str) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import subprocess
 import sys
 import unittest
@@ -140,11 +141,37 @@ class Buffer(Folder):
         self.assertEqual(list(self.folder.glob("*none*")), [])
         status, printed = run(str(self.folder), str(self.out("none")), "--camera", "cam_wrist")
         self.assertIn("meta/info.json: not a data set that `rapid export --to lerobot` wrote", printed)
+        earlier = self.folder / "earlier"
+        (earlier / "meta").mkdir(parents=True)
+        info = json.loads((Path(self.set) / "meta/info.json").read_text(encoding="utf-8"))
+        del info["features"]["rapid.plugged"]
+        (earlier / "meta/info.json").write_text(json.dumps(info), encoding="utf-8")
+        status, printed = run(str(earlier), str(self.out("none")), "--camera", "cam_wrist")
+        fix = "info.json: no rapid.plugged: exported by an earlier version: export again"
+        self.assertEqual((status, fix in printed), (1, True), printed)
 
     def test_help_needs_no_package(self) -> None:
         script = Path(export_umi.__file__)
         done = subprocess.run([sys.executable, "-S", "-E", script, "--help"], capture_output=True, check=False)
         self.assertEqual((done.returncode, b"--pose COLUMNS" in done.stdout), (0, True), done.stderr)
+
+
+class Columns(unittest.TestCase):
+    def test_a_name_may_end_in_a_number(self) -> None:
+        state = {"columns": ["arm.0", "arm.1", "arm.2"], "names": ["arm.shoulder.3", "arm.elbow", "arm.0"]}
+        for text, places in (
+            ("arm.shoulder.3", [0]),
+            ("arm.elbow,arm.2", [1, 2]),
+            ("arm.0-1", [0, 1]),
+            ("arm", [0, 1, 2]),
+            # The number in the sample, which the name of another column does not change.
+            ("arm.0", [0]),
+        ):
+            found = export_umi.columns("--pose", text, {"observation.state": state})
+            self.assertEqual(found.places, [("observation.state", at) for at in places], text)
+            self.assertEqual(found.sensors, ["arm"])
+        with self.assertRaisesRegex(export_umi.Unfit, "no arm.shoulder.4"):
+            export_umi.columns("--pose", "arm.shoulder.4", {"observation.state": state})
 
 
 class Poses(unittest.TestCase):

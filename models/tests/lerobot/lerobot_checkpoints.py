@@ -79,7 +79,7 @@ def statistics(*shape: int) -> dict[str, torch.Tensor]:
 
 
 def run(*arguments) -> SimpleNamespace:
-    """The command as a user gives it: status, what it printed, what it complained of."""
+    """The command as a user gives it: status, what it printed, its errors."""
     out, complaint = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(complaint):
         status = export_lerobot.main([str(argument) for argument in arguments])

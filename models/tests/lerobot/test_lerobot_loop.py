@@ -4,36 +4,60 @@ import contextlib
 import io
 import json
 import sys
+import tempfile
 import unittest
 from pathlib import Path
+from unittest import mock
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from recorded import PROGRAM, Folder
 
 import lerobot_loop
-from lerobot_rig import ACTIONS, CAMERA, CONDITIONS, EVENT_AT, Log, observed
+from lerobot_rig import ACTIONS, CAMERA, CONDITIONS, EVENT_AT, Event, Log, Source, observed
 
 
 class Figures(unittest.TestCase):
-    """What is said of a run, from what happened when."""
+    """The figures of a run, from what happened when."""
 
     def log(self, pictures: str, failed_at: float | None) -> Log:
         """A picture and an action each second; the camera fails at some time."""
         times = [float(second) for second in range(1, len(pictures) + 1)]
         return Log(actions=times, observations=list(zip(times, pictures, strict=True)), read=times[-1], failed_at=failed_at)
 
-    def said(self, line: dict) -> tuple:
+    def figures(self, line: dict) -> tuple:
         return line["status"], *(line[f"{what}_{when}"] for what in ("actions", "repeated") for when in ("before", "after"))
 
     def test_status_is_that_of_the_end(self) -> None:
-        self.assertEqual(self.said(observed(self.log("abcd", None), None)), ("normal", 4, 0, 0, 0))
-        self.assertEqual(self.said(observed(self.log("aabcc", 3.5), None)), ("stale", 3, 2, 1, 1))
-        self.assertEqual(self.said(observed(self.log("abbbc", 2.5), None)), ("normal", 2, 3, 0, 2))
+        self.assertEqual(self.figures(observed(self.log("abcd", None), None)), ("normal", 4, 0, 0, 0))
+        self.assertEqual(self.figures(observed(self.log("aabcc", 3.5), None)), ("stale", 3, 2, 1, 1))
+        self.assertEqual(self.figures(observed(self.log("abbbc", 2.5), None)), ("normal", 2, 3, 0, 2))
         line = observed(self.log("abbb", 2.5), TimeoutError("too old"))
-        self.assertEqual(self.said(line), ("crash", 2, 2, 0, 2))
+        self.assertEqual(self.figures(line), ("crash", 2, 2, 0, 2))
         self.assertEqual((line["raised"]["type"], line["raised_after_s"]), ("TimeoutError", 1.5))
         self.assertIsNone(observed(self.log("ab", None), TimeoutError())["raised_after_s"])
+
+    def test_a_camera_is_back_once_it_has_sent_a_picture(self) -> None:
+        log, found = Log(failed_at=1.0), []
+
+        class Pipe:
+            def write(self, _: bytes) -> None:
+                found.append((log.back_at is not None, log.returned.is_set()))
+                if len(found) == 2:
+                    raise BrokenPipeError
+
+        with tempfile.TemporaryDirectory() as folder:
+            source = Source(Path(folder) / "x.mjpeg", [b"x"], Event(closes=True, away_s=0.0), log)
+            source.wait()
+            with self.assertRaises(BrokenPipeError):
+                source.send(Pipe())
+            self.assertEqual(found, [(False, False), (True, True)])
+            # Nothing waits for a camera that is closed before that.
+            log.back_at = None
+            log.returned.clear()
+            with mock.patch.object(source, "play", side_effect=BrokenPipeError):
+                source.run()
+            self.assertEqual((log.back_at, log.returned.is_set()), (None, True))
 
     def test_the_time_without_an_action_counts_from_the_failure(self) -> None:
         line = observed(self.log("abcd", 1.5), None)

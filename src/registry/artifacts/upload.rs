@@ -8,6 +8,7 @@ use super::HEADER;
 
 /// The unit. Its configuration is in `/etc/rapid/upload.conf`.
 pub(super) fn service() -> String {
+    let steps = steps();
     format!(
         r"{HEADER}
 # Before the first start, as root:
@@ -27,13 +28,11 @@ After=network-online.target
 [Service]
 {BEFORE}# A file that was copied is known by its checksum, and a break costs the file that was being copied. What is being written,
 # or waits to be repaired, is called *.mcap.partial. An episode in the store is never replaced: another of its name is an
-# error here.
-ExecStart=/usr/bin/rclone copy ${{EPISODES}} ${{STORE}} {SESSIONS} --checksum
-ExecStart=/usr/bin/rclone copy ${{EPISODES}} ${{STORE}} {EPISODES} --checksum --immutable
-# By size and by the checksum that the store keeps: a byte that changes in the store behind that checksum is found by
+# error here. Each command runs whether or not those before it failed, and the unit fails in the end if one did: an episode
+# that cannot be copied does not keep the others from being removed. Checked is what was listed before the copy, by size and
+# by the checksum that the store keeps: a byte that changes in the store behind that checksum is found by
 # rapid-upload-check.service, which reads the copies.
-ExecStart=/usr/bin/rclone check ${{EPISODES}} ${{STORE}} {EPISODES} --one-way
-ExecStart=/bin/sh -euc '{REMOVE}'
+ExecStart=/bin/sh -uc '{steps}'
 {AFTER}"
     )
 }
@@ -45,9 +44,9 @@ pub(super) fn check_service() -> String {
         r"{HEADER}
 # Reads the copies of all episodes that are still here, and compares every byte: see rapid-upload.service for the first start.
 # A copy that differs, or is missing after a day, makes this unit fail, and the journal names it (of one that differs rclone
-# prints the name alone). `rapid inspect` shows whether the episode here is whole. If it is, delete the copy, and
-# rapid-upload.service copies it again:
-#   rclone --config /etc/rapid/rclone.conf deletefile lab:episodes/rig-1/NAME.mcap
+# prints the name alone). It is damaged, or it is another episode of the same name: delete neither before `rapid inspect` has
+# read both. Moved aside in the store, the copy is kept, and rapid-upload.service copies the episode that is here:
+#   rclone --config /etc/rapid/rclone.conf moveto --ignore-checksum lab:episodes/rig-1/NAME.mcap lab:episodes/rig-1/NAME.mcap.aside
 [Unit]
 Description=rapid: copies in the store read back
 ConditionPathExists=/etc/rapid/upload.conf
@@ -123,10 +122,22 @@ const EPISODES: &str = "--max-depth 1 --include=*.mcap";
 /// The files of sessions, of which one may change at any moment.
 const SESSIONS: &str = "--max-depth 1 --include=session*.toml --include=session*.md";
 
-/// Only what rclone lists as equal after reading both sides is removed; `$$` is a `$` of the shell. While copies are read back
-/// it is left to a later start.
-const REMOVE: &str = r#"[ -n "$${REMOVE_AFTER:-}" ] || exit 0; \
-  exec 9>>"$$EPISODES/.upload.lock"; flock --nonblock 9 || exit 0; equal=$$(mktemp); \
-  rclone check "$$EPISODES" "$$STORE" --max-depth 1 --include=*.mcap --min-age "$$REMOVE_AFTER" --one-way --download \
-    --match "$$equal" --differ=- || differs=yes; \
-  while IFS= read -r name; do rm -v -- "$$EPISODES/$$name"; done <"$$equal"; rm "$$equal"; [ -z "$${differs:-}" ]"#;
+/// The episodes that the list of the shell's variable `listed` names.
+const LISTED: &str = r#"--max-depth 1 --files-from-raw "$$listed""#;
+
+/// The commands of the upload; `$$` is a `$` of the shell. An episode that is closed after the list was made is left to the next
+/// start. Only what rclone lists as equal after reading both sides is removed, and nothing while copies are read back.
+fn steps() -> String {
+    format!(
+        r#"listed=$$(mktemp) && equal=$$(mktemp) || exit; failed=; \
+  rclone copy "$$EPISODES" "$$STORE" {SESSIONS} --checksum || failed=yes; \
+  rclone lsf "$$EPISODES" {EPISODES} --files-only >"$$listed" || failed=yes; \
+  rclone copy "$$EPISODES" "$$STORE" {LISTED} --checksum --immutable || failed=yes; \
+  rclone check "$$EPISODES" "$$STORE" {LISTED} --one-way || failed=yes; \
+  if [ -n "$${{REMOVE_AFTER:-}}" ] && exec 9>>"$$EPISODES/{LOCK}" && flock --nonblock 9; then \
+    rclone check "$$EPISODES" "$$STORE" {EPISODES} --min-age "$$REMOVE_AFTER" --one-way --download \
+      --match "$$equal" --differ=- || failed=yes; \
+    while IFS= read -r name; do rm -v -- "$$EPISODES/$$name" || failed=yes; done <"$$equal"; \
+  fi; rm "$$listed" "$$equal"; [ -z "$$failed" ]"#
+    )
+}
