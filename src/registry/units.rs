@@ -138,7 +138,7 @@ mod tests {
             ("16.6666667ms", Some(Duration::from_nanos(16_666_667))),
             ("0.3333333333333333333333333333333333333333333s", Some(Duration::from_nanos(333_333_333))),
             ("0.0001h", Some(Duration::from_millis(360))),
-            ("1.5y", Some(Duration::from_mins(788_940))),
+            ("1.5y", Some(Duration::from_hours(13_149))),
             ("1 5s", None),
             ("1. 5s", None),
             ("1.5 5s", None),
