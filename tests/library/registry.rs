@@ -88,9 +88,9 @@ fn the_columns_of_an_export_are_parsed_and_its_numbers_have_names() {
     assert_eq!(registry.export.state, ["arm.position", "tracker", "counter"]);
     assert_eq!(registry.export.action, ["/action.x", "arm.1-1"]);
     let names = |registry: &Registry, at: usize| registry.devices[at].form.as_ref().map(Form::names);
-    let named = |names: &[&str]| Some(names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>());
-    assert_eq!(names(&registry, 0), named(&["hip.position", "hip.velocity", "knee.position", "knee.velocity"]));
-    assert_eq!(names(&registry, 1), named(&["x", "y", "z", "qx", "qy", "qz", "qw"]));
+    let wanted = |names: &[&str]| Some(names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>());
+    assert_eq!(names(&registry, 0), wanted(&["hip.position", "hip.velocity", "knee.position", "knee.velocity"]));
+    assert_eq!(names(&registry, 1), wanted(&["x", "y", "z", "qx", "qy", "qz", "qw"]));
     let none = valid("minimal").registry;
     assert_eq!((none.export.state.len(), none.export.action.len(), names(&none, 0)), (0, 0, None));
     // In every registry as many names as numbers, none twice.
