@@ -351,9 +351,8 @@ fn distances_are_shown_as_they_are_recorded_and_observations_name_what_is_record
     let file = good(&place, running);
     client.read();
     assert!(client.compare(&place, &file)[DEPTH] > 40);
-    let of = |topic: &'static str| {
-        client.received.iter().filter(move |message| client.channels[&message.channel].topic == topic)
-    };
+    let (received, channels) = (&client.received, &client.channels);
+    let of = |topic: &'static str| received.iter().filter(move |message| channels[&message.channel].topic == topic);
     for Received { channel, data, .. } in of(DEPTH) {
         let message = DynamicMessage::decode(client.channels[channel].message.clone(), &data[..]).expect("a picture");
         let encoding = message.get_field_by_name("encoding").expect("a field").into_owned();
