@@ -152,7 +152,7 @@ fn packets_of_a_lidar_are_recorded_with_their_points() {
     }
 }
 
-/// The pose that a phone sends: a homogeneous matrix, column by column, as ARKit has it. Turned by 90 degrees about z.
+/// The pose that a phone sends: a homogeneous matrix, column by column, as `ARKit` has it. Turned by 90 degrees about z.
 const POSE: [f32; 16] = [0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.25, -1.5, 3.0, 1.0];
 /// The same as a position and a quaternion `x y z w`.
 const PLACE: ([f64; 3], [f64; 4]) = ([0.25, -1.5, 3.0], [0.0, 0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2]);

@@ -1,7 +1,5 @@
 //! Files of earlier formats stay readable: those of `tests/old`, whose README states what each does not have.
 
-#![expect(clippy::expect_used, reason = "what fails here fails a test")]
-
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
