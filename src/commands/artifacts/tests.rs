@@ -27,7 +27,7 @@ fn all_files_are_written_and_stale_ones_are_removed() {
     names.sort();
     assert_eq!(names, ["cam_wrist.yaml", "motor_state.yaml", "tactile_tip.yaml", "theirs.yaml"]);
     let listed = String::from_utf8(out).unwrap();
-    assert_eq!(listed.lines().count(), 9);
+    assert_eq!(listed.lines().count(), 11);
     assert!(listed.contains("gone.yaml: the entry no longer exists"), "{listed}");
 }
 
