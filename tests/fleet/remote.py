@@ -240,9 +240,14 @@ class Ends:
     def end(self, what, at, again):
         """`at` ends it and returns when; `again` undoes that."""
         rig, before = self.rig, self.rig.count()
+
+        def streaming():
+            return [rig.here.states(device)[-1] == "streaming" for device in ("cam_far", "state_far")]
+
+        # A connection that was just made may be made once more: what ends it then is not `at`.
+        until(f"both stream before {what}", lambda: all(streaming()))
         self.found.append((what, at(), self.BOTH))
-        for device in ("cam_far", "state_far"):
-            until(f"{device} after {what}", lambda: rig.here.states(device)[-1] != "streaming")
+        until(f"both are gone after {what}", lambda: not any(streaming()))
         again()
         rig.both(before)
 
