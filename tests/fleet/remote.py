@@ -241,13 +241,13 @@ class Ends:
         """`at` ends it and returns when; `again` undoes that."""
         rig, before = self.rig, self.rig.count()
 
-        def streaming():
-            return [rig.here.states(device)[-1] == "streaming" for device in ("cam_far", "state_far")]
+        def bits():
+            return int(rig.here.reported("state")[-1]["mask"], 16) & self.BOTH
 
-        # A connection that was just made may be made once more: what ends it then is not `at`.
-        until(f"both stream before {what}", lambda: all(streaming()))
+        # By the bits: a sensor is stalled for a while before it is taken for absent.
+        until(f"both stream before {what}", lambda: bits() == self.BOTH)
         self.found.append((what, at(), self.BOTH))
-        until(f"both are gone after {what}", lambda: not any(streaming()))
+        until(f"both are gone after {what}", lambda: bits() == 0)
         again()
         rig.both(before)
 
