@@ -18,10 +18,11 @@ use super::{Format, json_line};
 use crate::cli::{ExportArgs, PictureForm};
 use crate::episode::sha256;
 use crate::export::{
-    self, Choice, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal,
-    SetError, Survey, Verified,
+    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal, SetError,
+    Survey, Verified,
 };
 use crate::record::inspect::{self, ReadError};
+use crate::registry::ExportSpec;
 use crate::status::Grade;
 use crate::text;
 
@@ -315,13 +316,13 @@ fn fitting(
     for episode in &episodes {
         known.learn(episode);
     }
-    let of_user = Choice { state: args.state.clone(), action: args.action.clone() };
+    let of_user = ExportSpec { state: args.state.clone(), action: args.action.clone() };
     let mut common = set.features().cloned();
     let mut fitting = Vec::new();
     for episode in episodes {
         let choice = match &common {
             Some(common) => of_user.or(common.choice()),
-            None => of_user.or(&episode.export.clone().into()),
+            None => of_user.or(&episode.export),
         };
         let features = Features::of(&episode, &choice, pictures, &known)
             .and_then(|features| common.get_or_insert_with(|| features.clone()).check(&features).map(|()| features));

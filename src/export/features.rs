@@ -32,30 +32,6 @@ const CHOSEN: &str = "chosen";
 /// What every data set of LeRobot has, as 64-bit integers but for the first, which is f32 and seconds.
 pub(super) const OWN: [&str; 5] = ["timestamp", "frame_index", "episode_index", "index", "task_index"];
 
-/// Which columns the user chose, in the grammar of [`columns`].
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Choice {
-    /// Those of [`STATE`], in this order; all numbers of all sensors without a choice.
-    pub state: Vec<String>,
-    /// Those of [`ACTION`], in this order; without a choice those of the topic `/action`.
-    pub action: Vec<String>,
-}
-
-impl Choice {
-    /// This one, where it chooses anything, otherwise `other`.
-    #[must_use]
-    pub fn or(&self, other: &Self) -> Self {
-        let of = |mine: &Vec<String>, other: &Vec<String>| if mine.is_empty() { other.clone() } else { mine.clone() };
-        Self { state: of(&self.state, &other.state), action: of(&self.action, &other.action) }
-    }
-}
-
-impl From<ExportSpec> for Choice {
-    fn from(ExportSpec { state, action }: ExportSpec) -> Self {
-        Self { state, action }
-    }
-}
-
 /// Where the numbers of a column come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Origin {
@@ -98,7 +74,7 @@ pub struct Features {
     pub(super) state: Vec<Axis>,
     pub(super) action: Vec<Axis>,
     /// The choice that they follow from: of an episode whose sensors have other lengths other columns follow from it.
-    pub(super) choice: Choice,
+    pub(super) choice: ExportSpec,
 }
 
 /// A feature as `info.json` describes it.
@@ -119,7 +95,7 @@ impl Features {
     ///
     /// # Errors
     /// When a name chosen is not in the episode, or the shape of a sensor's samples is not known.
-    pub fn of(episode: &Survey, choice: &Choice, pictures: Pictures, known: &Known) -> Result<Self, Refusal> {
+    pub fn of(episode: &Survey, choice: &ExportSpec, pictures: Pictures, known: &Known) -> Result<Self, Refusal> {
         let mut features = Self {
             fps: episode.fps,
             modalities: episode.streams.iter().map(|stream| stream.name.clone()).collect(),
@@ -154,7 +130,7 @@ impl Features {
                 Content::Bytes => {}
             }
         }
-        let Choice { state, action } = &mut features.choice;
+        let ExportSpec { state, action } = &mut features.choice;
         if state.is_empty() {
             *state = vectors.iter().map(|vector| vector.name.clone()).collect();
         }
@@ -196,7 +172,7 @@ impl Features {
                 Feature { further, ..feature(&self.camera_key(*place), dtype, shape, names) }
             })
             .collect();
-        let Choice { state, action } = &self.choice;
+        let ExportSpec { state, action } = &self.choice;
         for (key, axes, chosen) in [(STATE, &self.state, state), (ACTION, &self.action, action)] {
             if !axes.is_empty() {
                 let names: Vec<&str> = axes.iter().map(|axis| axis.name.as_str()).collect();
@@ -300,7 +276,7 @@ impl Features {
             texts(key, "names")?.into_iter().zip(texts(key, "columns")?).map(read).collect()
         };
         let (state, action) = (read_all(STATE)?, read_all(ACTION)?);
-        let choice = Choice {
+        let choice = ExportSpec {
             state: texts(STATE, CHOSEN).unwrap_or_default(),
             action: texts(ACTION, CHOSEN).unwrap_or_default(),
         };
@@ -310,7 +286,7 @@ impl Features {
     }
 
     /// The choice that leads to these features.
-    pub fn choice(&self) -> &Choice {
+    pub fn choice(&self) -> &ExportSpec {
         &self.choice
     }
 
@@ -478,9 +454,9 @@ mod tests {
         }
     }
 
-    fn choice(state: &[&str], action: &[&str]) -> Choice {
+    fn choice(state: &[&str], action: &[&str]) -> ExportSpec {
         let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect();
-        Choice { state: texts(state), action: texts(action) }
+        ExportSpec { state: texts(state), action: texts(action) }
     }
 
     fn axis(place: usize, at: usize, name: &str) -> Axis {
@@ -548,7 +524,7 @@ mod tests {
         let camera = |found, declared| ("cam", Content::Camera { found, declared });
         let arm = ("arm", Content::Vector { found: Some(3), declared: None });
         let of = |content, known: &Known| {
-            Features::of(&episode(&[content, arm]), &Choice::default(), Pictures::Files, known)
+            Features::of(&episode(&[content, arm]), &ExportSpec::default(), Pictures::Files, known)
         };
         let height = |found: Result<Features, Refusal>| found.map(|features| features.cameras[0].1.height);
         let mut known = Known::default();
@@ -599,7 +575,7 @@ mod tests {
     #[test]
     fn a_choice_is_that_of_the_user_then_that_of_another_by_feature() {
         assert_eq!(choice(&["a"], &[]).or(&choice(&["b"], &["c"])), choice(&["a"], &["c"]));
-        assert_eq!(choice(&[], &[]).or(&choice(&[], &[])), Choice::default());
+        assert_eq!(choice(&[], &[]).or(&choice(&[], &[])), ExportSpec::default());
     }
 
     #[test]

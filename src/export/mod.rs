@@ -31,7 +31,7 @@ mod tests;
 mod verify;
 mod video;
 
-pub use features::{Choice, Features, Known};
+pub use features::{Features, Known};
 pub use ffmpeg::{Ffmpeg, FfmpegError};
 pub use picture::{Codec, Pictures};
 pub use rows::Refusal;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use super::cells::CellMaker;
-use super::features::{Axis, Choice, Features, MASK, Origin, PLUGGED, STATE, VALID};
+use super::features::{Axis, Features, MASK, Origin, PLUGGED, STATE, VALID};
 use super::picture::{Codec, Pictures, Shape};
 use super::rows::{Index, Listed, Refusal, Row};
 use super::set::{DataSet, SetError, prepare};
@@ -120,7 +120,7 @@ fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
         pictures: Pictures::Video(Codec::Av1),
         state: Vec::new(),
         action: Vec::new(),
-        choice: Choice::default(),
+        choice: ExportSpec::default(),
     };
     let kinds = index.modalities.iter().map(|modality| modality.kind).collect();
     let (mut frames, mut maker) = (FrameMaker::default(), CellMaker::new(&features, kinds).unwrap());
@@ -214,7 +214,7 @@ fn rows_that_were_prepared_for_another_position_are_written_again() {
         pictures: Pictures::Files,
         state: vec![axis(Origin::Modality(1), 0)],
         action: Vec::new(),
-        choice: Choice::default(),
+        choice: ExportSpec::default(),
     };
     let stop = AtomicBool::new(false);
     // Of the second episode alone, prepared for its position behind others.
@@ -302,7 +302,7 @@ fn raw_pictures_lose_nothing_and_what_cannot_be_used_is_black_and_not_valid() {
         state: vec![axis(Origin::Modality(1), 0)],
         pictures: Pictures::Files,
         action: vec![axis(Origin::Topic, 1), axis(Origin::Modality(1), 0), axis(Origin::Topic, 0)],
-        choice: Choice::default(),
+        choice: ExportSpec::default(),
     };
     let kinds = index.modalities.iter().map(|modality| modality.kind).collect();
     let mut maker = CellMaker::new(&features, kinds).unwrap();

@@ -46,7 +46,7 @@ pub struct LanMonitor {
 
 impl LanMonitor {
     /// Starts searching for those of these entries that are found on the network; `None` if there are none. `cooldown` is that
-    /// of the rig. Two monitors of one service may give one device to both, unless each entry names its instance.
+    /// of the rig. Two monitors of one service may give one device to both, unless their entries name different instances.
     pub fn open<'a>(devices: impl IntoIterator<Item = &'a DeviceSpec>, cooldown: Duration) -> Option<Self> {
         let (report, events) = mpsc::channel(DEPTH);
         let mut tasks = JoinSet::new();
