@@ -27,13 +27,7 @@ from policy_export.umi import config as checkpoint_config
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Returns the exit status: 0, or 1 with one line that names what cannot be exported."""
-    options = parser().parse_args(arguments)
-    try:
-        export(options)
-    except Unsupported as error:
-        return commandline.failed("export_umi_policy", error)
-    return 0
+    return commands.run("export_umi_policy", parser(), export, arguments)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -6,7 +6,23 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import commandline
+
 from . import Unsupported, bundle
+
+
+def run(
+    name: str,
+    parser: argparse.ArgumentParser,
+    export: Callable[[argparse.Namespace], None],
+    arguments: list[str] | None,
+) -> int:
+    """Returns the exit status: 0, or 1 with one line that names what cannot be exported."""
+    try:
+        export(parser.parse_args(arguments))
+    except Unsupported as error:
+        return commandline.failed(name, error)
+    return 0
 
 
 def write(
