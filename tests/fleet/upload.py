@@ -165,7 +165,7 @@ def changes(upload, read_back, variables, rig):
     assert flipped.read_bytes() == changed, "the upload replaced a copy"
     ended = run(read_back, variables, check=False)
     assert ended.returncode != 0 and ended.stdout.split() == [flipped.name], ended
-    # As the head of the unit says.
+    # As the head of the unit states.
     name = f"{variables['STORE']}/{flipped.name}"
     run([shutil.which("rclone"), "moveto", "--ignore-checksum", name, f"{name}.aside"], variables)
     run(upload, variables)
