@@ -18,6 +18,9 @@ use crate::outcome::Outcome;
 use crate::programs::{self, ProgramError};
 
 const WORDS: &str = include_str!("../guest/bench.sh");
+/// A script that has not ended by then hangs. Those that take minutes on an idle machine have taken more than ten on a busy
+/// one.
+const WATCHDOG: Duration = Duration::from_mins(30);
 /// Time limit per condition before the timeline starts. Generous: the host may be busy; it affects no measurement.
 const READY_WITHIN_S: u32 = 60;
 
@@ -81,8 +84,13 @@ impl Scenario {
             watch_mask: false,
             examples: Vec::new(),
             systemd: false,
-            limit: Duration::from_mins(10),
+            limit: WATCHDOG,
         }
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
     }
 
     /// Adds a device that is plugged from the start. Devices are numbered in the order they are added.
@@ -171,7 +179,7 @@ impl Scenario {
         self
     }
 
-    /// Minimum time limit of the guest's script: a watchdog, which ends a hanging script.
+    /// The least time that the guest's script has, for one that runs for longer than [`WATCHDOG`].
     #[must_use]
     pub fn limit(mut self, limit: Duration) -> Self {
         self.limit = self.limit.max(limit);

@@ -6,7 +6,6 @@
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
 
 use vbench::emu::can::adapter::Protocol;
 use vbench::emu::log::Moment;
@@ -188,7 +187,6 @@ exit 0
         .device(camera("TAC1", 320, 240))
         .registry(&registry)
         .script(&script)
-        .limit(Duration::from_secs(600))
 }
 
 /// The part of the script that assembles each configuration once; the outer loop is over the fingers.

@@ -1,7 +1,5 @@
 //! `rapid` with CAN adapters of every kind at once: a motor behind one serial line, a raw bus behind another, and one that is full.
 
-use std::time::Duration;
-
 use serde_json::Value;
 use vbench::check::{ended, episode, play};
 use vbench::emu::can::adapter::Protocol;
@@ -76,8 +74,7 @@ fn a_full_bus_is_recorded_and_disturbs_no_other_device() {
                 can("slcan", SLCAN, 1, "ad50:60c4", "CAN2", "adapter = \"slcan\"\nprotocol = \"raw\""),
                 can("damiao", "/rapid/damiao", 2, "2e88:4603", "CAN3", MOTOR),
             ]))
-            .script(SCRIPT)
-            .limit(Duration::from_secs(180)),
+            .script(SCRIPT),
     );
     ended(&outcome);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
@@ -138,8 +135,7 @@ exit 0
         Scenario::new("set-down")
             .device(DeviceSpec::can(Protocol::GsUsb).serial("CAN1"))
             .registry(&registry(&[can("bus", FULL, 0, "1d50:606f", "CAN1", "protocol = \"raw\"")]))
-            .script(script)
-            .limit(Duration::from_secs(120)),
+            .script(script),
     );
     ended(&outcome);
     let down = outcome.file("down");

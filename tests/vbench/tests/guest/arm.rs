@@ -1,8 +1,6 @@
 //! An arm of six motors behind one adapter, moved by a policy that was trained on demonstrations by hand: its actions are
 //! places of the tip. The tactile camera is pulled out and plugged in again while it moves, and `rapid` is killed.
 
-use std::time::Duration;
-
 use serde_json::Value;
 use vbench::check::{ended, episode, ms, only, play, rises_after};
 use vbench::emu::can::adapter::Protocol;
@@ -195,7 +193,6 @@ fn scenario(demonstration: &Recording) -> Scenario {
         .file("wrist", feed::pack(pictures(demonstration, WRIST)))
         .file("tactile", feed::pack(pictures(demonstration, TACTILE)))
         .file("steps", DENOISING_STEPS)
-        .limit(Duration::from_secs(480))
         .script(&[CHUNKS, SCRIPT].concat());
     bundle(scenario, |policy| {
         policy["control_hz"] = CONTROL_HZ.into();

@@ -1,8 +1,6 @@
 //! A joint with a brake on a line of a USB chip, an emergency stop on another line of it, and an enabling switch on a key:
 //! the kernel's own GPIO and input devices.
 
-use std::time::Duration;
-
 use serde_json::Value;
 use vbench::check::{ms, play};
 use vbench::emu::can::adapter::Protocol;
@@ -180,7 +178,7 @@ fn a_brake_is_engaged_before_its_joint_is_released_whatever_stops_it() {
         .spare(DeviceSpec::gpio().serial("GPIO1"))
         .registry(&text)
         .file("devices.toml", text);
-    let outcome = play(scenario.script(SCRIPT).limit(Duration::from_secs(180)));
+    let outcome = play(scenario.script(SCRIPT));
     assert_eq!(outcome.code, 0, "the guest's script: {}", outcome.log);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
     assert!(outcome.file("refused").contains("emergency stop door is pressed"), "{}", outcome.file("refused"));

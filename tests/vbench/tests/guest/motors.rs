@@ -106,8 +106,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
             .device(adapter.motor(0x05, 0x15, "DMH3510").motor(0x06, 0x16, "DM4310"))
             .registry(&registry(&[can("arm", ARM, 0, "1d50:606f", "CAN1", BUS)]))
             .example("publish_action")
-            .script(SCRIPT)
-            .limit(std::time::Duration::from_secs(180)),
+            .script(SCRIPT),
     );
     ended(&outcome);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());

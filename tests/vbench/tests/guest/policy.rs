@@ -254,7 +254,6 @@ fn scenario(demonstration: &Recording, feeds: &[(&str, Vec<Vec<u8>>); 2]) -> Sce
         .file("tactile", feed::pack(&feeds[1].1))
         .file("arm", feed::pack(demonstration.rows(ARM).iter().map(line)))
         .file("steps", DENOISING_STEPS)
-        .limit(Duration::from_secs(480))
         .script(&[CHUNKS, SCRIPT].concat());
     bundle(scenario, |policy| {
         policy["control_hz"] = CONTROL_HZ.into();
