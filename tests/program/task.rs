@@ -216,6 +216,11 @@ fn trials_are_reproducible_and_a_fixed_set_of_sensors_ends_those_in_which_one_is
     for row in fixed.iter().filter(|row| row["event"] == "condition") {
         assert_eq!((&row["crash"], &row["status"]), (&2.into(), &"crash".into()));
     }
+    // The policy sees nothing leave: it is asked at every eighth tick, and at no other.
+    for trial in fixed.iter().filter(|row| row["event"] == "trial") {
+        let count = |key: &str| trial["counts"][key].as_u64().expect("a count");
+        assert_eq!(count("requests"), (count("actions") + count("held_ticks")).div_ceil(8), "{trial}");
+    }
 }
 
 #[test]
