@@ -117,7 +117,7 @@ fn seeds_of_the_training_are_not_evaluated_without_a_warning() {
 }
 
 #[test]
-fn the_policy_that_remembers_has_its_last_pictures_after_the_unplug() {
+fn the_policy_with_held_samples_has_its_last_pictures_after_the_unplug() {
     let place = Place::new();
     let bundle = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id-memory");
     let shown = printed(&place, &["policy", "show", bundle, "--sim", "task"]);
