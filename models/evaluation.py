@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """Runs the policies with a sensor that is pulled out, and writes the results beside the paper's table.
 
-    evaluation.py --rapid ../target/release/rapid [--runs runs/evaluation] [--trials 100]
+    evaluation.py --rapid ../target/release/rapid [--runs runs/evaluation] [--trials 100] [--seeds-from 50000]
 
 Each run is a `rapid eval`, whose output is kept in RUNS/NAME.jsonl, below its command line and the program: what the same
 program has printed for it before is not run again. The results, `results/eval.jsonl` (the conditions) and
-`results/eval.md`, are of the policies that are in the repository now: output of others is refused.
+`results/eval.md`, are of the policies that are in the repository now: output of others is refused. Those of other trials
+than the first ones have the seed of the first trial in their names: `eval-60000.md`.
 """
 
 from __future__ import annotations
@@ -44,16 +45,16 @@ class Run:
     options: tuple[str, ...] = ()
     conditions: tuple[str, ...] = ()
 
-    def command(self, trials: int) -> list[str]:
-        """What prints its results, in the folder `models`."""
+    def command(self, trials: int, first: int) -> list[str]:
+        """What prints its results, in the folder `models`; `first`: the seed of the first trial."""
         chosen = [word for condition in self.conditions for word in ("--condition", condition)]
-        return ["eval", self.bundle, "--trials", str(trials), "--seed", str(FIRST_SEED), "--json", *self.options, *chosen]
+        return ["eval", self.bundle, "--trials", str(trials), "--seed", str(first), "--json", *self.options, *chosen]
 
 
 RUNS = (
     Run("plain", PLAIN, "absent pictures are zeros, the paper's rule"),
     Run("held", PLAIN, "the last sample stands in for the sensor", ("--hold-last", "20s"), ("hot-unplug", "hot-replug", "early-unplug")),
-    Run("memory", MEMORY, "trained to remember"),
+    Run("memory", MEMORY, "trained with held samples"),
     Run("static", PLAIN, "a loop with a fixed list", ("--static-config",), ("full", "no-tactile", "hot-unplug", "hot-replug")),
 )  # fmt: skip
 
@@ -68,6 +69,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/evaluation"), help="what is printed")
     parser.add_argument("--out", type=Path, default=MODELS / "results")
     parser.add_argument("--trials", type=int, default=100)
+    parser.add_argument("--seeds-from", type=seed, default=FIRST_SEED, metavar="N", help="seed of the first trial")
     args = parser.parse_args()
     args.runs.mkdir(parents=True, exist_ok=True)
     try:
@@ -76,14 +78,28 @@ def main() -> None:
         sys.exit(f"evaluation: {error}")
     lines = [{"run": name, **line} for name, part in printed.items() for line in part if line["event"] == "condition"]
     text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
-    (args.out / "eval.jsonl").write_text(text, encoding="utf-8")
-    (args.out / "eval.md").write_text(markdown(printed, args.trials), encoding="utf-8")
-    print(f"{args.out / 'eval.jsonl'} and .md")
+    name = named("eval", args.seeds_from)
+    (args.out / f"{name}.jsonl").write_text(text, encoding="utf-8")
+    (args.out / f"{name}.md").write_text(markdown(printed, args.trials, args.seeds_from), encoding="utf-8")
+    print(f"{args.out / name}.jsonl and .md")
+
+
+def seed(text: str) -> int:
+    """The seed of a first trial. No demonstration, and no evaluation while training, has one that is allowed."""
+    number = int(text)
+    if number < FIRST_SEED:
+        raise argparse.ArgumentTypeError(f"{number} is below {FIRST_SEED}: of demonstrations, or of evaluations while training")
+    return number
+
+
+def named(name: str, first: int) -> str:
+    """The name of what was made with the trials from `first` on."""
+    return name if first == FIRST_SEED else f"{name}-{first}"
 
 
 def evaluate(run: Run, args: argparse.Namespace) -> list[dict[str, Any]]:
     """The lines of a run, of an earlier one if there is one."""
-    file, command = args.runs / f"{run.name}.jsonl", run.command(args.trials)
+    file, command = args.runs / f"{named(run.name, args.seeds_from)}.jsonl", run.command(args.trials, args.seeds_from)
     head = {"event": "run", "command": command, "program": hashlib.sha256(args.rapid.read_bytes()).hexdigest()}
     known = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     if not known or json.loads(known[0]) != head:
@@ -135,12 +151,27 @@ def between(values: list[int]) -> str:
     return f"step {ordered[0]} to {ordered[-1]}, median {ordered[len(ordered) // 2]}"
 
 
-def markdown(printed: dict[str, list[dict[str, Any]]], trials: int) -> str:
+def origin(first: int) -> list[str]:
+    """How far the trials from `first` on had a part in which policies are in the repository."""
+    if first != FIRST_SEED:
+        return [f"Which policies are in the repository was decided with the trials from {FIRST_SEED} on in view (`eval.md`)."]
+    return [
+        "The policies are of training seed 0. Trainings with other seeds and of other lengths were run on these same trials, and six of",
+        "eight did worse ([figures](README.md#seeds-and-the-length-of-training)); these two stayed in the repository. So the tables are of",
+        "two trainings, and not of what another one gives. `evaluation.py --seeds-from N` runs the policies on other trials.",
+    ]
+
+
+def markdown(printed: dict[str, list[dict[str, Any]]], trials: int, first: int = FIRST_SEED) -> str:
     """The tables for people."""
     conditions = {run.name: {c["condition"]: c for c in printed[run.name] if c["event"] == "condition"} for run in RUNS}
     of = {
         name: [t for t in printed["plain"] if t["event"] == "trial" and t["condition"] == name] for name in TITLES
     }
+
+    def score(run: str) -> str:
+        return f"{conditions[run]['hot-unplug']['score']:.2f}"
+
     full, unplugged, early = of["full"], of["hot-unplug"], of["early-unplug"]
     triangular = sum(t["triangular"] for t in full)
     small = sum(t["size"] == "small" for t in full)
@@ -152,12 +183,16 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int) -> str:
         f"`models/{b}` (bundle `{next(iter(conditions[n].values()))['policy_hash'][:12]}`)"
         for b, n in ((PLAIN, "plain"), (MEMORY, "memory"))
     )
+    program = "scripts/train.sh python evaluation.py --rapid PROGRAM"
+    made = "`make evaluation`" if first == FIRST_SEED else f"`{program} --seeds-from {first}`"
     lines = [
         "# The policies with a sensor that is pulled out",
         "",
-        f"{bundles}, {trials} trials a condition, seeds {FIRST_SEED} to {FIRST_SEED + trials - 1}, which no demonstration has;",
+        f"{bundles}, {trials} trials a condition, seeds {first} to {first + trials - 1}, which no demonstration has;",
         f"{triangular} of the blocks are triangular, {small} small. A trial counts when the block ends in the bin of its texture;",
-        "Wilson's interval. No policy was chosen by these trials: both are of training seed 0.",
+        "Wilson's interval.",
+        "",
+        *origin(first),
         "",
     ]
     for run in RUNS[:3]:
@@ -170,10 +205,11 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int) -> str:
         f"that no demonstration has, {PLAIN} sorts {sorted_unseen} of {len(unseen)} with everything plugged in ({low:.2f} to {high:.2f}).",
         "",
         "Where absent pictures are zeros (the paper's rule), a policy whose tactile sensor is pulled out after the touch guesses, as",
-        "one that never had it. With `--hold-last 20s` the last sample stands in for the sensor: what was felt is kept. The policy",
-        "that is trained to remember has that in its bundle: in some of its training's windows the tactile pictures are those of",
-        "some moment before ([experiment](../experiments/tactile-id-memory.toml)). Held from before the touch a picture shows",
-        "nothing, and each of them guesses.",
+        f"one that never had it. With `--hold-last 20s` the last sample stands in for the sensor: what was felt is kept. `{MEMORY}`",
+        "has that rule in its bundle and is trained with held samples: in some of its training's windows the tactile pictures are those",
+        "of some moment before ([experiment](../experiments/tactile-id-memory.toml)). It sees two steps, as the other, and has no",
+        f"recurrent state: what is kept is the sample. The rule alone, with the weights of `{PLAIN}`, which were not trained for it, gives",
+        f"{score('held')} after the touch, beside {score('memory')}. Held from before the touch a picture shows nothing, and each of them guesses.",
         "",
         f"Each trial prints when the texture was first felt ({between([t['touched_at'] for t in full if t['touched_at'] is not None])}) and"
         " when the ways to the bins had",
@@ -184,8 +220,8 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int) -> str:
         "",
         "## A loop with a fixed list of sensors",
         "",
-        f"The weights of `{PLAIN}` without mask, in a loop that reads every sensor that was there at the start and fails when a read has",
-        "no sample within 200 ms, as LeRobot's cameras do (`async_read`; [its own loop](lerobot-loop.md) beside it):",
+        f"The weights of `{PLAIN}`, whose mask stays that of the start, in a loop that reads every sensor that was there then and fails",
+        "when a read has no sample within 200 ms, as LeRobot's cameras do (`async_read`; [its own loop](lerobot-loop.md) beside it):",
         "",
         *HEAD,
         *(row(TITLES[name], line) for name, line in conditions["static"].items()),
@@ -194,9 +230,9 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int) -> str:
         " crashed in both as well. Status is read from the run:",
         "crash if its loop failed, degraded if a sensor was absent at the end.",
         "",
-        "Made with `make evaluation`, which runs, and keeps in `eval.jsonl` without the lines of the trials:",
+        f"Made with {made}, which runs, and keeps in `{named('eval', first)}.jsonl` without the lines of the trials:",
         "",
-        *(f"    rapid {' '.join(run.command(trials))}" for run in RUNS),
+        *(f"    rapid {' '.join(run.command(trials, first))}" for run in RUNS),
         "",
         "The same seed gives the same trial on the same machine; another processor rounds differently, and of a hundred trials a",
         "few may end otherwise.",

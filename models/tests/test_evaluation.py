@@ -1,12 +1,15 @@
 """The evaluation: whose output it takes, and what it does not run again."""
 
 import argparse
+import contextlib
+import io
 import json
 import tempfile
 import unittest
 from pathlib import Path
+from unittest import mock
 
-from evaluation import MODELS, RUNS, TITLES, EvaluationError, evaluate, markdown, row
+from evaluation import FIRST_SEED, MODELS, RUNS, TITLES, EvaluationError, evaluate, main, markdown, row
 
 HELD = next(run for run in RUNS if run.name == "held")
 
@@ -21,7 +24,7 @@ class Output(unittest.TestCase):
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)
         self.folder = Path(folder.name)
-        self.args = argparse.Namespace(rapid=self.folder / "rapid", runs=self.folder, trials=2)
+        self.args = argparse.Namespace(rapid=self.folder / "rapid", runs=self.folder, trials=2, seeds_from=FIRST_SEED)
         self.lines = [
             line
             for name in HELD.conditions
@@ -34,7 +37,7 @@ class Output(unittest.TestCase):
         text = "\n".join(map(json.dumps, lines))
         self.args.rapid.write_text(
             f"#!/bin/sh\nif [ $1 = policy ]; then echo '{{\"hash\": \"ours\"}}'; exit; fi\n"
-            f"echo run >>{self.folder}/count\ncat <<'END'\n{text}\nEND\n",
+            f"echo run >>{self.folder}/count\necho $* >>{self.folder}/words\ncat <<'END'\n{text}\nEND\n",
             encoding="utf-8",
         )
         self.args.rapid.chmod(0o755)
@@ -60,8 +63,26 @@ class Output(unittest.TestCase):
         with self.assertRaisesRegex(EvaluationError, "not all of them"):
             evaluate(HELD, self.args)
 
+    def test_trials_with_other_seeds_are_kept_beside_the_first_ones(self):
+        evaluate(HELD, self.args)
+        self.args.seeds_from = 60_000
+        evaluate(HELD, self.args)
+        evaluate(HELD, self.args)
+        self.assertEqual([line.split()[5] for line in (self.folder / "words").read_text().splitlines()], ["50000", "60000"])
+        for file, seed in (("held.jsonl", "50000"), ("held-60000.jsonl", "60000")):
+            head = json.loads((self.folder / file).read_text(encoding="utf-8").splitlines()[0])
+            self.assertEqual(head["command"][head["command"].index("--seed") + 1], seed)
+
     def test_every_condition_has_a_title(self):
         self.assertTrue(all(name in TITLES for run in RUNS for name in run.conditions))
+
+
+class Options(unittest.TestCase):
+    def test_seeds_of_demonstrations_are_refused(self):
+        words = ["evaluation.py", "--rapid", "rapid", "--seeds-from", "49999"]
+        with mock.patch("sys.argv", words), contextlib.redirect_stderr(io.StringIO()) as printed:
+            self.assertRaises(SystemExit, main)
+        self.assertIn("49999 is below 50000", printed.getvalue())
 
 
 class Row(unittest.TestCase):
@@ -90,6 +111,10 @@ class Page(unittest.TestCase):
                 printed["plain"].append(trial | at)
         printed["static"].append({"event": "trial", "failure": "tactile_tip: no sample within 200ms"})
         self.assertEqual((results / "eval.md").read_text(encoding="utf-8"), markdown(printed, 100))
+        other = markdown(printed, 100, 60_000)
+        self.assertIn("seeds 60000 to 60099", other)
+        self.assertIn("evaluation.py --rapid PROGRAM --seeds-from 60000`", other)
+        self.assertEqual((other.count("--seed 60000"), other.count("--seed 50000")), (len(RUNS), 0))
 
 
 if __name__ == "__main__":

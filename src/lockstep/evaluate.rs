@@ -171,8 +171,8 @@ impl Hand {
 pub enum Configuration {
     /// Those that are present, by the mask.
     Dynamic,
-    /// Every sensor that was present at the start is read at every tick, without a mask, by a loop that fails when a read
-    /// does: [`StaticLoop`].
+    /// Every sensor that was present at the start is read at every tick by a loop that fails when a read does
+    /// ([`StaticLoop`]). The policy keeps the mask of the start.
     Static,
 }
 
@@ -451,6 +451,10 @@ impl Taker for Spectator<'_> {
         }
         if let Some(reads) = &mut self.reads {
             reads.take(topic, header);
+            // A fixed list has no mask: that a sensor has left, the policy is not told.
+            if topic == TopicId::Mask {
+                return;
+            }
         }
         self.pilot.take(topic, header, payload);
     }
@@ -483,6 +487,8 @@ pub fn robot_time(steps: u64) -> Duration {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mask::Bits;
+    use crate::policy::bundle::example;
 
     #[test]
     fn the_confidence_interval_is_that_of_wilson() {
@@ -528,5 +534,20 @@ mod tests {
         let (topic, header) = sample(1, 300);
         reads.take(topic, &header);
         assert!(reads.read(Stamp(400_000_000)).is_ok());
+    }
+
+    #[test]
+    fn the_policy_of_a_static_loop_keeps_the_mask_of_the_start() {
+        let registry = Registry::task();
+        let bundle = Bundle::parse(example::POLICY, "policy.json").unwrap_or_else(|errors| panic!("{errors}"));
+        let (start, later) = (PhysicalMask(0b111), PhysicalMask(0b101));
+        for (reads, expected) in [(None, later), (Some(StaticLoop::new(&registry, start)), start)] {
+            let pilot = Pilot::new(&bundle, &registry, WithoutMask::Hold, 0);
+            let mut spectator = Spectator { pilot, recorder: None, reads: None };
+            spectator.take(TopicId::Mask, &SampleHeader::default(), &Bits::from(start).payload(1));
+            spectator.reads = reads;
+            spectator.take(TopicId::Mask, &SampleHeader::default(), &Bits::from(later).payload(2));
+            assert_eq!(spectator.pilot.mask, expected);
+        }
     }
 }

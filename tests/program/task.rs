@@ -117,7 +117,7 @@ fn seeds_of_the_training_are_not_evaluated_without_a_warning() {
 }
 
 #[test]
-fn the_policy_that_remembers_has_its_last_pictures_after_the_unplug() {
+fn the_policy_with_held_samples_has_its_last_pictures_after_the_unplug() {
     let place = Place::new();
     let bundle = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id-memory");
     let shown = printed(&place, &["policy", "show", bundle, "--sim", "task"]);
@@ -215,6 +215,11 @@ fn trials_are_reproducible_and_a_fixed_set_of_sensors_ends_those_in_which_one_is
     let fixed = trials(&["--static-config"]);
     for row in fixed.iter().filter(|row| row["event"] == "condition") {
         assert_eq!((&row["crash"], &row["status"]), (&2.into(), &"crash".into()));
+    }
+    // The policy sees nothing leave: it is asked at every eighth tick, and at no other.
+    for trial in fixed.iter().filter(|row| row["event"] == "trial") {
+        let count = |key: &str| trial["counts"][key].as_u64().expect("a count");
+        assert_eq!(count("requests"), (count("actions") + count("held_ticks")).div_ceil(8), "{trial}");
     }
 }
 

@@ -17,11 +17,13 @@ const CONDITIONS: [(&str, &[&str]); 5] = [
     ("full", &[">= 0.95"]),
     ("no-tactile", &[">= 0.4", "<= 0.6"]),
     ("hot-unplug", &[]),
-    ("hot-replug", &[">= 0.9"]),
+    ("hot-replug", &[">= 0.95"]),
     ("no-wrist", &[]),
 ];
 /// Those in which a sensor is unplugged.
 const PULLED: [&str; 2] = ["hot-unplug", "hot-replug"];
+/// The one that is run once more, with the last sample of the sensor held.
+const HELD: &str = PULLED[0];
 
 /// The output of `rapid eval`.
 struct Evaluated {
@@ -49,6 +51,8 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let own = evaluate(bench, trials, &[])?;
     bench.progress("eval: the static configuration");
     let fixed = evaluate(bench, trials, &["--static-config"])?;
+    bench.progress("eval: the last sample held");
+    let held = evaluate(bench, trials, &["--hold-last", "20s", "--condition", HELD])?;
     let mut figures = Vec::new();
     for (condition, targets) in CONDITIONS {
         let figure = |bound: &str| {
@@ -65,6 +69,12 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     if let Some(first) = figures.first_mut() {
         first.note = format!("{trials} trials a condition; baseline: with --static-config");
     }
+    figures.push(
+        Figure::new(format!("eval/score, {HELD}, last sample held"), "", held.of(HELD, "score"))
+            .baseline(own.of(HELD, "score"))
+            .target(">= 0.95")
+            .note("with --hold-last 20s; baseline: without"),
+    );
     let names = CONDITIONS.map(|(condition, _)| condition);
     figures.push(
         Figure::new("eval/crashes, all conditions", "", Some(own.crashes(&names)))

@@ -57,7 +57,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
             .baseline(p50(&seen.bare_cpu))
             .note("the thread's own time: what another program takes does not count"),
         Figure::new("policy/sampler, multiple of baseline", "x", ratio(&seen.sampler))
-            .target("<= 1.1")
+            .target("<= 1.05")
             .note("the median of pairs, by the clock on the wall"),
         Figure::new("policy/sampler, multiple of baseline, cpu", "x", work).note("the same by the thread's own time"),
         Figure::new("policy/observation to chunk, multiple of baseline", "x", ratio(&seen.answer)),
