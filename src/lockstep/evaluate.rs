@@ -451,7 +451,7 @@ impl Taker for Spectator<'_> {
         }
         if let Some(reads) = &mut self.reads {
             reads.take(topic, header);
-            // A fixed list has no mask: that a sensor has left, the policy is not told.
+            // A fixed list has no mask: the policy does not see a sensor leave.
             if topic == TopicId::Mask {
                 return;
             }
