@@ -33,9 +33,9 @@ pub mod hotplug;
 pub mod inputs;
 pub mod interlock;
 pub mod interlocks;
-#[cfg(feature = "lan")]
 #[cfg(feature = "motors")]
 pub mod kinematics;
+#[cfg(feature = "lan")]
 pub mod link;
 #[cfg(feature = "foxglove")]
 pub mod live;

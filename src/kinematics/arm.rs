@@ -11,8 +11,8 @@ use crate::action::NoAction;
 use crate::registry::{EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, MotorSpec, TipRotation};
 
 /// How near the tip must come to its target: a tenth of what the motors resolve.
-const NEAR_M: f64 = 1e-4;
-const NEAR_RAD: f64 = 1e-3;
+pub(super) const NEAR_M: f64 = 1e-4;
+pub(super) const NEAR_RAD: f64 = 1e-3;
 /// Steps of the solver: what a tip moves within a tick needs three.
 const STEPS: usize = 100;
 /// Damping of a step (Levenberg 1944): directions in which the tip moves by less, m or rad for each rad of the joints, are
@@ -190,6 +190,11 @@ impl std::fmt::Debug for Solver {
 }
 
 impl Solver {
+    /// The motors of the joints that move the tip: all but the gripper's.
+    pub fn joints(&self) -> &[usize] {
+        &self.arm.motors
+    }
+
     /// The position of each motor for an action (x, y, z; the quaternion if it is commanded; the opening of the gripper), with
     /// the motors at `from` at present. A position beyond the box of the registry is moved to its edge.
     ///

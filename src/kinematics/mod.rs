@@ -10,7 +10,7 @@
 mod arm;
 mod chain;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 pub use arm::{Arm, ArmError, Solver};
 pub use chain::{Chain, ChainError};

@@ -2,22 +2,29 @@
 
 use proptest::prelude::*;
 
+use super::arm::{NEAR_M, NEAR_RAD};
 use super::*;
 use crate::action::NoAction::{Length, OutOfReach};
 use crate::registry::{
     CanProtocol, CanSpec, DamiaoSpec, EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, NodeSpec, Registry, TipRotation,
 };
+use crate::rotation;
 
 const URDF: &str = include_str!("../../tests/arm/arm.urdf");
 const JOINTS: [&str; 5] = ["waist", "lift", "elbow", "pitch", "roll"];
 
-/// A registry with the arm of the tests; `more` are further keys of its table.
+/// The motors of the arm of the tests; `more` are further keys of its table.
 fn motors(more: &str) -> DamiaoSpec {
-    let motor = |(at, name): (usize, &str)| {
+    declared(&JOINTS, more)
+}
+
+/// Motors of these joints and of a gripper, as a registry declares them.
+fn declared(joints: &[&str], more: &str) -> DamiaoSpec {
+    let motor = |(at, name): (usize, &&str)| {
         let slave = at + 1;
         format!("{{ name = \"{name}\", slave = {slave}, type = \"DM4310\", kp = 20, kd = 1, position = [-3, 3] }}")
     };
-    let list: Vec<_> = JOINTS.into_iter().chain(["jaw"]).enumerate().map(motor).collect();
+    let list: Vec<_> = joints.iter().chain(&["jaw"]).enumerate().map(motor).collect();
     let text = format!(
         "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\nprotocol = \"damiao\"\n\
          motors = [{}]\n[device.arm.effector]\nurdf = \"arm.urdf\"\ntip = \"tool\"\nmin = [-2, -2, 0]\nmax = [2, 2, 2]\n\
@@ -36,6 +43,44 @@ fn arm(more: &str) -> Arm {
     Arm::of(motors.effector.as_deref().expect("an effector"), &motors.motors, URDF).expect("it fits")
 }
 
+const Y: &str = "0 1 0";
+const Z: &str = "0 0 1";
+/// Joints whose tip takes any pose near by, each with its place on the one before and its axis: as many as a pose has
+/// coordinates, and one more, so that the elbow has a choice.
+pub(crate) const SIX: [(&str, &str); 6] =
+    [("0 0 0.2", Z), ("0 0 0.1", Y), ("0 0 0.4", Y), ("0 0 0.2", Z), ("0 0 0.2", Y), ("0 0 0.1", Z)];
+const SEVEN: [(&str, &str); 7] =
+    [("0 0 0.2", Z), ("0 0 0.1", Y), ("0 0 0.2", Z), ("0 0 0.2", Y), ("0 0 0.2", Z), ("0 0 0.2", Y), ("0 0 0.1", Z)];
+pub(crate) const COMMANDED: &str = "rotation = \"commanded\"";
+
+/// An arm of these joints. It stands aslant and its tool is bent, so that no rotation is the same in two frames.
+pub(crate) fn arm_of(joints: &[(&str, &str)], more: &str) -> Arm {
+    let names: Vec<String> = (0..joints.len()).map(|at| format!("j{at}")).collect();
+    let links: Vec<String> = (0..=joints.len()).map(|at| format!("<link name=\"l{at}\"/>")).collect();
+    let joint = |(at, (place, axis)): (usize, &(&str, &str))| {
+        let next = at + 1;
+        format!(
+            "<joint name=\"j{at}\" type=\"revolute\"><parent link=\"l{at}\"/><child link=\"l{next}\"/>\
+             <origin xyz=\"{place}\" rpy=\"0 0 0\"/><axis xyz=\"{axis}\"/>\
+             <limit lower=\"-2.9\" upper=\"2.9\" effort=\"10\" velocity=\"3\"/></joint>"
+        )
+    };
+    let moving: Vec<String> = joints.iter().enumerate().map(joint).collect();
+    let urdf = format!(
+        "<?xml version=\"1.0\"?><robot name=\"any\"><link name=\"table\"/>{}<link name=\"tool\"/>\
+         <joint name=\"mount\" type=\"fixed\"><parent link=\"table\"/><child link=\"l0\"/>\
+         <origin xyz=\"0.1 -0.05 0.2\" rpy=\"0.1 -0.2 0.3\"/></joint>{}\
+         <joint name=\"tool\" type=\"fixed\"><parent link=\"l{}\"/><child link=\"tool\"/>\
+         <origin xyz=\"0.03 0.02 0.12\" rpy=\"0.3 -0.2 0.5\"/></joint></robot>",
+        links.concat(),
+        moving.concat(),
+        joints.len()
+    );
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let motors = declared(&names, more);
+    Arm::of(motors.effector.as_deref().expect("an effector"), &motors.motors, &urdf).expect("it fits")
+}
+
 /// A sample of the motors at these positions.
 fn sample(positions: &[f64]) -> Vec<f64> {
     positions.iter().flat_map(|position| [*position, 0.0, 0.0, 0.0, 0.0, 0.0]).collect()
@@ -50,6 +95,23 @@ fn state(arm: &Arm, positions: &[f64]) -> [f64; 8] {
 
 fn distance(one: &[f64], other: &[f64]) -> f64 {
     one.iter().zip(other).map(|(one, other)| (one - other).powi(2)).sum::<f64>().sqrt()
+}
+
+/// How far two poses are apart: m, and rad; without the angle about z if that is free.
+pub(crate) fn apart(one: &[f64], other: &[f64], free_yaw: bool) -> [f64; 2] {
+    let [qx, qy, qz, qw] = [4, 5, 6, 7].map(|at| other[at]);
+    let [x, y, z, w] = rotation::product([4, 5, 6, 7].map(|at| one[at]), [-qx, -qy, -qz, qw]);
+    // A rotation about z, then one about an axis across it: the half angle of the second is that of x and y alone.
+    let half = if free_yaw { x.hypot(y).atan2(z.hypot(w)) } else { x.hypot(y).hypot(z).atan2(w.abs()) };
+    [distance(&one[..3], &other[..3]), 2.0 * half]
+}
+
+/// Numbers within these ranges, which successive steps fill evenly; the same in every run.
+fn spread(step: u32, ranges: &[[f64; 2]]) -> Vec<f64> {
+    // No two roots of primes have a common measure.
+    let primes = [2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0_f64];
+    let share = |prime: f64| (f64::from(step) * prime.sqrt()).fract();
+    ranges.iter().zip(primes).map(|([low, high], prime)| low + (high - low) * share(prime)).collect()
 }
 
 const DOWN: &str = "rotation = [0, 1, 0, 0]\nyaw = \"free\"";
@@ -131,6 +193,53 @@ proptest! {
         if let Ok(targets) = arm.solver().targets(&action, &places) {
             prop_assert!(targets[..5].iter().all(|target| (-3.0..=3.0).contains(target)), "{targets:?}");
             prop_assert!((0.0..=1.0).contains(&targets[5]), "{targets:?}");
+        }
+    }
+}
+
+/// Poses that the tip has with the joints at known positions, ordered with the joints elsewhere.
+#[test]
+fn targets_lead_to_the_commanded_position_and_rotation() {
+    const TURN: [f64; 2] = [-2.4, 2.4];
+    const LIFT: [f64; 2] = [-0.8, 0.8];
+    // Neither stretched nor with two axes in line: there a direction has no way.
+    const ELBOW: [f64; 2] = [0.8, 1.8];
+    const WRIST: [f64; 2] = [0.6, 1.6];
+    let free = "rotation = \"commanded\"\nyaw = \"free\"";
+    let cases: [(Arm, bool, &[[f64; 2]]); 3] = [
+        (arm(free), true, &[[-2.5, 2.5], [0.2, 0.8], [0.6, 1.2], [0.2, 1.0], [-2.0, 2.0]]),
+        (arm_of(&SIX, COMMANDED), false, &[TURN, LIFT, ELBOW, TURN, WRIST, TURN]),
+        (arm_of(&SEVEN, COMMANDED), false, &[TURN, LIFT, TURN, ELBOW, TURN, WRIST, TURN]),
+    ];
+    for (arm, free_yaw, ranges) in &cases {
+        let mut solver = arm.solver();
+        for step in 1..=100 {
+            let there = spread(step, ranges);
+            let wanted = state(arm, &[&there[..], &[0.0]].concat());
+            let mut from = [0.0; MAX_MOTORS];
+            let by = spread(3 * step + 1, &[[-0.15, 0.15]; 7]);
+            for (place, (position, by)) in from.iter_mut().zip(there.iter().zip(by)) {
+                *place = position + by;
+            }
+            let mut turned = [4, 5, 6, 7].map(|at| wanted[at]);
+            if *free_yaw {
+                // Whatever the angle about z is.
+                let half = f64::from(step);
+                turned = rotation::product([0.0, 0.0, half.sin(), half.cos()], turned);
+            }
+            // A quaternion and its negative are one rotation, and none needs to have exactly the length 1.
+            let length = if step.is_multiple_of(2) { 1.0 } else { -1.5 };
+            let action = [&wanted[..3], &turned.map(|part| length * part), &[0.25]].concat();
+            let targets = solver.targets(&action, &from);
+            let targets = targets.unwrap_or_else(|error| panic!("pose {step} of {} joints: {error}", ranges.len()));
+            let found = state(arm, &targets[..=ranges.len()]);
+            let [far, off] = apart(&found, &wanted, *free_yaw);
+            assert!(
+                far < NEAR_M && off < NEAR_RAD,
+                "pose {step} of {} joints: {far} m, {off} rad: {found:?} {wanted:?}",
+                ranges.len()
+            );
+            assert!((found[3] - 0.25).abs() < 1e-9, "the opening of pose {step}: {found:?}");
         }
     }
 }

@@ -111,6 +111,14 @@ fn changed(place: &Place, from: &str, to: &str) -> String {
     folder.display().to_string()
 }
 
+/// The same with so many actions of a chunk executed, at another rate.
+pub(crate) fn paced(place: &Place, executed: u32, hz: f64) -> String {
+    let rate = |executed: u32, hz: f64| {
+        format!("\"n_action_steps\": {executed},\n  \"action_start\": 1,\n  \"control_hz\": {hz:.1},")
+    };
+    changed(place, &rate(8, 10.0), &rate(executed, hz))
+}
+
 #[test]
 fn a_pulled_sensor_is_left_out_at_the_next_tick_and_actions_continue() {
     let place = Place::new();
@@ -335,11 +343,28 @@ fn a_held_sensor_is_observed_as_it_was_and_then_not_at_all() {
 fn a_policy_too_slow_for_its_rate_is_refused_with_the_figures() {
     let place = Place::new();
     // Its 15 actions cover 15 ms, and a chunk has ten times its steps.
-    let fast = changed(&place, "\"control_hz\": 10.0", "\"control_hz\": 1000.0");
+    let fast = paced(&place, 8, 1000.0);
     let (code, _, stderr) = infer(&place, &fast, PULLED, &["--denoising-steps", "100", "--duration", "3m"]);
     assert_eq!(code, Some(1), "{stderr}");
     assert!(stderr.contains("too slow on this machine") && stderr.contains("15 actions cover 15 ms"), "{stderr}");
     assert!(stderr.contains("--threads"), "{stderr}");
+}
+
+/// All actions of a chunk are executed before the next one is requested: however fast that is computed, there is a pause.
+#[test]
+fn a_policy_that_pauses_between_chunks_acts_after_a_warning_with_the_figures() {
+    let place = Place::new();
+    let pausing = paced(&place, 15, 1.0);
+    let (code, printed, stderr) = infer_until_it_acts(&place, &[pausing.as_str(), "--sim", "task"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    let is_warning = |event: &Value| {
+        let text = event["text"].as_str().unwrap_or_default();
+        let words = "15 actions cover 15000 ms at 1 Hz: the robot pauses between chunks; try a smaller n_action_steps";
+        event["event"] == "log" && event["level"] == "warn" && text.contains(words)
+    };
+    let warned = printed.iter().position(is_warning);
+    let acted = printed.iter().position(|event| event["event"] == "act");
+    assert!(warned.is_some() && warned < acted, "{printed:?}");
 }
 
 #[test]

@@ -157,6 +157,7 @@ fn finished(place: &Place, printed: &mut String) {
     run(&["unregister", "cam_wrist", "--dry-run", "--json"], 0);
     run(&["register", "--module", "tip_soft", "--dry-run", "--json"], 0);
     run(&["modules", "--json"], 0);
+    run(&["policy", "show", "--sim", "task", "--json"], 0);
 }
 
 /// What ends the program is the last object, whether it is an argument, a file or a rig.
@@ -210,6 +211,7 @@ const EVENTS: &[&str] = &[
     "registered_module",
     "module_type",
     "unregistered",
+    "policy_bundle",
     "error",
 ];
 

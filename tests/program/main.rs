@@ -36,6 +36,7 @@ mod nodes;
 mod observe;
 mod old_files;
 mod plot;
+mod policy;
 mod process;
 mod provenance;
 mod publishers;

@@ -7,6 +7,7 @@
 //! Invariant: an action whose pose the arm does not reach gives no target: without one in time the motors hold. It is
 //! counted and reported.
 
+use std::fmt;
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
@@ -23,7 +24,7 @@ use crate::time::Stamp;
 
 /// The longest time that an action without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);
-/// Motors nearer to their last target than this, rad, are on their way: the next target is sought from the last one, so that
+/// Joints nearer to their last target than this, rad, are on their way: the next target is sought from the last one, so that
 /// the arm stays as it is bent. Farther away they do not follow, or were moved by hand: it is sought from where they are.
 const ON_THE_WAY: f64 = 0.3;
 
@@ -33,7 +34,34 @@ pub(super) struct Effector {
     arm: Arm,
     motors: usize,
     latest: Arc<Latest>,
-    thread: Option<(Arc<AtomicBool>, JoinHandle<()>)>,
+    thread: Option<(Arc<AtomicBool>, JoinHandle<Tally>)>,
+}
+
+/// What became of the actions.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+struct Tally {
+    /// They became targets.
+    followed: u64,
+    /// The arm does not reach their poses.
+    out_of_reach: u64,
+    /// They are no poses of this arm, or not the policy's.
+    invalid: u64,
+}
+
+impl Tally {
+    fn refuse(&mut self, refused: NoAction) {
+        match refused {
+            NoAction::OutOfReach => self.out_of_reach += 1,
+            NoAction::NoNumbers | NoAction::Foreign | NoAction::Length => self.invalid += 1,
+        }
+    }
+}
+
+impl fmt::Display for Tally {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { followed, out_of_reach, invalid } = self;
+        write!(f, "{followed} actions followed, {out_of_reach} out of reach, {invalid} invalid")
+    }
 }
 
 /// Where the motors were at the last sample.
@@ -84,12 +112,16 @@ impl Effector {
         self.thread.as_ref().is_some_and(|(_, thread)| thread.is_finished())
     }
 
-    fn stop(&mut self) {
-        if let Some((stop, thread)) = self.thread.take() {
-            stop.store(true, Ordering::Release);
-            // Its panic has been reported; the motors hold without its targets.
-            let _ = thread.join();
+    /// Ends the thread, if it runs, and reports what became of its actions.
+    fn stop(&mut self) -> Option<Tally> {
+        let (stop, thread) = self.thread.take()?;
+        stop.store(true, Ordering::Release);
+        // Its panic has been reported; the motors hold without its targets.
+        let tally = thread.join().ok()?;
+        if tally != Tally::default() {
+            tracing::info!("thread `effector`: {tally}");
         }
+        Some(tally)
     }
 }
 
@@ -111,9 +143,9 @@ struct Worker {
 }
 
 impl Worker {
-    fn run(mut self) {
+    fn run(mut self) -> Tally {
         let mut last: Option<[f64; MAX_MOTORS]> = None;
-        let (mut solved, mut held) = (0_u64, 0_u64);
+        let mut tally = Tally::default();
         while !self.stop.load(Ordering::Acquire) {
             let mut action = [0.0; MAX_ACTION];
             match self.actions.newest(&mut action) {
@@ -124,26 +156,29 @@ impl Worker {
                     let from = last.filter(|last| self.are_on_the_way(last, &now)).unwrap_or(now);
                     match self.solver.targets(action, &from) {
                         Ok(targets) => {
-                            solved += 1;
+                            tally.followed += 1;
                             last = Some(targets);
                             self.targets.give(tick, targets.get(..self.motors).unwrap_or_default());
                         }
                         Err(refused) => {
-                            held += 1;
+                            tally.refuse(refused);
                             self.targets.refuse(refused);
                         }
                     }
                 }
-                Err(refused) => self.targets.refuse(refused),
+                Err(refused) => {
+                    tally.refuse(refused);
+                    self.targets.refuse(refused);
+                }
             }
         }
-        if solved + held > 0 {
-            tracing::info!("thread `effector`: {solved} actions followed, {held} not: their poses are out of reach");
-        }
+        tally
     }
 
     fn are_on_the_way(&self, last: &[f64; MAX_MOTORS], now: &[f64; MAX_MOTORS]) -> bool {
-        last.iter().zip(now).take(self.motors).all(|(last, now)| (last - now).abs() < ON_THE_WAY)
+        // A gripper that holds something stays far from its target, and where it is does not move the tip.
+        let pair = |joint: &usize| Some((last.get(*joint)?, now.get(*joint)?));
+        self.solver.joints().iter().filter_map(pair).all(|(last, now)| (last - now).abs() < ON_THE_WAY)
     }
 
     /// Until an action may have arrived.

@@ -2,6 +2,7 @@
 //! that answer at the other end.
 
 use std::net::UdpSocket;
+use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::thread;
 use std::time::Duration;
@@ -9,7 +10,7 @@ use std::time::Duration;
 use tokio::time::{Instant, interval, timeout};
 
 use super::*;
-use crate::action::Arming;
+use crate::action::{Arming, NoAction};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Reply, Value};
@@ -17,7 +18,9 @@ use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
 use crate::interlock::{InputState, Interlocks, StopKind};
 use crate::permission::Permission;
-use crate::registry::{MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
+use crate::registry::{
+    EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, TipRotation, WatchSpec,
+};
 use crate::time::Stamp;
 
 /// The longest that a condition is waited for.
@@ -166,6 +169,62 @@ async fn a_permanent_bus_off_is_reported_and_ends_the_driver() {
     let notice = reported(&mut motors, |notice| notice.text.contains("bus-off")).await;
     assert!(notice.is_problem && notice.arming == Arming::Disarmed, "{notice:?}");
     assert!(motors.order(Order::Arm).is_err(), "nothing can take it");
+}
+
+/// An action above an arm that turns in a plane, once it is given.
+#[derive(Debug, Default)]
+struct Above(AtomicBool);
+
+impl ActionSource for Above {
+    fn bell(&self) -> Option<BorrowedFd<'_>> {
+        None
+    }
+
+    fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
+        if !self.0.swap(false, Ordering::AcqRel) {
+            return Ok(None);
+        }
+        action[..3].copy_from_slice(&[0.0, 0.0, 1.0]);
+        Ok(Some((&action[..3], Stamp(1))))
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pose_out_of_reach_is_reported() {
+    const URDF: &str = "<?xml version=\"1.0\"?><robot name=\"one\"><link name=\"base\"/>\
+        <link name=\"beam\"/><link name=\"tool\"/>\
+        <joint name=\"joint1\" type=\"revolute\"><parent link=\"base\"/><child link=\"beam\"/><axis xyz=\"0 0 1\"/>\
+        <limit lower=\"-1\" upper=\"1\" effort=\"1\" velocity=\"1\"/></joint>\
+        <joint name=\"end\" type=\"fixed\"><parent link=\"beam\"/><child link=\"tool\"/>\
+        <origin xyz=\"0.5 0 0\" rpy=\"0 0 0\"/></joint></robot>";
+    let folder = tempfile::tempdir().unwrap();
+    let urdf = folder.path().join("arm.urdf");
+    std::fs::write(&urdf, URDF).unwrap();
+    let effector = EffectorSpec {
+        urdf,
+        frame: None,
+        tip: "tool".to_owned(),
+        rotation: TipRotation::Free,
+        free_yaw: false,
+        gripper: None,
+        min: [-1.0; 3],
+        max: [1.0; 3],
+    };
+    let with_arm = DamiaoSpec { effector: Some(Box::new(effector)), ..spec(1, 200) };
+    let (link, bus) = bus();
+    let (behaviour, thread) = motor(bus);
+    let mut motors = Motors::start(link, &with_arm).unwrap();
+    let above = Arc::<Above>::default();
+    motors.follow(Arc::clone(&above) as Arc<dyn ActionSource>);
+    // Before the first sample no action is followed, reachable or not.
+    let sample = timeout(PATIENCE, motors.read()).await.expect("a sample").unwrap();
+    assert_eq!(sample.bytes.len(), 8 * (SAMPLE_VALUES + 7), "the motor, and the pose of the tip");
+    above.0.store(true, Ordering::Release);
+    let notice = reported(&mut motors, |notice| notice.text.contains("the arm does not reach the pose")).await;
+    assert!(notice.is_problem, "{notice:?}");
+    motors.close().await;
+    behaviour.ends.store(true, Ordering::Release);
+    thread.join().unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
