@@ -510,11 +510,21 @@ class Experiment(Section):
                 if modality and modality in seen[:i]:
                     fix = "observe it once, or write mask_aware = false"
                     raise mistake(f"observation.{i}.modality", f"{modality!r} has one element in the mask", fix)
+            self._check_only_picture()
             return
         for i, o in enumerate(self.observation):
             if not o.required:
                 fix = "write required = true, or mask_aware = true in [policy]"
                 raise mistake(f"observation.{i}.required", "without a mask nothing may be absent", fix)
+
+    def _check_only_picture(self) -> None:
+        if len(self.images) > 1:
+            return
+        for i, o in enumerate(self.observation):
+            for key in ("window", "episode"):
+                if getattr(o.dropout, key):
+                    fix = "remove it, or observe another picture"
+                    raise mistake(f"observation.{i}.dropout.{key}", "the only picture is never taken away", fix)
 
     def _check_pictures(self) -> None:
         pool, shapes = self.encoder.pool, {o.shape for o in self.images}
