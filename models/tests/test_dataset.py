@@ -5,7 +5,7 @@ import unittest
 
 import numpy as np
 import torch
-from made_up import EXPERIMENTS, by_hand, experiment, made_up, observed, small
+from made_up import POLICIES, by_hand, experiment, made_up, observed, small
 
 from rapid_policy.dataset import Dataset, drop, inputs, unfit
 from rapid_policy.experiment import Experiment
@@ -200,7 +200,7 @@ class Dropout(unittest.TestCase):
         self.assertFalse(gone.any())
 
     def test_no_experiment_of_the_repository_takes_the_last_picture(self):
-        for path in EXPERIMENTS.glob("*.toml"):
+        for path in POLICIES:
             spec = experiment(path.stem)
             if spec.policy.mask_aware:
                 kept = self.masked(spec, np.ones((2000, len(spec.images)), bool), spec.policy.n_obs_steps)
