@@ -61,7 +61,7 @@ class Configuration:
 
 CONFIGURATIONS = (
     Configuration("vision", "vision only", "mix", 0.5),
-    # Without its single picture, only the arm's own state remains.
+    # Dropout leaves one picture at least: its single one is never taken away.
     Configuration("vision-mask", "vision + mask", "mix", 0.5),
     Configuration("tactile-id-arm", "vision + mask + diff", "mix", 1.0),
     Configuration("vision-diff-big", "vision + diff", "big", 0.5),
@@ -361,11 +361,13 @@ def markdown(report: dict[str, Any]) -> str:
         lines.append(f"| {' | '.join(map(str, cells))} |")
     missing = [c.name for c in CONFIGURATIONS if c.name not in {row["name"] for row in rows}]
     lines += ["", f"Not run: {', '.join(missing)}."] if missing else []
+    # What has to be known of figures that were made in another way than now; a new training has none.
+    lines += [line for row in rows if "note" in row for line in ("", f"**`{row['name']}`**: {row['note']}")]
     minutes = [t["minutes"] for t in trainings]
     lines += [
         "",
-        "Data: the paper's mixture of sizes (`mix`), or big blocks alone (`big`), with the number of demonstrations. `vision-mask`",
-        "has one picture to take away, and then only the arm's state is left. Diff: the tactile picture, as difference to the first",
+        "Data: the paper's mixture of sizes (`mix`), or big blocks alone (`big`), with the number of demonstrations. Dropout takes",
+        "pictures away and leaves one at least. Diff: the tactile picture, as difference to the first",
         "one. A training that has the tactile picture and is near 0.5 has not learned to use it: see",
         "[what its length changes](README.md#seeds-and-the-length-of-training).",
         "",

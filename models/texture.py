@@ -2,11 +2,13 @@
 """Classifies the texture of a block from single pictures: how well the tactile camera shows it, raw and as difference
 to the untouched gel, and whether the wrist camera shows it too; and how that depends on noise and pressure.
 
-    texture.py EPISODES [--encoder resnet18] [--cache runs/cache] [--out results] [--folds 10] [--iterations 400] [--seed 0]
+    texture.py EPISODES [--encoder resnet18] [--cache runs/cache] [--out results] [--folds N] [--iterations N] [--seed N]
 
-The classifier is an image encoder of the policy with one additional layer: the small one, or ResNet-18 from scratch (the
-paper's was trained on other pictures first). Every episode with pictures of a touch is tested by a classifier that was not
-trained on it: the episodes are divided into folds, and each fold is tested by one trained on the others.
+What is classified, by which pictures, and how it is trained and tested is an experiment, `experiments/texture.toml`; the
+options are in place of what it says. The classifier is an image encoder of the policy with one additional layer: the small
+one, or ResNet-18 from scratch (the paper's was trained on other pictures first). Every episode with pictures of a touch is
+tested by a classifier that was not trained on it: the episodes are divided into folds, and each fold is tested by one trained
+on the others.
 """
 
 from __future__ import annotations
@@ -24,10 +26,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from rapid_policy.classification import Classification, Input
 from rapid_policy.corpus import load
-from rapid_policy.episodes import Episode, EpisodeError
-from rapid_policy.experiment import Encoder
-from rapid_policy.experiment_file import ExperimentError, read_experiment
+from rapid_policy.episodes import Episode, EpisodeError, picture_source
+from rapid_policy.experiment import SMALL_POOL, Encoder
+from rapid_policy.experiment_file import ExperimentError, read_classification
 from rapid_policy.model import ENCODERS, parameters
 from rapid_policy.ranks import join
 from rapid_policy.results import wilson, write
@@ -35,25 +38,7 @@ from rapid_policy.train import hardware
 from torch import nn
 
 matplotlib.use("Agg")
-TEXTURES = ("triangular", "hexagonal")
-# Modality of the pictures, and whether they are the difference to the first one.
-INPUTS = {
-    "tactile, difference to the first picture": ("tactile_tip", True),
-    "tactile, as it is": ("tactile_tip", False),
-    "wrist camera": ("cam_wrist", False),
-}
-SIDE = 96
-# Random shift of a picture, each way, in pixels.
-PAD = 4
-# In contact: the gel has changed by this multiple of its noise before the touch.
-CONTACT = 1.5
-UNTOUCHED = 10
-BATCH = 64
-LEARNING_RATE = 1e-3
-# Standard deviations of noise that is added to the pictures of the first input, of a full scale of 1.
-NOISES = (0.0, 0.02, 0.05, 0.1, 0.2)
-# Parts of the pictures, by how strongly the gel has changed: the first are those of the weakest pressure.
-PRESSURES = 5
+EXPERIMENT = Path(__file__).parent / "experiments" / "texture.toml"
 
 
 @dataclass
@@ -63,7 +48,7 @@ class Pictures:
     pixels: NDArray[np.float32]
     """[N, 3, h, w] averaged as the encoder does, in -1..1, with a margin for shifts"""
     labels: NDArray[np.int64]
-    """[N] index in TEXTURES"""
+    """[N] index of the value of the label"""
     episodes: NDArray[np.int64]
     """[N] index of the episode"""
     change: NDArray[np.float32]
@@ -75,77 +60,84 @@ def main() -> None:
     parser.add_argument("episodes", type=Path)
     parser.add_argument("--cache", type=Path, default=Path(__file__).parent / "runs" / "cache", help="decoded episodes")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("--encoder", choices=sorted(ENCODERS), default="small")
+    parser.add_argument("--experiment", type=Path, default=EXPERIMENT, help="what is classified and how (*.toml)")
+    parser.add_argument("--encoder", choices=sorted(ENCODERS), help="in place of the experiment's")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda")
-    parser.add_argument("--folds", type=int, default=10)
-    parser.add_argument("--iterations", type=int, default=400, help="of each training")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folds", type=int, help="in place of the experiment's")
+    parser.add_argument("--iterations", type=int, help="of each training, in place of the experiment's")
+    parser.add_argument("--seed", type=int, help="in place of the experiment's")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    device, encoder = join(args.device).device, Encoder(type=args.encoder)
+    device = join(args.device).device
     try:
-        experiment = read_experiment(Path(__file__).parent / "experiments" / "tactile-id-arm.toml")
-        corpus = load(experiment, [args.episodes], args.cache, args.threads)
+        spec = asked(read_classification(args.experiment), args)
+        corpus = load(spec, [args.episodes], args.cache, args.threads)
         print(corpus.report(), file=sys.stderr)
         episodes = corpus.training
-        labels = [label(e) for e in episodes]
     except (EpisodeError, ExperimentError) as error:
         sys.exit(f"texture: {error}")
-    contact = [in_contact(e) for e in episodes]
+    labels = [spec.label_of(e.facts.tags) for e in episodes]
+    contact = [in_contact(spec, e) for e in episodes]
     begin, rows = time.monotonic(), {}
-    for name, (modality, differs) in INPUTS.items():
-        pictures = gather(episodes, labels, contact, modality, differs, encoder.pool)
-        training = Training(encoder, args.iterations, args.seed, device)
-        rows[name] = cross_validate(pictures, args.folds, training)
-        print(f"{name}: accuracy {rows[name]['accuracy']:.4f} of {rows[name]['pictures']} pictures", flush=True)
-    given = "" if args.encoder == "small" else f" --encoder {args.encoder}"
+    for o in spec.input:
+        row = cross_validate(gather(spec, o, episodes, labels, contact), Training(spec, o, device))
+        rows[o.title] = row
+        print(f"{o.title}: accuracy {row['accuracy']:.4f} of {row['pictures']} pictures", flush=True)
+    encoder, fitting, folds = spec.encoder, spec.training, spec.test.folds
+    given = "" if encoder.type == "small" else f" --encoder {encoder.type}"
     report = {
-        "command": f"texture.py EPISODES{given} --folds {args.folds} --iterations {args.iterations} --seed {args.seed}",
-        "encoder": args.encoder,
-        "parameters": parameters([Classifier(encoder)]),
+        "command": f"texture.py EPISODES{given} --folds {folds} --iterations {fitting.iterations} --seed {fitting.seed}",
+        "encoder": encoder.type,
+        "parameters": parameters([Classifier(spec, spec.touched)]),
         "hardware": hardware(device),
         "episodes": len(episodes),
-        "textures": {name: labels.count(i) for i, name in enumerate(TEXTURES)},
-        "folds": args.folds,
-        "iterations": args.iterations,
-        "seed": args.seed,
+        "textures": {name: labels.count(i) for i, name in enumerate(spec.label.values)},
+        "contact": spec.contact.noises,
+        "folds": folds,
+        "iterations": fitting.iterations,
+        "seed": fitting.seed,
         "minutes": round((time.monotonic() - begin) / 60, 1),
         "inputs": rows,
     }
-    name = "texture" if args.encoder == "small" else f"texture-{args.encoder}"
+    name = spec.name if encoder.type == "small" else f"{spec.name}-{encoder.type}"
     write(args.out, name, report, markdown(report, f"{name}.png"))
     plot(rows, args.out / f"{name}.png")
 
 
-def label(episode: Episode) -> int:
-    """The texture, from the tags that the simulation writes into an episode."""
-    try:
-        return TEXTURES.index(episode.facts.tags["texture"])
-    except (KeyError, ValueError) as error:
-        raise EpisodeError(episode.path, f"no tag `texture` of {' or '.join(TEXTURES)}") from error
+def asked(spec: Classification, args: argparse.Namespace) -> Classification:
+    """The experiment with what the command line has in place of it."""
+    training = {name: getattr(args, name) for name in ("iterations", "seed") if getattr(args, name) is not None}
+    changed: dict[str, Any] = {"training": spec.training.model_copy(update=training)}
+    if args.folds is not None:
+        changed["test"] = spec.test.model_copy(update={"folds": args.folds})
+    if args.encoder is not None and args.encoder != spec.encoder.type:
+        changed["encoder"] = Encoder(type=args.encoder)
+    return spec.model_copy(update=changed)
 
 
-def in_contact(episode: Episode) -> NDArray[np.bool_]:
+def in_contact(spec: Classification, episode: Episode) -> NDArray[np.bool_]:
     """[T] whether the fingertip is pressed on the block."""
-    changed = change(episode)
-    return episode.present("tactile_tip") & (changed > CONTACT * np.median(changed[1:UNTOUCHED]))
+    changed, before = change(spec, episode), slice(1, spec.contact.untouched)
+    touches = changed > spec.contact.noises * np.median(changed[before])
+    return episode.present(picture_source(spec.touched).name) & touches
 
 
-def change(episode: Episode) -> NDArray[np.float32]:
+def change(spec: Classification, episode: Episode) -> NDArray[np.float32]:
     """[T] mean change of the gel since the first picture."""
-    return np.abs(pool(episode, "tactile_tip", differs=True, size=Encoder().pool)).mean((1, 2, 3))
+    return np.abs(pool(episode, spec.touched, SMALL_POOL)).mean((1, 2, 3))
 
 
-def pool(episode: Episode, modality: str, differs: bool, size: int) -> NDArray[np.float32]:
+def pool(episode: Episode, o: Input, size: int) -> NDArray[np.float32]:
     """[T, 3, h, w]: pictures in -1..1, averaged over `size` pixels each way, with their edges repeated outwards."""
-    pictures = _unit(episode.value(modality))
-    if differs:
-        pictures = pictures - _unit(episode.value(modality)[episode.first(modality)][None])
+    name = picture_source(o).name
+    pictures = _unit(episode.value(name))
+    if o.operation == "diff_to_reference":
+        pictures = pictures - _unit(episode.value(name)[episode.first(name)][None])
     else:
         pictures = pictures * 2 - 1
-    padded = F.pad(F.avg_pool2d(pictures, size), (PAD // size,) * 4, mode="replicate")
-    return padded.numpy() * episode.present(modality)[:, None, None, None]
+    padded = F.pad(F.avg_pool2d(pictures, size), (o.augmentation.shift // size,) * 4, mode="replicate")
+    return padded.numpy() * episode.present(name)[:, None, None, None]
 
 
 def _unit(pictures: NDArray[np.uint8]) -> torch.Tensor:
@@ -154,15 +146,16 @@ def _unit(pictures: NDArray[np.uint8]) -> torch.Tensor:
 
 
 def gather(
-    episodes: list[Episode], labels: list[int], contact: list[NDArray[np.bool_]], modality: str, differs: bool, size: int
+    spec: Classification, o: Input, episodes: list[Episode], labels: list[int], contact: list[NDArray[np.bool_]]
 ) -> Pictures:
     """The pictures of one input at all ticks in contact."""
-    chosen = [c & e.present(modality) for c, e in zip(contact, episodes, strict=True)]
+    name, size = picture_source(o).name, spec.encoder.pool
+    chosen = [c & e.present(name) for c, e in zip(contact, episodes, strict=True)]
     return Pictures(
-        pixels=np.concatenate([pool(e, modality, differs, size)[c] for e, c in zip(episodes, chosen, strict=True)]),
+        pixels=np.concatenate([pool(e, o, size)[c] for e, c in zip(episodes, chosen, strict=True)]),
         labels=np.concatenate([np.full(c.sum(), k) for c, k in zip(chosen, labels, strict=True)]),
         episodes=np.concatenate([np.full(c.sum(), i) for i, c in enumerate(chosen)]),
-        change=np.concatenate([change(e)[c] for e, c in zip(episodes, chosen, strict=True)]),
+        change=np.concatenate([change(spec, e)[c] for e, c in zip(episodes, chosen, strict=True)]),
     )
 
 
@@ -170,38 +163,38 @@ def gather(
 class Training:
     """How a classifier is trained."""
 
-    encoder: Encoder
-    iterations: int
-    seed: int
+    spec: Classification
+    input: Input
     device: torch.device
 
     @property
     def margin(self) -> int:
         """Of the pictures as the encoder gets them."""
-        return PAD // self.encoder.pool
+        return self.input.augmentation.shift // self.spec.encoder.pool
 
 
-def cross_validate(pictures: Pictures, folds: int, training: Training) -> dict[str, Any]:
+def cross_validate(pictures: Pictures, training: Training) -> dict[str, Any]:
     """Counts the results of classifiers on pictures of episodes that they were not trained on."""
-    random = np.random.default_rng(training.seed)
-    answers = np.full((len(NOISES), len(pictures.labels)), -1)
-    for fold in deal(pictures, folds, random):
+    spec, seed = training.spec, training.spec.training.seed
+    random, noises, pressures = np.random.default_rng(seed), spec.test.noises, spec.test.pressures
+    answers = np.full((len(noises), len(pictures.labels)), -1)
+    for fold in deal(pictures, spec.test.folds, random):
         tested = np.isin(pictures.episodes, fold)
-        torch.manual_seed(training.seed)
+        torch.manual_seed(seed)
         classifier = fit(pictures, np.flatnonzero(~tested), training, random)
-        for level, deviation in enumerate(NOISES):
+        for level, deviation in enumerate(noises):
             # A picture is in -1..1 here, so that a full scale is 2; averaged pixels have less noise.
-            noise = 2 * deviation / training.encoder.pool
+            noise = 2 * deviation / spec.encoder.pool
             answers[level, tested] = classify(classifier, pictures.pixels[tested], noise, training, random)
     right = answers == pictures.labels
-    edges = np.quantile(pictures.change, np.linspace(0, 1, PRESSURES + 1)[1:-1])
+    edges = np.quantile(pictures.change, np.linspace(0, 1, pressures + 1)[1:-1])
     parts = np.digitize(pictures.change, edges)
     return {
-        **score(pictures, answers[0]),
-        "accuracy_by_noise": dict(zip(map(str, NOISES), right.mean(1).tolist(), strict=True)),
+        **score(pictures, answers[0], spec.label.values),
+        "accuracy_by_noise": dict(zip(map(str, noises), right.mean(1).tolist(), strict=True)),
         "accuracy_by_pressure": [
             {"change": float(pictures.change[parts == part].mean()), "accuracy": float(right[0, parts == part].mean())}
-            for part in range(PRESSURES)
+            for part in range(pressures)
         ],
     }
 
@@ -209,7 +202,7 @@ def cross_validate(pictures: Pictures, folds: int, training: Training) -> dict[s
 def deal(pictures: Pictures, folds: int, random: np.random.Generator) -> list[NDArray[np.int64]]:
     """Divides the episodes into `folds` folds, with both textures spread evenly."""
     shuffled = []
-    for texture in range(len(TEXTURES)):
+    for texture in np.unique(pictures.labels):
         shuffled.extend(random.permutation(np.unique(pictures.episodes[pictures.labels == texture])))
     return [np.array(shuffled[i::folds]) for i in range(folds)]
 
@@ -217,10 +210,11 @@ def deal(pictures: Pictures, folds: int, random: np.random.Generator) -> list[ND
 class Classifier(nn.Module):
     """Pictures [B, 3, h, w], averaged as the encoder does -> [B, 2]"""
 
-    def __init__(self, encoder: Encoder) -> None:
+    def __init__(self, spec: Classification, o: Input) -> None:
         super().__init__()
-        self.encoder = ENCODERS[encoder.type](SIDE, SIDE, encoder)
-        self.head = nn.Linear(encoder.features, len(TEXTURES))
+        _, height, width = o.shape
+        self.encoder = ENCODERS[spec.encoder.type](height, width, spec.encoder)
+        self.head = nn.Linear(spec.encoder.features, len(spec.label.values))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.head(self.encoder.pooled(x))
@@ -228,12 +222,15 @@ class Classifier(nn.Module):
 
 def fit(pictures: Pictures, chosen: NDArray[np.int64], training: Training, random: np.random.Generator) -> Classifier:
     """Trains on pictures randomly shifted. They are not turned: with the lights where they are, half a turn makes bumps holes."""
-    classifier = Classifier(training.encoder).to(training.device)
-    optimizer = torch.optim.AdamW(classifier.parameters(), LEARNING_RATE)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=training.iterations)
+    fitting = training.spec.training
+    classifier = Classifier(training.spec, training.input).to(training.device)
+    optimizer = torch.optim.AdamW(classifier.parameters(), fitting.learning_rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, fitting.learning_rate, total_steps=fitting.iterations
+    )
     height, width = (side - 2 * training.margin for side in pictures.pixels.shape[2:])
-    for _ in range(training.iterations):
-        rows = chosen[random.integers(len(chosen), size=BATCH)]
+    for _ in range(fitting.iterations):
+        rows = chosen[random.integers(len(chosen), size=fitting.pictures)]
         top, left = random.integers(2 * training.margin + 1, size=2)
         batch = torch.from_numpy(pictures.pixels[rows, :, top : top + height, left : left + width]).to(training.device)
         loss = F.cross_entropy(classifier(batch), torch.from_numpy(pictures.labels[rows]).to(training.device))
@@ -248,15 +245,16 @@ def fit(pictures: Pictures, chosen: NDArray[np.int64], training: Training, rando
 def classify(classifier: Classifier, pixels: NDArray[np.float32], noise: float, training: Training,
              random: np.random.Generator) -> NDArray[np.int64]:  # fmt: skip
     """[N] the predicted class of pictures with this deviation of noise on them."""
-    margin, found = training.margin, []
+    found = []
+    rows, columns = (slice(training.margin, side - training.margin) for side in pixels.shape[2:])
     for first in range(0, len(pixels), 256):
-        part = pixels[first : first + 256, :, margin:-margin, margin:-margin]
+        part = pixels[first : first + 256, :, rows, columns]
         noisy = torch.from_numpy(part + noise * random.standard_normal(part.shape, np.float32))
         found.append(classifier(noisy.to(training.device)).argmax(1).cpu())
     return torch.cat(found).numpy()
 
 
-def score(pictures: Pictures, answers: NDArray[np.int64]) -> dict[str, Any]:
+def score(pictures: Pictures, answers: NDArray[np.int64], values: tuple[str, ...]) -> dict[str, Any]:
     """Accuracy over pictures and over episodes (by majority of their pictures), precision, recall, counts."""
     labels = pictures.labels
     confusion = np.array([[np.sum((labels == t) & (answers == s)) for s in (0, 1)] for t in (0, 1)])
@@ -271,8 +269,8 @@ def score(pictures: Pictures, answers: NDArray[np.int64]) -> dict[str, Any]:
         "accuracy": float(np.mean(answers == labels)),
         "episode_accuracy": float(np.mean(by_episode)),
         "episode_interval": wilson(int(np.sum(by_episode)), len(by_episode)),
-        "precision": dict(zip(TEXTURES, (diagonal / np.maximum(confusion.sum(0), 1)).tolist(), strict=True)),
-        "recall": dict(zip(TEXTURES, (diagonal / np.maximum(confusion.sum(1), 1)).tolist(), strict=True)),
+        "precision": dict(zip(values, (diagonal / np.maximum(confusion.sum(0), 1)).tolist(), strict=True)),
+        "recall": dict(zip(values, (diagonal / np.maximum(confusion.sum(1), 1)).tolist(), strict=True)),
         "confusion": confusion.tolist(),
     }
 
@@ -309,7 +307,7 @@ def markdown(report: dict[str, Any], picture: str) -> str:
         f"A classifier of single pictures ({NETWORKS[report['encoder']]}; {report['parameters']:,} parameters), taken while the",
         f"fingertip is pressed on the block in {report['episodes']} simulated episodes",
         f"({', '.join(f'{n} {name}' for name, n in report['textures'].items())}). A picture is of a touch if the gel has changed by more",
-        f"than {CONTACT} times its noise; {touched} of the episodes have such pictures, and the others, whose touch is the weakest, are",
+        f"than {report['contact']} times its noise; {touched} of the episodes have such pictures, and the others, whose touch is the weakest, are",
         f"not part of it. Every episode is tested by a classifier that saw no picture of it: {report['folds']} folds, each classifier",
         f"trained for {report['iterations']} iterations, seed {report['seed']}.",
         "",
@@ -317,7 +315,7 @@ def markdown(report: dict[str, Any], picture: str) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for name, row in report["inputs"].items():
-        precision, recall = (" / ".join(f"{row[k][t]:.3f}" for t in TEXTURES) for k in ("precision", "recall"))
+        precision, recall = (" / ".join(f"{row[k][t]:.3f}" for t in report["textures"]) for k in ("precision", "recall"))
         low, high = row["episode_interval"]
         lines.append(
             f"| {name} | {row['pictures']} | {row['accuracy']:.2%} | {precision} | {recall} |"

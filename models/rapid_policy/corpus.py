@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from .cache import Cache, Entry
+from .classification import Classification
 from .episodes import ABSENCES, Episode, EpisodeError, Facts, episode_files, picture_source, sources
 from .experiment import Data, Experiment
 from .lerobot_source import split
@@ -47,7 +48,7 @@ class Corpus:
         return "\n".join([*lines, f"{counts}, {len(self.left_out)} left out, {self.unwanted} not asked for"])
 
 
-def load(spec: Experiment, folders: Sequence[Path], cache_folder: Path, workers: int = 1) -> Corpus:
+def load(spec: Experiment | Classification, folders: Sequence[Path], cache_folder: Path, workers: int = 1) -> Corpus:
     """The episodes in `folders`, decoded into the cache by so many processes."""
     files = [file.absolute() for folder in folders for file in episode_files(folder)]
     cache = Cache(cache_folder, sources(spec))
@@ -78,7 +79,7 @@ def load(spec: Experiment, folders: Sequence[Path], cache_folder: Path, workers:
     return Corpus(training, held_out, left_out, unwanted, _absences(spec, episodes))
 
 
-def _absences(spec: Experiment, episodes: list[Episode]) -> dict[str, int]:
+def _absences(spec: Experiment | Classification, episodes: list[Episode]) -> dict[str, int]:
     names = [picture_source(o).name for o in spec.images if not o.required]
     return {
         reason: sum(int(episode.absent(name, reason).sum()) for episode in episodes for name in names)
@@ -86,7 +87,9 @@ def _absences(spec: Experiment, episodes: list[Episode]) -> dict[str, int]:
     }
 
 
-def _unfit(spec: Experiment, episode: Episode) -> str | None:
+def _unfit(spec: Experiment | Classification, episode: Episode) -> str | None:
+    if isinstance(spec, Classification):
+        return spec.unfit(episode.facts.tags)
     # Torch is imported only where it is used: decoding needs none.
     from .dataset import unfit
 

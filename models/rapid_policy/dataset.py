@@ -267,8 +267,7 @@ def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArr
          random: np.random.Generator) -> Bools:  # fmt: skip
     """Takes pictures away at random: bool [B, To, M] of the rows `seen` [B, To, M], in episodes of the rows `spans` [B, 2].
 
-    Of several that are present at the newest step at least one always remains. A policy with one picture has its
-    vectors left.
+    Of those that are present at the newest step at least one always remains, also of a single one: the paper's rule.
     """
     out, there = present.copy(), present[:, -1]
     kept = there & (random.random(there.shape) >= [o.dropout.window for o in spec.images])
@@ -276,11 +275,10 @@ def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArr
     if any(o.dropout.episode for o in spec.images):
         away = _absences(spec, seen, spans, random)
         kept &= ~away[:, -1]
-    if len(spec.images) > 1:
-        # The one that remains in a window that lost all: any present one, with equal probability.
-        lot = np.where(there, random.random(there.shape), -1.0)
-        lost = ~kept.any(1) & there.any(1)
-        kept[lost, lot[lost].argmax(1)] = True
+    # The one that remains in a window that lost all: any present one, with equal probability.
+    lot = np.where(there, random.random(there.shape), -1.0)
+    lost = ~kept.any(1) & there.any(1)
+    kept[lost, lot[lost].argmax(1)] = True
     out &= ~away
     out[:, -1] = kept
     if out.shape[1] > 1 and any(o.dropout.replug for o in spec.images):

@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from . import lerobot_source
+from .classification import Classification
 from .experiment import Experiment
 from .lerobot_source import DatasetError
 from .pixels import FormatError, PixelError, decode, fit
@@ -69,12 +70,10 @@ def picture_source(o: Any) -> Source:
     return Source(o.modality, "image", o.required, o.size, o.resize, o.crop)
 
 
-def sources(spec: Experiment) -> tuple[Source, ...]:
+def sources(spec: Experiment | Classification) -> tuple[Source, ...]:
     """All that an experiment reads of an episode, each once."""
     wanted = [picture_source(o) for o in spec.images]
-    names = [part.modality for o in spec.vectors for part in o.sources]
-    names += [name for name in (spec.action.pose, spec.action.gripper) if name]
-    wanted += [Source(name, "vector") for name in names]
+    wanted += [Source(name, "vector") for name in spec.numbers]
     return tuple({source.name: source for source in wanted}.values())
 
 

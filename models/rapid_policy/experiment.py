@@ -366,6 +366,17 @@ class Encoder(Section):
         return self
 
 
+def check_picture(encoder: Encoder, o: Observation, key: str) -> None:
+    """Whether the encoder takes what is observed under `key`."""
+    if o.kind == "image" and encoder.type == "small" and any(side % SMALL_MULTIPLE for side in o.shape[1:]):
+        cause = f"{o.shape[1]}x{o.shape[2]}: the small encoder takes multiples of {SMALL_MULTIPLE}"
+        given = next(k for k in ("crop", "resize", "size") if getattr(o, k))
+        raise mistake(f"{key}.{given}", cause, 'resize or crop to such a size, or type = "resnet18"')
+    if o.augmentation.shift % encoder.pool:
+        cause = f"{o.augmentation.shift}: the encoder sees the picture at a half"
+        raise mistake(f"{key}.augmentation.shift", cause, f"write a multiple of {encoder.pool}")
+
+
 class Denoiser(Section):
     """The network that predicts the noise in actions."""
 
@@ -510,29 +521,29 @@ class Experiment(Section):
                 if modality and modality in seen[:i]:
                     fix = "observe it once, or write mask_aware = false"
                     raise mistake(f"observation.{i}.modality", f"{modality!r} has one element in the mask", fix)
+            self._check_only_picture()
             return
         for i, o in enumerate(self.observation):
             if not o.required:
                 fix = "write required = true, or mask_aware = true in [policy]"
                 raise mistake(f"observation.{i}.required", "without a mask nothing may be absent", fix)
 
+    def _check_only_picture(self) -> None:
+        if len(self.images) > 1:
+            return
+        for i, o in enumerate(self.observation):
+            for key in ("window", "episode"):
+                if getattr(o.dropout, key):
+                    fix = "remove it, or observe another picture"
+                    raise mistake(f"observation.{i}.dropout.{key}", "the only picture is never taken away", fix)
+
     def _check_pictures(self) -> None:
-        pool, shapes = self.encoder.pool, {o.shape for o in self.images}
+        shapes = {o.shape for o in self.images}
         if self.encoder.shared and len(shapes) > 1:
             cause = f"pictures of {len(shapes)} sizes"
             raise mistake("encoder.shared", cause, "resize all to one size, or write shared = false")
         for i, o in enumerate(self.observation):
-            if (
-                o.kind == "image"
-                and self.encoder.type == "small"
-                and any(side % SMALL_MULTIPLE for side in o.shape[1:])
-            ):
-                cause = f"{o.shape[1]}x{o.shape[2]}: the small encoder takes multiples of {SMALL_MULTIPLE}"
-                key = next(k for k in ("crop", "resize", "size") if getattr(o, k))
-                raise mistake(f"observation.{i}.{key}", cause, 'resize or crop to such a size, or type = "resnet18"')
-            if o.augmentation.shift % pool:
-                cause = f"{o.augmentation.shift}: the encoder sees the picture at a half"
-                raise mistake(f"observation.{i}.augmentation.shift", cause, f"write a multiple of {pool}")
+            check_picture(self.encoder, o, f"observation.{i}")
 
     @property
     def images(self) -> tuple[Observation, ...]:
@@ -543,6 +554,12 @@ class Experiment(Section):
     def vectors(self) -> tuple[Observation, ...]:
         """The vectors, in the order of the condition."""
         return tuple(o for o in self.observation if o.kind == "vector")
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Modalities whose numbers are read of an episode."""
+        observed = [part.modality for o in self.vectors for part in o.sources]
+        return (*observed, *(name for name in (self.action.pose, self.action.gripper) if name))
 
     @property
     def action_length(self) -> int:

@@ -1,4 +1,4 @@
-"""Reads an experiment from a TOML file. Every mistake is one line: file, key, cause and fix."""
+"""Reads an experiment from a TOML file: of a policy, or of a classifier. Every mistake is one line: file, key, cause and fix."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from .classification import Classification
 from .experiment import Experiment
 
 Location = tuple[int | str, ...]
+Kind = TypeVar("Kind", Experiment, Classification)
 
 
 class ExperimentError(Exception):
@@ -22,6 +24,15 @@ class ExperimentError(Exception):
 
 def read_experiment(path: Path) -> Experiment:
     """The experiment in the file. Its folders and its file of weights are made absolute."""
+    return _read(path, Experiment)
+
+
+def read_classification(path: Path) -> Classification:
+    """The same of a classifier."""
+    return _read(path, Classification)
+
+
+def _read(path: Path, kind: type[Kind]) -> Kind:
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -33,13 +44,13 @@ def read_experiment(path: Path) -> Experiment:
     except tomllib.TOMLDecodeError as error:
         raise ExperimentError(f"{path}: not TOML: {error}: correct that line") from error
     try:
-        experiment = Experiment.model_validate_json(json.dumps(table, default=str))
+        experiment = kind.model_validate_json(json.dumps(table, default=str))
     except ValidationError as error:
-        raise ExperimentError("\n".join(_line(path, table, found) for found in _causes(error))) from error
+        raise ExperimentError("\n".join(_line(kind, path, table, found) for found in _causes(error))) from error
     return _resolve(path, experiment)
 
 
-def _resolve(path: Path, experiment: Experiment) -> Experiment:
+def _resolve(path: Path, experiment: Kind) -> Kind:
     folder = path.resolve().parent
     folders = tuple(str((folder / name).resolve()) for name in experiment.data.folders)
     data = experiment.data.model_copy(update={"folders": folders})
@@ -61,12 +72,12 @@ def _causes(error: ValidationError) -> list[ErrorDetails]:
     return [one for one, follows in zip(found, inside, strict=True) if not (follows and one["type"] == "too_short")]
 
 
-def _line(path: Path, table: dict[str, Any], found: ErrorDetails) -> str:
+def _line(kind: type[BaseModel], path: Path, table: dict[str, Any], found: ErrorDetails) -> str:
     where, context = found["loc"], found.get("ctx", {})
     if found["type"] == "mistake":
         where += tuple(int(word) if word.isdigit() else word for word in context["key"].split(".") if word)
         return f"{path}: {_key(table, where)}: {context['cause']}: {context['fix']}"
-    model, name = _owner(where)
+    model, name = _owner(kind, where)
     if found["type"] == "extra_forbidden":
         return f"{path}: {_key(table, where)}: unknown: {_instead(model, name)}"
     cause = "missing" if found["type"] == "missing" else f"{_shown(found['input'])}: {_lower(found['msg'])}"
@@ -91,9 +102,8 @@ def _key(table: Any, where: Location) -> str:
     return ".".join(words)
 
 
-def _owner(where: Location) -> tuple[type[BaseModel], str]:
+def _owner(model: type[BaseModel], where: Location) -> tuple[type[BaseModel], str]:
     """The table in which a key stands, and the key."""
-    model: type[BaseModel] = Experiment
     names = [step for step in where if isinstance(step, str)]
     for at, name in enumerate(names):
         inner = _section(_field(model, name))

@@ -15,6 +15,8 @@ from rapid_policy.experiment import Experiment
 from rapid_policy.experiment_file import read_experiment
 
 EXPERIMENTS = MODELS / "experiments"
+CLASSIFIERS = [EXPERIMENTS / "texture.toml"]
+POLICIES = sorted(set(EXPERIMENTS.glob("*.toml")) - set(CLASSIFIERS))
 SIDE = 96
 
 

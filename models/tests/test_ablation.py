@@ -105,6 +105,14 @@ class Runs(unittest.TestCase):
         words = "ablation.py EPISODES --rapid RAPID --trials 2 --iterations 400 --seeds 0 1 --only vision-diff"
         self.assertIn(f"Made with\n\n    python {words}\n", text)
 
+    def test_what_is_noted_of_a_row_stands_below_the_table(self):
+        self.program([trial(True, "success")] * 2)
+        carry_out(self.trained("vision", 0), self.args)
+        summarize(self.args)
+        report = json.loads((self.args.out / "ablation.json").read_text())
+        report["configurations"][0]["note"] = "trained in another way."
+        self.assertIn("\n\n**`vision`**: trained in another way.\n\n", markdown(report))
+
     def test_another_table_has_other_files(self):
         self.program([trial(True, "success")] * 2)
         carry_out(self.trained("vision", 0), self.args)

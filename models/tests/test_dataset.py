@@ -5,7 +5,7 @@ import unittest
 
 import numpy as np
 import torch
-from made_up import by_hand, experiment, made_up, observed, small
+from made_up import POLICIES, by_hand, experiment, made_up, observed, small
 
 from rapid_policy.dataset import Dataset, drop, inputs, unfit
 from rapid_policy.experiment import Experiment
@@ -190,6 +190,21 @@ class Dropout(unittest.TestCase):
         present[:, 0] = False
         kept = self.masked(experiment(), present)[:, -1]
         self.assertEqual((int(kept[:, 0].max()), int(kept[:, 1].min())), (0, 1))
+
+    def test_the_only_picture_of_a_policy_remains(self):
+        spec = observed(experiment("vision-mask"), "wrist", required=False, dropout={"replug": 0.5})
+        kept = self.masked(spec, np.ones((2000, 1), bool))
+        self.assertTrue(kept[:, 1].all())
+        self.assertAlmostEqual(float(kept[:, 0].mean()), 0.5, delta=0.05)
+        gone = self.masked(spec, np.zeros((10, 1), bool))
+        self.assertFalse(gone.any())
+
+    def test_no_experiment_of_the_repository_takes_the_last_picture(self):
+        for path in POLICIES:
+            spec = experiment(path.stem)
+            if spec.policy.mask_aware:
+                kept = self.masked(spec, np.ones((2000, len(spec.images)), bool), spec.policy.n_obs_steps)
+                self.assertTrue(kept[:, -1].any(1).all(), path.stem)
 
     def test_in_the_middle_of_a_window_the_first_new_picture_is_shown(self):
         spec = observed(plain(), "wrist", dropout={"replug": 0.5})

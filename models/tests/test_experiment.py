@@ -8,7 +8,7 @@ import tempfile
 import unittest
 from pathlib import Path
 
-from made_up import EXPERIMENTS, experiment, small
+from made_up import EXPERIMENTS, POLICIES, experiment, small
 
 from rapid_policy.experiment import Denoiser, Experiment
 from rapid_policy.experiment_file import ExperimentError, read_experiment
@@ -41,7 +41,7 @@ class Mistakes(unittest.TestCase):
 
 class Ours(unittest.TestCase):
     def test_every_experiment_of_the_repository_is_right(self):
-        names = {path.stem: read_experiment(path).name for path in EXPERIMENTS.glob("*.toml")}
+        names = {path.stem: read_experiment(path).name for path in POLICIES}
         self.assertTrue({"tactile-id-arm", "tactile-id", "vision", "vision-mask"} <= set(names))
         for file, name in names.items():
             self.assertEqual(file, name)
@@ -63,7 +63,7 @@ class Ours(unittest.TestCase):
             self.assertEqual(Denoiser.model_validate_json(json.dumps(denoiser.sizes())), denoiser)
 
     def test_a_checkpoint_brings_its_description_back(self):
-        for path in EXPERIMENTS.glob("*.toml"):
+        for path in POLICIES:
             spec = read_experiment(path)
             again = Experiment.from_text(spec.to_text())
             self.assertEqual(again, spec)

@@ -8,7 +8,8 @@ use vbench::emu::feed;
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::can;
 use vbench::outcome::Outcome;
-use vbench::recording::{Recording, falls};
+use vbench::proto;
+use vbench::recording::{Message, Recording, falls};
 use vbench::scenario::Scenario;
 
 use crate::policy::{
@@ -31,6 +32,11 @@ const MOTORS: [&str; 6] = ["waist", "lift", "elbow", "pitch", "roll", "jaw"];
 const OF_A_MOTOR: usize = 6;
 const TIP: usize = OF_A_MOTOR * MOTORS.len();
 const TACTILE_BIT: u32 = 1;
+/// The tip follows an action to which it comes so near before the next one, m.
+const REACHED: f64 = 0.02;
+/// So far apart, at least, are two such actions between which the tip must be seen to go, m: the policy's actions are, within
+/// any few of them, and the tip comes much nearer to each.
+const APART: f64 = 0.01;
 const DENOISING_STEPS: &str = "2";
 
 const SCRIPT: &str = r#"
@@ -120,32 +126,112 @@ fn a_policy_moves_an_arm_by_its_tip_without_its_tactile_camera_too() {
     assert_eq!((samples, poses), (poses, episode.topic(&format!("{ARM}/joints")).count()));
 }
 
-/// In each of these times the policy acts and the tip follows its actions.
+/// A place in the frame of the arm, m.
+type Place = [f64; 3];
+
+/// An action, and where the tip was when it was nearest to it before the next one.
+struct Reached {
+    action: Place,
+    tip: Place,
+}
+
+/// In each of these times the policy acts, and the tip goes where its actions are.
 fn assert_moved(episode: &Recording, times: &[(u64, u64)]) {
-    let actions: Vec<(u64, Vec<f64>)> = episode.timed_rows("/action");
-    let tips: Vec<(u64, Vec<f64>)> = episode.timed_rows(ARM);
-    assert!(tips.iter().all(|(_, row)| row.len() == TIP + 8), "the pose follows the motors");
+    let actions = episode.timed_rows("/action");
+    assert!(episode.rows(ARM).iter().all(|row| row.len() == TIP + 8), "the pose follows the motors");
     assert!(actions.iter().all(|(_, action)| action.len() == 4), "an action is a place and an opening");
+    let actions: Vec<(u64, Place)> =
+        actions.iter().map(|(time, action)| (*time, [action[0], action[1], action[2]])).collect();
+    let tips = tips(episode);
     for (from, to) in times {
-        let of = |rows: &[(u64, Vec<f64>)]| -> Vec<(u64, Vec<f64>)> {
-            rows.iter().filter(|(time, _)| (*from..*to).contains(time)).cloned().collect()
-        };
-        let (actions, tips) = (of(&actions), of(&tips));
-        let far = |one: &[f64], other: &[f64]| {
-            one.iter().zip(other).take(3).map(|(one, other)| (one - other).powi(2)).sum::<f64>().sqrt()
-        };
-        // How near the tip came to each action before the next one.
-        let reached: Vec<f64> = actions
-            .windows(2)
-            .filter_map(|pair| {
-                let before = tips.iter().filter(|(time, _)| (pair[0].0..pair[1].0).contains(time));
-                before.map(|(_, row)| far(&row[TIP..], &pair[0].1)).min_by(f64::total_cmp)
-            })
-            .collect();
-        let near = reached.iter().filter(|distance| **distance < 0.02).count();
-        println!("{} actions, {near} of {} reached within 2 cm: {reached:.3?}", actions.len(), reached.len());
-        assert!(near >= 2, "the tip does not follow: {reached:?}");
+        let acted: Vec<(u64, Place)> =
+            actions.iter().filter(|(time, _)| (*from..*to).contains(time)).copied().collect();
+        let reached = reached(&acted, &tips);
+        let moved = follows(&reached).unwrap_or_else(|why| panic!("{why}; of {} actions", acted.len()));
+        println!("{} actions: {moved}", acted.len());
     }
+}
+
+/// Where the tip was, by the topic of its pose (`foxglove.PoseInFrame`: the pose is field 3, its position field 1).
+fn tips(episode: &Recording) -> Vec<(u64, Place)> {
+    let topic = format!("{ARM}/pose");
+    let place = |message: &Message| -> Place {
+        let position = proto::bytes(proto::bytes(&message.data, 3), 1);
+        [1, 2, 3].map(|field| f64::from_bits(proto::number(position, field)))
+    };
+    episode.topic(&topic).map(|message| (message.log_time, place(message))).collect()
+}
+
+/// Of each action but the last where the tip was nearest to it before the next one.
+fn reached(actions: &[(u64, Place)], tips: &[(u64, Place)]) -> Vec<Reached> {
+    let nearest = |pair: &[(u64, Place)]| {
+        let action = pair[0].1;
+        let then = tips.iter().filter(|(time, _)| (pair[0].0..pair[1].0).contains(time)).map(|(_, tip)| *tip);
+        let tip = then.min_by(|one, other| far(*one, action).total_cmp(&far(*other, action)))?;
+        Some(Reached { action, tip })
+    };
+    actions.windows(2).filter_map(nearest).collect()
+}
+
+/// Whether the tip goes from action to action, in words: it comes near to several, and between two that are apart it covers
+/// half of the way at least. That holds for a tip that comes within a quarter of the way to both, whenever that is; one that
+/// stands still near actions that differ little covers nothing.
+fn follows(reached: &[Reached]) -> Result<String, String> {
+    let near: Vec<&Reached> = reached.iter().filter(|one| far(one.tip, one.action) < REACHED).collect();
+    let distances: Vec<f64> = reached.iter().map(|one| far(one.tip, one.action)).collect();
+    let shown = format!("{} of {} reached within {REACHED} m: {distances:.3?}", near.len(), reached.len());
+    if near.len() < 2 {
+        return Err(format!("the tip does not follow: {shown}"));
+    }
+    let pairs = near.iter().enumerate().flat_map(|(at, one)| near[at + 1..].iter().map(move |other| (one, other)));
+    // How far two actions are apart, and how far the tip went in that direction.
+    let ways = pairs.map(|(one, other)| {
+        let apart = far(one.action, other.action);
+        (apart, along(way(one.tip, other.tip), way(one.action, other.action)) / apart)
+    });
+    let ways: Vec<(f64, f64)> = ways.filter(|(apart, _)| *apart >= APART).collect();
+    let Some((apart, went)) = ways.iter().max_by(|one, other| one.0.total_cmp(&other.0)) else {
+        return Err(format!("no two of the actions that are reached are {APART} m apart: {shown}"));
+    };
+    if !ways.iter().any(|(apart, went)| *went >= apart / 2.0) {
+        return Err(format!("the tip does not go from one action to another: {ways:.3?}: {shown}"));
+    }
+    Ok(format!("{shown}; the tip went {went:.3} m between two that are {apart:.3} m apart"))
+}
+
+fn way(from: Place, to: Place) -> Place {
+    std::array::from_fn(|axis| to[axis] - from[axis])
+}
+
+/// The scalar product.
+fn along(one: Place, other: Place) -> f64 {
+    one.iter().zip(&other).map(|(one, other)| one * other).sum()
+}
+
+fn far(one: Place, other: Place) -> f64 {
+    let way = way(one, other);
+    along(way, way).sqrt()
+}
+
+/// What is found of a tip that is at this place of each action.
+fn judged(actions: &[(u64, Place)], place: fn(Place) -> Place) -> Result<String, String> {
+    let tips: Vec<(u64, Place)> = actions.iter().map(|(time, action)| (time + 5, place(*action))).collect();
+    follows(&reached(actions, &tips))
+}
+
+#[test]
+fn a_tip_that_stands_still_does_not_follow() {
+    let actions: Vec<(u64, Place)> = (0..6).map(|at| (10 * at, [0.1 + 0.006 * at as f64, 0.2, 0.3])).collect();
+    assert!(judged(&actions, |action| action).is_ok());
+    // Still on its way when the next action comes.
+    assert!(judged(&actions, |[x, y, z]| [x - 0.006, y + 0.002, z]).is_ok());
+    let still = judged(&actions, |_| [0.115, 0.2, 0.3]);
+    assert!(still.as_ref().is_err_and(|why| why.contains("from one action to another")), "{still:?}");
+    let repeated: Vec<(u64, Place)> = (0..6).map(|at| (10 * at, [0.1, 0.2, 0.3])).collect();
+    let nowhere = judged(&repeated, |_| [0.1, 0.2, 0.3]);
+    assert!(nowhere.as_ref().is_err_and(|why| why.contains("apart")), "{nowhere:?}");
+    let elsewhere = judged(&actions, |[x, y, z]| [x, y + 0.1, z]);
+    assert!(elsewhere.as_ref().is_err_and(|why| why.contains("0 of 5")), "{elsewhere:?}");
 }
 
 fn between<'a>(outcome: &'a Outcome, from: &str, to: &str) -> &'a [Value] {
