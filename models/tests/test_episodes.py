@@ -1,8 +1,5 @@
 """The reader, on an episode that the program itself records: RAPID_BIN names it."""
 
-import os
-import shutil
-import subprocess
 import tempfile
 import unittest
 from pathlib import Path
@@ -10,13 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 from made_up import experiment
+from recorded import Folder, rapid
 
 from rapid_policy import episodes
 from rapid_policy.corpus import load
 from rapid_policy.episodes import EpisodeError, Source, episode_files, read_episode, sources
 from rapid_policy.judgement import judge
-
-RAPID = os.environ.get("RAPID_BIN", "")
 
 
 class Broken(unittest.TestCase):
@@ -68,14 +64,11 @@ class Chosen(unittest.TestCase):
         self.assertEqual(self.chosen(samples, stale=True, hold=True), 990)
 
 
-@unittest.skipUnless(RAPID, "RAPID_BIN names no program: NOTHING OF THE READER IS TESTED ON A REAL EPISODE")
-class Recorded(unittest.TestCase):
+class Recorded(Folder):
     @classmethod
     def setUpClass(cls):
-        cls.folder = Path(tempfile.mkdtemp())
-        cls.addClassCleanup(shutil.rmtree, cls.folder)
-        task = [RAPID, "--sim", "task", "--expert", "--record", "--episodes", "1", "--seed", "1000"]
-        subprocess.run([*task, "--out", str(cls.folder)], check=True, capture_output=True, timeout=120)
+        super().setUpClass()
+        rapid("--sim", "task", "--expert", "--record", "--episodes", "1", "--seed", "1000", "--out", ".", cwd=cls.folder)
         cls.spec = experiment()
         (cls.path,) = episode_files(cls.folder)
         cls.episode = read_episode(cls.path, sources(cls.spec))

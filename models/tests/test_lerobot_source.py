@@ -1,21 +1,16 @@
 """Data sets of LeRobot as a source: what `rapid export` made of episodes is learned from as the episodes are."""
 
 import json
-import os
-import subprocess
-import tempfile
 import unittest
-from pathlib import Path
 
 import numpy as np
 from made_up import experiment
+from recorded import Folder, rapid
 
 from rapid_policy import lerobot_source
 from rapid_policy.corpus import load
 from rapid_policy.dataset import Dataset
 from rapid_policy.episodes import EpisodeError, episode_files, read_episode, sources
-
-RAPID = os.environ.get("RAPID_BIN", "")
 
 
 class Present(unittest.TestCase):
@@ -61,20 +56,18 @@ class Columns(unittest.TestCase):
             self.numbers(["arm.0", "arm.2"], "arm")
 
 
-@unittest.skipUnless(RAPID, "RAPID_BIN names no program: DATA SETS OF LEROBOT ARE NOT TESTED")
-class Exported(unittest.TestCase):
+class Exported(Folder):
     @classmethod
     def setUpClass(cls):
-        temporary = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(temporary.cleanup)
+        super().setUpClass()
         # A data set has no tags: the experiment's seeds would choose none of its episodes.
-        cls.folder, cls.spec = Path(temporary.name), experiment(data={"seeds": None})
+        cls.spec = experiment(data={"seeds": None})
         cls.episodes, cls.rows = cls.folder / "episodes", cls.folder / "rows"
         for words in (
-            ("--sim", "task", "--expert", "--record", "--episodes", "2", "--seed", "1000", "--out", cls.episodes),
-            ("export", cls.episodes, "--to", "lerobot", "--out", cls.rows),
+            ("--sim", "task", "--expert", "--record", "--episodes", "2", "--seed", "1000", "--out", str(cls.episodes)),
+            ("export", str(cls.episodes), "--to", "lerobot", "--out", str(cls.rows)),
         ):
-            subprocess.run([RAPID, *words], check=True, capture_output=True, timeout=200, cwd=cls.folder)
+            rapid(*words, cwd=cls.folder)
 
     def test_both_are_the_same(self):
         wanted = sources(self.spec)
