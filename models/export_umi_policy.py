@@ -2,12 +2,13 @@
 """Exports a checkpoint of Universal Manipulation Interface (UMI) to a policy bundle.
 
     export_umi_policy.py cup.ckpt models/cup --hz 20 --modality camera0_rgb=cam_wrist --picture 1280x720 \\
-        --pose arm.0-6 --gripper arm.7 --low=-0.3,-0.5,0.02 --high=0.5,0.5,0.6 --start-rotation=1,0,0,0
+        --pose arm.0-6 --gripper arm.7 --low=-0.3,-0.5,0.02 --high=0.5,0.5,0.6
 
 A DiffusionUnetTimmPolicy of one robot, with ResNet-18 or 34, ViT or ConvNeXt base. COLUMNS are numbers of a sensor:
 arm.7, arm.0-6 (both included). The pose is x y z in metres and the quaternion x y z w of the same frame of the gripper
-as in the training data. A policy with robot0_eef_rot_axis_angle_wrt_start sees how it has turned since its run began:
---start-rotation where every run begins alike (UMI trains with 0.05 rad of noise there), otherwise --start-columns.
+as in the training data. A policy with robot0_eef_rot_axis_angle_wrt_start sees how it has turned since its run began,
+which is its first pose in the run; --start-rotation where every run is to count as begun alike (UMI trains with 0.05 rad of
+noise there), --start-columns where a sensor gives it.
 
 What the checkpoint cannot have in a bundle is refused by its key. No code in the file is run. The bundle is run against
 the networks in PyTorch before it gets its name; a difference above 1e-4 is an error. Needs the packages of
@@ -135,20 +136,14 @@ def settings(options: argparse.Namespace, config: checkpoint_config.Config, kind
 
 
 def begun(options: argparse.Namespace, config: checkpoint_config.Config, kind: type) -> dict:
-    """How the gripper is turned when a run begins, as a matrix, or which numbers of a sensor give it."""
+    """How the gripper is turned when a run begins, as a matrix, or which numbers of a sensor give it, where not its first
+    pose does."""
     import numpy as np
 
     from rapid_policy import poses
 
     key, rotation, named = checkpoint_config.SINCE_START, options.start_rotation, options.start_columns
-    needed, given = key in config.numbers, rotation is not None or named is not None
-    if needed and not given:
-        raise Unsupported(
-            f"{config.file}: cfg.policy.shape_meta.obs.{key}: how the gripper has turned since the run began; a bundle "
-            "does not remember that: give its rotation then with --start-rotation, or a sensor that gives it with "
-            "--start-columns"
-        )
-    if given and not needed:
+    if (rotation is not None or named is not None) and key not in config.numbers:
         raise Unsupported(f"--start-rotation, --start-columns: {config.file} does not observe {key}")
     if rotation is None:
         return {"start_columns": kind(*named) if named else None}

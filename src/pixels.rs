@@ -95,7 +95,7 @@ impl Pixels {
                 self.values.clear();
                 self.values.extend(picture.bytes.as_chunks::<2>().0.iter().flat_map(|count| [shade(*count); CHANNELS]));
             }
-            Encoding::Mjpeg => self.decode_jpeg(picture.bytes, width, height)?,
+            Encoding::Mjpeg => self.decode_jpeg(picture.bytes, [height, width], jpeg_options())?,
             other => return Err(PixelError::NoPicture(other)),
         }
         Ok([height, width])
@@ -106,14 +106,13 @@ impl Pixels {
         &self.values
     }
 
-    fn decode_jpeg(&mut self, bytes: &[u8], width: usize, height: usize) -> Result<(), PixelError> {
+    fn decode_jpeg(
+        &mut self,
+        bytes: &[u8],
+        [height, width]: [usize; 2],
+        options: DecoderOptions,
+    ) -> Result<(), PixelError> {
         with_mark(bytes, &mut self.jpeg);
-        // Strict: a truncated picture is refused, not padded with grey.
-        let options = DecoderOptions::default()
-            .jpeg_set_out_colorspace(ColorSpace::RGB)
-            .set_max_width(LARGEST)
-            .set_max_height(LARGEST)
-            .set_strict_mode(true);
         let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.jpeg), options);
         let damaged = |error: zune_jpeg::errors::DecodeErrors| PixelError::Damaged(error.to_string());
         decoder.decode_headers().map_err(damaged)?;
@@ -124,6 +123,15 @@ impl Pixels {
         self.values.resize(CHANNELS * width * height, 0);
         decoder.decode_into(&mut self.values).map_err(damaged)
     }
+}
+
+/// Strict: a truncated picture is refused, not padded with grey.
+fn jpeg_options() -> DecoderOptions {
+    DecoderOptions::default()
+        .jpeg_set_out_colorspace(ColorSpace::RGB)
+        .set_max_width(LARGEST)
+        .set_max_height(LARGEST)
+        .set_strict_mode(true)
 }
 
 /// Sets `marked` to the picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the
@@ -165,30 +173,4 @@ fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn distances_are_shades_and_their_length_is_checked() {
-        let bytes = [0_u16, 1, 16, 4080, u16::MAX, 160].map(u16::to_le_bytes).concat();
-        let mut pixels = Pixels::default();
-        let picture = |bytes| Picture { encoding: Encoding::Depth, width: 3, height: 2, bytes };
-        assert_eq!(pixels.decode(&picture(&bytes)), Ok([2, 3]));
-        let shades: Vec<u8> = pixels.values().iter().step_by(CHANNELS).copied().collect();
-        assert_eq!(shades, [0, 255, 254, 0, 0, 245]);
-        assert!(pixels.decode(&picture(&bytes[1..])).is_err());
-    }
-
-    #[test]
-    fn yuyv_is_bt_601_of_limited_range() {
-        for value in 0..=255_u8 {
-            let [y, u, v] = [f64::from(value) - 16.0, f64::from(255 - value) - 128.0, f64::from(value / 2) - 128.0];
-            let y = y * 255.0 / 219.0;
-            let expected = [y + 1.596_027 * v, y - 0.391_762 * u - 0.812_968 * v, y + 2.017_232 * u];
-            let found = colors(&[value, 255 - value, value, value / 2]);
-            for (found, expected) in found.iter().zip(expected) {
-                assert!((f64::from(*found) - expected.clamp(0.0, 255.0)).abs() <= 0.51, "{value}: {found} {expected}");
-            }
-        }
-    }
-}
+mod tests;

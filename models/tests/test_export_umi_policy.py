@@ -63,7 +63,9 @@ class Equals(Temporary):
     def samples(self, case: dict[str, Any], bundle: Bundle) -> dict[str, np.ndarray]:
         """Samples of all steps, [1, To, ...] by key."""
         steps, arm, seen = bundle.spec["n_obs_steps"], np.array(case["arm"]), pictures(case)
-        begun = np.tile([9.0, 9.0, *case["start"]], (steps, 1))
+        # Two or more numbers that are none of it, and the rotation, wherever its columns are.
+        first = next((spec["slice"][0] for spec in bundle.spec["observations"] if spec["key"] == "start_rotation"), 2)
+        begun = np.tile([*[9.0] * first, *case["start"]], (steps, 1))
         found = {spec["key"]: arm for spec in bundle.spec["observations"]} | {"start_rotation": begun} | seen
         # At the steps at which a camera is not seen there is something else.
         return {key: np.concatenate([v[:1] // 2] * (steps - len(v)) + [v])[None] for key, v in found.items()}
@@ -123,8 +125,13 @@ class Equals(Temporary):
         )
         self.assertEqual(spec["observations"][-1]["modality"], "home")
         self.assertEqual(spec["observations"][-1]["slice"], [2, 6])
+        self.assertNotIn("operation", spec["observations"][-1])
         camera = spec["observations"][0]
         self.assertEqual((camera["modality"], camera["resize"], camera["crop"]), ("wrist", [224, 280], [224, 224]))
+
+    def test_the_start_is_the_first_pose_of_the_run(self) -> None:
+        start = self.check("resnet", "--name", "cup")["observations"][-1]
+        self.assertEqual((start["modality"], start["slice"], start["operation"]), ("arm", [3, 7], "first_of_run"))
 
 
 def turned(executed: np.ndarray) -> np.ndarray:

@@ -312,8 +312,6 @@ class Refusals(Temporary):
 
     def test_the_start(self) -> None:
         write(self.file, golden("resnet")["cfg"], ema_model={})
-        key = "cfg.policy.shape_meta.obs.robot0_eef_rot_axis_angle_wrt_start"
-        self.refused(key, "--start-rotation", "--start-columns", arguments=RIG)
         self.refused("a quaternion x y z w has the length 1", arguments=(*RIG, "--start-rotation=0,0,0,2"))
         ignored = self.changed(
             lambda cfg: obs(cfg)["robot0_eef_rot_axis_angle_wrt_start"].update(ignore_by_policy=True)

@@ -1,5 +1,5 @@
 """Pictures as training decodes them, with Pillow: `tests/golden/jpeg`, against which the program's own decoder is tested
-(`src/policy/picture/tests.rs`). Each picture is `NAME.jpg` with its pixels in `NAME.ppm`.
+(`src/pixels/tests.rs`). Each picture is `NAME.jpg` with its pixels in `NAME.ppm`.
 
 python tests/test_jpeg_golden.py --write             # draws the pictures of cameras, and decodes all of them
 python tests/test_jpeg_golden.py --write EPISODE     # takes those of the simulated task from an episode too

@@ -156,7 +156,7 @@ fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result
         (again.samples_missing, "not: some of their samples are not in the file (captured before it started, or lost)"),
         (
             again.reference_unknown,
-            "not: the recording started after the policy, and the first picture, the reference for all others, is not \
+            "not: the recording started after the policy, and the first sample, the reference for all others, is not \
              in the file",
         ),
         (again.unlike, "not: their observations or length differ from this policy's"),

@@ -13,7 +13,7 @@ use crate::cli::{ObserveArgs, ShowArgs};
 use crate::compare::{self, ChunkInputs, CompareError};
 use crate::policy::bundle::{
     ActionRotation, Bundle, BundleAction, BundleErrors, ObservationInput, ObservationSpec, Representation,
-    VectorRotation, VectorSpec, WhenAbsent,
+    VectorOperation, VectorRotation, VectorSpec, WhenAbsent,
 };
 use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
@@ -288,16 +288,19 @@ fn observed(observation: &ObservationSpec, mask_aware: bool) -> String {
         (false, time) => format!("may be absent: the last sample for {} s, then zeros", time.as_secs_f64()),
     };
     let key = if observation.key == observation.modality { String::new() } else { format!(" as {}", observation.key) };
-    let turned = match &observation.input {
-        ObservationInput::Vector(VectorSpec { rotation: Some(VectorRotation::Rotation6d), .. }) => " (rotation_6d)",
-        _ => "",
+    let (turned, first) = match &observation.input {
+        ObservationInput::Vector(VectorSpec { rotation, operation, .. }) => (
+            rotation.map_or("", |VectorRotation::Rotation6d| " (rotation_6d)"),
+            operation.map_or("", |VectorOperation::FirstOfRun| " of the run's first sample"),
+        ),
+        ObservationInput::Image(_) => ("", ""),
     };
     let apart = match observation.down_sample_steps {
         1 => String::new(),
         ticks => format!(", a step every {ticks} ticks"),
     };
     let kind = kind(observation);
-    format!("{}{key}: {kind} {}{turned}{apart}, {when_absent}", observation.modality, shape.join("x"))
+    format!("{}{key}: {kind} {}{turned}{first}{apart}, {when_absent}", observation.modality, shape.join("x"))
 }
 
 /// What the network's actions are relative to, and how it gives their rotation.

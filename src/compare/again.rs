@@ -14,7 +14,7 @@ use super::survey::{RecordedAction, RecordedChunk, RecordedSamples, SEQUENCE_BIT
 use super::{CompareError, Ended};
 use crate::episode::decode::{Content, Scratch};
 use crate::episode::reader::{Item, Reader};
-use crate::policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation};
+use crate::policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation, VectorOperation};
 use crate::policy::compose::Composer;
 use crate::policy::model::Model;
 use crate::policy::request::Request;
@@ -302,7 +302,7 @@ impl Work<'_> {
         whole
     }
 
-    /// For a chunk that cannot be computed: its pictures are still the references of later ones.
+    /// For a chunk that cannot be computed: its samples are still the references of later ones.
     fn take_references(&mut self, chunk: &RecordedChunk) {
         let present: Vec<bool> = (0..self.references.len()).map(|at| self.request.is_present(at)).collect();
         for at in 0..present.len() {
@@ -321,7 +321,7 @@ impl Work<'_> {
         }
     }
 
-    /// Puts the first picture of observation `at` in all of its steps. Returns whether it is there.
+    /// Puts the first sample of observation `at` in all of its steps. Returns whether it is there.
     fn fill_with_first(&mut self, chunk: &RecordedChunk, at: usize) -> bool {
         let number = chunk.samples.get(at).and_then(|samples| samples.seqs.first());
         let there = |number: &u64| {
@@ -393,14 +393,14 @@ fn planned(chunk: &RecordedChunk, action: &RecordedAction, bundle: &Bundle) -> O
     Some(clamped.collect())
 }
 
-/// Whether the reference picture of an observation is known: the first one that the policy used, with which it compared
-/// all later ones. A recording may have begun after that; then the inputs of the policy are unknown, though every
+/// Whether the reference of an observation is known: the first sample that the policy used, with which it compared all later
+/// pictures, or which stood for them. A recording may have begun after that; then the inputs of the policy are unknown, though every
 /// sample of the chunk is there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reference {
-    /// There is none: its pictures are used as they are, or it has none.
+    /// There is none: its samples are used as they are.
     None,
-    /// The next picture becomes the reference.
+    /// The next sample becomes the reference.
     Next,
     /// It was read.
     Known,
@@ -413,8 +413,11 @@ impl Reference {
     fn all(survey: &Survey, bundle: &Bundle, registry: &Registry) -> Vec<Self> {
         let whole = holds_every_chunk(survey, bundle);
         let of = |observation: &ObservationSpec| {
-            let ObservationInput::Image(image) = &observation.input else { return Self::None };
-            if image.operation != Some(Operation::DiffToReference) {
+            let has_one = match &observation.input {
+                ObservationInput::Image(image) => image.operation == Some(Operation::DiffToReference),
+                ObservationInput::Vector(vector) => vector.operation == Some(VectorOperation::FirstOfRun),
+            };
+            if !has_one {
                 return Self::None;
             }
             // If the very first sample of the run is in the file, none can have been used before.

@@ -72,8 +72,13 @@ impl Message {
 
 impl Recorded {
     fn new() -> Self {
+        Self::of(&[])
+    }
+
+    /// Of a policy with these changes.
+    fn of(changes: &[onnx::Change<'_>]) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        onnx::write_bundle(&folder.path().join("bundle"), &[]);
+        onnx::write_bundle(&folder.path().join("bundle"), changes);
         let bundle = Bundle::load(&folder.path().join("bundle")).unwrap();
         let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
         let registry = Arc::new(Registry::task());
@@ -252,6 +257,43 @@ fn the_reference_picture_is_the_first_one_or_unknown() {
     assert!(changed.reference_unknown > 0 && changed.compared > 0 && changed.actions.without_chunk == 0, "{changed:?}");
     assert_eq!(changed.compared, total - feeling.len() as u64, "{changed:?}");
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+}
+
+#[test]
+fn the_first_numbers_of_a_run_stand_for_all_later_ones() {
+    let first = onnx::Change { what: r#""slice": [0, 4],"#, with: r#""slice": [0, 4], "operation": "first_of_run","# };
+    let recorded = Recorded::of(&[first]);
+    let chunks = recorded.chunks();
+    let whole = recorded.again(&recorded.bytes);
+    assert_eq!((whole.chunks, whole.compared), (chunks.len() as u64, chunks.len() as u64), "{whole:?}");
+    assert!(whole.difference.all.largest < 1e-6, "{whole:?}");
+
+    // Numbers of a later sample change nothing, those of the first sample everything.
+    let with_changed = |number: u64| {
+        let edit = |message: &mut Message| {
+            if message.topic == ARM && u64::from(message.sequence) == number {
+                message.add(0.5);
+            }
+            true
+        };
+        recorded.again(&recorded.edited(edit, |_| {}))
+    };
+    let later = with_changed(Recorded::sample(&chunks[3], 2).unwrap());
+    assert!(later.difference.all.largest < 1e-6 && later.compared == whole.compared, "{later:?}");
+    let first = Recorded::sample(&chunks[0], 2).unwrap();
+    let changed = with_changed(first);
+    // A difference of one chunk among all of them would be small in the mean.
+    let of_all = |spread: &Spread| spread.largest > 1e-3 && spread.mean > spread.largest / 2.0;
+    assert!(changed.difference.axes.iter().any(|axis| of_all(&axis.spread)), "{changed:?}");
+
+    // Without it no chunk can be computed.
+    let keep = |message: &mut Message| message.topic != ARM || u64::from(message.sequence) != first;
+    let without = recorded.again(&recorded.edited(keep, |_| {}));
+    assert_eq!(
+        (without.compared, without.samples_missing + without.reference_unknown),
+        (0, whole.compared),
+        "{without:?}"
+    );
 }
 
 #[test]

@@ -30,7 +30,8 @@ pub use files::{Graph, POLICY_FILE};
 pub use spec::{
     ActionRotation, BasePose, BetaSchedule, Bundle, BundleAction, BundleErrors, ColorOrder, GraphFile, ImageSpec,
     MaskSpec, Normalization, ObservationInput, ObservationSpec, Operation, PredictionType, Representation,
-    SchedulerKind, SchedulerSpec, SliceNormalization, TimestepSpacing, VectorRotation, VectorSpec, WhenAbsent,
+    SchedulerKind, SchedulerSpec, SliceNormalization, TimestepSpacing, VectorOperation, VectorRotation, VectorSpec,
+    WhenAbsent,
 };
 pub(super) use spec::{POSITION, QUATERNION};
 pub use suits::{Element, GraphShape, TensorShape};

@@ -5,7 +5,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::bundle::{Bundle, ObservationInput};
+use super::bundle::{Bundle, ObservationInput, VectorOperation};
 use super::library::Environment;
 use super::observation::{ObservationTensors, VectorError};
 use super::picture::{Picture, PictureError, Preprocessor};
@@ -61,6 +61,8 @@ struct Lane {
     pictures: Option<Preprocessor>,
     /// Values of a vector.
     numbers: Vec<f64>,
+    /// Of a vector that is its first sample: whether `numbers` are of that. `None` for all others.
+    has_first: Option<bool>,
 }
 
 impl Model {
@@ -76,6 +78,10 @@ impl Model {
                 ObservationInput::Vector(_) => None,
             },
             numbers: Vec::new(),
+            has_first: match &observation.input {
+                ObservationInput::Vector(vector) => vector.operation.map(|VectorOperation::FirstOfRun| false),
+                ObservationInput::Image(_) => None,
+            },
         });
         let sampler = Sampler::new(bundle, environment, computing)?;
         Ok(Self { lanes: lanes.collect(), tensors: ObservationTensors::new(bundle), sampler })
@@ -113,9 +119,10 @@ impl Model {
         self.sampler.chunk_len()
     }
 
-    /// A new episode: the next picture of each camera is its reference.
+    /// A new episode: the next sample of each modality is its first.
     pub fn reset(&mut self) {
         for lane in &mut self.lanes {
+            lane.has_first = lane.has_first.map(|_| false);
             if let Some(reference) = lane.pictures.as_mut().and_then(Preprocessor::reference) {
                 reference.reset();
             }
@@ -166,12 +173,17 @@ impl Lane {
             let picture = Picture { encoding, width: cell.width, height: cell.height, bytes: &cell.bytes };
             return Ok(pictures.write(&picture, place)?);
         }
-        let (numbers, rest) = cell.bytes.as_chunks::<8>();
-        if encoding != Encoding::F64 || !rest.is_empty() {
-            return Err(SampleError::Encoding);
+        if self.has_first != Some(true) {
+            let (numbers, rest) = cell.bytes.as_chunks::<8>();
+            if encoding != Encoding::F64 || !rest.is_empty() {
+                return Err(SampleError::Encoding);
+            }
+            self.numbers.clear();
+            self.numbers.extend(numbers.iter().map(|number| f64::from_le_bytes(*number)));
         }
-        self.numbers.clear();
-        self.numbers.extend(numbers.iter().map(|number| f64::from_le_bytes(*number)));
-        Ok(tensors.write_vector(at, step, &self.numbers)?)
+        tensors.write_vector(at, step, &self.numbers)?;
+        // One that was refused is not the first.
+        self.has_first = self.has_first.map(|_| true);
+        Ok(())
     }
 }

@@ -9,7 +9,8 @@ use std::time::Duration;
 use crate::support::mistakes;
 use proptest::prelude::*;
 use rapid::policy::bundle::{
-    BetaSchedule, Bundle, ColorOrder, Normalization, ObservationInput, Operation, SchedulerKind, WhenAbsent,
+    BetaSchedule, Bundle, ColorOrder, Normalization, ObservationInput, Operation, SchedulerKind, VectorOperation,
+    WhenAbsent,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -55,6 +56,7 @@ fn every_key_is_parsed() {
     assert_eq!((mean[2], std[0], *eps), (0.406, 0.229, 1e-8));
     let ObservationInput::Vector(vector) = &pose.input else { panic!("a vector") };
     assert_eq!((vector.len, vector.slice.clone(), &pose.normalization), (3, Some(0..3), &Normalization::Identity));
+    assert_eq!(vector.operation, Some(VectorOperation::FirstOfRun));
     let ObservationInput::Vector(vector) = &grip.input else { panic!("a vector") };
     assert_eq!((vector.len, vector.slice.clone(), grip.modality.as_str()), (1, None, "gripper"));
     let held = [wrist.when_absent, grip.when_absent];

@@ -49,7 +49,8 @@ class Rig:
     low: list[float]
     high: list[float]
     max_age_ms: int
-    # The tip's rotation when a run begins: a matrix that holds for every run, or where its quaternion is.
+    # The tip's rotation when a run begins: a matrix that holds for every run, or where its quaternion is. Without them it is
+    # that of the run's first pose.
     start: np.ndarray | None = None
     start_columns: Columns | None = None
 
@@ -109,7 +110,7 @@ def observation(made: Policy, rig: Rig, name: str) -> dict:
             POSITION: (rig.pose.part(0, 3), False, config.pose),
             ROTATION: (rig.pose.part(3, 7), True, config.pose),
             WIDTH: (rig.gripper, False, config.numbers.get(WIDTH)),
-            START: (rig.start_columns, True, Observation(1, 1)),
+            START: (rig.start_columns or rig.pose.part(3, 7), True, Observation(1, 1)),
         }[name]
         found = {
             "kind": "vector",
@@ -117,6 +118,8 @@ def observation(made: Policy, rig: Rig, name: str) -> dict:
             "shape": [6 if rotation else columns.end - columns.begin],
         }
         found |= {"slice": columns.slice} | ({"rotation": "rotation_6d"} if rotation else {})
+    if name == START and rig.start_columns is None:
+        found["operation"] = "first_of_run"
     found |= {} if seen.apart == 1 else {"down_sample_steps": seen.apart}
     return {"key": name, "required": True, **found, "normalization": {"mode": "identity"}}
 

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use serde::de::{Deserializer, Error, IgnoredAny, IntoDeserializer};
 use serde_json::{Map, Value};
 
-use super::spec::{ActionRotation, ColorOrder, Operation, VectorRotation, WhenAbsent};
+use super::spec::{ActionRotation, ColorOrder, Operation, VectorOperation, VectorRotation, WhenAbsent};
 use crate::text;
 
 /// Maximum number of actions in a chunk, and of values in an action.
@@ -101,6 +101,9 @@ pub(super) struct VectorFile {
     /// Null: values are used unchanged.
     #[serde(default, deserialize_with = "word_or_null")]
     pub(super) rotation: Option<VectorRotation>,
+    /// Null: those of each step.
+    #[serde(default, deserialize_with = "word_or_null")]
+    pub(super) operation: Option<VectorOperation>,
 }
 
 #[derive(Deserialize)]

@@ -380,7 +380,7 @@ const KEYS: &[Key] = keys! {
     "color": "\"rgb\" or \"bgr\"", "\"rgb\"";
     "resize": "[height, width] that pictures are resized to, or null", "[96, 96]";
     "crop": "[height, width] of the middle that is kept after the resize, or null", "[96, 96]";
-    "operation": "\"diff_to_reference\" or null", "null";
+    "operation": "\"diff_to_reference\" of a picture, \"first_of_run\" of a vector, or null", "null";
     "when_absent": "\"zero\" or {\"hold_last_ms\": 1 to 600000}; leave it out for zero", "\"zero\"";
     "down_sample_steps": "how many ticks are between two of its steps, 1 to 64; leave it out for 1", "1";
     "observations.rotation": "\"rotation_6d\" if slice names a quaternion; leave it out for numbers as they are", "null";

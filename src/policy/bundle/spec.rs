@@ -164,6 +164,16 @@ pub struct VectorSpec {
     pub slice: Option<Range<usize>>,
     /// `rotation`: `None` uses them as they are. Otherwise `slice` has the 4 numbers of a quaternion, and `len` is 6.
     pub rotation: Option<VectorRotation>,
+    /// `operation`, before the rotation.
+    pub operation: Option<VectorOperation>,
+}
+
+/// Which sample the numbers of a vector are of, where it is not that of the step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum VectorOperation {
+    /// The first one of that modality in the run or episode, kept across unplugs: where a movement began.
+    FirstOfRun,
 }
 
 /// What a vector is made of that is a rotation.

@@ -231,7 +231,7 @@ fn check_vector(entry: &str, file: &VectorFile, problems: &mut Problems) -> Vect
         let message = format!("[{}, {}] holds {} numbers, shape has {len}", slice.start, slice.end, slice.len());
         problems.wrong(&format!("{entry}.slice"), message);
     }
-    VectorSpec { len, slice: file.slice.clone(), rotation: file.rotation }
+    VectorSpec { len, slice: file.slice.clone(), rotation: file.rotation, operation: file.operation }
 }
 
 /// A normalisation of `len` dimensions, if that is known.
