@@ -117,7 +117,7 @@ impl Line<'_> {
     }
 }
 
-/// The stop behaviour of a joint.
+/// The stop behaviour of a joint, and how its motor sits on it.
 #[derive(Serialize)]
 struct MotorRow<'a> {
     name: &'a str,
@@ -127,6 +127,10 @@ struct MotorRow<'a> {
     emergency: &'static str,
     /// Its line and chip.
     brake: Option<String>,
+    /// What the motor reports at the zero of the joint, rad.
+    zero: f64,
+    /// It turns against the joint.
+    reversed: bool,
 }
 
 fn motors(registry: &Registry) -> impl Iterator<Item = MotorRow<'_>> {
@@ -147,19 +151,28 @@ impl<'a> MotorRow<'a> {
             other_fault: other_fault.word(),
             emergency: emergency.word(),
             brake: motor.brake.as_ref().map(|brake| format!("line {} of {}", brake.line, brake.chip.display())),
+            zero: motor.mounting.zero,
+            reversed: motor.mounting.reversed,
         }
     }
 }
 
 impl std::fmt::Display for MotorRow<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { name, device, own_fault, other_fault, emergency, brake } = self;
+        let Self { name, device, own_fault, other_fault, emergency, brake, zero, reversed } = self;
         write!(
             f,
             "motor {name} of {device}: {own_fault} on its own fault, {other_fault} on another's, {emergency} on an emergency \
              stop"
         )?;
-        brake.iter().try_for_each(|brake| write!(f, "; brake on {brake}"))
+        brake.iter().try_for_each(|brake| write!(f, "; brake on {brake}"))?;
+        if *zero != 0.0 {
+            write!(f, "; zero of the joint at {zero} rad of the motor")?;
+        }
+        if *reversed {
+            f.write_str("; reversed")?;
+        }
+        Ok(())
     }
 }
 
@@ -308,18 +321,22 @@ mod tests {
     }
 
     #[test]
-    fn the_stop_behaviour_of_each_joint_is_listed() {
+    fn the_stop_behaviour_and_the_mounting_of_each_joint_are_listed() {
         let motors = "[device.arm]\nvid = \"2e88\"\npid = \"4603\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\n\
                       adapter = \"damiao\"\nprotocol = \"damiao\"\nmotors = [\n\
                       { name = \"lift\", slave = 1, type = \"DM4310\", kp = 20, kd = 1, position = [0, 1], \
                       other_fault = \"brake\", brake = { chip = \"/dev/brakes\", line = 4, released = \"high\" } },\n\
-                      { name = \"wheel\", slave = 2, type = \"DM4310\", mode = \"velocity\", position = [-9, 9] },\n]\n";
+                      { name = \"wheel\", slave = 2, type = \"DM4310\", mode = \"velocity\", position = [-9, 9] },\n\
+                      { name = \"grip\", slave = 3, type = \"DM4310\", mode = \"velocity\", position = [-1, 1], \
+                      zero = 0.25, reversed = true },\n]\n";
         let (outcome, text) = checked(motors, Format::Text);
         assert_eq!(outcome, CommandStatus::Done, "{text}");
         for line in [
             "motor lift of arm: limp on its own fault, brake on another's, limp on an emergency stop; brake on line 4 of \
              /dev/brakes\n",
             "motor wheel of arm: limp on its own fault, hold on another's, limp on an emergency stop\n",
+            "motor grip of arm: limp on its own fault, hold on another's, limp on an emergency stop; zero of the joint at \
+             0.25 rad of the motor; reversed\n",
         ] {
             assert!(text.contains(line), "{text}");
         }
@@ -327,6 +344,7 @@ mod tests {
         assert!(json.contains(
             r#"{"event":"motor","kind":"motor","name":"lift","device":"arm","own_fault":"limp","other_fault":"brake""#
         ));
+        assert!(json.contains(r#""brake":null,"zero":0.25,"reversed":true}"#), "{json}");
     }
 
     #[test]

@@ -71,8 +71,8 @@ use crate::action::Trip;
 use crate::registry::DamiaoSpec;
 use crate::time::Stamp;
 
-/// Values per motor in a sample: position rad, velocity rad/s, torque Nm, temperature of the
-/// transistors °C, of the winding °C, and the code of its status.
+/// Values per motor in a sample: position rad, velocity rad/s and torque Nm of its joint, temperature of the transistors °C,
+/// of the winding °C, and the code of its status.
 pub const SAMPLE_VALUES: usize = 6;
 /// A motor may leave the frames of this many cycles unanswered, however short the configured time.
 const SILENT_CYCLES: u32 = 3;

@@ -35,8 +35,8 @@ pub use spec::{
     Framing, GpioInput, GripperSpec, Hook, Hooks, IdentitySpec, InferenceSpec, InputSpec, InterlockSpec, JointsSpec,
     KeyInput, LanFind, LanPicture, LanProtocol, LanSpec, Limits, LineInput, LineOff, MAX_BORROWED, MAX_BUTTONS,
     MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec,
-    Mount, NodeSpec, Opens, POOL_SPARE, POSE_ENDING, PREVIEW_DECODER, Parse, PhoneStream, PixelFormat, PointsSpec,
-    PoseLayout, PoseSpec, Probe, ProcessSpec, Provider, Quantity, Registry, RemoteSamples, RigSpec, SLCAN_BITRATES,
-    SerialSpec, Stop, StopSpec, TipForm, TipRotation, TransformSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale,
-    mounted, own_side,
+    Mount, Mounting, NodeSpec, Opens, POOL_SPARE, POSE_ENDING, PREVIEW_DECODER, Parse, PhoneStream, PixelFormat,
+    PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec, Provider, Quantity, Registry, RemoteSamples, RigSpec,
+    SLCAN_BITRATES, SerialSpec, Stop, StopSpec, TipForm, TipRotation, TransformSpec, UsbSpec, VerdictSpec, WatchSpec,
+    WhenStale, mounted, own_side,
 };

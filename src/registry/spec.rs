@@ -11,6 +11,7 @@ mod input;
 mod lan;
 mod module;
 mod motors;
+mod mounting;
 mod verdict;
 
 use std::fmt;
@@ -38,6 +39,7 @@ pub use motors::{
     BrakeSpec, DamiaoSpec, EffectorSpec, GripperSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop,
     StopSpec, TipRotation, WatchSpec,
 };
+pub use mounting::Mounting;
 pub use verdict::{Limits, VerdictSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: those that 8 subscribers hold, 4 each, the

@@ -10,6 +10,7 @@ use rapid::action::{ActionSource, ActuatorNotice, Arming, Order as Asked};
 use rapid::driver::DriverError;
 use rapid::driver::can::link::Link;
 use rapid::driver::can::motors::Motors;
+use rapid::registry::{DamiaoSpec, Mounting};
 use tokio::sync::mpsc::Receiver;
 use tokio::time::{Instant, interval, timeout};
 use vbench::emu::order::Order;
@@ -24,8 +25,12 @@ struct Driven {
 }
 
 fn open(adapter: &Adapter) -> Driven {
+    open_as(adapter, &spec(AXES))
+}
+
+fn open_as(adapter: &Adapter, spec: &DamiaoSpec) -> Driven {
     let link = Link::open_damiao(&adapter.path).expect("the line");
-    let mut motors = Motors::start(link, &spec(AXES)).expect("a thread");
+    let mut motors = Motors::start(link, spec).expect("a thread");
     let hand = Arc::<Hand>::default();
     motors.follow(Arc::clone(&hand) as Arc<dyn ActionSource>);
     let notices = motors.notices().expect("the first call");
@@ -91,6 +96,34 @@ async fn motors_move_after_an_arm_and_are_turned_off_at_the_end() {
     driven.motors.close().await;
     adapter.wait_until_off(&[1, 2]);
     assert_eq!(adapter.count("motor_timeout"), 0, "they were disabled, and did not time out by themselves");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_motor_that_turns_against_its_joint_goes_where_the_joint_is_to_be() {
+    let adapter = Adapter::plug(AXES);
+    let mut mounted = spec(AXES);
+    mounted.motors[0].mounting = Mounting { zero: -0.25, reversed: true };
+    let mut driven = open_as(&adapter, &mounted);
+    // Both motors are at their own zero.
+    until(&mut driven, None, |values, _| (values[0] + 0.25).abs() < 0.01 && values[6].abs() < 0.01).await;
+    driven.motors.order(Asked::Arm).expect("it listens");
+    let mut rose = false;
+    until(&mut driven, Some([0.5, 0.5]), |values, arming| {
+        rose |= values[1] > 0.1;
+        assert!(values[1] > -0.1, "the other way: {values:?}");
+        arming == Some(Arming::Armed) && (values[0] - 0.5).abs() < 0.05 && (values[6] - 0.5).abs() < 0.05
+    })
+    .await;
+    assert!(rose, "it moves in the direction of its action");
+    until(&mut driven, Some([3.0, 0.5]), |values, _| values[0] > 0.95).await;
+    let begun = Instant::now();
+    until(&mut driven, Some([3.0, 0.5]), |values, _| {
+        assert!(values[0] < 1.05, "beyond the limit of its joint: {values:?}");
+        begun.elapsed() > Duration::from_secs(1)
+    })
+    .await;
+    driven.motors.close().await;
+    adapter.wait_until_off(&[1, 2]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

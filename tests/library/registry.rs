@@ -16,9 +16,9 @@ use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
     BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Form, Framing, Hook, InputSpec, JointsSpec,
-    LanFind, LanPicture, LanProtocol, LineOff, Loaded, ModuleSpec, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens,
-    POOL_SPARE, Parse, PhoneStream, PointsSpec, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop, StopSpec,
-    VerdictSpec, WatchSpec,
+    LanFind, LanPicture, LanProtocol, LineOff, Loaded, ModuleSpec, MotionSpec, MotorKind, MotorMode, Mounting,
+    NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, PointsSpec, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop,
+    StopSpec, VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -32,10 +32,28 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_reported_in_full() {
-    mistakes::check("registry/invalid", "toml", 318, |text| {
+    mistakes::check("registry/invalid", "toml", 322, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });
+}
+
+#[test]
+fn a_motor_may_report_its_limits_as_far_as_it_counts() {
+    let path =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry/invalid/motor_zero_puts_limits_out_of_reach.toml");
+    let text = mistakes::read(&path);
+    for (was, is) in [
+        ("zero = 12", "zero = 11.5"),
+        // Its limits are from 10 to 13 rad of the motor with one sense, and from 11 to 14 rad with the other.
+        ("position = [-1, 2]", "position = [-0.5, 2]"),
+        // A motor that was set to count farther.
+        ("position = [-1, 2]", "position = [-20, 20]"),
+    ] {
+        let text = text.replace(was, is);
+        assert!(Registry::parse(&text, None).is_ok(), "{text}");
+    }
+    assert!(Registry::parse(&text.replace("reversed = true", "reversed = false"), None).is_err());
 }
 
 #[test]
@@ -338,6 +356,8 @@ fn a_bus_and_its_motors_are_parsed() {
     assert_eq!((gripper.mode, gripper.position), (MotorMode::Mit { kp: 0.8, kd: 0.05 }, [-1.5, 0.25]));
     // What is not written is a tenth of the motor's torque, and slow.
     assert_eq!((gripper.velocity, gripper.torque, gripper.slew), (2.0, 0.1, 2.0));
+    assert_eq!([gripper, wheel, thumb].map(|motor| motor.mounting), [Mounting::default(); 3]);
+    assert_eq!((roll.mounting, roll.position), (Mounting { zero: -0.75, reversed: true }, [-3.0, 3.0]));
     assert_eq!((gripper.max_mos, gripper.max_rotor), (80.0, 80.0));
     assert_eq!((roll.slave, roll.master, roll.mode), (6, 0, MotorMode::PositionVelocity));
     assert_eq!((roll.velocity, roll.slew, thumb.torque), (10.0, 4.0, 3.0));

@@ -2,7 +2,9 @@
 
 use std::time::Duration;
 
-use rapid::registry::{BrakeSpec, DamiaoSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
+use rapid::registry::{
+    BrakeSpec, DamiaoSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, WatchSpec,
+};
 
 /// A motor in MIT mode with the slave id `slave` that answers with 0x10 more.
 pub(crate) fn motor(slave: u16) -> MotorSpec {
@@ -12,6 +14,7 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
         master: 0x10 + slave,
         kind: MotorKind::Dm4310,
         mode: MotorMode::Mit { kp: 10.0, kd: 1.0 },
+        mounting: Mounting::default(),
         position: [-2.0, 2.0],
         velocity: 20.0,
         torque: 5.0,

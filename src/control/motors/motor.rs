@@ -12,8 +12,10 @@
 //!
 //! Invariant: a new command is sent only in `Enabling` and `On`; in `Kept` the last one is repeated.
 //! Invariant: a motor found enabled without an arm is disabled.
+//! Invariant: a number of the motor itself is in its frames alone; all others are of its joint (see `frames`).
 
 mod brake;
+mod frames;
 mod judged;
 mod last_will;
 mod parameters;
@@ -26,7 +28,7 @@ use super::notice::Notice;
 use super::notices::Notices;
 use super::watch::{Supervision, is_near};
 use crate::control::can::CanFrame;
-use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Ranges, StateCommand};
+use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
 use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
 use crate::control::limits::{Limits, stiffness, within_torque};
 use crate::control::ramp::Ramp;
@@ -34,6 +36,7 @@ use crate::registry::{MotorMode, MotorSpec, Stop};
 use crate::time::Stamp;
 use brake::Brake;
 pub(super) use brake::BrakeIs;
+use frames::within;
 use parameters::PROBE;
 
 /// Ids of commands, relative to the motor's own.
@@ -79,12 +82,6 @@ pub(super) const fn ramp(spec: &MotorSpec) -> Ramp {
     Ramp::new(spec.motion.acceleration, spec.motion.soft_start)
 }
 
-/// The positions that a motor can encode, `-range` to `range`: those beyond can be neither sent nor reported. The lower
-/// end is above the upper one if there are none.
-fn within([low, high]: [f64; 2], range: f64) -> [f64; 2] {
-    [low.max(-range), high.min(range)]
-}
-
 /// See the module's comment.
 #[derive(Debug)]
 #[expect(clippy::struct_excessive_bools, reason = "each is a fact of its own about the motor")]
@@ -93,7 +90,7 @@ pub(super) struct Motor {
     pub(super) phase: Phase,
     /// The ranges it encodes; `None` until they were read.
     pub(super) ranges: Option<Ranges>,
-    /// Its newest feedback, once its ranges are known.
+    /// Its newest feedback, of its joint, once its ranges are known.
     pub(super) feedback: Option<Feedback>,
     /// When the feedback arrived.
     pub(super) seen: Stamp,
@@ -205,7 +202,7 @@ impl Motor {
     /// Takes its feedback.
     pub(super) fn take_feedback(&mut self, frame: &CanFrame, now: Stamp, notices: &mut Notices) -> Result<(), Fault> {
         // Before its ranges are known, only its reported state counts.
-        let Some(feedback) = self.ranges.or(Ranges::new(1.0, 1.0, 1.0)).and_then(|r| Feedback::decode(frame, &r))
+        let Some(feedback) = self.ranges.or(Ranges::new(1.0, 1.0, 1.0)).and_then(|r| self.read_feedback(frame, &r))
         else {
             return Ok(());
         };
@@ -279,7 +276,7 @@ impl Motor {
                 notices.notify(Notice::Cleared { motor: self.index, status });
             }
             if self.spec.mode != MotorMode::Velocity {
-                let [low, high] = within(self.spec.position, ranges.position());
+                let [low, high] = within(&self.spec, ranges.position());
                 limits.set_range(low, high);
             }
         }
@@ -304,7 +301,7 @@ impl Motor {
         match self.spec.mode {
             MotorMode::Mit { kp, .. } => within_torque(command, q, self.spec.torque, kp),
             MotorMode::PositionVelocity => command,
-            MotorMode::Velocity => limits.brake(command, q, within(self.spec.position, ranges.position())),
+            MotorMode::Velocity => limits.brake(command, q, within(&self.spec, ranges.position())),
         }
     }
 
@@ -357,22 +354,20 @@ impl Motor {
             return self.command(command, send);
         };
         let (Some(ranges), Some(Feedback { q, .. })) = (&self.ranges, self.feedback) else { return };
-        if let Ok(frame) = codec::mit(self.spec.slave, &Mit { kp: 0.0, kd, q, dq: 0.0, tau: 0.0 }, ranges) {
+        if let Ok(frame) = self.mit_frame(q, [0.0, kd], ranges) {
             send(frame);
         }
     }
 
     fn command(&self, command: f64, send: &mut impl FnMut(CanFrame)) {
-        let slave = self.spec.slave;
         let Some(ranges) = &self.ranges else { return };
         let frame = match self.spec.mode {
             MotorMode::Mit { kp, kd } => {
                 let error = self.feedback.map_or(0.0, |feedback| command - feedback.q);
-                let kp = stiffness(kp, error, self.spec.torque);
-                codec::mit(slave, &Mit { kp, kd, q: command, dq: 0.0, tau: 0.0 }, ranges)
+                self.mit_frame(command, [stiffness(kp, error, self.spec.torque), kd], ranges)
             }
-            MotorMode::PositionVelocity => codec::position_velocity(slave, command, self.spec.velocity),
-            MotorMode::Velocity => codec::velocity(slave, command),
+            MotorMode::PositionVelocity => self.position_frame(command),
+            MotorMode::Velocity => self.velocity_frame(command),
         };
         // Commands are finite: targets are, and so are the values of a motor.
         if let Ok(frame) = frame {

@@ -5,6 +5,7 @@ mod always;
 mod arming;
 mod braking;
 mod following;
+mod mounted;
 mod returning;
 mod starting;
 mod stopping;

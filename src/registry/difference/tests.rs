@@ -40,6 +40,24 @@ fn spare(keys: &str) -> String {
 }
 
 #[test]
+fn a_motor_is_not_mounted_otherwise_under_a_running_arm() {
+    let arm = "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\nprotocol = \"damiao\"\n\
+               motors = [{ name = \"lift\", slave = 1, type = \"DM4310\", kp = 20, kd = 1, position = [-1, 1] }]\n";
+    let running = parsed(arm);
+    for keys in ["zero = 0.5", "reversed = true"] {
+        let now = parsed(&arm.replace("kd = 1", &format!("kd = 1, {keys}")));
+        for (was, is) in [(&running, &now), (&now, &running)] {
+            let found = Difference::between(was, is);
+            let [why] = found.needs_restart.as_slice() else { panic!("{keys}: {found:?}") };
+            assert!(why.starts_with("[device.arm]: format changed"), "{why}");
+        }
+    }
+    // As much as without the keys.
+    let same = parsed(&arm.replace("kd = 1", "kd = 1, zero = 0, reversed = false"));
+    assert_eq!(Difference::between(&running, &same), Difference::default());
+}
+
+#[test]
 fn only_an_added_entry_at_a_free_bit_is_taken_over() {
     let camera = "node = \"camera\"\n";
     for (case, text, bits, reasons) in [

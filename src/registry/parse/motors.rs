@@ -8,12 +8,14 @@ use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::Section;
 use crate::registry::spec::{
     ActionSpec, BrakeSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotionSpec, MotorKind, MotorMode, MotorSpec,
-    NodeSpec, Stop, StopSpec, WatchSpec,
+    Mounting, NodeSpec, Stop, StopSpec, WatchSpec,
 };
 use crate::registry::units::show_duration;
 
 const KEYS: [&str; 11] =
     ["name", "slave", "master", "type", "mode", "kp", "kd", "position", "velocity", "torque", "slew"];
+/// How it sits on its joint.
+const MOUNTING_KEYS: [&str; 2] = ["zero", "reversed"];
 /// How the command of a position starts and changes.
 const MOTION_KEYS: [&str; 3] = ["acceleration", "soft_start", "first_target"];
 /// Which behaviour of a motor is a fault, and how it stops then.
@@ -118,7 +120,7 @@ fn motors(table: &Section<'_>) -> Option<Vec<MotorSpec>> {
 }
 
 fn motor(entry: &Section<'_>) -> Option<MotorSpec> {
-    entry.allow(&[&KEYS[..], &MOTION_KEYS, &FAULT_KEYS, &TEMPERATURE_KEYS].concat());
+    entry.allow(&[&KEYS[..], &MOUNTING_KEYS, &MOTION_KEYS, &FAULT_KEYS, &TEMPERATURE_KEYS].concat());
     let name = name(entry);
     // 0x100 and more are the ids of commands in other modes.
     let slave: Option<u16> = entry.integer("slave", 1..=0xff);
@@ -134,6 +136,7 @@ fn motor(entry: &Section<'_>) -> Option<MotorSpec> {
     let torque = above_zero(entry, "torque", most_torque).unwrap_or(TORQUE_SHARE * most_torque);
     let mode = mode(entry);
     let position = position(entry, mode);
+    let mounting = mounting(entry, kind, position);
     // A position can change no faster than the motor turns; a speed within a hundredth of a second.
     let most_slew = if mode == Some(MotorMode::Velocity) { 100.0 * most_speed } else { most_speed };
     // To its highest speed within a tenth of a second.
@@ -150,6 +153,7 @@ fn motor(entry: &Section<'_>) -> Option<MotorSpec> {
         master: if entry.has("master") { master? } else { slave + MASTER_OFFSET },
         kind: kind?,
         mode,
+        mounting,
         position: position?,
         velocity,
         torque,
@@ -200,6 +204,36 @@ fn position(entry: &Section<'_>, mode: Option<MotorMode>) -> Option<[f64; 2]> {
             entry.refuse("position", message, fix)
         }
     }
+}
+
+/// How the motor sits on its joint, whose limits are these. What it cannot report there is a mistake.
+fn mounting(entry: &Section<'_>, kind: Option<MotorKind>, limits: Option<[f64; 2]>) -> Mounting {
+    let zero = entry.number("zero", f64::MIN..=f64::MAX).unwrap_or_default();
+    let mounting = Mounting { zero, reversed: entry.flag("reversed").unwrap_or_default() };
+    let Some(kind) = kind else { return mounting };
+    let [most, ..] = kind.shipped();
+    let is_beyond = |position: f64| position.abs() > most;
+    if is_beyond(zero) {
+        let message = format!("zero = {zero:?} is farther than a {} counts, {most} rad", kind.name());
+        let fix = "write what the motor reports at the zero of its joint, in rad: 90 degrees are 1.571 rad";
+        entry.report("zero", message, fix);
+        return mounting;
+    }
+    // Limits that are farther by themselves are of a motor that was set to count farther.
+    if let Some(limits) = limits.filter(|limits| !limits.iter().any(|end| is_beyond(*end))) {
+        let [low, high] = mounting.motor_range(limits);
+        if is_beyond(low) || is_beyond(high) {
+            let message = format!(
+                "zero = {zero:?} puts position = {limits:?} at {low:.2} to {high:.2} rad of the motor, and a {} counts to \
+                 {most} rad",
+                kind.name()
+            );
+            let fix =
+                "narrow position, or set the zero of the motor nearer to that of its joint, with its maker's program";
+            entry.report("zero", message, fix);
+        }
+    }
+    mounting
 }
 
 /// A number above zero.

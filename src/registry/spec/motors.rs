@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::form::tip_numbers;
+use super::mounting::Mounting;
 
 /// Most motors of one bus: an action has an axis each, a sample 6 numbers each.
 pub const MAX_MOTORS: usize = 10;
@@ -87,7 +88,7 @@ pub enum TipRotation {
 pub struct GripperSpec {
     /// Its index in [`DamiaoSpec::motors`].
     pub motor: usize,
-    /// Closed: opening 0, rad; within the position of the motor.
+    /// Closed: opening 0, rad, of its joint; within the position of the motor.
     pub closed: f64,
     /// Open: opening 1, rad; likewise, and not the same.
     pub open: f64,
@@ -106,6 +107,8 @@ pub struct MotorSpec {
     pub kind: MotorKind,
     /// How it is driven.
     pub mode: MotorMode,
+    /// How it sits on its joint. All positions, velocities and torques of this entry are of the joint.
+    pub mounting: Mounting,
     /// Lowest and highest position, rad; finite, the lowest first.
     pub position: [f64; 2],
     /// Highest speed, rad/s; above 0.

@@ -2,7 +2,7 @@
 
 use super::{Motor, Phase};
 use crate::control::can::CanFrame;
-use crate::control::damiao::codec::{self, Feedback, Mit, StateCommand};
+use crate::control::damiao::codec::{Feedback, StateCommand};
 use crate::registry::{MotorMode, Stop};
 
 impl Motor {
@@ -19,11 +19,11 @@ impl Motor {
                 MotorMode::Mit { kd, .. },
                 Some(ranges),
                 Some(Feedback { q, .. }),
-            ) => codec::mit(slave, &Mit { kp: 0.0, kd, q, dq: 0.0, tau: 0.0 }, &ranges).ok(),
+            ) => self.mit_frame(q, [0.0, kd], &ranges).ok(),
             (Stop::Damp | Stop::Hold | Stop::Brake, MotorMode::PositionVelocity, ..) => {
-                codec::position_velocity(slave, command, self.spec.velocity).ok()
+                self.position_frame(command).ok()
             }
-            (Stop::Damp | Stop::Hold | Stop::Brake, MotorMode::Velocity, ..) => codec::velocity(slave, 0.0).ok(),
+            (Stop::Damp | Stop::Hold | Stop::Brake, MotorMode::Velocity, ..) => self.velocity_frame(0.0).ok(),
             _ => None,
         };
         frame.unwrap_or_else(|| StateCommand::Disable.frame(slave))

@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use super::{Motor, Phase, within};
+use super::frames::within;
+use super::{Motor, Phase};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::Ranges;
 use crate::control::damiao::model;
@@ -71,7 +72,7 @@ impl Motor {
                 };
                 *slot = value;
                 Ranges::new(value, value, value).ok_or(unusable)?;
-                let [low, high] = within(self.spec.position, value);
+                let [low, high] = within(&self.spec, value);
                 if reply.parameter == Parameter::PMax && low > high {
                     return Err(unusable);
                 }

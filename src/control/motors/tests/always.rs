@@ -4,7 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::control::damiao::codec::StateCommand;
-use crate::registry::Stop;
+use crate::registry::{Mounting, Stop};
 
 /// What happens next.
 #[derive(Debug, Clone)]
@@ -30,6 +30,11 @@ enum Event {
 
 fn target() -> impl Strategy<Value = f64> {
     prop_oneof![8 => -2.5..2.5, 1 => any::<f64>(), 1 => Just(f64::NAN)]
+}
+
+/// Of a motor that counts beyond all limits of its joint.
+fn mounting() -> impl Strategy<Value = Mounting> {
+    (prop_oneof![Just(0.0_f64), -9.0_f64..9.0], any::<bool>()).prop_map(|(zero, reversed)| Mounting { zero, reversed })
 }
 
 fn event() -> impl Strategy<Value = Event> {
@@ -76,10 +81,7 @@ impl Event {
             Self::Stuck(motor, on) => world.sims[motor].stuck = on,
             Self::Heat(motor, celsius) => world.sims[motor].mos = celsius,
             Self::Deaf(motor, command) => world.sims[motor].deaf = command,
-            Self::PowerCycle(motor) => {
-                let Sim { slave, master, .. } = world.sims[motor];
-                world.sims[motor] = Sim { mode: 2, ..Sim::new(slave, master) };
-            }
+            Self::PowerCycle(motor) => world.sims[motor] = Sim { mode: 2, ..world.sims[motor].renewed() },
             Self::StuckBrakes(are_stuck) => world.are_brakes_stuck = are_stuck,
             Self::BrokenBrakes(broken) => world.brakes.broken = broken,
             Self::Latency(cycles) => world.latency = cycles,
@@ -101,7 +103,7 @@ proptest! {
     fn motors_move_only_as_permitted(
         events in prop::collection::vec(event(), 1..60), torque in prop_oneof![Just(1000.0), 0.5..5.0],
         stop in prop::sample::select(vec![Stop::Limp, Stop::Damp, Stop::Hold, Stop::Brake]),
-        has_brakes in any::<bool>(),
+        has_brakes in any::<bool>(), mountings in prop::array::uniform2(mounting()),
         modes in prop::sample::select(vec![
             [MIT, MIT], [MIT, MotorMode::PositionVelocity], [MotorMode::Velocity, MIT],
         ]),
@@ -110,6 +112,7 @@ proptest! {
         spec.motors.iter_mut().for_each(|motor| motor.torque = torque);
         spec.motors[0].stop.other_fault = stop;
         spec.motors[1].stop.own_fault = stop;
+        spec.motors.iter_mut().zip(mountings).for_each(|(motor, mounting)| motor.mounting = mounting);
         spec.motors.iter_mut().for_each(|motor| motor.brake = has_brakes.then(world::brake));
         let mut world = World::new(spec);
         for event in events {
@@ -117,7 +120,7 @@ proptest! {
         }
         // What was broken is repaired: from anywhere within the limits, an arm works.
         for sim in &mut world.sims {
-            *sim = Sim { mode: sim.mode, q: sim.q.clamp(-2.0, 2.0), status: sim.status, ..Sim::new(sim.slave, sim.master) };
+            *sim = Sim { mode: sim.mode, q: sim.q.clamp(-2.0, 2.0), status: sim.status, ..sim.renewed() };
             if matches!(sim.status, MotorStatus::Other(_)) {
                 sim.status = MotorStatus::Disabled;
             }

@@ -6,15 +6,20 @@ use super::*;
 use crate::action::Trip;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
-use crate::registry::{BrakeSpec, MotionSpec, MotorKind, MotorSpec, Stop, StopSpec, WatchSpec};
+use crate::registry::{BrakeSpec, MotionSpec, MotorKind, MotorSpec, Mounting, Stop, StopSpec, WatchSpec};
 
 pub(super) const CYCLE: Duration = Duration::from_millis(5);
 
-/// A motor as the public drivers know it.
+/// A motor as the public drivers know it, and its joint: `q`, `dq` and `tau` are of the joint, what it sends and takes is
+/// of the motor.
 #[derive(Debug, Clone)]
 pub(super) struct Sim {
     pub(super) slave: u16,
     pub(super) master: u16,
+    /// What the motor reports at the zero of the joint, rad.
+    pub(super) zero: f64,
+    /// -1 if it turns against the joint.
+    pub(super) sign: f64,
     pub(super) ranges: [f64; 3],
     pub(super) q: f64,
     pub(super) dq: f64,
@@ -45,6 +50,8 @@ impl Sim {
         Self {
             slave,
             master,
+            zero: 0.0,
+            sign: 1.0,
             ranges: [12.5, 30.0, 10.0],
             q: 0.25,
             dq: 0.0,
@@ -64,8 +71,30 @@ impl Sim {
         }
     }
 
+    /// Mounted as in its entry.
+    fn of(motor: &MotorSpec) -> Self {
+        let sign = if motor.mounting.reversed { -1.0 } else { 1.0 };
+        Self { zero: motor.mounting.zero, sign, ..Self::new(motor.slave, motor.master) }
+    }
+
+    /// As it was at first.
+    pub(super) fn renewed(&self) -> Self {
+        Self { zero: self.zero, sign: self.sign, ..Self::new(self.slave, self.master) }
+    }
+
     pub(super) fn is_on(&self) -> bool {
         self.status == MotorStatus::Enabled
+    }
+
+    /// The first number of a command, of the joint: position or velocity.
+    fn commanded(&self, frame: &CanFrame) -> f64 {
+        let number = command_of(frame, self.slave, self.ranges);
+        if frame.id == u32::from(self.slave) + 0x200 { number * self.sign } else { self.joint(number) }
+    }
+
+    /// Where the joint is with the motor there, rad.
+    fn joint(&self, motor: f64) -> f64 {
+        (motor - self.zero) * self.sign
     }
 
     pub(super) fn answer(&mut self, frame: &CanFrame) -> Option<CanFrame> {
@@ -105,7 +134,7 @@ impl Sim {
         if ![slave, slave + 0x100, slave + 0x200].contains(&frame.id) {
             return None;
         }
-        let number = command_of(frame, self.slave, self.ranges);
+        let number = self.commanded(frame);
         self.dq = 0.0;
         if self.is_on() {
             self.command = Some((frame.id, number));
@@ -149,13 +178,13 @@ impl Sim {
         let [p, v, t] = self.ranges;
         let id = self.slave.to_le_bytes()[0] & 0xf;
         let (mos, rotor) = (self.mos, self.rotor);
-        let (q, dq, tau) = (self.q, self.dq, self.tau);
+        let (q, dq, tau) = (self.zero + self.sign * self.q, self.sign * self.dq, self.sign * self.tau);
         let feedback = Feedback { id, status: self.status, q, dq, tau, mos, rotor };
         feedback.encode(self.master, &Ranges::new(p, v, t)?)
     }
 }
 
-/// The first number of a command: position or velocity.
+/// The first number of a command, of the motor: position or velocity.
 fn command_of(frame: &CanFrame, slave: u16, [range, ..]: [f64; 3]) -> f64 {
     let [a, b, c, d, ..] = frame.data;
     if frame.id == u32::from(slave) {
@@ -172,6 +201,7 @@ pub(super) fn motor(slave: u16, master: u16, mode: MotorMode) -> MotorSpec {
         master,
         kind: MotorKind::Dm4310,
         mode,
+        mounting: Mounting::default(),
         position: [-2.0, 2.0],
         velocity: 20.0,
         torque: 1000.0,
@@ -261,7 +291,7 @@ impl World {
         let axes = spec.motors.len();
         Self {
             bus: MotorBus::new(&spec, now),
-            sims: spec.motors.iter().map(|motor| Sim::new(motor.slave, motor.master)).collect(),
+            sims: spec.motors.iter().map(Sim::of).collect(),
             spec,
             now,
             notices: Vec::new(),
@@ -342,7 +372,8 @@ impl World {
                 continue;
             }
             let [p, v, t] = sim.ranges;
-            let report = Feedback::decode(frame, &Ranges::new(p, v, t).unwrap()).unwrap();
+            let own = Feedback::decode(frame, &Ranges::new(p, v, t).unwrap()).unwrap();
+            let report = Feedback { q: sim.joint(own.q), dq: own.dq * sim.sign, ..own };
             axis.unanswered = None;
             let passed = axis.received.replace(self.now).map_or(Duration::ZERO, |received| self.now.since(received));
             let fastest = (axis.speed.abs() + 1.25 * motor.velocity + 0.5).min(v);
@@ -431,15 +462,13 @@ impl World {
             let damps = frame.id == slave && kp == 0.0;
             let before = axis.command.map(|(before, _)| before);
             let rests = frame.id == slave + 0x200 && frame.data == [0; 8];
-            let keeps = damps
-                || rests
-                || before.is_some_and(|before| (command_of(frame, sim.slave, sim.ranges) - before).abs() < 1e-9);
+            let keeps = damps || rests || before.is_some_and(|before| (sim.commanded(frame) - before).abs() < 1e-9);
             assert!(self.judge.may_move || self.judge.may_keep && keeps, "{frame:x?} while nothing may move");
             assert!(unanswered < silent_after, "a command to a motor that is silent for {unanswered:?}");
             if damps {
                 continue;
             }
-            let command = command_of(frame, sim.slave, sim.ranges);
+            let command = sim.commanded(frame);
             let measured = axis.reported.expect("a command before any answer");
             let quantum = 25.0 / 65_535.0;
             if frame.id == slave + 0x200 {

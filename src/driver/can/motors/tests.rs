@@ -19,7 +19,7 @@ use crate::driver::can::socket::tests::{bus, bytes};
 use crate::interlock::{InputState, Interlocks, StopKind};
 use crate::permission::Permission;
 use crate::registry::{
-    EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, TipRotation, WatchSpec,
+    EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, TipRotation, WatchSpec,
 };
 use crate::time::Stamp;
 
@@ -33,6 +33,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         master: 0x10 + slave,
         kind: MotorKind::Dm4310,
         mode: MotorMode::Mit { kp: 10.0, kd: 1.0 },
+        mounting: Mounting::default(),
         position: [-1.0, 1.0],
         velocity: 5.0,
         torque: 5.0,

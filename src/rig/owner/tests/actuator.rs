@@ -3,7 +3,7 @@
 use super::*;
 use crate::registry::{
     ActionSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, MOTOR_CHANNELS, MotionSpec, MotorKind, MotorMode,
-    MotorSpec, StopSpec, WatchSpec,
+    MotorSpec, Mounting, StopSpec, WatchSpec,
 };
 
 const NUMBERS: usize = MOTOR_CHANNELS;
@@ -16,6 +16,7 @@ fn arm() -> Registry {
         master: 0x11,
         kind: MotorKind::Dm4310,
         mode: MotorMode::Mit { kp: 1.0, kd: 1.0 },
+        mounting: Mounting::default(),
         position: [-1.0, 1.0],
         velocity: 1.0,
         torque: 1.0,
