@@ -111,7 +111,7 @@ lerobot-loop: setup-build ## what LeRobot's own loop does when a camera fails: m
 	"$$python" models/lerobot_loop.py --rapid '$(TARGET)/release/rapid'
 
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
-lerobot-test: ## the exports from and to LeRobot, against LeRobot, and its own loop (fetches 8 GB of Python packages once)
+lerobot-test: ## the exports from and to LeRobot, against LeRobot, its own loop, and training on what it wrote (fetches 8 GB of Python packages once)
 	python=$$(scripts/venv.sh venv-lerobot models/requirements-lerobot.txt --no-deps); \
 	RAPID_BIN='$(BUILT)' "$$python" -m unittest discover -s models/tests/lerobot -v
 

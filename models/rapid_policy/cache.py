@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from .episodes import Episode, EpisodeError, Facts, Source, read_episode, read_facts
-from .lerobot_source import split
+from .lerobot_source import description, files, split
 
 MAGIC = b"RAPIDCACHE2\n"
 ALIGN = 64
@@ -55,6 +55,8 @@ class Entry:
     reasons: tuple[str, ...] = ()
     judged_by: str | None = None
     """The program that gave the verdict; none before it is judged."""
+    described: str = ""
+    """The hash of what a data set of LeRobot says of it; empty of a file of its own."""
 
 
 class Cache:
@@ -70,14 +72,14 @@ class Cache:
 
     def entry(self, path: Path) -> Entry:
         """What is known of a file as it is now; read from the disk if it has changed."""
-        stat = split(path)[0].stat()
+        state = _state(path)
         known = self._entries.get(str(path))
-        if known and (known.size, known.changed_ns) == (stat.st_size, stat.st_mtime_ns):
+        if known and state.items() <= asdict(known).items():
             return known
         digest = sha256(path)
-        entry = Entry(str(path), stat.st_size, stat.st_mtime_ns, digest)
+        entry = Entry(str(path), sha256=digest, **state)
         if known and known.sha256 == digest:
-            entry = Entry(**{**asdict(known), "size": stat.st_size, "changed_ns": stat.st_mtime_ns})
+            entry = Entry(**{**asdict(known), **state})
         else:
             try:
                 entry.facts = asdict(read_facts(path))
@@ -145,6 +147,7 @@ class Cache:
         A decoded file that is damaged is removed, so that the next run makes it again.
         """
         wrong = []
+        _hashed.cache_clear()
         for entry in entries:
             now, file = self._entries[entry.path], self.file(entry.sha256)
             if sha256(Path(entry.path)) != now.sha256:
@@ -250,13 +253,40 @@ def _read_index(file: Path) -> Iterator[Entry]:
 
 
 def sha256(path: Path) -> str:
-    """The hash of a file, in hexadecimal; of one of several episodes in a file that of the file and its index."""
-    file, index = split(path)
+    """The hash of a file, in hexadecimal; of an episode of a data set of LeRobot that of its files, and of which part of
+    them it is."""
+    if split(path)[1] is None:
+        return _hashed(path, *_stat(path))
+    digests = [_hashed(file, *_stat(file)) for file in files(path)]
+    return hashlib.sha256(json.dumps([digests, str(split(path)[1]), description(path)]).encode()).hexdigest()
+
+
+@functools.lru_cache(maxsize=64)
+def _hashed(file: Path, _size: int, _changed_ns: int) -> str:
+    """Of one file, as it is now: a data set has many episodes in each."""
+    if not file.exists():
+        return ""
     with file.open("rb") as opened:
-        digest = hashlib.file_digest(opened, "sha256")
-    if index is not None:
-        digest.update(f"#{index}".encode())
-    return digest.hexdigest()
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _state(path: Path) -> dict[str, Any]:
+    """By what an entry tells that its source has changed."""
+    if split(path)[1] is None:
+        size, changed_ns = _stat(path)
+        return {"size": size, "changed_ns": changed_ns}
+    stats = [_stat(file) for file in files(path)]
+    size, changed_ns = sum(size for size, _ in stats), max(changed_ns for _, changed_ns in stats)
+    return {"size": size, "changed_ns": changed_ns, "described": description(path)}
+
+
+def _stat(file: Path) -> tuple[int, int]:
+    """Its size and its time of change. One that is not there is as an empty one: the episode says that it is missing."""
+    try:
+        stat = file.stat()
+    except FileNotFoundError:
+        return 0, 0
+    return stat.st_size, stat.st_mtime_ns
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from .corpus import load
 from .episodes import Episode, EpisodeError, episode_files, read_episode, sources
 from .experiment import Experiment
 from .experiment_file import ExperimentError, read_experiment
-from .lerobot_source import is_dataset, split
+from .lerobot_source import files, is_dataset, split
 
 MB = 1e6
 
@@ -91,10 +91,12 @@ def _rate(read, sizes: list[float], seconds: float) -> float:
 
 
 def _recorded(episode: Episode) -> float:
-    """Bytes of its file; of one of several in a file its share."""
+    """Bytes of its file; of an episode of a data set of LeRobot its share of each of its files."""
     file, index = split(episode.path)
-    beside = 1 if index is None else sum(split(name)[0] == file for name in episode_files(_dataset(file)))
-    return file.stat().st_size / beside
+    if index is None:
+        return file.stat().st_size
+    every = [files(name) for name in episode_files(_dataset(file))]
+    return sum(mine.stat().st_size / sum(mine in of for of in every) for mine in files(episode.path))
 
 
 def _dataset(file: Path) -> Path:

@@ -15,8 +15,8 @@ from .cache import Cache, Entry
 from .classification import Classification
 from .episodes import ABSENCES, Episode, EpisodeError, Facts, episode_files, picture_source, sources
 from .experiment import Data, Experiment
-from .lerobot_source import split
 from .judgement import JudgementError, judge, program
+from .lerobot_source import MissingPackage, split
 
 SHOWN = 20
 
@@ -62,7 +62,10 @@ def load(spec: Experiment | Classification, folders: Sequence[Path], cache_folde
             unwanted += 1
         else:
             wanted.append(entry)
-    cache.build(wanted, workers)
+    try:
+        cache.build(wanted, workers)
+    except MissingPackage as error:
+        raise EpisodeError(folders[0], str(error)) from error
     episodes = []
     for entry in (cache.entry(Path(e.path)) for e in wanted):
         episode = cache.episode(entry) if entry.error is None else None

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from . import lerobot_source
 from .classification import Classification
 from .experiment import Experiment
-from .lerobot_source import DatasetError
+from .lerobot_source import DatasetError, MissingPackage
 from .pixels import FormatError, PixelError, decode, fit
 
 FRAMES = "/rapid/frame"
@@ -219,21 +219,23 @@ def _read_rows(path: Path, wanted: tuple[Source, ...]) -> Episode:
     try:
         facts, rows = read_facts(path), lerobot_source.tables(path)
         count = len(rows["frame_index"])
+        actions = rows.get("action", np.zeros((count, 0))).astype(np.float64)
+        acted = np.isfinite(actions).all(1) & ("action" in rows)
         arrays: dict[str, NDArray[Any]] = {
             "ticks": rows["frame_index"].ravel().astype(np.int64),
             "times": (rows["timestamp"].ravel() * 1e9).astype(np.int64),
-            "actions": rows.get("action", np.zeros((count, 0))).astype(np.float64),
-            "acted": np.full(count, "action" in rows),
+            "actions": np.where(acted[:, None], actions, 0.0),
+            "acted": acted,
         }
         for source in wanted:
             found = _of_pictures(path, source, rows) if source.kind == "image" else _of_numbers(path, source, rows)
             found |= lerobot_source.presence(rows, source.modality, count)
             arrays |= {f"{what} {source.name}": array for what, array in found.items()}
-    except EpisodeError:
+    except (EpisodeError, MissingPackage):
         raise
-    # A damaged file fails in the container, the compression or a column: each has its own errors.
+    # A damaged file fails in the container, the compression or a column: each has its own errors, some of several lines.
     except Exception as error:
-        raise EpisodeError(path, f"not an episode that is read: {error}") from error
+        raise EpisodeError(path, f"not an episode that is read: {' '.join(str(error).split())}") from error
     return Episode(path, facts, arrays)
 
 
@@ -241,7 +243,7 @@ def _of_pictures(path: Path, source: Source, rows: dict[str, Any]) -> dict[str, 
     found = lerobot_source.pictures(rows, source.modality)
     if found is None and source.required:
         raise EpisodeError(path, f"no feature 'observation.images.{source.modality}'")
-    found = found or [None] * len(rows["frame_index"])
+    found = [None] * len(rows["frame_index"]) if found is None else found
     return _stacked(source, [None if p is None else _fitted(path, source, p) for p in found])
 
 

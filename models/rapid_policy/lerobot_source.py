@@ -1,17 +1,23 @@
-"""Episodes of LeRobot data sets v3.0 with pictures, as `rapid export --to lerobot` makes them.
+"""Episodes of LeRobot data sets v3.0, as LeRobot writes them and `rapid export --to lerobot`.
 
-An episode is named `FILE.parquet#INDEX`: a file has several. A modality NAME is the feature `observation.images.NAME`, the
-columns `NAME.0`, `NAME.1` ... of `observation.state`, or the feature `observation.NAME` (so `state` is all of it). A data
-set of `rapid` lists these in `columns`, beside `names`, which are for people; of others the names count. Where the data set
-has `rapid.mask` and `rapid.valid` a sample is present if both are 1; in others every sample is. `rapid.plugged` is read
-where it is there.
+An episode is named `FILE.parquet#INDEX`: a file has several. A modality NAME is, of pictures, the feature
+`observation.images.NAME` or `observation.NAME`; of numbers the columns of `observation.state` that are named `NAME.0`,
+`NAME.1` ..., `NAME.pos` or just `NAME`, or the feature `observation.NAME` (so `state` is all of it). A data set of `rapid`
+lists the columns in `columns`, beside `names`, which are for people; of others the names count. Where the data set has
+`rapid.mask` and `rapid.valid` a sample is present if both are 1; in others every sample is. `rapid.plugged` is read where
+it is there.
 """
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import io
 import json
+import math
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +30,26 @@ if TYPE_CHECKING:
 
 DESCRIPTION = "meta/info.json"
 VERSION = "v3.0"
+# Of an episode's columns those with the files that it is in.
+PLACES = ("data/", "videos/")
 NAMED = re.compile(r"(.+\.parquet)#(\d+)")
 
 
 class DatasetError(Exception):
     """A data set, or a part of it, that is not read; the reason and the fix."""
+
+
+class MissingPackage(DatasetError):
+    """What reads it is not installed: no fault of an episode, and with it installed they serve."""
+
+
+@dataclass(frozen=True)
+class Video:
+    """The part of a file that an episode's frames of a camera are, in seconds."""
+
+    file: Path
+    begin: float
+    end: float
 
 
 def is_dataset(folder: Path) -> bool:
@@ -44,14 +65,12 @@ def split(path: Path) -> tuple[Path, int | None]:
 
 def episode_names(folder: Path) -> list[Path]:
     """The episodes of a data set."""
-    described = _described(folder)
-    pq, names = _parquet(), []
-    for file in sorted((folder / "meta/episodes").glob("*/*.parquet")):
-        columns = ["episode_index", "data/chunk_index", "data/file_index"]
-        for row in pq.read_table(file, columns=columns).to_pylist():
-            place = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
-            names.append((row["episode_index"], folder / described["data_path"].format(**place)))
-    return [Path(f"{file}#{index}") for index, file in sorted(names)]
+    template, names = _described(folder)["data_path"], []
+    for index, row in sorted(_episodes(folder).items()):
+        # One that meta/episodes names no video for is refused here, before anything is decoded.
+        _videos(folder, row)
+        names.append(Path(f"{folder / _place(template, row, 'data')}#{index}"))
+    return names
 
 
 def rate(path: Path) -> float:
@@ -59,41 +78,85 @@ def rate(path: Path) -> float:
     return float(_described(_folder(path))["fps"])
 
 
-def tables(path: Path) -> dict[str, Any]:
-    """The rows of an episode by feature: arrays, and of pictures a list of bytes. Beside it `names` and `columns`, by feature."""
-    file, index = split(path)
+def files(path: Path) -> list[Path]:
+    """The files that an episode's samples are in."""
+    videos = _videos(_folder(path), _episode(path)).values()
+    return [split(path)[0], *sorted({video.file for video in videos})]
+
+
+def description(path: Path) -> str:
+    """The hash of what the data set says of an episode: which names and times it has may change without its samples."""
     described = _described(_folder(path))
+    said = [described["fps"], described["features"], _episode(path)]
+    return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+
+
+def tables(path: Path) -> dict[str, Any]:
+    """The rows of an episode by feature: arrays, and of pictures a list. Beside it `names` and `columns`, by feature;
+    `videos`, by feature; `fps`."""
+    file, index = split(path)
+    folder, row = _folder(path), _episode(path)
+    described = _described(folder)
     table = _parquet().read_table(file, filters=[("episode_index", "=", index)])
+    if len(table) != row["length"]:
+        raise DatasetError(f"{file}: {len(table)} rows, where meta/episodes has {row['length']}")
     features = described["features"]
-    found = {name: _column(table, name, feature) for name, feature in features.items() if name in table.column_names}
-    videos = {name for name, feature in features.items() if feature["dtype"] == "video"}
-    names = {name: f.get("names") for name, f in features.items()}
-    columns = {name: f.get("columns", f.get("names")) for name, f in features.items()}
-    return found | {"names": names, "columns": columns, "videos": videos}
+    found = {name: _column(folder, table, name, f) for name, f in features.items() if name in table.column_names}
+    names = {name: _names(f, f.get("names")) for name, f in features.items()}
+    columns = {name: _names(f, f.get("columns", f.get("names"))) for name, f in features.items()}
+    return found | {"names": names, "columns": columns, "videos": _videos(folder, row), "fps": described["fps"]}
 
 
-def _column(table: pa.Table, name: str, feature: dict[str, Any]) -> Any:
+def _column(folder: Path, table: pa.Table, name: str, feature: dict[str, Any]) -> Any:
     column = table.column(name)
     if feature["dtype"] == "image":
-        return [row["bytes"] for row in column.to_pylist()]
+        # What LeRobot has not embedded yet is a file.
+        return [folder / row["path"] if row["bytes"] is None else row["bytes"] for row in column.to_pylist()]
     values = np.array(column.to_pylist())
-    return values[:, None] if values.ndim == 1 else values
+    return values.reshape(len(values), -1)
 
 
-def pictures(rows: dict[str, Any], modality: str) -> list[NDArray[np.uint8] | None] | None:
-    """Of a camera, where it is present; none if the data set has no such camera. A damaged one is none."""
-    feature = f"observation.images.{modality}"
-    if feature in rows["videos"]:
-        raise DatasetError(f"{feature} is a video, which is not read: export with --pictures jpeg")
-    if feature not in rows:
+def _names(feature: dict[str, Any], names: Any) -> list[str]:
+    """Of each number of a feature; none if they are of something else. LeRobot has them in a list, in lists by a key
+    (`motors`), or has the places by name."""
+    if isinstance(names, dict):
+        lists = [inner for inner in names.values() if isinstance(inner, list)]
+        names = sum(lists, []) if lists else sorted(names, key=lambda name: names[name])
+    return names if names and len(names) == math.prod(feature["shape"]) else []
+
+
+def pictures(rows: dict[str, Any], modality: str) -> Iterator[NDArray[np.uint8] | None] | None:
+    """Of a camera, where it is present; none if the data set has no such camera. A damaged picture is none, of a damaged
+    video nothing serves: after it frames may be wrong and look right."""
+    feature = _camera(rows, modality)
+    if feature is None:
         return None
-    present = _present(rows, modality, len(rows[feature]))
-    return [_picture(data) if there else None for data, there in zip(rows[feature], present, strict=True)]
+    present = _present(rows, modality, len(rows["frame_index"]))
+    if feature in rows["videos"]:
+        shown = zip(_frames(rows, feature), present, strict=True)
+        return (picture if there else None for picture, there in shown)
+    return (_picture(data) if there else None for data, there in zip(rows[feature], present, strict=True))
 
 
-def _picture(data: bytes) -> NDArray[np.uint8] | None:
+def _camera(rows: dict[str, Any], modality: str) -> str | None:
+    """The feature with the pictures of a camera."""
+    features = (f"observation.images.{modality}", f"observation.{modality}")
+    return next((f for f in features if f in rows["videos"] or isinstance(rows.get(f), list)), None)
+
+
+def _frames(rows: dict[str, Any], feature: str) -> Iterator[NDArray[np.uint8]]:
+    """Of each row, by its time."""
+    video, times = rows["videos"][feature], rows["timestamp"].ravel()
+    count = round((video.end - video.begin) * rows["fps"])
+    if count != len(times):
+        part = f"{count} frames from {video.begin:.4f} to {video.end:.4f} s"
+        raise DatasetError(f"{video.file}: {part} by meta/episodes, where the episode has {len(times)} rows")
+    return _decoder().frames(video.file, video.begin + times)
+
+
+def _picture(data: bytes | Path) -> NDArray[np.uint8] | None:
     try:
-        return np.array(Image.open(io.BytesIO(data)).convert("RGB"))
+        return np.array(Image.open(data if isinstance(data, Path) else io.BytesIO(data)).convert("RGB"))
     # Pillow has errors of its own for each format and each kind of damage.
     except Exception:
         return None
@@ -104,7 +167,7 @@ def numbers(rows: dict[str, Any], modality: str) -> tuple[NDArray[np.float64], N
     columns = _columns(rows, modality)
     if columns and "observation.state" in rows:
         values = rows["observation.state"][:, columns]
-    elif f"observation.{modality}" in rows:
+    elif isinstance(rows.get(f"observation.{modality}"), np.ndarray):
         values = rows[f"observation.{modality}"]
     else:
         return None
@@ -112,10 +175,10 @@ def numbers(rows: dict[str, Any], modality: str) -> tuple[NDArray[np.float64], N
 
 
 def _columns(rows: dict[str, Any], modality: str) -> list[int]:
-    """The places in observation.state of the numbers 0, 1 ... of a sensor."""
+    """The places in observation.state of the numbers of a sensor: in their order, or in that of the columns."""
     names = rows["columns"].get("observation.state") or []
-    found = [(name.rpartition("."), i) for i, name in enumerate(names) if isinstance(name, str)]
-    mine = [(number, i) for (owner, _, number), i in found if owner == modality]
+    found = [(name, *name.rpartition("."), i) for i, name in enumerate(names) if isinstance(name, str)]
+    mine = [(number, i) for name, owner, _, number, i in found if modality in (owner, name)]
     if not all(number.isdecimal() for number, _ in mine):
         return [i for _, i in mine]
     mine = sorted((int(number), i) for number, i in mine)
@@ -137,7 +200,7 @@ def presence(rows: dict[str, Any], modality: str, count: int) -> dict[str, NDArr
 
 def _has(rows: dict[str, Any], modality: str) -> bool:
     """Whether the data set has the sensor."""
-    return bool({f"observation.images.{modality}", f"observation.{modality}"} & rows.keys() or _columns(rows, modality))
+    return bool(_camera(rows, modality) or f"observation.{modality}" in rows or _columns(rows, modality))
 
 
 def _present(rows: dict[str, Any], modality: str, count: int) -> NDArray[np.bool_]:
@@ -161,16 +224,71 @@ def _folder(path: Path) -> Path:
 
 
 def _described(folder: Path) -> dict[str, Any]:
-    described = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+    described = _read_description(_now(folder / DESCRIPTION))
     version = described.get("codebase_version")
     if version != VERSION:
         raise DatasetError(f"{DESCRIPTION}: version {version!r}: convert it to {VERSION} with LeRobot's converter")
     return described
 
 
+@functools.lru_cache(maxsize=4)
+def _read_description(file: tuple[Path, int, int]) -> dict[str, Any]:
+    return json.loads(file[0].read_text(encoding="utf-8"))
+
+
+def _videos(folder: Path, row: dict[str, Any]) -> dict[str, Video]:
+    """The parts of videos that are an episode's, by feature."""
+    described, found = _described(folder), {}
+    for name, feature in described["features"].items():
+        if feature["dtype"] == "video":
+            file = _place(described["video_path"], row, f"videos/{name}", video_key=name)
+            span = [row[f"videos/{name}/{end}_timestamp"] for end in ("from", "to")]
+            found[name] = Video(folder / file, *span)
+    return found
+
+
+def _place(template: str, row: dict[str, Any], what: str, **names: str) -> str:
+    """The file of an episode's rows or frames."""
+    places = {name: row[f"{what}/{name}"] for name in ("chunk_index", "file_index")}
+    return template.format(**places, **names)
+
+
+def _episode(path: Path) -> dict[str, Any]:
+    """What the data set says of an episode."""
+    return _episodes(_folder(path))[split(path)[1]]
+
+
+def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
+    """What the data set says of each episode, without statistics."""
+    return _read_episodes(tuple(_now(file) for file in sorted((folder / "meta/episodes").glob("*/*.parquet"))))
+
+
+def _now(file: Path) -> tuple[Path, int, int]:
+    """A file as it is: what is read of it is kept, since each of many episodes asks, until it changes."""
+    stat = file.stat()
+    return file, stat.st_size, stat.st_mtime_ns
+
+
+@functools.lru_cache(maxsize=4)
+def _read_episodes(files: tuple[tuple[Path, int, int], ...]) -> dict[int, dict[str, Any]]:
+    pq, episodes = _parquet(), {}
+    for file, *_ in files:
+        columns = [c for c in pq.read_schema(file).names if c in ("episode_index", "length") or c.startswith(PLACES)]
+        episodes |= {row["episode_index"]: row for row in pq.read_table(file, columns=columns).to_pylist()}
+    return episodes
+
+
 def _parquet() -> Any:
     try:
         import pyarrow.parquet
     except ImportError as error:
-        raise DatasetError(f"data sets of LeRobot need pyarrow ({error}): pip install pyarrow") from error
+        raise MissingPackage(f"data sets of LeRobot need pyarrow ({error}): pip install pyarrow") from error
     return pyarrow.parquet
+
+
+def _decoder() -> Any:
+    try:
+        from . import video
+    except ImportError as error:
+        raise MissingPackage(f"data sets of LeRobot with videos need PyAV ({error}): pip install av") from error
+    return video
