@@ -5,7 +5,7 @@ out=/tmp/bench/out
 
 # Seconds after which a wait gives up, however few it names: a watchdog for hangs. Speed depends on the machine, and no
 # scenario judges it.
-watchdog=300
+watchdog=900
 
 # wait_for SECONDS COMMAND...: until the command succeeds; SECONDS is the time it may take on an idle machine.
 # A question starts processes, which an emulated machine has no time for while rapid starts on it: few are asked after 2 s.
