@@ -46,9 +46,9 @@ def main() -> None:
 def verify(spec: Experiment, folders: list[Path], folder: Path) -> int:
     """Hashes everything; the exit status."""
     cache = Cache(folder, sources(spec))
-    entries = [cache.entry(file.absolute()) for place in folders for file in episode_files(place)]
-    wrong = cache.verify(entries)
-    print("\n".join([*wrong, f"{len(entries)} episodes, {len(wrong)} wrong"]))
+    files = [file.absolute() for place in folders for file in episode_files(place)]
+    wrong = cache.verify(map(cache.entry, files))
+    print("\n".join([*wrong, f"{len(files)} episodes, {len(wrong)} wrong"]))
     return 1 if wrong else 0
 
 
