@@ -63,7 +63,8 @@ def bench(spec: Experiment, episodes: list[Episode], seconds: float = 4.0) -> di
     decoded = _rate(lambda i: read_episode(episodes[i].path, wanted), sizes, seconds)
     pixels = [sum(array.nbytes for array in e.arrays.values()) for e in episodes]
     read = _rate(lambda i: _copy(episodes[i]), sizes, seconds)
-    dataset, random = Dataset(spec, episodes), np.random.default_rng(0)
+    folder = episodes[0].arrays.file.parent
+    dataset, random = Dataset(spec, episodes, folder=folder), np.random.default_rng(0)
     rows, steps, size = sum(len(e) for e in episodes), spec.policy.n_obs_steps, spec.training.windows
     # A window is as much of the files as its ticks are of all.
     share = sum(sizes) / rows * steps * size

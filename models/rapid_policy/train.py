@@ -369,8 +369,9 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
             f"{args.experiment}: {changed}: not as in {checkpoint}: use another --out, or leave it as it was"
         )
     corpus = open_corpus(spec, args, ranks)
-    dataset = Dataset(spec, corpus.training)
-    held_out = Dataset(spec, corpus.held_out, dataset.ranges) if corpus.held_out and ranks.first else None
+    dataset, held_out = Dataset(spec, corpus.training, folder=corpus.folder), None
+    if corpus.held_out and ranks.first:
+        held_out = Dataset(spec, corpus.held_out, dataset.ranges, corpus.folder)
     facts = provenance(corpus.training, command(args, spec))
     facts |= {"hardware": hardware(ranks.device, ranks.world), "held_out": len(corpus.held_out)}
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
