@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -146,7 +147,7 @@ def _unit(pictures: NDArray[np.uint8]) -> torch.Tensor:
 
 
 def gather(
-    spec: Classification, o: Input, episodes: list[Episode], labels: list[int], contact: list[NDArray[np.bool_]]
+    spec: Classification, o: Input, episodes: Sequence[Episode], labels: list[int], contact: list[NDArray[np.bool_]]
 ) -> Pictures:
     """The pictures of one input at all ticks in contact."""
     name, size = picture_source(o).name, spec.encoder.pool

@@ -8,6 +8,8 @@ Below DIR is a folder for each set of modalities and sizes that an experiment re
 named by the SHA-256 of its source, with the arrays of `Episode` one behind the other; and `index.jsonl`, where the last
 line about a source holds. Files are complete when they have their name, and lines are appended whole: an interrupted
 run leaves what it finished. A source whose size or time of change differs is hashed again.
+
+What is known of an episode is read from the index when it is needed; in memory is where its line begins.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -34,8 +36,10 @@ from .lerobot_source import description, files, split
 MAGIC = b"RAPIDCACHE2\n"
 ALIGN = 64
 INDEX = "index.jsonl"
-# Maps that are open at a time; each costs address space and no memory.
+# Maps that are open at a time; each costs address space, a file descriptor (of 1024 by default) and no memory.
 OPEN = 512
+# Sources that wait for each process that decodes.
+QUEUED = 4
 
 
 @dataclass
@@ -68,18 +72,20 @@ class Cache:
         self.folder, self.wanted = folder / recipe[:16], wanted
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "sources.json").write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
-        self._entries = {entry.path: entry for entry in _read_index(self.folder / INDEX)}
+        self._index = self.folder / INDEX
+        # Where the last line about each source begins.
+        self._lines = dict(_read_index(self._index))
 
     def entry(self, path: Path) -> Entry:
         """What is known of a file as it is now; read from the disk if it has changed."""
         state = _state(path)
-        known = self._entries.get(str(path))
+        known = self._known(str(path))
         if known and state.items() <= asdict(known).items():
             return known
         digest = sha256(path)
         entry = Entry(str(path), sha256=digest, **state)
         if known and known.sha256 == digest:
-            entry = Entry(**{**asdict(known), **state})
+            entry = replace(known, **state)
         else:
             try:
                 entry.facts = asdict(read_facts(path))
@@ -90,14 +96,19 @@ class Cache:
 
     def record(self, entry: Entry) -> None:
         """Writes a line about a source."""
-        self._entries[entry.path] = entry
-        line = json.dumps(asdict(entry)) + "\n"
-        with (self.folder / INDEX).open("ab", buffering=0) as file:
-            file.write(line.encode())
+        line = (json.dumps(asdict(entry)) + "\n").encode()
+        with self._index.open("ab", buffering=0) as file:
+            file.write(line)
+            # Another process may have written before it.
+            self._lines[entry.path] = file.tell() - len(line)
 
-    def build(self, entries: list[Entry], workers: int) -> None:
+    def _known(self, path: str) -> Entry | None:
+        at = self._lines.get(path)
+        return None if at is None else _read_line(self._index, at)
+
+    def build(self, entries: Iterable[Entry], workers: int) -> None:
         """Decodes those that are not yet; what cannot be decoded gets its reason."""
-        missing = [e for e in entries if e.error is None and not self._whole(e)]
+        missing = [e.path for e in entries if e.error is None and not self._whole(e)]
         if not missing:
             return
         progress = tqdm(total=len(missing), desc="decoding", unit="episode", disable=not sys.stderr.isatty())
@@ -107,17 +118,21 @@ class Cache:
                 self.record(Entry(**{**asdict(entry), **changed, "facts": made.get("facts", entry.facts)}))
                 progress.update()
 
-    def _make(self, missing: list[Entry], workers: int) -> Iterator[tuple[Entry, dict[str, Any]]]:
-        jobs = [(entry, self.file(entry.sha256)) for entry in missing]
-        if workers <= 1 or len(jobs) == 1:
+    def _make(self, missing: list[str], workers: int) -> Iterator[tuple[Entry, dict[str, Any]]]:
+        jobs = ((entry, self.file(entry.sha256)) for entry in map(self._known, missing))
+        if workers <= 1 or len(missing) == 1:
             yield from ((entry, _decode(entry.path, entry.sha256, self.wanted, file)) for entry, file in jobs)
             return
+        running: dict[Future[dict[str, Any]], Entry] = {}
         # Not forked: a fork of a process with threads may hang.
-        with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=get_context("spawn")) as pool:
-            running = {pool.submit(_decode, e.path, e.sha256, self.wanted, file): e for e, file in jobs}
+        with ProcessPoolExecutor(min(workers, len(missing)), mp_context=get_context("spawn")) as pool:
             try:
-                for done in as_completed(running):
-                    yield running[done], done.result()
+                for entry, file in jobs:
+                    running[pool.submit(_decode, entry.path, entry.sha256, self.wanted, file)] = entry
+                    if len(running) == QUEUED * workers:
+                        yield from _finished(running)
+                while running:
+                    yield from _finished(running)
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
 
@@ -134,14 +149,17 @@ class Cache:
 
     def file(self, digest: str) -> Path:
         """Of an episode."""
-        return self.folder / f"{digest}.episode"
+        return _file(self.folder, digest)
 
     def episode(self, entry: Entry) -> Episode:
         """A decoded episode; its arrays are mapped when they are read."""
-        now = self._entries[entry.path]
-        return Episode(Path(now.path), Facts(**now.facts), Mapped(self.file(now.sha256)), now.sha256)
+        return _episode(self.folder, entry)
 
-    def verify(self, entries: list[Entry]) -> list[str]:
+    def episodes(self, paths: Iterable[str]) -> Decoded:
+        """Decoded episodes as they are now."""
+        return Decoded(self.folder, np.fromiter((self._lines[path] for path in paths), np.int64))
+
+    def verify(self, entries: Iterable[Entry]) -> list[str]:
         """Hashes every source and every decoded file; a line for each that is not what the index says.
 
         A decoded file that is damaged is removed, so that the next run makes it again.
@@ -149,14 +167,32 @@ class Cache:
         wrong = []
         _hashed.cache_clear()
         for entry in entries:
-            now, file = self._entries[entry.path], self.file(entry.sha256)
-            if sha256(Path(entry.path)) != now.sha256:
+            file = self.file(entry.sha256)
+            if sha256(Path(entry.path)) != entry.sha256:
                 wrong.append(f"{entry.path}: changed without a new time of change")
-                self.record(Entry(**{**asdict(now), "changed_ns": 0}))
-            elif now.content is not None and (not file.exists() or sha256(file) != now.content):
+                self.record(replace(entry, changed_ns=0))
+            elif entry.content is not None and (not file.exists() or sha256(file) != entry.content):
                 wrong.append(f"{file}: damaged; removed")
                 file.unlink(missing_ok=True)
         return wrong
+
+
+class Decoded(Sequence[Episode]):
+    """Episodes of a cache, each read from its line of the index when it is asked for."""
+
+    def __init__(self, folder: Path, lines: NDArray[np.int64]) -> None:
+        self._folder, self._lines = folder, lines
+        self._episode = functools.lru_cache(maxsize=OPEN)(lambda at: _episode(folder, _read_line(folder / INDEX, at)))
+
+    def __getitem__(self, row: int) -> Episode:
+        return self._episode(int(self._lines[row]))
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def part(self, rows: Sequence[int]) -> Decoded:
+        """Some of them."""
+        return Decoded(self._folder, self._lines[rows])
 
 
 class Mapped(Mapping[str, NDArray[Any]]):
@@ -240,16 +276,43 @@ def _decode(path: str, digest: str, wanted: tuple[Source, ...], file: Path) -> d
         return {"error": error.what}
 
 
-def _read_index(file: Path) -> Iterator[Entry]:
+def _file(folder: Path, digest: str) -> Path:
+    return folder / f"{digest}.episode"
+
+
+def _episode(folder: Path, entry: Entry) -> Episode:
+    return Episode(Path(entry.path), Facts(**entry.facts), Mapped(_file(folder, entry.sha256)), entry.sha256)
+
+
+def _finished(running: dict[Future[dict[str, Any]], Entry]) -> list[tuple[Entry, dict[str, Any]]]:
+    """Takes out those that are done, at least one."""
+    return [(running.pop(done), done.result()) for done in wait(running, return_when=FIRST_COMPLETED).done]
+
+
+def _read_index(file: Path) -> Iterator[tuple[str, int]]:
+    """The source that each whole line is about, and where the line begins."""
     if not file.exists():
         return
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            known = json.loads(line)
-            yield Entry(**{**known, "reasons": tuple(known["reasons"])})
-        except (ValueError, TypeError, KeyError):
-            # The end of a line that a full disk or a power cut took; its source is read again.
-            continue
+    at = 0
+    with file.open("rb") as opened:
+        for line in opened:
+            try:
+                yield _entry(line).path, at
+            except (ValueError, TypeError, KeyError):
+                # The end of a line that a full disk or a power cut took; its source is read again.
+                pass
+            at += len(line)
+
+
+def _read_line(file: Path, at: int) -> Entry:
+    with file.open("rb") as opened:
+        opened.seek(at)
+        return _entry(opened.readline())
+
+
+def _entry(line: bytes) -> Entry:
+    known = json.loads(line)
+    return Entry(**{**known, "reasons": tuple(known["reasons"])})
 
 
 def sha256(path: Path) -> str:

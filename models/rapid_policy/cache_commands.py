@@ -46,9 +46,9 @@ def main() -> None:
 def verify(spec: Experiment, folders: list[Path], folder: Path) -> int:
     """Hashes everything; the exit status."""
     cache = Cache(folder, sources(spec))
-    entries = [cache.entry(file.absolute()) for place in folders for file in episode_files(place)]
-    wrong = cache.verify(entries)
-    print("\n".join([*wrong, f"{len(entries)} episodes, {len(wrong)} wrong"]))
+    files = [file.absolute() for place in folders for file in episode_files(place)]
+    wrong = cache.verify(map(cache.entry, files))
+    print("\n".join([*wrong, f"{len(files)} episodes, {len(wrong)} wrong"]))
     return 1 if wrong else 0
 
 
@@ -63,7 +63,8 @@ def bench(spec: Experiment, episodes: list[Episode], seconds: float = 4.0) -> di
     decoded = _rate(lambda i: read_episode(episodes[i].path, wanted), sizes, seconds)
     pixels = [sum(array.nbytes for array in e.arrays.values()) for e in episodes]
     read = _rate(lambda i: _copy(episodes[i]), sizes, seconds)
-    dataset, random = Dataset(spec, episodes), np.random.default_rng(0)
+    folder = episodes[0].arrays.file.parent
+    dataset, random = Dataset(spec, episodes, folder=folder), np.random.default_rng(0)
     rows, steps, size = sum(len(e) for e in episodes), spec.policy.n_obs_steps, spec.training.windows
     # A window is as much of the files as its ticks are of all.
     share = sum(sizes) / rows * steps * size

@@ -6,8 +6,9 @@ An episode that is damaged or of no use is left out with its reason and never th
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from .cache import Cache, Entry
 from .classification import Classification
 from .episodes import ABSENCES, Episode, EpisodeError, Facts, episode_files, picture_source, sources
 from .experiment import Data, Experiment
-from .judgement import JudgementError, judge, program
+from .judgement import AT_ONCE, JudgementError, judge, program
 from .lerobot_source import MissingPackage, split
 
 SHOWN = 20
@@ -25,12 +26,14 @@ SHOWN = 20
 class Corpus:
     """The episodes of an experiment."""
 
-    training: list[Episode]
-    held_out: list[Episode]
+    training: Sequence[Episode]
+    held_out: Sequence[Episode]
     left_out: list[str]
     """A line for each file that is of no use, with the reason."""
     unwanted: int
     """Files that the filters of the experiment leave out."""
+    folder: Path
+    """In the cache, where these are decoded."""
 
     absences: dict[str, int] = field(default_factory=dict)
     """Rows without a picture of those that are not required, by the reason."""
@@ -40,7 +43,8 @@ class Corpus:
         lines = [*self.left_out[:SHOWN]]
         if len(self.left_out) > SHOWN:
             lines.append(f"and {len(self.left_out) - SHOWN} more")
-        lines += [f"{e.path}: note: {note}" for e in [*self.training, *self.held_out][:SHOWN] for note in e.facts.notes]
+        first = itertools.islice(itertools.chain(self.training, self.held_out), SHOWN)
+        lines += [f"{e.path}: note: {note}" for e in first for note in e.facts.notes]
         if any(self.absences.values()):
             found = ", ".join(f"{count} by {reason}" for reason, count in self.absences.items() if count)
             lines.append(f"rows without a picture: {found}")
@@ -50,44 +54,51 @@ class Corpus:
 
 def load(spec: Experiment | Classification, folders: Sequence[Path], cache_folder: Path, workers: int = 1) -> Corpus:
     """The episodes in `folders`, decoded into the cache by so many processes."""
-    files = [file.absolute() for folder in folders for file in episode_files(folder)]
+    files = [str(file.absolute()) for folder in folders for file in episode_files(folder)]
     cache = Cache(cache_folder, sources(spec))
-    entries = [cache.entry(file) for file in files]
-    entries = _judged(cache, entries)
+    _judge(cache, files)
     left_out, wanted, unwanted = [], [], 0
-    for entry in entries:
+    for file in files:
+        entry = cache.entry(Path(file))
         if entry.verdict not in spec.data.verdict:
             left_out.append(f"{entry.path}: left out, {entry.verdict or 'no verdict'}: {'; '.join(entry.reasons)}")
         elif entry.error is None and not matches(spec.data, Facts(**entry.facts)):
             unwanted += 1
         else:
-            wanted.append(entry)
+            wanted.append(file)
     try:
-        cache.build(wanted, workers)
+        cache.build(_entries(cache, wanted), workers)
     except MissingPackage as error:
         raise EpisodeError(folders[0], str(error)) from error
-    episodes = []
-    for entry in (cache.entry(Path(e.path)) for e in wanted):
-        episode = cache.episode(entry) if entry.error is None else None
-        reason = entry.error if episode is None else _unfit(spec, episode)
-        if episode is None or reason:
+    fit = []
+    for file in wanted:
+        entry = cache.entry(Path(file))
+        reason = _unfit(spec, cache.episode(entry)) if entry.error is None else entry.error
+        if entry.error is not None or reason:
             left_out.append(f"{entry.path}: left out, {reason}")
         else:
-            episodes.append(episode)
-    if not episodes:
+            fit.append(file)
+    if not fit:
         found = f"{len(left_out)} left out, {unwanted} not asked for"
         first = f"; the first: {left_out[0]}" if left_out else ": check the filters in [data]"
         raise EpisodeError(folders[0], f"no episode that is fit to learn from: {found}{first}")
-    training, held_out = divide(spec.data, episodes)
-    return Corpus(training, held_out, left_out, unwanted, _absences(spec, episodes))
+    episodes = cache.episodes(fit)
+    training, held_out = (episodes.part(rows) for rows in divide(spec.data, episodes))
+    return Corpus(training, held_out, left_out, unwanted, cache.folder, _absences(spec, episodes))
 
 
-def _absences(spec: Experiment | Classification, episodes: list[Episode]) -> dict[str, int]:
+def _entries(cache: Cache, files: Iterable[str]) -> Iterator[Entry]:
+    """One after the other: what is known of all of them is not kept in memory."""
+    return (cache.entry(Path(file)) for file in files)
+
+
+def _absences(spec: Experiment | Classification, episodes: Sequence[Episode]) -> dict[str, int]:
     names = [picture_source(o).name for o in spec.images if not o.required]
-    return {
-        reason: sum(int(episode.absent(name, reason).sum()) for episode in episodes for name in names)
-        for reason in ABSENCES
-    }
+    counts = dict.fromkeys(ABSENCES, 0)
+    for episode in episodes:
+        for name, reason in itertools.product(names, ABSENCES):
+            counts[reason] += int(episode.absent(name, reason).sum())
+    return counts
 
 
 def _unfit(spec: Experiment | Classification, episode: Episode) -> str | None:
@@ -99,26 +110,28 @@ def _unfit(spec: Experiment | Classification, episode: Episode) -> str | None:
     return unfit(spec, episode)
 
 
-def _judged(cache: Cache, entries: list[Entry]) -> list[Entry]:
-    """With the verdict of `rapid inspect`, asked once for each content and version of the program. A data set of LeRobot
-    has none: all of its episodes are taken."""
-    rows = [entry for entry in entries if split(Path(entry.path))[1] is not None]
-    for entry in rows:
-        if entry.verdict is None:
+def _judge(cache: Cache, files: list[str]) -> None:
+    """Asks for the verdict of `rapid inspect`, once for each content and version of the program. A data set of LeRobot has
+    none: all of its episodes are taken."""
+    recorded = []
+    for file in files:
+        if split(Path(file))[1] is None:
+            recorded.append(file)
+        elif (entry := cache.entry(Path(file))).verdict is None:
             cache.record(replace(entry, verdict="GOOD"))
-    files = [entry for entry in entries if entry not in rows]
-    if not files:
-        return [cache.entry(Path(entry.path)) for entry in entries]
+    if not recorded:
+        return
     try:
         asked = _version(program())
-        unknown = [entry for entry in files if entry.judged_by != asked]
-        judged = judge([Path(entry.path) for entry in unknown])
+        unknown = [entry.path for entry in _entries(cache, recorded) if entry.judged_by != asked]
+        for first in range(0, len(unknown), AT_ONCE):
+            entries = list(_entries(cache, unknown[first : first + AT_ONCE]))
+            judged = judge([Path(entry.path) for entry in entries])
+            for entry in entries:
+                found = judged[Path(entry.path)]
+                cache.record(replace(entry, verdict=found.verdict, reasons=found.reasons, judged_by=asked))
     except JudgementError as error:
-        raise EpisodeError(Path(files[0].path).parent, str(error)) from error
-    for entry in unknown:
-        judgement = judged[Path(entry.path)]
-        cache.record(replace(entry, verdict=judgement.verdict, reasons=judgement.reasons, judged_by=asked))
-    return [cache.entry(Path(entry.path)) for entry in entries]
+        raise EpisodeError(Path(recorded[0]).parent, str(error)) from error
 
 
 def _version(rapid: str) -> str:
@@ -140,17 +153,16 @@ def matches(data: Data, facts: Facts) -> bool:
     return seed.isdigit() and data.seeds[0] <= int(seed) <= data.seeds[1]
 
 
-def divide(data: Data, episodes: list[Episode]) -> tuple[list[Episode], list[Episode]]:
-    """Those learned from and those held out: by a hash, so that more episodes change nothing for the others."""
+def divide(data: Data, episodes: Sequence[Episode]) -> tuple[list[int], list[int]]:
+    """Which are learned from and which are held out: by a hash, so that more episodes change nothing for the others."""
     if not data.validation:
-        return episodes, []
+        return list(range(len(episodes))), []
     places = [_place(data, episode) for episode in episodes]
     border = max(data.validation, min(places))
-    held_out = [e for e, place in zip(episodes, places, strict=True) if place <= border]
-    training = [e for e, place in zip(episodes, places, strict=True) if place > border]
+    training = [row for row, place in enumerate(places) if place > border]
     if not training:
         raise EpisodeError(episodes[0].path.parent, "all episodes are held out: record more, or write validation = 0")
-    return training, held_out
+    return training, [row for row, place in enumerate(places) if place <= border]
 
 
 def _place(data: Data, episode: Episode) -> float:

@@ -3,12 +3,19 @@
 A batch is made in three steps. `plan` makes every random decision, in one order, so that neither workers nor several
 processes change what is learned; `gather` copies what the plan names out of the episodes, which may lie on a disk;
 `inputs` turns pixels into numbers on the device that trains.
+
+What there is of every tick lies in files: pictures in those of the episodes, numbers and windows in ones of this module.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -23,6 +30,9 @@ from .normalize import EXECUTED, MinMax
 
 # The range of the gripper's opening as it was seen, beside those of inputs and actions.
 OPENING = "opening"
+
+# Windows that are looked at together for the ranges of numbers.
+AT_ONCE = 4096
 
 Plan = dict[str, NDArray]
 Bools = NDArray[np.bool_]
@@ -57,62 +67,74 @@ class Dataset:
 
     A window belongs to a tick. It does not reach over a tick that lacks a required modality or an action, nor over a
     gap in the frame index: at such a place one segment ends and another begins, and steps beyond either end repeat it.
-    Pictures stay in the episodes.
+    Pictures stay in the episodes; numbers and windows are copied to files without names in `folder`, which end with the
+    data set. A folder in memory, as the system's for such files may be, makes it cost memory for each tick.
     """
 
-    def __init__(self, spec: Experiment, episodes: Sequence[Episode], ranges: dict[str, MinMax] | None = None) -> None:
-        self.spec, self.episodes = spec, list(episodes)
+    def __init__(self, spec: Experiment, episodes: Sequence[Episode], ranges: dict[str, MinMax] | None = None,
+                 folder: Path | None = None) -> None:  # fmt: skip
+        self.spec, self.episodes = spec, episodes
         self.names = {o.key: picture_source(o).name for o in spec.images}
         # Which of the observations each picture is.
         self.images = [i for i, o in enumerate(spec.observation) if o.kind == "image"]
-        read = [_Rows(spec, e) for e in self.episodes]
-        self.starts = np.cumsum([0, *(len(e) for e in self.episodes)])
-        self.windows = np.concatenate(
-            [r.windows() + start for r, start in zip(read, self.starts[:-1], strict=True)]
-            or [np.empty((0, 3), np.int64)]
-        )
-        if not len(self.windows):
+        read = _on_disk(self._read(), folder)
+        if not len(read.get("windows", ())):
             raise ValueError("no window to learn from: every tick lacks an action or a required modality")
-        self.present = np.concatenate([r.present for r in read])
-        self.targets = np.concatenate([r.targets for r in read])
-        self.now = np.concatenate([r.now for r in read]) if read[0].now is not None else None
-        vectors = {o.key: np.concatenate([r.vectors[o.key] for r in read]) for o in spec.vectors}
+        self.starts = np.cumsum([0, *read["length"]])
+        self.windows = read["windows"]
+        self.present, self.targets, self.now = read["present"], read["targets"], read.get("now")
+        self.vectors = {o.key: read[f"vector {o.key}"] for o in spec.vectors}
         self.ranges = dict(ranges or {})
         if spec.action.gripper_squeeze:
             self._squeeze(spec.action.gripper_squeeze)
         if ranges is None:
-            self.ranges |= self._ranges(vectors)
-        self.vectors = {key: self.ranges[key].apply(values) for key, values in vectors.items()}
+            self.ranges |= self._ranges()
+
+    def _read(self) -> Iterator[dict[str, NDArray]]:
+        """What there is of each episode."""
+        start = 0
+        for episode in self.episodes:
+            rows = _Rows(self.spec, episode)
+            vectors = {f"vector {key}": values for key, values in rows.vectors.items()}
+            now = {} if rows.now is None else {"now": rows.now}
+            every = {"windows": rows.windows() + start, "length": np.array([len(episode)]), "present": rows.present}
+            yield every | {"targets": rows.targets} | now | vectors
+            start += len(episode)
 
     def _squeeze(self, far: float) -> None:
         """The more closed the gripper was, the further it closes: what is wholly open stays so."""
-        opening = self.targets[:, -1:]
         if OPENING not in self.ranges:
-            self.ranges[OPENING] = MinMax.of(OPENING, opening[self.windows[:, 0]])
-        closed = (1 - self.ranges[OPENING].apply(opening).astype(np.float64)) / 2
-        self.targets[:, -1:] = opening - far * closed
+            self.ranges[OPENING] = MinMax.of(OPENING, self._extremes(lambda part: self.targets[part[:, 0], -1:]))
+        for first in range(0, len(self.targets), AT_ONCE):
+            opening = self.targets[first : first + AT_ONCE, -1:]
+            closed = (1 - self.ranges[OPENING].apply(opening).astype(np.float64)) / 2
+            opening -= far * closed
 
-    def _ranges(self, vectors: dict[str, NDArray[np.float64]]) -> dict[str, MinMax]:
-        used = self.windows[:, 0]
+    def _ranges(self) -> dict[str, MinMax]:
         ranges = {}
         for o in self.spec.vectors:
-            ranges[o.key] = MinMax.of(o.key, vectors[o.key][used], _turns([p.take for p in o.sources], o))
+            seen = self._extremes(lambda part, key=o.key: self.vectors[key][part[:, 0]])
+            ranges[o.key] = MinMax.of(o.key, seen, _turns([p.take for p in o.sources], o))
         action = self.spec.action
-        if action.representation == "absolute":
-            seen = [self._actions(used[:, None], used)]
-        else:
-            # What an action is relative to depends on the window.
-            seen = [
-                self._actions(self._done(part), part[:, 0])
-                for part in np.array_split(self.windows, len(used) // 4096 + 1)
-            ]
-        low, high = (np.stack([f(s.reshape(-1, s.shape[-1]), axis=0) for s in seen]) for f in (np.min, np.max))
+        absolute = action.representation == "absolute"
+        # What an action is relative to depends on the window.
+        seen = self._extremes(lambda part: self._actions(part[:, :1] if absolute else self._done(part), part[:, 0]))
         turns = range(POSITION, POSITION + ROTATIONS[action.rotation]) if action.source == "pose" else ()
-        ranges["action"] = MinMax.of("action", np.concatenate([low, high]), turns)
+        ranges["action"] = MinMax.of("action", seen, turns)
         if action.composed:
             turns = range(POSITION, POSITION + QUATERNION) if action.rotation != "none" else ()
-            ranges[EXECUTED] = MinMax.of(EXECUTED, self._executed(used), turns)
+            ranges[EXECUTED] = MinMax.of(EXECUTED, self._extremes(lambda part: self._executed(part[:, 0])), turns)
         return ranges
+
+    def _extremes(self, numbers: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """[2, D] the least and the greatest of the numbers [..., D] of all windows."""
+        found = []
+        for first in range(0, len(self.windows), AT_ONCE):
+            seen = numbers(self.windows[first : first + AT_ONCE])
+            seen = seen.reshape(-1, seen.shape[-1])
+            found.append((seen.min(0), seen.max(0)))
+        low, high = zip(*found, strict=True)
+        return np.stack([np.min(low, 0), np.max(high, 0)])
 
     def _executed(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """[T, D] absolute actions as the program executes them; of a rotation anything, its range is known."""
@@ -184,7 +206,7 @@ class Dataset:
         for i, o in enumerate(spec.observation):
             if o.kind == "image":
                 continue
-            values = self.vectors[o.key][plan["seen"][..., i]]
+            values = self.ranges[o.key].apply(self.vectors[o.key][plan["seen"][..., i]])
             if (noise := plan.get(f"noise {o.key}")) is not None:
                 values = values + noise
             batch.vectors[o.key] = torch.from_numpy(values)
@@ -328,6 +350,31 @@ def _shift(picture: NDArray[np.uint8], corner: Sequence[int], pool: int, out: ND
 def _unit(pictures: Tensor) -> Tensor:
     """u8 [N, H, W, 3] -> f32 [N, 3, H, W] in 0..1"""
     return pictures.permute(0, 3, 1, 2).float() / 255
+
+
+def _on_disk(parts: Iterator[dict[str, NDArray]], folder: Path | None) -> dict[str, NDArray]:
+    """The arrays of each name one behind the other, mapped from a file. They are written before they are mapped: a full
+    disk is an error, and no signal."""
+    files: dict[str, BinaryIO] = {}
+    rows: dict[str, tuple[np.dtype, tuple[int, ...]]] = {}
+    with contextlib.ExitStack() as opened:
+        for part in parts:
+            for name, array in part.items():
+                if name not in files:
+                    files[name] = opened.enter_context(tempfile.TemporaryFile(dir=folder))
+                    rows[name] = array.dtype, array.shape[1:]
+                if rows[name] != (array.dtype, array.shape[1:]):
+                    raise ValueError(f"{name}: {array.dtype} {array.shape[1:]} after {rows[name]}")
+                files[name].write(array.tobytes())
+        return {name: _map(file, *rows[name]) for name, file in files.items()}
+
+
+def _map(file: BinaryIO, kind: np.dtype, row: tuple[int, ...]) -> NDArray:
+    """[N, ...] as many as are in the file; nothing has no map."""
+    if not file.seek(0, os.SEEK_END):
+        return np.empty((0, *row), kind)
+    # As a plain array: each slice of a memmap costs as much again.
+    return np.memmap(file, kind, "r+").reshape(-1, *row).view(np.ndarray)
 
 
 def _turns(takes: list[str], o: Observation) -> list[int]:

@@ -21,7 +21,7 @@ import shutil
 import signal
 import sys
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -250,28 +250,29 @@ def half_width(device: torch.device) -> bool:
 
 def provenance(episodes: Sequence[Episode], command: str) -> dict[str, Any]:
     """The origin of the weights: training data and software."""
-    digest = hashlib.sha256()
+    digest, frames, recorded_by = hashlib.sha256(), 0, set()
+    seeds: list[int] = []
+    tags: dict[str, Counter[str]] = defaultdict(Counter)
     for episode in episodes:
         digest.update(bytes.fromhex(episode.sha256))
-    tags = [e.facts.tags for e in episodes]
-    seeds = sorted(int(t["seed"]) for t in tags if t.get("seed", "").isdigit())
+        frames += len(episode)
+        recorded_by.add(episode.facts.software)
+        for key, value in episode.facts.tags.items():
+            if key != "seed":
+                tags[key][value] += 1
+            elif value.isdigit():
+                seeds = [min([*seeds, int(value)]), max([*seeds, int(value)])]
     return {
         "episodes": len(episodes),
-        "frames": sum(len(e) for e in episodes),
-        "tags": _counted(tags),
-        "episode_seeds": [seeds[0], seeds[-1]] if seeds else None,
+        "frames": frames,
+        "tags": {key: dict(sorted(of.items())) for key, of in sorted(tags.items()) if len(of) <= COUNTED},
+        "episode_seeds": seeds or None,
         "episodes_sha256": digest.hexdigest(),
-        "recorded_by": sorted({e.facts.software for e in episodes}),
+        "recorded_by": sorted(recorded_by),
         "command": command,
         "torch": str(torch.__version__),
         "python": platform.python_version(),
     }
-
-
-def _counted(tags: list[dict[str, str]]) -> dict[str, dict[str, int]]:
-    """How many episodes have each value of a tag, of tags with few values."""
-    counts = {key: Counter(t[key] for t in tags if key in t) for key in sorted({key for t in tags for key in t})}
-    return {key: dict(sorted(of.items())) for key, of in counts.items() if key != "seed" and len(of) <= COUNTED}
 
 
 def hardware(device: torch.device, world: int = 1) -> str:
@@ -368,8 +369,9 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
             f"{args.experiment}: {changed}: not as in {checkpoint}: use another --out, or leave it as it was"
         )
     corpus = open_corpus(spec, args, ranks)
-    dataset = Dataset(spec, corpus.training)
-    held_out = Dataset(spec, corpus.held_out, dataset.ranges) if corpus.held_out and ranks.first else None
+    dataset, held_out = Dataset(spec, corpus.training, folder=corpus.folder), None
+    if corpus.held_out and ranks.first:
+        held_out = Dataset(spec, corpus.held_out, dataset.ranges, corpus.folder)
     facts = provenance(corpus.training, command(args, spec))
     facts |= {"hardware": hardware(ranks.device, ranks.world), "held_out": len(corpus.held_out)}
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:

@@ -23,6 +23,7 @@ from rapid_policy.cache import Cache, write
 from rapid_policy.checkpoint import begin
 from rapid_policy.dataset import Dataset
 from rapid_policy.episodes import Episode, Facts, sources
+from rapid_policy.experiment import Experiment
 from rapid_policy.feed import Feed
 from rapid_policy.judgement import Judgement
 
@@ -34,20 +35,16 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    # All of them: the experiment's own seeds are of recorded ones.
-    spec = experiment(data={"seeds": None})
-    for key in ("wrist", "tactile"):
-        spec = observed(spec, key, size=[args.side, args.side])
-    data, folder = args.folder / "data", args.folder / "cache"
+    spec, data, folder = pictures_of(args.side), args.folder / "data", args.folder / "cache"
     data.mkdir(parents=True, exist_ok=True)
     report = {"episodes": args.episodes, "ticks": args.episodes * args.ticks, "MB_before": anonymous()}
-    report["fill_s"] = timed(lambda: fill(spec, data, folder, args))
+    report["fill_s"] = timed(lambda: fill(spec, data, folder, args.episodes, args.ticks, args.side))
     with mock.patch.object(corpus, "judge", judge), mock.patch.object(corpus, "program", lambda: "/bin/true"):
         began = time.monotonic()
         found = corpus.load(spec, [data], folder)
-        report["load_s"] = time.monotonic() - began
+        report["load_s"], report["MB_loaded"] = time.monotonic() - began, anonymous()
     began = time.monotonic()
-    dataset = Dataset(spec, found.training)
+    dataset = Dataset(spec, found.training, folder=found.folder)
     report["windows_s"], report["MB_dataset"] = time.monotonic() - began, anonymous()
     begin(spec, len(dataset.windows), dataset.ranges, {}, torch.device("cpu"))
     feed = Feed(dataset, np.random.default_rng(0), 64, slice(None), 1)
@@ -62,24 +59,32 @@ def main() -> None:
     print(json.dumps({key: round(value, 1) for key, value in report.items()}))
 
 
-def fill(spec, data: Path, folder: Path, args: argparse.Namespace) -> None:
+def pictures_of(side: int) -> Experiment:
+    """An experiment that learns from all episodes: the seeds of the one in the repository are of recorded ones."""
+    spec = experiment(data={"seeds": None})
+    for key in ("wrist", "tactile"):
+        spec = observed(spec, key, size=[side, side])
+    return spec
+
+
+def fill(spec: Experiment, data: Path, folder: Path, episodes: int, ticks: int, side: int) -> None:
     """Episodes that are whole in the cache, each of a file that is its number."""
     cache, random = Cache(folder, sources(spec)), np.random.default_rng(0)
-    pictures = random.integers(0, 256, (args.ticks, args.side, args.side, 3)).astype(np.uint8)
-    for i in range(args.episodes):
+    pictures = random.integers(0, 256, (ticks, side, side, 3)).astype(np.uint8)
+    for i in range(episodes):
         file = data / f"{i:05}.mcap"
         if file.exists():
             continue
         file.write_text(str(i))
         entry = cache.entry(file)
         arrays = {
-            "ticks": np.arange(args.ticks),
-            "times": np.arange(args.ticks) * 100_000_000,
-            "actions": random.uniform(0, 1, (args.ticks, 4)),
-            "acted": np.ones(args.ticks, bool),
-            "value arm": random.uniform(0, 1, (args.ticks, 4)),
+            "ticks": np.arange(ticks),
+            "times": np.arange(ticks) * 100_000_000,
+            "actions": random.uniform(0, 1, (ticks, 4)),
+            "acted": np.ones(ticks, bool),
+            "value arm": random.uniform(0, 1, (ticks, 4)),
         }
-        arrays |= presence(args.ticks, "arm", "cam_wrist", "tactile_tip")
+        arrays |= presence(ticks, "arm", "cam_wrist", "tactile_tip")
         for name in ("cam_wrist", "tactile_tip"):
             arrays |= {f"value {name}": pictures, f"first {name}": np.zeros(1, np.int64)}
         content = write(cache.file(entry.sha256), Episode(file, Facts(), arrays, entry.sha256))
