@@ -49,6 +49,15 @@ class Many(unittest.TestCase):
             dataset.gather(dataset.plan(random, 64))
         return len(dataset.windows)
 
+    def peak(self, windows: int) -> int:
+        """Bytes that reading these takes at most."""
+        tracemalloc.start()
+        self.addCleanup(tracemalloc.stop)
+        self.assertEqual(self.read(), windows)
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
     def test_memory_does_not_grow_with_ticks(self):
         # More windows than are looked at together. What is imported when it is used is so before.
         few, many = 40, 160
@@ -57,11 +66,8 @@ class Many(unittest.TestCase):
         peaks = []
         for episodes in (few, many):
             self.fill(episodes)
-            tracemalloc.start()
-            self.addCleanup(tracemalloc.stop)
-            self.assertEqual(self.read(), episodes * TICKS)
-            peaks.append(tracemalloc.get_traced_memory()[1])
-            tracemalloc.stop()
+            # Python's own tables, such as that of its names, grow at any moment, by megabytes and once.
+            peaks.append(min(self.peak(episodes * TICKS) for _ in range(3)))
         self.assertLess((peaks[1] - peaks[0]) / (many - few), MOST, peaks)
 
     def test_descriptors_do_not_grow_with_episodes(self):
