@@ -108,7 +108,7 @@ class Recorded(Folder):
             self.addCleanup(file.unlink)
         with tempfile.TemporaryDirectory() as cache:
             found = load(self.spec, [self.folder], Path(cache))
-        self.assertEqual([e.path for e in found.training], [self.path])
+            self.assertEqual([e.path for e in found.training], [self.path])
         reasons = "\n".join(found.left_out)
         self.assertRegex(reasons, "changed.mcap: left out, ")
         self.assertRegex(reasons, "cut.mcap: left out, ")
