@@ -60,7 +60,7 @@ class Entry:
     judged_by: str | None = None
     """The program that gave the verdict; none before it is judged."""
     described: str = ""
-    """The hash of what a data set of LeRobot says of it; empty of a file of its own."""
+    """The hash of its description in a data set of LeRobot; empty of a file of its own."""
 
 
 class Cache:
@@ -344,7 +344,7 @@ def _state(path: Path) -> dict[str, Any]:
 
 
 def _stat(file: Path) -> tuple[int, int]:
-    """Its size and its time of change. One that is not there is as an empty one: the episode says that it is missing."""
+    """Its size and its time of change. One that is not there is as an empty one: the reason of the episode names it."""
     try:
         stat = file.stat()
     except FileNotFoundError:

@@ -85,10 +85,10 @@ def files(path: Path) -> list[Path]:
 
 
 def description(path: Path) -> str:
-    """The hash of what the data set says of an episode: which names and times it has may change without its samples."""
+    """The hash of an episode's description: its names and times may change without its samples."""
     described = _described(_folder(path))
-    said = [described["fps"], described["features"], _episode(path)]
-    return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+    whole = [described["fps"], described["features"], _episode(path)]
+    return hashlib.sha256(json.dumps(whole).encode()).hexdigest()
 
 
 def tables(path: Path) -> dict[str, Any]:
@@ -254,12 +254,12 @@ def _place(template: str, row: dict[str, Any], what: str, **names: str) -> str:
 
 
 def _episode(path: Path) -> dict[str, Any]:
-    """What the data set says of an episode."""
+    """The description of an episode in the data set."""
     return _episodes(_folder(path))[split(path)[1]]
 
 
 def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
-    """What the data set says of each episode, without statistics."""
+    """The description of each episode, without statistics."""
     return _read_episodes(tuple(_now(file) for file in sorted((folder / "meta/episodes").glob("*/*.parquet"))))
 
 

@@ -211,7 +211,7 @@ class ExportedVideos(Folder):
         found = load(self.spec, [folder], cache)
         self.assertEqual([e.sha256 for e in found.training], [e.sha256 for e in before.training])
 
-    def test_without_pyav_the_fix_is_said_and_no_episode_is_to_blame(self):
+    def test_without_pyav_the_fix_is_named_and_no_episode_is_left_out(self):
         cache, folder = self.folder / "without", self.folder / "h264"
         with mock.patch.dict(sys.modules, {"av": None}):
             sys.modules.pop("rapid_policy.video", None)

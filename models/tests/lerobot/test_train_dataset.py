@@ -159,7 +159,7 @@ class Written(unittest.TestCase):
         return found.left_out
 
     def change(self, file: Path, column: str, index: int, value: float) -> None:
-        """What the data set says of an episode."""
+        """Changes the description of an episode."""
         table = pq.read_table(file)
         values = table.column(column).to_pylist()
         values[index] = value
@@ -197,7 +197,7 @@ class Written(unittest.TestCase):
         self.change(folder / EPISODES, columns[1], 1, 4.7)
         self.assertEqual(self.left_out(folder, 2), [])
 
-    def test_other_rows_than_the_data_set_says(self) -> None:
+    def test_other_rows_than_the_data_set_describes(self) -> None:
         folder = self.copy("h264")
         table = pq.read_table(folder / ROWS)
         is_last = pc.equal(table["index"], len(table) - 1)
