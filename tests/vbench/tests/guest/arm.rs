@@ -42,20 +42,32 @@ const DENOISING_STEPS: &str = "2";
 const SCRIPT: &str = r#"
 # all ACTION: since the last mark every motor has logged this.
 all() { for motor in 1 2 3 4 5 6; do logged $1 "\"motor\":$motor" || return 1; done; }
-# moving: every motor follows. Motors that an emulated processor answered too late are armed again, as a user would; not for ever.
-moving() {
-  all commands_begin && return
-  if [[ $(grep -F '"event":"actuator"' $out/rapid.jsonl | tail -n 1) == *'"arming":"faulted"'* ]]; then
-    [ "$(wc -l <$out/armed)" -ge 8 ] || { echo again >>$out/armed; "${rapid[@]}" arm; }
-  fi
+# off: the last that each motor was ordered is to be off.
+off() {
+  local motor
+  for motor in 1 2 3 4 5 6; do
+    [[ $(grep -E '"action":"motor_(en|dis)abled"' $out/emu.jsonl | grep -F "\"motor\":$motor," | tail -n 1) == *motor_disabled* ]] || return 1
+  done
+}
+# armed: motors that an emulated processor answered too late are armed again, as a user would; not for ever.
+armed() {
+  [[ $(grep -F '"event":"actuator"' $out/rapid.jsonl | tail -n 1) == *'"arming":"faulted"'* ]] || return 0
+  [ "$(wc -l <$out/armed)" -ge 12 ] || { echo again >>$out/armed; "${rapid[@]}" arm; }
   sleep 2
   return 1
 }
+# moving: every motor follows.
+moving() { all commands_begin && return; armed; sleep 2; return 1; }
+# acting N MASK: there are more than N such chunks, and the arm is not stopped.
+acting() { armed && more_than "$1" "$2"; }
+await_acting() { wait_for 120 acting "$1" "$2" || fail "$(used "$2") chunks with the mask $2, or the arm stays stopped"; }
 begin() {
   rapid_start --infer /tmp/bench/bundle --arm --wait --denoising-steps $(cat /tmp/bench/steps) --record --out $out/$1 \
     --config /tmp/bench/devices.toml --json
 }
 touch $out/armed
+# A motor does not share a processor with the rig.
+for task in /proc/$emu_pid/task/*; do renice -n -10 -p ${task##*/} || fail 'no priority'; done >/dev/null
 emu plug 0 1 2
 wait_for 120 attached 0 1 || fail 'not attached'
 udevadm settle
@@ -63,11 +75,11 @@ udevadm settle
 begin first
 await_rapid 180 '"event":"act"' || fail 'the policy does not act'
 wait_for 60 moving || fail 'the arm does not move'
-await_used 1 0x07
+await_acting 1 0x07
 mark killed
 awk '{ printf "%.0f\n", $1 * 1e9 }' /proc/uptime >$out/killed
 kill -KILL $rapid_pid
-wait_for 60 all motor_disabled || fail 'a motor stays on'
+wait_for 60 off || fail 'a motor stays on'
 wait $rapid_pid
 "${rapid[@]}" recover $out/first >$out/recover.txt 2>&1 || fail "not repaired: $(cat $out/recover.txt)"
 "${rapid[@]}" inspect --json $out/first/*.mcap >$out/inspect.json
@@ -75,15 +87,15 @@ mark again
 begin rec
 await_rapid 180 '"event":"act"' || fail 'the policy does not act again'
 wait_for 60 moving || fail 'the arm does not move again'
-await_used 2 0x07
+await_acting 2 0x07
 emu unplug 1
-await_used 2 0x05
+await_acting 2 0x05
 seen=$(used 0x07)
 emu plug 1
-await_used $((seen + 2)) 0x07
+await_acting $((seen + 2)) 0x07
 mark end
 rapid_stop
-wait_for 30 all motor_disabled || fail 'a motor stays on at the end'
+wait_for 30 off || fail 'a motor stays on at the end'
 emu_done 2
 emu_quit
 exit 0

@@ -99,7 +99,7 @@ const WRIST: &str = "/rapid/camera/wrist";
 const SIDE: &str = "/rapid/camera/side";
 const TOF: &str = "/rapid/tof";
 
-/// Two cameras and a distance sensor; the second camera is out for 3 s.
+/// Two cameras and a distance sensor; the second camera is out for 3 s, from when its absence is known.
 #[test]
 fn unplugging_one_device_leaves_the_others_whole() {
     let registry = registry(&[
@@ -115,7 +115,8 @@ fn unplugging_one_device_leaves_the_others_whole() {
             .registry(&registry)
             .record(6, &["cam_wrist", "cam_side", "tof"])
             .at(2_000, "unplug 1")
-            .at(5_000, "plug 1")
+            .when("states 1 cam_side absent")
+            .at(3_000, "plug 1")
             .until("states 2 cam_side streaming"),
     );
     let episode = episode(&outcome);
@@ -216,8 +217,9 @@ fn identical_units_keep_their_entries() {
             .registry(&registry)
             .record(6, &["cam_left", "cam_right"])
             .at(2_000, "unplug 1")
-            .at(5_000, "plug 1")
             // Which entry the unit has is not known here.
+            .when("eval 'is absent published cam_left || is absent published cam_right'")
+            .at(3_000, "plug 1")
             .until("eval 'is streaming published cam_left && is streaming published cam_right'"),
     );
     let episode = episode(&outcome);
