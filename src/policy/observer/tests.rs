@@ -59,7 +59,7 @@ fn steps(observer: &Observer, bundle: &Bundle, tick: u64) -> [Vec<u64>; 2] {
         if !request.is_present(observation) {
             return Vec::new();
         }
-        (0..request.steps()).filter_map(step).collect()
+        (0..request.steps(observation)).filter_map(step).collect()
     })
 }
 
