@@ -120,7 +120,7 @@ pub struct ObservationSpec {
     /// `down_sample_steps`, N: ticks of the control grid between two of its steps, `1..=64`.
     pub down_sample_steps: usize,
     /// `history`: of pictures only. Then it is neither required nor held, and its span, from its first step to its last,
-    /// is at most [`MAX_SPAN`] ticks.
+    /// is at most 600 ticks.
     pub history: Option<HistorySpec>,
     /// `kind` and its settings.
     pub input: ObservationInput,
