@@ -55,7 +55,8 @@ struct Chunk {
 #[derive(Deserialize)]
 struct Observed {
     modality: String,
-    seqs: Vec<u64>,
+    /// Null for a step of a history without a sample.
+    seqs: Vec<Option<u64>>,
 }
 
 /// A modality's entry in the metadata record `rapid`.
@@ -86,6 +87,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         // An absent modality has none.
         request.set_present(at, !observed.seqs.is_empty());
         for (step, seq) in observed.seqs.iter().enumerate() {
+            // In a new request a step of a history has no sample.
+            let Some(seq) = seq else { continue };
             let payload = samples.get(seq).ok_or("a sample of the chunk is not in the episode: it began later")?;
             let (encoding, width, height) = match *modality.shape.as_slice() {
                 [height, width] => (Encoding::Mjpeg, width, height),
@@ -144,8 +147,8 @@ fn modalities(bytes: &[u8]) -> Result<Vec<Modality>, Box<dyn Error>> {
 }
 
 /// The payloads of these samples of a topic. A message has the lower 32 bits of a sample's number.
-fn samples(bytes: &[u8], topic: &str, seqs: &[u64]) -> Result<BTreeMap<u64, Vec<u8>>, Box<dyn Error>> {
-    let wanted: BTreeSet<u64> = seqs.iter().copied().collect();
+fn samples(bytes: &[u8], topic: &str, seqs: &[Option<u64>]) -> Result<BTreeMap<u64, Vec<u8>>, Box<dyn Error>> {
+    let wanted: BTreeSet<u64> = seqs.iter().copied().flatten().collect();
     let mut found = BTreeMap::new();
     for message in mcap::MessageStream::new(bytes)? {
         let message = message?;

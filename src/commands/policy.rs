@@ -223,12 +223,16 @@ impl Shown {
     fn json(&self) -> Value {
         let Self { bundle, computing, library, rig, unfit, chunk } = self;
         let observations = bundle.observations.iter().map(|observation| {
-            json!({
+            let mut shown = json!({
                 "key": observation.key, "modality": observation.modality, "kind": kind(observation),
                 "shape": shape(observation), "required": observation.required,
                 "hold_last_ms": held(observation).as_millis(),
                 "down_sample_steps": observation.down_sample_steps,
-            })
+            });
+            if let (Some(history), Some(shown)) = (&observation.history, shown.as_object_mut()) {
+                shown.insert("history".to_owned(), json!({"steps": history.steps, "valid": history.valid}));
+            }
+            shown
         });
         let pace = match Pace::of(bundle, *chunk).verdict {
             PaceVerdict::Whole => "whole",
@@ -282,6 +286,7 @@ impl Shown {
 fn observed(observation: &ObservationSpec, mask_aware: bool) -> String {
     let shape: Vec<String> = shape(observation).iter().map(ToString::to_string).collect();
     let when_absent = match (observation.required, held(observation)) {
+        _ if observation.history.is_some() => "zeros for a step that it was absent at".to_owned(),
         (true, _) => "required".to_owned(),
         (false, _) if !mask_aware => "holds without it".to_owned(),
         (false, Duration::ZERO) => "may be absent: zeros".to_owned(),
@@ -299,8 +304,12 @@ fn observed(observation: &ObservationSpec, mask_aware: bool) -> String {
         1 => String::new(),
         ticks => format!(", a step every {ticks} ticks"),
     };
+    let history = observation.history.as_ref().map_or(String::new(), |history| {
+        format!(", a history of {} steps ({} has which are there)", history.steps, history.valid)
+    });
     let kind = kind(observation);
-    format!("{}{key}: {kind} {}{turned}{first}{apart}, {when_absent}", observation.modality, shape.join("x"))
+    let shape = shape.join("x");
+    format!("{}{key}: {kind} {shape}{turned}{first}{history}{apart}, {when_absent}", observation.modality)
 }
 
 /// What the network's actions are relative to, and how it gives their rotation.

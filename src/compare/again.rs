@@ -97,7 +97,8 @@ struct Work<'a> {
 /// What a chunk is computed from, as the graphs take it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChunkInputs {
-    /// The observations by key, each with its shape and its numbers.
+    /// The observations by key, each with its shape and its numbers; behind one with a history which of its steps have
+    /// a sample, by the name of that input.
     pub observations: Vec<(String, Vec<usize>, Vec<f32>)>,
     /// The mask, with the name of the input; `None` if the policy has none.
     pub mask: Option<(String, Vec<f32>)>,
@@ -193,9 +194,14 @@ pub(super) fn compare(
 impl Work<'_> {
     /// Whether its observations and length match this policy's.
     fn is_like(&self, chunk: &RecordedChunk) -> bool {
-        let (observations, steps) = (&self.bundle.observations, self.bundle.n_obs_steps);
+        let observations = &self.bundle.observations;
         let same = |(samples, observation): (&RecordedSamples, &ObservationSpec)| {
-            samples.modality == observation.modality && [0, steps].contains(&samples.seqs.len())
+            let (seqs, steps) = (&samples.seqs, self.bundle.steps_of(observation));
+            let fits = match observation.history {
+                Some(_) => seqs.len() == steps,
+                None => [0, steps].contains(&seqs.len()) && seqs.iter().all(Option::is_some),
+            };
+            samples.modality == observation.modality && fits
         };
         chunk.samples.len() == observations.len()
             && chunk.samples.iter().zip(observations).all(same)
@@ -207,7 +213,7 @@ impl Work<'_> {
         let of = |(samples, device): (&RecordedSamples, &Option<usize>)| {
             let device = *device;
             let key = move |number: &u64| Some((device?, number & SEQUENCE_BITS));
-            samples.seqs.iter().filter_map(key).collect::<Vec<_>>()
+            samples.seqs.iter().flatten().filter_map(key).collect::<Vec<_>>()
         };
         chunk.samples.iter().zip(&self.devices).flat_map(of).collect()
     }
@@ -220,7 +226,7 @@ impl Work<'_> {
     fn compute(&mut self, chunk: &RecordedChunk) {
         let whole = self.fill(chunk);
         let uses = |reference: &Reference, request: &Request, at: usize, wanted: Reference| {
-            *reference == wanted && request.is_present(at)
+            *reference == wanted && request.has_samples(at)
         };
         let lost = |(at, reference): (usize, &Reference)| uses(reference, &self.request, at, Reference::Lost);
         if !whole || self.references.iter().enumerate().any(lost) {
@@ -264,17 +270,21 @@ impl Work<'_> {
     /// The inputs of the chunk that was computed last.
     fn inputs(&self, chunk: &RecordedChunk) -> ChunkInputs {
         let (bundle, tensors) = (self.bundle, self.model.tensors());
-        let steps = bundle.n_obs_steps;
-        let observations = bundle.observations.iter().enumerate().map(|(at, observation)| {
+        let mut observations = Vec::new();
+        for (at, observation) in bundle.observations.iter().enumerate() {
+            let steps = bundle.steps_of(observation);
             let shape = match &observation.input {
                 ObservationInput::Image(image) => vec![1, steps, 3, image.height, image.width],
                 ObservationInput::Vector(vector) => vec![1, steps, vector.len],
             };
-            (observation.key.clone(), shape, tensors.values(at).to_vec())
-        });
+            observations.push((observation.key.clone(), shape, tensors.values(at).to_vec()));
+            if let Some(history) = &observation.history {
+                observations.push((history.valid.clone(), vec![1, steps], tensors.valid(at).to_vec()));
+            }
+        }
         let (noise, step_noise) = self.model.noise(chunk.seed);
         ChunkInputs {
-            observations: observations.collect(),
+            observations,
             mask: bundle.mask.as_ref().map(|mask| (mask.input.clone(), tensors.mask().to_vec())),
             noise,
             step_noise,
@@ -291,12 +301,20 @@ impl Work<'_> {
         for (at, (samples, device)) in chunk.samples.iter().zip(&self.devices).enumerate() {
             self.request.set_present(at, !samples.seqs.is_empty());
             for (step, number) in samples.seqs.iter().enumerate() {
-                let kept = device.and_then(|device| self.samples.get(&(device, number & SEQUENCE_BITS)));
-                let (Some((header, bytes)), Some(cell)) = (kept, self.request.cell_mut(at, step)) else {
-                    whole = false;
+                let Some(number) = number else {
+                    if let Some(cell) = self.request.cell_mut(at, step) {
+                        cell.clear();
+                    }
                     continue;
                 };
-                cell.set(&SampleHeader { seq: *number, ..*header }, bytes);
+                let kept = device.and_then(|device| self.samples.get(&(device, number & SEQUENCE_BITS)));
+                whole &= kept.is_some();
+                // One that is not in the file was a sample all the same.
+                let (header, bytes) =
+                    kept.map_or((SampleHeader::default(), &[][..]), |(header, bytes)| (*header, bytes));
+                if let Some(cell) = self.request.cell_mut(at, step) {
+                    cell.set(&SampleHeader { seq: *number, ..header }, bytes);
+                }
             }
         }
         whole
@@ -304,17 +322,15 @@ impl Work<'_> {
 
     /// For a chunk that cannot be computed: its samples are still the references of later ones.
     fn take_references(&mut self, chunk: &RecordedChunk) {
-        let present: Vec<bool> = (0..self.references.len()).map(|at| self.request.is_present(at)).collect();
-        for at in 0..present.len() {
-            if self.references.get(at) != Some(&Reference::Next) || present.get(at) != Some(&true) {
+        let has_samples: Vec<bool> = (0..self.references.len()).map(|at| self.request.has_samples(at)).collect();
+        for at in 0..has_samples.len() {
+            if self.references.get(at) != Some(&Reference::Next) || has_samples.get(at) != Some(&true) {
                 continue;
             }
-            let known = self.fill_with_first(chunk, at) && {
-                for other in 0..present.len() {
-                    self.request.set_present(other, other == at);
-                }
-                self.model.observe(&self.request).is_ok()
-            };
+            for other in 0..has_samples.len() {
+                self.request.set_empty(other);
+            }
+            let known = self.fill_with_first(chunk, at) && self.model.observe(&self.request).is_ok();
             if let Some(reference) = self.references.get_mut(at) {
                 *reference = if known { Reference::Known } else { Reference::Lost };
             }
@@ -323,20 +339,16 @@ impl Work<'_> {
 
     /// Puts the first sample of observation `at` in all of its steps. Returns whether it is there.
     fn fill_with_first(&mut self, chunk: &RecordedChunk, at: usize) -> bool {
-        let number = chunk.samples.get(at).and_then(|samples| samples.seqs.first());
-        let there = |number: &u64| {
-            let device = self.devices.get(at).copied().flatten();
-            device.is_some_and(|device| self.samples.contains_key(&(device, number & SEQUENCE_BITS)))
-        };
-        if !number.is_some_and(there) {
-            return false;
-        }
-        let Some(first) = self.request.cell(at, 0).cloned() else { return false };
-        for step in 1..self.request.steps() {
+        let number = chunk.samples.get(at).and_then(|samples| samples.seqs.iter().flatten().next());
+        let device = self.devices.get(at).copied().flatten();
+        let (Some(number), Some(device)) = (number, device) else { return false };
+        let Some((header, bytes)) = self.samples.get(&(device, number & SEQUENCE_BITS)) else { return false };
+        for step in 0..self.request.steps(at) {
             if let Some(cell) = self.request.cell_mut(at, step) {
-                cell.clone_from(&first);
+                cell.set(&SampleHeader { seq: *number, ..*header }, bytes);
             }
         }
+        self.request.set_present(at, true);
         true
     }
 

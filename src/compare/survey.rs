@@ -74,7 +74,8 @@ impl RecordedChunk {
 #[derive(Debug, Clone, Deserialize)]
 pub(super) struct RecordedSamples {
     pub(super) modality: String,
-    pub(super) seqs: Vec<u64>,
+    /// `None` for a step of a history without a sample.
+    pub(super) seqs: Vec<Option<u64>>,
 }
 
 /// An action as it was published.

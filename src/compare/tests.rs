@@ -77,8 +77,13 @@ impl Recorded {
 
     /// Of a policy with these changes.
     fn of(changes: &[onnx::Change<'_>]) -> Self {
+        Self::with(&onnx::encoder(), changes)
+    }
+
+    /// Of a policy with this encoder.
+    fn with(encoder: &[u8], changes: &[onnx::Change<'_>]) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        onnx::write_bundle(&folder.path().join("bundle"), changes);
+        onnx::write_graphs(&folder.path().join("bundle"), encoder, changes);
         let bundle = Bundle::load(&folder.path().join("bundle")).unwrap();
         let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
         let registry = Arc::new(Registry::task());
@@ -257,6 +262,52 @@ fn the_reference_picture_is_the_first_one_or_unknown() {
     assert!(changed.reference_unknown > 0 && changed.compared > 0 && changed.actions.without_chunk == 0, "{changed:?}");
     assert_eq!(changed.compared, total - feeling.len() as u64, "{changed:?}");
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+}
+
+#[test]
+fn chunks_of_a_history_are_recomputed_with_its_gaps() {
+    let recorded = Recorded::with(&onnx::encoder_of_history(onnx::HISTORY_STEPS), &[onnx::HISTORY]);
+    let chunks = recorded.chunks();
+    let steps = |chunk: &Value| -> Vec<Option<u64>> {
+        chunk["samples"][1]["seqs"].as_array().unwrap().iter().map(Value::as_u64).collect()
+    };
+    let all: Vec<_> = chunks.iter().map(steps).collect();
+    assert!(all.iter().all(|steps| steps.len() == onnx::HISTORY_STEPS), "{all:?}");
+    let is_there = |steps: &Vec<Option<u64>>| steps.last().is_some_and(Option::is_some);
+    let seen = |steps: &Vec<Option<u64>>| steps.iter().flatten().count();
+    // Nothing before the run; without the sensor what it has felt is still seen; when it is back, not what it missed.
+    let ticks = usize::try_from(chunks[0]["tick"].as_u64().unwrap()).unwrap();
+    assert_eq!((is_there(&all[0]), seen(&all[0])), (true, ticks / 3 + 1), "{all:?}");
+    let gone = all.iter().position(|steps| !is_there(steps)).unwrap();
+    assert!(seen(&all[gone]) > 0, "{all:?}");
+    let back = all.iter().skip(gone).find(|steps| is_there(steps)).unwrap();
+    assert!(back[onnx::HISTORY_STEPS - 2].is_none(), "{all:?}");
+
+    let whole = recorded.again(&recorded.bytes);
+    assert_eq!((whole.chunks, whole.compared), (chunks.len() as u64, chunks.len() as u64), "{whole:?}");
+    assert!(whole.largest().unwrap() < 1e-6, "{whole:?}");
+
+    // What the graphs are given: zeros for each step without a sample, and which these are.
+    let file = recorded.file(&recorded.bytes);
+    let inputs = inputs(&file, &recorded.bundle, &recorded.environment, Computing::default(), gone).unwrap().unwrap();
+    let of = |key: &str| inputs.observations.iter().find(|(name, _, _)| name == key).unwrap().clone();
+    let (_, shape, valid) = of("tactile_valid");
+    let expected: Vec<f32> = all[gone].iter().map(|seq| f32::from(u8::from(seq.is_some()))).collect();
+    assert_eq!((shape, &valid), (vec![1, onnx::HISTORY_STEPS], &expected));
+    let (_, shape, values) = of("tactile");
+    assert_eq!(shape, [1, onnx::HISTORY_STEPS, 3, onnx::SIDE, onnx::SIDE]);
+    for (step, valid) in values.chunks(values.len() / onnx::HISTORY_STEPS).zip(&valid) {
+        assert!(*valid > 0.0 || step.iter().all(|value| *value == 0.0), "{step:?}");
+    }
+    assert_eq!(inputs.mask.unwrap().1, [1.0, 0.0], "the mask is of now");
+
+    // The first picture of the history is the reference: without it nothing that is compared with it is known.
+    let first = all[0].iter().flatten().next().copied().unwrap();
+    let keep = |message: &mut Message| message.topic != TACTILE || u64::from(message.sequence) != first;
+    let changed = recorded.again(&recorded.edited(keep, |_| {}));
+    let feeling = all.iter().filter(|steps| seen(steps) > 0).count() as u64;
+    assert_eq!(changed.samples_missing + changed.reference_unknown, feeling, "{changed:?}");
+    assert_eq!(changed.compared, chunks.len() as u64 - feeling, "{changed:?}");
 }
 
 #[test]

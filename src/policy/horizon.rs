@@ -31,7 +31,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::bundle::{Bundle, ObservationInput};
+use super::bundle::{Bundle, ObservationInput, ObservationSpec};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::Registry;
@@ -227,13 +227,22 @@ struct Modality {
 impl ActionQueue {
     /// For a bundle that matches the registry, with nothing computed yet.
     pub fn new(bundle: &Bundle, registry: &Registry, without_mask: WithoutMask) -> Self {
-        let modality = |observation: &super::bundle::ObservationSpec| Modality {
-            name: observation.modality.clone(),
-            id: registry.named(&observation.modality).map(|device| device.id),
-            required: observation.required,
-            is_picture: matches!(observation.input, ObservationInput::Image(_)),
+        let is_picture = |observation: &ObservationSpec| matches!(observation.input, ObservationInput::Image(_));
+        let modality = |(at, observation): (usize, &ObservationSpec)| {
+            // A history is no picture besides those that its modality is observed by now.
+            let counted = |(other_at, other): (usize, &ObservationSpec)| {
+                let goes_before = other.history.is_none() || other_at < at;
+                other.modality == observation.modality && is_picture(other) && goes_before
+            };
+            let is_counted = observation.history.is_some() && bundle.observations.iter().enumerate().any(counted);
+            Modality {
+                name: observation.modality.clone(),
+                id: registry.named(&observation.modality).map(|device| device.id),
+                required: observation.required,
+                is_picture: is_picture(observation) && !is_counted,
+            }
         };
-        let modalities: Vec<Modality> = bundle.observations.iter().map(modality).collect();
+        let modalities: Vec<Modality> = bundle.observations.iter().enumerate().map(modality).collect();
         let pictures = modalities.iter().filter(|modality| modality.is_picture).count();
         let needs = match (without_mask, bundle.mask_aware) {
             (WithoutMask::Hold, false) => Needs::All,

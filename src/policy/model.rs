@@ -2,6 +2,7 @@
 //!
 //! Invariant: the same request gives the same chunk, given the same reference pictures.
 //! Invariant: samples of an absent modality are not read: its numbers are zeros and its element of the mask is 0.
+//! Invariant: a picture of a history is converted once, as long as it is a step of one request after another.
 
 use std::time::{Duration, Instant};
 
@@ -63,7 +64,12 @@ struct Lane {
     numbers: Vec<f64>,
     /// Of a vector that is its first sample: whether `numbers` are of that. `None` for all others.
     has_first: Option<bool>,
+    /// Of a history, the sample whose numbers each of its steps in the tensors has.
+    written: Vec<Option<SampleId>>,
 }
+
+/// Tells the samples of a modality from one another: number, attachment, time of capture.
+type SampleId = (u64, u32, u64);
 
 impl Model {
     /// Loads the graphs of a bundle.
@@ -82,6 +88,7 @@ impl Model {
                 ObservationInput::Vector(vector) => vector.operation.map(|VectorOperation::FirstOfRun| false),
                 ObservationInput::Image(_) => None,
             },
+            written: vec![None; observation.history.as_ref().map_or(0, |history| history.steps)],
         });
         let sampler = Sampler::new(bundle, environment, computing)?;
         Ok(Self { lanes: lanes.collect(), tensors: ObservationTensors::new(bundle), sampler })
@@ -123,6 +130,8 @@ impl Model {
     pub fn reset(&mut self) {
         for lane in &mut self.lanes {
             lane.has_first = lane.has_first.map(|_| false);
+            // They were compared with the reference of the last episode.
+            lane.written.fill(None);
             if let Some(reference) = lane.pictures.as_mut().and_then(Preprocessor::reference) {
                 reference.reset();
             }
@@ -144,14 +153,16 @@ impl Model {
     /// When a sample cannot be used.
     pub fn observe(&mut self, request: &Request) -> Result<&ObservationTensors, AnswerError> {
         for (at, lane) in self.lanes.iter_mut().enumerate() {
-            let present = request.is_present(at);
-            self.tensors.set_present(at, present);
-            if !present {
-                continue;
-            }
-            for step in 0..request.steps() {
-                let written =
-                    request.cell(at, step).map_or(Ok(()), |cell| lane.write(cell, at, step, &mut self.tensors));
+            self.tensors.set_present(at, request.is_present(at));
+            for step in 0..request.steps(at) {
+                let written = match request.sample(at, step) {
+                    sample if request.has_history(at) => {
+                        let is_newest = step + 1 == request.steps(at);
+                        lane.write_history(sample, (at, step), is_newest, &mut self.tensors)
+                    }
+                    Some(cell) => lane.write(cell, at, step, &mut self.tensors),
+                    None => Ok(()),
+                };
                 written.map_err(|reason| AnswerError::Sample { modality: lane.modality.clone(), reason })?;
             }
         }
@@ -160,6 +171,44 @@ impl Model {
 }
 
 impl Lane {
+    /// Writes a step of a history, the oldest first: the first picture becomes the reference of the others. The newest
+    /// must be usable, as that of any observation; an older one that is not is as good as none: it would end the policy's
+    /// answers for as long as it is a step.
+    fn write_history(
+        &mut self,
+        sample: Option<&Cell>,
+        (at, step): (usize, usize),
+        is_newest: bool,
+        tensors: &mut ObservationTensors,
+    ) -> Result<(), SampleError> {
+        let which = sample.map(|cell| (cell.seq, cell.epoch, cell.capture_ns));
+        let from = which.and_then(|_| self.written.iter().position(|written| *written == which));
+        // In case that this one cannot be used.
+        self.set_written(step, None);
+        tensors.set_valid(at, step, sample.is_some());
+        match (sample, from) {
+            // The steps of the last request were others, mostly of the same pictures.
+            (Some(_), Some(from)) => tensors.copy_step(at, from, step),
+            (Some(cell), None) => match self.write(cell, at, step, tensors) {
+                Ok(()) => {}
+                Err(error) if is_newest => return Err(error),
+                Err(_) => {
+                    tensors.set_valid(at, step, false);
+                    return Ok(());
+                }
+            },
+            (None, _) => {}
+        }
+        self.set_written(step, which);
+        Ok(())
+    }
+
+    fn set_written(&mut self, step: usize, which: Option<SampleId>) {
+        if let Some(written) = self.written.get_mut(step) {
+            *written = which;
+        }
+    }
+
     fn write(
         &mut self,
         cell: &Cell,

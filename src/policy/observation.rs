@@ -2,8 +2,9 @@
 //!
 //! Invariant: the memory is allocated once, with the length given by the bundle.
 //! Invariant: an absent modality is zeros after normalisation, and its element of the mask is 0.
+//! Invariant: a step of a history without a sample is zeros after normalisation, and its element of `valid` is 0.
 
-use super::bundle::{Bundle, ObservationInput, VectorRotation, VectorSpec};
+use super::bundle::{Bundle, ObservationInput, ObservationSpec, VectorRotation, VectorSpec};
 use super::normalize::Normalizer;
 use crate::rotation;
 
@@ -43,8 +44,10 @@ struct Tensor {
     /// Values per step.
     step: usize,
     vector: Option<(VectorSpec, Normalizer)>,
-    /// Its modality's element of the mask.
+    /// Its modality's element of the mask, if this observation determines it.
     mask: Option<usize>,
+    /// With a history, whether each step has a sample; otherwise empty.
+    valid: Vec<f32>,
 }
 
 impl ObservationTensors {
@@ -59,12 +62,18 @@ impl ObservationTensors {
                     (vector.len, Some((vector.clone(), normalizer)))
                 }
             };
+            let steps = bundle.steps_of(observation);
+            // Of a modality with and without a history: what is held while it is absent has its element set.
+            let plain = |other: &ObservationSpec| other.modality == observation.modality && other.history.is_none();
+            let determines = observation.history.is_none() || !bundle.observations.iter().any(plain);
+            let element = order.iter().position(|modality| *modality == observation.modality);
             Tensor {
                 key: observation.key.clone(),
-                values: vec![0.0; bundle.n_obs_steps * step],
+                values: vec![0.0; steps * step],
                 step,
                 vector,
-                mask: order.iter().position(|modality| *modality == observation.modality),
+                mask: element.filter(|_| determines),
+                valid: vec![0.0; observation.history.as_ref().map_or(0, |_| steps)],
             }
         });
         Self { tensors: tensors.collect(), mask: vec![0.0; order.len()] }
@@ -120,11 +129,31 @@ impl ObservationTensors {
         Ok(())
     }
 
+    /// Writes step `to` of an observation with the numbers of its step `from`. A nonexistent step is ignored.
+    pub fn copy_step(&mut self, observation: usize, from: usize, to: usize) {
+        let Some(tensor) = self.tensors.get_mut(observation) else { return };
+        let steps = tensor.values.len() / tensor.step.max(1);
+        if from != to && from < steps && to < steps {
+            tensor.values.copy_within(from * tensor.step..(from + 1) * tensor.step, to * tensor.step);
+        }
+    }
+
+    /// Sets whether a step of a history has a sample. One that has none is zeros from now on, until it is written again.
+    pub fn set_valid(&mut self, observation: usize, step: usize, valid: bool) {
+        let Some(element) = self.tensors.get_mut(observation).and_then(|tensor| tensor.valid.get_mut(step)) else {
+            return;
+        };
+        *element = f32::from(u8::from(valid));
+        if !valid && let Some(place) = self.step_mut(observation, step) {
+            place.fill(0.0);
+        }
+    }
+
     /// Sets whether an observation's modality is present. An absent one is zeros from now on, until it is written
-    /// again.
+    /// again; of one with a history only the mask changes, and [`Self::set_valid`] sets the rest.
     pub fn set_present(&mut self, observation: usize, present: bool) {
         let Some(tensor) = self.tensors.get_mut(observation) else { return };
-        if !present {
+        if !present && tensor.valid.is_empty() {
             tensor.values.fill(0.0);
         }
         if let Some(element) = tensor.mask.and_then(|place| self.mask.get_mut(place)) {
@@ -135,6 +164,11 @@ impl ObservationTensors {
     /// The numbers of an observation, all steps.
     pub fn values(&self, observation: usize) -> &[f32] {
         self.tensors.get(observation).map_or(&[], |tensor| &tensor.values)
+    }
+
+    /// Whether each step of a history has a sample, 1 or 0; empty for an observation without a history.
+    pub fn valid(&self, observation: usize) -> &[f32] {
+        self.tensors.get(observation).map_or(&[], |tensor| &tensor.valid)
     }
 
     /// The mask, in the order of the bundle; empty if it has none.

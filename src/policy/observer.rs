@@ -6,6 +6,10 @@
 //! or before a modality was plugged in) uses the sample of the next step, as in training. A tick that was missed has the
 //! choice of the one before it. The samples of a modality that has left are shown for as long as the bundle holds them.
 //!
+//! An observation with a history has steps of its own number, and nothing stands in for one of them: a step has what was
+//! chosen at its tick, or no sample. It has them whether or not the modality is present at the last tick. Its samples are
+//! copied at any distance of its steps: a ring has what a tick needs, not what so many of them do.
+//!
 //! Invariant: nothing here allocates once the places of the samples have grown to the largest.
 
 use std::time::Duration;
@@ -24,8 +28,6 @@ use crate::time::Stamp;
 pub struct Observer {
     sync: Synchronizer<usize>,
     lanes: Vec<Lane>,
-    /// Steps of an observation.
-    steps: usize,
     /// Of the last tick that was observed.
     number: Option<u64>,
 }
@@ -34,16 +36,20 @@ pub struct Observer {
 #[derive(Debug)]
 struct Lane {
     id: Option<ModalityId>,
-    /// The newest samples, each at the index of its ring entry; behind these, if steps are more than a tick apart,
-    /// copies of the chosen ones, as many as ticks are remembered.
+    /// The newest samples, each at the index of its ring entry; behind these, if steps are more than a tick apart or a
+    /// history, copies of the chosen ones, as many as ticks are remembered.
     places: Vec<Place>,
     /// How many of them are the newest samples.
     newest: usize,
     next: usize,
     /// Where the next copy is written, from the first copy on.
     next_copy: usize,
+    /// Steps of the observation.
+    steps: usize,
     /// Ticks between two steps.
     apart: usize,
+    /// Nothing stands in for a step.
+    has_history: bool,
     /// The choices of the last ticks, the newest first.
     chosen: Vec<Option<Chosen>>,
     /// How long those of its last tick stand in for it while it is absent.
@@ -76,11 +82,8 @@ impl Lane {
 
     /// Keeps a chosen sample for as long as its tick is remembered.
     fn keep(&mut self, chosen: Chosen) -> Chosen {
-        if self.apart == 1 {
-            return chosen;
-        }
         let (samples, copies) = self.places.split_at_mut(self.newest);
-        let Some(sample) = samples.get(chosen.place) else { return chosen };
+        let Some(sample) = samples.get(chosen.place).filter(|_| !copies.is_empty()) else { return chosen };
         let (next, ticks) = (self.next_copy, copies.len());
         let last = (next + ticks - 1) % ticks;
         let which = |place: &Place| (place.header.seq, place.header.epoch, place.header.capture_ns);
@@ -93,6 +96,22 @@ impl Lane {
         }
         self.next_copy = (next + 1) % ticks;
         Chosen { place: self.newest + next, ..chosen }
+    }
+
+    /// A chosen sample; `None` if it has been overwritten.
+    fn sample(&self, chosen: Chosen) -> Option<&Place> {
+        self.places.get(chosen.place).filter(|place| place.header.seq == chosen.seq)
+    }
+
+    /// Fills the steps of a history, observation `at` of `request`.
+    fn fill_history(&self, at: usize, request: &mut Request) {
+        for (back, step) in (0..self.steps).rev().enumerate() {
+            let Some(cell) = request.cell_mut(at, step) else { continue };
+            match self.chosen.get(back * self.apart).copied().flatten().and_then(|chosen| self.sample(chosen)) {
+                Some(place) => cell.set(&place.header, &place.bytes),
+                None => cell.clear(),
+            }
+        }
     }
 }
 
@@ -131,16 +150,19 @@ impl Observer {
             })
             .collect();
         let lanes = devices().zip(&bundle.observations).map(|(device, observation)| {
-            let apart = observation.down_sample_steps;
-            let ticks = (bundle.n_obs_steps - 1) * apart + 1;
+            let (steps, apart) = (bundle.steps_of(observation), observation.down_sample_steps);
+            let ticks = (steps - 1) * apart + 1;
+            let has_history = observation.history.is_some();
             let newest = device.map_or(0, |device| device.depth);
             Lane {
                 id: device.map(|device| device.id),
-                places: vec![Place::default(); newest + if apart > 1 { ticks } else { 0 }],
+                places: vec![Place::default(); newest + if apart > 1 || has_history { ticks } else { 0 }],
                 newest,
                 next: 0,
                 next_copy: 0,
+                steps,
                 apart,
+                has_history,
                 chosen: vec![None; ticks],
                 hold: match observation.when_absent {
                     WhenAbsent::Zero => Duration::ZERO,
@@ -150,12 +172,7 @@ impl Observer {
                 kept_at: None,
             }
         });
-        Self {
-            lanes: lanes.collect(),
-            sync: Synchronizer::new(&modalities, registry.rig.sync_window),
-            steps: bundle.n_obs_steps,
-            number: None,
-        }
+        Self { lanes: lanes.collect(), sync: Synchronizer::new(&modalities, registry.rig.sync_window), number: None }
     }
 
     /// Stores a sample; ignores samples of modalities that the policy does not observe, and samples marked as damaged
@@ -218,16 +235,19 @@ impl Observer {
     /// Fills `request` with the samples chosen in the last ticks, up to its own tick.
     pub fn fill(&self, request: &mut Request) {
         for (at, lane) in self.lanes.iter().enumerate() {
+            if lane.has_history {
+                lane.fill_history(at, request);
+                continue;
+            }
             let shown = lane.shown(request.stamp);
             request.set_present(at, shown.is_some());
             let Some(shown) = shown else { continue };
             let mut chosen = None;
             // From the newest step back: a step without a sample uses that of the following step, and so does one whose
             // sample has been overwritten.
-            for (back, step) in (0..self.steps).rev().enumerate() {
+            for (back, step) in (0..lane.steps).rev().enumerate() {
                 let kept = shown.get(back * lane.apart).copied().flatten();
-                let kept =
-                    kept.filter(|kept| lane.places.get(kept.place).is_some_and(|place| place.header.seq == kept.seq));
+                let kept = kept.filter(|kept| lane.sample(*kept).is_some());
                 chosen = kept.or(chosen);
                 let (Some(kept), Some(cell)) = (chosen, request.cell_mut(at, step)) else { continue };
                 if let Some(place) = lane.places.get(kept.place) {

@@ -11,7 +11,7 @@ use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Chunk, ObservedSamples, What};
 use crate::time::Stamp;
 
-/// The samples of `To` ticks, and what was present at the last of them.
+/// The samples of the steps of each observation, and what was present at the last of them.
 #[derive(Debug, Clone, Default)]
 pub struct Request {
     /// Number of the last tick on the control grid.
@@ -22,10 +22,20 @@ pub struct Request {
     pub mask: PhysicalMask,
     /// Of the noise.
     pub seed: u64,
-    /// Steps of an observation.
-    steps: usize,
+    /// Of all steps of the first observation, then those of the next.
     cells: Vec<Cell>,
-    present: Vec<bool>,
+    observations: Vec<Observed>,
+}
+
+/// Where the cells of an observation are.
+#[derive(Debug, Clone, Copy, Default)]
+struct Observed {
+    begin: usize,
+    steps: usize,
+    /// Each of its steps is with or without a sample.
+    has_history: bool,
+    /// Of one without a history.
+    present: bool,
 }
 
 /// One sample.
@@ -33,6 +43,10 @@ pub struct Request {
 pub struct Cell {
     /// Its number.
     pub seq: u64,
+    /// Of which attachment of its device.
+    pub epoch: u32,
+    /// When it was captured.
+    pub capture_ns: u64,
     /// How `bytes` are encoded.
     pub encoding: Option<Encoding>,
     /// Pixels, of a picture.
@@ -41,16 +55,24 @@ pub struct Cell {
     pub height: u32,
     /// The payload.
     pub bytes: Vec<u8>,
+    /// There is one; of an observation without a history [`Request::is_present`] says so.
+    valid: bool,
 }
 
 impl Cell {
     /// Copies this sample.
     pub fn set(&mut self, header: &SampleHeader, bytes: &[u8]) {
-        self.seq = header.seq;
+        self.valid = true;
+        (self.seq, self.epoch, self.capture_ns) = (header.seq, header.epoch, header.capture_ns);
         self.encoding = Encoding::from_raw(header.encoding);
         (self.width, self.height) = (header.width, header.height);
         self.bytes.clear();
         self.bytes.extend_from_slice(bytes);
+    }
+
+    /// This step of a history has no sample. The memory is kept.
+    pub const fn clear(&mut self) {
+        self.valid = false;
     }
 }
 
@@ -58,35 +80,75 @@ impl Request {
     /// Room for the observations of a bundle.
     pub fn new(bundle: &Bundle) -> Self {
         let mut cells = Vec::new();
-        cells.resize_with(bundle.observations.len() * bundle.n_obs_steps, Cell::default);
-        Self { steps: bundle.n_obs_steps, cells, present: vec![false; bundle.observations.len()], ..Self::default() }
+        let observed = |observation: &ObservationSpec| {
+            let (begin, steps) = (cells.len(), bundle.steps_of(observation));
+            cells.resize_with(begin + steps, Cell::default);
+            Observed { begin, steps, has_history: observation.history.is_some(), present: false }
+        };
+        let observations = bundle.observations.iter().map(observed).collect();
+        Self { cells, observations, ..Self::default() }
     }
 
-    /// The sample of step `step`, 0 the oldest, of observation `observation`.
+    /// The cell of step `step`, 0 the oldest, of observation `observation`. What it contains is of this request only if
+    /// [`Self::sample`] gives it.
     pub fn cell(&self, observation: usize, step: usize) -> Option<&Cell> {
-        self.cells.get(observation * self.steps + step)
+        self.cells.get(self.place(observation, step)?)
     }
 
     /// The same, to be filled.
     pub fn cell_mut(&mut self, observation: usize, step: usize) -> Option<&mut Cell> {
-        self.cells.get_mut(observation * self.steps + step)
+        let place = self.place(observation, step)?;
+        self.cells.get_mut(place)
     }
 
-    /// Is the modality of an observation present, with samples for every step?
+    fn place(&self, observation: usize, step: usize) -> Option<usize> {
+        let observed = self.observations.get(observation)?;
+        (step < observed.steps).then_some(observed.begin + step)
+    }
+
+    /// The sample of a step; `None` if the modality of the observation is absent or, with a history, the step has none.
+    pub fn sample(&self, observation: usize, step: usize) -> Option<&Cell> {
+        let observed = self.observations.get(observation)?;
+        self.cell(observation, step).filter(|cell| if observed.has_history { cell.valid } else { observed.present })
+    }
+
+    /// Has any step of an observation a sample?
+    pub fn has_samples(&self, observation: usize) -> bool {
+        (0..self.steps(observation)).any(|step| self.sample(observation, step).is_some())
+    }
+
+    /// Is the modality of an observation present, with samples for every step? With a history: is there a sample of its
+    /// last step?
     pub fn is_present(&self, observation: usize) -> bool {
-        self.present.get(observation).copied().unwrap_or(false)
+        let last = self.steps(observation).checked_sub(1);
+        last.is_some_and(|last| self.sample(observation, last).is_some())
     }
 
-    /// Sets whether it is.
+    /// Sets whether it is. Of an observation with a history the cells alone say so.
     pub fn set_present(&mut self, observation: usize, present: bool) {
-        if let Some(place) = self.present.get_mut(observation) {
-            *place = present;
+        if let Some(observed) = self.observations.get_mut(observation) {
+            observed.present = present;
+        }
+    }
+
+    /// Sets that an observation has no sample at all.
+    pub fn set_empty(&mut self, observation: usize) {
+        self.set_present(observation, false);
+        for step in 0..self.steps(observation) {
+            if let Some(cell) = self.cell_mut(observation, step) {
+                cell.clear();
+            }
         }
     }
 
     /// Steps of an observation.
-    pub const fn steps(&self) -> usize {
-        self.steps
+    pub fn steps(&self, observation: usize) -> usize {
+        self.observations.get(observation).map_or(0, |observed| observed.steps)
+    }
+
+    /// Whether each step of an observation is with or without a sample.
+    pub fn has_history(&self, observation: usize) -> bool {
+        self.observations.get(observation).is_some_and(|observed| observed.has_history)
     }
 
     /// The event that it was answered with `actions`. `devices` are registered; `answered` gives how many of the actions
@@ -115,8 +177,8 @@ impl Request {
     /// Which samples these are.
     pub fn samples(&self, bundle: &Bundle) -> Vec<ObservedSamples> {
         let samples = |(at, observation): (usize, &ObservationSpec)| {
-            let seqs =
-                (0..self.steps).filter(|_| self.is_present(at)).filter_map(|step| Some(self.cell(at, step)?.seq));
+            let shown = self.is_present(at) || self.has_history(at);
+            let seqs = (0..self.steps(at)).filter(|_| shown).map(|step| Some(self.sample(at, step)?.seq));
             ObservedSamples { modality: observation.modality.clone(), seqs: seqs.collect() }
         };
         bundle.observations.iter().enumerate().map(samples).collect()

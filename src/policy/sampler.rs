@@ -58,6 +58,8 @@ pub struct Sampler {
     denoiser: BoundGraph,
     /// Inputs of the encoder: one for each observation of the bundle.
     observations: Vec<usize>,
+    /// Of those with a history, which of their steps have a sample.
+    valid: Vec<Option<usize>>,
     mask: Option<usize>,
     /// Inputs of the denoiser.
     sample: usize,
@@ -84,8 +86,11 @@ impl Sampler {
         let (encoder, denoiser) = (encoder.bind()?, denoiser.bind()?);
         let steps = computing.denoising_steps.unwrap_or(bundle.scheduler.num_inference_steps);
         let names = bundle.observations.iter().map(|observation| &observation.key);
+        let valid = bundle.observations.iter().map(|observation| observation.history.as_ref());
+        let valid = valid.map(|history| history.map(|history| encoder.input_index(&history.valid)).transpose());
         Ok(Self {
             observations: names.map(|name| encoder.input_index(name)).collect::<Result<_, _>>()?,
+            valid: valid.collect::<Result<_, _>>()?,
             mask: bundle.mask.as_ref().map(|mask| encoder.input_index(&mask.input)).transpose()?,
             sample: denoiser.input_index("sample")?,
             timestep: denoiser.input_index("timestep")?,
@@ -136,8 +141,11 @@ impl Sampler {
         if out.len() != self.noise.len() {
             return Err(PolicyError::Place { expected: self.noise.len(), found: out.len() });
         }
-        for (at, input) in self.observations.iter().enumerate() {
+        for (at, (input, valid)) in self.observations.iter().zip(&self.valid).enumerate() {
             self.encoder.write(*input, observation.values(at))?;
+            if let Some(valid) = valid {
+                self.encoder.write(*valid, observation.valid(at))?;
+            }
         }
         if let Some(mask) = self.mask {
             self.encoder.write(mask, observation.mask())?;

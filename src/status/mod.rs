@@ -579,8 +579,9 @@ impl fmt::Display for PolicyEnd {
 pub struct ObservedSamples {
     /// The modality.
     pub modality: String,
-    /// Sequence numbers of its samples, the oldest step first; empty if it was absent.
-    pub seqs: Vec<u64>,
+    /// Sequence numbers of its samples, the oldest step first; empty if it was absent. Of an observation with a history
+    /// one for each step, `None` for a step without a sample.
+    pub seqs: Vec<Option<u64>>,
 }
 
 /// A chunk of actions, its inputs, and its latency.

@@ -68,6 +68,20 @@ fn every_key_is_parsed() {
     assert_eq!(bundle.encoder.sha256, "abcdef0123456789".repeat(4));
 }
 
+#[test]
+fn a_history_is_parsed() {
+    let bundle = valid("history");
+    let [_, tactile, touched, _] = bundle.observations.as_slice() else { panic!("four observations") };
+    let history = touched.history.as_ref().unwrap();
+    assert_eq!((history.steps, history.valid.as_str(), touched.down_sample_steps), (12, "touched_valid", 5));
+    assert_eq!((tactile.history.as_ref(), bundle.steps_of(tactile), bundle.steps_of(touched)), (None, 2, 12));
+    // Nothing is held in it, whatever is asked for.
+    let held = bundle.holding_last(Some(Duration::from_secs(20)));
+    let modalities: Vec<_> = held.observations.iter().map(|observation| observation.when_absent).collect();
+    let twenty = WhenAbsent::HoldLast(Duration::from_secs(20));
+    assert_eq!(modalities, [WhenAbsent::Zero, twenty, WhenAbsent::Zero, WhenAbsent::Zero]);
+}
+
 /// A valid or nearly valid file with some bytes replaced, removed, doubled.
 fn mutated() -> impl Strategy<Value = String> {
     let sources: Vec<String> =

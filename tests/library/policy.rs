@@ -7,17 +7,19 @@
 
 use crate::support::allocations::allocations;
 use crate::support::onnx::{
-    self, ACTION, CONDITION_SHARE, Change, HORIZON, Message, SAMPLE_SHARE, SIDE, STEPS, TIMESTEP_SHARE, encoder_with,
-    external, within, write_bundle, write_graphs,
+    self, ACTION, CONDITION_SHARE, Change, HISTORY, HISTORY_STEPS, HORIZON, Message, SAMPLE_SHARE, SIDE, STEPS,
+    TIMESTEP_SHARE, encoder_of_history, encoder_with, external, within, write_bundle, write_graphs,
 };
 use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid::policy::graphs::LoadedGraph;
 use rapid::policy::library::Environment;
+use rapid::policy::model::Model;
 use rapid::policy::observation::ObservationTensors;
 use rapid::policy::picture::{Picture, Preprocessor};
+use rapid::policy::request::Request;
 use rapid::policy::sampler::{Computing, PolicyError, Sampler};
 use rapid::registry::InferenceSpec;
-use rapid::sample::Encoding;
+use rapid::sample::{Encoding, SampleHeader};
 
 fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
     let folder = tempfile::tempdir().unwrap();
@@ -187,6 +189,69 @@ fn numbers_of_the_wrong_shape_are_rejected_and_named() {
         sampler.chunk(&observation, 0, &mut [0.0; 3]),
         Err(PolicyError::Place { expected: 64, found: 3 })
     ));
+}
+
+/// A request with nothing but a history: a picture, or one that cannot be decoded, for each of its steps.
+fn history(bundle: &Bundle, steps: [Option<Result<u8, ()>>; HISTORY_STEPS]) -> Request {
+    let mut request = Request::new(bundle);
+    for (step, picture) in steps.into_iter().enumerate() {
+        let Some(picture) = picture else { continue };
+        let grey = vec![picture.unwrap_or(0); SIDE * SIDE];
+        let bytes = if picture.is_ok() { &grey[..] } else { &grey[..3] };
+        let (side, seq) = (u32::try_from(SIDE).unwrap(), picture.map_or(0, u64::from));
+        let encoding = Encoding::Grey as u32;
+        let header = SampleHeader { seq, encoding, width: side, height: side, ..SampleHeader::default() };
+        request.cell_mut(1, step).unwrap().set(&header, bytes);
+    }
+    request
+}
+
+#[test]
+fn the_encoder_gets_the_steps_of_a_history_and_which_of_them_there_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let as_it_is = Change { what: r#""operation": "diff_to_reference""#, with: r#""operation": null"# };
+    write_graphs(folder.path(), &encoder_of_history(HISTORY_STEPS), &[HISTORY, as_it_is]);
+    let bundle = Bundle::load(folder.path()).unwrap();
+    let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
+    let load = || Model::load(&bundle, &environment, Computing::default()).unwrap();
+    let [mut model, mut sampler] = [load(), load()];
+    let value = |grey: u8| f32::from(grey) / 255.0 * 2.0 - 1.0;
+    let some = |grey: u8| Some(Ok(grey));
+    for steps in [
+        [None, None, None, some(10)],
+        [None, None, some(10), some(20)],
+        [None, some(10), some(20), None],
+        [some(10), some(20), None, None],
+        [some(20), None, None, some(60)],
+        // In another order, and one several times.
+        [some(60), some(60), some(20), some(10)],
+        // One that cannot be decoded is none.
+        [some(60), Some(Err(())), None, some(70)],
+        [None; 4],
+    ] {
+        let request = history(&bundle, steps);
+        let tensors = model.observe(&request).unwrap();
+        let greys = steps.map(|step| step.and_then(Result::ok));
+        assert_eq!(tensors.valid(1), greys.map(|grey| f32::from(u8::from(grey.is_some()))), "{steps:?}");
+        for (numbers, grey) in tensors.values(1).chunks(3 * SIDE * SIDE).zip(greys) {
+            let expected = grey.map_or(0.0, value);
+            assert!(numbers.iter().all(|number| (number - expected).abs() < 1e-6), "{steps:?}: {numbers:?}");
+        }
+        assert_eq!(tensors.mask(), [0.0, f32::from(u8::from(steps[3].is_some()))], "the last step is now");
+        // The mean of the pictures and the share of the steps that there are, of three numbers of the encoder.
+        let count = greys.iter().flatten().count() as f64;
+        let sum: f64 = greys.iter().flatten().map(|grey| f64::from(value(*grey))).sum();
+        let mut found = vec![0.0; HORIZON * ACTION];
+        sampler.answer(&request, &mut found).unwrap();
+        let mut noise = vec![0.0; HORIZON * ACTION];
+        rapid::random::Random::new(0, 0x706f_6c69_6379).fill_normal(&mut noise);
+        let noise: Vec<f64> = noise.into_iter().map(f64::from).collect();
+        close(&found, &in_units(&by_hand((sum + count) / 4.0 / 3.0, &noise, 10)));
+    }
+    let damaged = history(&bundle, [some(1), some(2), some(3), Some(Err(()))]);
+    assert!(model.observe(&damaged).is_err(), "the newest picture must be one");
+    let tensors = model.observe(&history(&bundle, [some(1), some(2), some(3), some(4)])).unwrap();
+    assert_eq!(tensors.valid(1), [1.0; 4]);
 }
 
 #[test]

@@ -9,7 +9,9 @@
 use std::time::Duration;
 
 use crate::support::allocations::allocations;
-use crate::support::onnx::{ACTION, Change, HORIZON, STEPS, write_bundle};
+use crate::support::onnx::{
+    ACTION, Change, HISTORY, HISTORY_STEPS, HORIZON, STEPS, encoder_of_history, write_bundle, write_graphs,
+};
 use rapid::mask::PhysicalMask;
 use rapid::policy::bundle::Bundle;
 use rapid::policy::compose::Composer;
@@ -153,6 +155,67 @@ fn composing_a_chunk_and_steps_far_apart_do_not_allocate() {
     assert_eq!(allocations(|| (begin..begin + TICKS).for_each(|number| tick(number, false))), 0);
     let counts = pilot.queue.counts();
     assert!(counts.chunks > TICKS / 16 && counts.actions > TICKS / 2, "{counts:?}");
+}
+
+#[test]
+fn a_history_with_gaps_does_not_allocate() {
+    let (_folder, bundle) = changed_bundle(&[HISTORY]);
+    assert!(bundle.observations[1].history.is_some());
+    let registry = Registry::task();
+    let mut pilot = Pilot::new(&bundle, &registry, WithoutMask::Hold, 0);
+    let mut request = Request::new(&bundle);
+    let mut seen = [0_u64; 2];
+    let mut tick = |number: u64, large: bool| {
+        samples(&registry, number, large, |device, header, payload| {
+            pilot.observer.push(registry.devices[device].id, header, payload);
+        });
+        pilot.mask = PhysicalMask(if number % 16 < 12 { 0b111 } else { 0b101 });
+        let _ = pilot.look(number, at(number), at(number));
+        // Every step of the history is of every tick at some time.
+        pilot.fill(number, at(number), &mut request);
+        for step in 0..request.steps(1) {
+            seen[usize::from(request.sample(1, step).is_some())] += 1;
+        }
+    };
+    // So does a copy of the history: it has places for 10 ticks.
+    let begin = warm_up(&registry).max(64);
+    (0..begin).for_each(|number| tick(number, true));
+    assert_eq!(allocations(|| (begin..begin + TICKS).for_each(|number| tick(number, false))), 0);
+    assert!(seen.iter().all(|steps| *steps > TICKS / 2), "{seen:?}");
+}
+
+#[test]
+fn a_picture_of_a_history_is_decoded_once() {
+    const SIDE: u16 = 8;
+    let folder = tempfile::tempdir().unwrap();
+    write_graphs(folder.path(), &encoder_of_history(HISTORY_STEPS), &[HISTORY]);
+    let bundle = Bundle::load(folder.path()).unwrap();
+    let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
+    let mut model = Model::load(&bundle, &environment, Computing::default()).unwrap();
+    let mut request = Request::new(&bundle);
+    let pictures: Vec<Vec<u8>> = [40, 80, 120, 160, 200, 240].map(|color| jpeg(SIDE, color)).into();
+    // The steps of a history that begins with picture `first`.
+    let fill = |request: &mut Request, first: usize| {
+        for (step, picture) in pictures.iter().enumerate().skip(first).take(HISTORY_STEPS).enumerate() {
+            let (number, payload) = picture;
+            let side = u32::from(SIDE);
+            let (seq, encoding) = (number as u64, Encoding::Mjpeg as u32);
+            let header = SampleHeader { seq, encoding, width: side, height: side, ..SampleHeader::default() };
+            request.cell_mut(1, step).unwrap().set(&header, payload);
+        }
+    };
+    let mut chunk = vec![0.0; model.chunk_len()];
+    let mut answer = |request: &Request| model.answer(request, &mut chunk).unwrap();
+    fill(&mut request, 0);
+    answer(&request);
+    answer(&request);
+    assert_eq!(allocations(|| (0..50).for_each(|_| answer(&request))), 0, "the same pictures");
+    // The steps move on by one picture.
+    fill(&mut request, 1);
+    let one = allocations(|| answer(&request));
+    fill(&mut request, 2);
+    let other = allocations(|| answer(&request));
+    assert!(one > 0 && one == other, "{one} and {other}");
 }
 
 #[test]

@@ -91,11 +91,31 @@ fn sum(bytes: &[u8]) -> String {
 }
 
 pub(crate) fn encoder() -> Vec<u8> {
+    encoder_of(None)
+}
+
+/// The encoder where `tactile` is a history of `steps` steps: its number is the mean of the pictures and the mean of
+/// `tactile_valid`, added, whatever the mask says.
+pub(crate) fn encoder_of_history(steps: usize) -> Vec<u8> {
+    encoder_of(Some(steps))
+}
+
+/// The change of `policy.json` for it: four steps, three ticks from one to the next.
+pub(crate) const HISTORY: Change<'static> = Change {
+    what: r#""modality": "tactile_tip", "required": false,"#,
+    with: r#""modality": "tactile_tip", "required": false, "down_sample_steps": 3,
+     "history": {"steps": 4, "valid": "tactile_valid"},"#,
+};
+/// Its steps.
+pub(crate) const HISTORY_STEPS: usize = 4;
+
+fn encoder_of(history: Option<usize>) -> Vec<u8> {
     let mut graph = Message::default();
-    let images: [u64; 5] = [0, STEPS as u64, 3, SIDE as u64, SIDE as u64];
+    let images = |steps: usize| [0, steps as u64, 3, SIDE as u64, SIDE as u64];
+    let (wrist, tactile) = (images(STEPS), images(history.unwrap_or(STEPS)));
     let inputs: [(&str, &[u64], Option<i64>); 3] = [
-        ("wrist", &images, Some(0)),
-        ("tactile", &images, Some(1)),
+        ("wrist", &wrist, Some(0)),
+        ("tactile", &tactile, Some(1)),
         ("state", &[0, STEPS as u64, ACTION as u64], None),
     ];
     let mut conditions = Vec::new();
@@ -105,6 +125,13 @@ pub(crate) fn encoder() -> Vec<u8> {
         graph.message(11, &tensor(name, FLOAT, dims));
         graph.message(1, &node("Flatten", &[name], &named("flat"), &[integer("axis", 1)]));
         graph.message(1, &node("ReduceMean", &[&named("flat")], &named("mean"), &[integers("axes", &[1])]));
+        if let Some(steps) = history.filter(|_| name == "tactile") {
+            graph.message(11, &tensor("tactile_valid", FLOAT, &[0, steps as u64]));
+            graph.message(1, &node("ReduceMean", &["tactile_valid"], "valid_mean", &[integers("axes", &[1])]));
+            graph.message(1, &node("Add", &[&named("mean"), "valid_mean"], "felt", &[]));
+            conditions.push("felt".to_owned());
+            continue;
+        }
         let Some(place) = place else {
             conditions.push(named("mean"));
             continue;

@@ -19,6 +19,8 @@ type Side = Whole<1, 8192>;
 const LONGEST_HOLD_MS: i64 = 600_000;
 /// Most ticks between two steps of an observation.
 const MAX_DOWN_SAMPLE: i64 = 64;
+/// Most steps of a history.
+const MAX_HISTORY: i64 = 64;
 /// Maximum length of a vector.
 const MAX_VALUES: i64 = 4096;
 
@@ -77,9 +79,19 @@ pub(super) struct ImageFile {
     pub(super) operation: Option<Operation>,
     pub(super) normalization: Value,
     #[serde(default, deserialize_with = "when_absent")]
-    pub(super) when_absent: WhenAbsent,
+    pub(super) when_absent: Option<WhenAbsent>,
     #[serde(default)]
     pub(super) down_sample_steps: Option<Whole<1, MAX_DOWN_SAMPLE>>,
+    #[serde(default)]
+    pub(super) history: Option<Value>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct HistoryFile {
+    pub(super) steps: Whole<2, MAX_HISTORY>,
+    #[serde(deserialize_with = "name")]
+    pub(super) valid: String,
 }
 
 #[derive(Deserialize)]
@@ -95,7 +107,7 @@ pub(super) struct VectorFile {
     pub(super) slice: Option<Range<usize>>,
     pub(super) normalization: Value,
     #[serde(default, deserialize_with = "when_absent")]
-    pub(super) when_absent: WhenAbsent,
+    pub(super) when_absent: Option<WhenAbsent>,
     #[serde(default)]
     pub(super) down_sample_steps: Option<Whole<1, MAX_DOWN_SAMPLE>>,
     /// Null: values are used unchanged.
@@ -273,17 +285,18 @@ fn some_slice<'de, D: Deserializer<'de>>(value: D) -> Result<Option<Range<usize>
     slice(value).map(Some)
 }
 
-fn when_absent<'de, D: Deserializer<'de>>(value: D) -> Result<WhenAbsent, D::Error> {
+/// `None` only if the key is left out.
+fn when_absent<'de, D: Deserializer<'de>>(value: D) -> Result<Option<WhenAbsent>, D::Error> {
     #[derive(Deserialize)]
     #[serde(rename_all = "snake_case")]
     enum Written {
         Zero,
         HoldLastMs(Whole<1, LONGEST_HOLD_MS>),
     }
-    Ok(match Written::deserialize(value)? {
+    Ok(Some(match Written::deserialize(value)? {
         Written::Zero => WhenAbsent::Zero,
         Written::HoldLastMs(ms) => WhenAbsent::HoldLast(Duration::from_millis(ms.get() as u64)),
-    })
+    }))
 }
 
 pub(super) fn whole<'de, D: Deserializer<'de>, const MIN: i64, const MAX: i64>(value: D) -> Result<usize, D::Error> {

@@ -383,6 +383,9 @@ const KEYS: &[Key] = keys! {
     "operation": "\"diff_to_reference\" of a picture, \"first_of_run\" of a vector, or null", "null";
     "when_absent": "\"zero\" or {\"hold_last_ms\": 1 to 600000}; leave it out for zero", "\"zero\"";
     "down_sample_steps": "how many ticks are between two of its steps, 1 to 64; leave it out for 1", "1";
+    "history": "{\"steps\": 2 to 64, \"valid\": \"the name of another input of the encoder\"}, or leave it out", "null";
+    "history.steps": "how many steps it has, 2 to 64", "2";
+    "history.valid": "the name of the encoder's input that says which steps have a sample, as text", "\"valid\"";
     "observations.rotation": "\"rotation_6d\" if slice names a quaternion; leave it out for numbers as they are", "null";
     "observations.slice": "[begin, end] of the sample's numbers, end not included; leave it out for all of them", "[0, 1]";
 

@@ -29,7 +29,8 @@ pub struct Bundle {
     /// nothing from zeros in place of a missing modality.
     pub mask_aware: bool,
     /// `n_obs_steps`, To: observations from which a chunk is computed, `1..=64`. Step i of To is tick
-    /// k - (To - 1 - i) * N of the control grid, N the `down_sample_steps` of the observation.
+    /// k - (To - 1 - i) * N of the control grid, N the `down_sample_steps` of the observation. An observation with a
+    /// history has another number of steps: see [`Self::steps_of`].
     pub n_obs_steps: usize,
     /// `horizon`, Tp: actions in a chunk, `1..=1024`.
     pub horizon: usize,
@@ -60,13 +61,20 @@ pub struct Bundle {
 
 impl Bundle {
     /// With the last samples of every modality that it does not require held for `time`, if given, while that is absent.
+    /// A history has nothing held in it.
     #[must_use]
     pub fn holding_last(mut self, time: Option<Duration>) -> Self {
         let Some(time) = time else { return self };
-        for observation in self.observations.iter_mut().filter(|observation| !observation.required) {
+        let may_hold = |observation: &&mut ObservationSpec| !observation.required && observation.history.is_none();
+        for observation in self.observations.iter_mut().filter(may_hold) {
             observation.when_absent = WhenAbsent::HoldLast(time);
         }
         self
+    }
+
+    /// The number of steps of one of its observations.
+    pub fn steps_of(&self, observation: &ObservationSpec) -> usize {
+        observation.history.as_ref().map_or(self.n_obs_steps, |history| history.steps)
     }
 
     /// The modalities whose last samples are held while they are absent, and for how long.
@@ -111,10 +119,27 @@ pub struct ObservationSpec {
     pub when_absent: WhenAbsent,
     /// `down_sample_steps`, N: ticks of the control grid between two of its steps, `1..=64`.
     pub down_sample_steps: usize,
+    /// `history`: of pictures only. Then it is neither required nor held, and its span, from its first step to its last,
+    /// is at most 600 ticks.
+    pub history: Option<HistorySpec>,
     /// `kind` and its settings.
     pub input: ObservationInput,
     /// `normalization`, one entry per channel of a picture or per value of a vector.
     pub normalization: Normalization,
+}
+
+/// Most ticks from the first to the last step of a history. As many samples of its modality are kept.
+pub(super) const MAX_SPAN: usize = 600;
+
+/// `history`: an observation with steps of its own number, each with or without a sample. Nothing stands in for one
+/// that has none, and it is given whether or not its modality is present now.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HistorySpec {
+    /// `steps`, S: `2..=64`.
+    pub steps: usize,
+    /// `valid`: the name of the encoder's input f32 `[B, S]`, 1 for a step with a sample and 0 for one without. No other
+    /// input has it.
+    pub valid: String,
 }
 
 /// What stands in for an observation whose modality is absent.

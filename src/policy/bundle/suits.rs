@@ -175,17 +175,17 @@ impl Bundle {
     /// Every input and output that is missing, superfluous, or of another type or shape.
     pub fn check_graphs(&self, encoder: &GraphShape, denoiser: &GraphShape) -> Result<(), BundleErrors> {
         let mut problems = Problems::new(&self.label());
-        let steps = self.n_obs_steps;
-        let mut inputs: Vec<Wanted> = self
-            .observations
-            .iter()
-            .map(|observation| match &observation.input {
+        let mut inputs: Vec<Wanted> = Vec::new();
+        for observation in &self.observations {
+            let steps = self.steps_of(observation);
+            inputs.push(match &observation.input {
                 ObservationInput::Image(image) => {
                     Wanted::new(&observation.key, Element::F32, &[steps, CHANNELS, image.height, image.width])
                 }
                 ObservationInput::Vector(vector) => Wanted::new(&observation.key, Element::F32, &[steps, vector.len]),
-            })
-            .collect();
+            });
+            inputs.extend(observation.history.iter().map(|one| Wanted::new(&one.valid, Element::F32, &[steps])));
+        }
         if let Some(mask) = &self.mask {
             inputs.push(Wanted::new(&mask.input, Element::F32, &[mask.order.len()]));
         }

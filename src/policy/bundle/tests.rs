@@ -208,6 +208,25 @@ fn graphs_as_described_are_accepted() {
 }
 
 #[test]
+fn a_history_has_two_inputs_of_its_own_length() {
+    let text = include_str!("../../../tests/bundle/valid/history.json");
+    let bundle = Bundle::parse(text, "policy.json").unwrap_or_else(|errors| panic!("{errors}"));
+    let (mut encoder, denoiser) = graphs();
+    let missing = problems(bundle.check_graphs(&encoder, &denoiser));
+    assert_eq!(missing.len(), 2, "{missing:?}");
+    assert!(missing[0].contains("has no input \"touched\", f32 [B, 12, 3, 96, 96] is expected"), "{missing:?}");
+    assert!(missing[1].contains("has no input \"touched_valid\", f32 [B, 12] is expected"), "{missing:?}");
+    encoder.inputs.push(tensor("touched", Element::F32, &[0, 12, 3, 96, 96]));
+    encoder.inputs.push(tensor("touched_valid", Element::F32, &[0, 12]));
+    bundle.check_graphs(&encoder, &denoiser).unwrap();
+    encoder.inputs[4].dims = vec![None, Some(2), Some(3), Some(96), Some(96)];
+    encoder.inputs[5].element = Element::I64;
+    let wrong = problems(bundle.check_graphs(&encoder, &denoiser));
+    assert_eq!(wrong.len(), 2, "{wrong:?}");
+    assert!(wrong[1].contains("\"touched_valid\" is i64 [?, 12], by policy.json it is f32 [B, 12]"), "{wrong:?}");
+}
+
+#[test]
 fn every_difference_from_the_graphs_is_reported() {
     let (mut encoder, mut denoiser) = graphs();
     encoder.inputs[0].dims = vec![None, Some(3)];

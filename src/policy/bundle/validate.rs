@@ -8,11 +8,11 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::action::check_action;
-use super::file::{Graphs, Head, ImageFile, MaskFile, ObservationFile, VectorFile, Whole};
+use super::file::{Graphs, Head, HistoryFile, ImageFile, MaskFile, ObservationFile, VectorFile, Whole};
 use super::read::{Problems, Strict, read, read_tagged};
 use super::spec::{
-    Bundle, BundleErrors, ImageSpec, MaskSpec, Normalization, ObservationInput, ObservationSpec, QUATERNION,
-    SchedulerSpec, TimestepSpacing, VectorSpec, WhenAbsent,
+    Bundle, BundleErrors, HistorySpec, ImageSpec, MAX_SPAN, MaskSpec, Normalization, ObservationInput, ObservationSpec,
+    QUATERNION, SchedulerSpec, TimestepSpacing, VectorSpec, WhenAbsent,
 };
 use crate::registry::did_you_mean;
 
@@ -160,14 +160,38 @@ fn observations(value: &Value, problems: &mut Problems) -> Option<Vec<Observatio
         }
         found.push(observation);
     }
-    (found.len() == list.len()).then_some(found)
+    if found.len() < list.len() {
+        return None;
+    }
+    check_valid_names(&found, problems);
+    Some(found)
+}
+
+/// The input that says which steps of a history have a sample must not be another one, too.
+fn check_valid_names(observations: &[ObservationSpec], problems: &mut Problems) {
+    let named = |at: usize| observations.get(at).and_then(|one| one.history.as_ref()).map(|history| &history.valid);
+    for at in 0..observations.len() {
+        let Some(valid) = named(at) else { continue };
+        let key = observations.iter().position(|one| one.key == *valid);
+        let key = key.map(|key| format!("the key of observations[{key}]"));
+        let earlier = (0..at).find(|earlier| named(*earlier) == Some(valid));
+        let earlier = earlier.map(|earlier| format!("history.valid of observations[{earlier}]"));
+        if let Some(other) = key.or(earlier) {
+            let fix = "give it a name of its own, as the encoder's inputs have";
+            problems.report(&format!("observations[{at}].history.valid"), format!("\"{valid}\" is {other}"), fix);
+        }
+    }
 }
 
 fn observation(entry: &str, value: &Value, problems: &mut Problems) -> Option<ObservationSpec> {
     let read = read_tagged(entry, "kind", value, problems)?;
+    let mut history = None;
     let (key, modality, required, when_absent, steps, numbers, len, input) = match read {
         ObservationFile::Image(file) => {
             let input = ObservationInput::Image(check_image(entry, &file, problems));
+            if let Some(value) = &file.history {
+                history = Some(check_history(entry, value, &file, problems));
+            }
             let (when_absent, steps) = (file.when_absent, file.down_sample_steps);
             (file.key, file.modality, file.required, when_absent, steps, file.normalization, CHANNELS, input)
         }
@@ -179,13 +203,43 @@ fn observation(entry: &str, value: &Value, problems: &mut Problems) -> Option<Ob
             (file.key, file.modality, file.required, when_absent, steps, file.normalization, len, input)
         }
     };
-    let down_sample_steps = steps.map_or(1, Whole::get);
+    let (when_absent, down_sample_steps) = (when_absent.unwrap_or_default(), steps.map_or(1, Whole::get));
     let normalization = normalization(&format!("{entry}.normalization"), &numbers, Some(len), problems)?;
-    if required && when_absent != WhenAbsent::Zero {
+    if required && history.is_none() && when_absent != WhenAbsent::Zero {
         let fix = "leave it out: without what it requires the policy holds";
         problems.report(&format!("{entry}.when_absent"), "the observation is required", fix);
     }
-    Some(ObservationSpec { key, modality, required, when_absent, down_sample_steps, input, normalization })
+    let history = match history {
+        Some(history) => Some(history?),
+        None => None,
+    };
+    Some(ObservationSpec { key, modality, required, when_absent, down_sample_steps, history, input, normalization })
+}
+
+/// What an observation with a history must be besides. `None` only if the history itself cannot be read.
+fn check_history(entry: &str, value: &Value, file: &ImageFile, problems: &mut Problems) -> Option<HistorySpec> {
+    let HistoryFile { steps, valid } = read(&format!("{entry}.history"), value, problems)?;
+    let (steps, apart) = (steps.get(), file.down_sample_steps.map_or(1, Whole::get));
+    let span = (steps - 1) * apart;
+    if span > MAX_SPAN {
+        let plural = if apart == 1 { "" } else { "s" };
+        let message = format!("{steps} steps of {apart} tick{plural} are a span of {span} ticks, more than {MAX_SPAN}");
+        let fix = format!("take fewer steps, or a smaller down_sample_steps: (steps - 1) x it is at most {MAX_SPAN}");
+        problems.report(&format!("{entry}.history.steps"), message, fix);
+    }
+    if file.required {
+        let fix = "write \"required\": false here; another observation of the modality may be required";
+        problems.report(
+            &format!("{entry}.required"),
+            "an observation with a history is given without its modality too",
+            fix,
+        );
+    }
+    if file.when_absent.is_some() {
+        let fix = "leave it out: a step of a history without a sample is zeros, and nothing is held in it";
+        problems.report(&format!("{entry}.when_absent"), "the observation has a history", fix);
+    }
+    Some(HistorySpec { steps, valid })
 }
 
 fn check_image(entry: &str, file: &ImageFile, problems: &mut Problems) -> ImageSpec {
@@ -301,6 +355,12 @@ fn check_mask_fits(
     mask_aware: bool,
     problems: &mut Problems,
 ) {
+    let histories = || observations.iter().enumerate().filter_map(|(at, one)| Some((at, one.history.as_ref()?)));
+    for (at, _) in histories().filter(|_| !mask_aware) {
+        let message = "a history is of a policy that was trained with modalities left out, but mask_aware is false";
+        let fix = "write \"mask_aware\": true and its mask if it was, or leave history out";
+        problems.report(&format!("observations[{at}].history"), message, fix);
+    }
     let Some(mask) = mask else {
         if mask_aware {
             problems.wrong("mask", "is null, but the bundle is mask_aware");
@@ -315,11 +375,16 @@ fn check_mask_fits(
         let fix = did_you_mean(modality, &known, "the modalities here are");
         problems.report(&format!("mask.order[{at}]"), format!("names \"{modality}\", which no observation has"), fix);
     }
+    for (at, history) in histories().filter(|(_, history)| history.valid == mask.input) {
+        problems.wrong("mask.input", format!("\"{}\" is history.valid of observations[{at}]", history.valid));
+    }
     for (at, observation) in observations.iter().enumerate() {
         if observation.key == mask.input {
             problems.wrong("mask.input", format!("\"{}\" is the key of observations[{at}]", mask.input));
         }
-        if mask_aware && !observation.required && !mask.order.contains(&observation.modality) {
+        // An encoder knows by the last step of a history that its modality is absent.
+        let may_be_absent = !observation.required && observation.history.is_none();
+        if mask_aware && may_be_absent && !mask.order.contains(&observation.modality) {
             let message = format!("\"{}\" is not required, but mask.order does not have it", observation.modality);
             let fix = "write \"required\": true, or name it in mask.order if the encoder knows when it is absent";
             problems.report(&format!("observations[{at}]"), message, fix);

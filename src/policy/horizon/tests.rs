@@ -385,3 +385,29 @@ fn without_any_picture_it_holds_and_without_one_of_two_it_continues() {
     let mut queue = ActionQueue::new(&bundle, &registry(), WithoutMask::GoOn);
     assert_eq!(lockstep(&mut queue, 0, seen(NO_PICTURE)), Ok(1.0));
 }
+
+/// Of one camera that is observed twice, a history is not a second picture.
+#[test]
+fn a_history_is_no_picture_besides_those_of_its_modality() {
+    const ARM_ALONE: PhysicalMask = PhysicalMask(0b100);
+    let text = include_str!("../../../tests/bundle/valid/history.json");
+    let mut with_history = bundle();
+    with_history.observations = Bundle::parse(text, "policy.json").unwrap().observations;
+    // The wrist's camera is left out: the tactile sensor, its history, the arm.
+    with_history.observations.remove(0);
+    for at_first in [false, true] {
+        if at_first {
+            with_history.observations.swap(0, 1);
+        }
+        let mut queue = ActionQueue::new(&with_history, &registry(), WithoutMask::Hold);
+        assert_eq!(lockstep(&mut queue, 0, seen(ARM_ALONE)), Ok(1.0));
+    }
+    // With the camera there are two pictures, one of them a history alone: only what is there now counts.
+    let mut with_history = bundle();
+    with_history.observations = Bundle::parse(text, "policy.json").unwrap().observations;
+    with_history.observations[0].required = false;
+    with_history.observations.remove(1);
+    let mut queue = ActionQueue::new(&with_history, &registry(), WithoutMask::Hold);
+    assert_eq!(lockstep(&mut queue, 0, seen(NO_CAM)), Ok(1.0));
+    assert_eq!(lockstep(&mut queue, 1, seen(ARM_ALONE)), Err(HoldReason::NoPicture));
+}

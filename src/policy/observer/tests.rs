@@ -1,6 +1,7 @@
 //! Which samples are the steps of an observation: `state` of three steps, of the ticks k - 6, k - 3 and k; `grip`, of the
 //! same modality, of the ticks k - 2, k - 1 and k.
 
+use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
@@ -59,7 +60,7 @@ fn steps(observer: &Observer, bundle: &Bundle, tick: u64) -> [Vec<u64>; 2] {
         if !request.is_present(observation) {
             return Vec::new();
         }
-        (0..request.steps()).filter_map(step).collect()
+        (0..request.steps(observation)).filter_map(step).collect()
     })
 }
 
@@ -179,4 +180,147 @@ fn missed_ticks_count() {
     push(&mut observer, 91, Duration::from_millis(5), 91, 1);
     observer.look(0, at(91), at(91), ARM);
     assert_eq!(steps(&observer, &bundle, 91)[0], [91, 91, 91]);
+}
+
+/// `state`, the arm's newest sample among others, and `felt`, a history of its samples.
+fn bundle_with_history(steps: usize, apart: usize) -> Bundle {
+    bundle(|policy| {
+        let mut state = policy["observations"][1].clone();
+        state["required"] = false.into();
+        let felt = json!({
+            "key": "felt", "kind": "image", "modality": "arm", "required": false, "down_sample_steps": apart,
+            "shape": [3, 8, 8], "color": "rgb", "resize": null, "crop": null, "operation": null,
+            "history": {"steps": steps, "valid": "felt_valid"}, "normalization": {"mode": "identity"}});
+        policy["observations"] = json!([state, felt]);
+        policy["mask_aware"] = true.into();
+        policy["mask"] = json!({"input": "mask", "order": ["arm"], "absent": "zero_embedding"});
+    })
+}
+
+/// The numbers of the samples of `felt`, and that of the newest of `state`, as `request` has them at `tick`.
+fn felt(observer: &Observer, request: &mut Request, tick: u64) -> (Vec<Option<u64>>, Option<u64>) {
+    (request.tick, request.stamp) = (tick, at(tick));
+    observer.fill(request);
+    let number = |observation, step| {
+        let sample = request.sample(observation, step)?;
+        assert_eq!(sample.bytes, sample.seq.to_le_bytes(), "the bytes of another sample");
+        Some(sample.seq)
+    };
+    ((0..request.steps(1)).map(|step| number(1, step)).collect(), number(0, request.steps(0) - 1))
+}
+
+#[test]
+fn nothing_stands_in_for_a_step_of_a_history() {
+    // A sample a tick, of which two are kept in the ring.
+    for apart in [1, 3] {
+        let bundle = bundle_with_history(4, apart);
+        let mut observer = observer(&bundle, 2);
+        let mut request = Request::new(&bundle);
+        let is_there = |tick: u64| !(10..16).contains(&tick);
+        for tick in 0..40_u64 {
+            if is_there(tick) {
+                push(&mut observer, tick, Duration::from_millis(5), 100 + tick, if tick < 10 { 1 } else { 2 });
+            }
+            let mask = if is_there(tick) { ARM } else { PhysicalMask::EMPTY };
+            assert_eq!(observer.look(tick, at(tick), at(tick), mask).is_some(), is_there(tick));
+            let (felt, newest) = felt(&observer, &mut request, tick);
+            let of = |back: u64| tick.checked_sub(back).filter(|tick| is_there(*tick)).map(|tick| 100 + tick);
+            assert_eq!(felt, [3, 2, 1, 0].map(|back| of(back * apart as u64)), "tick {tick}, {apart} apart");
+            assert_eq!(newest, of(0), "tick {tick}");
+            assert_eq!([request.is_present(0), request.is_present(1)], [is_there(tick); 2], "tick {tick}");
+            // The steps before the unplug are shown until they are older than the history.
+            assert_eq!(request.has_samples(1), felt.iter().any(Option::is_some), "tick {tick}");
+            let seqs: Vec<_> = request.samples(&bundle).into_iter().map(|samples| samples.seqs).collect();
+            assert_eq!(seqs[1], felt, "what is recorded");
+            assert_eq!(seqs[0].is_empty(), !is_there(tick), "what is recorded");
+        }
+    }
+}
+
+#[test]
+fn a_history_begins_with_the_run_and_a_missed_tick_has_the_choice_before_it() {
+    let bundle = bundle_with_history(3, 2);
+    let mut observer = observer(&bundle, 60);
+    let mut request = Request::new(&bundle);
+    // Present, but without a sample.
+    assert!(observer.look(0, at(0), at(0), ARM).is_none());
+    assert_eq!(felt(&observer, &mut request, 0), (vec![None; 3], None));
+    for (tick, expected) in [
+        (1, [None, None, Some(1)]),
+        (2, [None, None, Some(2)]),
+        (3, [None, Some(1), Some(3)]),
+        // Of tick 4, 5 and 6, which are missed, with the choice of tick 3.
+        (7, [Some(3), Some(3), Some(7)]),
+        (8, [Some(3), Some(3), Some(8)]),
+        (9, [Some(3), Some(7), Some(9)]),
+        // More of them than the history has.
+        (30, [Some(9), Some(9), Some(30)]),
+    ] {
+        push(&mut observer, tick, Duration::from_millis(5), tick, 1);
+        observer.look(tick, at(tick), at(tick), ARM);
+        assert_eq!(felt(&observer, &mut request, tick).0, expected, "tick {tick}");
+    }
+    observer.clear();
+    push(&mut observer, 31, Duration::from_millis(5), 31, 1);
+    observer.look(0, at(31), at(31), ARM);
+    assert_eq!(felt(&observer, &mut request, 31).0, [None, None, Some(31)], "of another run");
+}
+
+#[test]
+fn a_history_is_not_held_and_counts_for_nothing_when_it_is_old() {
+    let bundle = bundle_with_history(3, 2).holding_last(Some(Duration::from_secs(60)));
+    let mut observer = observer(&bundle, 60);
+    let mut request = Request::new(&bundle);
+    assert_eq!(observer.first_sight(ARM), None);
+    push(&mut observer, 0, Duration::from_millis(5), 7, 1);
+    let age = observer.look(0, at(0), at(0), ARM);
+    assert!(age.is_some());
+    // The arm has left: only `state` is held, and nothing that is present has an age.
+    assert_eq!(observer.look(2, at(2), at(2), PhysicalMask::EMPTY), None);
+    assert_eq!(felt(&observer, &mut request, 2), (vec![None, Some(7), None], Some(7)));
+    assert_eq!([request.is_present(0), request.is_present(1)], [true, false]);
+    // Back, with a sample of now: the age is that of this one.
+    push(&mut observer, 4, Duration::from_millis(5), 9, 2);
+    assert_eq!(observer.look(4, at(4), at(4), ARM), age);
+    // Tick 2 was the last one that was looked at, tick 3 has its choice: none.
+    assert_eq!(felt(&observer, &mut request, 4).0, [Some(7), None, Some(9)]);
+}
+
+proptest! {
+    /// A step of a history is the newest step that an observation without one had at its tick, if it had any.
+    #[test]
+    fn a_history_is_what_was_newest_at_its_ticks(
+        steps in 2_usize..9,
+        apart in 1_usize..6,
+        depth in 2_usize..6,
+        // Ticks since the last one that was looked at, samples before it, and whether the arm is there.
+        ticks in prop::collection::vec(
+            (prop_oneof![8 => Just(1_u64), 1 => 2_u64..5, 1 => Just(60)], 0_u64..4, prop::bool::weighted(0.8)),
+            1..150,
+        ),
+    ) {
+        let bundle = bundle_with_history(steps, apart);
+        let mut observer = observer(&bundle, depth);
+        let mut request = Request::new(&bundle);
+        let mut newest: Vec<Option<u64>> = Vec::new();
+        let (mut seq, mut epoch, mut was_there) = (0, 0, false);
+        for (since, samples, is_there) in ticks {
+            let missed = usize::try_from(since).unwrap() - 1;
+            let last = newest.last().copied();
+            newest.extend(last.into_iter().cycle().take(missed));
+            let tick = newest.len() as u64;
+            epoch += u32::from(is_there && !was_there);
+            was_there = is_there;
+            for sample in (0..samples).filter(|_| is_there) {
+                seq += 1;
+                push(&mut observer, tick, Duration::from_millis(5 + 20 * (samples - 1 - sample)), seq, epoch);
+            }
+            let mask = if is_there { ARM } else { PhysicalMask::EMPTY };
+            observer.look(tick, at(tick), at(tick), mask);
+            let (felt, now) = felt(&observer, &mut request, tick);
+            newest.push(now);
+            let of = |step: usize| newest.iter().rev().nth((steps - 1 - step) * apart).copied().flatten();
+            prop_assert_eq!(felt, (0..steps).map(of).collect::<Vec<_>>(), "tick {}", tick);
+        }
+    }
 }

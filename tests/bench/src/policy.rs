@@ -45,7 +45,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
          compared, normalised, and the sampler; baseline: onnxruntime alone, the encoder once and the denoiser {} times \
          on memory that is filled already",
         subject.sampler.steps(),
-        bundle.observations.len() * bundle.n_obs_steps,
+        bundle.observations.iter().map(|observation| bundle.steps_of(observation)).sum::<usize>(),
         subject.sampler.steps()
     );
     let mut figures = vec![
@@ -169,6 +169,9 @@ impl Bare {
         let (mut encoder, mut denoiser) = (load(Graph::Encoder)?, load(Graph::Denoiser)?);
         for (at, spec) in bundle.observations.iter().enumerate() {
             encoder.write(encoder.input_index(&spec.key)?, observation.values(at))?;
+            if let Some(history) = &spec.history {
+                encoder.write(encoder.input_index(&history.valid)?, observation.valid(at))?;
+            }
         }
         if let Some(mask) = &bundle.mask {
             encoder.write(encoder.input_index(&mask.input)?, observation.mask())?;
@@ -200,12 +203,14 @@ pub(crate) fn request(bundle: &Bundle) -> Result<Request, Failure> {
     let mut request = Request::new(bundle);
     let (mut trial, mut expert) = (Trial::new(SEED), Expert::new(SEED));
     let mut payload = Vec::new();
-    for number in 0..STEPS + request.steps() {
+    let steps = (0..bundle.observations.len()).map(|at| request.steps(at)).max().unwrap_or(0);
+    for number in 0..STEPS + steps {
         let target = expert.act(&trial.world);
         trial.command(target);
         trial.step(0.0);
-        let Some(step) = number.checked_sub(STEPS) else { continue };
         for (at, observation) in bundle.observations.iter().enumerate() {
+            // The last step of each is that of the last tick.
+            let Some(step) = number.checked_sub(STEPS + steps - request.steps(at)) else { continue };
             let part = PARTS.iter().find(|(name, _)| *name == observation.modality);
             let (_, part) = part.ok_or_else(|| format!("the simulated task has no `{}`", observation.modality))?;
             trial.sample(*part, &mut payload)?;

@@ -16,6 +16,11 @@ pub fn bundle(bytes: &[u8]) {
             let covered: usize = bundle.action.normalization.iter().map(|slice| slice.slice.len()).sum();
             assert_eq!(covered, bundle.action.outputs());
             assert!(bundle.mask_aware <= bundle.mask.is_some(), "a reader that knows the mask reads it");
+            for observation in &bundle.observations {
+                let Some(history) = &observation.history else { continue };
+                assert!((2..=64).contains(&history.steps) && bundle.mask_aware && !observation.required);
+                assert!((history.steps - 1) * observation.down_sample_steps <= 600, "as many samples are kept");
+            }
         }
         Err(errors) => assert!(!errors.diagnostics.is_empty()),
     }
