@@ -20,7 +20,8 @@ LIMIT_MARGIN = 0.05
 
 def encoder_inputs(spec: Experiment) -> list[str]:
     """Names of the encoder's inputs, in order."""
-    return [*(o.key for o in spec.observation), *([MASK] if spec.policy.mask_aware else [])]
+    names = [*(o.key for o in spec.observation), *(o.valid for o in spec.histories)]
+    return [*names, *([MASK] if spec.policy.mask_aware else [])]
 
 
 def write_policy(spec: Experiment, facts: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -97,9 +98,11 @@ def _observation(o: Observation, ranges: dict[str, MinMax]) -> dict[str, Any]:
         turned = {"rotation": "rotation_6d"} if o.turned else {}
         return {**common, "slice": list(o.run_slice), **turned, "normalization": ranges[o.key].to_dict()}
     held = {"when_absent": o.when_absent.model_dump()} if o.when_absent else {}
+    history = {"history": {"steps": o.history.steps, "valid": o.valid}} if o.history else {}
     return {
         **common,
         **held,
+        **history,
         "color": o.color,
         "resize": list(o.resize) if o.resize else None,
         "crop": list(o.crop) if o.crop else None,

@@ -71,7 +71,9 @@ def _network(spec: Experiment) -> dict[str, Any]:
 
 def encoder_example(spec: Experiment, batch: int = 2, mask: tuple[int, ...] | None = None) -> tuple[Tensor, ...]:
     """Random inputs of the encoder."""
-    inputs = [torch.rand(batch, spec.policy.n_obs_steps, *o.shape) * 2 - 1 for o in spec.observation]
+    steps = [o.history.steps if o.history else spec.policy.n_obs_steps for o in spec.observation]
+    inputs = [torch.rand(batch, n, *o.shape) * 2 - 1 for n, o in zip(steps, spec.observation, strict=True)]
+    inputs += [torch.randint(0, 2, (batch, o.history.steps)).float() for o in spec.histories]
     if spec.policy.mask_aware:
         row = torch.tensor(mask or (1,) * len(spec.images), dtype=torch.float32)
         inputs.append(row.repeat(batch, 1))
@@ -103,17 +105,18 @@ def write_graph(module: nn.Module, example: tuple[Tensor, ...], inputs: list[str
 
 
 def largest_difference(spec: Experiment, policy: Policy, folder: Path) -> float:
-    """Difference between graphs and PyTorch, over random inputs: every mask, batches of 1 and 3, all timesteps used."""
+    """Difference between graphs and PyTorch, over random inputs: every mask, histories with some steps, all and none,
+    batches of 1 and 3, all timesteps used."""
     encoder, denoiser = (session(folder / name) for name in (ENCODER, DENOISER))
     masks = itertools.product((0, 1), repeat=len(spec.images)) if spec.policy.mask_aware else [None]
     differences = []
     with torch.no_grad():
-        for mask, batch in itertools.product(masks, (1, 3)):
-            inputs = encoder_example(spec, batch, mask)
+        for mask, batch, seen in itertools.product(masks, (1, 3), (None, 0.0, 1.0) if spec.histories else (None,)):
+            inputs = _with_histories(spec, encoder_example(spec, batch, mask), seen)
             expected = policy.encoder(*inputs)
             differences.append(_difference(expected, encoder, encoder_inputs(spec), inputs))
             if mask is not None:
-                # The contents of an absent picture must have no effect.
+                # The contents of an absent picture must have no effect, nor those of a step that is not there.
                 spoilt = _spoil_absent(spec, inputs, mask)
                 differences.append(_difference(expected, encoder, encoder_inputs(spec), spoilt))
         for timestep, batch in itertools.product(range(0, 100, 10), (1, 3)):
@@ -124,11 +127,22 @@ def largest_difference(spec: Experiment, policy: Policy, folder: Path) -> float:
     return float(np.max(differences))
 
 
-def _spoil_absent(spec: Experiment, inputs: tuple[Tensor, ...], mask: tuple[int, ...]) -> tuple[Tensor, ...]:
-    """The same inputs, with NaN where the mask has no picture."""
-    absent = {o.key for o, there in zip(spec.images, mask, strict=True) if not there}
+def _with_histories(spec: Experiment, inputs: tuple[Tensor, ...], seen: float | None) -> tuple[Tensor, ...]:
+    """The same inputs, with `seen` for every step of every history; unchanged if it is none."""
+    names = {o.valid for o in spec.histories} if seen is not None else set()
     named = zip(encoder_inputs(spec), inputs, strict=True)
-    return tuple(torch.full_like(value, torch.nan) if name in absent else value for name, value in named)
+    return tuple(torch.full_like(value, seen) if name in names else value for name, value in named)
+
+
+def _spoil_absent(spec: Experiment, inputs: tuple[Tensor, ...], mask: tuple[int, ...]) -> tuple[Tensor, ...]:
+    """The same inputs, with NaN where the mask has no picture, and where a history has none."""
+    named = dict(zip(encoder_inputs(spec), inputs, strict=True))
+    for o, there in zip(spec.images, mask, strict=True):
+        if not there:
+            named[o.key] = torch.full_like(named[o.key], torch.nan)
+    for o in spec.histories:
+        named[o.key] = torch.where(named[o.valid][..., None, None, None] > 0.5, named[o.key], torch.nan)
+    return tuple(named.values())
 
 
 def session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:

@@ -178,7 +178,7 @@ class Dropout(unittest.TestCase):
         shape = (count, steps, present.shape[1])
         spans = np.tile([0, 100], (count, 1))
         seen = np.broadcast_to(seen[:, :, None], shape)
-        return drop(spec, np.broadcast_to(present[:, None], shape), seen, spans, np.random.default_rng(0))
+        return drop(spec, np.broadcast_to(present[:, None], shape), seen, spans, np.random.default_rng(0)).visible
 
     def test_dropout_leaves_one_picture_and_brings_none_back(self):
         present = np.ones((20_000, 2), bool)
