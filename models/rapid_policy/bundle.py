@@ -182,6 +182,7 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
 def _seen(o: Observation) -> str:
     sizes = [f"{what} to {size[1]}x{size[0]}" for what, size in (("resized", o.resize), ("cropped", o.crop)) if size]
     what = [o.modality, *sizes, *(["difference to the first picture"] if o.operation else [])]
+    what += [f"{o.history.steps} steps over {o.span} ticks, those that there were"] if o.history else []
     return f"`{o.key}` ({', '.join(what)})"
 
 
@@ -195,6 +196,7 @@ def _absent(spec: Experiment) -> str:
         dropped += [f"`{o.key}` {given}"] if given else []
     held = [f"the last of `{o.key}` for {o.when_absent.hold_last_ms / 1000:g} s" for o in spec.images if o.when_absent]
     stands = f"{', '.join(held)}; then, and all others, zeroed" if held else "zeroed"
+    dropped += [f"from `{o.key}` what is newer than a moment, where `{spec.images[spec.column(o)].key}` is" for o in spec.histories]
     return f"{stands} after their encoders, by the mask; taken away in training: " + (", ".join(dropped) or "none")
 
 

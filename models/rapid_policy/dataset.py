@@ -34,6 +34,9 @@ OPENING = "opening"
 # Windows that are looked at together for the ranges of numbers.
 AT_ONCE = 4096
 
+# Pictures that are made inputs of at a time: few enough to stay in a processor's cache.
+TOGETHER = 32
+
 # Share of the windows without a picture in which there was none before either.
 NEVER = 1 / 3
 
@@ -312,27 +315,31 @@ class Dataset:
 def inputs(spec: Experiment, batch: Batch, device: torch.device) -> dict[str, Tensor]:
     """By key: pictures f32 [B, To, 3, H / pool, W / pool] and vectors f32 [B, To, D], in -1..1; by the name of its validity
     f32 [B, S] of a history, 1 for the steps that there are."""
-    out = {}
-    for o in (*spec.images, *spec.histories):
-        pixels = batch.pictures[o.key].to(device, non_blocking=True)
-        pictures = _unit(pixels.flatten(0, 1))
-        if o.operation == "diff_to_reference":
-            # With min 0 and max 1, normalising (v - reference) / 2 + 0.5 gives v - reference.
-            reference = _unit(batch.references[o.key].to(device, non_blocking=True))
-            pictures = pictures - reference.repeat_interleave(pixels.shape[1], 0)
-        else:
-            pictures = pictures * 2 - 1
-        if spec.encoder.pool > 1:
-            pictures = F.avg_pool2d(pictures, spec.encoder.pool)
-        pictures = pictures.contiguous().unflatten(0, pixels.shape[:2])
-        if o.color == "bgr":
-            pictures = pictures.flip(2)
-        if o.key in batch.gains:
-            pictures = (pictures + 1) * batch.gains[o.key].to(device) - 1
-        shown = batch.shown[o.key].to(device)[:, :, None, None, None]
-        out[o.key] = torch.where(shown, pictures, torch.zeros((), device=device))
+    out = {o.key: _picture_input(spec, o, batch, device) for o in (*spec.images, *spec.histories)}
     out |= {o.valid: batch.shown[o.key].to(device).float() for o in spec.histories}
     return out | {o.key: batch.vectors[o.key].to(device, non_blocking=True) for o in spec.vectors}
+
+
+def _picture_input(spec: Experiment, o: Observation, batch: Batch, device: torch.device) -> Tensor:
+    """f32 [B, To, 3, H / pool, W / pool]; only those that are shown are computed, the others are zeros."""
+    shown, pixels, (_, height, width), pool = batch.shown[o.key], batch.pictures[o.key], o.shape, spec.encoder.pool
+    found = torch.zeros(shown.numel(), 3, height // pool, width // pool, device=device)
+    for places in shown.flatten().nonzero().squeeze(1).split(TOGETHER):
+        windows = places // shown.shape[1]
+        pictures = _unit(pixels.flatten(0, 1)[places].to(device, non_blocking=True))
+        if o.operation == "diff_to_reference":
+            # With min 0 and max 1, normalising (v - reference) / 2 + 0.5 gives v - reference.
+            pictures = pictures - _unit(batch.references[o.key][windows].to(device, non_blocking=True))
+        else:
+            pictures = pictures * 2 - 1
+        if pool > 1:
+            pictures = F.avg_pool2d(pictures, pool)
+        if o.color == "bgr":
+            pictures = pictures.flip(1)
+        if o.key in batch.gains:
+            pictures = (pictures + 1) * batch.gains[o.key][windows, 0].to(device) - 1
+        found[places.to(device)] = pictures
+    return found.unflatten(0, shown.shape)
 
 
 def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArray[np.int64],

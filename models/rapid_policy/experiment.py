@@ -195,8 +195,7 @@ class Observation(Section):
         if self.when_absent:
             raise mistake("when_absent", "nothing stands in for a step of a history", "remove it")
         if self.dropout.any:
-            cause = "a history is without what its modality's other observation is without"
-            raise mistake("dropout", cause, "remove it, and write it there")
+            raise mistake("dropout", "that of the modality's other observation decides", "write it there alone")
         if self.span > LONGEST_HISTORY:
             cause = f"from the first to the last step {self.span} ticks, more than {LONGEST_HISTORY}"
             raise mistake("history.steps", cause, "write fewer, or a smaller down_sample_steps")

@@ -141,23 +141,29 @@ class ObservationEncoder(nn.Module):
         vectors = [observations[key] for key in self.vector_keys]
         embeddings = []
         for i, key in enumerate(self.image_keys):
-            embedding = self._embed(key, observations[key], pooled)
+            embedding = self._embed(key, observations[key], pooled=pooled)
             if mask is not None:
                 # Selected, not multiplied: NaN times zero is still NaN, and an absent picture may contain anything.
                 present = mask[:, None, i : i + 1] > 0.5
                 embedding = torch.where(present, embedding, torch.zeros((), dtype=embedding.dtype, device=mask.device))
             embeddings.append(embedding)
         for key, (valid, now) in self.history_keys.items():
-            embedding = self._embed(now, observations[key], pooled)
-            remembered = self.histories[key](embedding, observations[valid] > 0.5)
+            there = observations[valid] > 0.5
+            # A graph computes all steps, whichever there are; training only those.
+            embedding = self._embed(now, observations[key], pooled=pooled, there=there if pooled else None)
+            remembered = self.histories[key](embedding, there)
             embeddings.append(remembered.unsqueeze(1).expand(-1, self.steps, -1))
         return torch.cat([x.float() for x in vectors + embeddings], -1).flatten(1)
 
-    def _embed(self, key: str, pictures: Tensor, pooled: bool) -> Tensor:
-        """[B, To, 3, H, W] -> [B, To, F], by the encoder of the picture `key`."""
+    def _embed(self, key: str, pictures: Tensor, *, pooled: bool, there: Tensor | None = None) -> Tensor:
+        """[B, To, 3, H, W] -> [B, To, F], by the encoder of the picture `key`; with `there` [B, To] zeros for the others."""
         encoder = self.images[SHARED if self.shared else key]
-        embedding = (encoder.pooled if pooled else encoder)(pictures.flatten(0, 1))
-        return embedding.unflatten(0, pictures.shape[:2])
+        see = encoder.pooled if pooled else encoder
+        if there is None:
+            return see(pictures.flatten(0, 1)).unflatten(0, pictures.shape[:2])
+        places = there.flatten().nonzero().squeeze(1)
+        seen = see(pictures.flatten(0, 1)[places])
+        return seen.new_zeros(there.numel(), seen.shape[1]).index_copy(0, places, seen).unflatten(0, there.shape)
 
 
 class ConvBlock(nn.Module):
