@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from made_up import Experiment, experiment, observed, small
+from made_up import Experiment, experiment, observed, small, with_history
 
 from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json, write_card, write_policy
 from rapid_policy.export import _network, denoiser_example, encoder_example, largest_difference, write_graph
@@ -40,15 +40,6 @@ def write(policy: Policy, folder: Path) -> dict[str, Any]:
     write_graph(policy.encoder, encoder_example(spec), encoder_inputs(spec), "global_cond", folder / ENCODER)
     write_graph(policy.denoiser, denoiser_example(spec), inputs, "epsilon", folder / DENOISER)
     return write_policy(spec, {"normalization": RANGES, "network": _network(spec)}, folder)
-
-
-def with_history(spec: Experiment) -> Experiment:
-    """The same, which remembers what it touched."""
-    described = json.loads(spec.to_text())
-    tactile = next(o for o in described["observation"] if o["key"] == "tactile")
-    touched = {key: value for key, value in tactile.items() if key != "dropout"}
-    described["observation"].append({**touched, "key": "touched", "history": {"steps": 4}})
-    return Experiment.from_text(json.dumps(described))
 
 
 class Mask(unittest.TestCase):
