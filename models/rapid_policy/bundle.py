@@ -196,7 +196,8 @@ def _absent(spec: Experiment) -> str:
         dropped += [f"`{o.key}` {given}"] if given else []
     held = [f"the last of `{o.key}` for {o.when_absent.hold_last_ms / 1000:g} s" for o in spec.images if o.when_absent]
     stands = f"{', '.join(held)}; then, and all others, zeroed" if held else "zeroed"
-    dropped += [f"from `{o.key}` what is newer than a moment, where `{spec.images[spec.column(o)].key}` is" for o in spec.histories]
+    taken = [(o, now) for o in spec.histories if (now := spec.images[spec.column(o)]).dropout.window]
+    dropped += [f"from `{o.key}` with `{now.key}` all that is newer than a moment, or all" for o, now in taken]
     return f"{stands} after their encoders, by the mask; taken away in training: " + (", ".join(dropped) or "none")
 
 

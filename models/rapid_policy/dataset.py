@@ -34,7 +34,7 @@ OPENING = "opening"
 # Windows that are looked at together for the ranges of numbers.
 AT_ONCE = 4096
 
-# Pictures that are made inputs of at a time: few enough to stay in a processor's cache.
+# Pictures that a CPU makes inputs of at a time: few enough to stay in its cache.
 TOGETHER = 32
 
 # Share of the windows without a picture in which there was none before either.
@@ -324,7 +324,9 @@ def _picture_input(spec: Experiment, o: Observation, batch: Batch, device: torch
     """f32 [B, To, 3, H / pool, W / pool]; only those that are shown are computed, the others are zeros."""
     shown, pixels, (_, height, width), pool = batch.shown[o.key], batch.pictures[o.key], o.shape, spec.encoder.pool
     found = torch.zeros(shown.numel(), 3, height // pool, width // pool, device=device)
-    for places in shown.flatten().nonzero().squeeze(1).split(TOGETHER):
+    every = shown.flatten().nonzero().squeeze(1)
+    # Another device copies a few large arrays faster than many small ones.
+    for places in every.split(TOGETHER if device.type == "cpu" else max(1, len(every))):
         windows = places // shown.shape[1]
         pictures = _unit(pixels.flatten(0, 1)[places].to(device, non_blocking=True))
         if o.operation == "diff_to_reference":
