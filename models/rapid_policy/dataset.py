@@ -346,7 +346,8 @@ def _picture_input(spec: Experiment, o: Observation, batch: Batch, device: torch
 
 def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArray[np.int64],
          random: np.random.Generator) -> Dropped:  # fmt: skip
-    """Takes pictures away at random that are `present` [B, To, M] at the rows `seen` [B, To, M], in episodes of the rows `spans` [B, 2].
+    """Takes pictures away at random that are `present` [B, To, M] at the rows `seen` [B, To, M], in episodes of the rows
+    `spans` [B, 2].
 
     Of those that are present at the newest step at least one always remains, also of a single one: the paper's rule.
     """
