@@ -2,7 +2,8 @@
 
     python recompute.py POLICY CHUNK.npz
 
-Prints how far it is from the recorded chunk, in the units of the action; an error if that is more than 0.001.
+The arrays are named as the encoder's inputs: of a history its pictures, and which of its steps there are (1; else 0, and the
+picture is zeros). Prints how far it is from the recorded chunk, in the units of the action; an error if that is more than 0.001.
 """
 
 import json

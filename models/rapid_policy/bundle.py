@@ -20,7 +20,8 @@ LIMIT_MARGIN = 0.05
 
 def encoder_inputs(spec: Experiment) -> list[str]:
     """Names of the encoder's inputs, in order."""
-    return [*(o.key for o in spec.observation), *([MASK] if spec.policy.mask_aware else [])]
+    names = [*(o.key for o in spec.observation), *(o.valid for o in spec.histories)]
+    return [*names, *([MASK] if spec.policy.mask_aware else [])]
 
 
 def write_policy(spec: Experiment, facts: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -97,9 +98,11 @@ def _observation(o: Observation, ranges: dict[str, MinMax]) -> dict[str, Any]:
         turned = {"rotation": "rotation_6d"} if o.turned else {}
         return {**common, "slice": list(o.run_slice), **turned, "normalization": ranges[o.key].to_dict()}
     held = {"when_absent": o.when_absent.model_dump()} if o.when_absent else {}
+    history = {"history": {"steps": o.history.steps, "valid": o.valid}} if o.history else {}
     return {
         **common,
         **held,
+        **history,
         "color": o.color,
         "resize": list(o.resize) if o.resize else None,
         "crop": list(o.crop) if o.crop else None,
@@ -179,6 +182,7 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
 def _seen(o: Observation) -> str:
     sizes = [f"{what} to {size[1]}x{size[0]}" for what, size in (("resized", o.resize), ("cropped", o.crop)) if size]
     what = [o.modality, *sizes, *(["difference to the first picture"] if o.operation else [])]
+    what += [f"{o.history.steps} steps over {o.span} ticks, those that there were"] if o.history else []
     return f"`{o.key}` ({', '.join(what)})"
 
 
@@ -192,6 +196,8 @@ def _absent(spec: Experiment) -> str:
         dropped += [f"`{o.key}` {given}"] if given else []
     held = [f"the last of `{o.key}` for {o.when_absent.hold_last_ms / 1000:g} s" for o in spec.images if o.when_absent]
     stands = f"{', '.join(held)}; then, and all others, zeroed" if held else "zeroed"
+    taken = [(o, now) for o in spec.histories if (now := spec.images[spec.column(o)]).dropout.window]
+    dropped += [f"from `{o.key}` with `{now.key}` all that is newer than a moment, or all" for o, now in taken]
     return f"{stands} after their encoders, by the mask; taken away in training: " + (", ".join(dropped) or "none")
 
 

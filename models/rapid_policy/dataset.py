@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -34,6 +34,12 @@ OPENING = "opening"
 # Windows that are looked at together for the ranges of numbers.
 AT_ONCE = 4096
 
+# Pictures that a CPU makes inputs of at a time: few enough to stay in its cache.
+TOGETHER = 32
+
+# Share of the windows without a picture in which there was none before either.
+NEVER = 1 / 3
+
 Plan = dict[str, NDArray]
 Bools = NDArray[np.bool_]
 
@@ -43,19 +49,32 @@ class Batch:
     """B windows."""
 
     pictures: dict[str, Tensor]
-    """u8 [B, To, H, W, 3] by key; of a picture that is masked or absent anything."""
+    """u8 [B, To, H, W, 3] by key, with a history [B, S, H, W, 3]; of a picture that is masked or absent anything."""
     references: dict[str, Tensor]
     """u8 [B, H, W, 3] by key: of differences, what to compare with."""
     gains: dict[str, Tensor]
     """f32 [B, 1, 1, 1, 1] by key: brightness."""
     shown: dict[str, Tensor]
-    """bool [B, To] by key: there is a picture."""
+    """bool [B, To] by key, with a history [B, S]: there is a picture."""
     vectors: dict[str, Tensor]
     """f32 [B, To, D] in -1..1 by key."""
     mask: Tensor
     """f32 [B, M], 1 for pictures that are present."""
     actions: Tensor
     """f32 [B, Tp, Da] in -1..1"""
+
+
+class Dropped(NamedTuple):
+    """What `drop` leaves of M pictures, and how it took the others away."""
+
+    visible: Bools
+    """[B, To, M]"""
+    windows: Bools
+    """[B, M] present at the newest step, and taken away by `dropout.window`."""
+    out: NDArray[np.int64]
+    """[B, M] the row at which it leaves by `dropout.episode`."""
+    back: NDArray[np.int64]
+    """[B, M] the row at which it is back; that of `out` where it does not leave."""
 
 
 class Unfit(ValueError):
@@ -74,9 +93,9 @@ class Dataset:
     def __init__(self, spec: Experiment, episodes: Sequence[Episode], ranges: dict[str, MinMax] | None = None,
                  folder: Path | None = None) -> None:  # fmt: skip
         self.spec, self.episodes = spec, episodes
-        self.names = {o.key: picture_source(o).name for o in spec.images}
+        self.names = {o.key: picture_source(o).name for o in (*spec.images, *spec.histories)}
         # Which of the observations each picture is.
-        self.images = [i for i, o in enumerate(spec.observation) if o.kind == "image"]
+        self.images = [i for i, o in enumerate(spec.observation) if o in spec.images]
         read = _on_disk(self._read(), folder)
         if not len(read.get("windows", ())):
             raise ValueError("no window to learn from: every tick lacks an action or a required modality")
@@ -154,27 +173,56 @@ class Dataset:
         apart = np.outer(np.arange(1 - spec.policy.n_obs_steps, 1), [o.down_sample_steps for o in spec.observation])
         seen = np.maximum(tick[:, None, None] + apart, windows[:, 1:2, None])
         plan: Plan = {"tick": tick, "seen": seen, "done": self._done(windows)}
-        pool = spec.encoder.pool
         for o in spec.images:
-            varied = o.augmentation
-            if varied.shift and vary:
-                far = varied.shift // pool
-                plan[f"corner {o.key}"] = random.integers(-far, far + 1, (size, 2)) * pool
-            if varied.brightness and vary:
-                gain = random.uniform(1 - varied.brightness, 1 + varied.brightness, (size, 1, 1, 1, 1))
-                plan[f"gain {o.key}"] = gain.astype(np.float32)
+            self._vary(plan, o, random, vary=vary)
         for o in spec.vectors:
             if o.augmentation.noise and vary:
                 noise = random.standard_normal((*seen.shape[:2], *o.shape), np.float32)
                 plan[f"noise {o.key}"] = noise * np.float32(o.augmentation.noise)
         pictures = seen[..., self.images]
-        visible = self.present[pictures, np.arange(len(self.images))]
+        plan["visible"] = self.present[pictures, np.arange(len(self.images))]
+        dropped = None
         if spec.policy.mask_aware and vary:
-            visible = drop(spec, visible, pictures, self._episode_spans(tick), random)
-        plan["visible"] = visible
+            dropped = drop(spec, plan["visible"], pictures, self._episode_spans(tick), random)
+            plan["visible"] = dropped.visible
         if vary:
             self._hold(plan, random)
+        # Last: but for their histories, windows are those of a policy without any.
+        for o in spec.histories:
+            self._vary(plan, o, random, vary=vary)
+        hidden = None if dropped is None else hide(spec, dropped, random)
+        for o in spec.histories:
+            self._remember(plan, o, windows[:, 1:2], dropped, hidden)
         return plan
+
+    def _vary(self, plan: Plan, o: Observation, random: np.random.Generator, *, vary: bool) -> None:
+        """The shift and the brightness of a picture."""
+        varied, pool, size = o.augmentation, self.spec.encoder.pool, len(plan["tick"])
+        if varied.shift and vary:
+            far = varied.shift // pool
+            plan[f"corner {o.key}"] = random.integers(-far, far + 1, (size, 2)) * pool
+        if varied.brightness and vary:
+            gain = random.uniform(1 - varied.brightness, 1 + varied.brightness, (size, 1, 1, 1, 1))
+            plan[f"gain {o.key}"] = gain.astype(np.float32)
+
+    def _remember(self, plan: Plan, o: Observation, begin: NDArray[np.int64], dropped: Dropped | None,
+                  hidden: NDArray[np.int64] | None) -> None:  # fmt: skip
+        """The rows [B, S] of a history and which of them there are, of windows whose segments `begin` [B, 1]."""
+        i, tick = self.spec.column(o), plan["tick"][:, None]
+        ago = np.arange(o.history.steps)[::-1] * o.down_sample_steps
+        rows = tick - ago
+        valid = rows >= begin
+        # Of what is before the beginning any row of the episode is named, and none is read.
+        rows = np.where(valid, rows, tick)
+        valid &= self.present[rows, i]
+        if dropped is not None and hidden is not None:
+            valid &= (rows < dropped.out[:, i : i + 1]) | (rows >= dropped.back[:, i : i + 1])
+            valid &= ago >= hidden[:, i : i + 1]
+        # What is there now is decided by the picture of now, the one that always remains included.
+        valid[:, -1] = plan["visible"][:, -1, i]
+        # What is held has been absent since; a history holds nothing.
+        valid &= ago >= plan.get(f"since {self.spec.images[i].key}", 0)
+        plan[f"seen {o.key}"], plan[f"valid {o.key}"] = rows, valid
 
     def _hold(self, plan: Plan, random: np.random.Generator) -> None:
         """Some windows see a picture as it was before it left: from what has passed since then they are the same."""
@@ -201,8 +249,9 @@ class Dataset:
             steps, shown = _replugged(plan["seen"][..., self.images[i]] - plan.get(f"since {o.key}", 0), visible[:, :, i])
             batch.shown[o.key] = torch.from_numpy(shown)
             self._pictures(batch, o, plan, steps, shown)
-            if (gain := plan.get(f"gain {o.key}")) is not None:
-                batch.gains[o.key] = torch.from_numpy(gain)
+        for o in spec.histories:
+            batch.shown[o.key] = torch.from_numpy(plan[f"valid {o.key}"])
+            self._pictures(batch, o, plan, plan[f"seen {o.key}"], plan[f"valid {o.key}"])
         for i, o in enumerate(spec.observation):
             if o.kind == "image":
                 continue
@@ -213,23 +262,25 @@ class Dataset:
         return batch
 
     def _pictures(self, batch: Batch, o: Observation, plan: Plan, steps: NDArray[np.int64], shown: Bools) -> None:
-        """All steps of a window have the same shift; beyond an edge the edge is repeated."""
+        """All steps of a window have the same shift and brightness; beyond an edge the edge is repeated."""
         name, (_, height, width), pool = self.names[o.key], o.shape, self.spec.encoder.pool
         corners = plan.get(f"corner {o.key}")
         pictures = np.zeros((*steps.shape, height, width, 3), np.uint8)
         compared = np.zeros((len(steps), height, width, 3), np.uint8) if o.operation else None
-        owners = np.searchsorted(self.starts, steps[:, -1], "right") - 1
-        for b in np.flatnonzero(shown[:, -1]):
+        owners = np.searchsorted(self.starts, plan["tick"], "right") - 1
+        for b in np.flatnonzero(shown.any(1)):
             episode = self.episodes[owners[b]]
             source, rows = episode.value(name), steps[b] - self.starts[owners[b]]
             corner = (0, 0) if corners is None else corners[b]
-            for step, row in enumerate(rows):
-                _shift(source[row], corner, pool, pictures[b, step])
+            for step in np.flatnonzero(shown[b]):
+                _shift(source[rows[step]], corner, pool, pictures[b, step])
             if compared is not None:
                 _shift(source[episode.first(name)], corner, pool, compared[b])
         batch.pictures[o.key] = torch.from_numpy(pictures)
         if compared is not None:
             batch.references[o.key] = torch.from_numpy(compared)
+        if (gain := plan.get(f"gain {o.key}")) is not None:
+            batch.gains[o.key] = torch.from_numpy(gain)
 
     def _done(self, windows: NDArray[np.int64]) -> NDArray[np.int64]:
         """[B, Tp] rows of the actions of windows."""
@@ -262,63 +313,90 @@ class Dataset:
 
 
 def inputs(spec: Experiment, batch: Batch, device: torch.device) -> dict[str, Tensor]:
-    """By key: pictures f32 [B, To, 3, H / pool, W / pool] and vectors f32 [B, To, D], in -1..1."""
-    out = {}
-    for o in spec.images:
-        pixels = batch.pictures[o.key].to(device, non_blocking=True)
-        pictures = _unit(pixels.flatten(0, 1))
-        if o.operation == "diff_to_reference":
-            # With min 0 and max 1, normalising (v - reference) / 2 + 0.5 gives v - reference.
-            reference = _unit(batch.references[o.key].to(device, non_blocking=True))
-            pictures = pictures - reference.repeat_interleave(pixels.shape[1], 0)
-        else:
-            pictures = pictures * 2 - 1
-        if spec.encoder.pool > 1:
-            pictures = F.avg_pool2d(pictures, spec.encoder.pool)
-        pictures = pictures.contiguous().unflatten(0, pixels.shape[:2])
-        if o.color == "bgr":
-            pictures = pictures.flip(2)
-        if o.key in batch.gains:
-            pictures = (pictures + 1) * batch.gains[o.key].to(device) - 1
-        shown = batch.shown[o.key].to(device)[:, :, None, None, None]
-        out[o.key] = torch.where(shown, pictures, torch.zeros((), device=device))
+    """By key: pictures f32 [B, To, 3, H / pool, W / pool] and vectors f32 [B, To, D], in -1..1; by the name of its validity
+    f32 [B, S] of a history, 1 for the steps that there are."""
+    out = {o.key: _picture_input(spec, o, batch, device) for o in (*spec.images, *spec.histories)}
+    out |= {o.valid: batch.shown[o.key].to(device).float() for o in spec.histories}
     return out | {o.key: batch.vectors[o.key].to(device, non_blocking=True) for o in spec.vectors}
 
 
+def _picture_input(spec: Experiment, o: Observation, batch: Batch, device: torch.device) -> Tensor:
+    """f32 [B, To, 3, H / pool, W / pool]; only those that are shown are computed, the others are zeros."""
+    shown, pixels, (_, height, width), pool = batch.shown[o.key], batch.pictures[o.key], o.shape, spec.encoder.pool
+    found = torch.zeros(shown.numel(), 3, height // pool, width // pool, device=device)
+    every = shown.flatten().nonzero().squeeze(1)
+    # Another device copies a few large arrays faster than many small ones.
+    for places in every.split(TOGETHER if device.type == "cpu" else max(1, len(every))):
+        windows = places // shown.shape[1]
+        pictures = _unit(pixels.flatten(0, 1)[places].to(device, non_blocking=True))
+        if o.operation == "diff_to_reference":
+            # With min 0 and max 1, normalising (v - reference) / 2 + 0.5 gives v - reference.
+            pictures = pictures - _unit(batch.references[o.key][windows].to(device, non_blocking=True))
+        else:
+            pictures = pictures * 2 - 1
+        if pool > 1:
+            pictures = F.avg_pool2d(pictures, pool)
+        if o.color == "bgr":
+            pictures = pictures.flip(1)
+        if o.key in batch.gains:
+            pictures = (pictures + 1) * batch.gains[o.key][windows, 0].to(device) - 1
+        found[places.to(device)] = pictures
+    return found.unflatten(0, shown.shape)
+
+
 def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArray[np.int64],
-         random: np.random.Generator) -> Bools:  # fmt: skip
-    """Takes pictures away at random: bool [B, To, M] of the rows `seen` [B, To, M], in episodes of the rows `spans` [B, 2].
+         random: np.random.Generator) -> Dropped:  # fmt: skip
+    """Takes pictures away at random that are `present` [B, To, M] at the rows `seen` [B, To, M], in episodes of the rows
+    `spans` [B, 2].
 
     Of those that are present at the newest step at least one always remains, also of a single one: the paper's rule.
     """
-    out, there = present.copy(), present[:, -1]
-    kept = there & (random.random(there.shape) >= [o.dropout.window for o in spec.images])
-    away = np.zeros_like(present)
+    visible, there = present.copy(), present[:, -1]
+    windows = there & (random.random(there.shape) < [o.dropout.window for o in spec.images])
+    out = back = np.zeros(there.shape, np.int64)
     if any(o.dropout.episode for o in spec.images):
-        away = _absences(spec, seen, spans, random)
-        kept &= ~away[:, -1]
+        out, back = _absences(spec, spans, random)
+    away = (seen >= out[:, None]) & (seen < back[:, None])
+    kept = there & ~windows & ~away[:, -1]
     # The one that remains in a window that lost all: any present one, with equal probability.
     lot = np.where(there, random.random(there.shape), -1.0)
     lost = ~kept.any(1) & there.any(1)
     kept[lost, lot[lost].argmax(1)] = True
-    out &= ~away
-    out[:, -1] = kept
-    if out.shape[1] > 1 and any(o.dropout.replug for o in spec.images):
+    visible &= ~away
+    visible[:, -1] = kept
+    if visible.shape[1] > 1 and any(o.dropout.replug for o in spec.images):
         cut = random.random(there.shape) < [o.dropout.replug for o in spec.images]
-        first = random.integers(1, out.shape[1], there.shape)
-        out &= ~(cut[:, None] & (np.arange(out.shape[1])[None, :, None] < first[:, None]))
-    return out
+        first = random.integers(1, visible.shape[1], there.shape)
+        visible &= ~(cut[:, None] & (np.arange(visible.shape[1])[None, :, None] < first[:, None]))
+    return Dropped(visible, windows & ~kept, out, back)
 
 
-def _absences(spec: Experiment, seen: NDArray[np.int64], spans: NDArray[np.int64],
-              random: np.random.Generator) -> Bools:  # fmt: skip
-    """[B, To, M] where a picture is absent because it left in the middle of the episode, for a time or to its end."""
-    count = (seen.shape[0], seen.shape[2])
+def hide(spec: Experiment, dropped: Dropped, random: np.random.Generator) -> NDArray[np.int64]:
+    """[B, M] ticks back from the newest that a history lacks, one draw for each window and modality.
+
+    Where `dropout.window` took the picture of now it was never plugged in, or it was unplugged some time ago: a moment as
+    likely as any other that the longest history of the modality shows.
+    """
+    hidden = np.zeros(dropped.windows.shape, np.int64)
+    spans: dict[int, int] = {}
+    for o in spec.histories:
+        spans[spec.column(o)] = max(spans.get(spec.column(o), 0), o.span)
+    for i, span in spans.items():
+        never = random.random(len(hidden)) < NEVER
+        ago = np.where(never, span + 1, random.integers(1, span + 1, len(hidden)))
+        hidden[:, i] = np.where(dropped.windows[:, i], ago, 0)
+    return hidden
+
+
+def _absences(spec: Experiment, spans: NDArray[np.int64],
+              random: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # fmt: skip
+    """[B, M] rows at which a picture leaves in the middle of the episode and is back, for a time or to its end."""
+    count = (len(spans), len(spec.images))
     leaves = random.random(count) < [o.dropout.episode for o in spec.images]
     begin, end = spans[:, :1], spans[:, 1:]
     out = begin + (random.random(count) * (end - begin)).astype(np.int64)
     back = np.where(random.random(count) < 0.5, end, out + 1 + (random.random(count) * (end - out)).astype(np.int64))
-    return leaves[:, None] & (seen >= out[:, None]) & (seen < back[:, None])
+    return out, np.where(leaves, back, out)
 
 
 def _replugged(seen: NDArray[np.int64], visible: Bools) -> tuple[NDArray[np.int64], Bools]:

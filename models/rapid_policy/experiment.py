@@ -20,6 +20,8 @@ TRAIN_TIMESTEPS = 100
 POSITION = 3
 ROTATIONS = {"none": 0, "rotation_6d": 6, "quaternion": 4}
 QUATERNION = 4
+# Ticks that a history may reach back, which the program keeps.
+LONGEST_HISTORY = 600
 TAKES = {"position": POSITION, "rotation_6d": 6, "quaternion": 4}
 
 
@@ -98,6 +100,12 @@ class HoldLast(Section):
     hold_last_ms: int = known("for how long, ms", 20000, ge=1, le=600_000)
 
 
+class History(Section):
+    """In place of the policy's steps more of them, further back, each with whether there was a picture."""
+
+    steps: int = known("how many, the newest included", 12, ge=2, le=64)
+
+
 class Augmentation(Section):
     """What is varied at random in training."""
 
@@ -155,6 +163,9 @@ class Observation(Section):
     )
     dropout: Dropout = known("how often it is taken away in training", {"window": 0.3}, Dropout())
     when_absent: HoldLast | None = known("what stands in for it while it is absent", {"hold_last_ms": 20000}, None)
+    history: History | None = known(
+        "pictures: steps of its own, also of before it was unplugged", {"steps": 12}, None
+    )
     augmentation: Augmentation = known("what is varied in training", {"shift": 4}, Augmentation())
 
     @model_validator(mode="after")
@@ -170,10 +181,24 @@ class Observation(Section):
             raise mistake("dropout", "what is required is never absent", "write required = false, or remove dropout")
         if self.required and self.when_absent:
             raise mistake("when_absent", "what is required is never absent", "write required = false, or remove the key")
+        if self.history:
+            self._check_history()
         if self.dropout.held and not self.when_absent:
             fix = "write when_absent = { hold_last_ms = 20000 }"
             raise mistake("dropout.held", "at run time nothing stands in for it", fix)
         return self
+
+    def _check_history(self) -> None:
+        if self.required:
+            cause = "of what is required, but it is given whether or not there is a picture now"
+            raise mistake("history", cause, "write required = false")
+        if self.when_absent:
+            raise mistake("when_absent", "nothing stands in for a step of a history", "remove it")
+        if self.dropout.any:
+            raise mistake("dropout", "that of the modality's other observation decides", "write it there alone")
+        if self.span > LONGEST_HISTORY:
+            cause = f"from the first to the last step {self.span} ticks, more than {LONGEST_HISTORY}"
+            raise mistake("history.steps", cause, "write fewer, or a smaller down_sample_steps")
 
     def _check_picture(self) -> None:
         if not (self.crop or self.resize or self.size):
@@ -213,6 +238,16 @@ class Observation(Section):
         return (sum(part.length for part in self.sources),)
 
     @property
+    def valid(self) -> str:
+        """Of a history: name of the encoder's input that says which steps there are."""
+        return f"{self.key}_valid"
+
+    @property
+    def span(self) -> int:
+        """Of a history: ticks from the first step to the last."""
+        return (self.history.steps - 1) * self.down_sample_steps if self.history else 0
+
+    @property
     def sources(self) -> tuple[Part, ...]:
         """Vectors: what they are made of in the episodes."""
         return self.parts or (Part(modality=self.modality, columns=self.columns),)
@@ -232,7 +267,9 @@ class Observation(Section):
         return begin, begin + self.shape[0]
 
 
-_IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout", "when_absent"}
+_IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout", "when_absent", "history"}
+# What an encoder sees of a picture depends on.
+_SIGHT = ("size", "resize", "crop", "color", "operation")
 _VECTOR_KEYS = {"columns", "parts", "slice"}
 
 
@@ -496,9 +533,11 @@ class Experiment(Section):
     @model_validator(mode="after")
     def _check(self) -> Experiment:
         keys = [o.key for o in self.observation]
+        taken = {"mask", "action", *(o.valid for o in self.histories)}
         for i, o in enumerate(self.observation):
-            if o.key in keys[:i] or o.key in ("mask", "action"):
+            if o.key in keys[:i] or o.key in taken:
                 raise mistake(f"observation.{i}.key", f"{o.key!r} is taken", "give each input a name of its own")
+        self._check_histories()
         self._check_mask()
         self._check_pictures()
         base = self.action.base
@@ -512,11 +551,30 @@ class Experiment(Section):
             raise mistake("policy.horizon", cause, f"write a multiple of {levels}, or fewer widths of the denoiser")
         return self
 
+    def _check_histories(self) -> None:
+        now = {o.modality: o for o in self.images}
+        for i, o in enumerate(self.observation):
+            if not o.history:
+                continue
+            if not self.policy.mask_aware:
+                fix = "write mask_aware = true in [policy], or remove it"
+                raise mistake(f"observation.{i}.history", "without a mask nothing may be absent", fix)
+            if o.modality not in now:
+                fix = "observe it without a history too, which decides when it is taken away"
+                raise mistake(f"observation.{i}.history", f"the only observation of {o.modality!r}", fix)
+            self._check_sight(i, o, now[o.modality])
+
+    def _check_sight(self, i: int, history: Observation, now: Observation) -> None:
+        for key in _SIGHT:
+            if getattr(history, key) != getattr(now, key):
+                cause = f"not as of {now.key!r}: one encoder sees both"
+                raise mistake(f"observation.{i}.{key}", cause, "write the same in both")
+
     def _check_mask(self) -> None:
         if self.policy.mask_aware:
             if not self.images:
                 raise mistake("policy.mask_aware", "no pictures that could be absent", "write mask_aware = false")
-            seen = [o.modality if o.kind == "image" else None for o in self.observation]
+            seen = [o.modality if o in self.images else None for o in self.observation]
             for i, modality in enumerate(seen):
                 if modality and modality in seen[:i]:
                     fix = "observe it once, or write mask_aware = false"
@@ -547,8 +605,17 @@ class Experiment(Section):
 
     @property
     def images(self) -> tuple[Observation, ...]:
-        """The pictures, in the order of the mask."""
-        return tuple(o for o in self.observation if o.kind == "image")
+        """The pictures of now, in the order of the mask."""
+        return tuple(o for o in self.observation if o.kind == "image" and not o.history)
+
+    @property
+    def histories(self) -> tuple[Observation, ...]:
+        """The pictures with a history, in the order of the condition."""
+        return tuple(o for o in self.observation if o.history)
+
+    def column(self, history: Observation) -> int:
+        """Which of `images` is of the same modality."""
+        return [o.modality for o in self.images].index(history.modality)
 
     @property
     def vectors(self) -> tuple[Observation, ...]:
@@ -574,7 +641,8 @@ class Experiment(Section):
     @property
     def condition(self) -> int:
         """Length of the condition: the vectors and embeddings of all observation steps."""
-        step = sum(o.shape[0] for o in self.vectors) + len(self.images) * self.encoder.features
+        pictures = len(self.images) + len(self.histories)
+        step = sum(o.shape[0] for o in self.vectors) + pictures * self.encoder.features
         return self.policy.n_obs_steps * step
 
     def to_text(self) -> str:

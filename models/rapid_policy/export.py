@@ -71,11 +71,20 @@ def _network(spec: Experiment) -> dict[str, Any]:
 
 def encoder_example(spec: Experiment, batch: int = 2, mask: tuple[int, ...] | None = None) -> tuple[Tensor, ...]:
     """Random inputs of the encoder."""
-    inputs = [torch.rand(batch, spec.policy.n_obs_steps, *o.shape) * 2 - 1 for o in spec.observation]
+    steps = [o.history.steps if o.history else spec.policy.n_obs_steps for o in spec.observation]
+    inputs = [torch.rand(batch, n, *o.shape) * 2 - 1 for n, o in zip(steps, spec.observation, strict=True)]
+    inputs += [_valid_example(batch, o.history.steps) for o in spec.histories]
     if spec.policy.mask_aware:
         row = torch.tensor(mask or (1,) * len(spec.images), dtype=torch.float32)
         inputs.append(row.repeat(batch, 1))
     return tuple(inputs)
+
+
+def _valid_example(batch: int, steps: int) -> Tensor:
+    """Which steps of a history there are: of three rows some of the first, all of the second, none of the third."""
+    valid = torch.randint(0, 2, (batch, steps)).float()
+    valid[1::3], valid[2::3] = 1, 0
+    return valid
 
 
 def denoiser_example(spec: Experiment, batch: int = 2, timestep: int = 90) -> tuple[Tensor, ...]:
@@ -103,7 +112,8 @@ def write_graph(module: nn.Module, example: tuple[Tensor, ...], inputs: list[str
 
 
 def largest_difference(spec: Experiment, policy: Policy, folder: Path) -> float:
-    """Difference between graphs and PyTorch, over random inputs: every mask, batches of 1 and 3, all timesteps used."""
+    """Difference between graphs and PyTorch, over random inputs: every mask, histories with some steps, all and none,
+    batches of 1 and 3, all timesteps used."""
     encoder, denoiser = (session(folder / name) for name in (ENCODER, DENOISER))
     masks = itertools.product((0, 1), repeat=len(spec.images)) if spec.policy.mask_aware else [None]
     differences = []
@@ -113,7 +123,7 @@ def largest_difference(spec: Experiment, policy: Policy, folder: Path) -> float:
             expected = policy.encoder(*inputs)
             differences.append(_difference(expected, encoder, encoder_inputs(spec), inputs))
             if mask is not None:
-                # The contents of an absent picture must have no effect.
+                # The contents of an absent picture must have no effect, nor those of a step that is not there.
                 spoilt = _spoil_absent(spec, inputs, mask)
                 differences.append(_difference(expected, encoder, encoder_inputs(spec), spoilt))
         for timestep, batch in itertools.product(range(0, 100, 10), (1, 3)):
@@ -125,10 +135,14 @@ def largest_difference(spec: Experiment, policy: Policy, folder: Path) -> float:
 
 
 def _spoil_absent(spec: Experiment, inputs: tuple[Tensor, ...], mask: tuple[int, ...]) -> tuple[Tensor, ...]:
-    """The same inputs, with NaN where the mask has no picture."""
-    absent = {o.key for o, there in zip(spec.images, mask, strict=True) if not there}
-    named = zip(encoder_inputs(spec), inputs, strict=True)
-    return tuple(torch.full_like(value, torch.nan) if name in absent else value for name, value in named)
+    """The same inputs, with NaN where the mask has no picture, and where a history has none."""
+    named = dict(zip(encoder_inputs(spec), inputs, strict=True))
+    for o, there in zip(spec.images, mask, strict=True):
+        if not there:
+            named[o.key] = torch.full_like(named[o.key], torch.nan)
+    for o in spec.histories:
+        named[o.key] = torch.where(named[o.valid][..., None, None, None] > 0.5, named[o.key], torch.nan)
+    return tuple(named.values())
 
 
 def session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:

@@ -90,21 +90,49 @@ class ResNetEncoder(nn.Module):
 ENCODERS = {"small": SmallEncoder, "resnet18": ResNetEncoder}
 
 
+class HistoryPooling(nn.Module):
+    """Embeddings [B, S, F] of the steps of a history, bool [B, S] which there are -> [B, F]: their mean, weighted by a
+    learned score of each; zeros where there is none."""
+
+    # Of a step that is not there, beside which every other one has all the weight.
+    LEAST = -1e9
+
+    def __init__(self, features: int, steps: int) -> None:
+        super().__init__()
+        self.score = nn.Linear(features, 1)
+        self.places = nn.Parameter(torch.zeros(steps))
+
+    def forward(self, embeddings: Tensor, valid: Tensor) -> Tensor:
+        # Selected, not multiplied: what is not there may contain anything.
+        embeddings = torch.where(valid.unsqueeze(-1), embeddings.float(), 0.0)
+        scores = self.score(embeddings).squeeze(-1).float() + self.places
+        weights = F.softmax(torch.where(valid, scores, self.LEAST), -1)
+        # Without any step the softmax has given all the same weight.
+        return (torch.where(valid, weights, 0.0).unsqueeze(-1) * embeddings).sum(1)
+
+
 class ObservationEncoder(nn.Module):
-    """All observations -> `global_cond` [B, Dc]: at each step the vectors, then an embedding of each picture."""
+    """All observations -> `global_cond` [B, Dc]: at each step the vectors, an embedding of each picture, and one of each
+    history, which is the same at every step."""
 
     def __init__(self, spec: Experiment) -> None:
         super().__init__()
-        self.keys = [o.key for o in spec.observation]
+        self.keys = [*(o.key for o in spec.observation), *(o.valid for o in spec.histories)]
         self.image_keys = [o.key for o in spec.images]
         self.vector_keys = [o.key for o in spec.vectors]
         self.mask_aware, self.shared = spec.policy.mask_aware, spec.encoder.shared
+        self.steps = spec.policy.n_obs_steps
+        # By key: the name of its validity, and the picture of now whose encoder sees it too.
+        self.history_keys = {o.key: (o.valid, spec.images[spec.column(o)].key) for o in spec.histories}
         kind = ENCODERS[spec.encoder.type]
         one_each = {SHARED: spec.images[0]} if self.shared and spec.images else {o.key: o for o in spec.images}
         self.images = nn.ModuleDict({key: kind(*o.shape[1:], spec.encoder) for key, o in one_each.items()})
+        pooled = {o.key: HistoryPooling(spec.encoder.features, o.history.steps) for o in spec.histories}
+        self.histories = nn.ModuleDict(pooled)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Inputs in the order of the observations: pictures [B, To, 3, H, W], vectors [B, To, D]; then the mask."""
+        """Inputs in the order of the observations: pictures [B, To, 3, H, W], with a history [B, S, 3, H, W], vectors
+        [B, To, D]; then the validity [B, S] of each history; then the mask."""
         observations = dict(zip(self.keys, inputs, strict=False))
         return self.encode(observations, inputs[-1] if self.mask_aware else None, pooled=False)
 
@@ -113,15 +141,29 @@ class ObservationEncoder(nn.Module):
         vectors = [observations[key] for key in self.vector_keys]
         embeddings = []
         for i, key in enumerate(self.image_keys):
-            pictures, encoder = observations[key], self.images[SHARED if self.shared else key]
-            embedding = (encoder.pooled if pooled else encoder)(pictures.flatten(0, 1))
-            embedding = embedding.unflatten(0, pictures.shape[:2])
+            embedding = self._embed(key, observations[key], pooled=pooled)
             if mask is not None:
                 # Selected, not multiplied: NaN times zero is still NaN, and an absent picture may contain anything.
                 present = mask[:, None, i : i + 1] > 0.5
                 embedding = torch.where(present, embedding, torch.zeros((), dtype=embedding.dtype, device=mask.device))
             embeddings.append(embedding)
+        for key, (valid, now) in self.history_keys.items():
+            there = observations[valid] > 0.5
+            # A graph computes all steps, whichever there are; training only those.
+            embedding = self._embed(now, observations[key], pooled=pooled, there=there if pooled else None)
+            remembered = self.histories[key](embedding, there)
+            embeddings.append(remembered.unsqueeze(1).expand(-1, self.steps, -1))
         return torch.cat([x.float() for x in vectors + embeddings], -1).flatten(1)
+
+    def _embed(self, key: str, pictures: Tensor, *, pooled: bool, there: Tensor | None = None) -> Tensor:
+        """[B, To, 3, H, W] -> [B, To, F], by the encoder of the picture `key`; with `there` [B, To] zeros for the others."""
+        encoder = self.images[SHARED if self.shared else key]
+        see = encoder.pooled if pooled else encoder
+        if there is None:
+            return see(pictures.flatten(0, 1)).unflatten(0, pictures.shape[:2])
+        places = there.flatten().nonzero().squeeze(1)
+        seen = see(pictures.flatten(0, 1)[places])
+        return seen.new_zeros(there.numel(), seen.shape[1]).index_copy(0, places, seen).unflatten(0, there.shape)
 
 
 class ConvBlock(nn.Module):

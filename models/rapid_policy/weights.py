@@ -67,7 +67,8 @@ def _observation(o: dict[str, Any]) -> dict[str, Any]:
         begin, end = o.get("slice") or (0, o["shape"][0])
         return {**named, "columns": list(range(begin, end))}
     size = {key: o[key] for key in ("resize", "crop", "operation") if o.get(key)}
-    return {**named, **({"size": o["shape"][1:]} if not {"resize", "crop"} & set(size) else {}), **size}
+    history = {"history": {"steps": o["history"]["steps"]}} if "history" in o else {}
+    return {**named, **({"size": o["shape"][1:]} if not {"resize", "crop"} & set(size) else {}), **size, **history}
 
 
 def _network(

@@ -47,6 +47,15 @@ def observed(spec: Experiment, key: str, **values: Any) -> Experiment:
     return Experiment.from_text(json.dumps(described))
 
 
+def with_history(spec: Experiment) -> Experiment:
+    """The same, which remembers what it touched."""
+    described = json.loads(spec.to_text())
+    tactile = next(o for o in described["observation"] if o["key"] == "tactile")
+    touched = {key: value for key, value in tactile.items() if key != "dropout"}
+    described["observation"].append({**touched, "key": "touched", "history": {"steps": 4}})
+    return Experiment.from_text(json.dumps(described))
+
+
 def presence(length: int, *names: str) -> dict[str, np.ndarray]:
     """The arrays of modalities that are there in every row."""
     return {f"{what} {name}": np.ones(length, bool) for name in names for what in ("present", "plugged", "running")}

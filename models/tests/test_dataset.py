@@ -2,11 +2,13 @@
 
 import json
 import unittest
+from unittest import mock
 
 import numpy as np
 import torch
 from made_up import POLICIES, by_hand, experiment, made_up, observed, small
 
+from rapid_policy import dataset as module
 from rapid_policy.dataset import Dataset, drop, inputs, unfit
 from rapid_policy.experiment import Experiment
 
@@ -19,6 +21,14 @@ def plain() -> Experiment:
     for key in ("wrist", "tactile", "state"):
         spec = observed(spec, key, augmentation={}, **({"dropout": {}} if key != "state" else {}))
     return spec
+
+
+def remembering(**dropout: float) -> Experiment:
+    """A policy with a history without chance, but for how the tactile picture is taken away: 12 steps, 5 ticks apart."""
+    spec = experiment("tactile-id-memory")
+    for key in ("wrist", "tactile", "touched", "state"):
+        spec = observed(spec, key, augmentation={})
+    return observed(observed(spec, "wrist", dropout={}), "tactile", dropout=dropout)
 
 
 def segments(dataset: Dataset) -> list[tuple[int, int]]:
@@ -178,7 +188,7 @@ class Dropout(unittest.TestCase):
         shape = (count, steps, present.shape[1])
         spans = np.tile([0, 100], (count, 1))
         seen = np.broadcast_to(seen[:, :, None], shape)
-        return drop(spec, np.broadcast_to(present[:, None], shape), seen, spans, np.random.default_rng(0))
+        return drop(spec, np.broadcast_to(present[:, None], shape), seen, spans, np.random.default_rng(0)).visible
 
     def test_dropout_leaves_one_picture_and_brings_none_back(self):
         present = np.ones((20_000, 2), bool)
@@ -259,6 +269,145 @@ class Dropout(unittest.TestCase):
         plan = dataset.plan(np.random.default_rng(0), 50, vary=False)
         self.assertEqual(sorted(plan), ["done", "seen", "tick", "visible"])
         self.assertTrue(plan["visible"].all())
+
+
+class Histories(unittest.TestCase):
+    """Tactile pictures show their row: of each window the rows that its history shows, None where there is no picture."""
+
+    def shown(self, dataset: Dataset, size: int = 100) -> tuple[np.ndarray, np.ndarray, list[list[int | None]]]:
+        """The tick in its episode and the tactile bit of each window, and its history."""
+        plan = dataset.plan(np.random.default_rng(0), size)
+        batch = dataset.gather(plan)
+        given = inputs(dataset.spec, batch, CPU)
+        there = given["touched_valid"] == 1
+        self.assertEqual(float(given["touched"][~there].abs().sum()), 0)
+        rows = (given["touched"][:, :, 0, 0, 0] * 255).round().int().tolist()
+        history = [[r if t else None for r, t in zip(*one, strict=True)] for one in zip(rows, there.tolist(), strict=True)]
+        starts = dataset.starts[np.searchsorted(dataset.starts, plan["tick"], "right") - 1]
+        return plan["tick"] - starts, batch.mask[:, 1].numpy() == 1, history
+
+    def test_it_is_what_there_was_at_each_of_its_ticks(self):
+        episode = by_hand(100)
+        episode.present("tactile_tip")[30:50] = False
+        dataset = Dataset(remembering(), [episode])
+        dataset.windows = dataset.windows[[70, 44, 52]]
+        tick, bit, found = self.shown(dataset)
+        self.assertEqual({int(t): (bool(b), tuple(h)) for t, b, h in zip(tick, bit, found, strict=True)}, {
+            70: (True, (15, 20, 25, None, None, None, None, 50, 55, 60, 65, 70)),
+            # The tick itself has none; those of before are still there.
+            44: (False, (*[None] * 3, 4, 9, 14, 19, 24, 29, None, None, None)),
+            # Nothing stands in for a step of before the replug.
+            52: (True, (None, 2, 7, 12, 17, 22, 27, None, None, None, None, 52)),
+        })  # fmt: skip
+
+    def test_before_the_beginning_there_is_nothing(self):
+        broken = by_hand(100)
+        broken.present("phone")[40] = False
+        dataset = Dataset(remembering(), [by_hand(100), broken])
+        # The last tick of an episode and the two around a pose that is none have no action.
+        dataset.windows = dataset.windows[np.isin(dataset.windows[:, 0], [0, 100 + 12, 100 + 47])]
+        tick, _, found = self.shown(dataset)
+        expected = {0: (*[None] * 11, 0), 12: (*[None] * 9, 2, 7, 12), 47: (*[None] * 10, 42, 47)}
+        self.assertEqual({int(t): tuple(h) for t, h in zip(tick, found, strict=True)}, expected)
+
+    def test_its_last_step_is_there_if_the_picture_of_now_is(self):
+        episode = by_hand(100)
+        episode.present("tactile_tip")[30:50] = False
+        episode.present("cam_wrist")[45:60] = False
+        spec = observed(remembering(window=0.5, episode=0.4, replug=0.3), "wrist", dropout={"window": 0.5, "episode": 0.4})
+        # Where both are absent no window is learned from.
+        plan = Dataset(spec, [episode]).plan(np.random.default_rng(0), 4000)
+        bit = plan["visible"][:, -1, 1]
+        np.testing.assert_array_equal(plan["valid touched"][:, -1], bit)
+        self.assertTrue(0.2 < bit.mean() < 0.8)
+
+    def test_a_window_without_the_picture_was_unplugged_some_time_ago(self):
+        dataset = Dataset(remembering(window=0.5), [by_hand(100)])
+        dataset.windows = dataset.windows[dataset.windows[:, 0] >= 55]
+        plan = dataset.plan(np.random.default_rng(0), 20_000)
+        bit, valid = plan["visible"][:, -1, 1], plan["valid touched"]
+        self.assertAlmostEqual(bit.mean(), 0.5, delta=0.02)
+        self.assertTrue(valid[bit].all())
+        left = valid[~bit].sum(1)
+        counts = np.bincount(left, minlength=13) / len(left)
+        self.assertAlmostEqual(counts[0], 1 / 3, delta=0.02)
+        # 1 to 55 ticks ago: the oldest step is always there.
+        np.testing.assert_allclose(counts[1:12], 2 / 3 / 11, atol=0.01)
+        self.assertEqual(counts[12], 0)
+        # Those that are left are the oldest.
+        np.testing.assert_array_equal(valid[~bit], np.arange(12) < left[:, None])
+
+    def test_two_histories_of_a_modality_lack_the_same(self):
+        described = json.loads(remembering(window=0.5).to_text())
+        touched = next(o for o in described["observation"] if o["key"] == "touched")
+        described["observation"].append({**touched, "key": "lately", "down_sample_steps": 1})
+        dataset = Dataset(Experiment.from_text(json.dumps(described)), [by_hand(100)])
+        plan = dataset.plan(np.random.default_rng(0), 4000)
+        there = {}
+        for key in ("touched", "lately"):
+            for b, (rows, valid) in enumerate(zip(plan[f"seen {key}"], plan[f"valid {key}"], strict=True)):
+                for row, is_there in zip(rows[rows < rows[-1]].tolist(), valid[rows < rows[-1]].tolist(), strict=True):
+                    self.assertEqual(there.setdefault((b, row), is_there), is_there)
+
+    def test_what_leaves_in_the_middle_of_an_episode_is_gone_from_its_history(self):
+        dataset = Dataset(remembering(episode=0.5), [by_hand(100)])
+        dataset.windows = dataset.windows[[40, 70]]
+
+        def left(_, spans, random):
+            random.random(len(spans))
+            return tuple(np.tile([0, row], (len(spans), 1)) for row in (30, 45))
+
+        with mock.patch.object(module, "_absences", left):
+            tick, bit, found = self.shown(dataset)
+        self.assertEqual({int(t): (bool(b), tuple(h)) for t, b, h in zip(tick, bit, found, strict=True)}, {
+            40: (False, (*[None] * 3, 0, 5, 10, 15, 20, 25, None, None, None)),
+            70: (True, (15, 20, 25, None, None, None, 45, 50, 55, 60, 65, 70)),
+        })  # fmt: skip
+
+    def test_what_is_held_is_not_in_it(self):
+        held = {"dropout": {"held": 0.5}, "when_absent": {"hold_last_ms": 3000}}
+        spec = observed(remembering(), "tactile", **held)
+        dataset = Dataset(spec, [by_hand(100)])
+        dataset.windows = dataset.windows[70:71]
+        batch, given = drawn(dataset, 200)
+        now = (given["tactile"][:, -1, 0, 0, 0] * 255).round().int()
+        self.assertTrue((batch.mask == 1).all())
+        self.assertTrue(int(now.min()) < 45 and int(now.max()) == 70)
+        for last, valid in zip(now.tolist(), given["touched_valid"].tolist(), strict=True):
+            self.assertEqual(valid, [float(row <= last) for row in range(15, 71, 5)])
+
+    def test_all_of_a_history_is_shifted_as_one_and_as_its_reference(self):
+        spec = observed(remembering(), "touched", augmentation={"shift": 4})
+        episode = by_hand(100)
+        tactile = episode.value("tactile_tip")
+        tactile[1:, 40] += 4
+        dataset = Dataset(spec, [episode])
+        dataset.windows = dataset.windows[70:71]
+        _, given = drawn(dataset, 64)
+        rows = given["touched"][:, :, 0, :, 0] - given["touched"][:, :, 0, :1, 0]
+        places = rows.argmax(2)
+        self.assertTrue((places == places[:, :1]).all())
+        self.assertEqual(set(places.unique().tolist()), {18, 19, 20, 21, 22})
+        self.assertEqual(set((given["tactile"][:, 1, 0, :, 0] * 255).round().unique().tolist()), {70.0, 72.0})
+
+    def test_windows_are_those_of_a_policy_without(self):
+        spec = observed(experiment("tactile-id"), "tactile", dropout={"window": 0.4})
+        plain, with_one = (Dataset(s, [by_hand(60)]) for s in (spec, experiment("tactile-id-memory")))
+        one, other = (d.plan(np.random.default_rng(3), 50) for d in (plain, with_one))
+        self.assertEqual(sorted(set(other) - set(one)), ["corner touched", "seen touched", "valid touched"])
+        # The observation is between two others.
+        other["seen"] = other["seen"][..., [0, 1, 3]]
+        for name, values in one.items():
+            np.testing.assert_array_equal(values, other[name], name)
+        batch = with_one.gather({name: rows[10:20] for name, rows in with_one.plan(np.random.default_rng(3), 50).items()})
+        whole = with_one.gather(with_one.plan(np.random.default_rng(3), 50))
+        self.assertTrue(torch.equal(batch.pictures["touched"], whole.pictures["touched"][10:20]))
+
+    def test_a_measurement_takes_nothing_from_it(self):
+        dataset = Dataset(experiment("tactile-id-memory"), [by_hand(100)])
+        dataset.windows = dataset.windows[55:]
+        plan = dataset.plan(np.random.default_rng(0), 50, vary=False)
+        self.assertTrue(plan["valid touched"].all())
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from made_up import Experiment, experiment, observed, small
+from made_up import Experiment, experiment, observed, small, with_history
 
 from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json, write_card, write_policy
 from rapid_policy.export import _network, denoiser_example, encoder_example, largest_difference, write_graph
-from rapid_policy.model import Policy
+from rapid_policy.model import HistoryPooling, Policy
 from rapid_policy.resnet import ResNet18
 from rapid_policy.weights import load_policy
 
@@ -55,6 +55,76 @@ class Mask(unittest.TestCase):
                 present = policy.encoder(wrist, tactile, state, torch.ones(2, 2))
             self.assertTrue(torch.equal(plain, spoilt))
             self.assertFalse(torch.equal(plain, present))
+
+
+class History(unittest.TestCase):
+    """Of `tactile-id-memory`: wrist, tactile, touched with a history, state; which steps there are; the mask."""
+
+    def setUp(self):
+        self.policy = random_policy(experiment("tactile-id-memory", encoder={"width": 8}))
+        self.inputs = dict(zip(encoder_inputs(self.policy.spec), encoder_example(self.policy.spec), strict=True))
+
+    def condition(self, **changed: torch.Tensor) -> torch.Tensor:
+        """[B, To, D]; the last 64 are of the history."""
+        with torch.no_grad():
+            return self.policy.encoder(*(self.inputs | changed).values()).unflatten(1, (2, -1))
+
+    def test_what_goes_in(self):
+        self.assertEqual(list(self.inputs), ["wrist", "tactile", "touched", "state", "touched_valid", "mask"])
+        self.assertEqual(tuple(self.inputs["touched"].shape), (2, 12, 3, 96, 96))
+        self.assertEqual(tuple(self.inputs["mask"].shape), (2, 2))
+        self.assertEqual(list(self.policy.encoder.images), ["wrist", "tactile"])
+        self.assertEqual(self.condition().flatten(1).shape[1], self.policy.spec.condition)
+
+    def test_a_step_that_is_not_there_changes_nothing_even_if_it_is_not_a_number(self):
+        there = self.inputs["touched_valid"][..., None, None, None] > 0.5
+        spoilt = self.condition(touched=torch.where(there, self.inputs["touched"], torch.nan))
+        self.assertTrue(torch.equal(spoilt, self.condition()))
+        self.assertFalse(torch.equal(self.condition(touched=-self.inputs["touched"]), self.condition()))
+
+    def test_without_any_step_it_is_zeros(self):
+        none = self.condition(touched_valid=torch.zeros(2, 12), touched=torch.full((2, 12, 3, 96, 96), torch.nan))
+        self.assertEqual(float(none[..., -64:].abs().max()), 0)
+        self.assertTrue(none.isfinite().all())
+
+    def test_it_is_seen_by_the_encoder_of_the_picture_of_now_at_every_step(self):
+        only = torch.zeros(2, 12)
+        only[:, 3] = 1
+        touched = self.inputs["touched"].clone()
+        touched[:, 3] = self.inputs["tactile"][:, 1]
+        seen = self.condition(touched=touched, touched_valid=only)
+        torch.testing.assert_close(seen[:, 1, -64:], seen[:, 1, -128:-64])
+        self.assertTrue(torch.equal(seen[:, 0, -64:], seen[:, 1, -64:]))
+        # It is there without the picture of now.
+        absent = self.condition(touched=touched, touched_valid=only, mask=torch.tensor([[1.0, 0.0]] * 2))
+        self.assertTrue(torch.equal(absent[..., -64:], seen[..., -64:]))
+
+    def test_the_order_of_its_steps_is_known_by_their_places_alone(self):
+        torch.manual_seed(0)
+        pooling, embeddings, order = HistoryPooling(8, 5), torch.randn(3, 5, 8), torch.randperm(5)
+        valid = torch.tensor([[1, 1, 0, 1, 1], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]]) > 0
+        with torch.no_grad():
+            plain = pooling(embeddings, valid)
+            torch.testing.assert_close(pooling(embeddings[:, order], valid[:, order]), plain)
+            torch.testing.assert_close(plain[1], embeddings[1, 4])
+            pooling.places.copy_(torch.arange(5.0))
+            self.assertFalse(torch.allclose(pooling(embeddings[:, order], valid[:, order]), pooling(embeddings, valid)))
+
+    def test_training_computes_the_same_of_the_steps_that_there_are(self):
+        pooled = dict(self.inputs)
+        for key in ("wrist", "tactile", "touched"):
+            pooled[key] = torch.nn.functional.avg_pool2d(pooled[key].flatten(0, 1), 2).unflatten(0, pooled[key].shape[:2])
+        for valid in (self.inputs["touched_valid"], torch.zeros(2, 12)):
+            pooled["touched_valid"] = valid
+            encoded = self.policy.encoder.encode(pooled, pooled["mask"], pooled=True)
+            expected = self.condition(touched_valid=valid).flatten(1)
+            torch.testing.assert_close(encoded, expected, rtol=1e-4, atol=1e-5)
+            with torch.autocast("cpu", torch.bfloat16):
+                half = self.policy.encoder.encode(pooled, pooled["mask"], pooled=True)
+            self.assertEqual(half.dtype, torch.float32)
+            torch.testing.assert_close(half, expected, rtol=0.1, atol=0.1)
+            half.sum().backward()
+            self.assertTrue(all(w.grad.isfinite().all() for w in self.policy.encoder.parameters()))
 
 
 class Encoders(unittest.TestCase):
@@ -143,6 +213,9 @@ class Bundle(unittest.TestCase):
             ("resnet18", experiment(**sizes)),
             ("by hand", experiment("tactile-id")),
             ("transformer", experiment("transformer", policy={"horizon": 14, "n_obs_steps": 3})),
+            ("history", small("tactile-id-memory")),
+            ("history, shared", experiment("tactile-id-memory", encoder={"shared": True, "width": 8}, policy={"n_obs_steps": 3})),
+            ("history, transformer", with_history(small("transformer"))),
         ):
             with self.subTest(name), tempfile.TemporaryDirectory() as folder_name:
                 folder = Path(folder_name)
@@ -189,6 +262,15 @@ class Bundle(unittest.TestCase):
         )
         self.assertEqual([len(described["action"]["limits"]["min"]), described["action"]["base"]], [8, action["base"]])
 
+    def test_a_history_is_written_and_has_no_column_of_the_mask(self):
+        described = policy_json(experiment("tactile-id-memory"), {"normalization": RANGES}, {ENCODER: "", DENOISER: ""})
+        found = {o["key"]: o.get("history") for o in described["observations"]}
+        history = {"steps": 12, "valid": "touched_valid"}
+        self.assertEqual(found, {"wrist": None, "tactile": None, "touched": history, "state": None})
+        touched = described["observations"][2]
+        self.assertEqual((touched["down_sample_steps"], touched["required"], "when_absent" in touched), (5, False, False))
+        self.assertEqual(described["mask"]["order"], ["cam_wrist", "tactile_tip"])
+
     def test_the_program_makes_six_numbers_of_a_quaternion(self):
         parts = [{"modality": "phone", "take": "rotation_6d"}]
         six = {"mode": "min_max", "min": [-1] * 6, "max": [1] * 6}
@@ -206,11 +288,12 @@ class Bundle(unittest.TestCase):
             "seed": 0, "final_loss": 0.5, "difference": 1e-6, "command": "python", "tags": {"texture": {"a": 1, "b": 1}},
         }  # fmt: skip
         with tempfile.TemporaryDirectory() as name:
-            for experiment_name in ("tactile-id-arm", "tactile-id", "vision"):
+            for experiment_name in ("tactile-id-arm", "tactile-id", "tactile-id-memory", "vision"):
                 write_card(experiment(experiment_name), facts, Path(name))
                 card = (Path(name) / "README.md").read_text(encoding="utf-8")
                 self.assertIn("2 episodes (1 a, 1 b), 20 ticks", card)
-                self.assertEqual("the next pose of `phone`" in card, experiment_name == "tactile-id")
+                self.assertEqual("the next pose of `phone`" in card, experiment_name in ("tactile-id", "tactile-id-memory"))
+                self.assertEqual("12 steps over 55 ticks" in card, experiment_name == "tactile-id-memory")
 
 
 @unittest.skipUnless(RAPID, "skipped: no program in $RAPID_BIN")

@@ -3,14 +3,48 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 import unittest
 from pathlib import Path
 
 import numpy as np
+import torch
+from made_up import small
 from recorded import Folder, rapid
+from test_networks import random_policy, write
+
+from rapid_policy.bundle import encoder_inputs
+from rapid_policy.diffusion import ddim
+from rapid_policy.export import encoder_example
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "examples"))
+
+
+class History(unittest.TestCase):
+    """A chunk of a policy that remembers, which no program computed."""
+
+    def test_its_arrays_are_named_as_the_inputs(self) -> None:
+        from recompute import recompute
+
+        spec = small("tactile-id-memory")
+        policy, inputs = random_policy(spec), encoder_example(spec, 1)
+        noise = torch.randn(1, spec.policy.horizon, spec.action_length)
+        with torch.no_grad():
+            condition = policy.encoder(*inputs)
+            wanted = ddim(lambda x, t: policy.denoiser(x, t, condition), noise, spec.policy.inference_steps)[0]
+        arrays = dict(zip(encoder_inputs(spec), (value.numpy() for value in inputs), strict=True)) | {"noise": noise.numpy()}
+        with tempfile.TemporaryDirectory() as folder:
+            (part,) = write(policy, Path(folder))["action"]["normalization"]
+            low, high = np.array(part["min"]), np.array(part["max"])
+            expected = (wanted.numpy() + 1) / 2 * (high - low) + low
+            self.assertLess(np.abs(recompute(Path(folder), arrays) - expected).max(), 1e-3)
+            # A step that is not there counts for nothing, and one that is for something.
+            there = arrays["touched_valid"][..., None, None, None] > 0
+            arrays["touched"] = np.where(there, arrays["touched"], 7).astype(np.float32)
+            self.assertLess(np.abs(recompute(Path(folder), arrays) - expected).max(), 1e-3)
+            arrays["touched"] = -arrays["touched"]
+            self.assertGreater(np.abs(recompute(Path(folder), arrays) - expected).max(), 1e-3)
 
 
 class Recompute(Folder):

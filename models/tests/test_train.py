@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 import torch
 import written
-from made_up import MODELS, Experiment, by_hand, made_up, path, small
+from made_up import MODELS, Experiment, by_hand, made_up, path, small, with_history
 
 from rapid_policy import progress
 from rapid_policy import train as module
@@ -82,6 +82,31 @@ class Learning(Case):
         run = start(spec, dataset)
         final = Trainer(run, dataset, self.folder).train()
         self.assertLess(final, 0.8 * sum(run.losses[:20]) / 20)
+
+    def test_the_loss_of_a_policy_that_remembers_falls(self):
+        spec = with_history(small(iterations=250, precision="bf16", scheduler="constant"))
+        dataset = Dataset(spec, [made_up(40)])
+        run = start(spec, dataset)
+        final = Trainer(run, dataset, self.folder).train()
+        self.assertLess(final, 0.85 * sum(run.losses[:20]) / 20)
+        # Which steps serve is learned too.
+        self.assertTrue(run.policy.encoder.histories["touched"].places.all())
+
+    def test_histories_are_the_same_by_threads_and_after_a_stop(self):
+        spec = small("tactile-id-memory", precision="float32")
+        dataset = Dataset(spec, [by_hand(40), by_hand(8, 1)])
+        through = start(spec, dataset)
+        Trainer(through, dataset, self.folder).train()
+        stopped = start(spec, dataset)
+        with (
+            mock.patch.object(module.Progress, "step", side_effect=[None, None, KeyboardInterrupt]),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            Trainer(stopped, dataset, self.folder, workers=2).train()
+        resumed = start(spec, dataset)
+        resumed.load(read_checkpoint(self.folder / CHECKPOINT))
+        Trainer(resumed, dataset, self.folder, workers=2).train()
+        self.assertEqual(resumed.losses, through.losses)
 
     def test_dropout_is_resumed_and_measures_nothing(self):
         spec = small("transformer", iterations=6, validate_every=2)
