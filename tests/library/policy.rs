@@ -196,7 +196,7 @@ fn history(bundle: &Bundle, steps: [Option<Result<u8, ()>>; HISTORY_STEPS]) -> R
     let mut request = Request::new(bundle);
     for (step, picture) in steps.into_iter().enumerate() {
         let Some(picture) = picture else { continue };
-        let grey = vec![picture.unwrap_or(0); SIDE * SIDE];
+        let grey = [picture.unwrap_or(0); SIDE * SIDE];
         let bytes = if picture.is_ok() { &grey[..] } else { &grey[..3] };
         let (side, seq) = (u32::try_from(SIDE).unwrap(), picture.map_or(0, u64::from));
         let encoding = Encoding::Grey as u32;

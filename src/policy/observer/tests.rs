@@ -268,7 +268,7 @@ fn a_history_begins_with_the_run_and_a_missed_tick_has_the_choice_before_it() {
 
 #[test]
 fn a_history_is_not_held_and_counts_for_nothing_when_it_is_old() {
-    let bundle = bundle_with_history(3, 2).holding_last(Some(Duration::from_secs(60)));
+    let bundle = bundle_with_history(3, 2).holding_last(Some(Duration::from_mins(1)));
     let mut observer = observer(&bundle, 60);
     let mut request = Request::new(&bundle);
     assert_eq!(observer.first_sight(ARM), None);
