@@ -125,7 +125,7 @@ CARD = """\
 | Parameters | {parameters:,}, float32 |
 | Data | {episodes} episodes{tagged}, {frames} ticks, recorded by {recorded_by}; seeds of the episodes {seeds} |
 | Data, SHA-256 | `{episodes_sha256}` |
-| Training | {iterations} iterations of {windows} windows x {draws} noises, {minutes:.1f} min on {hardware}; seed {seed} |
+| Training | {iterations} iterations of {windows} windows x {draws} noises, {minutes:.1f} min on {hardware}; seed {seed} |{began}
 | Final loss | {final_loss:.4f} (mean squared error of the noise, mean of the last hundred iterations) |
 | Exported graphs against PyTorch | largest difference {difference:.1e} over all masks |
 {note}
@@ -145,14 +145,23 @@ SIMULATED = """
     make train POLICY={name}
 
 which does, one after the other:
-
+"""
+RECORDED = """
     rapid --sim task --handheld --expert --record --episodes {episodes} --out EPISODES --seed {first}"""
+# Of the first weights.
+BEFORE = """
+    python -m rapid_policy.train experiments/{name}.toml --data EPISODES --out FIRST --iterations {iterations} --seed {seed}
+    python -m rapid_policy.export FIRST/checkpoint.pt --out BUNDLE"""
 
 
 def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
     """Writes the model card, `README.md` of the bundle; every figure in it comes from `facts`."""
     seeds, action = facts["episode_seeds"], spec.action
-    made = SIMULATED.format(name=spec.name, episodes=facts["episodes"], first=seeds[0]) if spec.name in MADE and seeds else ""
+    before, made = facts.get("started_from"), ""
+    if spec.name in MADE and seeds:
+        made = "" if before else SIMULATED.format(name=spec.name)
+        made += RECORDED.format(episodes=facts["episodes"], first=seeds[0])
+    made += BEFORE.format(**before) if before else ""
     card = CARD.format(
         **{
             **facts,
@@ -172,11 +181,20 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
             "tagged": _tagged(facts.get("tags", {})),
             "recorded_by": ", ".join(facts["recorded_by"]),
             "seeds": f"{seeds[0]} to {seeds[1]}" if seeds else "unknown",
+            "began": _began(before),
             "note": f"\n{spec.note}\n" if spec.note else "",
             "recorded": made,
         }
     )
     (folder / "README.md").write_text(card, encoding="utf-8")
+
+
+def _began(bundle: dict[str, Any] | None) -> str:
+    """The row about the bundle whose weights were the first ones."""
+    if not bundle:
+        return ""
+    whole = f"`{bundle['name']}` of {bundle['iterations']} iterations, seed {bundle['seed']}"
+    return f"\n| First weights | those of {whole}, SHA-256 of its `policy.json` `{bundle['policy_sha256']}` |"
 
 
 def _seen(o: Observation) -> str:

@@ -13,6 +13,7 @@ import torch
 
 from .experiment import Experiment, Training
 from .model import Policy
+from .weights import start_from
 
 CHECKPOINT, BEST, BEST_SUCCESS = "checkpoint.pt", "best.pt", "best-success.pt"
 
@@ -93,13 +94,17 @@ class Run:
         return max((found["score"] for found in self.evaluations), default=0.0)
 
 
-def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: dict[str, Any], device: Any) -> Run:
-    """Networks with random weights, determined by the seed, for `windows` windows whose vectors have these ranges."""
+def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: dict[str, Any], device: Any,
+          bundle: Path | None = None) -> Run:  # fmt: skip
+    """Networks with random weights, determined by the seed, or those of a bundle, for `windows` windows whose vectors have
+    these ranges."""
     schedule = spec.training
     torch.manual_seed(schedule.seed)
     policy = Policy(spec)
     if spec.encoder.weights:
         policy.start_from(Path(spec.encoder.weights))
+    if bundle:
+        start_from(policy, bundle)
     policy = policy.to(device)
     facts = {**provenance, "windows": windows, "normalization": {key: value.to_dict() for key, value in ranges.items()}}
     iterations = schedule.iterations or max(1, round((schedule.epochs or 1) * windows / schedule.windows))

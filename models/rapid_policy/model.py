@@ -149,8 +149,9 @@ class ObservationEncoder(nn.Module):
             embeddings.append(embedding)
         for key, (valid, now) in self.history_keys.items():
             there = observations[valid] > 0.5
-            # A graph computes all steps, whichever there are; training only those.
-            embedding = self._embed(now, observations[key], pooled=pooled, there=there if pooled else None)
+            # A graph, of onnxruntime or of a GPU, computes all steps, whichever there are; training on a CPU only those.
+            fewer = pooled and there.device.type == "cpu"
+            embedding = self._embed(now, observations[key], pooled=pooled, there=there if fewer else None)
             remembered = self.histories[key](embedding, there)
             embeddings.append(remembered.unsqueeze(1).expand(-1, self.steps, -1))
         return torch.cat([x.float() for x in vectors + embeddings], -1).flatten(1)

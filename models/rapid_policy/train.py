@@ -44,6 +44,7 @@ from .model import Policy, parameters
 from .progress import BOARD_EVERY, Board, Progress, plot, recent
 from .ranks import Ranks, join
 from .trials import CONDITION, FIRST_SEED, MOST, Trials, check_count, check_seeds
+from .weights import origin
 
 # Batches of a measurement on held-out episodes, at most.
 VALIDATION_BATCHES = 16
@@ -77,6 +78,37 @@ class Losses(nn.Module):
         with torch.autocast(self._device.type, torch.bfloat16, enabled=both):
             predicted = self.policy.denoiser(add_noise(clean, noise, timestep, self._table), timestep, condition)
         return F.mse_loss(predicted.float(), noise)
+
+
+class Replayed(nn.Module):
+    """`Losses` whose kernels a GPU is given as one graph, for they are many and small: launching them takes ten times as
+    long as computing them. The first batch determines the sizes."""
+
+    def __init__(self, losses: nn.Module, arguments: tuple[Any, ...]) -> None:
+        super().__init__()
+        self._keys, self._has_mask = list(arguments[0]), arguments[1] is not None
+        graph = _Flat(losses, self._keys, self._has_mask)
+        self._graph = torch.cuda.make_graphed_callables(graph, self._flat(arguments), allow_unused_input=True)
+
+    def _flat(self, arguments: tuple[Any, ...]) -> tuple[Tensor, ...]:
+        observations, mask, *others = arguments
+        return (*(observations[key] for key in self._keys), *([mask] if self._has_mask else []), *others)
+
+    def forward(self, *arguments: Any) -> Tensor:
+        return self._graph(*self._flat(arguments))
+
+
+class _Flat(nn.Module):
+    """`Losses` of tensors alone, as a graph needs them."""
+
+    def __init__(self, losses: nn.Module, keys: list[str], has_mask: bool) -> None:
+        super().__init__()
+        self.losses, self._keys, self._has_mask = losses, keys, has_mask
+
+    def forward(self, *tensors: Tensor) -> Tensor:
+        observations = dict(zip(self._keys, tensors, strict=False))
+        others = tensors[len(self._keys) :]
+        return self.losses(observations, *others) if self._has_mask else self.losses(observations, None, *others)
 
 
 class Trainer:
@@ -165,7 +197,10 @@ class Trainer:
 
     def _step(self, batch: Batch) -> float:
         run, device = self.run, self.ranks.device
-        loss = self.losses(*self._arguments(run.spec, batch, run.schedule.windows, self.rows, device))
+        arguments = self._arguments(run.spec, batch, run.schedule.windows, self.rows, device)
+        if device.type == "cuda" and self.ranks.world == 1 and not isinstance(self.losses, Replayed):
+            self.losses = Replayed(self.losses, arguments)
+        loss = self.losses(*arguments)
         mean = self.ranks.mean(loss)
         if not math.isfinite(mean):
             raise ValueError(f"the loss is not finite in iteration {run.iteration}")
@@ -302,6 +337,7 @@ def parse() -> argparse.Namespace:
     add("--workers", type=int, default=1, help="threads that read ahead, and processes that decode")
     add("--device", default="auto", help="auto, cpu, cuda")
     add("--resume", action="store_true", help="continue from the checkpoint in --out")
+    add("--start-from", type=Path, metavar="BUNDLE", help="begin with the weights of a policy that was exported")
     add("--rapid", metavar="PROGRAM", help="gives the verdicts and evaluates (default: RAPID_BIN, or rapid of the PATH)")
     add(
         "--evaluate-every",
@@ -374,11 +410,12 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
         held_out = Dataset(spec, corpus.held_out, dataset.ranges, corpus.folder)
     facts = provenance(corpus.training, command(args, spec))
     facts |= {"hardware": hardware(ranks.device, ranks.world), "held_out": len(corpus.held_out)}
+    facts |= _started_from(args, state)
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
         raise ValueError(f"{checkpoint} was trained on other episodes than these")
     if rapid:
         check_seeds(facts["episode_seeds"], args.evaluate_trials)
-    run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device)
+    run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device, None if state else args.start_from)
     if state:
         run.load(state)
         if rapid:
@@ -396,10 +433,19 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
     return Trainer(run, dataset, args.out, held_out=held_out, ranks=ranks, **options)
 
 
+def _started_from(args: argparse.Namespace, state: dict[str, Any] | None) -> dict[str, Any]:
+    """Of the bundle whose weights it began with, if it did: a resumed training has begun."""
+    before = state["provenance"].get("started_from") if state else None
+    if args.start_from and not state:
+        before = origin(args.start_from)
+    return {"started_from": before} if before else {}
+
+
 def command(args: argparse.Namespace, spec: Experiment) -> str:
     """How the training is repeated."""
     words = ["python -m rapid_policy.train", f"experiments/{args.experiment.name}", "--data EPISODES --out RUN"]
     words += [f"--iterations {args.iterations}"] if args.iterations is not None else []
+    words += ["--start-from BUNDLE"] if args.start_from else []
     return " ".join([*words, f"--seed {spec.training.seed}"])
 
 

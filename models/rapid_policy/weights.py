@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,73 @@ def load_policy(folder: Path) -> Policy:
     _load(policy.encoder, encoder, folder / ENCODER)
     _load(policy.denoiser, denoiser, folder / DENOISER)
     return policy.eval()
+
+
+def start_from(policy: Policy, folder: Path) -> None:
+    """Gives `policy` the weights of a bundle that `rapid_policy.export` made, as far as that has them.
+
+    What it has not are histories: the denoiser takes one at first for what it takes the picture of now for, whose encoder sees
+    it. Raises `ValueError` where the networks differ otherwise.
+    """
+    before = load_policy(folder)
+    known, weights = before.state_dict(), dict(policy.state_dict())
+    for name, weight in weights.items():
+        found = known.get(name)
+        if found is None and name.startswith("encoder.histories."):
+            continue
+        if found is None or found.shape != weight.shape:
+            found = _rearranged(found, weight, before.spec, policy.spec)
+        if found is None:
+            fix = "start from a policy with the same networks, observations and actions"
+            raise ValueError(f"{folder}: {name} is not that of {policy.spec.name}: {fix}")
+        weights[name] = found
+    policy.load_state_dict(weights)
+
+
+def origin(folder: Path) -> dict[str, Any]:
+    """What a training that starts from a bundle has to say of it."""
+    text = (folder / POLICY).read_bytes()
+    described = json.loads(text)
+    trained = {key: described["training"].get(key) for key in ("iterations", "seed", "started_from")}
+    return {"name": described["name"], "policy_sha256": hashlib.sha256(text).hexdigest(), **trained}
+
+
+def _rearranged(found: torch.Tensor | None, weight: torch.Tensor, old: Experiment, new: Experiment) -> torch.Tensor | None:
+    """The weights [outputs, inputs] of a layer whose last inputs are the condition, of all steps or of one."""
+    if found is None or found.dim() != 2 or len(found) != len(weight):
+        return None
+    columns, steps = _columns(old, new), new.policy.n_obs_steps
+    if columns is None or old.policy.n_obs_steps != steps:
+        return None
+    before = old.condition // steps
+    for repeated in (steps, 1):
+        first = found.shape[1] - repeated * before
+        if first >= 0 and weight.shape[1] == first + repeated * len(columns):
+            seen = torch.arange(repeated)[:, None] * before + torch.tensor(columns)
+            return torch.cat([found[:, :first], found[:, first + seen.flatten()]], 1)
+    return None
+
+
+def _columns(old: Experiment, new: Experiment) -> list[int] | None:
+    """Which number of a step of the old condition each number of one of the new is."""
+    known, at = {}, 0
+    for key, length in _condition(old):
+        known[key] = range(at, at + length)
+        at += length
+    for o in new.histories:
+        known.setdefault(o.key, known.get(new.images[new.column(o)].key, range(0)))
+    columns = []
+    for key, length in _condition(new):
+        if len(known.get(key, ())) != length:
+            return None
+        columns += known[key]
+    return columns
+
+
+def _condition(spec: Experiment) -> list[tuple[str, int]]:
+    """What a step of the condition has, in order, and how many numbers of each."""
+    pictures = [(o.key, spec.encoder.features) for o in (*spec.images, *spec.histories)]
+    return [*((o.key, o.shape[0]) for o in spec.vectors), *pictures]
 
 
 def _initializers(path: Path) -> dict[str, torch.Tensor]:

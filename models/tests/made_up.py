@@ -32,7 +32,7 @@ def small(name: str = "tactile-id-arm", **training: Any) -> Experiment:
     """The same with small networks."""
     denoiser = {"layers": 2, "heads": 2, "width": 32} if name == "transformer" else {"widths": [8, 16]}
     sizes = {"encoder": {"width": 8, "features": 8, "keypoints": 4}, "denoiser": denoiser}
-    training = {"iterations": 8, "windows": 4, "warmup": 2, **training}
+    training = {"iterations": 8, "windows": 4, "draws": 2, "warmup": 2, **training}
     if "epochs" in training:
         training["iterations"] = None
     return experiment(name, **sizes, training=training)
@@ -54,6 +54,11 @@ def with_history(spec: Experiment) -> Experiment:
     touched = {key: value for key, value in tactile.items() if key != "dropout"}
     described["observation"].append({**touched, "key": "touched", "history": {"steps": 4}})
     return Experiment.from_text(json.dumps(described))
+
+
+def twelve_steps(**tables: dict[str, Any]) -> Experiment:
+    """`tactile-id-memory` with a history of twelve steps, half a second apart."""
+    return observed(experiment("tactile-id-memory", **tables), "touched", down_sample_steps=5, history={"steps": 12})
 
 
 def presence(length: int, *names: str) -> dict[str, np.ndarray]:

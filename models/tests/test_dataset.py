@@ -6,7 +6,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from made_up import POLICIES, by_hand, experiment, made_up, observed, small
+from made_up import POLICIES, by_hand, experiment, made_up, observed, small, twelve_steps
 
 from rapid_policy import dataset as module
 from rapid_policy.dataset import Dataset, drop, inputs, unfit
@@ -25,7 +25,7 @@ def plain() -> Experiment:
 
 def remembering(**dropout: float) -> Experiment:
     """A policy with a history without chance, but for how the tactile picture is taken away: 12 steps, 5 ticks apart."""
-    spec = experiment("tactile-id-memory")
+    spec = twelve_steps()
     for key in ("wrist", "tactile", "touched", "state"):
         spec = observed(spec, key, augmentation={})
     return observed(observed(spec, "wrist", dropout={}), "tactile", dropout=dropout)
@@ -392,7 +392,7 @@ class Histories(unittest.TestCase):
 
     def test_windows_are_those_of_a_policy_without(self):
         spec = observed(experiment("tactile-id"), "tactile", dropout={"window": 0.4})
-        plain, with_one = (Dataset(s, [by_hand(60)]) for s in (spec, experiment("tactile-id-memory")))
+        plain, with_one = (Dataset(s, [by_hand(60)]) for s in (spec, twelve_steps()))
         one, other = (d.plan(np.random.default_rng(3), 50) for d in (plain, with_one))
         self.assertEqual(sorted(set(other) - set(one)), ["corner touched", "seen touched", "valid touched"])
         # The observation is between two others.
@@ -404,7 +404,7 @@ class Histories(unittest.TestCase):
         self.assertTrue(torch.equal(batch.pictures["touched"], whole.pictures["touched"][10:20]))
 
     def test_a_measurement_takes_nothing_from_it(self):
-        dataset = Dataset(experiment("tactile-id-memory"), [by_hand(100)])
+        dataset = Dataset(twelve_steps(), [by_hand(100)])
         dataset.windows = dataset.windows[55:]
         plan = dataset.plan(np.random.default_rng(0), 50, vary=False)
         self.assertTrue(plan["valid touched"].all())

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from made_up import Experiment, experiment, observed, small, with_history
+from made_up import Experiment, experiment, observed, small, twelve_steps, with_history
 
 from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json, write_card, write_policy
 from rapid_policy.export import _network, denoiser_example, encoder_example, largest_difference, write_graph
 from rapid_policy.model import HistoryPooling, Policy
 from rapid_policy.resnet import ResNet18
-from rapid_policy.weights import load_policy
+from rapid_policy.weights import load_policy, start_from
 
 RAPID = os.environ.get("RAPID_BIN")
 RANGES = {
@@ -61,7 +61,7 @@ class History(unittest.TestCase):
     """Of `tactile-id-memory`: wrist, tactile, touched with a history, state; which steps there are; the mask."""
 
     def setUp(self):
-        self.policy = random_policy(experiment("tactile-id-memory", encoder={"width": 8}))
+        self.policy = random_policy(twelve_steps(encoder={"width": 8}))
         self.inputs = dict(zip(encoder_inputs(self.policy.spec), encoder_example(self.policy.spec), strict=True))
 
     def condition(self, **changed: torch.Tensor) -> torch.Tensor:
@@ -227,6 +227,45 @@ class Bundle(unittest.TestCase):
                 for key, weight in policy.state_dict().items():
                     self.assertTrue(torch.equal(weight, again.state_dict()[key]), key)
 
+    def test_a_policy_starts_with_the_weights_of_a_bundle(self):
+        with tempfile.TemporaryDirectory() as name:
+            folder, before = Path(name), random_policy(experiment())
+            write(before, folder)
+            same = Policy(experiment())
+            start_from(same, folder)
+            for key, weight in before.state_dict().items():
+                self.assertTrue(torch.equal(weight, same.state_dict()[key]), key)
+            one = {"type": "small", "width": 8, "features": 64, "keypoints": 16}
+            for changed in (experiment(encoder=one), experiment("transformer"), experiment(policy={"n_obs_steps": 1})):
+                with self.assertRaisesRegex(ValueError, f"{folder}: .* is not that of .*: start from a policy with the same"):
+                    start_from(Policy(changed), folder)
+
+    def test_a_history_starts_as_what_the_picture_of_now_is(self):
+        for kind in ("tactile-id", "transformer"):
+            with self.subTest(kind), tempfile.TemporaryDirectory() as name:
+                folder, plain = Path(name), random_policy(experiment(kind))
+                write(plain, folder)
+                remembering = Policy(with_history(experiment(kind))).eval()
+                start_from(remembering, folder)
+                (history,) = remembering.spec.histories
+                size, sample, step = history.history.steps, torch.randn(2, 16, 4), torch.full((2,), 50)
+                seen = {o.key: torch.randn(2, 2, *o.shape) for o in plain.spec.observation}
+                before = seen | {history.key: torch.randn(2, size, *history.shape), history.valid: torch.zeros(2, size)}
+
+                def denoised(policy, observations, mask, at=(sample, step)):
+                    condition = policy.encoder.encode(observations, torch.tensor([mask] * 2), pooled=False)
+                    return policy.denoiser(*at, condition)
+
+                # Without a step it is the policy that it began as.
+                torch.testing.assert_close(denoised(remembering, before, [1.0, 1.0]), denoised(plain, seen, [1.0, 1.0]))
+                # What it saw before stands for what is not there now.
+                still = seen["tactile"][:, :1]
+                once = {history.key: still.expand(-1, size, -1, -1, -1), history.valid: torch.ones(2, size)}
+                now = seen | {"tactile": still.expand(-1, 2, -1, -1, -1)}
+                torch.testing.assert_close(
+                    denoised(remembering, seen | once, [1.0, 0.0]), denoised(plain, now, [1.0, 1.0]), atol=2e-5, rtol=1e-4
+                )
+
     def test_the_bundle_of_the_repository_is_loaded(self):
         policy = load_policy(Path(__file__).parents[1] / "tactile-id")
         self.assertEqual(sum(p.numel() for p in policy.parameters()), 1_645_286)
@@ -265,10 +304,10 @@ class Bundle(unittest.TestCase):
     def test_a_history_is_written_and_has_no_column_of_the_mask(self):
         described = policy_json(experiment("tactile-id-memory"), {"normalization": RANGES}, {ENCODER: "", DENOISER: ""})
         found = {o["key"]: o.get("history") for o in described["observations"]}
-        history = {"steps": 12, "valid": "touched_valid"}
+        history = {"steps": 20, "valid": "touched_valid"}
         self.assertEqual(found, {"wrist": None, "tactile": None, "touched": history, "state": None})
         touched = described["observations"][2]
-        self.assertEqual((touched["down_sample_steps"], touched["required"], "when_absent" in touched), (5, False, False))
+        self.assertEqual((touched["down_sample_steps"], touched["required"], "when_absent" in touched), (3, False, False))
         self.assertEqual(described["mask"]["order"], ["cam_wrist", "tactile_tip"])
 
     def test_the_program_makes_six_numbers_of_a_quaternion(self):
@@ -293,7 +332,7 @@ class Bundle(unittest.TestCase):
                 card = (Path(name) / "README.md").read_text(encoding="utf-8")
                 self.assertIn("2 episodes (1 a, 1 b), 20 ticks", card)
                 self.assertEqual("the next pose of `phone`" in card, experiment_name in ("tactile-id", "tactile-id-memory"))
-                self.assertEqual("12 steps over 55 ticks" in card, experiment_name == "tactile-id-memory")
+                self.assertEqual("20 steps over 57 ticks" in card, experiment_name == "tactile-id-memory")
 
 
 @unittest.skipUnless(RAPID, "skipped: no program in $RAPID_BIN")

@@ -327,7 +327,7 @@ class CommandLine(Case):
         for before, after in (
             ("width = 16", "width = 8"),
             ("widths = [32, 64, 128]", "widths = [8, 16]"),
-            ("iterations = 4200", 'iterations = 10\nprecision = "float32"\nwarmup = 1'),
+            ("iterations = 12000", 'iterations = 10\nprecision = "float32"\nwarmup = 1'),
             ("windows = 64", "windows = 8"),
         ):
             self.assertIn(before, text)
