@@ -117,12 +117,12 @@ fn seeds_of_the_training_are_not_evaluated_without_a_warning() {
 }
 
 #[test]
-fn the_policy_with_held_samples_has_its_last_pictures_after_the_unplug() {
+fn the_policy_with_a_history_continues_after_the_unplug() {
     let place = Place::new();
     let bundle = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id-memory");
     let shown = printed(&place, &["policy", "show", bundle, "--sim", "task"]);
     let observations = shown[0]["observations"].as_array().expect("observations");
-    assert!(observations.iter().any(|one| one["hold_last_ms"] == 20_000), "{shown:?}");
+    assert!(observations.iter().any(|one| one["history"]["steps"] == 20), "{shown:?}");
     let trials = printed(&place, &["eval", bundle, "--trials", "1", "--condition", "hot-unplug"]);
     let trial = trials.iter().find(|line| line["event"] == "trial").expect("a trial");
     assert_eq!((&trial["status"], &trial["failure"]), (&"degraded".into(), &Value::Null), "{trial}");
