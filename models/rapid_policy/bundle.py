@@ -150,8 +150,8 @@ RECORDED = """
     rapid --sim task --handheld --expert --record --episodes {episodes} --out EPISODES --seed {first}"""
 # Of the first weights.
 BEFORE = """
-    python -m rapid_policy.train experiments/{name}.toml --data EPISODES --out FIRST --iterations {iterations} --seed {seed}
-    python -m rapid_policy.export FIRST/checkpoint.pt --out BUNDLE"""
+    {command}
+    python -m rapid_policy.export RUN/checkpoint.pt --out BUNDLE"""
 
 
 def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
@@ -161,7 +161,7 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
     if spec.name in MADE and seeds:
         made = "" if before else SIMULATED.format(name=spec.name)
         made += RECORDED.format(episodes=facts["episodes"], first=seeds[0])
-    made += BEFORE.format(**before) if before else ""
+    made += "".join(BEFORE.format(command=one["command"]) for one in _first_ones(before) if one.get("command"))
     card = CARD.format(
         **{
             **facts,
@@ -187,6 +187,11 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
         }
     )
     (folder / "README.md").write_text(card, encoding="utf-8")
+
+
+def _first_ones(bundle: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """The bundles whose weights it began with, the first one first."""
+    return [*_first_ones(bundle.get("started_from")), bundle] if bundle else []
 
 
 def _began(bundle: dict[str, Any] | None) -> str:

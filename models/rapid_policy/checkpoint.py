@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from .bundle import DENOISER, ENCODER, policy_json
 from .experiment import Experiment, Training
 from .model import Policy
-from .weights import start_from
+from .weights import First
 
 CHECKPOINT, BEST, BEST_SUCCESS = "checkpoint.pt", "best.pt", "best-success.pt"
 
@@ -95,7 +96,7 @@ class Run:
 
 
 def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: dict[str, Any], device: Any,
-          bundle: Path | None = None) -> Run:  # fmt: skip
+          first: First | None = None) -> Run:  # fmt: skip
     """Networks with random weights, determined by the seed, or those of a bundle, for `windows` windows whose vectors have
     these ranges."""
     schedule = spec.training
@@ -103,10 +104,10 @@ def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: di
     policy = Policy(spec)
     if spec.encoder.weights:
         policy.start_from(Path(spec.encoder.weights))
-    if bundle:
-        start_from(policy, bundle)
-    policy = policy.to(device)
     facts = {**provenance, "windows": windows, "normalization": {key: value.to_dict() for key, value in ranges.items()}}
+    if first:
+        first.give(policy, policy_json(spec, facts, {ENCODER: "", DENOISER: ""}))
+    policy = policy.to(device)
     iterations = schedule.iterations or max(1, round((schedule.epochs or 1) * windows / schedule.windows))
     # For measuring: dropout would make its losses, and the random numbers behind them, others each time.
     average, random = copy.deepcopy(policy).requires_grad_(False).eval(), np.random.default_rng(schedule.seed)

@@ -44,7 +44,7 @@ from .model import Policy, parameters
 from .progress import BOARD_EVERY, Board, Progress, plot, recent
 from .ranks import Ranks, join
 from .trials import CONDITION, FIRST_SEED, MOST, Trials, check_count, check_seeds
-from .weights import origin
+from .weights import First
 
 # Batches of a measurement on held-out episodes, at most.
 VALIDATION_BATCHES = 16
@@ -399,6 +399,9 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
     rapid = program() if args.evaluate_every else None
     args.out.mkdir(parents=True, exist_ok=True)
     checkpoint = args.out / CHECKPOINT
+    if args.resume and args.start_from:
+        raise ValueError("--start-from: a training that is resumed has begun: leave it out, or leave --resume out")
+    first = First.read(args.start_from) if args.start_from else None
     state = read_checkpoint(checkpoint) if args.resume else None
     if state and (changed := spec.learns_the_same(Experiment.from_text(state["experiment"]))):
         raise ValueError(
@@ -410,12 +413,12 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
         held_out = Dataset(spec, corpus.held_out, dataset.ranges, corpus.folder)
     facts = provenance(corpus.training, command(args, spec))
     facts |= {"hardware": hardware(ranks.device, ranks.world), "held_out": len(corpus.held_out)}
-    facts |= _started_from(args, state)
+    facts |= _begun(first, state)
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
         raise ValueError(f"{checkpoint} was trained on other episodes than these")
     if rapid:
         check_seeds(facts["episode_seeds"], args.evaluate_trials)
-    run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device, None if state else args.start_from)
+    run = begin(spec, len(dataset.windows), dataset.ranges, facts, ranks.device, first)
     if state:
         run.load(state)
         if rapid:
@@ -433,18 +436,18 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
     return Trainer(run, dataset, args.out, held_out=held_out, ranks=ranks, **options)
 
 
-def _started_from(args: argparse.Namespace, state: dict[str, Any] | None) -> dict[str, Any]:
-    """Of the bundle whose weights it began with, if it did: a resumed training has begun."""
-    before = state["provenance"].get("started_from") if state else None
-    if args.start_from and not state:
-        before = origin(args.start_from)
-    return {"started_from": before} if before else {}
+def _begun(first: First | None, state: dict[str, Any] | None) -> dict[str, Any]:
+    """How it began: of a training that is resumed, what its checkpoint has."""
+    if state:
+        return {key: state["provenance"][key] for key in ("command", "started_from") if key in state["provenance"]}
+    return {"started_from": first.origin()} if first else {}
 
 
 def command(args: argparse.Namespace, spec: Experiment) -> str:
     """How the training is repeated."""
     words = ["python -m rapid_policy.train", f"experiments/{args.experiment.name}", "--data EPISODES --out RUN"]
     words += [f"--iterations {args.iterations}"] if args.iterations is not None else []
+    words += [f"--minutes {args.minutes:g}"] if math.isfinite(args.minutes) else []
     words += ["--start-from BUNDLE"] if args.start_from else []
     return " ".join([*words, f"--seed {spec.training.seed}"])
 

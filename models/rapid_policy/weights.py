@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,38 +29,80 @@ def load_policy(folder: Path) -> Policy:
     return policy.eval()
 
 
-def start_from(policy: Policy, folder: Path) -> None:
-    """Gives `policy` the weights of a bundle that `rapid_policy.export` made, as far as that has them.
+@dataclass(frozen=True)
+class First:
+    """The bundle whose weights a training begins with."""
 
-    What it has not are histories: the denoiser takes one at first for what it takes the picture of now for, whose encoder sees
-    it. Raises `ValueError` where the networks differ otherwise.
-    """
-    before = load_policy(folder)
-    known, weights = before.state_dict(), dict(policy.state_dict())
-    for name, weight in weights.items():
-        found = known.get(name)
-        if found is None and name.startswith("encoder.histories."):
-            continue
-        if found is None or found.shape != weight.shape:
-            found = _rearranged(found, weight, before.spec, policy.spec)
-        if found is None:
-            fix = "start from a policy with the same networks, observations and actions"
-            raise ValueError(f"{folder}: {name} is not that of {policy.spec.name}: {fix}")
-        weights[name] = found
-    policy.load_state_dict(weights)
+    folder: Path
+    described: dict[str, Any]
+    """Its `policy.json`."""
+    policy: Policy
+
+    @classmethod
+    def read(cls, folder: Path) -> First:
+        """Raises `ValueError` for what is not a bundle that `rapid_policy.export` made."""
+        try:
+            described = json.loads((folder / POLICY).read_text(encoding="utf-8"))
+            return cls(folder, described, load_policy(folder))
+        except OSError as error:
+            raise ValueError(f"{error.filename or folder}: {error.strerror or error}: name the folder of a bundle") from error
+        # What is no bundle fails in the reader of JSON, of the description or of a graph.
+        except Exception as error:
+            reason = " ".join(str(error).split())[:120] or type(error).__name__
+            raise ValueError(f"{folder}: not a bundle of rapid_policy.export: {type(error).__name__}: {reason}") from error
+
+    def origin(self) -> dict[str, Any]:
+        """What is recorded of it in the training that it begins."""
+        digest = hashlib.sha256((self.folder / POLICY).read_bytes()).hexdigest()
+        trained = self.described.get("training") or {}
+        known = {key: trained.get(key) for key in ("command", "iterations", "seed", "started_from")}
+        return {"name": self.described["name"], "policy_sha256": digest, **known}
+
+    def give(self, policy: Policy, described: dict[str, Any]) -> None:
+        """Gives the weights to `policy`, whose `policy.json` is to be `described`.
+
+        Only histories may be missing: the denoiser takes one at first for the current picture of its modality, whose encoder sees
+        it. Raises `ValueError` where inputs, actions or networks differ otherwise.
+        """
+        self._check_meaning(described)
+        known, weights = self.policy.state_dict(), dict(policy.state_dict())
+        for name, weight in weights.items():
+            found = known.get(name)
+            if found is None and name.startswith("encoder.histories."):
+                continue
+            if found is not None and _sees_condition(name):
+                found = _rearranged(found, weight, self.policy.spec, policy.spec)
+            if found is None or found.shape != weight.shape:
+                fix = "start from a policy with the same networks and observations"
+                raise ValueError(f"{self.folder}: {name} does not fit {policy.spec.name}: {fix}")
+            weights[name] = found
+        policy.load_state_dict(weights)
+
+    def _check_meaning(self, described: dict[str, Any]) -> None:
+        """The same key stands for the same input, and the actions are the same."""
+        ours, theirs = ({o["key"]: o for o in of["observations"]} for of in (described, self.described))
+        pairs = [(f"observation `{key}`", o, theirs[key]) for key, o in ours.items() if key in theirs]
+        for what, ours, theirs in (*pairs, ("action", described["action"], self.described["action"])):
+            for key in sorted((ours.keys() | theirs.keys()) - _OTHERWISE):
+                if ours.get(key) != theirs.get(key):
+                    cause = f"{key} of {what} is {theirs.get(key)!r} there and {ours.get(key)!r} here"
+                    raise ValueError(f"{self.folder}: {cause}: start from a policy with the same inputs and actions")
+            if ours["normalization"] != theirs["normalization"]:
+                print(f"train: {what} has another range in these episodes than in {self.folder}: its numbers are scaled anew")
 
 
-def origin(folder: Path) -> dict[str, Any]:
-    """What a training that starts from a bundle has to say of it."""
-    text = (folder / POLICY).read_bytes()
-    described = json.loads(text)
-    trained = {key: described["training"].get(key) for key in ("iterations", "seed", "started_from")}
-    return {"name": described["name"], "policy_sha256": hashlib.sha256(text).hexdigest(), **trained}
+# What may differ between two policies of the same meaning.
+_OTHERWISE = {"normalization", "required", "when_absent", "limits", "actuator"}
 
 
-def _rearranged(found: torch.Tensor | None, weight: torch.Tensor, old: Experiment, new: Experiment) -> torch.Tensor | None:
+def _sees_condition(name: str) -> bool:
+    """The layers of the denoisers whose last inputs are the condition, or a step of it."""
+    return name.endswith(".film.1.weight") or name == "denoiser.observation.weight"
+
+
+def _rearranged(found: torch.Tensor, weight: torch.Tensor, old: Experiment, new: Experiment) -> torch.Tensor | None:
     """The weights [outputs, inputs] of a layer whose last inputs are the condition, of all steps or of one."""
-    if found is None or found.dim() != 2 or len(found) != len(weight):
+    if found.dim() != 2 or len(found) != len(weight):
         return None
     columns, steps = _columns(old, new), new.policy.n_obs_steps
     if columns is None or old.policy.n_obs_steps != steps:
@@ -135,7 +178,7 @@ def _observation(o: dict[str, Any]) -> dict[str, Any]:
         begin, end = o.get("slice") or (0, o["shape"][0])
         return {**named, "columns": list(range(begin, end))}
     size = {key: o[key] for key in ("resize", "crop", "operation") if o.get(key)}
-    history = {"history": {"steps": o["history"]["steps"]}} if "history" in o else {}
+    history = {"history": {"steps": o["history"]["steps"]}} if o.get("history") else {}
     return {**named, **({"size": o["shape"][1:]} if not {"resize", "crop"} & set(size) else {}), **size, **history}
 
 

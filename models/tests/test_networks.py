@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from made_up import Experiment, experiment, observed, small, twelve_steps, with_history
 
-from rapid_policy.bundle import DENOISER, ENCODER, encoder_inputs, policy_json, write_card, write_policy
+from rapid_policy.bundle import DENOISER, ENCODER, POLICY, encoder_inputs, policy_json, write_card, write_policy
 from rapid_policy.export import _network, denoiser_example, encoder_example, largest_difference, write_graph
 from rapid_policy.model import HistoryPooling, Policy
 from rapid_policy.resnet import ResNet18
-from rapid_policy.weights import load_policy, start_from
+from rapid_policy.weights import First, load_policy
 
 RAPID = os.environ.get("RAPID_BIN")
 RANGES = {
@@ -227,26 +227,73 @@ class Bundle(unittest.TestCase):
                 for key, weight in policy.state_dict().items():
                     self.assertTrue(torch.equal(weight, again.state_dict()[key]), key)
 
+    def start(self, spec, folder):
+        """A policy of this experiment that begins with the weights of the bundle."""
+        policy = Policy(spec).eval()
+        ours = policy_json(spec, {"normalization": RANGES}, {ENCODER: "", DENOISER: ""})
+        First.read(folder).give(policy, ours)
+        return policy
+
     def test_a_policy_starts_with_the_weights_of_a_bundle(self):
         with tempfile.TemporaryDirectory() as name:
             folder, before = Path(name), random_policy(experiment())
             write(before, folder)
-            same = Policy(experiment())
-            start_from(same, folder)
+            same = self.start(experiment(), folder)
             for key, weight in before.state_dict().items():
                 self.assertTrue(torch.equal(weight, same.state_dict()[key]), key)
             one = {"type": "small", "width": 8, "features": 64, "keypoints": 16}
-            for changed in (experiment(encoder=one), experiment("transformer"), experiment(policy={"n_obs_steps": 1})):
-                with self.assertRaisesRegex(ValueError, f"{folder}: .* is not that of .*: start from a policy with the same"):
-                    start_from(Policy(changed), folder)
+            for changed, reason in (
+                (experiment(encoder=one), "does not fit"),
+                (experiment("transformer"), "does not fit"),
+                (experiment(policy={"n_obs_steps": 1}), "does not fit"),
+                (observed(experiment(), "tactile", operation=None), "operation of observation `tactile` is 'diff_to_reference' there"),
+                (observed(experiment(), "tactile", color="bgr"), "color of observation `tactile` is 'rgb' there and 'bgr' here"),
+                (observed(experiment(), "wrist", modality="other"), "modality of observation `wrist` is"),
+                (observed(experiment(), "wrist", down_sample_steps=3), "down_sample_steps of observation `wrist` is"),
+                (experiment(action={"names": ["z", "y", "x", "grip"]}), "names of action is"),
+            ):
+                with self.subTest(reason), self.assertRaisesRegex(ValueError, f"{folder}: .*{reason}.*: start from a policy with"):
+                    self.start(changed, folder)
 
-    def test_a_history_starts_as_what_the_picture_of_now_is(self):
-        for kind in ("tactile-id", "transformer"):
+    def test_what_it_sees_keeps_its_weights_in_any_order(self):
+        for kind in ("tactile-id-arm", "transformer"):
+            with self.subTest(kind), tempfile.TemporaryDirectory() as name:
+                folder, before = Path(name), random_policy(experiment(kind))
+                write(before, folder)
+                described = json.loads(experiment(kind).to_text())
+                described["observation"].reverse()
+                turned = self.start(Experiment.from_text(json.dumps(described)), folder)
+                seen, at = {o.key: torch.randn(2, 2, *o.shape) for o in before.spec.observation}, (torch.randn(2, 16, 4), torch.full((2,), 50))
+                found = [p.denoiser(*at, p.encoder.encode(seen, mask, pooled=False)) for p, mask in (
+                    (before, torch.tensor([[1.0, 0.0]] * 2)), (turned, torch.tensor([[0.0, 1.0]] * 2)))]  # fmt: skip
+                torch.testing.assert_close(*found)
+
+    def test_what_is_no_bundle_is_refused_with_its_folder(self):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            with self.assertRaisesRegex(ValueError, f"{folder}/policy.json: No such file or directory: name the folder of a bundle"):
+                First.read(folder)
+            written = write(random_policy(small()), folder)
+            First.read(folder)
+            for text in (
+                "", "[]", "{", "null", '"text"',
+                *(json.dumps({key: value for key, value in written.items() if key != gone}) for gone in ("action", "observations", "training")),
+                *(json.dumps({**written, key: value}) for key in ("observations", "action", "training", "name") for value in (None, "Some Text", [1])),
+            ):  # fmt: skip
+                (folder / POLICY).write_text(text, encoding="utf-8")
+                with self.subTest(text[:40]), self.assertRaisesRegex(ValueError, f"{folder}: not a bundle of rapid_policy.export: "):
+                    First.read(folder)
+            (folder / POLICY).write_text(json.dumps(written), encoding="utf-8")
+            (folder / ENCODER).write_bytes(b"no graph")
+            with self.assertRaisesRegex(ValueError, f"{folder}: not a bundle of rapid_policy.export: "):
+                First.read(folder)
+
+    def test_a_history_starts_as_what_the_current_picture_is(self):
+        for kind in ("tactile-id-arm", "transformer"):
             with self.subTest(kind), tempfile.TemporaryDirectory() as name:
                 folder, plain = Path(name), random_policy(experiment(kind))
                 write(plain, folder)
-                remembering = Policy(with_history(experiment(kind))).eval()
-                start_from(remembering, folder)
+                remembering = self.start(with_history(experiment(kind)), folder)
                 (history,) = remembering.spec.histories
                 size, sample, step = history.history.steps, torch.randn(2, 16, 4), torch.full((2,), 50)
                 seen = {o.key: torch.randn(2, 2, *o.shape) for o in plain.spec.observation}

@@ -264,7 +264,7 @@ mod tests {
         let more = |one: usize| {
             let other = (one + 1) % 3;
             let differences = colours[one].iter().zip(&colours[other]).map(|(one, other)| one - other);
-            (format!("channel {one} less {other}"), differences.collect())
+            (format!("what channel {one} has more than {other}"), differences.collect())
         };
         let mut all: Vec<(String, Vec<f64>)> = (0..3).map(more).collect();
         all.push(("the sum of the channels".to_owned(), sum));
@@ -283,13 +283,13 @@ mod tests {
         for (name, plane) in planes(picture) {
             let of_pixels = moments(&plane);
             add("moment", &name, &of_pixels);
-            for lag in [1, 4, 8] {
+            for lag in [1, 8] {
                 for (direction, values) in ["rows", "columns"].into_iter().zip(differences(&plane, lag)) {
                     let of = moments(&values);
                     let what = format!("of differences over {lag} along {direction},");
                     add(&format!("moment {what}"), &name, &of);
                     add(&format!("size of the skewness {what}"), &name, &[of[2].abs()]);
-                    if lag == 1 {
+                    if lag == 1 && name.starts_with("channel") {
                         let sizes = values.iter().map(|value| value.abs()).collect();
                         add(&format!("quantile of the size {what}"), &name, &quantiles(sizes, [10, 50, 90, 99]));
                         add(&format!("quantile {what}"), &name, &quantiles(values, [1, 10, 50, 90, 99]));
@@ -361,12 +361,12 @@ mod tests {
 
     #[test]
     fn no_statistic_of_pixels_of_differences_of_the_spectrum_or_of_the_lights_separates_the_textures() {
-        check_that_none_separates(&blocks(300, |seed, texture| statistics(&imprint(seed, texture))), 0.6);
+        check_that_none_separates(&blocks(200, |seed, texture| statistics(&imprint(seed, texture))), 0.6);
     }
 
     #[test]
     fn none_separates_them_in_the_pictures_that_a_policy_sees() {
-        check_that_none_separates(&blocks(300, |seed, texture| statistics(&felt(seed, texture))), 0.6);
+        check_that_none_separates(&blocks(200, |seed, texture| statistics(&felt(seed, texture))), 0.6);
     }
 
     /// The check can fail, and there is something to see: to who knows where the lights are, bumps and holes are different.

@@ -119,7 +119,10 @@ fn a_policy_moves_an_arm_by_its_tip_without_its_tactile_camera_too() {
     }
     println!("{}armed again: {} times", outcome.file("recover.txt"), outcome.file("armed").lines().count());
     let repaired: Value = serde_json::from_str(&outcome.file("inspect.json")).expect("one object");
-    assert_eq!((&repaired["verdict"], &repaired["end"]), (&"SUSPECT".into(), &"finished".into()), "{repaired}");
+    let whole = [&repaired["end"], &repaired["damaged_chunks"], &repaired["recovered"]["lossless"]];
+    assert_eq!(whole, [&Value::from("finished"), &Value::from(0), &Value::from("true")], "{repaired}");
+    // Which of the two depends on how many samples an emulated processor was in time for.
+    assert!(repaired["verdict"] == "SUSPECT" || repaired["verdict"] == "BAD", "{repaired}");
 
     let episode = episode(&outcome);
     let edges = episode.mask_edges();
