@@ -120,9 +120,11 @@ class Trained(unittest.TestCase):
 
 class Pages(unittest.TestCase):
     def test_those_in_the_repository_are_of_their_figures(self):
-        for name in ("texture", "texture-resnet18"):
-            report = json.loads((MODELS / "results" / f"{name}.json").read_text(encoding="utf-8"))
-            self.assertEqual((MODELS / "results" / f"{name}.md").read_text(encoding="utf-8"), markdown(report, f"{name}.png"))
+        pages = [file.with_suffix("") for file in (MODELS / "results").glob("texture*.md")]
+        self.assertIn(MODELS / "results" / "texture", pages)
+        for page in pages:
+            report = json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))
+            self.assertEqual(page.with_suffix(".md").read_text(encoding="utf-8"), markdown(report, f"{page.name}.png"))
 
 
 if __name__ == "__main__":

@@ -393,6 +393,34 @@ class CommandLine(Case):
         self.assertEqual(described["action"]["representation"], "absolute")
         self.assertNotIn("rotation", described["action"])
 
+    def test_a_training_begins_with_the_weights_of_another(self):
+        from rapid_policy.export import export
+
+        judge = {"RAPID_BIN": str(self.judge)}
+        self.assertEqual(self.run_train(*self.words("first"), **judge).returncode, 0)
+        bundle, first = self.folder / "bundle", read_checkpoint(self.folder / "first" / CHECKPOINT)
+        export(first, bundle)
+        start = ("--start-from", str(bundle))
+        # Before any episode is read.
+        refused = self.run_train(*self.words("second", "--start-from", str(self.folder / "none")), RAPID_BIN="/bin/false")
+        self.assertRegex(refused.stderr, r"^train: .*/none/policy.json: No such file or directory: name the folder of a bundle\n$")
+        begun = self.run_train(*self.words("second", *start, "--iterations", "3", "--minutes", "9"), **judge)
+        self.assertEqual(begun.returncode, 0, begun.stderr)
+        resumed = self.run_train(*self.words("second", "--resume"), **judge)
+        self.assertEqual(resumed.returncode, 0, resumed.stderr)
+        both = self.run_train(*self.words("second", "--resume", *start), **judge)
+        self.assertRegex(both.stderr, "^train: --start-from: a training that is resumed has begun: leave it out, or leave --resume out\n$")
+        second = read_checkpoint(self.folder / "second" / CHECKPOINT)
+        self.assertLess(second["losses"][0], first["losses"][0])
+        command = "python -m rapid_policy.train experiments/small.toml --data EPISODES --out RUN"
+        export(second, self.folder / "again")
+        card = (self.folder / "again" / "README.md").read_text(encoding="utf-8")
+        commands = [line.strip() for line in card.splitlines() if "rapid_policy." in line]
+        exports = [f"python -m rapid_policy.export RUN/checkpoint.pt --out {name}" for name in ("BUNDLE", "tactile-id")]
+        trainings = [f"{command} --seed 0", f"{command} --iterations 3 --minutes 9 --start-from BUNDLE --seed 0"]
+        self.assertEqual(commands, [trainings[0], exports[0], trainings[1], exports[1]])
+        self.assertIn("| First weights | those of `tactile-id` of 10 iterations, seed 0, SHA-256", card)
+
     def test_sigterm_leaves_a_checkpoint_to_continue_from(self):
         command = [sys.executable, "-m", "rapid_policy.train", *self.words("run", "--iterations", "100000")]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "RAPID_BIN": str(self.judge), "PYTHONUNBUFFERED": "1"}
