@@ -101,12 +101,12 @@ class Page(unittest.TestCase):
         results = MODELS / "results"
         lines = [json.loads(line) for line in (results / "eval.jsonl").read_text(encoding="utf-8").splitlines()]
         printed = {run.name: [line for line in lines if line["run"] == run.name] for run in RUNS}
-        touched, parted = ([first] + [median] * 98 + [last] for first, median, last in ((20, 33, 52), (35, 58, 78)))
+        touched, parted = ([first] + [median] * 98 + [last] for first, median, last in ((23, 33, 53), (46, 58, 78)))
         for name in TITLES:
-            unplugged = {"hot-unplug": [58, *[34] * 99], "early-unplug": [10] * 100}.get(name, [None] * 100)
+            unplugged = {"hot-unplug": [34] * 100, "early-unplug": [10] * 100}.get(name, [None] * 100)
             for i in range(100):
                 trial = {"event": "trial", "condition": name, "triangular": i < 51, "size": "small" if i < 54 else "big"}
-                trial |= {"unseen_period": i < 22, "outcome": "success" if i else "wrong_bin"}
+                trial |= {"unseen_period": i < 22, "outcome": "success"}
                 at = {"touched_at": touched[i], "parted_at": parted[i], "unplugged_at": unplugged[i]}
                 printed["plain"].append(trial | at)
         printed["static"].append({"event": "trial", "failure": "tactile_tip: no sample within 200ms"})
