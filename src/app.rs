@@ -403,8 +403,9 @@ fn receive_orders(
 /// The screen has limits for a reader that does not read. This one is for a screen that is stuck: crossterm 0.29 reads
 /// endlessly from a terminal that was hung up at the wrong moment.
 const LAST_OUTPUT: Duration = Duration::from_secs(10);
-/// Limit for a chunk that is being computed; computing one takes a tenth of a second at most.
-const LAST_CHUNK: Duration = Duration::from_secs(5);
+/// Limit for a chunk that is being computed. A chunk may take as long as its actions cover, which is seconds of a large policy
+/// or a busy machine; the 30 s in which the service must stop leave a third for the files.
+const LAST_CHUNK: Duration = Duration::from_secs(20);
 /// Limit for the remaining output after a second signal: enough for the terminal to be restored.
 const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 
