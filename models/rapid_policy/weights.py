@@ -1,4 +1,8 @@
-"""The networks of a bundle, back in PyTorch: the weights are taken from the graphs, so that the bundle is enough."""
+"""The networks of a bundle, back in PyTorch: the weights are taken from the graphs, so that the bundle is enough; and a
+training that begins with them.
+
+Invariant: a weight is given only to an input or action of the same meaning, whatever its place.
+"""
 
 from __future__ import annotations
 

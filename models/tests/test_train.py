@@ -52,6 +52,14 @@ class Case(unittest.TestCase):
         self.printed = output.start()
         self.addCleanup(output.stop)
 
+    def interrupt(self, trainer: Trainer) -> None:
+        """Ends a training in its third iteration."""
+        with (
+            mock.patch.object(module.Progress, "step", side_effect=[None, None, KeyboardInterrupt]),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            trainer.train()
+
 
 class Learning(Case):
     def test_the_first_losses_are_what_they_were(self):
@@ -98,11 +106,7 @@ class Learning(Case):
         through = start(spec, dataset)
         Trainer(through, dataset, self.folder).train()
         stopped = start(spec, dataset)
-        with (
-            mock.patch.object(module.Progress, "step", side_effect=[None, None, KeyboardInterrupt]),
-            self.assertRaises(KeyboardInterrupt),
-        ):
-            Trainer(stopped, dataset, self.folder, workers=2).train()
+        self.interrupt(Trainer(stopped, dataset, self.folder, workers=2))
         resumed = start(spec, dataset)
         resumed.load(read_checkpoint(self.folder / CHECKPOINT))
         Trainer(resumed, dataset, self.folder, workers=2).train()
@@ -115,11 +119,7 @@ class Learning(Case):
         through = start(spec, dataset)
         Trainer(through, dataset, self.folder).train()
         stopped = start(spec, dataset)
-        with (
-            mock.patch.object(module.Progress, "step", side_effect=[None, None, KeyboardInterrupt]),
-            self.assertRaises(KeyboardInterrupt),
-        ):
-            Trainer(stopped, dataset, self.folder, held_out=held_out).train()
+        self.interrupt(Trainer(stopped, dataset, self.folder, held_out=held_out))
         resumed = start(spec, dataset)
         resumed.load(read_checkpoint(self.folder / CHECKPOINT))
         trainer = Trainer(resumed, dataset, self.folder, held_out=held_out)
@@ -226,11 +226,7 @@ class Interrupted(Case):
             with self.subTest(workers=workers):
                 spec, dataset, through = self.through(workers)
                 stopped = start(spec, dataset)
-                with (
-                    mock.patch.object(module.Progress, "step", side_effect=[None, None, KeyboardInterrupt]),
-                    self.assertRaises(KeyboardInterrupt),
-                ):
-                    Trainer(stopped, dataset, self.folder, workers=workers).train()
+                self.interrupt(Trainer(stopped, dataset, self.folder, workers=workers))
                 state = read_checkpoint(self.folder / CHECKPOINT)
                 self.assertEqual(state["iteration"], 3)
                 self.assertNotIn("final_loss", state["provenance"])
