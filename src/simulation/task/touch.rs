@@ -300,13 +300,10 @@ mod tests {
             add("quantile", &name, &quantiles(plane, [0, 10, 50, 90, 100]));
         }
         for step in 0..4 {
+            let lights = format!("the divergence of lights at {step} quarters of a turn");
             let of = moments(&divergence(picture, f64::from(step) * PI / 2.0));
-            add("moment", &format!("the divergence of lights at {step} quarters of a turn"), &of);
-            add(
-                "size of the skewness",
-                &format!("the divergence of lights at {step} quarters of a turn"),
-                &[of[2].abs()],
-            );
+            add("moment", &lights, &of);
+            add("size of the skewness", &lights, &[of[2].abs()]);
         }
         found
     }
