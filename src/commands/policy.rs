@@ -37,10 +37,10 @@ pub enum ShowError {
     /// The episode.
     #[error(transparent)]
     Compare(#[from] CompareError),
-    /// It has no such chunk, or not all that it was computed from.
+    /// It has no such chunk of this policy, or not all that it was computed from.
     #[error(
-        "{}: there is no chunk {number} in it whose samples are all there: it has chunks only if a policy ran, and the \
-         first ones may be from before its beginning; name another with --chunk",
+        "{}: there is no chunk {number} of this policy in it whose samples are all there: name the folder of the policy that \
+         ran, or another chunk with --chunk: the first ones may be from before its beginning",
         file.display()
     )]
     NoChunk {
