@@ -209,7 +209,7 @@ class Dataset:
                   hidden: NDArray[np.int64] | None) -> None:  # fmt: skip
         """The rows [B, S] of a history and which of them there are, of windows whose segments `begin` [B, 1]."""
         i, tick = self.spec.column(o), plan["tick"][:, None]
-        ago = np.arange(o.history.steps)[::-1] * o.down_sample_steps
+        ago = np.array(o.ages)
         rows = tick - ago
         valid = rows >= begin
         # Of what is before the beginning any row of the episode is named, and none is read.
@@ -250,8 +250,10 @@ class Dataset:
             batch.shown[o.key] = torch.from_numpy(shown)
             self._pictures(batch, o, plan, steps, shown)
         for o in spec.histories:
-            batch.shown[o.key] = torch.from_numpy(plan[f"valid {o.key}"])
-            self._pictures(batch, o, plan, plan[f"seen {o.key}"], plan[f"valid {o.key}"])
+            # The networks look at a history only where there is no picture of now: of no other window is it read.
+            shown = plan[f"valid {o.key}"] & ~visible[:, -1:, spec.column(o)]
+            batch.shown[o.key] = torch.from_numpy(shown)
+            self._pictures(batch, o, plan, plan[f"seen {o.key}"], shown)
         for i, o in enumerate(spec.observation):
             if o.kind == "image":
                 continue

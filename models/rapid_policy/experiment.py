@@ -243,9 +243,15 @@ class Observation(Section):
         return f"{self.key}_valid"
 
     @property
+    def ages(self) -> tuple[int, ...]:
+        """Of a history: how many ticks before the newest observation each step is, the oldest first."""
+        steps = self.history.steps if self.history else 0
+        return tuple(age * self.down_sample_steps for age in reversed(range(steps)))
+
+    @property
     def span(self) -> int:
         """Of a history: ticks from the first step to the last."""
-        return (self.history.steps - 1) * self.down_sample_steps if self.history else 0
+        return max(self.ages, default=0)
 
     @property
     def sources(self) -> tuple[Part, ...]:
@@ -610,7 +616,7 @@ class Experiment(Section):
 
     @property
     def histories(self) -> tuple[Observation, ...]:
-        """The pictures with a history, in the order of the condition."""
+        """The pictures with a history."""
         return tuple(o for o in self.observation if o.history)
 
     def column(self, history: Observation) -> int:
@@ -641,8 +647,7 @@ class Experiment(Section):
     @property
     def condition(self) -> int:
         """Length of the condition: the vectors and embeddings of all observation steps."""
-        pictures = len(self.images) + len(self.histories)
-        step = sum(o.shape[0] for o in self.vectors) + pictures * self.encoder.features
+        step = sum(o.shape[0] for o in self.vectors) + len(self.images) * self.encoder.features
         return self.policy.n_obs_steps * step
 
     def to_text(self) -> str:

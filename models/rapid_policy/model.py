@@ -7,7 +7,7 @@ one processor core runs ten times in a control period. Both have the same inputs
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
@@ -92,15 +92,21 @@ ENCODERS = {"small": SmallEncoder, "resnet18": ResNetEncoder}
 
 class HistoryPooling(nn.Module):
     """Embeddings [B, S, F] of the steps of a history, bool [B, S] which there are -> [B, F]: their mean, weighted by a
-    learned score of each; zeros where there is none."""
+    learned score of each; zeros where there is none.
+
+    At first the score is the age alone, and the newest step that there is has nearly all the weight: before it has learned
+    which steps to remember, it remembers the last.
+    """
 
     # Of a step that is not there, beside which every other one has all the weight.
     LEAST = -1e9
 
-    def __init__(self, features: int, steps: int) -> None:
+    def __init__(self, features: int, ages: Sequence[int]) -> None:
+        """`ages`: ticks before the newest observation, of each step."""
         super().__init__()
-        self.score = nn.Linear(features, 1)
-        self.places = nn.Parameter(torch.zeros(steps))
+        self.score = nn.Linear(features, 1, bias=False)
+        nn.init.zeros_(self.score.weight)
+        self.places = nn.Parameter(-torch.tensor(ages, dtype=torch.float32))
 
     def forward(self, embeddings: Tensor, valid: Tensor) -> Tensor:
         # Selected, not multiplied: what is not there may contain anything.
@@ -112,8 +118,10 @@ class HistoryPooling(nn.Module):
 
 
 class ObservationEncoder(nn.Module):
-    """All observations -> `global_cond` [B, Dc]: at each step the vectors, an embedding of each picture, and one of each
-    history, which is the same at every step."""
+    """All observations -> `global_cond` [B, Dc]: at each step the vectors and an embedding of each picture.
+
+    For the embedding of an absent picture stands what is remembered of it, by its histories, and without any zeros.
+    """
 
     def __init__(self, spec: Experiment) -> None:
         super().__init__()
@@ -121,14 +129,14 @@ class ObservationEncoder(nn.Module):
         self.image_keys = [o.key for o in spec.images]
         self.vector_keys = [o.key for o in spec.vectors]
         self.mask_aware, self.shared = spec.policy.mask_aware, spec.encoder.shared
-        self.steps = spec.policy.n_obs_steps
-        # By key: the name of its validity, and the picture of now whose encoder sees it too.
-        self.history_keys = {o.key: (o.valid, spec.images[spec.column(o)].key) for o in spec.histories}
         kind = ENCODERS[spec.encoder.type]
         one_each = {SHARED: spec.images[0]} if self.shared and spec.images else {o.key: o for o in spec.images}
         self.images = nn.ModuleDict({key: kind(*o.shape[1:], spec.encoder) for key, o in one_each.items()})
-        pooled = {o.key: HistoryPooling(spec.encoder.features, o.history.steps) for o in spec.histories}
-        self.histories = nn.ModuleDict(pooled)
+        # By the key of the picture of now, whose encoder sees them too.
+        of_each = {o.key: [h for h in spec.histories if h.modality == o.modality] for o in spec.images}
+        self.history_keys = {key: [(h.key, h.valid) for h in found] for key, found in of_each.items()}
+        ages = {key: [age for h in found for age in h.ages] for key, found in of_each.items() if found}
+        self.histories = nn.ModuleDict({key: HistoryPooling(spec.encoder.features, of) for key, of in ages.items()})
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Inputs in the order of the observations: pictures [B, To, 3, H, W], with a history [B, S, 3, H, W], vectors
@@ -145,16 +153,21 @@ class ObservationEncoder(nn.Module):
             if mask is not None:
                 # Selected, not multiplied: NaN times zero is still NaN, and an absent picture may contain anything.
                 present = mask[:, None, i : i + 1] > 0.5
-                embedding = torch.where(present, embedding, torch.zeros((), dtype=embedding.dtype, device=mask.device))
+                embedding = torch.where(present, embedding, self._remembered(key, observations, embedding, pooled=pooled))
             embeddings.append(embedding)
-        for key, (valid, now) in self.history_keys.items():
-            there = observations[valid] > 0.5
-            # A graph, of onnxruntime or of a GPU, computes all steps, whichever there are; training on a CPU only those.
-            fewer = pooled and there.device.type == "cpu"
-            embedding = self._embed(now, observations[key], pooled=pooled, there=there if fewer else None)
-            remembered = self.histories[key](embedding, there)
-            embeddings.append(remembered.unsqueeze(1).expand(-1, self.steps, -1))
         return torch.cat([x.float() for x in vectors + embeddings], -1).flatten(1)
+
+    def _remembered(self, key: str, observations: dict[str, Tensor], now: Tensor, *, pooled: bool) -> Tensor:
+        """What stands for the embedding `now` of an absent picture, the same at every step: [B, 1, F] or a zero."""
+        if not self.history_keys[key]:
+            return torch.zeros((), dtype=now.dtype, device=now.device)
+        seen, there = [], []
+        for history, valid in self.history_keys[key]:
+            there.append(observations[valid] > 0.5)
+            # A graph, of onnxruntime or of a GPU, computes all steps, whichever there are; training on a CPU only those.
+            fewer = pooled and now.device.type == "cpu"
+            seen.append(self._embed(key, observations[history], pooled=pooled, there=there[-1] if fewer else None))
+        return self.histories[key](torch.cat(seen, 1), torch.cat(there, 1)).unsqueeze(1).to(now.dtype)
 
     def _embed(self, key: str, pictures: Tensor, *, pooled: bool, there: Tensor | None = None) -> Tensor:
         """[B, To, 3, H, W] -> [B, To, F], by the encoder of the picture `key`; with `there` [B, To] zeros for the others."""

@@ -65,8 +65,8 @@ class First:
     def give(self, policy: Policy, described: dict[str, Any]) -> None:
         """Gives the weights to `policy`, whose `policy.json` is to be `described`.
 
-        Only histories may be missing: the denoiser takes one at first for the current picture of its modality, whose encoder sees
-        it. Raises `ValueError` where inputs, actions or networks differ otherwise.
+        Only histories may be missing: at first one remembers the last picture. Raises `ValueError` where inputs, actions or
+        networks differ otherwise.
         """
         self._check_meaning(described)
         known, weights = self.policy.state_dict(), dict(policy.state_dict())
@@ -126,8 +126,6 @@ def _columns(old: Experiment, new: Experiment) -> list[int] | None:
     for key, length in _condition(old):
         known[key] = range(at, at + length)
         at += length
-    for o in new.histories:
-        known.setdefault(o.key, known.get(new.images[new.column(o)].key, range(0)))
     columns = []
     for key, length in _condition(new):
         if len(known.get(key, ())) != length:
@@ -138,7 +136,7 @@ def _columns(old: Experiment, new: Experiment) -> list[int] | None:
 
 def _condition(spec: Experiment) -> list[tuple[str, int]]:
     """What a step of the condition has, in order, and how many numbers of each."""
-    pictures = [(o.key, spec.encoder.features) for o in (*spec.images, *spec.histories)]
+    pictures = [(o.key, spec.encoder.features) for o in spec.images]
     return [*((o.key, o.shape[0]) for o in spec.vectors), *pictures]
 
 

@@ -279,12 +279,16 @@ class Histories(unittest.TestCase):
         plan = dataset.plan(np.random.default_rng(0), size)
         batch = dataset.gather(plan)
         given = inputs(dataset.spec, batch, CPU)
-        there = given["touched_valid"] == 1
-        self.assertEqual(float(given["touched"][~there].abs().sum()), 0)
-        rows = (given["touched"][:, :, 0, 0, 0] * 255).round().int().tolist()
-        history = [[r if t else None for r, t in zip(*one, strict=True)] for one in zip(rows, there.tolist(), strict=True)]
+        there, now = plan["valid touched"], batch.mask[:, 1].numpy() == 1
         starts = dataset.starts[np.searchsorted(dataset.starts, plan["tick"], "right") - 1]
-        return plan["tick"] - starts, batch.mask[:, 1].numpy() == 1, history
+        rows = plan["seen touched"] - starts[:, None]
+        # It is read where it is looked at: where there is no picture of now.
+        read = there & ~now[:, None]
+        np.testing.assert_array_equal(given["touched_valid"] == 1, read)
+        pictures = given["touched"][:, :, 0, 0, 0].numpy() * 255
+        np.testing.assert_array_equal(pictures.round(), np.where(read, rows, 0))
+        history = [[r if t else None for r, t in zip(*one, strict=True)] for one in zip(rows.tolist(), there.tolist(), strict=True)]
+        return plan["tick"] - starts, now, history
 
     def test_it_is_what_there_was_at_each_of_its_ticks(self):
         episode = by_hand(100)
@@ -369,11 +373,12 @@ class Histories(unittest.TestCase):
         spec = observed(remembering(), "tactile", **held)
         dataset = Dataset(spec, [by_hand(100)])
         dataset.windows = dataset.windows[70:71]
-        batch, given = drawn(dataset, 200)
-        now = (given["tactile"][:, -1, 0, 0, 0] * 255).round().int()
+        plan = dataset.plan(np.random.default_rng(0), 200)
+        batch = dataset.gather(plan)
+        now = (inputs(spec, batch, CPU)["tactile"][:, -1, 0, 0, 0] * 255).round().int()
         self.assertTrue((batch.mask == 1).all())
         self.assertTrue(int(now.min()) < 45 and int(now.max()) == 70)
-        for last, valid in zip(now.tolist(), given["touched_valid"].tolist(), strict=True):
+        for last, valid in zip(now.tolist(), plan["valid touched"].tolist(), strict=True):
             self.assertEqual(valid, [float(row <= last) for row in range(15, 71, 5)])
 
     def test_all_of_a_history_is_shifted_as_one_and_as_its_reference(self):
@@ -381,14 +386,16 @@ class Histories(unittest.TestCase):
         episode = by_hand(100)
         tactile = episode.value("tactile_tip")
         tactile[1:, 40] += 4
-        dataset = Dataset(spec, [episode])
-        dataset.windows = dataset.windows[70:71]
+        episode.present("tactile_tip")[66:71] = False
+        dataset, now = Dataset(spec, [episode]), Dataset(spec, [episode])
+        dataset.windows, now.windows = dataset.windows[70:71], dataset.windows[65:66]
         _, given = drawn(dataset, 64)
-        rows = given["touched"][:, :, 0, :, 0] - given["touched"][:, :, 0, :1, 0]
-        places = rows.argmax(2)
+        seen = given["touched"][:, :-1]
+        places = (seen[:, :, 0, :, 0] - seen[:, :, 0, :1, 0]).argmax(2)
         self.assertTrue((places == places[:, :1]).all())
         self.assertEqual(set(places.unique().tolist()), {18, 19, 20, 21, 22})
-        self.assertEqual(set((given["tactile"][:, 1, 0, :, 0] * 255).round().unique().tolist()), {70.0, 72.0})
+        _, given = drawn(now, 64)
+        self.assertEqual(set((given["tactile"][:, 1, 0, :, 0] * 255).round().unique().tolist()), {65.0, 67.0})
 
     def test_windows_are_those_of_a_policy_without(self):
         spec = observed(experiment("tactile-id"), "tactile", dropout={"window": 0.4})
@@ -399,9 +406,10 @@ class Histories(unittest.TestCase):
         other["seen"] = other["seen"][..., [0, 1, 3]]
         for name, values in one.items():
             np.testing.assert_array_equal(values, other[name], name)
-        batch = with_one.gather({name: rows[10:20] for name, rows in with_one.plan(np.random.default_rng(3), 50).items()})
+        batch = with_one.gather({name: rows[10:40] for name, rows in with_one.plan(np.random.default_rng(3), 50).items()})
         whole = with_one.gather(with_one.plan(np.random.default_rng(3), 50))
-        self.assertTrue(torch.equal(batch.pictures["touched"], whole.pictures["touched"][10:20]))
+        self.assertTrue(batch.shown["touched"].any())
+        self.assertTrue(torch.equal(batch.pictures["touched"], whole.pictures["touched"][10:40]))
 
     def test_a_measurement_takes_nothing_from_it(self):
         dataset = Dataset(twelve_steps(), [by_hand(100)])

@@ -64,10 +64,13 @@ class History(unittest.TestCase):
         self.policy = random_policy(twelve_steps(encoder={"width": 8}))
         self.inputs = dict(zip(encoder_inputs(self.policy.spec), encoder_example(self.policy.spec), strict=True))
 
+    ABSENT = torch.tensor([[1.0, 0.0]] * 2)
+
     def condition(self, **changed: torch.Tensor) -> torch.Tensor:
-        """[B, To, D]; the last 64 are of the history."""
+        """[B, To, D] without the tactile picture of now; the last 64 are what stands for it."""
         with torch.no_grad():
-            return self.policy.encoder(*(self.inputs | changed).values()).unflatten(1, (2, -1))
+            given = self.inputs | {"mask": self.ABSENT} | changed
+            return self.policy.encoder(*given.values()).unflatten(1, (2, -1))
 
     def test_what_goes_in(self):
         self.assertEqual(list(self.inputs), ["wrist", "tactile", "touched", "state", "touched_valid", "mask"])
@@ -87,28 +90,51 @@ class History(unittest.TestCase):
         self.assertEqual(float(none[..., -64:].abs().max()), 0)
         self.assertTrue(none.isfinite().all())
 
-    def test_it_is_seen_by_the_encoder_of_the_picture_of_now_at_every_step(self):
+    def test_it_stands_for_the_absent_picture_at_every_step_as_its_encoder_sees_it(self):
         only = torch.zeros(2, 12)
         only[:, 3] = 1
         touched = self.inputs["touched"].clone()
         touched[:, 3] = self.inputs["tactile"][:, 1]
-        seen = self.condition(touched=touched, touched_valid=only)
-        torch.testing.assert_close(seen[:, 1, -64:], seen[:, 1, -128:-64])
-        self.assertTrue(torch.equal(seen[:, 0, -64:], seen[:, 1, -64:]))
-        # It is there without the picture of now.
-        absent = self.condition(touched=touched, touched_valid=only, mask=torch.tensor([[1.0, 0.0]] * 2))
-        self.assertTrue(torch.equal(absent[..., -64:], seen[..., -64:]))
+        remembered = self.condition(touched=touched, touched_valid=only)
+        there = self.condition(mask=torch.ones(2, 2))
+        torch.testing.assert_close(remembered[:, 1], there[:, 1])
+        self.assertTrue(torch.equal(remembered[:, 0, -64:], remembered[:, 1, -64:]))
+        # Beside the picture of now it is nothing, and nothing stands for a picture without a history.
+        self.assertTrue(torch.equal(self.condition(mask=torch.ones(2, 2), touched=-touched), there))
+        without = self.condition(mask=torch.zeros(2, 2))
+        self.assertEqual(float(without[..., -128:-64].abs().max()), 0)
+
+    def test_before_it_is_trained_it_remembers_the_last(self):
+        torch.manual_seed(0)
+        pooling, embeddings = HistoryPooling(8, range(0, 15, 3)[::-1]), torch.randn(4, 5, 8)
+        valid = torch.tensor([[1, 1, 1, 1, 1], [1, 1, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0]]) > 0
+        last = torch.stack([embeddings[0, 4], embeddings[1, 2], embeddings[2, 2], torch.zeros(8)])
+        with torch.no_grad():
+            torch.testing.assert_close(pooling(embeddings, valid), last, atol=0.2, rtol=0)
 
     def test_the_order_of_its_steps_is_known_by_their_places_alone(self):
         torch.manual_seed(0)
-        pooling, embeddings, order = HistoryPooling(8, 5), torch.randn(3, 5, 8), torch.randperm(5)
+        pooling, embeddings, order = HistoryPooling(8, range(5)[::-1]), torch.randn(3, 5, 8), torch.randperm(5)
         valid = torch.tensor([[1, 1, 0, 1, 1], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]]) > 0
         with torch.no_grad():
+            self.assertFalse(torch.allclose(pooling(embeddings[:, order], valid[:, order]), pooling(embeddings, valid)))
+            pooling.places.zero_()
+            pooling.score.weight.normal_()
             plain = pooling(embeddings, valid)
             torch.testing.assert_close(pooling(embeddings[:, order], valid[:, order]), plain)
             torch.testing.assert_close(plain[1], embeddings[1, 4])
-            pooling.places.copy_(torch.arange(5.0))
-            self.assertFalse(torch.allclose(pooling(embeddings[:, order], valid[:, order]), pooling(embeddings, valid)))
+
+    def test_two_histories_of_a_picture_are_remembered_as_one(self):
+        described = json.loads(twelve_steps().to_text())
+        touched = next(o for o in described["observation"] if o["key"] == "touched")
+        described["observation"].append({**touched, "key": "lately", "down_sample_steps": 1, "history": {"steps": 3}})
+        policy = random_policy(Experiment.from_text(json.dumps(described)))
+        self.assertEqual(policy.encoder.histories["tactile"].places.shape, (15,))
+        inputs = dict(zip(encoder_inputs(policy.spec), encoder_example(policy.spec, mask=(1, 0)), strict=True))
+        with torch.no_grad():
+            found = policy.encoder(*inputs.values())
+            for key in ("touched", "lately"):
+                self.assertFalse(torch.equal(policy.encoder(*(inputs | {key: -inputs[key]}).values()), found), key)
 
     def test_training_computes_the_same_of_the_steps_that_there_are(self):
         pooled = dict(self.inputs)
@@ -116,11 +142,11 @@ class History(unittest.TestCase):
             pooled[key] = torch.nn.functional.avg_pool2d(pooled[key].flatten(0, 1), 2).unflatten(0, pooled[key].shape[:2])
         for valid in (self.inputs["touched_valid"], torch.zeros(2, 12)):
             pooled["touched_valid"] = valid
-            encoded = self.policy.encoder.encode(pooled, pooled["mask"], pooled=True)
+            encoded = self.policy.encoder.encode(pooled, self.ABSENT, pooled=True)
             expected = self.condition(touched_valid=valid).flatten(1)
             torch.testing.assert_close(encoded, expected, rtol=1e-4, atol=1e-5)
             with torch.autocast("cpu", torch.bfloat16):
-                half = self.policy.encoder.encode(pooled, pooled["mask"], pooled=True)
+                half = self.policy.encoder.encode(pooled, self.ABSENT, pooled=True)
             self.assertEqual(half.dtype, torch.float32)
             torch.testing.assert_close(half, expected, rtol=0.1, atol=0.1)
             half.sum().backward()
@@ -288,7 +314,7 @@ class Bundle(unittest.TestCase):
             with self.assertRaisesRegex(ValueError, f"{folder}: not a bundle of rapid_policy.export: "):
                 First.read(folder)
 
-    def test_a_history_starts_as_what_the_current_picture_is(self):
+    def test_a_policy_that_is_to_remember_starts_as_one_that_holds_the_last(self):
         for kind in ("tactile-id-arm", "transformer"):
             with self.subTest(kind), tempfile.TemporaryDirectory() as name:
                 folder, plain = Path(name), random_policy(experiment(kind))
@@ -297,21 +323,22 @@ class Bundle(unittest.TestCase):
                 (history,) = remembering.spec.histories
                 size, sample, step = history.history.steps, torch.randn(2, 16, 4), torch.full((2,), 50)
                 seen = {o.key: torch.randn(2, 2, *o.shape) for o in plain.spec.observation}
-                before = seen | {history.key: torch.randn(2, size, *history.shape), history.valid: torch.zeros(2, size)}
+                still = seen["tactile"][:, :1]
+                never = {history.key: torch.randn(2, size, *history.shape), history.valid: torch.zeros(2, size)}
+                once = {history.key: still.expand(-1, size, -1, -1, -1), history.valid: torch.ones(2, size)}
 
                 def denoised(policy, observations, mask, at=(sample, step)):
                     condition = policy.encoder.encode(observations, torch.tensor([mask] * 2), pooled=False)
                     return policy.denoiser(*at, condition)
 
-                # Without a step it is the policy that it began as.
-                torch.testing.assert_close(denoised(remembering, before, [1.0, 1.0]), denoised(plain, seen, [1.0, 1.0]))
-                # What it saw before stands for what is not there now.
-                still = seen["tactile"][:, :1]
-                once = {history.key: still.expand(-1, size, -1, -1, -1), history.valid: torch.ones(2, size)}
-                now = seen | {"tactile": still.expand(-1, 2, -1, -1, -1)}
-                torch.testing.assert_close(
-                    denoised(remembering, seen | once, [1.0, 0.0]), denoised(plain, now, [1.0, 1.0]), atol=2e-5, rtol=1e-4
-                )
+                for remembered, stands in ((never, [1.0, 0.0]), (once, [1.0, 1.0])):
+                    torch.testing.assert_close(
+                        denoised(remembering, seen | remembered, [1.0, 1.0]), denoised(plain, seen, [1.0, 1.0])
+                    )
+                    held = seen | {"tactile": still.expand(-1, 2, -1, -1, -1)}
+                    torch.testing.assert_close(
+                        denoised(remembering, seen | remembered, [1.0, 0.0]), denoised(plain, held, stands), atol=2e-5, rtol=1e-4
+                    )
 
     def test_the_bundle_of_the_repository_is_loaded(self):
         policy = load_policy(Path(__file__).parents[1] / "tactile-id")

@@ -98,7 +98,11 @@ class Learning(Case):
         final = Trainer(run, dataset, self.folder).train()
         self.assertLess(final, 0.85 * sum(run.losses[:20]) / 20)
         # Which steps serve is learned too.
-        self.assertTrue(run.policy.encoder.histories["touched"].places.all())
+        learned = run.policy.encoder.histories["tactile"]
+        moved = learned.places != -torch.tensor(spec.histories[0].ages)
+        # Where a history is looked at, its last step is never there.
+        self.assertEqual(moved.tolist(), [True, True, True, False])
+        self.assertTrue(learned.score.weight.all())
 
     def test_histories_are_the_same_by_threads_and_after_a_stop(self):
         spec = small("tactile-id-memory", precision="float32")
