@@ -553,12 +553,11 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
     let file = good(&place, running);
     client.compare(&place, &file);
     let masks = client.received.iter().filter(|message| client.channels[&message.channel].topic == "/rapid/mask");
-    let sequences: Vec<_> = masks
-        .map(|message| <MaskMessage as prost::Message>::decode(&message.data[..]).expect("a mask").sequence)
-        .collect();
+    let times: Vec<_> = masks.map(|message| message.log_time).collect();
     assert!(client.received.len() > resumed + 100, "it continues when the client reads again");
-    let largest = sequences.windows(2).map(|pair| pair[1] - pair[0]).max().expect("two masks");
-    assert!(largest > 500, "it was never stuck: {largest} masks were left out at a time");
+    // By time: how many masks there are in a second depends on the machine.
+    let largest = times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).max().expect("two masks");
+    assert!(largest > 1_000_000_000, "it was never stuck: the masks of {largest} ns were left out at a time");
 
     // The mask in the file has no hole. How even its rhythm is, `make bench` measures.
     let episode = Episode::read(&place.path(&file));
@@ -634,7 +633,9 @@ fn a_port_in_use_is_an_error_of_the_start() {
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(1), "{errors}");
     let expected = format!("error: --foxglove {address}: Address already in use");
-    assert!(errors.starts_with(&expected) && errors.contains("name another port"), "{errors}");
+    // On a machine that gives no real-time priority a warning stands before it.
+    let is_named = errors.lines().any(|line| line.starts_with(&expected) && line.contains("name another port"));
+    assert!(is_named, "{errors}");
     assert!(place.episodes("out").is_empty() && place.shared_memory().is_empty(), "{:?}", place.shared_memory());
 }
 
