@@ -85,7 +85,7 @@ fleet-test: setup-build ## upload to a real S3 server, sensors of another comput
 	RAPID_BIN='$(or $(RAPID_BIN),$(TARGET)/debug/rapid)' scripts/fleet.sh
 
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.
-train: setup-build ## record demonstrations, train on them, export models/tactile-id (POLICY=, THREADS=2, MINUTES=)
+train: setup-build ## record demonstrations, train on them, export models/tactile-id (POLICY=, START_FROM=, THREADS=2, MINUTES=)
 	cargo build --release --locked
 	scripts/train.sh policy '$(TARGET)/release/rapid'
 

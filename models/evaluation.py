@@ -152,9 +152,10 @@ def between(values: list[int]) -> str:
 
 
 ORIGIN = [
-    "Of three trainings each, which differ by their seed, the policy is the one that sorted most in the trials from 40000 on",
-    "([figures](README.md#seeds-and-the-length-of-training)), before it ran any of these. The tables are of these trainings, and not",
-    "of what another one gives.",
+    f"`{PLAIN}` is, of three trainings that differ by their seed, the one that sorted most in the trials from 40000 on",
+    "([figures](README.md#seeds-and-the-length-of-training)), before it ran any of these. "
+    f"`{MEMORY}` is one training, which began",
+    "with its weights, and not a choice. The tables are of these trainings, and not of what another one gives.",
 ]
 
 

@@ -11,7 +11,8 @@
 # RAPID is the program, default target/release/rapid. Demonstrations and checkpoints are in RUNS=models/runs; existing
 # ones are used again: a stopped training continues. EPISODES=240 and SEED=1000 of the demonstrations by hand (those with the arm
 # are 480 from 1000 on: the experiments of the ablation say which of them); THREADS=2 of a training, MINUTES of one that is
-# no part of the ablation, EVALUATE iterations between two evaluations of one; POLICY=tactile-id; JOBS=1 trainings of the
+# no part of the ablation, EVALUATE iterations between two evaluations of one, START_FROM=BUNDLE whose weights it begins with
+# (tactile-id-memory: models/tactile-id); POLICY=tactile-id; JOBS=1 trainings of the
 # ablation at a time, SEEDS="0 1 2" of them; ENCODER=small.
 #
 # Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks complete.
@@ -97,7 +98,9 @@ experiment() {
 # Trains an experiment under the name of its bundle, or continues, and exports.
 learn() {
     local file="$1" name="$2" run="$RUNS/$2" options=("${SCHEDULE[@]}")
-    [[ ! -f $run/checkpoint.pt ]] || options+=(--resume)
+    if [[ -f $run/checkpoint.pt ]]; then options+=(--resume)
+    elif [[ -n ${START_FROM:-} ]]; then options+=(--start-from "$(realpath "$START_FROM")")
+    fi
     in_models -m rapid_policy.train "$file" --out "$run" --cache "$RUNS/cache" "${options[@]}" "${@:3}"
     in_models -m rapid_policy.export "$run/checkpoint.pt" --out "$name"
 }
