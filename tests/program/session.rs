@@ -209,11 +209,9 @@ fn a_plan_records_its_episodes_and_ends_the_run() {
     let plan = ["--goal", "2", "--episode-time", "700ms", "--reset-time", "100ms", "--countdown", "50ms"];
     let output = place.run(&[&["--sim", "--headless", "--record", "--out", "out"], &plan[..]].concat());
     let text = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), Some(0), "{text}");
     assert_eq!(place.episodes("out").len(), 2, "{text}");
-    // Which verdict an episode of 0.7 s has depends on the machine; one that is BAD is an exit code.
-    let of = |verdict: &str| text.lines().filter(|line| line.starts_with(verdict)).count();
-    assert_eq!(of("GOOD ") + of("SUSPECT ") + of("BAD "), 2, "{text}");
-    assert_eq!(output.status.code(), Some(if of("BAD ") > 0 { 4 } else { 0 }), "{text}");
+    assert_eq!(text.lines().filter(|line| line.starts_with("GOOD ")).count(), 2, "{text}");
     for words in [&["--goal", "2", "--duration", "3s"][..], &["--goal", "0"], &["--episode-time", "0s"]] {
         assert_eq!(place.run(words).status.code(), Some(2), "{words:?}");
     }
