@@ -218,6 +218,7 @@ def _absent(spec: Experiment) -> str:
         given = ", ".join(f"{'' if way == 'window' else way + ' '}{share:g}" for way, share in ways.items() if share)
         dropped += [f"`{o.key}` {given}"] if given else []
     held = [f"the last of `{o.key}` for {o.when_absent.hold_last_ms / 1000:g} s" for o in spec.images if o.when_absent]
+    held += [f"what `{o.key}` remembers of `{spec.images[spec.column(o)].key}`" for o in spec.histories]
     stands = f"{', '.join(held)}; then, and all others, zeroed" if held else "zeroed"
     taken = [(o, now) for o in spec.histories if (now := spec.images[spec.column(o)]).dropout.window]
     dropped += [f"from `{o.key}` with `{now.key}` all that is newer than a moment, or all" for o, now in taken]
