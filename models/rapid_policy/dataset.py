@@ -62,6 +62,8 @@ class Batch:
     """f32 [B, M], 1 for pictures that are present."""
     actions: Tensor
     """f32 [B, Tp, Da] in -1..1"""
+    outcomes: Tensor
+    """f32 [B, Da] in -1..1: the last action of each window's episode; [B, 0] unless a picture predicts it."""
 
 
 class Dropped(NamedTuple):
@@ -102,6 +104,8 @@ class Dataset:
         self.starts = np.cumsum([0, *read["length"]])
         self.windows = read["windows"]
         self.present, self.targets, self.now = read["present"], read["targets"], read.get("now")
+        # Of each episode the last row that has an action; of one without windows that of another, which none asks for.
+        self.ends = self.windows[np.searchsorted(self.windows[:, 0], self.starts[1:]) - 1, 2] - 1
         self.vectors = {o.key: read[f"vector {o.key}"] for o in spec.vectors}
         self.ranges = dict(ranges or {})
         if spec.action.gripper_squeeze:
@@ -242,9 +246,8 @@ class Dataset:
     def gather(self, plan: Plan) -> Batch:
         """The windows of a plan, or of a part of its rows."""
         spec, visible = self.spec, plan["visible"]
-        batch = Batch(
-            {}, {}, {}, {}, {}, torch.from_numpy(visible[:, -1].astype(np.float32)), self._batch_actions(plan)
-        )
+        mask = torch.from_numpy(visible[:, -1].astype(np.float32))
+        batch = Batch({}, {}, {}, {}, {}, mask, self._batch_actions(plan), self._outcomes(plan))
         for i, o in enumerate(spec.images):
             steps, shown = _replugged(plan["seen"][..., self.images[i]] - plan.get(f"since {o.key}", 0), visible[:, :, i])
             batch.shown[o.key] = torch.from_numpy(shown)
@@ -269,7 +272,7 @@ class Dataset:
         corners = plan.get(f"corner {o.key}")
         pictures = np.zeros((*steps.shape, height, width, 3), np.uint8)
         compared = np.zeros((len(steps), height, width, 3), np.uint8) if o.operation else None
-        owners = np.searchsorted(self.starts, plan["tick"], "right") - 1
+        owners = self._owners(plan["tick"])
         for b in np.flatnonzero(shown.any(1)):
             episode = self.episodes[owners[b]]
             source, rows = episode.value(name), steps[b] - self.starts[owners[b]]
@@ -292,6 +295,12 @@ class Dataset:
     def _batch_actions(self, plan: Plan) -> Tensor:
         return torch.from_numpy(self.ranges["action"].apply(self._actions(plan["done"], plan["tick"])))
 
+    def _outcomes(self, plan: Plan) -> Tensor:
+        if not self.spec.predicts_outcomes:
+            return torch.zeros(len(plan["tick"]), 0)
+        ends = self.ends[self._owners(plan["tick"])]
+        return torch.from_numpy(self.ranges["action"].apply(self._actions(ends[:, None], plan["tick"])[:, 0]))
+
     def _actions(self, done: NDArray[np.int64], tick: NDArray[np.int64]) -> NDArray[np.float64]:
         """[B, Tp, Da] of the rows `done` [B, Tp], where the newest observation is of `tick` [B]."""
         action, targets = self.spec.action, self.targets[done]
@@ -308,9 +317,13 @@ class Dataset:
             wanted = poses.delta(wanted, np.concatenate([self.now[done[:, : start + 1]], wanted[:, start:-1]], 1))
         return np.concatenate([poses.numbers(wanted, action.rotation), targets[..., 16:]], -1)
 
+    def _owners(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:
+        """[B] which of the episodes each window is of."""
+        return np.searchsorted(self.starts, tick, "right") - 1
+
     def _episode_spans(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:
         """[B, 2] first row, and row behind the last, of each window's episode."""
-        owners = np.searchsorted(self.starts, tick, "right") - 1
+        owners = self._owners(tick)
         return np.stack([self.starts[owners], self.starts[owners + 1]], 1)
 
 

@@ -167,6 +167,9 @@ class Observation(Section):
         "pictures: steps of its own, also of before it was unplugged", {"steps": 12}, None
     )
     augmentation: Augmentation = known("what is varied in training", {"shift": 4}, Augmentation())
+    outcome: float = known(
+        "pictures: weight of a second loss, by which it predicts the last action of the episode by itself", 0.5, 0.0, ge=0
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Observation:
@@ -196,6 +199,8 @@ class Observation(Section):
             raise mistake("when_absent", "nothing stands in for a step of a history", "remove it")
         if self.dropout.any:
             raise mistake("dropout", "that of the modality's other observation decides", "write it there alone")
+        if self.outcome:
+            raise mistake("outcome", "a history is looked at only where there is no picture", "write it in the other observation alone")
         if self.span > LONGEST_HISTORY:
             cause = f"from the first to the last step {self.span} ticks, more than {LONGEST_HISTORY}"
             raise mistake("history.steps", cause, "write fewer, or a smaller down_sample_steps")
@@ -273,7 +278,7 @@ class Observation(Section):
         return begin, begin + self.shape[0]
 
 
-_IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout", "when_absent", "history"}
+_IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout", "when_absent", "history", "outcome"}
 # What an encoder sees of a picture depends on.
 _SIGHT = ("size", "resize", "crop", "color", "operation")
 _VECTOR_KEYS = {"columns", "parts", "slice"}
@@ -546,6 +551,7 @@ class Experiment(Section):
         self._check_histories()
         self._check_mask()
         self._check_pictures()
+        self._check_outcomes()
         base = self.action.base
         if base and base.modality not in (o.modality for o in self.vectors):
             known_ones = ", ".join(sorted({o.modality for o in self.vectors})) or "none yet"
@@ -556,6 +562,13 @@ class Experiment(Section):
             cause = f"{self.policy.horizon} cannot be halved {self.denoiser.halvings} times"
             raise mistake("policy.horizon", cause, f"write a multiple of {levels}, or fewer widths of the denoiser")
         return self
+
+    def _check_outcomes(self) -> None:
+        for i, o in enumerate(self.observation):
+            if o.outcome and self.action.source == "pose" and self.action.representation != "absolute":
+                cause = f"where an episode ends is not known of {self.action.representation} actions"
+                fix = 'write representation = "absolute" in [action], or remove it'
+                raise mistake(f"observation.{i}.outcome", cause, fix)
 
     def _check_histories(self) -> None:
         now = {o.modality: o for o in self.images}
@@ -633,6 +646,11 @@ class Experiment(Section):
         """Modalities whose numbers are read of an episode."""
         observed = [part.modality for o in self.vectors for part in o.sources]
         return (*observed, *(name for name in (self.action.pose, self.action.gripper) if name))
+
+    @property
+    def predicts_outcomes(self) -> bool:
+        """Whether a picture predicts the last action of the episode by itself."""
+        return any(o.outcome for o in self.images)
 
     @property
     def action_length(self) -> int:

@@ -25,18 +25,26 @@ class Losses(nn.Module):
         self._table = alphas_cumprod().to(device)
 
     def forward(self, observations: dict[str, Tensor], mask: Tensor | None, clean: Tensor, timestep: Tensor,
-                noise: Tensor) -> Tensor:  # fmt: skip
-        """Mean squared error of the predicted noise."""
+                noise: Tensor, outcome: Tensor) -> Tensor:  # fmt: skip
+        """Mean squared error of the predicted noise and, weighted, of the `outcome` [B, Da] as pictures predict it.
+
+        The noise of a window depends on what decides the outcome only where the ways part, and there only by as much as they
+        have parted: what is small in a picture would be learned late, or, with another seed, not at all.
+        """
         # By itself only the encoder: its convolutions gain most from half precision, the denoiser's small ones nothing.
         both = self._precision == "bf16"
         half = both or (self._precision == "auto" and half_width(self._device))
         with torch.autocast(self._device.type, torch.bfloat16, enabled=half):
             condition = self.policy.encoder.encode(observations, mask, pooled=True)
         draws = len(clean) // len(condition)
-        condition = condition.float().repeat(draws, 1)
+        seen = condition.float()
+        condition = seen.repeat(draws, 1)
         with torch.autocast(self._device.type, torch.bfloat16, enabled=both):
             predicted = self.policy.denoiser(add_noise(clean, noise, timestep, self._table), timestep, condition)
-        return F.mse_loss(predicted.float(), noise)
+        loss = F.mse_loss(predicted.float(), noise)
+        if self.policy.outcomes is not None:
+            loss = loss + self.policy.outcomes.loss(seen, outcome)
+        return loss
 
 
 class Replayed(nn.Module):

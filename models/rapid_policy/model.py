@@ -180,6 +180,32 @@ class ObservationEncoder(nn.Module):
         return seen.new_zeros(there.numel(), seen.shape[1]).index_copy(0, places, seen).unflatten(0, there.shape)
 
 
+class Outcomes(nn.Module):
+    """`global_cond` [B, Dc] -> the last action of the episode, as some pictures predict it, each by itself.
+
+    By itself, because where a vector shows it too, which it does as soon as the ways to different ends part, a picture would
+    have nothing more to learn. Each is that of the newest step, or what is remembered of it; zeros predict the mean.
+    """
+
+    def __init__(self, spec: Experiment) -> None:
+        super().__init__()
+        self._steps, self._features = spec.policy.n_obs_steps, spec.encoder.features
+        # Where the pictures begin in a step of the condition.
+        self._first = sum(o.shape[0] for o in spec.vectors)
+        self.weights = {str(i): o.outcome for i, o in enumerate(spec.images) if o.outcome}
+        self.heads = nn.ModuleDict({i: nn.Linear(self._features, spec.action_length) for i in self.weights})
+
+    def forward(self, condition: Tensor) -> dict[str, Tensor]:
+        """[B, Da] of each, by its place among the pictures."""
+        newest = condition.unflatten(1, (self._steps, -1))[:, -1]
+        pictures = newest[:, self._first :].unflatten(1, (-1, self._features))
+        return {i: head(pictures[:, int(i)]) for i, head in self.heads.items()}
+
+    def loss(self, condition: Tensor, outcome: Tensor) -> Tensor:
+        """Mean squared errors to `outcome` [B, Da], each times its weight."""
+        return torch.stack([self.weights[i] * F.mse_loss(found, outcome) for i, found in self(condition).items()]).sum()
+
+
 class ConvBlock(nn.Module):
     """[B, C, T] -> [B, outputs, T]"""
 
@@ -310,6 +336,8 @@ class Policy(nn.Module):
         self.spec = spec
         self.encoder = ObservationEncoder(spec)
         self.denoiser = DENOISERS[spec.denoiser.type](spec)
+        # Of the training alone: no bundle has it.
+        self.outcomes = Outcomes(spec) if spec.predicts_outcomes else None
 
     def start_from(self, weights: Path) -> None:
         """The image encoders begin with torchvision's weights."""

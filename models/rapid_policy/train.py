@@ -167,7 +167,7 @@ class Trainer:
         timestep, noise = (x.unflatten(0, (draws, size))[:, rows].flatten(0, 1).to(device) for x in (timestep, noise))
         mask = batch.mask.to(device) if spec.policy.mask_aware else None
         clean = batch.actions.to(device).repeat(draws, 1, 1)
-        return inputs(spec, batch, device), mask, clean, timestep, noise
+        return inputs(spec, batch, device), mask, clean, timestep, noise, batch.outcomes.to(device)
 
     def _validate(self, board: Board) -> None:
         """The loss of the averaged weights on held-out episodes: the same windows and noise each time, nothing varied."""

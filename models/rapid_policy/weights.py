@@ -65,14 +65,14 @@ class First:
     def give(self, policy: Policy, described: dict[str, Any]) -> None:
         """Gives the weights to `policy`, whose `policy.json` is to be `described`.
 
-        Only histories may be missing: at first one remembers the last picture. Raises `ValueError` where inputs, actions or
+        Only what predicts outcomes may be missing, and histories: at first one remembers the last picture. Raises `ValueError` where inputs, actions or
         networks differ otherwise.
         """
         self._check_meaning(described)
         known, weights = self.policy.state_dict(), dict(policy.state_dict())
         for name, weight in weights.items():
             found = known.get(name)
-            if found is None and name.startswith("encoder.histories."):
+            if found is None and name.startswith(("encoder.histories.", "outcomes.")):
                 continue
             if found is not None and _sees_condition(name):
                 found = _rearranged(found, weight, self.policy.spec, policy.spec)

@@ -102,6 +102,23 @@ class Windows(unittest.TestCase):
         wrist = ((given["wrist"][:, :, 0, 0, 0] + 1) * 127.5).round().int()
         self.assertEqual({tuple(row) for row in wrist.tolist()}, {(0, 0), (11, 12), (38, 39)})
 
+    def test_an_outcome_is_the_last_action_of_the_episode(self):
+        first, second, third = made_up(30), made_up(10), made_up(20)
+        # A segment ends at 11, and the last row that has an action is 27.
+        first.present("arm")[11] = False
+        first.acted[28:] = False
+        second.acted[:4] = second.acted[5:] = False
+        spec = plain()
+        self.assertEqual(drawn(Dataset(spec, [first]), 5)[0].outcomes.shape, (5, 0))
+        dataset = Dataset(observed(spec, "tactile", outcome=0.5), [second, first, third])
+        batch, given = drawn(dataset, 500)
+        outcomes = dataset.ranges["action"].invert(batch.outcomes.numpy())[:, 0].round().astype(int)
+        self.assertEqual(set(outcomes.tolist()), {4, 27, 19})
+        # A window of the first episode can be told by a tick that the third has not.
+        seen = ((given["wrist"][:, -1, 0, 0, 0] + 1) * 127.5).round().int().numpy()
+        self.assertEqual(set(outcomes[seen >= 20].tolist()), {27})
+        self.assertEqual(set(outcomes[seen == 11].tolist()), {19})
+
     def test_nothing_to_learn_from_is_said(self):
         episode = made_up(10)
         episode.present("arm")[:] = False

@@ -281,6 +281,20 @@ class Bundle(unittest.TestCase):
                 with self.subTest(reason), self.assertRaisesRegex(ValueError, f"{folder}: .*{reason}.*: start from a policy with"):
                     self.start(changed, folder)
 
+    def test_what_predicts_outcomes_is_in_no_bundle_and_begins_anew(self):
+        with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as two:
+            plain, spec = random_policy(experiment()), observed(experiment(), "tactile", outcome=0.5)
+            guided = Policy(spec)
+            self.assertIsNone(plain.outcomes)
+            guided.load_state_dict(plain.state_dict() | {f"outcomes.{k}": v for k, v in guided.outcomes.state_dict().items()})
+            write(plain, Path(one))
+            write(guided.eval(), Path(two))
+            for name in (ENCODER, DENOISER):
+                self.assertEqual((Path(one) / name).read_bytes(), (Path(two) / name).read_bytes())
+            begun = self.start(spec, Path(one))
+            for key, weight in plain.state_dict().items():
+                self.assertTrue(torch.equal(weight, begun.state_dict()[key]), key)
+
     def test_what_it_sees_keeps_its_weights_in_any_order(self):
         for kind in ("tactile-id-arm", "transformer"):
             with self.subTest(kind), tempfile.TemporaryDirectory() as name:

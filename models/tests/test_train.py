@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -15,12 +16,14 @@ from unittest import mock
 import numpy as np
 import torch
 import written
-from made_up import MODELS, Experiment, by_hand, made_up, path, small, with_history
+from made_up import MODELS, Experiment, by_hand, made_up, observed, path, small, with_history
 
 from rapid_policy import progress
 from rapid_policy import train as module
 from rapid_policy.checkpoint import BEST, BEST_SUCCESS, CHECKPOINT, Run, begin, read_checkpoint
 from rapid_policy.dataset import Dataset
+from rapid_policy.losses import Losses
+from rapid_policy.model import Policy
 from rapid_policy.train import Stopped, Trainer
 
 # The first losses of the policy that is shipped, in small, on `episodes()`: computed before experiments were files.
@@ -83,6 +86,37 @@ class Learning(Case):
                 final = Trainer(run, dataset, self.folder).train()
                 self.assertLess(final, 0.8 * sum(run.losses[:20]) / 20)
                 self.assertTrue((self.folder / "loss.png").stat().st_size > 0)
+
+    def test_an_outcome_is_learned_beside_the_noise(self):
+        plain = small(iterations=60, windows=16, precision="float32")
+        spec = observed(plain, "tactile", outcome=0.5)
+        dataset = Dataset(spec, episodes())
+        run = start(spec, dataset)
+        trainer = Trainer(run, dataset, self.folder)
+        batch = dataset.gather(dataset.plan(np.random.default_rng(0), 16))
+        device, random = trainer.ranks.device, torch.Generator().manual_seed(0)
+        given = trainer._arguments(spec, batch, 16, slice(None), device, random)
+        without = Losses(Policy(plain), device)
+
+        def error() -> torch.Tensor:
+            """Of the outcome, by a layer of the test's own: the last 8 numbers of the condition are what the newest tactile picture shows."""
+            (head,) = run.policy.outcomes.heads.values()
+            seen = run.policy.encoder.encode(*given[:2], pooled=True)[:, -8:]
+            return (seen @ head.weight.T + head.bias - batch.outcomes).square().mean()
+
+        def check() -> float:
+            without.policy.load_state_dict(run.policy.state_dict(), strict=False)
+            with torch.no_grad():
+                self.assertAlmostEqual(trainer.losses(*given).item(), without(*given).item() + 0.5 * error().item(), places=5)
+            return error().item()
+
+        before = check()
+        error().backward()
+        # Only the picture that predicts it learns by it.
+        for name, weight in run.policy.encoder.named_parameters():
+            self.assertEqual(weight.grad is not None and bool(weight.grad.any()), name.startswith("images.tactile."), name)
+        trainer.train()
+        self.assertLess(check(), 0.5 * before)
 
     def test_the_loss_of_a_transformer_falls(self):
         spec = small("transformer", iterations=250)
@@ -381,6 +415,9 @@ class CommandLine(Case):
         changed = self.run_train(*self.words("run", "--resume"), RAPID_BIN=str(self.judge))
         self.assertRegex(changed.stderr, "train: .*small.toml: denoiser: not as in .*checkpoint.pt: use another --out")
         text = self.experiment.read_text().replace("[8, 8]", "[8, 16]")
+        self.experiment.write_text(re.sub("(?m)^outcome = .*$", "", text), encoding="utf-8")
+        changed = self.run_train(*self.words("run", "--resume"), RAPID_BIN=str(self.judge))
+        self.assertRegex(changed.stderr, "train: .*small.toml: observation: not as in .*checkpoint.pt: use another --out")
         self.experiment.write_text(text.replace("[data]\n", '[data]\nabsences = ["unplug"]\n'))
         changed = self.run_train(*self.words("run", "--resume"), RAPID_BIN=str(self.judge))
         self.assertRegex(changed.stderr, "train: .*small.toml: data.absences: not as in .*checkpoint.pt: use another --out")
