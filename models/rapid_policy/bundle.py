@@ -126,7 +126,7 @@ CARD = """\
 | Data | {episodes} episodes{tagged}, {frames} ticks, recorded by {recorded_by}; seeds of the episodes {seeds} |
 | Data, SHA-256 | `{episodes_sha256}` |
 | Training | {iterations} iterations of {windows} windows x {draws} noises, {minutes:.1f} min on {hardware}; seed {seed} |{began}
-| Final loss | {final_loss:.4f} (mean squared error of the noise, mean of the last hundred iterations) |
+| Final loss | {final_loss:.4f} (mean squared error of the noise{outcomes}, mean of the last hundred iterations) |
 | Exported graphs against PyTorch | largest difference {difference:.1e} over all masks |
 {note}
 ![The loss over the iterations](loss.png)
@@ -182,6 +182,7 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
             "recorded_by": ", ".join(facts["recorded_by"]),
             "seeds": f"{seeds[0]} to {seeds[1]}" if seeds else "unknown",
             "began": _began(before),
+            "outcomes": _outcomes(spec),
             "note": f"\n{spec.note}\n" if spec.note else "",
             "recorded": made,
         }
@@ -200,6 +201,11 @@ def _began(bundle: dict[str, Any] | None) -> str:
         return ""
     whole = f"`{bundle['name']}` of {bundle['iterations']} iterations, seed {bundle['seed']}"
     return f"\n| First weights | those of {whole}, SHA-256 of its `policy.json` `{bundle['policy_sha256']}` |"
+
+
+def _outcomes(spec: Experiment) -> str:
+    """What the loss has beside the noise."""
+    return "".join(f" and, times {o.outcome:g}, of the outcome as `{o.key}` predicts it" for o in spec.images if o.outcome)
 
 
 def _seen(o: Observation) -> str:

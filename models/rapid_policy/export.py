@@ -51,7 +51,7 @@ def export(state: dict[str, Any], out: Path) -> float:
         "batch_windows": schedule.windows,
         "draws": schedule.draws,
         "minutes": round(state["seconds"] / 60, 1),
-        "parameters": parameters([policy]),
+        "parameters": parameters([policy.encoder, policy.denoiser]),
         "difference": difference,
         "network": _network(spec),
     }

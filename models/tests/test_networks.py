@@ -421,6 +421,10 @@ class Bundle(unittest.TestCase):
                 self.assertIn("2 episodes (1 a, 1 b), 20 ticks", card)
                 self.assertEqual("the next pose of `phone`" in card, experiment_name in ("tactile-id", "tactile-id-memory"))
                 self.assertEqual("20 steps over 57 ticks" in card, experiment_name == "tactile-id-memory")
+                self.assertIn("error of the noise, mean of", card)
+            write_card(observed(experiment(), "tactile", outcome=0.5), facts, Path(name))
+            card = (Path(name) / "README.md").read_text(encoding="utf-8")
+            self.assertIn("error of the noise and, times 0.5, of the outcome as `tactile` predicts it, mean of", card)
 
 
 @unittest.skipUnless(RAPID, "skipped: no program in $RAPID_BIN")
