@@ -99,7 +99,8 @@ def main() -> None:
     chosen = [c for c in CONFIGURATIONS if not args.only or c.name in args.only]
     trainings = [Training(c, seed, args.runs / f"{c.name}-{seed}") for seed in args.seeds for c in chosen]
     failed = 0
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    # Not the handler of SIGINT, which a shell has ignored by what it starts in the background.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     pool = ThreadPoolExecutor(args.jobs)
     try:
         done = {pool.submit(carry_out, training, args): training for training in trainings}

@@ -152,10 +152,10 @@ def between(values: list[int]) -> str:
 
 
 ORIGIN = [
-    f"`{PLAIN}` is, of three trainings that differ by their seed, the one that sorted most in the trials from 40000 on",
-    "([figures](README.md#seeds-and-the-length-of-training)), before it ran any of these. "
-    f"`{MEMORY}` is one training, which began",
-    "with its weights, and not a choice. The tables are of these trainings, and not of what another one gives.",
+    f"`{PLAIN}` began with the weights of the one of three trainings, different by their seed, that sorted most in the trials from",
+    "40000 on, and learned on from there, with an outcome ([figures](README.md#seeds-and-the-length-of-training)), before it ran any",
+    f"of these. `{MEMORY}` is one training, which began with its weights. The tables are of these trainings, and not of what",
+    "another one gives.",
 ]
 
 

@@ -2,6 +2,9 @@
 
 import argparse
 import json
+import signal
+import subprocess
+import sys
 import tempfile
 import unittest
 from pathlib import Path
@@ -85,6 +88,29 @@ class Runs(unittest.TestCase):
         with self.assertRaises(ValueError):
             carry_out(training, self.args)
         self.assertFalse(training.trials.exists())
+
+    def test_sigterm_ends_it_in_the_background_too(self):
+        """Where a shell starts it with `&`, SIGINT is ignored."""
+        program = (
+            "import sys, ablation\n"
+            "def carry_out(*_):\n"
+            "    print('begun', flush=True)\n"
+            "    ablation.CHILDREN.run(['sleep', '600'])\n"
+            "ablation.carry_out = carry_out\n"
+            "ablation.main()\n"
+        )
+        command = [sys.executable, "-c", program, str(self.folder), "--rapid", str(self.rapid), "--runs", str(self.folder)]
+        for ignored in (False, True):
+            process = subprocess.Popen(
+                command, cwd=MODELS, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                preexec_fn=(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None,
+            )  # fmt: skip
+            self.addCleanup(process.kill)
+            self.assertEqual(process.stdout.readline(), "begun\n")
+            process.terminate()
+            _, errors = process.communicate(timeout=60)
+            self.assertEqual(process.returncode, 1)
+            self.assertIn("ablation: interrupted; the same command continues", errors)
 
     def test_the_table_has_all_trials_and_each_training(self):
         self.program([trial(True, "success"), trial(False, "success", "small")])

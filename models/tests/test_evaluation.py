@@ -101,7 +101,7 @@ class Page(unittest.TestCase):
         results = MODELS / "results"
         lines = [json.loads(line) for line in (results / "eval.jsonl").read_text(encoding="utf-8").splitlines()]
         printed = {run.name: [line for line in lines if line["run"] == run.name] for run in RUNS}
-        touched, parted = ([first] + [median] * 98 + [last] for first, median, last in ((23, 33, 53), (46, 58, 78)))
+        touched, parted = ([first] + [median] * 98 + [last] for first, median, last in ((23, 33, 49), (44, 58, 78)))
         for name in TITLES:
             unplugged = {"hot-unplug": [34] * 100, "early-unplug": [10] * 100}.get(name, [None] * 100)
             for i in range(100):
