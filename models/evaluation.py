@@ -152,9 +152,9 @@ def between(values: list[int]) -> str:
 
 
 ORIGIN = [
-    f"`{PLAIN}` began with the weights of the one of three trainings, different by their seed, that sorted most in the trials from",
-    "40000 on, and learned on from there, with an outcome ([figures](README.md#seeds-and-the-length-of-training)), before it ran any",
-    f"of these. `{MEMORY}` is one training, which began with its weights. The tables are of these trainings, and not of what",
+    f"`{PLAIN}` continues the best of three seeds (trials from 40000 on), trained further with an outcome",
+    "([figures](README.md#seeds-and-the-length-of-training)); it was chosen before any trial below was run.",
+    f"`{MEMORY}` is one training, which began with its weights. The tables are of these trainings, and not of what",
     "another one gives.",
 ]
 

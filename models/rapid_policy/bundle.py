@@ -137,8 +137,10 @@ CARD = """\
     python -m rapid_policy.export RUN/checkpoint.pt --out {name}
 
 in `models/`. The seed fixes the first weights, the order of the windows and the noise. Sums on another processor, or with
-another number of threads, round differently, so that another machine gets weights that differ in detail.
+another number of threads, round differently, so that another machine gets weights that differ in detail.{earlier}
 """
+EARLIER = """ Trainings
+before the last one had the experiment and the recordings of their time: the file may have changed since."""
 # The policies that `make train` makes.
 MADE = ("tactile-id", "tactile-id-memory")
 SIMULATED = """
@@ -183,6 +185,7 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
             "seeds": f"{seeds[0]} to {seeds[1]}" if seeds else "unknown",
             "began": _began(before),
             "outcomes": _outcomes(spec),
+            "earlier": EARLIER if before else "",
             "note": f"\n{spec.note}\n" if spec.note else "",
             "recorded": made,
         }

@@ -72,8 +72,8 @@ class Run:
 
     def load(self, state: dict[str, Any]) -> None:
         """Continues from the checkpoint `state`."""
-        self.policy.load_state_dict(state["policy"])
-        self.average.load_state_dict(state["average"])
+        load_weights(self.policy, state["policy"])
+        load_weights(self.average, state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.random.bit_generator.state = self.random_state = json.loads(state["random"])
         torch.set_rng_state(state["torch_random"])
@@ -121,6 +121,15 @@ def optimizer(schedule: Training, policy: Policy) -> torch.optim.Optimizer:
         return torch.optim.SGD(weights, rate, momentum=schedule.betas[0], weight_decay=decay)
     kind = torch.optim.AdamW if schedule.optimizer == "adamw" else torch.optim.Adam
     return kind(weights, rate, betas=schedule.betas, weight_decay=decay, fused=True)
+
+
+def load_weights(policy: Policy, weights: dict[str, torch.Tensor]) -> None:
+    """Those of a checkpoint. Raises `ValueError` if they are of other networks than its experiment describes now."""
+    missing = sorted(policy.state_dict().keys() ^ weights.keys())
+    if missing:
+        cause = f"of another version of rapid_policy, whose networks were others ({missing[0]})"
+        raise ValueError(f"the checkpoint is {cause}: train again, or use that version")
+    policy.load_state_dict(weights)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -63,7 +63,8 @@ class Batch:
     actions: Tensor
     """f32 [B, Tp, Da] in -1..1"""
     outcomes: Tensor
-    """f32 [B, Da] in -1..1: the last action of each window's episode; [B, 0] unless a picture predicts it."""
+    """f32 [B, Da], in -1..1 but for one that no window has: the last action of each window's episode; [B, 0] unless a picture
+    predicts it."""
 
 
 class Dropped(NamedTuple):
@@ -104,8 +105,7 @@ class Dataset:
         self.starts = np.cumsum([0, *read["length"]])
         self.windows = read["windows"]
         self.present, self.targets, self.now = read["present"], read["targets"], read.get("now")
-        # Of each episode the last row that has an action; of one without windows that of another, which none asks for.
-        self.ends = self.windows[np.searchsorted(self.windows[:, 0], self.starts[1:]) - 1, 2] - 1
+        self.ends = read["last"]
         self.vectors = {o.key: read[f"vector {o.key}"] for o in spec.vectors}
         self.ranges = dict(ranges or {})
         if spec.action.gripper_squeeze:
@@ -121,7 +121,7 @@ class Dataset:
             vectors = {f"vector {key}": values for key, values in rows.vectors.items()}
             now = {} if rows.now is None else {"now": rows.now}
             every = {"windows": rows.windows() + start, "length": np.array([len(episode)]), "present": rows.present}
-            yield every | {"targets": rows.targets} | now | vectors
+            yield every | {"targets": rows.targets, "last": np.array([rows.last + start])} | now | vectors
             start += len(episode)
 
     def _squeeze(self, far: float) -> None:
@@ -490,6 +490,8 @@ class _Rows:
         self.usable = np.ones(len(episode), bool)
         self.vectors = {o.key: self._vector(o) for o in spec.vectors}
         self.now: NDArray[np.float64] | None = None
+        # The last row that has an action, whatever else it lacks.
+        self.last = 0
         self.targets = self._recorded() if spec.action.source == "action" else self._next_poses()
         found = [np.asarray(episode.present(picture_source(o).name)) for o in spec.images]
         self.present = np.stack(found, 1) if found else np.zeros((len(episode), 0), bool)
@@ -560,7 +562,7 @@ class _Rows:
             actions = actions[:, spec.columns]
         if actions.shape[1] != len(spec.names):
             raise Unfit(f"/action: {actions.shape[1]} numbers, expected {len(spec.names)}")
-        self.usable &= np.asarray(self.episode.acted)
+        self._act(np.asarray(self.episode.acted))
         return actions
 
     def _next_poses(self) -> NDArray[np.float64]:
@@ -575,9 +577,13 @@ class _Rows:
             there = there & np.asarray(self.episode.present(spec.gripper))
         self.now = None if absolute else matrices
         follows = there[:-1] & there[1:] & (np.diff(self.episode.ticks) == 1)
-        self.usable &= np.append(follows, False)
+        self._act(np.append(follows, False))
         targets = np.concatenate(parts, 1)
         return np.concatenate([targets[1:], targets[-1:]])
+
+    def _act(self, acted: Bools) -> None:
+        self.usable &= acted
+        self.last = int(np.flatnonzero(acted)[-1]) if acted.any() else 0
 
     def _opening(self, modality: str, column: int) -> NDArray[np.float64]:
         before = self.usable.copy()

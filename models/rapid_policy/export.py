@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from . import bundle
 from .bundle import DENOISER, ENCODER, encoder_inputs
-from .checkpoint import read_checkpoint
+from .checkpoint import load_weights, read_checkpoint
 from .model import Policy, parameters
 from .progress import plot
 from .experiment import Experiment
@@ -34,7 +34,7 @@ def export(state: dict[str, Any], out: Path) -> float:
     """Writes the bundle of the checkpoint `state` into `out`. Returns the largest difference from PyTorch."""
     spec = Experiment.from_text(state["experiment"])
     policy = Policy(spec)
-    policy.load_state_dict(state["average"])
+    load_weights(policy, state["average"])
     policy.eval()
     out.mkdir(parents=True, exist_ok=True)
     write_graph(policy.encoder, encoder_example(spec), encoder_inputs(spec), "global_cond", out / ENCODER)

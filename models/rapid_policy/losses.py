@@ -18,8 +18,10 @@ from .model import Policy
 class Losses(nn.Module):
     """The loss of a batch, as one module: what several processes compute together."""
 
-    def __init__(self, policy: Policy, device: torch.device) -> None:
+    def __init__(self, policy: Policy, device: torch.device, *, outcomes: bool = True) -> None:
+        """Without `outcomes` of the noise alone, which is what a bundle predicts."""
         super().__init__()
+        self._outcomes = outcomes and policy.outcomes is not None
         self.policy = policy
         self._device, self._precision = device, policy.spec.training.precision
         self._table = alphas_cumprod().to(device)
@@ -42,7 +44,7 @@ class Losses(nn.Module):
         with torch.autocast(self._device.type, torch.bfloat16, enabled=both):
             predicted = self.policy.denoiser(add_noise(clean, noise, timestep, self._table), timestep, condition)
         loss = F.mse_loss(predicted.float(), noise)
-        if self.policy.outcomes is not None:
+        if self._outcomes:
             loss = loss + self.policy.outcomes.loss(seen, outcome)
         return loss
 

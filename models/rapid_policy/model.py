@@ -98,6 +98,9 @@ class HistoryPooling(nn.Module):
     which steps to remember, it remembers the last.
     """
 
+    # Difference of the first scores of two steps that are as far apart as the nearest ones: less, and the last is not most of
+    # what is remembered; much more, and the others have no gradient.
+    APART = 3.0
     # Of a step that is not there, beside which every other one has all the weight.
     LEAST = -1e9
 
@@ -106,7 +109,9 @@ class HistoryPooling(nn.Module):
         super().__init__()
         self.score = nn.Linear(features, 1, bias=False)
         nn.init.zeros_(self.score.weight)
-        self.places = nn.Parameter(-torch.tensor(ages, dtype=torch.float32))
+        times = sorted(set(ages))
+        nearest = min((b - a for a, b in zip(times, times[1:], strict=False)), default=1)
+        self.places = nn.Parameter(-torch.tensor(ages, dtype=torch.float32) * (self.APART / nearest))
 
     def forward(self, embeddings: Tensor, valid: Tensor) -> Tensor:
         # Selected, not multiplied: what is not there may contain anything.
@@ -184,7 +189,7 @@ class Outcomes(nn.Module):
     """`global_cond` [B, Dc] -> the last action of the episode, as some pictures predict it, each by itself.
 
     By itself, because where a vector shows it too, which it does as soon as the ways to different ends part, a picture would
-    have nothing more to learn. Each is that of the newest step, or what is remembered of it; zeros predict the mean.
+    have nothing more to learn. Each is that of the newest step, or what is remembered of it; of zeros it is the layer's bias.
     """
 
     def __init__(self, spec: Experiment) -> None:

@@ -80,7 +80,7 @@ def plot(losses: list[float], title: str, path: Path, validation: list[tuple[int
         axes.plot(np.arange(SMOOTHED - 1, len(losses)), smooth, label=f"mean of {SMOOTHED}")
     if validation:
         axes.plot(*zip(*validation, strict=True), "o-", markersize=3, label="episodes held out")
-    axes.set(yscale="log", xlabel="iteration", ylabel="mean squared error of the noise", title=title)
+    axes.set(yscale="log", xlabel="iteration", ylabel="loss", title=title)
     axes.legend()
     axes.grid(alpha=0.3)
     figure.tight_layout()

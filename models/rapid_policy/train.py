@@ -170,9 +170,11 @@ class Trainer:
         return inputs(spec, batch, device), mask, clean, timestep, noise, batch.outcomes.to(device)
 
     def _validate(self, board: Board) -> None:
-        """The loss of the averaged weights on held-out episodes: the same windows and noise each time, nothing varied."""
+        """The loss of the averaged weights on held-out episodes: the same windows and noise each time, nothing varied.
+
+        Of the noise alone: by it the best weights are chosen, and what predicts outcomes is in no bundle."""
         run, held_out = self.run, self.held_out
-        measure = Losses(run.average, self.ranks.device)
+        measure = Losses(run.average, self.ranks.device, outcomes=False)
         random, noise = np.random.default_rng(0), torch.Generator().manual_seed(0)
         size, found = run.schedule.windows, []
         with torch.no_grad():

@@ -70,6 +70,7 @@ class First:
         """
         self._check_meaning(described)
         known, weights = self.policy.state_dict(), dict(policy.state_dict())
+        known |= _scores(policy, _places(self.policy))
         for name, weight in weights.items():
             found = known.get(name)
             if found is None and name.startswith(("encoder.histories.", "outcomes.")):
@@ -93,6 +94,25 @@ class First:
                     raise ValueError(f"{self.folder}: {cause}: start from a policy with the same inputs and actions")
             if ours["normalization"] != theirs["normalization"]:
                 print(f"train: {what} has another range in these episodes than in {self.folder}: its numbers are scaled anew")
+
+
+def _places(policy: Policy) -> dict[str, torch.Tensor]:
+    """Of each history by its key: what the scores of its steps begin with."""
+    found, steps = {}, {o.key: o.history.steps for o in policy.spec.histories if o.history}
+    for picture, pooling in policy.encoder.histories.items():
+        keys = [key for key, _ in policy.encoder.history_keys[picture]]
+        parts = pooling.places.detach().split([steps[key] for key in keys])
+        found |= dict(zip(keys, parts, strict=True))
+    return found
+
+
+def _scores(policy: Policy, known: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The same as weights of `policy`, whose own are those of the histories that are not `known`."""
+    own = _places(policy)
+    return {
+        f"encoder.histories.{picture}.places": torch.cat([known.get(key, own[key]) for key, _ in policy.encoder.history_keys[picture]])
+        for picture in policy.encoder.histories
+    }
 
 
 # What may differ between two policies of the same meaning.

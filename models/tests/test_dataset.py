@@ -104,13 +104,17 @@ class Windows(unittest.TestCase):
 
     def test_an_outcome_is_the_last_action_of_the_episode(self):
         first, second, third = made_up(30), made_up(10), made_up(20)
-        # A segment ends at 11, and the last row that has an action is 27.
-        first.present("arm")[11] = False
+        # A segment ends at 11 and at 25, and the last row that has an action is 27.
+        first.present("arm")[11] = first.present("arm")[25] = False
+        first.present("arm")[26:] = False
         first.acted[28:] = False
         second.acted[:4] = second.acted[5:] = False
+        # No window is of this one.
+        silent = made_up(15)
+        silent.present("arm")[:] = False
         spec = plain()
         self.assertEqual(drawn(Dataset(spec, [first]), 5)[0].outcomes.shape, (5, 0))
-        dataset = Dataset(observed(spec, "tactile", outcome=0.5), [second, first, third])
+        dataset = Dataset(observed(spec, "tactile", outcome=0.5), [silent, second, first, silent, third, silent])
         batch, given = drawn(dataset, 500)
         outcomes = dataset.ranges["action"].invert(batch.outcomes.numpy())[:, 0].round().astype(int)
         self.assertEqual(set(outcomes.tolist()), {4, 27, 19})

@@ -111,6 +111,13 @@ class History(unittest.TestCase):
         last = torch.stack([embeddings[0, 4], embeddings[1, 2], embeddings[2, 2], torch.zeros(8)])
         with torch.no_grad():
             torch.testing.assert_close(pooling(embeddings, valid), last, atol=0.2, rtol=0)
+        # However far apart they are, the last one is most of it, and the others can be learned.
+        for apart in (1, 3, 30, 64):
+            pooling = HistoryPooling(8, range(0, 5 * apart, apart)[::-1])
+            with torch.no_grad():
+                torch.testing.assert_close(pooling(embeddings, valid), last, atol=0.2, rtol=0)
+            pooling(embeddings[:1], valid[:1]).square().sum().backward()
+            self.assertGreater(float(pooling.places.grad[3].abs()), 1e-3, apart)
 
     def test_the_order_of_its_steps_is_known_by_their_places_alone(self):
         torch.manual_seed(0)
@@ -307,6 +314,28 @@ class Bundle(unittest.TestCase):
                 found = [p.denoiser(*at, p.encoder.encode(seen, mask, pooled=False)) for p, mask in (
                     (before, torch.tensor([[1.0, 0.0]] * 2)), (turned, torch.tensor([[0.0, 1.0]] * 2)))]  # fmt: skip
                 torch.testing.assert_close(*found)
+
+    def test_a_history_keeps_its_scores_in_any_order_and_another_has_its_own(self):
+        def remembering(*keys: str) -> Experiment:
+            described = json.loads(with_history(experiment()).to_text())
+            touched = described["observation"].pop()
+            of = {"touched": {}, "lately": {"history": {"steps": 3}}, "felt": {"down_sample_steps": 5}}
+            described["observation"] += [{**touched, "key": key, **of[key]} for key in keys]
+            return Experiment.from_text(json.dumps(described))
+
+        def places(policy: Policy) -> list[torch.Tensor]:
+            return policy.encoder.histories["tactile"].places.detach()
+
+        with tempfile.TemporaryDirectory() as name:
+            folder, before = Path(name), random_policy(remembering("touched", "lately"))
+            write(before, folder)
+            first, second = places(before).split([4, 3])
+            self.assertTrue(torch.equal(places(self.start(remembering("lately", "touched"), folder)), torch.cat([second, first])))
+            self.assertTrue(torch.equal(places(self.start(remembering("lately"), folder)), second))
+            for keys in (("felt",), ("touched", "felt"), ("felt", "lately", "touched")):
+                spec = remembering(*keys)
+                parts = {"touched": first, "lately": second, "felt": places(Policy(spec))[slice(4) if keys[0] == "felt" else slice(4, 8)]}
+                self.assertTrue(torch.equal(places(self.start(spec, folder)), torch.cat([parts[key] for key in keys])), keys)
 
     def test_what_is_no_bundle_is_refused_with_its_folder(self):
         with tempfile.TemporaryDirectory() as name:

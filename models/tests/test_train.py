@@ -87,36 +87,61 @@ class Learning(Case):
                 self.assertLess(final, 0.8 * sum(run.losses[:20]) / 20)
                 self.assertTrue((self.folder / "loss.png").stat().st_size > 0)
 
-    def test_an_outcome_is_learned_beside_the_noise(self):
-        plain = small(iterations=60, windows=16, precision="float32")
-        spec = observed(plain, "tactile", outcome=0.5)
-        dataset = Dataset(spec, episodes())
+    def test_outcomes_are_learned_beside_the_noise(self):
+        weights = {"wrist": 0.25, "tactile": 0.5}
+        for plain, predict in (
+            (small(iterations=60, windows=16, precision="float32"), ("wrist", "tactile")),
+            (small(iterations=60, windows=16, precision="float32"), ("wrist",)),
+            (small("vision-diff", iterations=60, windows=16, precision="float32"), ("tactile",)),
+            (with_history(small(iterations=60, windows=16, precision="float32")), ("tactile",)),
+            (small("transformer", iterations=60, windows=16, precision="float32"), ("wrist", "tactile")),
+        ):
+            with self.subTest(plain.name, predict=predict, histories=len(plain.histories)):
+                spec = plain
+                for key in predict:
+                    spec = observed(spec, key, outcome=weights[key])
+                self.learns_outcomes(plain, spec, {key: weights[key] for key in predict})
+
+    def learns_outcomes(self, plain: Experiment, spec: Experiment, weights: dict[str, float]) -> None:
+        dataset = Dataset(spec, [by_hand(40)] if spec.name == "transformer" else episodes())
         run = start(spec, dataset)
+        # A dropout would be another one in each measurement.
+        run.policy.eval()
         trainer = Trainer(run, dataset, self.folder)
         batch = dataset.gather(dataset.plan(np.random.default_rng(0), 16))
         device, random = trainer.ranks.device, torch.Generator().manual_seed(0)
         given = trainer._arguments(spec, batch, 16, slice(None), device, random)
-        without = Losses(Policy(plain), device)
+        without = Losses(Policy(plain).eval(), device)
+        measured = Losses(run.policy, device, outcomes=False)
+        # Of a step of the condition, what the pictures show is last, 8 numbers of each: here of the newest step.
+        places = {o.key: slice(-8 * (2 - i), -8 * (1 - i) or None) for i, o in enumerate(spec.images)}
+        heads = dict(zip(weights, run.policy.outcomes.heads.values(), strict=True))
 
-        def error() -> torch.Tensor:
-            """Of the outcome, by a layer of the test's own: the last 8 numbers of the condition are what the newest tactile picture shows."""
-            (head,) = run.policy.outcomes.heads.values()
-            seen = run.policy.encoder.encode(*given[:2], pooled=True)[:, -8:]
-            return (seen @ head.weight.T + head.bias - batch.outcomes).square().mean()
+        def error(key: str) -> torch.Tensor:
+            """Of the outcome as one picture predicts it, computed by the test itself."""
+            seen = run.policy.encoder.encode(*given[:2], pooled=True)[:, places[key]]
+            return (seen @ heads[key].weight.T + heads[key].bias - batch.outcomes).square().mean()
 
         def check() -> float:
             without.policy.load_state_dict(run.policy.state_dict(), strict=False)
             with torch.no_grad():
-                self.assertAlmostEqual(trainer.losses(*given).item(), without(*given).item() + 0.5 * error().item(), places=5)
-            return error().item()
+                noise, errors = without(*given).item(), {key: error(key).item() for key in weights}
+                whole = noise + sum(weight * errors[key] for key, weight in weights.items())
+                self.assertAlmostEqual(trainer.losses(*given).item(), whole, places=5)
+                self.assertAlmostEqual(measured(*given).item(), noise, places=5)
+            return sum(errors.values())
 
         before = check()
-        error().backward()
-        # Only the picture that predicts it learns by it.
-        for name, weight in run.policy.encoder.named_parameters():
-            self.assertEqual(weight.grad is not None and bool(weight.grad.any()), name.startswith("images.tactile."), name)
+        for key in weights:
+            run.optimizer.zero_grad()
+            error(key).backward()
+            # Only the picture that predicts it learns by it.
+            learning = {n for n, weight in run.policy.encoder.images.named_parameters() if weight.grad is not None and weight.grad.any()}
+            self.assertEqual(learning, {n for n, _ in run.policy.encoder.images.named_parameters() if n.startswith(f"{key}.")})
+        run.optimizer.zero_grad()
         trainer.train()
-        self.assertLess(check(), 0.5 * before)
+        run.policy.eval()
+        self.assertLess(check(), 0.6 * before)
 
     def test_the_loss_of_a_transformer_falls(self):
         spec = small("transformer", iterations=250)
@@ -311,6 +336,17 @@ class Interrupted(Case):
 
 
 class Safety(Case):
+    def test_weights_of_other_networks_are_refused(self):
+        run = start(small(), Dataset(small(), episodes()))
+        run.save(self.folder / CHECKPOINT)
+        state = read_checkpoint(self.folder / CHECKPOINT)
+        for weights in ("policy", "average"):
+            name, weight = state[weights].popitem()
+            with self.assertRaisesRegex(ValueError, f"the checkpoint is of another version .*{name}.*: train again, or use that version"):
+                run.load(state)
+            state[weights][name] = weight
+        run.load(state)
+
     def test_a_checkpoint_runs_no_code(self):
         mark = self.folder / "ran"
 
