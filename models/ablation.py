@@ -190,7 +190,8 @@ def carry_out(training: Training, args: argparse.Namespace) -> None:
     """Trains, exports and evaluates, as far as that has not been done."""
     training.folder.mkdir(parents=True, exist_ok=True)
     asked = {
-        "experiment": training.configuration.file.read_text(encoding="utf-8"),
+        # Without its comments, which change nothing of what is learned.
+        "experiment": json.loads(read_experiment(training.configuration.file).to_text()),
         "episodes": str(args.episodes.absolute()),
         "iterations": args.iterations,
     }
@@ -327,8 +328,8 @@ def counted(trials: list[dict[str, Any]]) -> dict[str, float]:
 
 AIDED = [
     "In training the tactile picture, where there is one, also predicts the last action of the episode by itself",
-    "([outcome](../README.md#the-outcome-of-an-episode)); the wrist camera does not. What a row with it has more is of the input with",
-    "this loss. The paper has none.",
+    "([outcome](../README.md#the-outcome-of-an-episode)); the wrist camera does not. What such a row gains, it gains by the input and",
+    "this loss together. The paper has no such loss.",
 ]
 
 

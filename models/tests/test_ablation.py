@@ -2,14 +2,17 @@
 
 import argparse
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import unittest
 from pathlib import Path
+from unittest import mock
 
-from ablation import CONFIGURATIONS, ITERATIONS, MODELS, NAME, SEEDS, TRIALS, Training, carry_out, command, counted, markdown, summarize
+from ablation import CONFIGURATIONS, ITERATIONS, MODELS, NAME, SEEDS, TRIALS, Training
+from ablation import carry_out, command, counted, markdown, summarize
 from rapid_policy.experiment_file import read_experiment
 
 FACTS = {"episodes": 240, "frames": 25_600, "batch_windows": 64, "iterations": 400, "minutes": 2.0, "final_loss": 0.02}
@@ -73,6 +76,19 @@ class Runs(unittest.TestCase):
             changed = argparse.Namespace(**{**vars(self.args), key: other})
             with self.assertRaisesRegex(ValueError, "other episodes or iterations: delete it"):
                 carry_out(training, changed)
+
+    def test_of_an_experiment_a_value_counts_and_a_comment_does_not(self):
+        self.program([trial(True, "success")] * 2)
+        shutil.copytree(MODELS / "experiments", self.folder / "experiments")
+        training = self.trained("vision", 0)
+        with mock.patch("ablation.MODELS", self.folder):
+            carry_out(training, self.args)
+            file, text = training.configuration.file, training.configuration.file.read_text(encoding="utf-8")
+            file.write_text(f"# Another comment.\n{text}", encoding="utf-8")
+            carry_out(training, self.args)
+            file.write_text(text.replace("learning_rate = 0.001", "learning_rate = 0.002"), encoding="utf-8")
+            with self.assertRaisesRegex(ValueError, "of another experiment"):
+                carry_out(training, self.args)
 
     def test_an_interrupted_evaluation_does_not_count(self):
         self.program([trial(True, "success")])
