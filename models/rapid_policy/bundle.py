@@ -139,8 +139,8 @@ CARD = """\
 in `models/`. The seed fixes the first weights, the order of the windows and the noise. Sums on another processor, or with
 another number of threads, round differently, so that another machine gets weights that differ in detail.{earlier}
 """
-EARLIER = """ Trainings
-before the last one had the experiment and the recordings of their time: the file may have changed since."""
+EARLIER = """ The
+earlier commands ran with the experiment file and the recordings of that time, which may differ from the present ones."""
 # The policies that `make train` makes.
 MADE = ("tactile-id", "tactile-id-memory")
 SIMULATED = """

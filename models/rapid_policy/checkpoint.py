@@ -125,9 +125,9 @@ def optimizer(schedule: Training, policy: Policy) -> torch.optim.Optimizer:
 
 def load_weights(policy: Policy, weights: dict[str, torch.Tensor]) -> None:
     """Those of a checkpoint. Raises `ValueError` if they are of other networks than its experiment describes now."""
-    missing = sorted(policy.state_dict().keys() ^ weights.keys())
-    if missing:
-        cause = f"of another version of rapid_policy, whose networks were others ({missing[0]})"
+    different = sorted(policy.state_dict().keys() ^ weights.keys())
+    if different:
+        cause = f"of another version of rapid_policy, whose networks were others ({different[0]})"
         raise ValueError(f"the checkpoint is {cause}: train again, or use that version")
     policy.load_state_dict(weights)
 

@@ -28,11 +28,7 @@ class Losses(nn.Module):
 
     def forward(self, observations: dict[str, Tensor], mask: Tensor | None, clean: Tensor, timestep: Tensor,
                 noise: Tensor, outcome: Tensor) -> Tensor:  # fmt: skip
-        """Mean squared error of the predicted noise and, weighted, of the `outcome` [B, Da] as pictures predict it.
-
-        The noise of a window depends on what decides the outcome only where the ways part, and there only by as much as they
-        have parted: what is small in a picture would be learned late, or, with another seed, not at all.
-        """
+        """Mean squared error of the predicted noise and, weighted, of the `outcome` [B, Da] as pictures predict it."""
         # By itself only the encoder: its convolutions gain most from half precision, the denoiser's small ones nothing.
         both = self._precision == "bf16"
         half = both or (self._precision == "auto" and half_width(self._device))

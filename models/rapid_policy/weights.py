@@ -65,8 +65,8 @@ class First:
     def give(self, policy: Policy, described: dict[str, Any]) -> None:
         """Gives the weights to `policy`, whose `policy.json` is to be `described`.
 
-        Only what predicts outcomes may be missing, and histories: at first one remembers the last picture. Raises `ValueError` where inputs, actions or
-        networks differ otherwise.
+        Only what predicts outcomes may be missing, and histories: at first one remembers the last picture. Raises `ValueError`
+        where inputs, actions or networks differ otherwise.
         """
         self._check_meaning(described)
         known, weights = self.policy.state_dict(), dict(policy.state_dict())
@@ -109,10 +109,9 @@ def _places(policy: Policy) -> dict[str, torch.Tensor]:
 def _scores(policy: Policy, known: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """The same as weights of `policy`, whose own are those of the histories that are not `known`."""
     own = _places(policy)
-    return {
-        f"encoder.histories.{picture}.places": torch.cat([known.get(key, own[key]) for key, _ in policy.encoder.history_keys[picture]])
-        for picture in policy.encoder.histories
-    }
+    keys = {picture: [key for key, _ in policy.encoder.history_keys[picture]] for picture in policy.encoder.histories}
+    parts = {picture: [known.get(key, own[key]) for key in of] for picture, of in keys.items()}
+    return {f"encoder.histories.{picture}.places": torch.cat(of) for picture, of in parts.items()}
 
 
 # What may differ between two policies of the same meaning.
