@@ -50,6 +50,8 @@ def recompute(policy, arrays):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     arrays = np.load(sys.argv[2])
     apart = np.abs(recompute(Path(sys.argv[1]), arrays) - arrays["recorded"]).max()
     print(f"largest difference of {arrays['recorded'].size} numbers: {apart:.2e}")
