@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tempfile
 import unittest
@@ -40,6 +41,12 @@ class History(unittest.TestCase):
             low, high = np.array(part["min"]), np.array(part["max"])
             expected = (wanted.numpy() + 1) / 2 * (high - low) + low
             self.assertLess(np.abs(recompute(Path(folder), arrays) - expected).max(), 1e-3)
+            for recorded, code in ((expected, 0), (expected + 0.002, 1), (expected * np.nan, 1)):
+                chunk = Path(folder) / "chunk.npz"
+                np.savez(chunk, **arrays, recorded=recorded)
+                command = [sys.executable, str(ROOT / "examples" / "recompute.py"), folder, str(chunk)]
+                done = subprocess.run(command, capture_output=True, text=True, check=False)
+                self.assertEqual((done.returncode, done.stderr), (code, ""))
             # A step that is not there counts for nothing, and one that is for something.
             there = arrays["touched_valid"][..., None, None, None] > 0
             arrays["touched"] = np.where(there, arrays["touched"], 7).astype(np.float32)
