@@ -2,7 +2,8 @@
 """Classifies the texture of a block from single pictures: how well the tactile camera shows it, raw and as difference
 to the untouched gel, and whether the wrist camera shows it too; and how that depends on noise and pressure.
 
-    texture.py EPISODES [--encoder resnet18] [--cache runs/cache] [--out results] [--folds N] [--iterations N] [--seed N]
+    texture.py EPISODES [--encoder resnet18] [--input KEY]... [--cache runs/cache] [--out results]
+               [--folds N] [--iterations N] [--seed N] [--threads N]
 
 What is classified, by which pictures, and how it is trained and tested is an experiment, `experiments/texture.toml`; the
 options are in place of what it says. The classifier is an image encoder of the policy with one additional layer: the small
@@ -57,12 +58,13 @@ class Pictures:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Tells the texture of a block from single pictures.")
+    parser = argparse.ArgumentParser(description="Classifies the texture of a block from single pictures.")
     parser.add_argument("episodes", type=Path)
     parser.add_argument("--cache", type=Path, default=Path(__file__).parent / "runs" / "cache", help="decoded episodes")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--experiment", type=Path, default=EXPERIMENT, help="what is classified and how (*.toml)")
     parser.add_argument("--encoder", choices=sorted(ENCODERS), help="in place of the experiment's")
+    parser.add_argument("--input", action="append", metavar="KEY", help="of the experiment; repeat for several (all)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda")
     parser.add_argument("--folds", type=int, help="in place of the experiment's")
     parser.add_argument("--iterations", type=int, help="of each training, in place of the experiment's")
@@ -72,7 +74,8 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     device = join(args.device).device
     try:
-        spec = asked(read_classification(args.experiment), args)
+        written = read_classification(args.experiment)
+        spec, classified = asked(written, args), inputs(written, args.input)
         corpus = load(spec, [args.episodes], args.cache, args.threads)
         print(corpus.report(), file=sys.stderr)
         episodes = corpus.training
@@ -81,14 +84,16 @@ def main() -> None:
     labels = [spec.label_of(e.facts.tags) for e in episodes]
     contact = [in_contact(spec, e) for e in episodes]
     begin, rows = time.monotonic(), {}
-    for o in spec.input:
+    for o in classified:
         row = cross_validate(gather(spec, o, episodes, labels, contact), Training(spec, o, device))
         rows[o.title] = row
         print(f"{o.title}: accuracy {row['accuracy']:.4f} of {row['pictures']} pictures", flush=True)
     encoder, fitting, folds = spec.encoder, spec.training, spec.test.folds
     given = "" if encoder.type == "small" else f" --encoder {encoder.type}"
+    given += "".join(f" --input {key}" for key in args.input or ())
     report = {
         "command": f"texture.py EPISODES{given} --folds {folds} --iterations {fitting.iterations} --seed {fitting.seed}",
+        "as_written": not args.input and (spec.test, fitting) == (written.test, written.training),
         "encoder": encoder.type,
         "parameters": parameters([Classifier(spec, spec.touched)]),
         "hardware": hardware(device),
@@ -115,6 +120,15 @@ def asked(spec: Classification, args: argparse.Namespace) -> Classification:
     if args.encoder is not None and args.encoder != spec.encoder.type:
         changed["encoder"] = Encoder(type=args.encoder)
     return spec.model_copy(update=changed)
+
+
+def inputs(spec: Classification, keys: list[str] | None) -> list[Input]:
+    """Those of the experiment with these keys, all without any. The one that shows the touch may be left out: it is read still."""
+    known = [o.key for o in spec.input]
+    for key in keys or ():
+        if key not in known:
+            raise ExperimentError(f"--input {key}: the experiment has no such input: write one of them: {', '.join(known)}")
+    return [o for o in spec.input if not keys or o.key in keys]
 
 
 def in_contact(spec: Classification, episode: Episode) -> NDArray[np.bool_]:
@@ -334,9 +348,9 @@ def markdown(report: dict[str, Any], picture: str) -> str:
         "The RAPID paper has 99.73 % for a ResNet-18 trained on ImageNet first, on pictures of a real gel (one split of the",
         "episodes in 80/10/10, precision 1.000 / 0.994, recall 0.995 / 1.000).",
         "",
-        f"Made with `make texture{given}`, which runs",
+        f"Made with `make texture{given}`, which runs" if report["as_written"] else "Made with",
         "",
-        f"    python {report['command']}",
+        f"    {'python' if report['as_written'] else 'scripts/train.sh python'} {report['command']}",
         "",
         f"on demonstrations with the arm; {report['minutes']} minutes on {report['hardware']}.",
     ]

@@ -14,7 +14,7 @@ from made_up import CLASSIFIERS, MODELS, made_up
 from rapid_policy.classification import Classification
 from rapid_policy.episodes import Episode, Facts, sources
 from rapid_policy.experiment_file import ExperimentError, read_classification, read_experiment
-from texture import Training, asked, cross_validate, gather, in_contact, markdown
+from texture import Training, asked, cross_validate, gather, in_contact, inputs, markdown
 
 (FILE,) = CLASSIFIERS
 TOUCHED = 20
@@ -81,6 +81,17 @@ class Experiments(unittest.TestCase):
         self.assertEqual((changed.encoder.type, changed.test.folds), ("resnet18", 3))
         self.assertEqual((changed.training.iterations, changed.training.seed), (7, 5))
         self.assertEqual(changed.training.pictures, spec.training.pictures)
+
+    def test_inputs_are_chosen_by_key_in_the_order_of_the_experiment(self):
+        spec = read_classification(FILE)
+        self.assertEqual(inputs(spec, None), list(spec.input))
+        self.assertEqual([o.key for o in inputs(spec, ["wrist", "tactile", "wrist"])], ["tactile", "wrist"])
+        with self.assertRaises(ExperimentError) as raised:
+            inputs(spec, ["tactile", "finger"])
+        self.assertEqual(
+            str(raised.exception),
+            "--input finger: the experiment has no such input: write one of them: difference, tactile, wrist",
+        )
 
     def test_an_episode_without_the_label_is_unfit(self):
         spec = read_classification(FILE)
