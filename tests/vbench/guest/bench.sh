@@ -118,6 +118,23 @@ logged() {
 # states N DEVICE STATE: rapid has reported this state of the device at least N times.
 states() { [ "$(grep -F '"event":"state"' $out/rapid.jsonl | grep -F "\"device\":\"$2\"" | grep -cF "\"state\":\"$3\"")" -ge "$1" ]; }
 
+# ordered enabled|disabled MOTOR...: the last that each of these motors was ordered, is this.
+ordered() {
+  local order=$1 motor; shift
+  for motor in "$@"; do
+    [[ $(grep -E '"action":"motor_(en|dis)abled"' $out/emu.jsonl | grep -F "\"motor\":$motor," | tail -n 1) == *motor_$order* ]] || return 1
+  done
+}
+
+# armed: the motors are not stopped by a fault. Those that an emulated processor answered too late are armed again, as a user
+# would, not for ever; armed_again has a line for each time.
+armed() {
+  [[ $(grep -F '"event":"actuator"' $out/rapid.jsonl | tail -n 1) == *'"arming":"faulted"'* ]] || return 0
+  [ "$(cat $out/armed_again 2>/dev/null | wc -l)" -ge 12 ] || { echo again >>$out/armed_again; "${rapid[@]}" arm; }
+  sleep 2
+  return 1
+}
+
 # held fd|task: number of rapid's descriptors or threads.
 held() { ls "/proc/$rapid_pid/$1" | wc -l; }
 

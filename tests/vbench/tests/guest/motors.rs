@@ -27,16 +27,20 @@ arm() { "${rapid[@]}" arm || fail 'rapid takes no order'; }
 # both ACTION: since the last mark both motors have logged this.
 both() { logged $1 '"motor":5' && logged $1 '"motor":6'; }
 actuator() { has_line $out/rapid.jsonl '"event":"actuator"' "\"arming\":\"$1\""; }
-# again WORD: marks, arms, and waits until both are enabled.
+# following: both are enabled and get commands.
+following() { armed && ordered enabled 5 6 && both commands_begin; }
+# again WORD: marks, arms, and waits until both follow.
 again() {
   sleep 1
   mark $1
   arm
-  wait_for 30 both motor_enabled || fail "not enabled: $1"
-  wait_for 20 both commands_begin || fail "no commands: $1"
+  sleep 2
+  wait_for 60 following || fail "they do not follow: $1"
   sleep 1
+  wait_for 60 following || fail "they no longer follow: $1"
 }
 
+touch $out/armed_again
 rapid_start --headless --record --arm --out $out/rec --config /tmp/bench/devices.toml --json
 await_rapid 60 '"event":"recording"' || fail 'not recording'
 # Remembered, though nothing is there that could move: it outweighs --arm.
@@ -48,6 +52,7 @@ publisher=$!
 sleep 3
 again armed
 sleep 3
+wait_for 60 following || fail 'they no longer follow'
 mark moving
 emu unplug 0
 wait_for 20 states 1 arm absent || fail 'still there'
@@ -110,6 +115,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
     );
     ended(&outcome);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
+    println!("armed again: {} times", outcome.file("armed_again").lines().count());
     let log = &outcome.emu[..];
 
     // The adapter came up by itself, at the bus's rate; the motors' own time limit was set before anything moved.
