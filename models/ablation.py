@@ -331,68 +331,88 @@ AIDED = [
     "([outcome](../README.md#the-outcome-of-an-episode)); the wrist camera does not. What such a row gains, it gains by the input and",
     "this loss together. The paper has no such loss.",
 ]
+COLUMNS = ("configuration", "data", "dropout", "success", "95 %", "big", "small", "wrong bin", "incomplete", "of those in a bin",
+           "left", "paper")  # fmt: skip
 
 
 def markdown(report: dict[str, Any]) -> str:
     """The table for people."""
     rows = report["configurations"]
-    trainings = [training for row in rows for training in row["trainings"]]
-    iterations = ", ".join(sorted({f"{t['iterations']:,}" for t in trainings}))
-    seeds = sorted({t["seed"] for t in trainings})
-    partial = [row["name"] for row in rows if len(row["trainings"]) < len(seeds)]
-    made_by_default = command(NAME, SEEDS, TRIALS, ITERATIONS, [c.name for c in CONFIGURATIONS])
-    count = ("One configuration", *(f"{number} configurations" for number in ("Two", "Three", "Four", "Five")))[len(rows) - 1]
+    present = {row["name"] for row in rows}
+    missing = [c.name for c in CONFIGURATIONS if c.name not in present]
     lines = [
+        *introduction(report),
+        *(f"| {' | '.join(words)} |" for words in (COLUMNS, ["---"] * len(COLUMNS), *map(cells, rows))),
+        *(["", f"Not run: {', '.join(missing)}."] if missing else []),
+        # What has to be known of figures that were made in another way than now; a new training has none.
+        *(line for row in rows if "note" in row for line in ("", f"**`{row['name']}`**: {row['note']}")),
+        *explanation(report),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def introduction(report: dict[str, Any]) -> list[str]:
+    """What was trained and how it was run, and what the columns mean."""
+    rows, trainings = report["configurations"], all_trainings(report)
+    seeds = sorted({t["seed"] for t in trainings})
+    each = f"seed {seeds[0]}" if len(seeds) == 1 else f"each of the seeds {', '.join(map(str, seeds))}"
+    partial = [row["name"] for row in rows if len(row["trainings"]) < len(seeds)]
+    count = ("One configuration", *(f"{number} configurations" for number in ("Two", "Three", "Four", "Five")))[len(rows) - 1]
+    return [
         "# What each input is worth",
         "",
-        f"{count} of the policy, each trained for {iterations} iterations with the seeds {', '.join(map(str, seeds))}, and run by",
-        f"the program (`rapid eval`) with everything plugged in: {rows[0]['trials'] // len(rows[0]['trainings'])} trials of each"
-        f" training, with seeds that no demonstration has",
-        f"({report['first_seed']} and on; {rows[0]['triangular']:.0%} of the blocks triangular; big and small ones). Success: the block ends"
-        " in the bin of its texture, of all",
-        "trials of all trainings; in brackets each training, and the 95 % interval of the lowest and of the highest (Wilson).",
-        "Incomplete: it ends in no bin. Of those in a bin: the share in the right one, which is what the policy knows of the texture.",
-        "Left: it ends in the bin of the triangular ones, whichever it is.",
+        f"{count} of the policy, each trained for {lengths(trainings)} iterations with {each}, and run by",
+        f"the program (`rapid eval`) with everything plugged in: {trials_of_each(rows[0])} trials per training, from seed {report['first_seed']}"
+        " on, which no",
+        f"demonstration has; {rows[0]['triangular']:.0%} of the blocks are triangular, and they are big or small.",
         "",
-        *([f"Not all trainings are there of: {', '.join(partial)}.", ""] if partial else []),
-        "| configuration | data | dropout | success | 95 % | big | small | wrong bin | incomplete | of those in a bin | left"
-        " | paper |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "- success: the block ends in the bin of its texture; share of all trials, and of those of each training in brackets",
+        "- 95 %: the interval (Wilson) of the lowest and of the highest training",
+        "- incomplete: the block ends in no bin",
+        "- of those in a bin: the share in the right one, which is what the policy knows of the texture",
+        "- left: the share in the bin of the triangular blocks, right or wrong",
+        "",
+        *([f"Some trainings are missing of: {', '.join(partial)}.", ""] if partial else []),
     ]
-    for row in rows:
-        shares = sorted(t["success"] for t in row["trainings"])
-        each_trials = row["trials"] // len(row["trainings"])
-        ends = [results.wilson(round(share * each_trials), each_trials) for share in (shares[0], shares[-1])]
-        binned = row["success"] + row["wrong_bin"]
-        each = ", ".join(f"{t['success']:.2f}" for t in row["trainings"])
-        cells = [
-            f"{row['title']} (`{row['name']}`)",
-            f"{row['data']}, {row['trainings'][0]['episodes']}",
-            row["dropout"] or "-",
-            f"{row['success']:.2f} ({each})",
-            "; ".join(f"{low:.2f}-{high:.2f}" for low, high in ends),
-            *("-" if share is None else f"{share:.2f}" for share in row["success_by_size"].values()),
-            f"{row['wrong_bin']:.2f}",
-            f"{row['incomplete']:.2f}",
-            f"{row['success'] / binned:.2f}" if binned else "-",
-            f"{row['put_left']:.2f}",
-            f"{row['paper']:.2f}",
-        ]
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    missing = [c.name for c in CONFIGURATIONS if c.name not in {row["name"] for row in rows}]
-    lines += ["", f"Not run: {', '.join(missing)}."] if missing else []
-    # What has to be known of figures that were made in another way than now; a new training has none.
-    lines += [line for row in rows if "note" in row for line in ("", f"**`{row['name']}`**: {row['note']}")]
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """One line of the table, in the order of `COLUMNS`."""
+    shares = sorted(t["success"] for t in row["trainings"])
+    each = trials_of_each(row)
+    ends = [results.wilson(round(share * each), each) for share in (shares[0], shares[-1])]
+    binned = row["success"] + row["wrong_bin"]
+    of_each = ", ".join(f"{t['success']:.2f}" for t in row["trainings"])
+    return [
+        f"{row['title']} (`{row['name']}`)",
+        f"{row['data']}, {row['trainings'][0]['episodes']}",
+        str(row["dropout"] or "-"),
+        f"{row['success']:.2f} ({of_each})",
+        "; ".join(f"{low:.2f}-{high:.2f}" for low, high in ends),
+        *("-" if share is None else f"{share:.2f}" for share in row["success_by_size"].values()),
+        f"{row['wrong_bin']:.2f}",
+        f"{row['incomplete']:.2f}",
+        f"{row['success'] / binned:.2f}" if binned else "-",
+        f"{row['put_left']:.2f}",
+        f"{row['paper']:.2f}",
+    ]
+
+
+def explanation(report: dict[str, Any]) -> list[str]:
+    """What the words of the table mean, and how it was made."""
+    rows, trainings = report["configurations"], all_trainings(report)
     minutes = [t["minutes"] for t in trainings]
-    lines += [
+    made_by_default = command(NAME, SEEDS, TRIALS, ITERATIONS, [c.name for c in CONFIGURATIONS])
+    return [
         "",
-        "Data: the paper's mixture of sizes (`mix`), or big blocks alone (`big`), with the number of demonstrations. Dropout takes",
-        "pictures away and leaves one at least. Diff: the tactile picture, as difference to the first",
-        "one. A training that has the tactile picture and is near 0.5 has not learned to use it: see",
+        "Data: the paper's mixture of sizes (`mix`), or big blocks alone (`big`), with the number of demonstrations. Dropout: how often",
+        "a picture is taken away in training; one is always left. Diff: the tactile picture, as difference to the first one of the",
+        "episode. A training that has the tactile picture and is near 0.5 has not learned to use it: see",
         "[what its length changes](README.md#seeds-and-the-length-of-training).",
         *(AIDED if any(row.get("outcome") for row in rows) else []),
         "",
-        f"The paper trains for 200 epochs of data that it does not count. Here {iterations} iterations of {trainings[0]['batch_windows']} windows are",
+        "The paper trains for 200 epochs of an amount of data that it does not give. Here"
+        f" {lengths(trainings)} iterations of {trainings[0]['batch_windows']} windows are",
         f"{epochs(report)} of these demonstrations. Trained on {', '.join(sorted({t['hardware'] for t in trainings}))}, {min(minutes):.0f} to"
         f" {max(minutes):.0f} minutes each.",
         "",
@@ -404,7 +424,21 @@ def markdown(report: dict[str, Any]) -> str:
         "",
         f"    {rows[0]['command']}",
     ]
-    return "\n".join(lines) + "\n"
+
+
+def all_trainings(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """Those of all configurations."""
+    return [training for row in report["configurations"] for training in row["trainings"]]
+
+
+def trials_of_each(row: dict[str, Any]) -> int:
+    """Trials of one training."""
+    return row["trials"] // len(row["trainings"])
+
+
+def lengths(trainings: list[dict[str, Any]]) -> str:
+    """Iterations of a training, in words."""
+    return ", ".join(sorted({f"{t['iterations']:,}" for t in trainings}))
 
 
 def epochs(report: dict[str, Any]) -> str:

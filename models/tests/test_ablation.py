@@ -143,7 +143,7 @@ class Runs(unittest.TestCase):
         self.assertIn("0.50 (1.00, 0.00)", text)
         self.assertIn("about 1 epochs", text)
         self.assertIn("Not run: vision, vision-mask, tactile-id-arm, vision-diff-big.", text)
-        self.assertIn("\nOne configuration of the policy, each trained for 400 iterations", text)
+        self.assertIn("\nOne configuration of the policy, each trained for 400 iterations with each of the seeds 0, 1, and", text)
         words = "ablation.py EPISODES --rapid RAPID --trials 2 --iterations 400 --seeds 0 1 --only vision-diff"
         self.assertIn(f"Made with\n\n    python {words}\n", text)
 
@@ -152,6 +152,7 @@ class Runs(unittest.TestCase):
         carry_out(self.trained("vision", 0), self.args)
         summarize(self.args)
         report = json.loads((self.args.out / "ablation.json").read_text())
+        self.assertIn("each trained for 400 iterations with seed 0, and", markdown(report))
         report["configurations"][0]["note"] = "trained in another way."
         self.assertIn("\n\n**`vision`**: trained in another way.\n\n", markdown(report))
 
