@@ -30,11 +30,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+import matplotlib.pyplot as plt
 from rapid_policy import results
 from rapid_policy.checkpoint import CHECKPOINT
 from rapid_policy.experiment import Experiment
 from rapid_policy.experiment_file import ExperimentError, read_experiment
 
+matplotlib.use("Agg")
 MODELS = Path(__file__).parent
 FIRST_SEED = 50_000
 # Seconds until a wait for a training notices a signal.
@@ -264,7 +267,9 @@ def summarize(args: argparse.Namespace) -> None:
         "first_seed": FIRST_SEED,
         "configurations": rows,
     }
-    results.write(args.out, args.name, report, markdown(report))
+    picture = f"{args.name}.png"
+    results.write(args.out, args.name, report, markdown(report, picture))
+    plot(report, args.out / picture)
 
 
 def command(name: str, seeds: list[int], trials: int, iterations: int, chosen: list[str]) -> str:
@@ -335,8 +340,8 @@ COLUMNS = ("configuration", "data", "dropout", "success", "95 %", "big", "small"
            "left", "paper")  # fmt: skip
 
 
-def markdown(report: dict[str, Any]) -> str:
-    """The table for people."""
+def markdown(report: dict[str, Any], picture: str) -> str:
+    """The table for people, and a picture of it."""
     rows = report["configurations"]
     present = {row["name"] for row in rows}
     missing = [c.name for c in CONFIGURATIONS if c.name not in present]
@@ -346,9 +351,34 @@ def markdown(report: dict[str, Any]) -> str:
         *(["", f"Not run: {', '.join(missing)}."] if missing else []),
         # What has to be known of figures that were made in another way than now; a new training has none.
         *(line for row in rows if "note" in row for line in ("", f"**`{row['name']}`**: {row['note']}")),
+        "",
+        f"![Success of each training]({picture})",
         *explanation(report),
     ]
     return "\n".join(lines) + "\n"
+
+
+def plot(report: dict[str, Any], to: Path) -> None:
+    """A point for each training, with its interval, beside the paper's."""
+    rows = report["configurations"]
+    figure, axes = plt.subplots(figsize=(8, 0.9 + 0.6 * len(rows)))
+    for place, row in enumerate(rows):
+        each = trials_of_each(row)
+        for at, training in enumerate(row["trainings"]):
+            share = training["success"]
+            low, high = results.wilson(round(share * each), each)
+            height = place - 0.2 * (at - (len(row["trainings"]) - 1) / 2)
+            label = "one training, with its 95 % interval" if place == at == 0 else None
+            axes.errorbar(share, height, xerr=[[share - low], [high - share]], fmt="o", color="C0", markersize=4, label=label)
+        axes.plot(row["paper"], place, "D", color="C1", fillstyle="none", label="the paper" if place == 0 else None)
+    axes.axvline(0.5, color="grey", linewidth=0.8, linestyle="--", label="a guess")
+    names = [f"{row['title']}, {row['data']}" for row in rows]
+    axes.set(yticks=range(len(rows)), yticklabels=names, ylim=(len(rows) - 0.5, -0.5), xlabel="blocks in the right bin")
+    axes.grid(axis="x", alpha=0.3)
+    axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
+    figure.tight_layout()
+    figure.savefig(to, dpi=110)
+    plt.close(figure)
 
 
 def introduction(report: dict[str, Any]) -> list[str]:

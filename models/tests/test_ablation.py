@@ -139,7 +139,7 @@ class Runs(unittest.TestCase):
         self.assertEqual((row["trials"], row["success"], row["wrong_bin"], row["incomplete"]), (4, 0.5, 0.25, 0.25))
         self.assertEqual([t["success"] for t in row["trainings"]], [1.0, 0.0])
         self.assertEqual(row["success_by_size"], {"big": 0.5, "small": 0.5})
-        text = markdown(report)
+        text = markdown(report, "ablation.png")
         self.assertIn("0.50 (1.00, 0.00)", text)
         self.assertIn("about 1 epochs", text)
         self.assertIn("Not run: vision, vision-mask, tactile-id-arm, vision-diff-big.", text)
@@ -152,32 +152,36 @@ class Runs(unittest.TestCase):
         carry_out(self.trained("vision", 0), self.args)
         summarize(self.args)
         report = json.loads((self.args.out / "ablation.json").read_text())
-        self.assertIn("each trained for 400 iterations with seed 0, and", markdown(report))
+        self.assertIn("each trained for 400 iterations with seed 0, and", markdown(report, "ablation.png"))
         report["configurations"][0]["note"] = "trained in another way."
-        self.assertIn("\n\n**`vision`**: trained in another way.\n\n", markdown(report))
+        self.assertIn("\n\n**`vision`**: trained in another way.\n\n", markdown(report, "ablation.png"))
 
     def test_another_table_has_other_files(self):
         self.program([trial(True, "success")] * 2)
         carry_out(self.trained("vision", 0), self.args)
         summarize(self.args)
         first = (self.args.out / "ablation.md").read_text()
+        self.assertIn("](ablation.png)", first)
         self.args.name = "ablation-400"
         summarize(self.args)
         self.assertEqual((self.args.out / "ablation.md").read_text(), first)
         report = json.loads((self.args.out / "ablation-400.json").read_text())
+        self.assertIn("](ablation-400.png)", (self.args.out / "ablation-400.md").read_text())
+        for picture in ("ablation.png", "ablation-400.png"):
+            self.assertGreater((self.args.out / picture).stat().st_size, 1000)
         self.assertTrue(report["command"].endswith("--only vision --name ablation-400"), report["command"])
 
 
 class Pages(unittest.TestCase):
     def test_those_in_the_repository_are_of_their_figures(self):
         report = json.loads((MODELS / "results" / "ablation.json").read_text(encoding="utf-8"))
-        self.assertEqual((MODELS / "results" / "ablation.md").read_text(encoding="utf-8"), markdown(report))
+        self.assertEqual((MODELS / "results" / "ablation.md").read_text(encoding="utf-8"), markdown(report, "ablation.png"))
         # By `make ablation` only a table of all that it makes.
         seeds, rows = " ".join(map(str, SEEDS)), [c.name for c in CONFIGURATIONS]
         for chosen, made in ((rows, "Made with `make ablation`, which runs\n"), (rows[1:], "Made with\n")):
             report["command"] = command(NAME, SEEDS, TRIALS, ITERATIONS, chosen)
             self.assertIn(f"--seeds {seeds}", report["command"])
-            self.assertIn(made, markdown(report))
+            self.assertIn(made, markdown(report, "ablation.png"))
 
 
 class Counting(unittest.TestCase):
