@@ -277,17 +277,18 @@ class Curves(Case):
 
 
 class Interrupted(Case):
-    def through(self, workers: int = 0):
-        spec = small(iterations=8)
+    def through(self, workers: int = 0, spec: Experiment | None = None):
+        spec = spec or small(iterations=8)
         dataset = Dataset(spec, episodes())
         run = start(spec, dataset)
         Trainer(run, dataset, self.folder, workers=workers).train()
         return spec, dataset, run
 
     def test_a_stopped_run_continues_as_if_it_had_not_been(self):
-        for workers in (0, 2):
-            with self.subTest(workers=workers):
-                spec, dataset, through = self.through(workers)
+        plain = small(iterations=8)
+        for workers, asked in ((0, plain), (2, plain), (0, observed(plain, "tactile", outcome=0.5))):
+            with self.subTest(workers=workers, outcomes=asked is not plain):
+                spec, dataset, through = self.through(workers, asked)
                 stopped = start(spec, dataset)
                 self.interrupt(Trainer(stopped, dataset, self.folder, workers=workers))
                 state = read_checkpoint(self.folder / CHECKPOINT)
@@ -297,8 +298,9 @@ class Interrupted(Case):
                 resumed.load(state)
                 Trainer(resumed, dataset, self.folder, workers=workers).train()
                 self.assertEqual(resumed.losses, through.losses)
-                for name, weight in through.average.state_dict().items():
-                    self.assertTrue(torch.equal(weight, resumed.average.state_dict()[name]), name)
+                for whole, again in ((through.policy, resumed.policy), (through.average, resumed.average)):
+                    for name, weight in whole.state_dict().items():
+                        self.assertTrue(torch.equal(weight, again.state_dict()[name]), name)
 
     def test_a_signal_ends_it_after_the_iteration(self):
         for number in (signal.SIGTERM, signal.SIGINT):
