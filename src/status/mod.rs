@@ -361,7 +361,7 @@ impl StopStatus {
         let (kind, name, word) = (self.kind.label(), &self.stop, self.word());
         let rest = match self.state {
             InputState::Lost => format!(" ({})", self.detail),
-            InputState::Runs => ": nothing moves before the next arm".to_owned(),
+            InputState::Runs => ": nothing moves until the actuator is armed again".to_owned(),
             InputState::Stopped => String::new(),
         };
         format!("{kind} {name} {word}{rest}")

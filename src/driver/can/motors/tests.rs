@@ -276,7 +276,7 @@ async fn notices_wait_for_room() {
         }
     }
     for _ in 0..COUNT {
-        reported(&mut motors, |notice| notice.text.contains("of at most 80 °C")).await;
+        reported(&mut motors, |notice| notice.text.contains("(limit 80 °C)")).await;
     }
 }
 
