@@ -81,16 +81,16 @@ impl Trip {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum NoAction {
     /// It is not a list of finite numbers.
-    #[error("an action is no list of 1 to {MAX_ACTION} finite 64-bit floats")]
+    #[error("an action is not a list of 1 to {MAX_ACTION} finite 64-bit floats")]
     NoNumbers,
     /// A policy of this process drives the actuator.
     #[error("another program publishes actions while a policy runs here: end one of them")]
     Foreign,
     /// It is a pose that the arm cannot take.
-    #[error("the arm does not reach the pose that is asked for, or has no way there: it follows no such action")]
+    #[error("the arm cannot reach the pose of an action, or has no path to it: the action is not followed")]
     OutOfReach,
     /// It is not as long as the actions of the arm.
-    #[error("an action has another number of values than the actions of the arm")]
+    #[error("an action does not have as many values as the arm takes")]
     Length,
 }
 

@@ -114,7 +114,7 @@ It shows a rapid that runs without a screen, as a service or in another terminal
 may be attached, `rapid logs -f` among them. The run continues when the monitor or its connection ends. When the run ends, the \
 monitor shows its last state and waits for the next.
 
-Allowed are the user of the run, root and, if the run was started with --group-control as the service is, the \
+The user of the run and root may attach; if the run was started with --group-control, as the service is, so may the \
 members of its group.
 
 Examples:
@@ -287,14 +287,14 @@ pub enum Command {
         /// Continue with new lines until the run ends
         #[arg(long, short)]
         follow: bool,
-        /// Least severity: debug, info, warn or error
+        /// Lowest severity shown: debug, info, warn or error
         #[arg(long, value_name = "LEVEL", default_value = "info", hide_possible_values = true)]
         level: LevelArg,
         /// Times in UTC instead of the zone of this machine
         #[arg(long)]
         utc: bool,
     },
-    /// Take entries added to the registry over into a running rapid
+    /// Apply entries added to the registry to a running rapid
     #[command(after_long_help = RELOAD)]
     Reload,
     /// Begin, end, discard or label episodes of a running rapid

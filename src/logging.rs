@@ -181,7 +181,7 @@ impl Sink for StderrSink {
         let mut text = self.render(&line);
         let lost = self.lost.swap(0, Ordering::Relaxed);
         if lost > 0 {
-            let report = format!("{lost} lines of the log lost: their reader was behind");
+            let report = format!("{} of the log lost: their reader was behind", text::counted(lost, "line"));
             text.insert_str(0, &self.render(&LogLine { level: Level::Warn, text: report, ..line }));
         }
         if !self.outlet.try_send(text.into_bytes()) {

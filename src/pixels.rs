@@ -20,7 +20,7 @@ pub(crate) const LARGEST: usize = 8192;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PixelError {
     /// The samples are not pictures.
-    #[error("the samples are no pictures but {0:?}")]
+    #[error("the samples are {0:?}, not pictures")]
     NoPicture(Encoding),
     /// It cannot be decoded.
     #[error("damaged picture: {0}")]

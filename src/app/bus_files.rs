@@ -20,7 +20,8 @@ pub(super) async fn watch(mut watchman: Watchman) -> ! {
         let Some(first) = removed.first() else { continue };
         let others = match removed.len() - 1 {
             0 => String::new(),
-            count => format!(", and {count} others of the bus"),
+            1 => ", and another file of the bus".to_owned(),
+            count => format!(", and {count} other files of the bus"),
         };
         tracing::warn!(
             "{}{others}: removed during the run, which continues; programs that start now may \

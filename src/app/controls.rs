@@ -19,7 +19,7 @@ pub(super) fn set(board: &Arc<Board>, id: ModalityId, control: String, value: i6
         let node = board.node(id).filter(|node| node.starts_with("/dev/"));
         let name = control.clone();
         let set = match node {
-            None => Err("it is no camera of this machine that is open".to_owned()),
+            None => Err("it is not an open camera of this machine".to_owned()),
             Some(node) => spawn_blocking(move || camera::set_control(Path::new(&node), &name, value))
                 .await
                 .unwrap_or_else(|_| Err("setting it panicked; please report this".to_owned())),

@@ -104,7 +104,7 @@ impl Reload {
         let path = file(&self.registry)?.to_owned();
         if !self.registry.devices.is_empty() && !path.exists() {
             // A new file would give the bits of this run to other devices.
-            let gone = format!("{} is gone, and this run has entries of it", path.display());
+            let gone = format!("{} is gone, and this run uses its entries", path.display());
             return Err(format!("{gone}: put it back, or restart rapid; nothing was written"));
         }
         let (reply, attached) = oneshot::channel();

@@ -8,8 +8,8 @@ use crate::status::Grade;
 use crate::time::Zone;
 
 pub(super) const LIST: &str = "\
-Every file is read completely and judged again, and the labels and notes of its session are shown beside it. Of the \
-options of one kind any may apply, of different kinds all must. A file that cannot be read is always listed.
+Every file is read completely and judged again, and the labels and notes of its session are shown beside it. \
+Several verdicts or labels are alternatives; all other options must match. A file that cannot be read is always listed.
 
 Examples:
   rapid list
@@ -36,10 +36,10 @@ pub struct ListArgs {
     /// Only those with this tag; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = super::tag)]
     pub tag: Vec<(String, String)>,
-    /// Only those with samples of this sensor; repeatable: of all of them
+    /// Only those with samples of this sensor; repeatable, all required
     #[arg(long, value_name = "NAME")]
     pub sensor: Vec<String>,
-    /// Only those without any sample of this sensor; repeatable: of none of them
+    /// Only those without any sample of this sensor; repeatable, all excluded
     #[arg(long, value_name = "NAME")]
     pub without: Vec<String>,
     /// Only those begun at this date or later: 2026-11-24, 2026-11-24T13:30

@@ -62,7 +62,7 @@ pub struct PolicyArgs {
     /// Open the monitor
     #[arg(long, requires = "infer", conflicts_with = "headless", hide_short_help = true)]
     pub monitor: bool,
-    /// Continue when a sensor is missing that the policy was not trained to miss
+    /// Continue when a sensor is missing that the policy was not trained to do without
     #[arg(long, alias = "go-on", requires = "infer", hide_short_help = true)]
     pub ignore_missing: bool,
     /// Hold the last sample of a sensor that is unplugged for this long [default: as the policy states]
@@ -123,7 +123,7 @@ pub enum PolicyCommand {
     #[command(after_long_help = "Examples:\n  rapid policy show\n  rapid policy show models/tactile-id --sim task\n  \
         rapid policy show POLICY --threads 4 --json")]
     Show(ShowArgs),
-    /// Write what a recorded chunk of actions was computed from, as arrays of `NumPy`
+    /// Write what a recorded chunk of actions was computed from, as `NumPy` arrays
     ///
     /// The observations by their keys, the mask, the noise, and the recorded chunk (`recorded`): with the graphs of the policy
     /// they are all that is needed to compute it again (examples/recompute.py).
@@ -178,7 +178,7 @@ pub struct EvalArgs {
     /// Seed of the first trial; demonstrations start at 0 unless recorded with another --seed
     #[arg(long, value_name = "N", default_value_t = 50_000)]
     pub seed: u64,
-    /// Condition, all of which --help explains; repeatable [default: all]
+    /// Condition (--help explains each); repeatable [default: all]
     #[arg(long, value_name = "NAME", value_parser = condition)]
     pub condition: Vec<Condition>,
     /// Baseline: a loop that reads a fixed list of sensors, and fails when a read does
@@ -239,6 +239,6 @@ const COMPARISON: &str = "Comparison options";
 fn tolerance(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(difference) if (0.0..f64::INFINITY).contains(&difference) => Ok(difference),
-        _ => Err("write a number from 0 on, for example 1e-4".to_owned()),
+        _ => Err("write a number of 0 or more, for example 1e-4".to_owned()),
     }
 }

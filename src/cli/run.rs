@@ -58,7 +58,8 @@ pub struct RunArgs {
     /// Enable the actuator as soon as it is connected, instead of by `rapid arm` or the monitor
     #[arg(long, hide_short_help = true)]
     pub arm: bool,
-    /// Let the monitor lead through a first episode of the simulated rig, or with --infer through a policy's loss of a sensor
+    /// Let the monitor guide you through a first episode of the simulated rig, or with --infer through a policy's loss of a
+    /// sensor
     #[arg(long, requires = "sim", hide_short_help = true)]
     pub tour: bool,
     /// Half width of the synchronisation window of an observation [default: from the registry]
@@ -81,7 +82,7 @@ pub struct LiveArgs {
     /// Show all topics live in Foxglove, as they are recorded [default address: 127.0.0.1:8765]
     ///
     /// In Foxglove: open connection, `ws://localhost:8765`. From another machine: `ssh -L 8765:localhost:8765 RIG`. With an
-    /// address that is not of this machine alone, such as 0.0.0.0:8765, whoever reaches the port sees what the sensors see.
+    /// address that other machines can reach, such as 0.0.0.0:8765, whoever reaches the port sees what the sensors see.
     #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = live_address, default_missing_value = "127.0.0.1:8765", hide_short_help = true)]
     pub foxglove: Option<SocketAddr>,
     /// Let Foxglove begin and end episodes, arm and disarm
@@ -99,7 +100,7 @@ pub struct WebArgs {
     ///
     /// For a phone in the same network: `--web 0.0.0.0`. Such an address needs the link with a token, which the monitor shows
     /// as a QR code (key W) and a run without a monitor prints. Whoever has the link sees the cameras and begins, ends and
-    /// discards episodes; motors it neither arms nor disarms.
+    /// discards episodes; it neither arms nor disarms motors.
     #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = web_address, default_missing_value = "127.0.0.1:8766", hide_short_help = true)]
     pub web: Option<SocketAddr>,
     /// Keep the page's token in this file, so that links remain valid; rapid writes it
@@ -128,7 +129,7 @@ pub struct TaskArgs {
     /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
     #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window", "infer", "arm", "foxglove", "web"], hide_short_help = true)]
     pub expert: bool,
-    /// With the gripper in a hand: its pose and opening are recorded, no arm and no action
+    /// Handheld gripper: its pose and opening are recorded, but no arm and no action
     #[arg(long, requires = "expert", hide_short_help = true)]
     pub handheld: bool,
     /// Demonstrations to record, one trial each

@@ -48,7 +48,7 @@ pub enum EpisodeCommand {
         #[arg(value_name = "FILE", value_parser = file_name)]
         episode: Option<String>,
     },
-    /// Take the episode discarded last back from the trash
+    /// Take the last discarded episode back from the trash
     #[command(after_long_help = "Examples:\n  rapid episode undo")]
     Undo,
     /// Mark this moment of the episode
@@ -121,7 +121,7 @@ impl EpisodeCommand {
 /// What to do with the session.
 #[derive(Debug, Subcommand)]
 pub enum SessionCommand {
-    /// Change what the next episodes are of
+    /// Change task, tags, goal or modules of the next episodes
     #[command(
         after_long_help = "Examples:\n  rapid session plan --task \"place block\" --tag finger=soft --goal 50\n  rapid session plan --tag finger=\n  rapid session plan --module tip_soft"
     )]

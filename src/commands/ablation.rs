@@ -157,7 +157,8 @@ fn write_text(
     }
     let done = counts.iter().filter(|count| **count >= plan.episodes).count();
     let missing: usize = counts.iter().map(|count| plan.episodes.saturating_sub(*count)).sum();
-    writeln!(out, "{done} of {} configurations done, {missing} episodes to record", wanted.len())?;
+    let missing = text::counted(missing as u64, "episode");
+    writeln!(out, "{done} of {} done, {missing} to record", text::counted(wanted.len() as u64, "configuration"))?;
     for (why, count) in not_counted {
         writeln!(out, "not counted: {count} {why}")?;
     }

@@ -151,17 +151,20 @@ fn print(
 }
 
 fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result<()> {
-    writeln!(out, "{} chunks, {} computed again", again.chunks, again.compared)?;
+    writeln!(out, "{}, {} computed again", text::counted(again.chunks, "chunk"), again.compared)?;
     let others = [
-        (again.samples_missing, "not: some of their samples are not in the file (captured before it started, or lost)"),
+        (
+            again.samples_missing,
+            "not compared: some of their samples are not in the file (captured before it started, or lost)",
+        ),
         (
             again.reference_unknown,
-            "not: the recording started after the policy, and the first sample, the reference for all others, is not \
-             in the file",
+            "not compared: the recording started after the policy, and the first sample, the reference for all others, \
+             is not in the file",
         ),
-        (again.unlike, "not: their observations or length differ from this policy's"),
-        (again.unreadable, "not: their events cannot be read"),
-        (again.failed, "not: the policy failed"),
+        (again.unlike, "not compared: their observations or length differ from this policy's"),
+        (again.unreadable, "not compared: their events cannot be read"),
+        (again.failed, "not compared: the policy failed"),
     ];
     print_others(&others, again.failure.as_deref(), out)?;
     if again.compared > 0 {
@@ -169,8 +172,9 @@ fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result
     }
     let actions = &again.actions;
     if actions.recorded > 0 {
-        writeln!(out, "\n{} actions, {} compared with those of the chunks", actions.recorded, actions.compared)?;
-        print_others(&[(actions.without_chunk, "not: no chunk in the file covers their tick")], None, out)?;
+        let recorded = text::counted(actions.recorded, "action");
+        writeln!(out, "\n{recorded}, {} compared with those of the chunks", actions.compared)?;
+        print_others(&[(actions.without_chunk, "not compared: no chunk in the file covers their tick")], None, out)?;
         if actions.compared > 0 {
             table(&actions.difference, out)?;
         }
@@ -186,13 +190,15 @@ fn print_beside(beside: &Beside, bundle: &Bundle, out: &mut dyn Write) -> io::Re
     let Beside { ticks, compared, recorded, counts, .. } = beside;
     writeln!(
         out,
-        "{ticks} ticks at {} Hz, {recorded} recorded actions, {} chunks; {compared} ticks compared",
+        "{} at {} Hz, {}, {}; {compared} compared",
+        text::counted(*ticks, "tick"),
         text::hertz(bundle.control_hz),
-        counts.chunks
+        text::counted(*recorded, "recorded action"),
+        text::counted(counts.chunks, "chunk")
     )?;
-    print_others(&[(beside.without_recorded, "not: no action was recorded then")], None, out)?;
+    print_others(&[(beside.without_recorded, "not compared: no action was recorded then")], None, out)?;
     for (reason, held) in &beside.held {
-        writeln!(out, "  {held} not: {reason}")?;
+        writeln!(out, "  {held} not compared: {reason}")?;
     }
     if let Some(failure) = &beside.failure {
         writeln!(out, "    {}", text::plain(failure))?;

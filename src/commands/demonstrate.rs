@@ -78,8 +78,9 @@ pub fn run(
         let folder = text::plain(&request.out.to_string_lossy()).into_owned();
         writeln!(
             out,
-            "{done} demonstrations in {folder}: {triangular} triangular, {} hexagonal, {good} GOOD; {steps} steps, {} of \
+            "{} in {folder}: {triangular} triangular, {} hexagonal, {good} GOOD; {steps} steps, {} of \
              robot time in {:.1} s ({times:.0} times real time)",
+            text::counted(done as u64, "demonstration"),
             done - triangular,
             text::clock(recorded),
             taken.as_secs_f64(),

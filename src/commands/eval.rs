@@ -117,8 +117,8 @@ fn warn_of_training_seeds(bundle: &Bundle, args: &EvalArgs) {
     let end = args.seed.saturating_add(args.trials as u64);
     if args.seed <= last && first < end {
         let text = format!(
-            "the seeds {first} to {last} are those of demonstrations that this policy was trained on: choose others, \
-             such as --seed {}",
+            "this policy was trained on demonstrations with the seeds {first} to {last}: choose others, such as \
+             --seed {}",
             last.saturating_add(1)
         );
         let _ = writeln!(io::stderr(), "{} {text}", Palette::of(&io::stderr()).warn("warning:"));
@@ -173,9 +173,9 @@ fn table(
     };
     writeln!(
         out,
-        "{}  {} trials per condition from seed {}; {kind}\n",
+        "{}  {} per condition from seed {}; {kind}\n",
         text::plain(&bundle.name),
-        args.trials,
+        text::counted(args.trials as u64, "trial"),
         args.seed
     )?;
     writeln!(out, "condition     score  95 %          success  wrong bin  incomplete  crash  status    paper")?;

@@ -39,8 +39,9 @@ pub enum ShowError {
     Compare(#[from] CompareError),
     /// It has no such chunk of this policy, or not all that it was computed from.
     #[error(
-        "{}: there is no chunk {number} of this policy in it whose samples are all there: name the folder of the policy that \
-         ran, or another chunk with --chunk: the first ones may be from before its beginning",
+        "{}: it has no chunk {number} of this policy, or not all samples that the chunk was computed from: name the \
+         folder of the policy that ran, or another chunk with --chunk; samples of the first chunks may be older than \
+         the episode",
         file.display()
     )]
     NoChunk {
@@ -286,7 +287,7 @@ impl Shown {
 fn observed(observation: &ObservationSpec, mask_aware: bool) -> String {
     let shape: Vec<String> = shape(observation).iter().map(ToString::to_string).collect();
     let when_absent = match (observation.required, held(observation)) {
-        _ if observation.history.is_some() => "zeros for a step that it was absent at".to_owned(),
+        _ if observation.history.is_some() => "zeros for steps at which it was absent".to_owned(),
         (true, _) => "required".to_owned(),
         (false, _) if !mask_aware => "holds without it".to_owned(),
         (false, Duration::ZERO) => "may be absent: zeros".to_owned(),
@@ -305,7 +306,7 @@ fn observed(observation: &ObservationSpec, mask_aware: bool) -> String {
         ticks => format!(", a step every {ticks} ticks"),
     };
     let history = observation.history.as_ref().map_or(String::new(), |history| {
-        format!(", a history of {} steps ({} has which are there)", history.steps, history.valid)
+        format!(", a history of {} steps (input {} says which are present)", history.steps, history.valid)
     });
     let kind = kind(observation);
     let shape = shape.join("x");

@@ -199,7 +199,7 @@ impl Driver {
         match self {
             Self::Motors(_) => Ok(()),
             Self::Sim(driver) => driver.command(target),
-            _ => Err(DriverError::Fatal("of real devices, motors behind a CAN adapter alone take actions".to_owned())),
+            _ => Err(DriverError::Fatal("of real devices, only motors behind a CAN adapter take actions".to_owned())),
         }
     }
 

@@ -103,7 +103,10 @@ impl Sim {
                 (content, task::STEP_HZ, CAMERA_BACKLOG)
             }
             SimSource::Process | SimSource::Replay { .. } => {
-                return Err(DriverError::Fatal(format!("{} sends no samples made up here", device.name)));
+                return Err(DriverError::Fatal(format!(
+                    "{}: no simulator makes samples for this kind of device",
+                    device.name
+                )));
             }
         };
         let capacity = match &content {

@@ -531,7 +531,7 @@ mod tests {
         assert_eq!(height(of(camera(shape(480), shape(240)), &known)).unwrap(), 480);
         assert_eq!(height(of(camera(None, shape(240)), &known)).unwrap(), 240);
         let refused = height(of(camera(None, None), &known)).unwrap_err().to_string();
-        assert!(refused.starts_with("cam: no usable sample to know the size of"), "{refused}");
+        assert!(refused.starts_with("cam: no usable sample to take the size from"), "{refused}");
         known.learn(&episode(&[camera(shape(720), None), arm]));
         assert_eq!(height(of(camera(None, shape(240)), &known)).unwrap(), 720);
         assert_eq!(Known::of(&features()).length("arm"), Some(2));

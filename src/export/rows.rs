@@ -54,13 +54,15 @@ pub enum Refusal {
         problem: String,
     },
     /// Observations that are no whole number a second.
-    #[error("{0} observations a second, and LeRobot takes whole numbers alone: record with `--rate 30`")]
+    #[error("{0} observations a second, and LeRobot takes whole numbers only: record with `--rate 30`")]
     Rate(f64),
     /// Without a frame index.
     #[error("no frames: nothing on {FRAME_TOPIC}")]
     NoFrames,
     /// The rows would not be at equal distances.
-    #[error("ticks {first} to {last} are missing of the frame index, and the rows of a data set have equal distances")]
+    #[error(
+        "ticks {first} to {last} are missing from the frame index, and the rows of a data set must be evenly spaced"
+    )]
     Hole {
         /// The first tick that is missing.
         first: u64,
@@ -91,7 +93,7 @@ pub enum Refusal {
         shape: String,
     },
     /// A sensor without any sample, here or in the set.
-    #[error("{0}: no usable sample to know the size of, and neither the other episodes nor the registry have it")]
+    #[error("{0}: no usable sample to take the size from, and neither the other episodes nor the registry give it")]
     NoSize(String),
     /// Numbers of several lengths.
     #[error("{name}: {found} numbers, and {expected} before")]

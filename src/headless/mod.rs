@@ -188,7 +188,11 @@ impl Printer {
         } else {
             let time = crate::time::time_of_day(self.wall.wall_ns(now.taken));
             let palette = self.columns.palette;
-            format!("{}  {}", palette.faint(&time), palette.warn(&format!("{missed} events missed: output was behind")))
+            format!(
+                "{}  {}",
+                palette.faint(&time),
+                palette.warn(&format!("{} missed: output was behind", text::counted(missed, "event")))
+            )
         };
         self.whole_line(&line)
     }

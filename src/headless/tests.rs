@@ -217,7 +217,7 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 104 chunks, 3 late, 0 unused, latency p50 34.5 ms p99 48.0 ms
     22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 0 chunks, 3 late, 0 unused
     22:13:20.000Z  pendant            pressed       emergency stop pendant pressed
-    22:13:20.000Z  pendant            held          enabling switch pendant held: nothing moves before the next arm
+    22:13:20.000Z  pendant            held          enabling switch pendant held: nothing moves until the actuator is armed again
     22:13:20.000Z  pendant            lost          enabling switch pendant lost (nothing was received for 200ms)
     22:13:20.000Z  log                warn          something
     "#);

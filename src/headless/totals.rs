@@ -269,8 +269,8 @@ impl Summary {
             lines.push(format!("policy   {}{dry}  {}", palette.bold(&text::plain(policy)), sum));
         }
         if self.missed_events > 0 {
-            let text = format!("{} events are missing above: this output was behind", self.missed_events);
-            lines.push(palette.warn(&text));
+            let events = text::counted(self.missed_events, "event");
+            lines.push(palette.warn(&format!("{events} missing above: this output was behind")));
         }
         lines.push(format!("{} s in all", text::hertz(self.seconds)));
         lines.join("\n")

@@ -53,7 +53,10 @@ pub enum ArmError {
         message: String,
     },
     /// A joint whose motor must be elsewhere.
-    #[error("{}: no position of joint {joint:?} is also one of its motor ({range:?})", file.display())]
+    #[error(
+        "{}: the limits of joint {joint:?} and the `position` of its motor ({range:?}) do not overlap",
+        file.display()
+    )]
     Range {
         /// The description.
         file: PathBuf,
@@ -68,7 +71,7 @@ impl ArmError {
     /// What to write in place of it.
     pub const fn fix(&self) -> &'static str {
         match self {
-            Self::File { .. } => "write urdf = the path of a description, beginning beside this file",
+            Self::File { .. } => "write urdf = the path of a description, relative to this file",
             Self::Chain { source: ChainError::NoDescription(_), .. } => "write a URDF file; xacro is expanded first",
             Self::Chain { source: ChainError::NoLink(_) | ChainError::NotAttached { .. }, .. } => {
                 "write the names of two of its links as `frame` and `tip`"

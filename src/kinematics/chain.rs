@@ -65,7 +65,7 @@ impl Chain {
     /// When there is no such chain, or it has a joint that no motor can move.
     pub fn read(urdf: &str, frame: Option<&str>, tip: &str) -> Result<Self, ChainError> {
         if is_deeper_than(urdf, DEEPEST) {
-            return Err(ChainError::NoDescription(format!("more than {DEEPEST} elements within each other")));
+            return Err(ChainError::NoDescription(format!("elements are nested more than {DEEPEST} deep")));
         }
         let robot = urdf_rs::read_from_string(urdf).map_err(|error| ChainError::NoDescription(error.to_string()))?;
         for link in frame.into_iter().chain([tip]) {

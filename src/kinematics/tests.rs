@@ -350,11 +350,11 @@ fn a_description_that_does_not_fit_is_refused_by_name() {
             swapped("\"lift\" type=\"revolute\"", "\"lift\" type=\"prismatic\""),
             "joint \"lift\" is neither",
         ),
-        (effector.clone(), "<a>".repeat(500_000), "elements within each other"),
+        (effector.clone(), "<a>".repeat(500_000), "elements are nested"),
         (
             effector.clone(),
             swapped("lower=\"-2.5\" upper=\"2.5\"", "lower=\"4\" upper=\"5\""),
-            "no position of joint \"lift\"",
+            "the limits of joint \"lift\"",
         ),
         (
             effector.clone(),

@@ -182,8 +182,8 @@ impl Live {
         if !address.ip().is_loopback() {
             let moves = if control { ", begins and ends episodes, and arms motors" } else { "" };
             let text = format!(
-                "Foxglove: {address} is not of this machine alone: whoever reaches that port sees what the sensors \
-                 see{moves}; there is no password. `ssh -L {PORT}:localhost:{PORT}` needs no such address"
+                "Foxglove: {address} can be reached from other machines: whoever reaches that port sees what the \
+                 sensors see{moves}; there is no password. `ssh -L {PORT}:localhost:{PORT}` needs no such address"
             );
             self.board.announce(What::Log { level: Level::Warn, text });
         }

@@ -24,6 +24,7 @@ use crate::observation::{OBSERVATION_TOPIC, Observation};
 use crate::registry::{DeviceSpec, Form, Registry};
 use crate::sample::SampleHeader;
 use crate::status::Event;
+use crate::text;
 use crate::time::{Stamp, WallClock};
 
 /// Time between two messages about where a sensor sits.
@@ -233,9 +234,9 @@ impl Topics {
     /// What was left out since the last call, if anything was.
     pub(super) fn left_out(&mut self) -> Option<String> {
         let LeftOut { pictures, events } = std::mem::take(&mut self.left_out);
-        let parts = [(pictures, "pictures"), (events, "events")];
+        let parts = [(pictures, "picture"), (events, "event")];
         let parts: Vec<_> =
-            parts.iter().filter(|(count, _)| *count > 0).map(|(count, of)| format!("{count} {of}")).collect();
+            parts.iter().filter(|(count, _)| *count > 0).map(|(count, of)| text::counted(*count, of)).collect();
         (!parts.is_empty()).then(|| format!("{} not sent: they came faster than they are shown", parts.join(", ")))
     }
 }

@@ -93,7 +93,7 @@ fn a_stalled_reader_blocks_no_writer_and_is_informed_of_lost_lines() {
     }
     drop(sink);
     let text = reading.join().unwrap().unwrap();
-    assert!(text.contains("lines of the log lost: their reader was behind"));
+    assert!(text.contains(" of the log lost: their reader was behind"));
     assert!(text.ends_with("last\n"));
 }
 

@@ -123,10 +123,10 @@ pub enum ChunkError {
     #[error("a chunk of the wrong length")]
     Length,
     /// NaN or infinity.
-    #[error("a chunk with values that are no finite numbers")]
+    #[error("a chunk with values that are not finite numbers")]
     NotFinite,
     /// A rotation in it is none.
-    #[error("a chunk with a rotation that is none: its rows are zero or parallel, or its quaternion is zero")]
+    #[error("a chunk with an invalid rotation: its rows are zero or parallel, or its quaternion is zero")]
     NoRotation,
     /// The pose that its actions are relative to is none.
     #[error("a chunk relative to a sample that has no pose: it is too short, not finite, or its quaternion is zero")]

@@ -92,7 +92,7 @@ pub enum Cause {
     #[error("it cannot be loaded: {0}")]
     Unloadable(String),
     /// It is too old for this program.
-    #[error("it is version {0}, and 1.{OLDEST} is the oldest that serves")]
+    #[error("it is version {0}, and 1.{OLDEST} is the oldest that works")]
     TooOld(String),
     /// No memory may be mapped as executable.
     #[error("it cannot be unpacked into memory: {0}")]

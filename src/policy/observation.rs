@@ -25,7 +25,7 @@ pub enum VectorError {
         wanted: String,
     },
     /// Numbers that are to be a rotation are none.
-    #[error("observation `{0}` is a rotation, but the quaternion of the sample is none: zero, or not finite")]
+    #[error("observation `{0}` is a rotation, but the quaternion of the sample is invalid: zero, or not finite")]
     Rotation(String),
 }
 

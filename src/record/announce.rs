@@ -7,6 +7,7 @@ use std::time::Duration;
 use super::quality::{Measures, Meter};
 use crate::registry::{DeviceSpec, Limits, Registry};
 use crate::status::{Board, Level, What};
+use crate::text;
 use crate::time::{Stamp, nanoseconds};
 
 /// Shortest time between announcements of a modality.
@@ -55,7 +56,10 @@ impl Announced {
         let counts = &meter.counts;
         let mut news = Vec::new();
         if counts.dropped > self.dropped {
-            news.push(format!("{} samples lost on the way to the file", counts.dropped - self.dropped));
+            news.push(format!(
+                "{} lost on the way to the file",
+                text::counted(counts.dropped - self.dropped, "sample")
+            ));
             self.dropped = counts.dropped;
         }
         // A few are normal: only what would already make the episode suspect is announced.
@@ -67,7 +71,7 @@ impl Announced {
         ] {
             let beyond = limit.is_some_and(|limit| count as f64 > limit * expected as f64);
             if beyond && count >= reported.saturating_add(LEAST_SAMPLES) {
-                news.push(format!("{} samples {what}", count - *reported));
+                news.push(format!("{} {what}", text::counted(count - *reported, "sample")));
                 *reported = count;
             }
         }

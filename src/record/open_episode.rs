@@ -118,7 +118,7 @@ impl OpenEpisode {
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
         for (named, sensed) in &configuration.contradicted {
             let text =
-                format!("module {named} was named, but {sensed} is in its slot by its sensor: recorded as {sensed}");
+                format!("module {named} was named, but the sensor in its slot is of {sensed}: recorded as {sensed}");
             board.announce(What::Log { level: Level::Warn, text });
         }
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);

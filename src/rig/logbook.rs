@@ -22,6 +22,7 @@ use tokio::time::timeout;
 
 use crate::folder::state_directory;
 use crate::status::{Board, Level, What};
+use crate::text;
 use crate::time;
 
 /// Size in bytes at which a new file is started.
@@ -106,8 +107,11 @@ fn keep(mut files: Files, inbox: Receiver<Page>, missing: &AtomicU64, board: &Bo
             }
         };
         let lost = missing.swap(0, Ordering::Relaxed);
-        let lost =
-            if lost > 0 { format!("{} {lost} lines are missing\n", time::rfc3339(wall_ns)) } else { String::new() };
+        let lost = if lost > 0 {
+            format!("{} {} missing\n", time::rfc3339(wall_ns), text::counted(lost, "line"))
+        } else {
+            String::new()
+        };
         let line = format!("{lost}{} {text}\n", time::rfc3339(wall_ns));
         if let Err(error) = files.write(&device, &line)
             && !complained

@@ -123,7 +123,7 @@ impl Output {
         self.reported = Stamp::now();
         let left_out = std::mem::take(&mut self.left_out);
         if left_out > 0 {
-            self.note(Level::Warn, &format!("prints too much: {left_out} lines are left out"));
+            self.note(Level::Warn, &format!("prints too much: {} left out", text::counted(left_out, "line")));
         }
     }
 

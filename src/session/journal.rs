@@ -96,7 +96,10 @@ pub enum JournalError {
         why: String,
     },
     /// The file of a session in progress could not be read, and was moved.
-    #[error("{error}; it is {} now, and what it notes of episodes is not used: what it discarded stays in .trash", moved.display())]
+    #[error(
+        "{error}; it was moved to {}, and what it records about episodes is not used: what was discarded stays in .trash",
+        moved.display()
+    )]
     Moved {
         /// What is wrong with it.
         error: Box<JournalError>,

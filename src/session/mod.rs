@@ -81,7 +81,7 @@ pub enum Refusal {
     #[error("this session has no such episode; `rapid session` lists what it has")]
     Unknown,
     /// The task is empty.
-    #[error("a task has a name")]
+    #[error("a task needs a name")]
     NoTask,
 }
 

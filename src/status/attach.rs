@@ -104,7 +104,7 @@ pub enum LinkError {
     #[error("{}", unanswered(.0))]
     Io(#[from] io::Error),
     /// Another version of the program sends other messages.
-    #[error("the run is another version of rapid ({0}): use the same one here")]
+    #[error("the run uses another version of rapid ({0}): use the same version here")]
     Version(String),
     /// The run refused.
     #[error("the run refuses: {0}")]

@@ -361,7 +361,7 @@ impl StopStatus {
         let (kind, name, word) = (self.kind.label(), &self.stop, self.word());
         let rest = match self.state {
             InputState::Lost => format!(" ({})", self.detail),
-            InputState::Runs => ": nothing moves before the next arm".to_owned(),
+            InputState::Runs => ": nothing moves until the actuator is armed again".to_owned(),
             InputState::Stopped => String::new(),
         };
         format!("{kind} {name} {word}{rest}")
@@ -564,7 +564,9 @@ pub struct PolicyEnd {
 impl fmt::Display for PolicyEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { actions, held, chunks, late, unused, latency_p50_ms, latency_p99_ms } = self;
-        write!(f, "{actions} actions, {held} ticks held, {chunks} chunks, {late} late, {unused} unused")?;
+        let [acted, without, computed] =
+            [(actions, "action"), (held, "tick"), (chunks, "chunk")].map(|(count, of)| text::counted(*count, of));
+        write!(f, "{acted}, {without} held, {computed}, {late} late, {unused} unused")?;
         // Without a chunk there is no latency.
         if *chunks + *unused > 0 {
             write!(f, ", latency p50 {latency_p50_ms:.1} ms p99 {latency_p99_ms:.1} ms")?;

@@ -166,8 +166,8 @@ fn announce(board: &Board, address: SocketAddr, token: Option<&Token>) {
     board.log(Level::Info, &text);
     if !address.ip().is_loopback() {
         let text = format!(
-            "page: {address} is not of this machine alone: whoever has the link sees what the cameras see, and begins, ends \
-             and discards episodes; what is sent is not encrypted"
+            "page: {address} can be reached from other machines: whoever has the link sees what the cameras see, and \
+             begins, ends and discards episodes; what is sent is not encrypted"
         );
         board.log(Level::Warn, &text);
     }

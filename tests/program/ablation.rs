@@ -97,7 +97,7 @@ fn impossible_values_are_rejected_with_the_valid_ones() {
     };
     assert!(refused(&["ablation"]).contains("--finger A,B"));
     assert!(refused(&["ablation", "--finger", "a", "--modality", "smell"]).contains("\"smell\""));
-    assert!(refused(&["ablation", "--finger", "a", "--modality", "a", "--episodes", "0"]).contains("from 1 on"));
+    assert!(refused(&["ablation", "--finger", "a", "--modality", "a", "--episodes", "0"]).contains("1 or more"));
     assert!(refused(&["--headless", "--sim", "--module", "soft_tpi"]).contains("did you mean \"soft_tip\"?"));
     let both = refused(&["--headless", "--sim", "--module", "soft_tip", "--module", "get"]);
     assert!(both.contains("both sit in the slot tip"), "{both}");

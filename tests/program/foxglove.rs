@@ -641,7 +641,7 @@ fn a_port_in_use_is_an_error_of_the_start() {
 
 #[test]
 fn an_address_of_the_network_is_served_and_warned_of() {
-    const WARNING: &str = "is not of this machine alone";
+    const WARNING: &str = "can be reached from other machines";
     let place = lenient_place();
     for (at, control, is_warned) in [("0.0.0.0:0", false, true), ("0.0.0.0:0", true, true), (ANY, true, false)] {
         let mut options = vec!["--sim", "--headless", "--json", "--out", "out", "--foxglove", at];

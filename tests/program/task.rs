@@ -111,7 +111,7 @@ fn seeds_of_the_training_are_not_evaluated_without_a_warning() {
     let warned = |seed: &str| {
         let output = place.run(&["eval", BUNDLE, "--trials", "1", "--condition", "full", "--seed", seed]);
         assert_eq!(output.status.code(), Some(0));
-        String::from_utf8_lossy(&output.stderr).contains("that this policy was trained on")
+        String::from_utf8_lossy(&output.stderr).contains("this policy was trained on demonstrations with the seeds")
     };
     assert!(warned("1000") && !warned("50000"));
 }

@@ -268,7 +268,8 @@ fn nodes(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDev
         }
     }
     if open > 0 {
-        found.push(Finding::ok("nodes", format!("{open} nodes of registered devices may be opened")));
+        let open = text::counted(open, "node");
+        found.push(Finding::ok("nodes", format!("{open} of registered devices may be opened")));
     }
     let missing = entries.iter().filter(|entry| !plugged.iter().any(|(other, _)| other.name == entry.name));
     let missing: Vec<String> = missing

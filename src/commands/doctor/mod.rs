@@ -97,7 +97,8 @@ fn write_findings(findings: &[Finding], out: &mut dyn Write) -> io::Result<()> {
         }
     }
     let count = |level| findings.iter().filter(|finding| finding.level == level).count();
-    writeln!(out, "\n{} ok, {} warnings, {} bad", count(Level::Ok), count(Level::Warn), count(Level::Bad))
+    let warnings = text::counted(count(Level::Warn) as u64, "warning");
+    writeln!(out, "\n{} ok, {warnings}, {} bad", count(Level::Ok), count(Level::Bad))
 }
 
 fn tree_line(device: &UsbDevice, entries: &[&str]) -> String {

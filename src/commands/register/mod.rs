@@ -495,7 +495,8 @@ impl SampleStats {
         }
         let hz = f64::from(self.samples) / elapsed.as_secs_f64().max(1e-3);
         let size = text::size(self.bytes / u64::from(self.samples));
-        format!("{} samples, {} per second, {size} each, {}", self.samples, text::hertz(hz), self.first)
+        let samples = text::counted(u64::from(self.samples), "sample");
+        format!("{samples}, {} per second, {size} each, {}", text::hertz(hz), self.first)
     }
 }
 

@@ -230,7 +230,7 @@ fn unread_notices_are_dropped_and_counted() {
 fn a_notice_names_its_motor() {
     let names = ["shoulder".to_owned(), "elbow".to_owned()];
     let fault = Fault::Hot { motor: 1, part: Part::Mos, celsius: 81.0, limit: 80.0 };
-    assert_eq!(fault.words(&names).to_string(), "the transistors of motor elbow have 81 °C, more than 80 °C");
+    assert_eq!(fault.words(&names).to_string(), "motor elbow: transistors at 81 °C (limit 80 °C)");
     let notice = Notice::Fault(Fault::Latched { motor: 0, status: MotorStatus::OverCurrent });
     assert_eq!(notice.words(&names).to_string(), "motor shoulder reports over-current: all motors are stopped");
     assert!(notice.is_problem() && !Notice::Armed.is_problem());

@@ -45,20 +45,27 @@ impl fmt::Display for Strange {
         match self {
             Self::Jump { from, to } => write!(
                 f,
-                "reports {to:.3} rad after {from:.3} rad, where it cannot have come: a damaged frame, or another program \
-                 set its zero"
+                "reports {to:.3} rad after {from:.3} rad, which it cannot have reached: a damaged frame, or another \
+                 program set its zero"
             ),
             Self::Beyond { position, range: [low, high] } => {
                 write!(f, "is at {position:.3} rad, outside its limits of {low} to {high} rad")
             }
-            Self::Fast { velocity, limit } => write!(f, "moves at {velocity:.2} rad/s, and {limit} rad/s is its limit"),
-            Self::Strong { torque, limit } => write!(f, "reports {torque:.2} Nm, and {limit} Nm is its limit"),
-            Self::Driven { torque } => write!(f, "moves away from its command against {torque} Nm, its limit"),
+            Self::Fast { velocity, limit } => {
+                write!(f, "moves at {velocity:.2} rad/s, beyond its limit of {limit} rad/s")
+            }
+            Self::Strong { torque, limit } => write!(f, "reports {torque:.2} Nm, beyond its limit of {limit} Nm"),
+            Self::Driven { torque } => {
+                write!(f, "moves away from its command, against its full torque limit of {torque} Nm")
+            }
             Self::Frozen { position, velocity } => {
-                write!(f, "reports {velocity:.2} rad/s and stays at {position:.3} rad: its encoder stands still")
+                write!(f, "reports {velocity:.2} rad/s but stays at {position:.3} rad: its encoder stands still")
             }
             Self::Blocked { torque } => {
-                write!(f, "does not move with {torque} Nm, its limit: it is blocked, or its encoder stands still")
+                write!(
+                    f,
+                    "does not move at its torque limit of {torque} Nm: it is blocked, or its encoder stands still"
+                )
             }
             Self::Lagging { command, is } => write!(f, "does not follow: {command:.3} is commanded, {is:.3} reported"),
         }
@@ -71,7 +78,7 @@ impl fmt::Display for Words<'_, Fault> {
             Fault::Silent { motor } => write!(f, "motor {} does not answer", self.name(motor)),
             Fault::Latched { motor, status } => write!(f, "motor {} reports {status}", self.name(motor)),
             Fault::Hot { motor, part, celsius, limit } => {
-                write!(f, "the {part} of motor {} have {celsius} °C, more than {limit} °C", self.name(motor))
+                write!(f, "motor {}: {part} at {celsius} °C (limit {limit} °C)", self.name(motor))
             }
             Fault::Strange { motor, what } => write!(f, "motor {} {what}", self.name(motor)),
             Fault::Changed { motor, parameter, value } => {
@@ -105,7 +112,7 @@ impl fmt::Display for Words<'_, Fault> {
             Fault::Unusable { motor, parameter: Parameter::PMax, value }
                 if value.number().is_finite() && value.number() > 0.0 =>
             {
-                write!(f, "motor {} counts to {value} rad, and its `position` lies beyond that", self.name(motor))
+                write!(f, "motor {} reports at most {value} rad, and its `position` lies beyond that", self.name(motor))
             }
             Fault::Unusable { motor, parameter, value } => {
                 write!(f, "{parameter} of motor {} is {value}, and cannot be used or changed", self.name(motor))
@@ -117,14 +124,14 @@ impl fmt::Display for Words<'_, Fault> {
 impl fmt::Display for Words<'_, Refusal> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.what {
-            Refusal::Length => f.write_str("it has not one number for each motor"),
-            Refusal::NotFinite => f.write_str("a number of it is not finite"),
+            Refusal::Length => f.write_str("it does not have one number for each motor"),
+            Refusal::NotFinite => f.write_str("one of its numbers is not finite"),
             Refusal::Old => f.write_str("it is too old"),
             Refusal::Early => f.write_str("its time is in the future"),
             Refusal::Returning => f.write_str("joints are being driven back into their limits"),
             Refusal::Far { motor } => write!(
                 f,
-                "it is the first after the arm, and motor {} is farther from it than `first_target`",
+                "it is the first after arming, and motor {} is farther from it than `first_target`",
                 self.name(*motor)
             ),
         }
@@ -138,7 +145,8 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::Unanswered { motor } => write!(f, "motor {} has not answered yet", self.name(*motor)),
             Notice::RangesDiffer { motor, read, shipped: [p, v, t] } => write!(
                 f,
-                "motor {} counts in PMAX {} VMAX {} TMAX {}, its type is shipped with {p} {v} {t}; the motor's own are used",
+                "motor {} counts in PMAX {} VMAX {} TMAX {}, but its type is shipped with {p} {v} {t}; the motor's own are \
+                 used",
                 self.name(*motor),
                 read.position(),
                 read.velocity(),
@@ -148,17 +156,17 @@ impl fmt::Display for Words<'_, Notice> {
                 write!(f, "{parameter} of motor {} was {was} and is {is} now", self.name(*motor))
             }
             Notice::Warm { motor, part, celsius, limit } => {
-                write!(f, "the {part} of motor {} have {celsius} °C, of at most {limit} °C", self.name(*motor))
+                write!(f, "motor {}: {part} at {celsius} °C (limit {limit} °C)", self.name(*motor))
             }
             Notice::Strange { motor, what } => write!(f, "motor {} {what}", self.name(*motor)),
             Notice::OtherMaster { motor } => {
-                write!(f, "another program on the bus commands motor {}: end it before an arm", self.name(*motor))
+                write!(f, "another program on the bus commands motor {}: end it before arming", self.name(*motor))
             }
             Notice::Latched { motor, status } => {
-                write!(f, "motor {} reports {status}: the next arm clears it", self.name(*motor))
+                write!(f, "motor {} reports {status}: arming clears it", self.name(*motor))
             }
             Notice::Cleared { motor, status } => {
-                write!(f, "motor {} reported {status}: cleared for this arm", self.name(*motor))
+                write!(f, "motor {} reported {status}: cleared in order to arm", self.name(*motor))
             }
             Notice::Arming => f.write_str("motors are being armed"),
             Notice::Armed => f.write_str("motors are armed, and hold until an action comes"),
@@ -175,8 +183,8 @@ impl fmt::Display for Words<'_, Notice> {
             }
             Notice::Kept { damped, held, braked } => {
                 let parts = [
-                    ("damped until a disarm", damped),
-                    ("holding until a disarm", held),
+                    ("damped until disarmed", damped),
+                    ("holding until disarmed", held),
                     ("holding until the brake is engaged", braked),
                 ];
                 for (word, bits) in parts.into_iter().filter(|(_, bits)| **bits != 0) {
@@ -190,14 +198,14 @@ impl fmt::Display for Words<'_, Notice> {
             }
             Notice::NotBraked { motor } => write!(
                 f,
-                "the brake of motor {} cannot be driven: its motor alone holds the joint; support it before a disarm",
+                "the brake of motor {} cannot be driven: its motor alone holds the joint; support it before disarming",
                 self.name(*motor)
             ),
             Notice::Clamped { motor, target, used } => {
                 write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
             }
             Notice::Refused(refusal) => {
-                write!(f, "an action moves nothing: {}", Words { what: refusal, names: self.names, stops: self.stops })
+                write!(f, "an action is refused: {}", Words { what: refusal, names: self.names, stops: self.stops })
             }
         }
     }

@@ -69,7 +69,7 @@ impl Browser {
         let daemon = match ServiceDaemon::new() {
             Ok(daemon) => daemon,
             Err(error) => {
-                tracing::error!(%error, "devices that announce themselves are not found: mDNS cannot be spoken");
+                tracing::error!(%error, "devices that announce themselves are not found: mDNS is not available");
                 return None;
             }
         };

@@ -218,7 +218,7 @@ impl<const MIN: i64, const MAX: i64> TryFrom<i64> for Whole<MIN, MAX> {
         let found = usize::try_from(number).ok().filter(|_| (MIN..=MAX).contains(&number));
         found.map(Self).ok_or_else(|| match MAX - MIN {
             0 => format!("{number} is not supported, only {MIN} is"),
-            _ => format!("{number} is not within {MIN} and {MAX}"),
+            _ => format!("{number} is not between {MIN} and {MAX}"),
         })
     }
 }

@@ -15,6 +15,7 @@ use super::spec::{
     QUATERNION, SchedulerSpec, TimestepSpacing, VectorSpec, WhenAbsent,
 };
 use crate::registry::did_you_mean;
+use crate::text::counted;
 
 /// What `format` must be.
 const FORMAT: &str = "rapid-policy/1";
@@ -116,14 +117,14 @@ fn section<T: DeserializeOwned>(root: &Value, name: &str, problems: &mut Problem
 
 fn check_range(entry: &str, number: f64, range: &RangeInclusive<f64>, problems: &mut Problems) {
     if !range.contains(&number) {
-        problems.wrong(entry, format!("{number} is not within {} and {}", range.start(), range.end()));
+        problems.wrong(entry, format!("{number} is not between {} and {}", range.start(), range.end()));
     }
 }
 
 pub(super) fn check_length(entry: &str, numbers: &[f32], len: usize, problems: &mut Problems) -> bool {
     if numbers.len() != len {
-        let plural = if len == 1 { "" } else { "s" };
-        problems.wrong(entry, format!("has {} numbers for {len} dimension{plural}", numbers.len()));
+        let [found, len] = [(numbers.len(), "number"), (len, "dimension")].map(|(count, of)| counted(count as u64, of));
+        problems.wrong(entry, format!("has {found} for {len}"));
     }
     numbers.len() == len
 }
@@ -319,7 +320,7 @@ pub(super) fn normalization(
                 return None;
             }
             if !(0.0..=1.0).contains(eps) {
-                problems.wrong(&place("eps"), format!("{eps} is not within 0 and 1"));
+                problems.wrong(&place("eps"), format!("{eps} is not between 0 and 1"));
                 return None;
             }
             for (at, std) in std.iter().enumerate() {
@@ -401,7 +402,7 @@ fn check_scheduler(scheduler: &SchedulerSpec, problems: &mut Problems) {
     }
     let range = scheduler.clip_sample_range;
     if !(1e-6..=1000.0).contains(&range) {
-        problems.wrong("scheduler.clip_sample_range", format!("{range} is not within 0.000001 and 1000"));
+        problems.wrong("scheduler.clip_sample_range", format!("{range} is not between 0.000001 and 1000"));
     }
     let (train, steps) = (scheduler.num_train_timesteps, scheduler.num_inference_steps);
     let last = (steps - 1) * (train / steps) + scheduler.steps_offset;

@@ -181,7 +181,7 @@ fn unsuitable_pictures_are_refused_with_their_reason() {
     let grey = vec![9; 6];
     let whole = jpeg(&vec![90; 3 * 16 * 16], [16, 16]);
     let cases: [(Picture<'_>, &str); 7] = [
-        (picture(Encoding::F64, [2, 2], &grey), "the samples are no pictures but F64"),
+        (picture(Encoding::F64, [2, 2], &grey), "the samples are F64, not pictures"),
         (picture(Encoding::Grey, [2, 2], &grey), "6 bytes, where a picture of 2x2 has 4"),
         (picture(Encoding::Yuyv, [1, 3], &grey), "damaged picture: an odd number of pixels in YUYV"),
         (picture(Encoding::Grey, [0, 2], &[]), "damaged picture: 2x0 pixels"),

@@ -50,7 +50,7 @@ pub(super) fn damage(integrity: &Integrity) -> String {
         FileEnd::Finished => "parts of it are damaged",
         FileEnd::Unfinished => UNFINISHED,
         FileEnd::Torn => "its last record is cut",
-        FileEnd::Damaged => "from some place on it cannot be read",
+        FileEnd::Damaged => "it cannot be read from some place on",
     };
     let left_out = integrity.left_out.sentences(integrity.damaged_chunks);
     std::iter::once(end.to_owned()).chain(left_out).collect::<Vec<_>>().join("; ")

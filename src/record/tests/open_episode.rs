@@ -6,6 +6,7 @@ use super::super::provenance::Attached;
 use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
 use crate::provenance::UnplugSource;
+use crate::text::counted;
 use crate::time::WallClock;
 
 /// An open episode of its own clock, one second after the monotonic clock's zero.
@@ -129,7 +130,7 @@ fn losses_are_announced_once_a_second_and_counted_all() {
             answer.push(text);
         }
     }
-    let lost = |count: u64, name: &str| format!("{name}: {count} samples lost on the way to the file");
+    let lost = |count: u64, name: &str| format!("{name}: {} lost on the way to the file", counted(count, "sample"));
     let both = |count, own| format!("{}, {own} samples lost by the device", lost(count, "tof"));
     assert_eq!(answer, [lost(2, "tof"), both(200, 101), lost(u64::MAX, "cam_wrist"), both(196, 98)]);
     let tallies = &read(&report.file).metadata["rapid/summary"]["modalities"];

@@ -204,7 +204,11 @@ pub(super) fn streams<'a>(owner: &Draft<'a>, programs: Programs<'_>) -> Vec<Draf
     let usb = owner.identity.as_ref().and_then(IdentitySpec::usb);
     if usb.is_some_and(|usb| usb.serial.is_none() && usb.port.is_none()) {
         let fix = "write its serial = \"...\" or its port = \"...\"";
-        owner.section.report(STREAM, "any unit of the model fits: of which one the stream is, is not known", fix);
+        owner.section.report(
+            STREAM,
+            "any unit of the model fits: it is not known which one the stream belongs to",
+            fix,
+        );
     }
     let mut drafts = Vec::new();
     for (at, stream, value) in streams.fields() {
@@ -379,7 +383,7 @@ pub(super) fn action(section: &Section<'_>, moves: bool) -> Option<ActionSpec> {
     }
     table.allow(&ACTION_KEYS);
     for key in ACTION_KEYS {
-        table.need(key, &format!("write {key} = a list with one entry an axis"));
+        table.need(key, &format!("write {key} = a list with one entry per axis"));
     }
     // All of them first: every mistake is reported.
     let (names, units) = (table.texts("names"), table.texts("units"));

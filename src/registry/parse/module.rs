@@ -28,7 +28,7 @@ pub(super) fn modules(root: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<ModuleSpe
             section.report_at(section.at, format!("{name:?} cannot be a module's name"), fix);
         }
         if name == "none" {
-            let fix = "give it another name: `--module none` is that no named one is mounted";
+            let fix = "give it another name: `--module none` means that no declared one is mounted";
             section.report_at(section.at, "\"none\" cannot be a module's name", fix);
         }
         modules.extend(module(name, &section, drafts, &modules));

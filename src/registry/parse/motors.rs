@@ -214,7 +214,7 @@ fn mounting(entry: &Section<'_>, kind: Option<MotorKind>, limits: Option<[f64; 2
     let [most, ..] = kind.shipped();
     let is_beyond = |position: f64| position.abs() > most;
     if is_beyond(zero) {
-        let message = format!("zero = {zero:?} is farther than a {} counts, {most} rad", kind.name());
+        let message = format!("zero = {zero:?} is farther than a {} can count, {most} rad", kind.name());
         let fix = "write what the motor reports at the zero of its joint, in rad: 90 degrees are 1.571 rad";
         entry.report("zero", message, fix);
         return mounting;

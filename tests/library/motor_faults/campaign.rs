@@ -240,7 +240,7 @@ impl Campaign {
             14 => {
                 let degrees = 101 + self.random.below(10);
                 self.order(&format!("hot 0.{id} {degrees}"));
-                self.owe(motor, "have", NAMED_WITHIN);
+                self.owe(motor, "°C", NAMED_WITHIN);
                 self.pass(100);
                 self.order(&format!("hot 0.{id} 40"));
             }

@@ -333,7 +333,7 @@ fn positions_beyond_the_range_of_the_motor_are_a_fault() {
             let expected = Fault::Unusable { motor: 0, parameter: Parameter::PMax, value: Value::Float(12.5) };
             assert_eq!(fault, expected, "{position:?}");
             let text = fault.words(world.bus.names()).to_string();
-            assert_eq!(text, "motor joint_1 counts to 12.5 rad, and its `position` lies beyond that");
+            assert_eq!(text, "motor joint_1 reports at most 12.5 rad, and its `position` lies beyond that");
         }
     }
 }

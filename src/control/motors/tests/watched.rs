@@ -88,7 +88,7 @@ type Trouble = (&'static str, fn(&mut World), std::ops::RangeInclusive<usize>, &
 fn a_persistent_condition_causes_a_warning_and_then_a_named_fault() {
     const TROUBLES: [Trouble; 6] = [
         ("it sinks", |world| (world.sims[0].stuck, world.sims[0].drift) = (true, -0.77), 40..=80, "moves away from"),
-        ("it is blocked", |world| world.sims[0].stuck = true, 400..=450, "does not move with 1 Nm"),
+        ("it is blocked", |world| world.sims[0].stuck = true, 400..=450, "does not move at its torque limit of 1 Nm"),
         ("its encoder is frozen", |world| world.sims[0].stuck = true, 400..=450, "does not move"),
         (
             "it is pushed out",

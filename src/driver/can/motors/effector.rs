@@ -20,6 +20,7 @@ use crate::action::{ActionSource, MAX_ACTION, NoAction};
 use crate::bell::Bell;
 use crate::kinematics::{Arm, Solver};
 use crate::registry::{MAX_MOTORS, MOTOR_CHANNELS};
+use crate::text;
 use crate::time::Stamp;
 
 /// The longest time that an action without a notification waits.
@@ -60,7 +61,7 @@ impl Tally {
 impl fmt::Display for Tally {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { followed, out_of_reach, invalid } = self;
-        write!(f, "{followed} actions followed, {out_of_reach} out of reach, {invalid} invalid")
+        write!(f, "{} followed, {out_of_reach} out of reach, {invalid} invalid", text::counted(*followed, "action"))
     }
 }
 

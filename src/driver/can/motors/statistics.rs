@@ -6,6 +6,7 @@ use std::time::Duration;
 use hdrhistogram::Histogram;
 
 use crate::control::motors::Counts;
+use crate::text;
 use crate::time::nanoseconds;
 
 /// Longest time the statistics distinguish, ns.
@@ -88,17 +89,18 @@ impl LoopStatistics {
     /// What went wrong, with what the motors' bus counted, for people; `None` if nothing did.
     pub(super) fn mishaps(&self, bus: &Counts) -> Option<String> {
         let all = [
-            (bus.faults, "faults"),
-            (bus.refused, "actions refused"),
-            (bus.clamped, "values beyond their limits"),
-            (self.full, "frames without room to the bus"),
-            (self.unsent, "frames that the adapter did not send"),
-            (self.lost_frames, "frames lost before they were read"),
-            (bus.strangers, "frames of no motor of the entry"),
-            (self.lost_samples, "samples that were not read in time"),
-            (bus.lost_notices, "notices that were not read in time"),
+            (bus.faults, "fault", ""),
+            (bus.refused, "action", " refused"),
+            (bus.clamped, "value", " beyond the limits"),
+            (self.full, "frame", " without room in the queue to the bus"),
+            (self.unsent, "frame", " not sent by the adapter"),
+            (self.lost_frames, "frame", " lost before being read"),
+            (bus.strangers, "frame", " of no motor of the entry"),
+            (self.lost_samples, "sample", " not read in time"),
+            (bus.lost_notices, "notice", " not read in time"),
         ];
-        let counted = all.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
+        let counted = all.iter().filter(|(count, ..)| *count > 0);
+        let counted = counted.map(|(count, what, how)| format!("{}{how}", text::counted(*count, what)));
         let counted = counted.collect::<Vec<_>>().join(", ");
         (!counted.is_empty()).then_some(counted)
     }
@@ -127,6 +129,6 @@ mod tests {
         assert_eq!(statistics.mishaps(&Counts::default()), None);
         statistics.full = 3;
         let bus = Counts { actions: 9, faults: 1, ..Counts::default() };
-        assert_eq!(statistics.mishaps(&bus).as_deref(), Some("1 faults, 3 frames without room to the bus"));
+        assert_eq!(statistics.mishaps(&bus).as_deref(), Some("1 fault, 3 frames without room in the queue to the bus"));
     }
 }

@@ -221,7 +221,7 @@ async fn a_pose_out_of_reach_is_reported() {
     let sample = timeout(PATIENCE, motors.read()).await.expect("a sample").unwrap();
     assert_eq!(sample.bytes.len(), 8 * (SAMPLE_VALUES + 7), "the motor, and the pose of the tip");
     above.0.store(true, Ordering::Release);
-    let notice = reported(&mut motors, |notice| notice.text.contains("the arm does not reach the pose")).await;
+    let notice = reported(&mut motors, |notice| notice.text.contains("the arm cannot reach the pose")).await;
     assert!(notice.is_problem, "{notice:?}");
     motors.close().await;
     behaviour.ends.store(true, Ordering::Release);
@@ -276,7 +276,7 @@ async fn notices_wait_for_room() {
         }
     }
     for _ in 0..COUNT {
-        reported(&mut motors, |notice| notice.text.contains("of at most 80 °C")).await;
+        reported(&mut motors, |notice| notice.text.contains("(limit 80 °C)")).await;
     }
 }
 

@@ -217,7 +217,9 @@ impl Camera {
             match newest(&self.server).await {
                 Ok(Some(clip)) => Before::Clip(clip),
                 Ok(None) => Before::Nothing,
-                Err(reason) => Before::Unknown(format!("which clip was newest before it is not known: {reason}")),
+                Err(reason) => {
+                    Before::Unknown(format!("it is not known which clip was the newest before it: {reason}"))
+                }
             }
         };
         self.books.set_shutter(Some(Shutter { episode, before })).await;
@@ -243,7 +245,7 @@ impl Camera {
             && !self.look().await.is_ok_and(|state| !state.recording)
         {
             if !std::mem::replace(&mut self.is_stated, true) {
-                tracing::error!(device = self.name, %error, "the camera records on; it is asked again to stop");
+                tracing::error!(device = self.name, %error, "the camera is still recording; it is asked again to stop");
             }
             return false;
         }
@@ -314,7 +316,7 @@ impl Camera {
         let newest = newest(&self.server).await.ok().flatten();
         let newest = newest.map(|Name { folder, file }| format!("; the newest on the card is {folder}/{file}"));
         let (episode, newest) = (shutter.episode.display(), newest.unwrap_or_default());
-        tracing::error!(device = self.name, "which clip belongs to {episode} is not known: {reason}{newest}");
+        tracing::error!(device = self.name, "it is not known which clip belongs to {episode}: {reason}{newest}");
     }
 
     /// Continues fetching clips.
@@ -354,10 +356,17 @@ impl Drop for Camera {
         }
         if let Some((shutter, _)) = &self.unlisted {
             let episode = shutter.episode.display();
-            tracing::error!(device = self.name, "which clip belongs to {episode} is not known: it was not listed yet");
+            tracing::error!(
+                device = self.name,
+                "it is not known which clip belongs to {episode}: it was not listed yet"
+            );
         }
         if let Some(shutter) = self.books.shutter() {
-            tracing::warn!(device = self.name, "the camera may record on, for {}{then}", shutter.episode.display());
+            tracing::warn!(
+                device = self.name,
+                "the camera may still be recording, for {}{then}",
+                shutter.episode.display()
+            );
         }
     }
 }

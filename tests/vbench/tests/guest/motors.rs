@@ -175,7 +175,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
     let faulted: Vec<&str> = outcome.rapid.iter().filter(is_faulted).filter_map(|line| line["text"].as_str()).collect();
     println!("{faulted:#?}");
     for trouble in
-        ["shoulder reports over-current:", "gripper does not answer:", "gripper have 95 °C, more than 80 °C:"]
+        ["shoulder reports over-current:", "gripper does not answer:", "gripper: transistors at 95 °C (limit 80 °C):"]
     {
         let reported = faulted.iter().any(|text| text.contains(trouble) && text.ends_with("all motors are stopped"));
         assert!(reported, "{trouble} is not reported in {faulted:#?}");
