@@ -23,7 +23,7 @@ MB = 1e6
 def main() -> None:
     parser = argparse.ArgumentParser(prog="rapid_policy.cache", description="Builds, verifies or measures the decoded episodes on disk.")
     parser.add_argument("part", choices=("build", "verify", "bench"))
-    parser.add_argument("experiment", type=Path, help="which modalities and sizes are read from an episode (*.toml)")
+    parser.add_argument("experiment", type=Path, help="says what is read from an episode (*.toml)")
     parser.add_argument("--cache", type=Path, required=True, metavar="DIR", help="folder of decoded episodes")
     parser.add_argument("--data", type=Path, nargs="+", metavar="FOLDER", help="in place of the experiment's folders")
     parser.add_argument("--workers", type=int, default=2, help="processes that decode")
