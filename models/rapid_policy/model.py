@@ -169,7 +169,7 @@ class ObservationEncoder(nn.Module):
         seen, there = [], []
         for history, valid in self.history_keys[key]:
             there.append(observations[valid] > 0.5)
-            # A graph, in onnxruntime or on a GPU, computes all steps, valid or not; training on a CPU computes only the valid ones.
+            # A graph, in onnxruntime or on a GPU, computes all steps, valid or not; training on a CPU only the valid ones.
             fewer = pooled and now.device.type == "cpu"
             seen.append(self._embed(key, observations[history], pooled=pooled, there=there[-1] if fewer else None))
         return self.histories[key](torch.cat(seen, 1), torch.cat(there, 1)).unsqueeze(1).to(now.dtype)
