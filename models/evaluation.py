@@ -4,7 +4,7 @@
     evaluation.py --rapid ../target/release/rapid [--runs runs/evaluation] [--trials 100] [--seeds-from 50000]
 
 Each run is a `rapid eval`, whose output is kept in RUNS/NAME.jsonl, below its command line and the hash of the program: a run
-whose output by the same program is already there is not repeated. The results, `results/eval.jsonl` (the conditions) and
+whose output by the same program is there already is not repeated. The results, `results/eval.jsonl` (the conditions) and
 `results/eval.md`, are those of the policies that are in the repository now: output of others is refused. With --seeds-from,
 results have the seed of the first trial in their names: `eval-60000.md`.
 """
@@ -66,7 +66,7 @@ class EvaluationError(Exception):
 def main() -> None:
     parser = argparse.ArgumentParser(description="Runs the policies with a sensor that is pulled out.")
     parser.add_argument("--rapid", type=Path, required=True, help="the program")
-    parser.add_argument("--runs", type=Path, default=Path("runs/evaluation"), help="folder of what is printed (default: runs/evaluation)")
+    parser.add_argument("--runs", type=Path, default=Path("runs/evaluation"), help="folder of what is printed")
     parser.add_argument("--out", type=Path, default=MODELS / "results")
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--seeds-from", type=seed, default=FIRST_SEED, metavar="N", help="seed of the first trial")

@@ -5,7 +5,8 @@
         --modality observation.images.top=cam_top --modality observation.state=arm
 
 For policies with one or two cameras and observation.state. The bundle is compared with LeRobot on random observations
-before it gets its name; a difference above 1e-4 is an error. Needs the packages of models/requirements-lerobot.txt. Nothing is fetched.
+before it gets its name; a difference above 1e-4 is an error. Needs the packages of models/requirements-lerobot.txt.
+Nothing is fetched.
 """
 
 import argparse

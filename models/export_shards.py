@@ -61,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
     add("--out", metavar="SHARDS", type=Path, required=True, help="folder of the shards")
     add("--episodes-per-shard", metavar="N", type=int, default=100, help="episodes in a shard (default: 100)")
     add("--rapid", metavar="PROGRAM", default="rapid", help="the program on each machine (default: rapid)")
-    add("--address", help="address of the cluster (default: RAY_ADDRESS, or the one on this machine; if there is none, this machine alone)")
+    add("--address", help="address of the cluster (default: RAY_ADDRESS, or the one on this machine; without one: this machine)")
     add("--retries", metavar="N", type=int, default=3, help="retries of a shard whose machine died (default: 3)")
     of_merge = commands.add_parser("merge", help="make one data set of the shards, with LeRobot", **plain)
     of_merge.add_argument("shards", metavar="SHARDS", type=Path, help="folder of the shards")

@@ -5,8 +5,8 @@
 
 For the program, everything is measured: startup, reading the episode twice, statistics, checksum, writing; its AV1 videos
 too, if there is an ffmpeg. For LeRobot, only `add_frame`, `save_episode` and `finalize` are measured, on pictures that are
-already decoded, with the four threads per camera of lerobot-record: pictures as PNG, and as AV1 video. Prints one JSON object. Needs the packages of
-models/requirements-lerobot.txt and an idle machine.
+already decoded, with the four threads per camera of lerobot-record: pictures as PNG, and as AV1 video. Prints one JSON
+object. Needs the packages of models/requirements-lerobot.txt and an idle machine.
 """
 
 import argparse

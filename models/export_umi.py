@@ -98,7 +98,7 @@ def parser() -> argparse.ArgumentParser:
     add("out", metavar="OUT", type=Path, help="the buffer, NAME.zarr.zip; must not exist")
     more = {"action": "append", "default": []}
     add("--camera", metavar="SENSOR", **more, help="the next camera; may be repeated")
-    add("--size", metavar="WxH", type=size, help="crop pictures around their centre to these proportions, and scale them to this size")
+    add("--size", metavar="WxH", type=size, help="crop pictures around their centre to this shape and scale them to this size")
     add("--pose", metavar="COLUMNS", **more, help="pose of the next gripper; may be repeated")
     add("--gripper", metavar="COLUMN[*FACTOR]", **more, help="its opening; FACTOR converts it to metres")
     add("--array", metavar="NAME=COLUMNS", **more, help="a further array (f32), such as state=arm or action=action")

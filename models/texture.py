@@ -123,7 +123,8 @@ def asked(spec: Classification, args: argparse.Namespace) -> Classification:
 
 
 def inputs(spec: Classification, keys: list[str] | None) -> list[Input]:
-    """Those of the experiment with these keys, or all if there are none. The one that shows the touch may be left out: it is still read."""
+    """Those of the experiment with these keys, or all if there are none. The one that shows the touch may be left out: it is
+    still read."""
     known = [o.key for o in spec.input]
     for key in keys or ():
         if key not in known:
@@ -236,7 +237,8 @@ class Classifier(nn.Module):
 
 
 def fit(pictures: Pictures, chosen: NDArray[np.int64], training: Training, random: np.random.Generator) -> Classifier:
-    """Trains on randomly shifted pictures. They are not rotated: under fixed lights, half a turn would make bumps look like holes."""
+    """Trains on randomly shifted pictures. They are not rotated: under fixed lights, half a turn would make bumps look like
+    holes."""
     fitting = training.spec.training
     classifier = Classifier(training.spec, training.input).to(training.device)
     optimizer = torch.optim.AdamW(classifier.parameters(), fitting.learning_rate)

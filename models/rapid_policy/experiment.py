@@ -1,8 +1,8 @@
 """An experiment: the data, the policy and its training, as one description that loader, networks, training and exporter
 share. `experiment_file` reads it from TOML; a checkpoint or a bundle's weights restore it.
 
-The models check each key, and keys that depend on each other. A finding names cause and fix; `experiment_file` adds its place
-in the file.
+The models check each key, and keys that depend on each other. A finding names cause and fix; `experiment_file` adds its
+place in the file.
 """
 
 from __future__ import annotations

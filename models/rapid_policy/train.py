@@ -291,7 +291,7 @@ def parse() -> argparse.Namespace:
         type=whole(MOST),
         default=20,
         metavar="N",
-        help=f"trials of the simulated task: condition {CONDITION}, seeds from {FIRST_SEED} on, which no reported result uses (20)",
+        help=f"trials of the simulated task: condition {CONDITION}, seeds from {FIRST_SEED} on, which no result uses (20)",
     )
     return parser.parse_args()
 
