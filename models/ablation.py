@@ -6,9 +6,9 @@
 
 The configurations are those of the RAPID paper's appendix, each an experiment of `experiments/`, all trained for the same
 number of iterations. Each is exported and evaluated by `rapid eval`, the program that runs policies, with everything plugged
-in. What an earlier run has trained or evaluated in the same way is used again, and an interrupted training continues; what
-was trained in another way is refused: --name gives such a table other files and runs. The results are rewritten after every
-evaluation, with all that are available.
+in. What an earlier run has trained or evaluated in the same way is reused, and an interrupted training continues; what
+was trained in another way is refused: --name gives such a table files and runs of its own. The results are rewritten after
+every evaluation, with all those available.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Configuration:
     """One row of the table."""
 
     name: str
-    """Of its experiment, its policy and its folders."""
+    """The name of its experiment, its policy and its folders."""
     title: str
     """Its name in the paper."""
     data: str
@@ -90,7 +90,7 @@ class Training:
 
     @property
     def trials(self) -> Path:
-        """What `rapid eval` printed of it."""
+        """What `rapid eval` printed about it."""
         return self.folder / "eval.json"
 
     @property
@@ -129,20 +129,20 @@ def main() -> None:
 
 
 def as_done(pending: set[Future]) -> Iterator[Future]:
-    """Each as it ends. A signal that arrives just before a wait is noticed after it only, so that none is long."""
+    """Each as it ends. A signal that arrives just before a wait is noticed only after it, so no wait is long."""
     while pending:
         done, pending = wait(pending, timeout=NOTICED, return_when=FIRST_COMPLETED)
         yield from done
 
 
 class Children:
-    """The programs that run; none starts after the end, which lets a training write its checkpoint."""
+    """The running programs; none starts after `end`, which lets a training write its checkpoint."""
 
     def __init__(self) -> None:
         self._lock, self._running, self._ended = threading.Lock(), set(), False
 
     def run(self, command: list[str], **options: Any) -> str | None:
-        """Runs a program to its end; what it printed, if that is asked for.
+        """Runs a program to its end. Returns what it printed, if that is asked for.
 
         Raises `CalledProcessError` if it fails.
         """
@@ -190,7 +190,7 @@ def parse() -> argparse.Namespace:
 
 
 def carry_out(training: Training, args: argparse.Namespace) -> None:
-    """Trains, exports and evaluates, as far as that has not been done."""
+    """Trains, exports and evaluates, as far as that has not been done yet."""
     training.folder.mkdir(parents=True, exist_ok=True)
     asked = {
         # Without its comments, which change nothing of what is learned.
@@ -229,7 +229,7 @@ def logged(training: Training, command: list[str], args: argparse.Namespace) -> 
 
 
 def is_judged(training: Training, args: argparse.Namespace) -> bool:
-    """Whether this very bundle has had as many trials."""
+    """Whether this very bundle has had that many trials."""
     if not training.trials.exists():
         return False
     record = json.loads(training.trials.read_text(encoding="utf-8"))
@@ -273,7 +273,7 @@ def summarize(args: argparse.Namespace) -> None:
 
 
 def command(name: str, seeds: list[int], trials: int, iterations: int, chosen: list[str]) -> str:
-    """What makes a table of the configurations `chosen`."""
+    """The command that makes a table of the configurations `chosen`."""
     words = [f"ablation.py EPISODES --rapid RAPID --trials {trials} --iterations {iterations}"]
     words += [f"--seeds {' '.join(map(str, seeds))}"]
     words += [f"--only {one}" for one in chosen if len(chosen) < len(CONFIGURATIONS)]
@@ -282,7 +282,7 @@ def command(name: str, seeds: list[int], trials: int, iterations: int, chosen: l
 
 
 def summary(configuration: Configuration, args: argparse.Namespace) -> dict[str, Any] | None:
-    """One row, of all seeds of its training; none if nothing has been evaluated yet."""
+    """One row, over all seeds of its training; none if nothing has been evaluated yet."""
     trainings = [Training(configuration, seed, args.runs / f"{configuration.name}-{seed}") for seed in args.seeds]
     parts = [part(training) for training in trainings if is_judged(training, args)]
     if not parts:

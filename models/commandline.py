@@ -1,11 +1,11 @@
-"""What the commands under models/ share: a parser made of the text of their module, and errors that are one line."""
+"""What the commands under models/ share: a parser made from the docstring of their module, and errors of one line."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
-# Of a parser, and of those of its subcommands.
+# Settings of a parser, and of those of its subcommands.
 PLAIN = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
 
 

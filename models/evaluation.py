@@ -3,10 +3,10 @@
 
     evaluation.py --rapid ../target/release/rapid [--runs runs/evaluation] [--trials 100] [--seeds-from 50000]
 
-Each run is a `rapid eval`, whose output is kept in RUNS/NAME.jsonl, below its command line and the program: what the same
-program has printed for it before is not run again. The results, `results/eval.jsonl` (the conditions) and
-`results/eval.md`, are of the policies that are in the repository now: output of others is refused. Those of other trials
-than the first ones have the seed of the first trial in their names: `eval-60000.md`.
+Each run is a `rapid eval`, whose output is kept in RUNS/NAME.jsonl, below its command line and the hash of the program: a run
+whose output by the same program is there already is not repeated. The results, `results/eval.jsonl` (the conditions) and
+`results/eval.md`, are those of the policies that are in the repository now: output of others is refused. With --seeds-from,
+results have the seed of the first trial in their names: `eval-60000.md`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Run:
     conditions: tuple[str, ...] = ()
 
     def command(self, trials: int, first: int) -> list[str]:
-        """What prints its results, in the folder `models`; `first`: the seed of the first trial."""
+        """The command that prints its results, in the folder `models`; `first`: the seed of the first trial."""
         chosen = [word for condition in self.conditions for word in ("--condition", condition)]
         return ["eval", self.bundle, "--trials", str(trials), "--seed", str(first), "--json", *self.options, *chosen]
 
@@ -66,7 +66,7 @@ class EvaluationError(Exception):
 def main() -> None:
     parser = argparse.ArgumentParser(description="Runs the policies with a sensor that is pulled out.")
     parser.add_argument("--rapid", type=Path, required=True, help="the program")
-    parser.add_argument("--runs", type=Path, default=Path("runs/evaluation"), help="what is printed")
+    parser.add_argument("--runs", type=Path, default=Path("runs/evaluation"), help="folder of what is printed")
     parser.add_argument("--out", type=Path, default=MODELS / "results")
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--seeds-from", type=seed, default=FIRST_SEED, metavar="N", help="seed of the first trial")
@@ -85,7 +85,7 @@ def main() -> None:
 
 
 def seed(text: str) -> int:
-    """The seed of a first trial. No demonstration, and no evaluation while training, has one that is allowed."""
+    """Reads the seed of a first trial. No demonstration and no evaluation while training has a seed that is allowed here."""
     number = int(text)
     if number < FIRST_SEED:
         raise argparse.ArgumentTypeError(f"{number} is below {FIRST_SEED}: of demonstrations, or of evaluations while training")
@@ -98,7 +98,7 @@ def named(name: str, first: int) -> str:
 
 
 def evaluate(run: Run, args: argparse.Namespace) -> list[dict[str, Any]]:
-    """The lines of a run, of an earlier one if there is one."""
+    """The lines of a run, or of the same one made earlier."""
     file, command = args.runs / f"{named(run.name, args.seeds_from)}.jsonl", run.command(args.trials, args.seeds_from)
     head = {"event": "run", "command": command, "program": hashlib.sha256(args.rapid.read_bytes()).hexdigest()}
     known = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
@@ -122,14 +122,14 @@ def evaluate(run: Run, args: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def bundle_hash(rapid: Path, bundle: str) -> str:
-    """What `rapid` calls the bundle."""
+    """The hash that `rapid` has for the bundle."""
     command = [str(rapid.absolute()), "policy", "show", bundle, "--sim", "task", "--json"]
     printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=MODELS).stdout
     return json.loads(printed.splitlines()[0])["hash"]
 
 
 def row(title: str, line: dict[str, Any], compares: bool = True) -> str:
-    """Of a table, from what `rapid eval` printed of a condition; `compares`: with the paper's rows."""
+    """A row of a table, from what `rapid eval` printed about a condition; `compares`: beside the paper's."""
     low, high = line["interval"]
     known = [line["paper_score"], line["paper_status"]]
     paper = " ".join(str(part) for part in known if part not in (None, "-")) or "-"

@@ -4,8 +4,9 @@
     export_lerobot.py outputs/train/pick/checkpoints/last/pretrained_model models/pick --hz 30 \\
         --modality observation.images.top=cam_top --modality observation.state=arm
 
-One or two cameras and observation.state. The bundle is run against LeRobot on random observations before it gets its
-name; a difference above 1e-4 is an error. Needs the packages of models/requirements-lerobot.txt. Nothing is fetched.
+For policies with one or two cameras and observation.state. The bundle is compared with LeRobot on random observations
+before it gets its name; a difference above 1e-4 is an error. Needs the packages of models/requirements-lerobot.txt.
+Nothing is fetched.
 """
 
 import argparse
@@ -62,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--mask-aware",
         action="store_true",
-        help="zero the embedding of a camera that is absent; only for a policy that was trained so",
+        help="zero the embedding of a camera that is absent; only for a policy that was trained that way",
     )
     add(
         "--required",

@@ -4,8 +4,8 @@
     export_shards.py export /data/episodes --out /data/shards -- --state motor_state --verify
     export_shards.py merge /data/shards --out /data/blocks
 
-What follows `--` are options of `rapid export`. All machines see the episodes and the shards under the same paths, and
-have `rapid`. A task makes a shard of some episodes in a folder that gets its name when it is complete; when its machine
+What follows `--` are options of `rapid export`. All machines must see the episodes and the shards under the same paths, and
+have `rapid`. A task makes a shard of some episodes, in a folder that gets its name when it is complete; if its machine
 dies, another one makes it again. The same command continues after any interruption, and adds shards of new episodes.
 `export` needs the packages of models/requirements-fleet.txt, `merge` those of models/requirements-lerobot.txt.
 """
@@ -59,11 +59,11 @@ def parser() -> argparse.ArgumentParser:
     add = of_export.add_argument
     add("episodes", metavar="FILE|DIR", nargs="+", type=Path, help="episodes, or folders of them")
     add("--out", metavar="SHARDS", type=Path, required=True, help="folder of the shards")
-    add("--episodes-per-shard", metavar="N", type=int, default=100, help="of a task (default: 100)")
+    add("--episodes-per-shard", metavar="N", type=int, default=100, help="episodes in a shard (default: 100)")
     add("--rapid", metavar="PROGRAM", default="rapid", help="the program on each machine (default: rapid)")
-    add("--address", help="of the cluster (default: RAY_ADDRESS, or that of this machine; without one: this machine)")
-    add("--retries", metavar="N", type=int, default=3, help="of a shard whose machine died (default: 3)")
-    of_merge = commands.add_parser("merge", help="make one data set of them, with LeRobot", **plain)
+    add("--address", help="address of the cluster (default: RAY_ADDRESS, or the one on this machine; without one: this machine)")
+    add("--retries", metavar="N", type=int, default=3, help="retries of a shard whose machine died (default: 3)")
+    of_merge = commands.add_parser("merge", help="make one data set of the shards, with LeRobot", **plain)
     of_merge.add_argument("shards", metavar="SHARDS", type=Path, help="folder of the shards")
     of_merge.add_argument("--out", metavar="SET", type=Path, required=True, help="the data set; must not exist")
     return out
@@ -91,14 +91,14 @@ def export(options: argparse.Namespace, words: list[str]) -> int:
         task = ray.remote(num_cpus=1, max_retries=options.retries)(shard)
         pending = {task.remote(str(shards), name, files, options.rapid, words): name for name, files in wanted.items()}
         failed = collect(ray, pending)
-        # Of machines that died.
+        # Left by machines that died.
         for left in shards.glob(".shard-*.partial"):
             shutil.rmtree(left, ignore_errors=True)
     return 1 if failed else 0
 
 
 def plan(shards: Path, named: list[Path], size: int) -> dict[str, list[str]]:
-    """The episodes of each shard: those that are listed, and further ones for what is not yet."""
+    """The episodes of each shard: of those that are listed, and of further ones for episodes that are not listed yet."""
     found: list[Path] = []
     for path in named:
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
@@ -161,7 +161,7 @@ def shard(folder: str, name: str, files: list[str], rapid: str, words: list[str]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         events = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
         summary = next((event for event in events if event["event"] == "export"), None)
-        # Without any episode that fits, the code is 1, too, and the shard is an empty one.
+        # Without any episode that fits, the code is 1, too, and the shard is empty.
         if not summary or summary["differences"] or (ended.returncode != 0 and summary["episodes"]):
             raise Failed(f"{node}: {rapid} export: {ended.returncode}: {(ended.stderr or ended.stdout).strip()[-500:]}")
         if summary["episodes"]:
@@ -180,7 +180,7 @@ def shard(folder: str, name: str, files: list[str], rapid: str, words: list[str]
 
 
 def pack(folder: Path) -> None:
-    """Makes few large files of the file of each episode; most of it are JPEGs, which do not become smaller."""
+    """Packs the files of the episodes into a few large ones. Most of their content is JPEGs, which do not become smaller."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

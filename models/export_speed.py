@@ -3,11 +3,10 @@
 
     export_speed.py episodes/20261125_place-block_001.mcap --rapid target/release/rapid
 
-Of the program everything is measured: its start, reading the episode twice, statistics, checksum, writing; where there is an
-ffmpeg, its AV1 videos too. Of LeRobot only
-`add_frame`, `save_episode` and `finalize`, on pictures that are decoded already, with the four threads per camera that
-lerobot-record has: pictures as PNG, and as AV1 video. Prints one JSON object. Needs the packages of
-models/requirements-lerobot.txt and an idle machine.
+For the program, everything is measured: startup, reading the episode twice, statistics, checksum, writing; its AV1 videos
+too, if there is an ffmpeg. For LeRobot, only `add_frame`, `save_episode` and `finalize` are measured, on pictures that are
+already decoded, with the four threads per camera of lerobot-record: pictures as PNG, and as AV1 video. Prints one JSON
+object. Needs the packages of models/requirements-lerobot.txt and an idle machine.
 """
 
 import argparse
@@ -30,7 +29,7 @@ def main() -> int:
     parser = commandline.parser(__doc__)
     parser.add_argument("episode", metavar="FILE", type=Path)
     parser.add_argument("--rapid", metavar="PROGRAM", default="rapid")
-    parser.add_argument("--times", metavar="N", type=int, default=3, help="the fastest of N (default: 3)")
+    parser.add_argument("--times", metavar="N", type=int, default=3, help="run each N times and take the fastest (default: 3)")
     options = parser.parse_args()
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""Makes a replay buffer of UMI and diffusion_policy of a data set that `rapid export --to lerobot` wrote.
+"""Makes a replay buffer for UMI and diffusion_policy from a data set that `rapid export --to lerobot` wrote.
 
     rapid export episodes --to lerobot --out blocks
     export_umi.py blocks blocks.zarr.zip --camera cam_wrist --size 224x224 --pose phone_pose --gripper motor_state.0
 
 COLUMNS are numbers of observation.state or action: `arm` (all of that sensor), `arm.3`, `arm.0-5`, `arm.hip.position` (a name
-in the data set), `action.0-3`, joined by commas. A pose is 6 of them (x y z in metres and a rotation vector), 7 (x y z and a quaternion x y z w), or 16 (a matrix
-4x4, column by column, as phones send it). Each --camera, and each pair of --pose and --gripper, is the next number of UMI:
-camera0_rgb, robot0_eef_pos ...
+in the data set), `action.0-3`, joined by commas. A pose is 6 of them (x y z in metres and a rotation vector), 7 (x y z and a
+quaternion x y z w), or 16 (a 4x4 matrix, column by column, as phones send it). Each --camera, and each pair of --pose and
+--gripper, takes the next number in UMI's names: camera0_rgb, robot0_eef_pos ...
 
-Nothing is made up for a pose: an episode of the buffer is a run of rows in which all poses, all grippers and what
---require names are valid. A camera that is absent is black there, and rapid_mask states it. Needs the packages of
+No pose is made up: an episode of the buffer is a run of rows in which all poses, all grippers and what --require names
+are valid. The picture of an absent camera is black, and rapid_mask shows that it is absent. Needs the packages of
 models/requirements-fleet.txt.
 """
 
@@ -47,7 +47,7 @@ else:
 
 MASK, PLUGGED, VALID, AGE, TIME = "rapid.mask", "rapid.plugged", "rapid.valid", "rapid.age", "rapid.time_ns"
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
-# Pictures that are decoded and packed side by side.
+# Pictures that are decoded and packed in parallel.
 BATCH = 64
 
 
@@ -57,7 +57,7 @@ class Unfit(Exception):
 
 @dataclass(frozen=True)
 class Columns:
-    """Numbers of the data set: the feature and the place in it of each, and the sensors they are of."""
+    """Numbers of the data set: the feature of each and its place there, and the sensors that they belong to."""
 
     text: str
     places: list[tuple[str, int]]
@@ -98,11 +98,11 @@ def parser() -> argparse.ArgumentParser:
     add("out", metavar="OUT", type=Path, help="the buffer, NAME.zarr.zip; must not exist")
     more = {"action": "append", "default": []}
     add("--camera", metavar="SENSOR", **more, help="the next camera; may be repeated")
-    add("--size", metavar="WxH", type=size, help="cut pictures to this shape around their middle and scale them")
+    add("--size", metavar="WxH", type=size, help="crop pictures around their centre to this shape and scale them to this size")
     add("--pose", metavar="COLUMNS", **more, help="pose of the next gripper; may be repeated")
-    add("--gripper", metavar="COLUMN[*FACTOR]", **more, help="its opening; FACTOR makes it metres")
-    add("--array", metavar="NAME=COLUMNS", **more, help="a further array, as state=arm or action=action (f32)")
-    add("--require", metavar="SENSOR", **more, help="leave out rows in which it is not valid; may be repeated")
+    add("--gripper", metavar="COLUMN[*FACTOR]", **more, help="its opening; FACTOR converts it to metres")
+    add("--array", metavar="NAME=COLUMNS", **more, help="a further array (f32), such as state=arm or action=action")
+    add("--require", metavar="SENSOR", **more, help="leave out rows in which this one is not valid; may be repeated")
     add("--min-rows", metavar="N", type=int, default=24, help="leave out shorter runs of rows (default: 24)")
     add("--verify", action="store_true", help="read OUT back and compare every picture and number with SET")
     return out
@@ -210,14 +210,14 @@ def plan(options: argparse.Namespace, features: dict, numbers: dict) -> Buffer:
 
 def columns(option: str, text: str, features: dict) -> Columns:
     """COLUMNS of the command line."""
-    # By the number in the sample of a sensor, and the names of these for people.
+    # By the number in the sample of a sensor, and by their names for people.
     known: dict[str, tuple[str, int]] = {}
     named: dict[str, str] = {}
     owners: dict[tuple[str, int], str] = {}
     for key in (STATE, ACTION):
         feature = features.get(key, {"columns": [], "names": []})
         for at, (column, name) in enumerate(zip(feature["columns"], feature["names"], strict=True)):
-            if not column.startswith("/"):  # of a topic, which is no sensor
+            if not column.startswith("/"):  # of a topic, which is not a sensor
                 known.setdefault(column, (key, at))
                 named.setdefault(name, column)
                 owners[key, at] = column.rpartition(".")[0]
@@ -284,7 +284,7 @@ def take(of: Columns, numbers: dict) -> numpy.ndarray:
 
 
 def robot(name: str, pose: Columns, width: Columns, numbers: dict, buffer: Buffer) -> dict:
-    """UMI's arrays of a gripper."""
+    """UMI's arrays for a gripper."""
     rows = numpy.flatnonzero(buffer.chosen >= 0)
     found = six(take(pose, numbers)[rows])
     wrong = numpy.flatnonzero(~numpy.isfinite(found).all(1))
@@ -304,7 +304,7 @@ def robot(name: str, pose: Columns, width: Columns, numbers: dict, buffer: Buffe
 
 
 def six(values: numpy.ndarray) -> numpy.ndarray:
-    """Poses [T, 6, 7 or 16] as positions and rotation vectors [T, 6]; not a number where there is no rotation."""
+    """Poses [T, 6, 7 or 16] as positions and rotation vectors [T, 6]; NaN where there is no rotation."""
     out = numpy.full((len(values), 6), numpy.nan)
     if values.shape[1] == 6:
         return values

@@ -5,13 +5,13 @@
         --pose arm.0-6 --gripper arm.7 --low=-0.3,-0.5,0.02 --high=0.5,0.5,0.6
 
 A DiffusionUnetTimmPolicy of one robot, with ResNet-18 or 34, ViT or ConvNeXt base. COLUMNS are numbers of a sensor:
-arm.7, arm.0-6 (both included). The pose is x y z in metres and the quaternion x y z w of the same frame of the gripper
-as in the training data. A policy with robot0_eef_rot_axis_angle_wrt_start sees how it has turned since its run began,
-which is its first pose in the run; --start-rotation where every run is to count as begun alike (UMI trains with 0.05 rad of
-noise there), --start-columns where a sensor gives it.
+arm.7, arm.0-6 (both included). The pose is x y z in metres and the quaternion x y z w of the same gripper frame
+as in the training data. A policy with robot0_eef_rot_axis_angle_wrt_start sees how the gripper has turned since its first pose
+in the run. Give --start-rotation if every run is to count as begun with the same rotation (UMI trains with 0.05 rad of
+noise there), or --start-columns if a sensor gives the rotation at the start.
 
-What the checkpoint cannot have in a bundle is refused by its key. No code in the file is run. The bundle is run against
-the networks in PyTorch before it gets its name; a difference above 1e-4 is an error. Needs the packages of
+What a bundle cannot express is refused, with its key. No code in the file is run. The bundle is compared with the networks
+in PyTorch before it gets its name; a difference above 1e-4 is an error. Needs the packages of
 models/requirements.txt. Nothing is fetched.
 """
 
@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
         "--hz",
         type=positive,
         required=True,
-        help="actions a second: the rate of the data (GoPro 59.94) divided by the action's down_sample_steps",
+        help="actions per second: the rate of the data (GoPro 59.94) divided by the action's down_sample_steps",
     )
     add(
         "--modality",
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="WIDTHxHEIGHT",
         type=size,
         help="size of the cameras' pictures: they are resized and cropped as in UMI, but without antialiasing "
-        "(default: they have the size of the checkpoint)",
+        "(default: they have the checkpoint's size)",
     )
     add("--pose", metavar="COLUMNS", required=True, type=columns(7), help="7 numbers: where the gripper is")
     add("--gripper", metavar="COLUMNS", required=True, type=columns(1), help="its opening in metres")
@@ -70,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
         "--start-rotation", metavar="X,Y,Z,W", type=numbers(4), help="the gripper's quaternion when a run begins"
     )
     start.add_argument(
-        "--start-columns", metavar="COLUMNS", type=columns(4), help="4 numbers of a sensor that gives it all the time"
+        "--start-columns", metavar="COLUMNS", type=columns(4), help="4 numbers of a sensor that gives it throughout the run"
     )
     add("--scheduler", choices=["DDIM", "DDPM"], help="run with this scheduler instead of cfg.policy.noise_scheduler's")
     add("--steps", type=count, metavar="N", help="run this many steps instead of cfg.policy.num_inference_steps")
@@ -107,7 +107,7 @@ def export(options: argparse.Namespace) -> None:
 
 
 def scheduled(options: argparse.Namespace, config: checkpoint_config.Config) -> checkpoint_config.Config:
-    """With the scheduler and the number of steps that the command line wants."""
+    """The configuration, with the scheduler and the number of steps that the command line asks for."""
     wanted = {"type": options.scheduler, "num_inference_steps": options.steps}
     scheduler = config.scheduler | {key: value for key, value in wanted.items() if value is not None}
     return dataclasses.replace(config, scheduler=checkpoint_config.visited(config.file, scheduler))
@@ -136,7 +136,7 @@ def settings(options: argparse.Namespace, config: checkpoint_config.Config, kind
 
 
 def begun(options: argparse.Namespace, config: checkpoint_config.Config, kind: type) -> dict:
-    """How the gripper is turned when a run begins, as a matrix, or which numbers of a sensor give it, where not its first
+    """How the gripper is turned when a run begins, as a matrix, or which numbers of a sensor give it, unless its first
     pose does."""
     import numpy as np
 

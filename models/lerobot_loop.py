@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Asks LeRobot's own record loop what it does when a camera fails, and writes the answer beside the other results.
+"""Runs LeRobot's own record loop with a camera that fails, and writes what it does beside the other results.
 
     lerobot_loop.py --rapid ../target/release/rapid [--out results]
 
 An episode of the simulated task with the arm is recorded and exported by the program; its pictures are what LeRobot's cameras
-read. Each condition runs in a process of its own, `lerobot_rig.py`, and its line is what that process saw. The results are
+read. Each condition runs in a process of its own, `lerobot_rig.py`, and its line is what that process recorded. The results are
 `lerobot-loop.jsonl` and `lerobot-loop.md`. Needs the packages of requirements-lerobot.txt: `make lerobot-loop` has them.
 """
 
@@ -64,7 +64,7 @@ def record(rapid: Path, folder: Path) -> Path:
 
 
 def run(data: Path, condition: str, folder: Path) -> dict[str, Any]:
-    """The line of a condition; `exit` is how its process ended, negative: by that signal."""
+    """The line of a condition; `exit` is the exit code of its process, or, negative, the signal that ended it."""
     place = folder / condition
     place.mkdir()
     environment = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}

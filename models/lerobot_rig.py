@@ -4,7 +4,7 @@
     lerobot_rig.py DATASET CONDITION OUT
 
 LeRobot's are the loop, the policy, `predict_action`, the cameras (`OpenCVCamera`: thread, timeouts, errors), the follower's
-`get_observation` and `send_action`, and the data set that is written. Ours are what no simulation of LeRobot's has: the motors
+`get_observation` and `send_action`, and the data set that is written. Ours is what LeRobot has no simulation of: the motors
 (`Motors`) and what OpenCV opens (`Source`), a named pipe with the JPEGs of an episode. Nothing of LeRobot's is patched.
 
 What is written to OUT, one JSON line, is read from the run: times of actions and of the event, the pictures that the loop was
@@ -55,16 +55,16 @@ IMAGES = "observation.images."
 CAMERA = "tactile_tip"
 # Pictures a second; the loop runs at the rate of the data set.
 CAMERA_HZ = 30
-# It fails after so many actions, and the episode ends after so many.
+# How many actions it fails after, and how many the episode ends after.
 EVENT_AT, ACTIONS = 20, 60
 
 
 @dataclass(frozen=True)
 class Event:
-    """What the camera does: its reads fail, as those of a device that is pulled out, or it is open and sends nothing."""
+    """What the camera does: its reads fail, like those of a device that is pulled out, or it is open and sends nothing."""
 
     closes: bool
-    # Until it is back: seconds, or how many times the loop was given its last picture again. Without either it stays away.
+    # When it is back: after seconds, or once the loop was given its last picture again so often. Without either it stays away.
     away_s: float | None = None
     old: int = 0
 
@@ -95,17 +95,17 @@ class Log:
     returned: threading.Event = field(default_factory=threading.Event)
 
     def repeats(self) -> list[float]:
-        """When the loop was given the picture that it had before."""
+        """When the loop was given the same picture as the time before."""
         pairs = zip(self.observations[1:], self.observations, strict=False)
         return [at for (at, digest), (_, last) in pairs if digest == last]
 
     def old(self) -> int:
-        """How often since the camera failed."""
+        """How often that happened since the camera failed."""
         return sum(at > self.failed_at for at in self.repeats())
 
 
 class Source(threading.Thread):
-    """The pictures of an episode, again and again, in a named pipe, from which OpenCV reads them as of a file."""
+    """The pictures of an episode, again and again, in a named pipe, from which OpenCV reads them as from a file."""
 
     def __init__(self, path: Path, pictures: list[bytes], event: Event | None, log: Log):
         super().__init__(name=str(path), daemon=True)
@@ -136,7 +136,7 @@ class Source(threading.Thread):
             self.send(pipe)
 
     def send(self, pipe: Any) -> None:
-        """Sends pictures until the camera fails; without end where it does not, or has been away. It is back once one is sent."""
+        """Sends pictures until the camera fails; endlessly if it does not, or has been away. It is back once one is sent."""
         fails = self.event is not None and self.log.failed_at is None
         while not (fails and self.log.due.is_set()):
             pipe.write(next(self.pictures))
@@ -146,7 +146,7 @@ class Source(threading.Thread):
             time.sleep(1 / CAMERA_HZ)
 
     def wait(self) -> None:
-        """Ends when the camera is to be back; not at all if it stays away."""
+        """Returns when the camera is to be back; never if it stays away."""
         if self.event.old:
             with self.log.observed:
                 self.log.observed.wait_for(lambda: self.log.old() >= self.event.old)
@@ -186,12 +186,12 @@ class Motors:
         self.log.actions.append(time.perf_counter())
         if len(self.log.actions) == EVENT_AT:
             self.log.due.set()
-        # What LeRobot's key "right" sets.
+        # What the key "right" sets in LeRobot.
         self.events["exit_early"] = len(self.log.actions) == ACTIONS
 
 
 class Follower(SOFollower):
-    """LeRobot's follower with other motors. What its loop is given of CAMERA is noted."""
+    """LeRobot's follower with other motors. It records what its loop is given from CAMERA."""
 
     def __init__(self, config: SO101FollowerConfig, motors: Motors, log: Log):
         # Not SOFollower's own, which opens a serial port.
@@ -222,7 +222,7 @@ def main() -> None:
     robot.connect()
     error = None
     try:
-        # As LeRobot's `record` does; its episode has no end but an error and ACTIONS.
+        # As LeRobot's `record` does; only an error or ACTIONS ends the episode.
         with VideoEncodingManager(dataset):
             record_loop(robot, events, dataset.fps, dataset=dataset, control_time_s=math.inf, single_task="loop", **parts)
             dataset.save_episode()
@@ -242,7 +242,7 @@ def main() -> None:
 
 
 def rig(data: Path, condition: str, log: Log, events: dict[str, bool]) -> Follower:
-    """The follower with a camera for each of the data set's; pipes and calibration are in the present folder."""
+    """The follower with a camera for each of the data set's; pipes and calibration are in the current folder."""
     info = json.loads((data / "meta/info.json").read_text(encoding="utf-8"))["features"]
     names = [key.removeprefix(IMAGES) for key in info if key.startswith(IMAGES)]
     (file,) = (data / "data").glob("*/*.parquet")
@@ -286,7 +286,7 @@ def facts(fps: int) -> dict[str, Any]:
 
 
 def observed(log: Log, error: Exception | None) -> dict[str, Any]:
-    """The run in figures. It is a crash if its loop raised, stale if it ended on a picture that it had before."""
+    """The run in figures. It is a crash if its loop raised, stale if it ended on the same picture as the time before."""
     failed = log.failed_at or math.inf
     after = [at for at in log.actions if at > failed]
     repeats = log.repeats()

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Classifies the texture of a block from single pictures: how well the tactile camera shows it, raw and as difference
-to the untouched gel, and whether the wrist camera shows it too; and how that depends on noise and pressure.
+"""Classifies the texture of a block from single pictures: how well the tactile camera shows it, raw and as the difference
+from the untouched gel, and whether the wrist camera shows it too; and how that depends on noise and pressure.
 
     texture.py EPISODES [--encoder resnet18] [--input KEY]... [--cache runs/cache] [--out results]
                [--folds N] [--iterations N] [--seed N] [--threads N]
 
-What is classified, by which pictures, and how it is trained and tested is an experiment, `experiments/texture.toml`; the
-options are in place of what it says. The classifier is an image encoder of the policy with one additional layer: the small
-one, or ResNet-18 from scratch (the paper's was trained on other pictures first). Every episode with pictures of a touch is
+An experiment, `experiments/texture.toml`, states what is classified, by which pictures, and how it is trained and tested; the
+options replace parts of it. The classifier is an image encoder of the policy with one additional layer: the small
+one, or ResNet-18 from scratch (the paper's was pretrained on other pictures). Every episode with pictures of a touch is
 tested by a classifier that was not trained on it: the episodes are divided into folds, and each fold is tested by one trained
 on the others.
 """
@@ -54,7 +54,7 @@ class Pictures:
     episodes: NDArray[np.int64]
     """[N] index of the episode"""
     change: NDArray[np.float32]
-    """[N] mean change of the gel, of a full scale of 2: what the pressure does"""
+    """[N] mean change of the gel, of a full scale of 2: it grows with the pressure"""
 
 
 def main() -> None:
@@ -112,7 +112,7 @@ def main() -> None:
 
 
 def asked(spec: Classification, args: argparse.Namespace) -> Classification:
-    """The experiment with what the command line has in place of it."""
+    """The experiment, with the command line's options in place of its own."""
     training = {name: getattr(args, name) for name in ("iterations", "seed") if getattr(args, name) is not None}
     changed: dict[str, Any] = {"training": spec.training.model_copy(update=training)}
     if args.folds is not None:
@@ -123,7 +123,8 @@ def asked(spec: Classification, args: argparse.Namespace) -> Classification:
 
 
 def inputs(spec: Classification, keys: list[str] | None) -> list[Input]:
-    """Those of the experiment with these keys, all without any. The one that shows the touch may be left out: it is read still."""
+    """Those of the experiment with these keys, or all if there are none. The one that shows the touch may be left out: it is
+    still read."""
     known = [o.key for o in spec.input]
     for key in keys or ():
         if key not in known:
@@ -184,7 +185,7 @@ class Training:
 
     @property
     def margin(self) -> int:
-        """Of the pictures as the encoder gets them."""
+        """The margin of the pictures as the encoder gets them."""
         return self.input.augmentation.shift // self.spec.encoder.pool
 
 
@@ -236,7 +237,8 @@ class Classifier(nn.Module):
 
 
 def fit(pictures: Pictures, chosen: NDArray[np.int64], training: Training, random: np.random.Generator) -> Classifier:
-    """Trains on pictures randomly shifted. They are not turned: with the lights where they are, half a turn makes bumps holes."""
+    """Trains on randomly shifted pictures. They are not rotated: under fixed lights, half a turn would make bumps look like
+    holes."""
     fitting = training.spec.training
     classifier = Classifier(training.spec, training.input).to(training.device)
     optimizer = torch.optim.AdamW(classifier.parameters(), fitting.learning_rate)

@@ -3,7 +3,7 @@
 
     torch_latency.py BUNDLE [--json] [--chunks 200] [--threads 1]
 
-Both use the weights of the bundle's graphs. The times include neither decoding of pictures nor reading of devices.
+Both use the weights of the bundle's graphs. The times include neither decoding pictures nor reading devices.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from rapid_policy.weights import load_policy
 from torch import Tensor
 
 WARM_UP = 20
-# Above this the two do not compute the same, and comparing times would be meaningless. The differences of the single
+# Above this the two do not compute the same, and comparing times would be meaningless. The differences of the individual
 # graphs accumulate over the denoising steps.
 SAME = 1e-3
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Times a chunk of actions in PyTorch beside onnxruntime.")
+    parser = argparse.ArgumentParser(description="Times a chunk of actions in PyTorch and in onnxruntime.")
     parser.add_argument("bundle", type=Path)
-    parser.add_argument("--chunks", type=int, default=200, help="measured, after a warm-up")
+    parser.add_argument("--chunks", type=int, default=200, help="chunks to measure, after a warm-up (default: 200)")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()

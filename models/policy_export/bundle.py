@@ -1,4 +1,4 @@
-"""What every exporter writes beside the graphs: policy.json, README.md, and numbers in them."""
+"""What every exporter writes beside the graphs: policy.json, README.md, and the numbers in them."""
 
 import hashlib
 import json
@@ -48,7 +48,7 @@ def decimals(values: np.ndarray) -> list[float]:
 
 
 def write_card(policy: dict, source: str, command: str, notes: str, folder: Path) -> None:
-    """README.md: the model card, derived from policy.json. `source` is what it was made of by models/`command`."""
+    """README.md: the model card, derived from policy.json. `source` is what models/`command` made it from."""
     action, scheduler, training = policy["action"], policy["scheduler"], policy["training"]
     rows = []
     for spec in policy["observations"]:

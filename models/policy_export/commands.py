@@ -63,7 +63,7 @@ def is_new(out: Path) -> None:
 
 
 def modalities(keys: list[str], named: list[tuple[str, str]], default: Callable[[str], str]) -> dict[str, str]:
-    """The modality of each observation: as the options `--modality` have it, otherwise `default`."""
+    """The modality of each observation: as the options `--modality` give it, otherwise `default`."""
     found = {key: default(key) for key in keys}
     for key, name in named:
         if key not in found:

@@ -1,4 +1,4 @@
-"""Writes a network as an ONNX graph, and what an encoder's graph does to pictures.
+"""Writes a network as an ONNX graph, and has the layers of an encoder's graph that resize and crop pictures.
 
 Resize and crop stay in the graph, because a bundle's own resize has no antialiasing and torchvision's has.
 """
@@ -17,11 +17,11 @@ OPSET = 17
 
 
 class Resize(nn.Module):
-    """torchvision's bilinear resize with antialiasing, of pictures of one size, as two matrices."""
+    """torchvision's bilinear resize with antialiasing, for pictures of one size, as two matrices."""
 
     def __init__(self, size: tuple[int, int], target: tuple[int, int]):
         super().__init__()
-        # It is linear in each direction: applied to the identity it shows its matrix.
+        # It is linear in each direction: applied to the identity, it gives its matrix.
         self.register_buffer("rows", interpolation(size[0], target[0]))
         self.register_buffer("columns", interpolation(size[1], target[1]).T.contiguous())
 

@@ -1,4 +1,4 @@
-"""Runs a bundle from its files alone, with numpy and onnxruntime: replaces the program, to check a bundle."""
+"""Runs a bundle from its files alone, with numpy and onnxruntime: stands in for the program, to check a bundle."""
 
 import json
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class Bundle:
         self.encoder, self.denoiser = session("encoder"), session("denoiser")
 
     def condition(self, inputs: dict[str, np.ndarray], mask: np.ndarray | None) -> np.ndarray:
-        """The condition for normalised observations by key; absent ones according to the mask are zeros."""
+        """The condition for normalised observations by key; those that are absent by the mask are zeros."""
         spec = self.spec["mask"]
         inputs = dict(inputs)
         if spec is not None:
@@ -68,7 +68,7 @@ class Bundle:
         return x, denormalize(x, self.spec["action"]["normalization"])
 
     def compose(self, actions: np.ndarray, newest: np.ndarray) -> np.ndarray:
-        """What is executed of actions [n, Da] in their units: poses with `rotation_6d` that are absolute, or relative
+        """What is executed for actions [n, Da] in their units: poses with `rotation_6d` that are absolute, or relative
         to the pose in `newest`, a sample of the base's modality."""
         spec = self.spec["action"]
         assert spec["rotation"] == "rotation_6d" and spec["representation"] in ("absolute", "relative")

@@ -1,4 +1,4 @@
-"""Judges how much a written bundle differs from the networks it was made of."""
+"""Judges how much a written bundle differs from the networks it was made from."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ SEED = 20
 
 
 class Mismatch(Unsupported):
-    """The bundle computes something else than its source."""
+    """The bundle computes something other than its source."""
 
 
 def judge(found: dict[str, float], source: str) -> dict[str, float]:

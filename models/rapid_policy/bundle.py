@@ -14,7 +14,7 @@ from .experiment import Experiment, Observation
 FORMAT = "rapid-policy/1"
 ENCODER, DENOISER, POLICY = "encoder.onnx", "denoiser.onnx", "policy.json"
 MASK = "mask"
-# An action may go this share of the range of the demonstrated ones beyond it.
+# An action may exceed the range of the demonstrated ones by this share of it.
 LIMIT_MARGIN = 0.05
 
 
@@ -150,7 +150,7 @@ which does, one after the other:
 """
 RECORDED = """
     rapid --sim task --handheld --expert --record --episodes {episodes} --out EPISODES --seed {first}"""
-# Of the first weights.
+# What made the first weights.
 BEFORE = """
     {command}
     python -m rapid_policy.export RUN/checkpoint.pt --out BUNDLE"""
@@ -194,12 +194,12 @@ def write_card(spec: Experiment, facts: dict[str, Any], folder: Path) -> None:
 
 
 def _first_ones(bundle: dict[str, Any] | None) -> list[dict[str, Any]]:
-    """The bundles whose weights it began with, the first one first."""
+    """The bundles whose weights it began with, the earliest first."""
     return [*_first_ones(bundle.get("started_from")), bundle] if bundle else []
 
 
 def _began(bundle: dict[str, Any] | None) -> str:
-    """The row about the bundle whose weights were the first ones."""
+    """The row about the bundle that gave the first weights."""
     if not bundle:
         return ""
     whole = f"`{bundle['name']}` of {bundle['iterations']} iterations, seed {bundle['seed']}"
@@ -207,7 +207,7 @@ def _began(bundle: dict[str, Any] | None) -> str:
 
 
 def _outcomes(spec: Experiment) -> str:
-    """What the loss has beside the noise."""
+    """What the loss contains besides the noise."""
     return "".join(f" and, times {o.outcome:g}, of the outcome as `{o.key}` predicts it" for o in spec.images if o.outcome)
 
 

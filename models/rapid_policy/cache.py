@@ -5,11 +5,11 @@
     python -m rapid_policy.cache bench  EXPERIMENT.toml --cache DIR [--data FOLDER...]
 
 Below DIR is a folder for each set of modalities and sizes that an experiment reads. In it is a file for each episode,
-named by the SHA-256 of its source, with the arrays of `Episode` one behind the other; and `index.jsonl`, where the last
-line about a source holds. Files are complete when they have their name, and lines are appended whole: an interrupted
-run leaves what it finished. A source whose size or time of change differs is hashed again.
+named by the SHA-256 of its source, with the arrays of `Episode` one after the other; and `index.jsonl`, where the last
+line about a source counts. A file gets its name when it is complete, and lines are appended whole: an interrupted
+run leaves what it finished. A source whose size or modification time differs is hashed again.
 
-What is known of an episode is read from the index when it is needed; in memory is where its line begins.
+What is known of an episode is read from the index when it is needed; memory holds only where its line begins.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from .lerobot_source import description, files, split
 MAGIC = b"RAPIDCACHE2\n"
 ALIGN = 64
 INDEX = "index.jsonl"
-# Maps that are open at a time; each costs address space, a file descriptor (of 1024 by default) and no memory.
+# Maps that are open at a time; each costs address space, a file descriptor (of 1024 by default) but no memory.
 OPEN = 512
-# Sources that wait for each process that decodes.
+# Sources that are queued for each process that decodes.
 QUEUED = 4
 
 
@@ -60,7 +60,7 @@ class Entry:
     judged_by: str | None = None
     """The program that gave the verdict; none before it is judged."""
     described: str = ""
-    """The hash of its description in a data set of LeRobot; empty of a file of its own."""
+    """The hash of its description in a data set of LeRobot; empty for a file of its own."""
 
 
 class Cache:
@@ -107,7 +107,7 @@ class Cache:
         return None if at is None else _read_line(self._index, at)
 
     def build(self, entries: Iterable[Entry], workers: int) -> None:
-        """Decodes those that are not yet; what cannot be decoded gets its reason."""
+        """Decodes those that are not decoded yet; one that cannot be decoded gets its reason."""
         missing = [e.path for e in entries if e.error is None and not self._whole(e)]
         if not missing:
             return
@@ -137,7 +137,7 @@ class Cache:
                 pool.shutdown(wait=True, cancel_futures=True)
 
     def _whole(self, entry: Entry) -> bool:
-        """Its file is there, of the right source and length. Contents are what `verify` reads."""
+        """Whether its file is there, with the right source and length. Only `verify` reads the contents."""
         file = self.file(entry.sha256)
         if entry.content is None or not file.exists():
             return False
@@ -148,7 +148,7 @@ class Cache:
             return False
 
     def file(self, digest: str) -> Path:
-        """Of an episode."""
+        """The decoded file of an episode."""
         return _file(self.folder, digest)
 
     def episode(self, entry: Entry) -> Episode:
@@ -160,7 +160,7 @@ class Cache:
         return Decoded(self.folder, np.fromiter((self._lines[path] for path in paths), np.int64))
 
     def verify(self, entries: Iterable[Entry]) -> list[str]:
-        """Hashes every source and every decoded file; a line for each that is not what the index says.
+        """Hashes every source and every decoded file. Returns a line for each that is not what the index says.
 
         A decoded file that is damaged is removed, so that the next run makes it again.
         """
@@ -240,7 +240,7 @@ def _padded(length: int) -> int:
 
 
 def write(file: Path, episode: Episode) -> str:
-    """Writes an episode; it has its name when it is whole. Returns the SHA-256 of the file."""
+    """Writes an episode; the file gets its name when it is complete. Returns the SHA-256 of the file."""
     described, at = {}, 0
     arrays = {name: np.ascontiguousarray(array) for name, array in episode.arrays.items()}
     for name, array in arrays.items():
@@ -252,7 +252,7 @@ def write(file: Path, episode: Episode) -> str:
     try:
         with partial.open("wb") as opened:
             for part in (MAGIC, len(header).to_bytes(8, "little"), header, *arrays.values()):
-                # Before each array, and behind the last one, zeros up to the next multiple.
+                # Before each array, and after the last one, zeros up to the next multiple.
                 pad = b"\0" * (_padded(opened.tell()) - opened.tell()) if isinstance(part, np.ndarray) else b""
                 for data in (pad, part.data.cast("B") if isinstance(part, np.ndarray) and part.size else bytes(part)):
                     opened.write(data)
@@ -267,7 +267,7 @@ def write(file: Path, episode: Episode) -> str:
 
 
 def _decode(path: str, digest: str, wanted: tuple[Source, ...], file: Path) -> dict[str, Any]:
-    """Decodes one source, in a process of its own: its facts and the hash of its file, or the reason that it cannot."""
+    """Decodes one source, in a process of its own: its facts and the hash of its file, or the reason why it cannot be decoded."""
     try:
         episode = read_episode(Path(path), wanted)
         episode.sha256 = digest
@@ -285,7 +285,7 @@ def _episode(folder: Path, entry: Entry) -> Episode:
 
 
 def _finished(running: dict[Future[dict[str, Any]], Entry]) -> list[tuple[Entry, dict[str, Any]]]:
-    """Takes out those that are done, at least one."""
+    """Removes those that are done, at least one, and returns them."""
     return [(running.pop(done), done.result()) for done in wait(running, return_when=FIRST_COMPLETED).done]
 
 
@@ -299,7 +299,7 @@ def _read_index(file: Path) -> Iterator[tuple[str, int]]:
             try:
                 yield _entry(line).path, at
             except (ValueError, TypeError, KeyError):
-                # The end of a line that a full disk or a power cut took; its source is read again.
+                # A line that a full disk or a power cut shortened; its source is read again.
                 pass
             at += len(line)
 
@@ -316,7 +316,7 @@ def _entry(line: bytes) -> Entry:
 
 
 def sha256(path: Path) -> str:
-    """The hash of a file, in hexadecimal; of an episode of a data set of LeRobot that of its files, and of which part of
+    """The hash of a file, in hexadecimal; for an episode of a data set of LeRobot, that of its files and of which part of
     them it is."""
     if split(path)[1] is None:
         return _hashed(path, *_stat(path))
@@ -326,7 +326,7 @@ def sha256(path: Path) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _hashed(file: Path, _size: int, _changed_ns: int) -> str:
-    """Of one file, as it is now: a data set has many episodes in each."""
+    """The hash of one file, as it is now; kept, because each file of a data set has many episodes."""
     if not file.exists():
         return ""
     with file.open("rb") as opened:
@@ -334,7 +334,7 @@ def _hashed(file: Path, _size: int, _changed_ns: int) -> str:
 
 
 def _state(path: Path) -> dict[str, Any]:
-    """By what an entry tells that its source has changed."""
+    """What shows an entry that its source has changed."""
     if split(path)[1] is None:
         size, changed_ns = _stat(path)
         return {"size": size, "changed_ns": changed_ns}
@@ -344,7 +344,7 @@ def _state(path: Path) -> dict[str, Any]:
 
 
 def _stat(file: Path) -> tuple[int, int]:
-    """Its size and its time of change. One that is not there is as an empty one: the reason of the episode names it."""
+    """Its size and modification time. A missing file is treated as an empty one: the episode's reason names it."""
     try:
         stat = file.stat()
     except FileNotFoundError:

@@ -21,13 +21,13 @@ MB = 1e6
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="rapid_policy.cache", description="Decoded episodes on disk.")
+    parser = argparse.ArgumentParser(prog="rapid_policy.cache", description="Builds, verifies or measures the decoded episodes on disk.")
     parser.add_argument("part", choices=("build", "verify", "bench"))
-    parser.add_argument("experiment", type=Path, help="what is read of an episode (*.toml)")
+    parser.add_argument("experiment", type=Path, help="says what is read from an episode (*.toml)")
     parser.add_argument("--cache", type=Path, required=True, metavar="DIR", help="folder of decoded episodes")
     parser.add_argument("--data", type=Path, nargs="+", metavar="FOLDER", help="in place of the experiment's folders")
     parser.add_argument("--workers", type=int, default=2, help="processes that decode")
-    parser.add_argument("--json", action="store_true", help="bench: figures as an object")
+    parser.add_argument("--json", action="store_true", help="bench: print the figures as a JSON object")
     args = parser.parse_args()
     try:
         spec = read_experiment(args.experiment)
@@ -53,9 +53,9 @@ def verify(spec: Experiment, folders: list[Path], folder: Path) -> int:
 
 
 def bench(spec: Experiment, episodes: list[Episode], seconds: float = 4.0) -> dict[str, float]:
-    """MB a second of one core: files decoded as without a cache, the cache in sequence, and windows at random.
+    """MB per second of one core: files decoded as without a cache, the cache in sequence, and windows at random.
 
-    Each in bytes of the recorded files, so that they compare; the cache in bytes of pixels too.
+    Each in bytes of the recorded files, so that they can be compared; the cache also in bytes of pixels.
     """
     from .dataset import Dataset
 
@@ -66,7 +66,7 @@ def bench(spec: Experiment, episodes: list[Episode], seconds: float = 4.0) -> di
     folder = episodes[0].arrays.file.parent
     dataset, random = Dataset(spec, episodes, folder=folder), np.random.default_rng(0)
     rows, steps, size = sum(len(e) for e in episodes), spec.policy.n_obs_steps, spec.training.windows
-    # A window is as much of the files as its ticks are of all.
+    # A window's share of the files is its ticks' share of all ticks.
     share = sum(sizes) / rows * steps * size
     drawn = _rate(lambda _: dataset.gather(dataset.plan(random, size)), [share], seconds)
     return {
@@ -81,7 +81,7 @@ def bench(spec: Experiment, episodes: list[Episode], seconds: float = 4.0) -> di
 
 
 def _rate(read, sizes: list[float], seconds: float) -> float:
-    """MB a second of processor time."""
+    """MB per second of processor time."""
     read(0)
     done, at, began = 0.0, 0, time.process_time()
     while (used := time.process_time() - began) < seconds:
@@ -92,7 +92,7 @@ def _rate(read, sizes: list[float], seconds: float) -> float:
 
 
 def _recorded(episode: Episode) -> float:
-    """Bytes of its file; of an episode of a data set of LeRobot its share of each of its files."""
+    """Bytes of its file; for an episode of a data set of LeRobot, its share of each of its files."""
     file, index = split(episode.path)
     if index is None:
         return file.stat().st_size

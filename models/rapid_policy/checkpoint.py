@@ -30,16 +30,16 @@ class Run:
     random: np.random.Generator
     provenance: dict[str, Any]
     iterations: int
-    """Of the whole schedule."""
+    """How many the whole schedule has."""
     iteration: int = 0
     seconds: float = 0.0
     losses: list[float] = field(default_factory=list)
     validation: list[tuple[int, float]] = field(default_factory=list)
-    """Iteration and loss on the episodes that are held out."""
+    """Iteration and loss on held-out episodes."""
     evaluations: list[dict[str, Any]] = field(default_factory=list)
     """What `trials` has found: iteration, trials, success, score and interval."""
     random_state: dict[str, Any] | None = None
-    """Of `random` behind the last batch that was learned from: the feed is ahead."""
+    """The state of `random` after the last batch that was learned from: the feed is ahead of it."""
 
     @property
     def schedule(self) -> Training:
@@ -56,7 +56,7 @@ class Run:
             "optimizer": self.optimizer.state_dict(),
             "random": json.dumps(self.random_state or self.random.bit_generator.state),
             "torch_random": torch.get_rng_state(),
-            # Of dropout on a GPU.
+            # For dropout on a GPU.
             "cuda_random": torch.cuda.get_rng_state() if torch.cuda.is_initialized() else None,
             "provenance": {**self.provenance, **facts},
             "iterations": self.iterations,
@@ -86,7 +86,7 @@ class Run:
 
     @property
     def best(self) -> float:
-        """The lowest loss on the episodes that are held out."""
+        """The lowest loss on held-out episodes."""
         return min((loss for _, loss in self.validation), default=float("inf"))
 
     @property
@@ -109,13 +109,13 @@ def begin(spec: Experiment, windows: int, ranges: dict[str, Any], provenance: di
         first.give(policy, policy_json(spec, facts, {ENCODER: "", DENOISER: ""}))
     policy = policy.to(device)
     iterations = schedule.iterations or max(1, round((schedule.epochs or 1) * windows / schedule.windows))
-    # For measuring: dropout would make its losses, and the random numbers behind them, others each time.
+    # For measuring: dropout would change its losses, and the random numbers after them, each time.
     average, random = copy.deepcopy(policy).requires_grad_(False).eval(), np.random.default_rng(schedule.seed)
     return Run(spec, policy, average, optimizer(schedule, policy), random, facts, iterations)
 
 
 def optimizer(schedule: Training, policy: Policy) -> torch.optim.Optimizer:
-    """As the schedule has it."""
+    """The one that the schedule names."""
     weights, rate, decay = policy.parameters(), schedule.learning_rate, schedule.weight_decay
     if schedule.optimizer == "sgd":
         return torch.optim.SGD(weights, rate, momentum=schedule.betas[0], weight_decay=decay)
@@ -124,7 +124,7 @@ def optimizer(schedule: Training, policy: Policy) -> torch.optim.Optimizer:
 
 
 def load_weights(policy: Policy, weights: dict[str, torch.Tensor]) -> None:
-    """Those of a checkpoint. Raises `ValueError` if they are of other networks than its experiment describes now."""
+    """Loads those of a checkpoint. Raises `ValueError` if they are of other networks than its experiment describes now."""
     different = sorted(policy.state_dict().keys() ^ weights.keys())
     if different:
         cause = f"of another version of rapid_policy, whose networks were others ({different[0]})"
@@ -133,13 +133,13 @@ def load_weights(policy: Policy, weights: dict[str, torch.Tensor]) -> None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The state in a checkpoint. Its pickle may hold tensors and plain data alone: others are refused, not run."""
+    """The state in a checkpoint. Its pickle may hold only tensors and plain data: anything else is refused, not run."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         Experiment.from_text(state["experiment"])
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror or error}") from error
-    # What is no checkpoint fails in the container, the unpickler or the description.
+    # What is not a checkpoint fails in the container, the unpickler or the description.
     except Exception as error:
         reason = str(error).strip().splitlines()[0]
         raise ValueError(f"{path}: not a checkpoint of rapid_policy.train: {reason}") from error

@@ -1,4 +1,4 @@
-"""An experiment that trains a classifier of single pictures: what is told apart, by which pictures, and how it is tested."""
+"""An experiment that trains a classifier of single pictures: what it distinguishes, by which pictures, and how it is tested."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import model_validator
 
 from .experiment import Data, Encoder, Name, Observation, Section, check_picture, known, mistake
 
-# Of an observation, what a classifier of single pictures has a use for.
+# The keys of an observation that a classifier of single pictures uses.
 _USED = {"key", "title", "kind", "modality", "required", "size", "resize", "crop", "operation", "augmentation"}
 
 
@@ -30,18 +30,18 @@ class Input(Observation):
 
 
 class Label(Section):
-    """What is told apart."""
+    """What is distinguished."""
 
-    tag: str = known("of an episode", "texture", min_length=1)
-    values: tuple[str, ...] = known("that it has", ["triangular", "hexagonal"], min_length=2, max_length=2)
+    tag: str = known("tag of an episode", "texture", min_length=1)
+    values: tuple[str, ...] = known("its values that are distinguished", ["triangular", "hexagonal"], min_length=2, max_length=2)
 
 
 class Contact(Section):
     """Which pictures are of a touch; others are not classified."""
 
     input: Name = known("key of the input that shows it, a difference", "difference")
-    noises: float = known("it has changed by so many times its noise", 1.5, 1.5, gt=0)
-    untouched: int = known("pictures at the beginning of an episode, of which the noise is taken", 10, 10, ge=3)
+    noises: float = known("a touch changes it by more than this many times its noise", 1.5, 1.5, gt=0)
+    untouched: int = known("pictures at the beginning of an episode, from which the noise is measured", 10, 10, ge=3)
 
 
 class Fitting(Section):
@@ -58,7 +58,7 @@ class Testing(Section):
 
     folds: int = known("parts of the episodes, each tested by a classifier trained on the others", 10, 10, ge=2)
     noises: tuple[float, ...] = known(
-        "deviations of noise on the tested pictures, of a full scale of 1; the first is the result",
+        "standard deviations of noise added to the tested pictures, of a full scale of 1; the first gives the result",
         [0.0, 0.02, 0.05],
         (0.0,),
         min_length=1,
@@ -67,12 +67,12 @@ class Testing(Section):
 
 
 class Classification(Section):
-    """All of it."""
+    """The whole experiment."""
 
     format: Literal["rapid-classification/1"] = known("of this file", "rapid-classification/1")
     name: Name = known("of the experiment", "texture")
     data: Data = known("which episodes are learned from and tested", {}, Data())
-    label: Label = known("what is told apart", {"tag": "texture"})
+    label: Label = known("what is distinguished", {"tag": "texture"})
     contact: Contact = known("which pictures are of a touch", {"input": "difference"})
     input: tuple[Input, ...] = known("a picture that is classified", {}, min_length=1)
     encoder: Encoder = known("the network that sees", {}, Encoder())
@@ -95,12 +95,12 @@ class Classification(Section):
 
     @property
     def images(self) -> tuple[Input, ...]:
-        """The pictures that are read of an episode."""
+        """The pictures that are read from an episode."""
         return self.input
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """Modalities whose numbers are read of an episode."""
+        """Modalities whose numbers are read from an episode."""
         return ()
 
     @property
@@ -109,7 +109,7 @@ class Classification(Section):
         return next(o for o in self.input if o.key == self.contact.input)
 
     def label_of(self, tags: Mapping[str, str]) -> int | None:
-        """Which of the values an episode has."""
+        """The index of the value that an episode has; none if it has none of them."""
         value = tags.get(self.label.tag)
         return self.label.values.index(value) if value in self.label.values else None
 

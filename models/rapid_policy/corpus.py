@@ -1,6 +1,6 @@
 """The episodes of an experiment: found, judged, filtered, decoded, and divided into those learned from and those held out.
 
-An episode that is damaged or of no use is left out with its reason and never the end of a run, unless none remains.
+An episode that is damaged or of no use is left out with its reason, and does not end a run unless none remains.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Corpus:
     left_out: list[str]
     """A line for each file that is of no use, with the reason."""
     unwanted: int
-    """Files that the filters of the experiment leave out."""
+    """How many files the filters of the experiment leave out."""
     folder: Path
-    """In the cache, where these are decoded."""
+    """Where in the cache these are decoded."""
 
     absences: dict[str, int] = field(default_factory=dict)
-    """Rows without a picture of those that are not required, by the reason."""
+    """How many rows lack a picture that is not required, by reason."""
 
     def report(self) -> str:
         """For people."""
@@ -53,7 +53,7 @@ class Corpus:
 
 
 def load(spec: Experiment | Classification, folders: Sequence[Path], cache_folder: Path, workers: int = 1) -> Corpus:
-    """The episodes in `folders`, decoded into the cache by so many processes."""
+    """The episodes in `folders`, decoded into the cache by `workers` processes."""
     files = [str(file.absolute()) for folder in folders for file in episode_files(folder)]
     cache = Cache(cache_folder, sources(spec))
     _judge(cache, files)
@@ -104,7 +104,7 @@ def _absences(spec: Experiment | Classification, episodes: Sequence[Episode]) ->
 def _unfit(spec: Experiment | Classification, episode: Episode) -> str | None:
     if isinstance(spec, Classification):
         return spec.unfit(episode.facts.tags)
-    # Torch is imported only where it is used: decoding needs none.
+    # Torch is imported only where it is used: decoding does not need it.
     from .dataset import unfit
 
     return unfit(spec, episode)
@@ -141,7 +141,7 @@ def _version(rapid: str) -> str:
 
 
 def matches(data: Data, facts: Facts) -> bool:
-    """Whether the filters of the experiment take an episode."""
+    """Whether the filters of the experiment accept an episode."""
     for tag, values in data.tags.items():
         if facts.tags.get(tag) not in ((values,) if isinstance(values, str) else values):
             return False

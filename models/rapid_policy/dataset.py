@@ -1,10 +1,10 @@
 """Windows of episodes as inputs of the networks.
 
 A batch is made in three steps. `plan` makes every random decision, in one order, so that neither workers nor several
-processes change what is learned; `gather` copies what the plan names out of the episodes, which may lie on a disk;
+processes change what is learned; `gather` copies what the plan names out of the episodes, which may be on disk;
 `inputs` turns pixels into numbers on the device that trains.
 
-What there is of every tick lies in files: pictures in those of the episodes, numbers and windows in ones of this module.
+The data of every tick are in files: pictures in those of the episodes, numbers and windows in ones that this module makes.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from .episodes import ABSENCES, Episode, picture_source
 from .experiment import POSITION, QUATERNION, ROTATIONS, Experiment, Observation, Part
 from .normalize import EXECUTED, MinMax
 
-# The range of the gripper's opening as it was seen, beside those of inputs and actions.
+# Name of the range of the recorded gripper opening, beside those of inputs and actions.
 OPENING = "opening"
 
-# Windows that are looked at together for the ranges of numbers.
+# Windows that are read at a time to find the ranges of numbers.
 AT_ONCE = 4096
 
-# Pictures that a CPU makes inputs of at a time: few enough to stay in its cache.
+# Pictures that a CPU turns into inputs at a time: few enough to stay in its cache.
 TOGETHER = 32
 
-# Share of the windows without a picture in which there was none before either.
+# Of the windows without a picture, the share in which there was none before either.
 NEVER = 1 / 3
 
 Plan = dict[str, NDArray]
@@ -49,13 +49,13 @@ class Batch:
     """B windows."""
 
     pictures: dict[str, Tensor]
-    """u8 [B, To, H, W, 3] by key, with a history [B, S, H, W, 3]; of a picture that is masked or absent anything."""
+    """u8 [B, To, H, W, 3] by key, with a history [B, S, H, W, 3]; a picture that is masked or absent may be anything."""
     references: dict[str, Tensor]
-    """u8 [B, H, W, 3] by key: of differences, what to compare with."""
+    """u8 [B, H, W, 3] by key, for differences: the picture to compare with."""
     gains: dict[str, Tensor]
     """f32 [B, 1, 1, 1, 1] by key: brightness."""
     shown: dict[str, Tensor]
-    """bool [B, To] by key, with a history [B, S]: there is a picture."""
+    """bool [B, To] by key, with a history [B, S]: whether there is a picture."""
     vectors: dict[str, Tensor]
     """f32 [B, To, D] in -1..1 by key."""
     mask: Tensor
@@ -63,7 +63,7 @@ class Batch:
     actions: Tensor
     """f32 [B, Tp, Da] in -1..1"""
     outcomes: Tensor
-    """f32 [B, Da], in -1..1 but for one that no window has: the last action of each window's episode; [B, 0] unless a picture
+    """f32 [B, Da]: the last action of each window's episode, in -1..1 unless no window contains it; [B, 0] unless a picture
     predicts it."""
 
 
@@ -77,7 +77,7 @@ class Dropped(NamedTuple):
     out: NDArray[np.int64]
     """[B, M] the row at which it leaves by `dropout.episode`."""
     back: NDArray[np.int64]
-    """[B, M] the row at which it is back; that of `out` where it does not leave."""
+    """[B, M] the row at which it is back; the same as `out` where it does not leave."""
 
 
 class Unfit(ValueError):
@@ -87,17 +87,17 @@ class Unfit(ValueError):
 class Dataset:
     """All ticks of all episodes in sequence, and the windows among them.
 
-    A window belongs to a tick. It does not reach over a tick that lacks a required modality or an action, nor over a
-    gap in the frame index: at such a place one segment ends and another begins, and steps beyond either end repeat it.
-    Pictures stay in the episodes; numbers and windows are copied to files without names in `folder`, which end with the
-    data set. A folder in memory, as the system's for such files may be, makes it cost memory for each tick.
+    A window belongs to a tick. It does not reach across a tick that lacks a required modality or an action, nor across a
+    gap in the frame index: there one segment ends and another begins, and steps beyond either end repeat that end.
+    Pictures stay in the episodes; numbers and windows are copied to unnamed files in `folder`, which vanish with the
+    data set. If that folder is in memory, as the system's temporary one may be, each tick costs memory.
     """
 
     def __init__(self, spec: Experiment, episodes: Sequence[Episode], ranges: dict[str, MinMax] | None = None,
                  folder: Path | None = None) -> None:  # fmt: skip
         self.spec, self.episodes = spec, episodes
         self.names = {o.key: picture_source(o).name for o in (*spec.images, *spec.histories)}
-        # Which of the observations each picture is.
+        # The index of each picture among the observations.
         self.images = [i for i, o in enumerate(spec.observation) if o in spec.images]
         read = _on_disk(self._read(), folder)
         if not len(read.get("windows", ())):
@@ -114,7 +114,7 @@ class Dataset:
             self.ranges |= self._ranges()
 
     def _read(self) -> Iterator[dict[str, NDArray]]:
-        """What there is of each episode."""
+        """The arrays of each episode."""
         start = 0
         for episode in self.episodes:
             rows = _Rows(self.spec, episode)
@@ -125,7 +125,7 @@ class Dataset:
             start += len(episode)
 
     def _squeeze(self, far: float) -> None:
-        """The more closed the gripper was, the further it closes: what is wholly open stays so."""
+        """The more closed the gripper was, the further it closes: fully open stays fully open."""
         if OPENING not in self.ranges:
             self.ranges[OPENING] = MinMax.of(OPENING, self._extremes(lambda part: self.targets[part[:, 0], -1:]))
         for first in range(0, len(self.targets), AT_ONCE):
@@ -150,7 +150,7 @@ class Dataset:
         return ranges
 
     def _extremes(self, numbers: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> NDArray[np.float64]:
-        """[2, D] the least and the greatest of the numbers [..., D] of all windows."""
+        """[2, D] minimum and maximum of the numbers [..., D] of all windows."""
         found = []
         for first in range(0, len(self.windows), AT_ONCE):
             seen = numbers(self.windows[first : first + AT_ONCE])
@@ -160,7 +160,7 @@ class Dataset:
         return np.stack([np.min(low, 0), np.max(high, 0)])
 
     def _executed(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """[T, D] absolute actions as the program executes them; of a rotation anything, its range is known."""
+        """[T, D] absolute actions as the program executes them; zeros for a rotation, whose range is known."""
         targets, turned = self.targets[rows], self.spec.action.rotation != "none"
         if self.now is not None:
             positions, rest = targets[:, :16].reshape(-1, 4, 4)[:, :3, 3], targets[:, 16:]
@@ -191,7 +191,7 @@ class Dataset:
             plan["visible"] = dropped.visible
         if vary:
             self._hold(plan, random)
-        # Last: but for their histories, windows are those of a policy without any.
+        # Last, so that apart from their histories windows are those of a policy without any.
         for o in spec.histories:
             self._vary(plan, o, random, vary=vary)
         hidden = None if dropped is None else hide(spec, dropped, random)
@@ -211,20 +211,20 @@ class Dataset:
 
     def _remember(self, plan: Plan, o: Observation, begin: NDArray[np.int64], dropped: Dropped | None,
                   hidden: NDArray[np.int64] | None) -> None:  # fmt: skip
-        """The rows [B, S] of a history and which of them there are, of windows whose segments `begin` [B, 1]."""
+        """The rows [B, S] of a history and which of them have a picture, for windows whose segments begin at `begin` [B, 1]."""
         i, tick = self.spec.column(o), plan["tick"][:, None]
         ago = np.array(o.ages)
         rows = tick - ago
         valid = rows >= begin
-        # Of what is before the beginning any row of the episode is named, and none is read.
+        # A step before the beginning names an arbitrary row of the episode, which is not read.
         rows = np.where(valid, rows, tick)
         valid &= self.present[rows, i]
         if dropped is not None and hidden is not None:
             valid &= (rows < dropped.out[:, i : i + 1]) | (rows >= dropped.back[:, i : i + 1])
             valid &= ago >= hidden[:, i : i + 1]
-        # What is there now is decided by the picture of now, the one that always remains included.
+        # The current picture decides about the newest step, even where it is the one that always remains.
         valid[:, -1] = plan["visible"][:, -1, i]
-        # What is held has been absent since; a history holds nothing.
+        # A held picture has been absent since then; a history holds nothing.
         valid &= ago >= plan.get(f"since {self.spec.images[i].key}", 0)
         plan[f"seen {o.key}"], plan[f"valid {o.key}"] = rows, valid
 
@@ -253,7 +253,7 @@ class Dataset:
             batch.shown[o.key] = torch.from_numpy(shown)
             self._pictures(batch, o, plan, steps, shown)
         for o in spec.histories:
-            # The networks look at a history only where there is no picture of now: of no other window is it read.
+            # The networks look at a history only where the current picture is absent: it is read for no other window.
             shown = plan[f"valid {o.key}"] & ~visible[:, -1:, spec.column(o)]
             batch.shown[o.key] = torch.from_numpy(shown)
             self._pictures(batch, o, plan, plan[f"seen {o.key}"], shown)
@@ -302,7 +302,7 @@ class Dataset:
         return torch.from_numpy(self.ranges["action"].apply(self._actions(ends[:, None], plan["tick"])[:, 0]))
 
     def _actions(self, done: NDArray[np.int64], tick: NDArray[np.int64]) -> NDArray[np.float64]:
-        """[B, Tp, Da] of the rows `done` [B, Tp], where the newest observation is of `tick` [B]."""
+        """[B, Tp, Da] at the rows `done` [B, Tp], where the newest observation is that of `tick` [B]."""
         action, targets = self.spec.action, self.targets[done]
         if self.now is None:
             return targets
@@ -318,18 +318,18 @@ class Dataset:
         return np.concatenate([poses.numbers(wanted, action.rotation), targets[..., 16:]], -1)
 
     def _owners(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:
-        """[B] which of the episodes each window is of."""
+        """[B] index of the episode that each window belongs to."""
         return np.searchsorted(self.starts, tick, "right") - 1
 
     def _episode_spans(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:
-        """[B, 2] first row, and row behind the last, of each window's episode."""
+        """[B, 2] first row, and row after the last, of each window's episode."""
         owners = self._owners(tick)
         return np.stack([self.starts[owners], self.starts[owners + 1]], 1)
 
 
 def inputs(spec: Experiment, batch: Batch, device: torch.device) -> dict[str, Tensor]:
-    """By key: pictures f32 [B, To, 3, H / pool, W / pool] and vectors f32 [B, To, D], in -1..1; by the name of its validity
-    f32 [B, S] of a history, 1 for the steps that there are."""
+    """By key: pictures f32 [B, To, 3, H / pool, W / pool] and vectors f32 [B, To, D], in -1..1; for a history also
+    f32 [B, S], by the name of its validity, 1 for the steps that have a picture."""
     out = {o.key: _picture_input(spec, o, batch, device) for o in (*spec.images, *spec.histories)}
     out |= {o.valid: batch.shown[o.key].to(device).float() for o in spec.histories}
     return out | {o.key: batch.vectors[o.key].to(device, non_blocking=True) for o in spec.vectors}
@@ -361,10 +361,10 @@ def _picture_input(spec: Experiment, o: Observation, batch: Batch, device: torch
 
 def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArray[np.int64],
          random: np.random.Generator) -> Dropped:  # fmt: skip
-    """Takes pictures away at random that are `present` [B, To, M] at the rows `seen` [B, To, M], in episodes of the rows
+    """Takes away, at random, pictures that are `present` [B, To, M] at the rows `seen` [B, To, M], in episodes with the rows
     `spans` [B, 2].
 
-    Of those that are present at the newest step at least one always remains, also of a single one: the paper's rule.
+    Of those present at the newest step at least one always remains, even if there is only one: the paper's rule.
     """
     visible, there = present.copy(), present[:, -1]
     windows = there & (random.random(there.shape) < [o.dropout.window for o in spec.images])
@@ -387,10 +387,10 @@ def drop(spec: Experiment, present: Bools, seen: NDArray[np.int64], spans: NDArr
 
 
 def hide(spec: Experiment, dropped: Dropped, random: np.random.Generator) -> NDArray[np.int64]:
-    """[B, M] ticks back from the newest that a history lacks, one draw for each window and modality.
+    """[B, M] how many of the newest ticks a history lacks, one draw for each window and modality.
 
-    Where `dropout.window` took the picture of now it was never plugged in, or it was unplugged some time ago: a moment as
-    likely as any other that the longest history of the modality shows.
+    Where `dropout.window` took the current picture away, it was never plugged in, or it was unplugged some time ago: at any
+    moment of the modality's longest history, with equal probability.
     """
     hidden = np.zeros(dropped.windows.shape, np.int64)
     spans: dict[int, int] = {}
@@ -405,7 +405,7 @@ def hide(spec: Experiment, dropped: Dropped, random: np.random.Generator) -> NDA
 
 def _absences(spec: Experiment, spans: NDArray[np.int64],
               random: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # fmt: skip
-    """[B, M] rows at which a picture leaves in the middle of the episode and is back, for a time or to its end."""
+    """[B, M] rows at which a picture leaves in the middle of the episode and at which it is back, at its end if it stays away."""
     count = (len(spans), len(spec.images))
     leaves = random.random(count) < [o.dropout.episode for o in spec.images]
     begin, end = spans[:, :1], spans[:, 1:]
@@ -415,7 +415,7 @@ def _absences(spec: Experiment, spans: NDArray[np.int64],
 
 
 def _replugged(seen: NDArray[np.int64], visible: Bools) -> tuple[NDArray[np.int64], Bools]:
-    """[B, To] rows and whether there are pictures: just plugged in again, earlier steps show the first new one."""
+    """[B, To] rows and whether there are pictures: just after a replug, earlier steps show the first new one."""
     rows, shown = seen.copy(), np.repeat(visible[:, -1:], seen.shape[1], 1)
     for step in range(seen.shape[1] - 2, -1, -1):
         rows[:, step] = np.where(visible[:, step], seen[:, step], rows[:, step + 1])
@@ -446,8 +446,8 @@ def _unit(pictures: Tensor) -> Tensor:
 
 
 def _on_disk(parts: Iterator[dict[str, NDArray]], folder: Path | None) -> dict[str, NDArray]:
-    """The arrays of each name one behind the other, mapped from a file. They are written before they are mapped: a full
-    disk is an error, and no signal."""
+    """The arrays of each name one after the other, mapped from a file. They are written before they are mapped: a full
+    disk is then an error, not a signal."""
     files: dict[str, BinaryIO] = {}
     rows: dict[str, tuple[np.dtype, tuple[int, ...]]] = {}
     with contextlib.ExitStack() as opened:
@@ -463,7 +463,7 @@ def _on_disk(parts: Iterator[dict[str, NDArray]], folder: Path | None) -> dict[s
 
 
 def _map(file: BinaryIO, kind: np.dtype, row: tuple[int, ...]) -> NDArray:
-    """[N, ...] as many as are in the file; nothing has no map."""
+    """[N, ...] as many as are in the file; an empty file cannot be mapped."""
     if not file.seek(0, os.SEEK_END):
         return np.empty((0, *row), kind)
     # As a plain array: each slice of a memmap costs as much again.
@@ -471,7 +471,7 @@ def _map(file: BinaryIO, kind: np.dtype, row: tuple[int, ...]) -> NDArray:
 
 
 def _turns(takes: list[str], o: Observation) -> list[int]:
-    """Numbers of a vector that are of a rotation."""
+    """The indices of a vector's numbers that belong to a rotation."""
     found, at = [], 0
     for part, take in zip(o.sources, takes, strict=True):
         found += range(at, at + part.length) if take in ("rotation_6d", "quaternion") else ()
@@ -480,7 +480,7 @@ def _turns(takes: list[str], o: Observation) -> list[int]:
 
 
 class _Rows:
-    """What the rows of one episode are for an experiment: everything but pictures."""
+    """What an experiment takes from the rows of one episode: everything but pictures."""
 
     def __init__(self, spec: Experiment, episode: Episode) -> None:
         self.spec, self.episode = spec, episode
@@ -498,7 +498,7 @@ class _Rows:
         for o, present in zip(spec.images, found, strict=True):
             if o.required:
                 self.usable &= present
-            # What an experiment is not to take for an unplugged sensor ends a segment.
+            # An absence that is not to be learned as an unplugged sensor ends a segment.
             for reason in set(ABSENCES) - set(spec.data.absences):
                 self.usable &= ~episode.absent(picture_source(o).name, reason)
         # Pictures that are not required: at least one of them must be present.
@@ -566,8 +566,8 @@ class _Rows:
         return actions
 
     def _next_poses(self) -> NDArray[np.float64]:
-        """[T, ...] the pose of the next tick, and the opening then: as it is learned if it is absolute, otherwise as a
-        matrix. The last tick of a run of them has no action."""
+        """[T, ...] the pose and the opening of the next tick: the pose as it is learned if it is absolute, otherwise as a
+        matrix. The last of consecutive ticks has no action."""
         spec = self.spec.action
         matrices, there = self._poses(spec.pose or "")
         absolute = spec.representation == "absolute"

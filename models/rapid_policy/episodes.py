@@ -2,7 +2,7 @@
 
 The frame index of a file (`/rapid/frame`) names the sample of every modality at every tick by its sequence number, and
 the mask in force. What is read here is therefore what a policy would have been given, not the nearest sample by a rule
-of our own. What the numbers mean for a policy is `dataset`'s part.
+of our own. `dataset` knows what the numbers mean for a policy.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from .pixels import FormatError, PixelError, decode, fit
 
 FRAMES = "/rapid/frame"
 ACTIONS = "/action"
-# Why a tick has no sample of a modality: its device is unplugged, or the rig has none; its driver does not run; or it runs,
-# and sends nothing that can be used.
+# Why a tick has no sample of a modality: its device is unplugged, or the rig has none; its driver is not running; or it runs
+# but sends nothing usable.
 ABSENCES = ("unplug", "crash", "stall")
 # A message names its sample by the lower half of the 64-bit sequence number.
 SEQUENCE_BITS = 0xFFFF_FFFF
@@ -51,14 +51,14 @@ class Source:
     kind: str
     """`image` or `vector`."""
     required: bool = True
-    """An episode whose rig has no such modality is of no use."""
+    """Whether an episode whose rig has no such modality is of no use."""
     size: tuple[int, int] | None = None
     resize: tuple[int, int] | None = None
     crop: tuple[int, int] | None = None
 
     @property
     def name(self) -> str:
-        """Of its arrays in an episode."""
+        """The name of its arrays in an episode."""
         parts = [self.modality]
         parts += [f"resize {self.resize[0]}x{self.resize[1]}"] if self.resize else []
         parts += [f"crop {self.crop[0]}x{self.crop[1]}"] if self.crop else []
@@ -71,7 +71,7 @@ def picture_source(o: Any) -> Source:
 
 
 def sources(spec: Experiment | Classification) -> tuple[Source, ...]:
-    """All that an experiment reads of an episode, each once."""
+    """All that an experiment reads from an episode, each source once."""
     wanted = [picture_source(o) for o in spec.images]
     wanted += [Source(name, "vector") for name in spec.numbers]
     return tuple({source.name: source for source in wanted}.values())
@@ -79,7 +79,7 @@ def sources(spec: Experiment | Classification) -> tuple[Source, ...]:
 
 @dataclass
 class Facts:
-    """What an episode's metadata say and training uses."""
+    """What training uses of an episode's metadata."""
 
     software: str = ""
     task: str = ""
@@ -87,9 +87,9 @@ class Facts:
     tags: dict[str, str] = field(default_factory=dict)
     modules: list[str] = field(default_factory=list)
     layouts: dict[str, str] = field(default_factory=dict)
-    """By modality: how the registry says that a pose is laid out."""
+    """By modality: the layout of its pose, as the registry has it."""
     notes: list[str] = field(default_factory=list)
-    """What was found in the samples and taken as absent."""
+    """Faulty samples that were found and treated as absent."""
 
 
 @dataclass
@@ -101,7 +101,7 @@ class Episode:
     arrays: Mapping[str, NDArray[Any]]
     """`ticks` i64 [T], number in the frame index; `times` i64 [T], ns of the wall clock; `actions` f64 [T, Da] and `acted`
     bool [T]; for each source `value NAME`, pictures u8 [T, H, W, 3] (red first) or vectors f64 [T, D], `present NAME`
-    bool [T], `plugged NAME` and `running NAME` bool [T], and of pictures `first NAME` i64 [1], the row of the first one or
+    bool [T], `plugged NAME` and `running NAME` bool [T], and for pictures `first NAME` i64 [1], the row of the first one or
     -1."""
     sha256: str = ""
     """Of the file."""
@@ -122,15 +122,15 @@ class Episode:
         return self.arrays["acted"]
 
     def value(self, name: str) -> NDArray[Any]:
-        """[T, ...] of a source."""
+        """[T, ...] the samples of a source."""
         return self.arrays[f"value {name}"]
 
     def present(self, name: str) -> NDArray[np.bool_]:
-        """[T] of a source: its bit is set in the mask, and the tick has a sample of it."""
+        """[T] whether the bit of a source is set in the mask, and the tick has a sample of it."""
         return self.arrays[f"present {name}"]
 
     def absent(self, name: str, reason: str) -> NDArray[np.bool_]:
-        """[T] of a source: not present, for one of `ABSENCES`."""
+        """[T] whether a source is not present for this one of `ABSENCES`."""
         plugged, running = self.arrays[f"plugged {name}"], self.arrays[f"running {name}"]
         reasons = {"unplug": ~plugged, "crash": plugged & ~running, "stall": plugged & running}
         return ~self.present(name) & reasons[reason]
@@ -144,7 +144,7 @@ class Episode:
 
 
 def episode_files(folder: Path) -> list[Path]:
-    """The finished episodes of a folder, by name; of a data set of LeRobot those in its files."""
+    """The finished episodes of a folder, by name; for a data set of LeRobot, those in its files."""
     if lerobot_source.is_dataset(folder):
         try:
             files = lerobot_source.episode_names(folder)
@@ -186,7 +186,7 @@ def _facts(path: Path, about: dict[str, str]) -> Facts:
 
 
 def read_episode(path: Path, wanted: tuple[Source, ...]) -> Episode:
-    """One file, read whole with its checksums."""
+    """Reads one file completely, and verifies its checksums."""
     if lerobot_source.split(path)[1] is not None:
         return _read_rows(path, wanted)
     try:
@@ -208,7 +208,7 @@ def read_episode(path: Path, wanted: tuple[Source, ...]) -> Episode:
                 messages[channel.topic].append(_Message(message.log_time, message.sequence, schema.name, decoded))
     except EpisodeError:
         raise
-    # Damage is found in the container, the compression, a schema or a message: each has its own errors.
+    # Damage shows in the container, the compression, a schema or a message, each with errors of its own.
     except Exception as error:
         raise EpisodeError(path, f"not a whole episode: {error}") from error
     return _assemble(path, facts, streams, wanted, messages)
@@ -233,7 +233,7 @@ def _read_rows(path: Path, wanted: tuple[Source, ...]) -> Episode:
             arrays |= {f"{what} {source.name}": array for what, array in found.items()}
     except (EpisodeError, MissingPackage):
         raise
-    # A damaged file fails in the container, the compression or a column: each has its own errors, some of several lines.
+    # A damaged file fails in the container, the compression or a column, each with errors of its own, some of several lines.
     except Exception as error:
         raise EpisodeError(path, f"not an episode that is read: {' '.join(str(error).split())}") from error
     return Episode(path, facts, arrays)
@@ -330,7 +330,7 @@ def _chosen(stream: dict[str, Any], frames: list[_Message], samples: list[_Messa
         if not usable:
             chosen.append(None)
             continue
-        # After a replug a device may count from the beginning again: of several with one number the nearest is used.
+        # After a replug a device may count from the beginning again: of several samples with the same number the nearest is used.
         captured = frame.time - slot.age_ns + latency
         candidates = by_sequence[slot.seq & SEQUENCE_BITS]
         chosen.append(min(candidates, key=lambda m: abs(m.time - captured), default=None))
@@ -341,13 +341,13 @@ def _presence(stream: dict[str, Any] | None, frames: list[_Message]) -> dict[str
     """[T] whether the device of a modality is plugged in, and whether its bit is set."""
     slots = [next((s for s in m.body.modalities if stream and s.bit == stream["bit"]), None) for m in frames]
     running = np.array([slot is not None and slot.present for slot in slots], bool)
-    # Files of earlier versions do not have it: what runs is plugged in, of the rest nothing is known.
+    # Files of earlier versions lack it: what runs is plugged in; about the rest nothing is known.
     plugged = np.array([getattr(slot, "plugged", False) for slot in slots], bool)
     return {"plugged": plugged | running, "running": running}
 
 
 def _pictures(path: Path, source: Source, chosen: list[_Message | None], notes: list[str]) -> dict[str, NDArray[Any]]:
-    """A damaged picture counts as none, as it does while a policy runs; one of another size ends it."""
+    """A damaged picture counts as absent, as it does while a policy runs; one of another size is an error."""
     rows: list[NDArray[np.uint8] | None] = []
     damaged = 0
     for message in chosen:
@@ -362,7 +362,7 @@ def _pictures(path: Path, source: Source, chosen: list[_Message | None], notes: 
 
 
 def _stacked(source: Source, rows: list[NDArray[np.uint8] | None]) -> dict[str, NDArray[Any]]:
-    """The arrays of pictures, of which some are absent."""
+    """The arrays of pictures, some of which may be absent."""
     present = np.array([row is not None for row in rows])
     shape = source.crop or source.resize or source.size or (0, 0)
     values = np.zeros((len(rows), *shape, 3), np.uint8)
@@ -382,7 +382,7 @@ def _picture(path: Path, source: Source, message: _Message) -> NDArray[np.uint8]
 
 
 def _fitted(path: Path, source: Source, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """At the size that the policy takes."""
+    """The picture at the size that the policy takes."""
     fitted = fit(pixels, source.resize, source.crop)
     wanted = source.crop or source.resize or source.size or pixels.shape[:2]
     if fitted is None or fitted.shape[:2] != wanted:
@@ -392,7 +392,7 @@ def _fitted(path: Path, source: Source, pixels: NDArray[np.uint8]) -> NDArray[np
 
 
 def _vectors(path: Path, source: Source, chosen: list[_Message | None], notes: list[str]) -> dict[str, NDArray[Any]]:
-    """A sample with a number that is not finite counts as none."""
+    """A sample with a number that is not finite counts as absent."""
     rows = [None if m is None else _numbers(path, source.modality, m) for m in chosen]
     length = next((len(row) for row in rows if row is not None), 0)
     values, present = np.zeros((len(rows), length)), np.zeros(len(rows), bool)
@@ -419,7 +419,7 @@ def _numbers(path: Path, what: str, message: _Message) -> NDArray[np.float64]:
 def _actions(
     path: Path, facts: Facts, frames: list[_Message], messages: list[_Message]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """[T, Da] and [T]: an action belongs to the tick with its time. Da is 0 without any."""
+    """[T, Da] actions, and [T] whether there is one: each belongs to the tick at its time. Da is 0 if there are none."""
     times = np.array([m.time for m in frames])
     rows = [_numbers(path, ACTIONS, m) for m in messages]
     length = len(rows[0]) if rows else 0

@@ -1,8 +1,8 @@
 """An experiment: the data, the policy and its training, as one description that loader, networks, training and exporter
-share. `experiment_file` reads it from TOML; a checkpoint and a bundle's weights bring it back.
+share. `experiment_file` reads it from TOML; a checkpoint or a bundle's weights restore it.
 
-The models check each key and what keys mean together. A finding names cause and fix; where it stands in a file is
-`experiment_file`'s part.
+The models check each key, and keys that depend on each other. A finding names cause and fix; `experiment_file` adds its
+place in the file.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-# Averaged by the small encoder before anything else, pixels each way.
+# Pixels each way that the small encoder averages before anything else.
 SMALL_POOL = 2
 # The small encoder halves the pooled picture twice.
 SMALL_MULTIPLE = SMALL_POOL * 4
@@ -20,7 +20,7 @@ TRAIN_TIMESTEPS = 100
 POSITION = 3
 ROTATIONS = {"none": 0, "rotation_6d": 6, "quaternion": 4}
 QUATERNION = 4
-# Ticks that a history may reach back, which the program keeps.
+# Ticks that a history may reach back, and that the program therefore keeps.
 LONGEST_HISTORY = 600
 TAKES = {"position": POSITION, "rotation_6d": 6, "quaternion": 4}
 
@@ -31,7 +31,7 @@ def mistake(key: str, cause: str, fix: str) -> PydanticCustomError:
 
 
 def known(meaning: str, example: Any, default: Any = ..., **limits: Any) -> Any:
-    """A key: what it means and an example, which messages about it show."""
+    """A key with its meaning and an example, both of which messages about it show."""
     return Field(default, description=meaning, examples=[example], **limits)
 
 
@@ -49,7 +49,7 @@ Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 class Section(BaseModel):
-    """A table of the file; a key that is unknown is a mistake."""
+    """A table of the file; an unknown key is a mistake."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, populate_by_name=True)
 
@@ -95,13 +95,13 @@ class Dropout(Section):
 
 
 class HoldLast(Section):
-    """What stands in for an absent picture at run time: its last ones, for a time; without it, nothing does."""
+    """What stands in for an absent picture at run time: its last ones, for a time. Without this table, nothing does."""
 
     hold_last_ms: int = known("for how long, ms", 20000, ge=1, le=600_000)
 
 
 class History(Section):
-    """In place of the policy's steps more of them, further back, each with whether there was a picture."""
+    """More steps than the policy's and further back, in their place, each with whether there was a picture."""
 
     steps: int = known("how many, the newest included", 12, ge=2, le=64)
 
@@ -118,7 +118,7 @@ class Part(Section):
     """A part of a vector, taken from one modality of the episodes."""
 
     modality: Name = known("modality of the episodes", "phone")
-    take: Literal["columns", "position", "rotation_6d", "quaternion"] = known("what of it", "position", "columns")
+    take: Literal["columns", "position", "rotation_6d", "quaternion"] = known("what is taken from it", "position", "columns")
     columns: tuple[Column, ...] | None = known('which of its numbers, for take = "columns"', [0], None, min_length=1)
 
     @model_validator(mode="after")
@@ -145,9 +145,9 @@ class Observation(Section):
     down_sample_steps: int = known("ticks between two of its steps", 3, 1, ge=1, le=64)
     size: Size | None = known("pictures: [height, width] as the camera gives them", [96, 96], None)
     resize: Size | None = known("pictures: [height, width] to which they are resized", [96, 128], None)
-    crop: Size | None = known("pictures: [height, width] of the middle that is taken", [96, 96], None)
+    crop: Size | None = known("pictures: [height, width] of the centre that is kept", [96, 96], None)
     color: Literal["rgb", "bgr"] = known("pictures: order of the colours", "rgb", "rgb")
-    operation: Literal["diff_to_reference"] | None = known("pictures", "diff_to_reference", None)
+    operation: Literal["diff_to_reference"] | None = known("pictures: what is computed from them", "diff_to_reference", None)
     columns: tuple[Column, ...] | None = known(
         "vectors: which numbers of the modality", [0, 1, 2, 3], None, min_length=1
     )
@@ -164,11 +164,11 @@ class Observation(Section):
     dropout: Dropout = known("how often it is taken away in training", {"window": 0.3}, Dropout())
     when_absent: HoldLast | None = known("what stands in for it while it is absent", {"hold_last_ms": 20000}, None)
     history: History | None = known(
-        "pictures: steps of its own, also of before it was unplugged", {"steps": 12}, None
+        "pictures: steps of its own, including those from before it was unplugged", {"steps": 12}, None
     )
     augmentation: Augmentation = known("what is varied in training", {"shift": 4}, Augmentation())
     outcome: float = known(
-        "pictures: weight of a second loss, by which it predicts the last action of the episode by itself", 0.5, 0.0, ge=0
+        "pictures: weight of a second loss, of predicting the episode's last action from it alone", 0.5, 0.0, ge=0
     )
 
     @model_validator(mode="after")
@@ -244,7 +244,7 @@ class Observation(Section):
 
     @property
     def valid(self) -> str:
-        """Of a history: name of the encoder's input that says which steps there are."""
+        """Of a history: name of the encoder's input that says which steps have a picture."""
         return f"{self.key}_valid"
 
     @property
@@ -279,13 +279,13 @@ class Observation(Section):
 
 
 _IMAGE_KEYS = {"size", "resize", "crop", "color", "operation", "dropout", "when_absent", "history", "outcome"}
-# What an encoder sees of a picture depends on.
+# What an encoder sees of a picture depends on these.
 _SIGHT = ("size", "resize", "crop", "color", "operation")
 _VECTOR_KEYS = {"columns", "parts", "slice"}
 
 
 class Base(Section):
-    """Where the pose is, at run time, that actions are relative to: the one whose samples the episodes have as `pose`."""
+    """Where to find, at run time, the pose that actions are relative to: the one that the episodes have as `pose`."""
 
     modality: Name = known("of a vector that the policy observes", "arm")
     position: tuple[Column, Column] = known("which of its numbers are x, y, z, the end not included", [0, 3])
@@ -303,7 +303,7 @@ class Base(Section):
 
 
 class Action(Section):
-    """What the policy does, and where it is in the episodes."""
+    """What the policy does, and where the episodes have it."""
 
     source: Literal["action", "pose"] = known(
         "where it is recorded: on the topic /action, or as the next pose", "pose", "action", alias="from"
@@ -315,7 +315,7 @@ class Action(Section):
     pose: Name | None = known("modality with the pose", "phone", None)
     gripper: Name | None = known("modality with the opening", "gripper", None)
     gripper_column: int = known("which of its numbers", 0, 0, ge=0)
-    gripper_squeeze: float = known("how much further it closes than was seen: what it holds stopped it", 0.1, 0.0, ge=0)
+    gripper_squeeze: float = known("how much further it closes than was recorded: what it held stopped it", 0.1, 0.0, ge=0)
     representation: Literal["absolute", "relative", "delta"] = known(
         "what a pose is relative to", "relative", "absolute"
     )
@@ -378,14 +378,14 @@ class Action(Section):
 
     @property
     def outputs(self) -> int:
-        """Numbers that are learned of an action."""
+        """How many numbers of an action are learned."""
         if self.source == "action":
             return len(self.names)
         return POSITION + ROTATIONS[self.rotation] + (self.gripper is not None)
 
     @property
     def composed(self) -> bool:
-        """Whether something else is executed than what is learned."""
+        """Whether what is executed differs from what is learned."""
         return self.representation != "absolute" or self.rotation != "none"
 
 
@@ -415,7 +415,7 @@ class Encoder(Section):
 
 
 def check_picture(encoder: Encoder, o: Observation, key: str) -> None:
-    """Whether the encoder takes what is observed under `key`."""
+    """Raises a mistake if the encoder does not take what is observed under `key`."""
     if o.kind == "image" and encoder.type == "small" and any(side % SMALL_MULTIPLE for side in o.shape[1:]):
         cause = f"{o.shape[1]}x{o.shape[2]}: the small encoder takes multiples of {SMALL_MULTIPLE}"
         given = next(k for k in ("crop", "resize", "size") if getattr(o, k))
@@ -432,9 +432,9 @@ class Denoiser(Section):
     widths: tuple[Annotated[int, Field(ge=8, le=4096, multiple_of=8)], ...] = known(
         "unet: channels of each level", [32, 64, 128], (32, 64, 128), min_length=1, max_length=6
     )
-    kernel: int = known("unet: of its convolutions", 5, 5, ge=1, le=15)
-    layers: int = known("transformer: one behind the other", 4, 4, ge=1, le=48)
-    heads: int = known("transformer: of the attention in a layer", 4, 4, ge=1, le=64)
+    kernel: int = known("unet: kernel size of its convolutions", 5, 5, ge=1, le=15)
+    layers: int = known("transformer: how many", 4, 4, ge=1, le=48)
+    heads: int = known("transformer: attention heads per layer", 4, 4, ge=1, le=64)
     width: int = known("transformer: length of a token", 128, 128, ge=8, le=4096)
     dropout: Share = known("transformer: share of the values that are dropped in training", 0.1, 0.1)
 
@@ -457,7 +457,7 @@ class Denoiser(Section):
         return len(self.widths) - 1 if self.type == "unet" else 0
 
     def sizes(self) -> dict[str, Any]:
-        """The keys of its type, with what they are."""
+        """The keys of its type, with their values."""
         return {key: value for key, value in self.model_dump(mode="json").items() if self._is_of_type(key)}
 
     def _is_of_type(self, key: str) -> bool:
@@ -474,10 +474,10 @@ class Horizon(Section):
     n_obs_steps: int = known("observations seen", 2, 2, ge=1, le=64)
     horizon: int = known("actions predicted", 16, 16, ge=1, le=1024)
     n_action_steps: int = known("actions executed before the next prediction", 8, 8, ge=1, le=1024)
-    control_hz: float = known("steps a second, as recorded", 10, 10.0, gt=0, le=1000)
+    control_hz: float = known("ticks per second, as recorded", 10, 10.0, gt=0, le=1000)
     max_observation_age_ms: int = known("older observations are not acted upon", 300, 300, ge=1)
     mask_aware: bool = known("learns to do without a modality", True, True)
-    inference_steps: int = known("of the sampler", 10, 10, ge=1, le=TRAIN_TIMESTEPS)
+    inference_steps: int = known("steps of the sampler", 10, 10, ge=1, le=TRAIN_TIMESTEPS)
 
     @model_validator(mode="after")
     def _check(self) -> Horizon:
@@ -495,8 +495,8 @@ class Training(Section):
     """The schedule."""
 
     iterations: int | None = known("batches; or epochs", 3900, None, ge=1)
-    epochs: float | None = known("so many windows as the data have, as often; drawn at random", 30, None, gt=0)
-    minutes: float | None = known("ends then at the latest", 30, None, gt=0)
+    epochs: float | None = known("times as many windows as the data have, drawn at random", 30, None, gt=0)
+    minutes: float | None = known("the training ends after them at the latest", 30, None, gt=0)
     windows: int = known("in a batch", 64, 64, ge=1)
     draws: int = known("noises for each window: the encoder, the expensive half, runs once for all", 2, 2, ge=1)
     optimizer: Literal["adamw", "adam", "sgd"] = known("which", "adamw", "adamw")
@@ -507,7 +507,7 @@ class Training(Section):
     weight_decay: float = known("of the optimiser", 1e-6, 1e-6, ge=0)
     scheduler: Literal["cosine", "linear", "constant"] = known("how the learning rate falls", "cosine", "cosine")
     final_rate: float = known("share of the learning rate at the end", 0.005, 0.005, ge=0, le=1)
-    warmup: int = known("iterations in which it rises", 100, 100, ge=0)
+    warmup: int = known("iterations in which the learning rate rises", 100, 100, ge=0)
     decay: float = known("of the moving average of the weights, which is exported", 0.995, 0.995, ge=0, lt=1)
     clip: float = known("largest norm of the gradients", 1.0, 1.0, gt=0)
     seed: int = known("of weights, windows and noise", 0, 0, ge=0)
@@ -527,7 +527,7 @@ class Training(Section):
 
 
 class Experiment(Section):
-    """All of it."""
+    """The whole experiment."""
 
     format: Literal["rapid-experiment/1"] = known("of this file", "rapid-experiment/1")
     name: Name = known("of the policy", "tactile-id")
@@ -624,7 +624,7 @@ class Experiment(Section):
 
     @property
     def images(self) -> tuple[Observation, ...]:
-        """The pictures of now, in the order of the mask."""
+        """The current pictures, in the order of the mask."""
         return tuple(o for o in self.observation if o.kind == "image" and not o.history)
 
     @property
@@ -633,7 +633,7 @@ class Experiment(Section):
         return tuple(o for o in self.observation if o.history)
 
     def column(self, history: Observation) -> int:
-        """Which of `images` is of the same modality."""
+        """The index in `images` of the picture of the same modality."""
         return [o.modality for o in self.images].index(history.modality)
 
     @property
@@ -643,7 +643,7 @@ class Experiment(Section):
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """Modalities whose numbers are read of an episode."""
+        """Modalities whose numbers are read from an episode."""
         observed = [part.modality for o in self.vectors for part in o.sources]
         return (*observed, *(name for name in (self.action.pose, self.action.gripper) if name))
 
@@ -654,12 +654,12 @@ class Experiment(Section):
 
     @property
     def action_length(self) -> int:
-        """Numbers of an action, as the networks have it."""
+        """How many numbers an action has in the networks."""
         return self.action.outputs
 
     @property
     def action_start(self) -> int:
-        """Index of the prediction that is the action of the newest observation."""
+        """Index, in the prediction, of the action for the tick of the newest observation."""
         return self.policy.n_obs_steps - 1
 
     @property
@@ -678,7 +678,7 @@ class Experiment(Section):
         return Experiment.model_validate_json(text)
 
     def learns_the_same(self, other: Experiment) -> str | None:
-        """Where `other` describes other weights; none if a training of one continues the other's."""
+        """Where `other` describes different weights; none if the training of one can continue the other's."""
         for table in ("policy", "observation", "action", "encoder", "denoiser"):
             if getattr(self, table) != getattr(other, table):
                 return table

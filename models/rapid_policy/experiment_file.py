@@ -19,7 +19,7 @@ Kind = TypeVar("Kind", Experiment, Classification)
 
 
 class ExperimentError(Exception):
-    """The mistakes of a file, a line each."""
+    """The mistakes of a file, one per line."""
 
 
 def read_experiment(path: Path) -> Experiment:
@@ -28,7 +28,7 @@ def read_experiment(path: Path) -> Experiment:
 
 
 def read_classification(path: Path) -> Classification:
-    """The same of a classifier."""
+    """The same for a classifier."""
     return _read(path, Classification)
 
 
@@ -65,7 +65,7 @@ def _resolve(path: Path, experiment: Kind) -> Kind:
 
 
 def _causes(error: ValidationError) -> list[ErrorDetails]:
-    """Without those that only follow from a mistake further in: a list is not too short because one of it is wrong."""
+    """Without those that only follow from a mistake further in: a list is not too short because an element is wrong."""
     found = error.errors()
     places = [one["loc"] for one in found]
     inside = [any(len(p) > len(one["loc"]) and p[: len(one["loc"])] == one["loc"] for p in places) for one in found]
@@ -94,7 +94,7 @@ def _key(table: Any, where: Location) -> str:
             words.append(str(named) if named else str(step))
         else:
             inner = table.get(step) if isinstance(table, dict) else None
-            # A step that is no key of the file is the variant of a value that may be one of several.
+            # A step that is not a key of the file is one of the variants that a value may have.
             if inner is None and table is not None and not isinstance(table, dict):
                 continue
             words.append(step)
@@ -118,7 +118,7 @@ def _field(model: type[BaseModel], name: str) -> Any:
 
 
 def _section(field: Any) -> type[BaseModel] | None:
-    """The table that is the value of a field, or of which it is a list."""
+    """The table that the value of a field is, or is a list of."""
     if field is None:
         return None
     for kind in (field.annotation, *get_args(field.annotation)):

@@ -62,7 +62,7 @@ def export(state: dict[str, Any], out: Path) -> float:
 
 
 def _network(spec: Experiment) -> dict[str, Any]:
-    """The sizes of the graphs, with which `weights` makes the networks again."""
+    """The sizes of the graphs, from which `weights` makes the networks again."""
     encoder = spec.encoder.model_dump(mode="json")
     if spec.encoder.weights:
         encoder["weights"] = Path(spec.encoder.weights).name
@@ -81,7 +81,7 @@ def encoder_example(spec: Experiment, batch: int = 2, mask: tuple[int, ...] | No
 
 
 def _valid_example(batch: int, steps: int) -> Tensor:
-    """Which steps of a history there are: of three rows some of the first, all of the second, none of the third."""
+    """Which steps of a history have a picture: of every three rows some in the first, all in the second, none in the third."""
     valid = torch.randint(0, 2, (batch, steps)).float()
     valid[1::3], valid[2::3] = 1, 0
     return valid
@@ -161,7 +161,7 @@ def _difference(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="rapid_policy.export", description="Makes a bundle of a checkpoint.")
+    parser = argparse.ArgumentParser(prog="rapid_policy.export", description="Makes a bundle from a checkpoint.")
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="folder of the bundle")
     args = parser.parse_args()

@@ -23,7 +23,7 @@ class Feed:
         self._waiting: deque[tuple[Future[Batch], dict[str, Any]]] = deque()
 
     def next(self) -> tuple[Batch, dict[str, Any]]:
-        """A batch, and the state of the generator behind it, from which a resumed training continues."""
+        """A batch, and the state of the generator after it, from which a resumed training continues."""
         if self._pool is None:
             plan, state = self._plan()
             return self._dataset.gather(plan), state

@@ -1,4 +1,4 @@
-"""The verdict on recorded files by `rapid inspect`, which is that of the recorder and the monitor.
+"""The verdict of `rapid inspect` on recorded files, the same as that of the recorder and the monitor.
 
 Only the standard library is used, so that whoever picks episodes can ask without an environment for training.
 """
@@ -37,7 +37,7 @@ class Judgement:
 
 
 def program() -> str:
-    """The program that gives the verdict: RAPID_BIN, otherwise `rapid` of the PATH."""
+    """The program that gives the verdict: RAPID_BIN, otherwise `rapid` in the PATH."""
     named = os.environ.get("RAPID_BIN")
     found = shutil.which(named or "rapid")
     if found is None:
@@ -58,7 +58,7 @@ def judge(files: Iterable[Path]) -> dict[Path, Judgement]:
 
 
 def _ask(rapid: str, files: list[Path]) -> dict[Path, Judgement]:
-    # The program takes a file with several names once.
+    # The program reads a file with several names only once.
     asked = {file: str(file.resolve()) for file in files}
     names = sorted(set(asked.values()))
     # Naming a file twice makes the output a list, in which an unreadable file has a line like the others.

@@ -1,11 +1,11 @@
-"""Episodes of LeRobot data sets v3.0, as LeRobot writes them and `rapid export --to lerobot`.
+"""Episodes of LeRobot data sets v3.0, as LeRobot and `rapid export --to lerobot` write them.
 
-An episode is named `FILE.parquet#INDEX`: a file has several. A modality NAME is, of pictures, the feature
-`observation.images.NAME` or `observation.NAME`; of numbers the columns of `observation.state` that are named `NAME.0`,
+An episode is named `FILE.parquet#INDEX`: a file has several. A modality NAME is, for pictures, the feature
+`observation.images.NAME` or `observation.NAME`; for numbers, the columns of `observation.state` that are named `NAME.0`,
 `NAME.1` ..., `NAME.pos` or just `NAME`, or the feature `observation.NAME` (so `state` is all of it). A data set of `rapid`
-lists the columns in `columns`, beside `names`, which are for people; of others the names count. Where the data set has
-`rapid.mask` and `rapid.valid` a sample is present if both are 1; in others every sample is. `rapid.plugged` is read where
-it is there.
+lists the columns in `columns`, beside `names`, which are for people; in others the names count. Where the data set has
+`rapid.mask` and `rapid.valid`, a sample is present if both are 1; in others every sample is. `rapid.plugged` is read if
+the data set has it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = "meta/info.json"
 VERSION = "v3.0"
-# Of an episode's columns those with the files that it is in.
+# Prefixes of the columns of meta/episodes that state in which files an episode is.
 PLACES = ("data/", "videos/")
 NAMED = re.compile(r"(.+\.parquet)#(\d+)")
 
@@ -40,12 +40,12 @@ class DatasetError(Exception):
 
 
 class MissingPackage(DatasetError):
-    """What reads it is not installed: no fault of an episode, and with it installed they serve."""
+    """A package that reads them is not installed: no fault of the episodes, which can be used once it is."""
 
 
 @dataclass(frozen=True)
 class Video:
-    """The part of a file that an episode's frames of a camera are, in seconds."""
+    """The part of a file, in seconds, that has a camera's frames of an episode."""
 
     file: Path
     begin: float
@@ -67,14 +67,14 @@ def episode_names(folder: Path) -> list[Path]:
     """The episodes of a data set."""
     template, names = _described(folder)["data_path"], []
     for index, row in sorted(_episodes(folder).items()):
-        # One that meta/episodes names no video for is refused here, before anything is decoded.
+        # An episode for which meta/episodes names no video is refused here, before anything is decoded.
         _videos(folder, row)
         names.append(Path(f"{folder / _place(template, row, 'data')}#{index}"))
     return names
 
 
 def rate(path: Path) -> float:
-    """Rows a second of an episode's data set."""
+    """Rows per second of an episode's data set."""
     return float(_described(_folder(path))["fps"])
 
 
@@ -92,8 +92,8 @@ def description(path: Path) -> str:
 
 
 def tables(path: Path) -> dict[str, Any]:
-    """The rows of an episode by feature: arrays, and of pictures a list. Beside it `names` and `columns`, by feature;
-    `videos`, by feature; `fps`."""
+    """The rows of an episode by feature: arrays, and for pictures a list. Also `names`, `columns` and `videos`, each by
+    feature, and `fps`."""
     file, index = split(path)
     folder, row = _folder(path), _episode(path)
     described = _described(folder)
@@ -110,15 +110,15 @@ def tables(path: Path) -> dict[str, Any]:
 def _column(folder: Path, table: pa.Table, name: str, feature: dict[str, Any]) -> Any:
     column = table.column(name)
     if feature["dtype"] == "image":
-        # What LeRobot has not embedded yet is a file.
+        # A picture that LeRobot has not embedded yet is a file.
         return [folder / row["path"] if row["bytes"] is None else row["bytes"] for row in column.to_pylist()]
     values = np.array(column.to_pylist())
     return values.reshape(len(values), -1)
 
 
 def _names(feature: dict[str, Any], names: Any) -> list[str]:
-    """Of each number of a feature; none if they are of something else. LeRobot has them in a list, in lists by a key
-    (`motors`), or has the places by name."""
+    """The name of each number of a feature; none if the names are of something else. LeRobot has them in a list, in lists
+    by a key (`motors`), or as places by name."""
     if isinstance(names, dict):
         lists = [inner for inner in names.values() if isinstance(inner, list)]
         names = sum(lists, []) if lists else sorted(names, key=lambda name: names[name])
@@ -126,8 +126,8 @@ def _names(feature: dict[str, Any], names: Any) -> list[str]:
 
 
 def pictures(rows: dict[str, Any], modality: str) -> Iterator[NDArray[np.uint8] | None] | None:
-    """Of a camera, where it is present; none if the data set has no such camera. A damaged picture is none, of a damaged
-    video nothing serves: after it frames may be wrong and look right."""
+    """The pictures of a camera where it is present; none if the data set has no such camera. A damaged picture is none;
+    nothing of a damaged video is used: frames after the damage may be wrong and look right."""
     feature = _camera(rows, modality)
     if feature is None:
         return None
@@ -145,7 +145,7 @@ def _camera(rows: dict[str, Any], modality: str) -> str | None:
 
 
 def _frames(rows: dict[str, Any], feature: str) -> Iterator[NDArray[np.uint8]]:
-    """Of each row, by its time."""
+    """The frame of each row, by its time."""
     video, times = rows["videos"][feature], rows["timestamp"].ravel()
     count = round((video.end - video.begin) * rows["fps"])
     if count != len(times):
@@ -163,7 +163,7 @@ def _picture(data: bytes | Path) -> NDArray[np.uint8] | None:
 
 
 def numbers(rows: dict[str, Any], modality: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """Of a sensor [T, D], and [T] where it is present; none if the data set has no such sensor."""
+    """The numbers of a sensor [T, D], and [T] where it is present; none if the data set has no such sensor."""
     columns = _columns(rows, modality)
     if columns and "observation.state" in rows:
         values = rows["observation.state"][:, columns]
@@ -175,7 +175,7 @@ def numbers(rows: dict[str, Any], modality: str) -> tuple[NDArray[np.float64], N
 
 
 def _columns(rows: dict[str, Any], modality: str) -> list[int]:
-    """The places in observation.state of the numbers of a sensor: in their order, or in that of the columns."""
+    """The places in observation.state of a sensor's numbers: in the order of these, or in that of the columns."""
     names = rows["columns"].get("observation.state") or []
     found = [(name, *name.rpartition("."), i) for i, name in enumerate(names) if isinstance(name, str)]
     mine = [(number, i) for name, owner, _, number, i in found if modality in (owner, name)]
@@ -190,8 +190,8 @@ def _columns(rows: dict[str, Any], modality: str) -> list[int]:
 
 
 def presence(rows: dict[str, Any], modality: str, count: int) -> dict[str, NDArray[np.bool_]]:
-    """[T] whether the device of a sensor is plugged in, and whether its bit is set. In a data set that does not record them
-    both are, of each sensor that it has."""
+    """[T] whether the device of a sensor is plugged in, and whether its bit is set. Where a data set does not record
+    them, both hold for each sensor that it has."""
     running = _flags(rows, "rapid.mask", modality)
     running = np.full(count, _has(rows, modality)) if running is None else running
     plugged = _flags(rows, "rapid.plugged", modality)
@@ -209,7 +209,7 @@ def _present(rows: dict[str, Any], modality: str, count: int) -> NDArray[np.bool
 
 
 def _flags(rows: dict[str, Any], feature: str, modality: str) -> NDArray[np.bool_] | None:
-    """Of a feature with a flag for each sensor; none if it has none for this one."""
+    """The flags of a sensor in a feature with one for each; none if it has none for this one."""
     names = rows["names"].get(feature) or []
     return rows[feature][:, names.index(modality)] > 0.5 if modality in names else None
 
@@ -237,7 +237,7 @@ def _read_description(file: tuple[Path, int, int]) -> dict[str, Any]:
 
 
 def _videos(folder: Path, row: dict[str, Any]) -> dict[str, Video]:
-    """The parts of videos that are an episode's, by feature."""
+    """The parts of videos that belong to an episode, by feature."""
     described, found = _described(folder), {}
     for name, feature in described["features"].items():
         if feature["dtype"] == "video":
@@ -264,7 +264,7 @@ def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
 
 
 def _now(file: Path) -> tuple[Path, int, int]:
-    """A file as it is: what is read of it is kept, since each of many episodes asks, until it changes."""
+    """A file as it is now: what is read from it is kept until it changes, since each of many episodes asks."""
     stat = file.stat()
     return file, stat.st_size, stat.st_mtime_ns
 

@@ -19,7 +19,7 @@ class Losses(nn.Module):
     """The loss of a batch, as one module: what several processes compute together."""
 
     def __init__(self, policy: Policy, device: torch.device, *, outcomes: bool = True) -> None:
-        """Without `outcomes` of the noise alone, which is what a bundle predicts."""
+        """Without `outcomes`, the loss is of the noise alone, which is what a bundle predicts."""
         super().__init__()
         self._outcomes = outcomes and policy.outcomes is not None
         self.policy = policy
@@ -29,7 +29,7 @@ class Losses(nn.Module):
     def forward(self, observations: dict[str, Tensor], mask: Tensor | None, clean: Tensor, timestep: Tensor,
                 noise: Tensor, outcome: Tensor) -> Tensor:  # fmt: skip
         """Mean squared error of the predicted noise and, weighted, of the `outcome` [B, Da] as pictures predict it."""
-        # By itself only the encoder: its convolutions gain most from half precision, the denoiser's small ones nothing.
+        # `auto` is for the encoder only: its convolutions gain most from half precision, the denoiser's small ones nothing.
         both = self._precision == "bf16"
         half = both or (self._precision == "auto" and half_width(self._device))
         with torch.autocast(self._device.type, torch.bfloat16, enabled=half):
@@ -46,7 +46,7 @@ class Losses(nn.Module):
 
 
 class Replayed(nn.Module):
-    """`Losses` whose kernels a GPU is given as one graph, for they are many and small: launching each by itself keeps it waiting.
+    """`Losses` whose kernels a GPU gets as one graph: they are many and small, and launching each by itself keeps it waiting.
     The first batch determines the sizes."""
 
     def __init__(self, losses: nn.Module, arguments: tuple[Any, ...]) -> None:
@@ -64,7 +64,7 @@ class Replayed(nn.Module):
 
 
 class _Flat(nn.Module):
-    """`Losses` of tensors alone, as a graph needs them."""
+    """`Losses` with tensors as its only arguments, as a graph needs them."""
 
     def __init__(self, losses: nn.Module, keys: list[str], has_mask: bool) -> None:
         super().__init__()

@@ -39,7 +39,7 @@ class SpatialSoftmax(nn.Module):
 class SmallEncoder(nn.Module):
     """One picture [B, 3, H, W] in -1..1 -> [B, features].
 
-    Half the picture is enough to see a lattice: it is averaged to that first.
+    Half its size is enough to see a lattice: the picture is averaged to that first.
     """
 
     def __init__(self, height: int, width: int, sizes: Encoder) -> None:
@@ -91,21 +91,21 @@ ENCODERS = {"small": SmallEncoder, "resnet18": ResNetEncoder}
 
 
 class HistoryPooling(nn.Module):
-    """Embeddings [B, S, F] of the steps of a history, bool [B, S] which there are -> [B, F]: their mean, weighted by a
-    learned score of each; zeros where there is none.
+    """Embeddings [B, S, F] of the steps of a history, bool [B, S] which of them are valid -> [B, F]: the mean of those,
+    weighted by a learned score of each; zeros if there are none.
 
-    At first the score is the age alone, and the newest step that there is has nearly all the weight: before it has learned
-    which steps to remember, it remembers the last.
+    At first the score is the age alone, and the newest valid step has nearly all the weight: before it has learned which
+    steps to remember, it remembers the last one.
     """
 
-    # Difference of the first scores of two steps that are as far apart as the nearest ones: less, and the last is not most of
-    # what is remembered; much more, and the others have no gradient.
+    # Difference between the initial scores of the two steps that are nearest to each other: with less, the last is not most of
+    # what is remembered; with much more, the others have no gradient.
     APART = 3.0
-    # Of a step that is not there, beside which every other one has all the weight.
+    # The score of a step that is not valid, beside which any other one has all the weight.
     LEAST = -1e9
 
     def __init__(self, features: int, ages: Sequence[int]) -> None:
-        """`ages`: ticks before the newest observation, of each step."""
+        """`ages`: for each step, how many ticks before the newest observation it is."""
         super().__init__()
         self.score = nn.Linear(features, 1, bias=False)
         nn.init.zeros_(self.score.weight)
@@ -114,18 +114,18 @@ class HistoryPooling(nn.Module):
         self.places = nn.Parameter(-torch.tensor(ages, dtype=torch.float32) * (self.APART / nearest))
 
     def forward(self, embeddings: Tensor, valid: Tensor) -> Tensor:
-        # Selected, not multiplied: what is not there may contain anything.
+        # Selected, not multiplied: a step that is not valid may contain anything.
         embeddings = torch.where(valid.unsqueeze(-1), embeddings.float(), 0.0)
         scores = self.score(embeddings).squeeze(-1).float() + self.places
         weights = F.softmax(torch.where(valid, scores, self.LEAST), -1)
-        # Without any step the softmax has given all the same weight.
+        # Without any valid step the softmax has given all of them the same weight.
         return (torch.where(valid, weights, 0.0).unsqueeze(-1) * embeddings).sum(1)
 
 
 class ObservationEncoder(nn.Module):
     """All observations -> `global_cond` [B, Dc]: at each step the vectors and an embedding of each picture.
 
-    For the embedding of an absent picture stands what is remembered of it, by its histories, and without any zeros.
+    The embedding of an absent picture is replaced by what its histories remember of it, or by zeros if it has none.
     """
 
     def __init__(self, spec: Experiment) -> None:
@@ -137,7 +137,7 @@ class ObservationEncoder(nn.Module):
         kind = ENCODERS[spec.encoder.type]
         one_each = {SHARED: spec.images[0]} if self.shared and spec.images else {o.key: o for o in spec.images}
         self.images = nn.ModuleDict({key: kind(*o.shape[1:], spec.encoder) for key, o in one_each.items()})
-        # By the key of the picture of now, whose encoder sees them too.
+        # By the key of the current picture, whose encoder sees them too.
         of_each = {o.key: [h for h in spec.histories if h.modality == o.modality] for o in spec.images}
         self.history_keys = {key: [(h.key, h.valid) for h in found] for key, found in of_each.items()}
         ages = {key: [age for h in found for age in h.ages] for key, found in of_each.items() if found}
@@ -163,19 +163,19 @@ class ObservationEncoder(nn.Module):
         return torch.cat([x.float() for x in vectors + embeddings], -1).flatten(1)
 
     def _remembered(self, key: str, observations: dict[str, Tensor], now: Tensor, *, pooled: bool) -> Tensor:
-        """What stands for the embedding `now` of an absent picture, the same at every step: [B, 1, F] or a zero."""
+        """What replaces the embedding `now` of an absent picture, the same at every step: [B, 1, F] or a zero."""
         if not self.history_keys[key]:
             return torch.zeros((), dtype=now.dtype, device=now.device)
         seen, there = [], []
         for history, valid in self.history_keys[key]:
             there.append(observations[valid] > 0.5)
-            # A graph, of onnxruntime or of a GPU, computes all steps, whichever there are; training on a CPU only those.
+            # A graph, in onnxruntime or on a GPU, computes all steps, valid or not; training on a CPU only the valid ones.
             fewer = pooled and now.device.type == "cpu"
             seen.append(self._embed(key, observations[history], pooled=pooled, there=there[-1] if fewer else None))
         return self.histories[key](torch.cat(seen, 1), torch.cat(there, 1)).unsqueeze(1).to(now.dtype)
 
     def _embed(self, key: str, pictures: Tensor, *, pooled: bool, there: Tensor | None = None) -> Tensor:
-        """[B, To, 3, H, W] -> [B, To, F], by the encoder of the picture `key`; with `there` [B, To] zeros for the others."""
+        """[B, To, 3, H, W] -> [B, To, F], by the encoder of the picture `key`; with `there` [B, To], zeros where it is false."""
         encoder = self.images[SHARED if self.shared else key]
         see = encoder.pooled if pooled else encoder
         if there is None:
@@ -188,8 +188,9 @@ class ObservationEncoder(nn.Module):
 class Outcomes(nn.Module):
     """`global_cond` [B, Dc] -> the last action of the episode, as some pictures predict it, each by itself.
 
-    By itself, because where a vector shows it too, which it does as soon as the ways to different ends part, a picture would
-    have nothing more to learn. Each is that of the newest step, or what is remembered of it; of zeros it is the layer's bias.
+    By itself, because a vector shows it too as soon as the trajectories to different endings diverge, and a picture would then
+    have nothing more to learn. Each embedding is that of the newest step, or what is remembered of it; for zeros the
+    prediction is the layer's bias.
     """
 
     def __init__(self, spec: Experiment) -> None:
@@ -201,7 +202,7 @@ class Outcomes(nn.Module):
         self.heads = nn.ModuleDict({i: nn.Linear(self._features, spec.action_length) for i in self.weights})
 
     def forward(self, condition: Tensor) -> dict[str, Tensor]:
-        """[B, Da] of each, by its place among the pictures."""
+        """[B, Da] from each, by its place among the pictures."""
         newest = condition.unflatten(1, (self._steps, -1))[:, -1]
         pictures = newest[:, self._first :].unflatten(1, (-1, self._features))
         return {i: head(pictures[:, int(i)]) for i, head in self.heads.items()}
@@ -280,7 +281,7 @@ class UNetDenoiser(nn.Module):
 
     @classmethod
     def of(cls, spec: Experiment) -> UNetDenoiser:
-        """That of an experiment."""
+        """The denoiser of an experiment."""
         return cls(spec.action_length, spec.condition, spec.denoiser.widths, spec.denoiser.kernel)
 
     def forward(self, sample: Tensor, timestep: Tensor, global_cond: Tensor) -> Tensor:
@@ -300,7 +301,7 @@ class UNetDenoiser(nn.Module):
 class TransformerDenoiser(nn.Module):
     """The same by attention: a token for each action, which sees all others, the diffusion step and each observation step.
 
-    What a bundle calls `global_cond` is the observation steps, one behind the other.
+    What a bundle calls `global_cond` is the observation steps, one after the other.
     """
 
     def __init__(self, spec: Experiment) -> None:
@@ -341,11 +342,11 @@ class Policy(nn.Module):
         self.spec = spec
         self.encoder = ObservationEncoder(spec)
         self.denoiser = DENOISERS[spec.denoiser.type](spec)
-        # Of the training alone: no bundle has it.
+        # For training only: no bundle has it.
         self.outcomes = Outcomes(spec) if spec.predicts_outcomes else None
 
     def start_from(self, weights: Path) -> None:
-        """The image encoders begin with torchvision's weights."""
+        """Gives the image encoders torchvision's weights to begin with."""
         for encoder in self.encoder.images.values():
             encoder.trunk.load_file(weights)
 

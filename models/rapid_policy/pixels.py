@@ -12,7 +12,7 @@ from PIL import Image
 Pixels = NDArray[np.uint8]
 
 COMPRESSED, RAW = "foxglove.CompressedImage", "foxglove.RawImage"
-# Bytes a pixel of each encoding of a raw picture.
+# Bytes per pixel of each encoding of a raw picture.
 ENCODINGS = {
     "rgb8": 3,
     "bgr8": 3,
@@ -35,7 +35,7 @@ class PixelError(Exception):
 
 
 class FormatError(Exception):
-    """Messages that are no pictures which are read."""
+    """Messages that are not pictures that can be read."""
 
 
 def decode(schema: str, message: Any) -> Pixels:
@@ -72,7 +72,7 @@ def _raw(message: Any) -> Pixels:
 
 
 def _yuv(rows: Pixels, y: int) -> Pixels:
-    """Two pixels in four bytes: BT.601 of limited range in 1/65536; `y` is the place of the first brightness."""
+    """Two pixels in four bytes: BT.601 with limited range, in units of 1/65536; `y` is the place of the first brightness."""
     if rows.shape[1] % 4:
         raise PixelError("an odd number of pixels in YUYV")
     pairs = rows.reshape(len(rows), -1, 4).astype(np.int32)
@@ -122,6 +122,6 @@ def _taps(size: int, resized: int, wanted: int) -> tuple[NDArray[np.int64], NDAr
 
 
 def _crop_start(size: int, wanted: int) -> int:
-    """An odd rest is halved to the even side, as torchvision's CenterCrop does."""
+    """An odd remainder is halved to the even number, as torchvision's CenterCrop does."""
     rest = size - wanted
     return rest // 2 + (rest % 4 == 3)

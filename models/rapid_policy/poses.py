@@ -1,8 +1,8 @@
 """Poses of recordings: from the numbers of a sample to position and rotation, and what one pose is relative to another.
 
-The conventions are those of UMI: a relative pose is inverse(base) @ pose; of a delta the position is the difference in
-the axes of the frame in which poses are given, the rotation is rotation @ inverse(rotation before). Six numbers of a
-rotation are the first two rows of its matrix, a quaternion is x y z w with w not negative.
+The conventions are those of UMI: a relative pose is inverse(base) @ pose; in a delta the position is the difference along
+the axes of the frame in which poses are given, and the rotation is rotation @ inverse(rotation before). The six numbers
+of a rotation are the first two rows of its matrix; a quaternion is x y z w with w not negative.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 LENGTHS = {"columns": 16, "rows": 16, "quaternion": 7}
-# What numbers may be off before they are no rotation: trackers give 32-bit numbers.
+# How far numbers may be off and still be a rotation: trackers give 32-bit numbers.
 SLACK = 0.05
 
 
@@ -40,7 +40,7 @@ def matrices(values: Floats, layout: str) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _nearest(given: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """The nearest rotations, and which of the matrices are rotations but for rounding."""
+    """The nearest rotations, and which of the matrices are rotations, apart from rounding."""
     finite = np.isfinite(given).all((1, 2))
     u, sizes, v = np.linalg.svd(np.where(finite[:, None, None], given, np.eye(3)))
     rotations = u @ v

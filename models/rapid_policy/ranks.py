@@ -21,17 +21,17 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """It writes and reports."""
+        """Whether this process is the one that writes and reports."""
         return self.rank == 0
 
     def wait(self) -> None:
-        """Until all are here."""
+        """Waits until all processes are here."""
         if self.world > 1:
             dist.barrier()
 
     def agree(self, *values: float) -> list[float]:
-        """Numbers of the first process, and in the last place the largest of all: the clock is the first one's, a
-        signal may reach any."""
+        """The values of the first process, except for the last, which is the largest of all processes: the clock is
+        the first one's, but a signal may reach any."""
         if self.world == 1:
             return list(values)
         shared = torch.tensor(values[:-1], dtype=torch.float64, device=self.device)
@@ -41,7 +41,7 @@ class Ranks:
         return [*shared.tolist(), *largest.tolist()]
 
     def mean(self, value: torch.Tensor) -> float:
-        """Of all processes."""
+        """The mean over all processes."""
         value = value.detach().clone()
         if self.world > 1:
             dist.all_reduce(value)
@@ -55,17 +55,17 @@ class Ranks:
         return slice(self.rank * share, (self.rank + 1) * share)
 
     def together(self, module: nn.Module) -> nn.Module:
-        """The module with gradients that are the mean of all processes."""
+        """The module, with gradients averaged over all processes."""
         return DistributedDataParallel(module) if self.world > 1 else module
 
     def end(self) -> None:
-        """Nothing is shared any more."""
+        """Leaves the other processes."""
         if self.world > 1:
             dist.destroy_process_group()
 
 
 def join(device: str) -> Ranks:
-    """As torchrun's environment has it; `device` is auto, cpu or cuda."""
+    """This process, by torchrun's environment; `device` is auto, cpu or cuda."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"

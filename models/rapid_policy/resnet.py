@@ -1,6 +1,6 @@
 """ResNet-18 (He et al., 2016) without its classifier. Weights have torchvision's names, so that its files load.
 
-From scratch the normalisation is by groups, because a moving average of weights does not go with batch statistics
+From scratch it has group normalisation, because a moving average of weights does not work with batch statistics
 (Chi et al., 2023). With weights from a file the statistics of that file are kept as they are.
 """
 
@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 CHANNELS = (64, 128, 256, 512)
-# Of the picture's side, in the features.
+# How many pixels of the picture's side one step of the features covers.
 STRIDE = 32
 
 
@@ -32,7 +32,7 @@ class FrozenNorm(nn.Module):
 
 
 def norm(channels: int, frozen: bool) -> nn.Module:
-    """Of a convolution's output."""
+    """The normalisation of a convolution's output."""
     return FrozenNorm(channels) if frozen else nn.GroupNorm(channels // 16, channels)
 
 
@@ -71,7 +71,7 @@ class ResNet18(nn.Module):
         return self.layer4(self.layer3(self.layer2(self.layer1(x))))
 
     def load_file(self, path: Path) -> None:
-        """The weights of torchvision's resnet18, which have a classifier that is left out."""
+        """Loads the weights of torchvision's resnet18, without those of its classifier."""
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
             wanted = self.state_dict()

@@ -17,7 +17,7 @@ def write(folder: Path, name: str, report: dict[str, Any], markdown: str) -> Non
 
 
 def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """Where 95 % of the repetitions would have the true share (Wilson's score interval)."""
+    """An interval that would contain the true share in 95 % of repetitions (Wilson's score interval)."""
     share, spread = successes / trials, z * z / trials
     middle = (share + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(share * (1 - share) / trials + spread / (4 * trials))

@@ -4,9 +4,9 @@
     python -m rapid_policy.train EXPERIMENT.toml --out RUN --rapid PROGRAM --evaluate-every 500 --evaluate-trials 20
     torchrun --nproc-per-node 2 -m rapid_policy.train EXPERIMENT.toml --out RUN
 
-Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` continues), RUN/best.pt (of the
-lowest loss on held-out episodes, if there are any), RUN/best-success.pt (of the most trials that succeeded, with
---evaluate-every), curves for TensorBoard and RUN/loss.png. SIGTERM, SIGINT and SIGHUP end it after the present iteration,
+Writes RUN/checkpoint.pt (from which `rapid_policy.export` makes a bundle and `--resume` continues), RUN/best.pt (with the
+lowest loss on held-out episodes, if there are any), RUN/best-success.pt (with the most trials that succeeded, with
+--evaluate-every), curves for TensorBoard and RUN/loss.png. SIGTERM, SIGINT and SIGHUP end it after the current iteration,
 with a checkpoint.
 """
 
@@ -46,9 +46,9 @@ from .ranks import Ranks, join
 from .trials import CONDITION, FIRST_SEED, MOST, Trials, check_count, check_seeds
 from .weights import First
 
-# Batches of a measurement on held-out episodes, at most.
+# Most batches in a measurement on held-out episodes.
 VALIDATION_BATCHES = 16
-# Values of a tag that the model card counts.
+# The model card counts the values of a tag that has no more of them.
 COUNTED = 8
 
 
@@ -73,7 +73,7 @@ class Trainer:
     def train(self) -> float:
         """Trains to the end of the schedule. Returns the final loss: the mean of the last hundred iterations.
 
-        Whatever ends it before, the checkpoint in `out` is the one to continue from.
+        Whatever ends it earlier, the checkpoint in `out` is the one to continue from.
         """
         run, first = self.run, self.ranks.first
         progress = Progress(run.spec.name, run.iterations, run.iteration, first)
@@ -100,7 +100,7 @@ class Trainer:
         return run.provenance["final_loss"]
 
     def _evaluate_last(self, board: Board) -> None:
-        # It takes a while, in which nothing of the training can be lost any more.
+        # It takes a while, during which nothing of the training can be lost any more.
         self.run.save(self.out / CHECKPOINT)
         self.trials.finish(board, lambda: self.stopping)
         if self.stopping:
@@ -159,7 +159,7 @@ class Trainer:
     @staticmethod
     def _arguments(spec: Experiment, batch: Batch, size: int, rows: slice, device: torch.device,
                    random: torch.Generator | None = None) -> tuple[Any, ...]:  # fmt: skip
-        """Of `Losses`. The noise is drawn for the whole batch of `size` windows, whatever part `rows` is of it."""
+        """The arguments of `Losses`. The noise is drawn for the whole batch of `size` windows, whatever part `rows` is of it."""
         draws = spec.training.draws
         shape = (draws * size, spec.policy.horizon, spec.action_length)
         timestep = torch.randint(0, TRAIN_TIMESTEPS, (draws * size,), generator=random)
@@ -172,7 +172,7 @@ class Trainer:
     def _validate(self, board: Board) -> None:
         """The loss of the averaged weights on held-out episodes: the same windows and noise each time, nothing varied.
 
-        Of the noise alone: by it the best weights are chosen, and what predicts outcomes is in no bundle."""
+        It is that of the noise alone: it chooses the best weights, and what predicts outcomes is in no bundle."""
         run, held_out = self.run, self.held_out
         measure = Losses(run.average, self.ranks.device, outcomes=False)
         random, noise = np.random.default_rng(0), torch.Generator().manual_seed(0)
@@ -203,7 +203,7 @@ def _signals() -> list[signal.Signals]:
 
 
 def _set_rate(run: Run, done: float) -> float:
-    """Warm-up, then down as the schedule has it. Returns the rate."""
+    """Sets the learning rate: a warm-up, then a fall as the schedule states. Returns it."""
     schedule = run.schedule
     fallen = {"cosine": 0.5 * (1 + math.cos(math.pi * done)), "linear": 1 - done, "constant": 1.0}[schedule.scheduler]
     share = fallen + (schedule.final_rate if schedule.scheduler != "constant" else 0.0)
@@ -264,21 +264,21 @@ def parse() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="rapid_policy.train", description="Trains a policy from recorded episodes.")
     add = parser.add_argument
-    add("experiment", type=Path, help="its description (*.toml)")
+    add("experiment", type=Path, help="the experiment (*.toml)")
     add("--data", type=Path, nargs="+", metavar="FOLDER", help="episodes, in place of the experiment's folders")
     add(
         "--out", type=Path, required=True, metavar="RUN", help="folder for checkpoints, curves and the plot of the loss"
     )
     add("--cache", type=Path, help="folder of decoded episodes (default: cache, beside RUN)")
     add("--iterations", type=int, help="in place of the experiment's")
-    add("--minutes", type=float, default=math.inf, help="end after so long at the latest")
+    add("--minutes", type=float, default=math.inf, help="end after this long at the latest")
     add("--seed", type=int, help="in place of the experiment's")
-    add("--threads", type=int, default=2, help="of the CPU")
-    add("--workers", type=int, default=1, help="threads that read ahead, and processes that decode")
+    add("--threads", type=int, default=2, help="threads of the CPU (default: 2)")
+    add("--workers", type=int, default=1, help="threads that read ahead, and processes that decode (default: 1)")
     add("--device", default="auto", help="auto, cpu, cuda")
     add("--resume", action="store_true", help="continue from the checkpoint in --out")
-    add("--start-from", type=Path, metavar="BUNDLE", help="begin with the weights of a policy that was exported")
-    add("--rapid", metavar="PROGRAM", help="gives the verdicts and evaluates (default: RAPID_BIN, or rapid of the PATH)")
+    add("--start-from", type=Path, metavar="BUNDLE", help="begin with the weights of an exported policy")
+    add("--rapid", metavar="PROGRAM", help="gives the verdicts and evaluates (default: RAPID_BIN, or rapid in the PATH)")
     add(
         "--evaluate-every",
         type=whole(10**9),
@@ -291,7 +291,7 @@ def parse() -> argparse.Namespace:
         type=whole(MOST),
         default=20,
         metavar="N",
-        help=f"of the simulated task, condition {CONDITION}, seeds from {FIRST_SEED} on, which no result is reported of (20)",
+        help=f"trials of the simulated task: condition {CONDITION}, seeds from {FIRST_SEED} on, which no result uses (20)",
     )
     return parser.parse_args()
 
@@ -308,7 +308,7 @@ def whole(most: int) -> Callable[[str], int]:
 
 
 def with_options(spec: Experiment, args: argparse.Namespace) -> Experiment:
-    """The experiment, with what the command line has in place of it."""
+    """The experiment, with the command line's options in place of its own."""
     changes: dict[str, Any] = {} if args.iterations is None else {"iterations": args.iterations, "epochs": None}
     changes |= {} if args.seed is None else {"seed": args.seed}
     return spec.model_copy(update={"training": spec.training.model_copy(update=changes)})
@@ -377,14 +377,14 @@ def prepare(args: argparse.Namespace, ranks: Ranks) -> Trainer:
 
 
 def _begun(first: First | None, state: dict[str, Any] | None) -> dict[str, Any]:
-    """How it began: of a training that is resumed, what its checkpoint has."""
+    """How the training began; if it is resumed, as its checkpoint has it."""
     if state:
         return {key: state["provenance"][key] for key in ("command", "started_from") if key in state["provenance"]}
     return {"started_from": first.origin()} if first else {}
 
 
 def command(args: argparse.Namespace, spec: Experiment) -> str:
-    """How the training is repeated."""
+    """The command that repeats the training."""
     words = ["python -m rapid_policy.train", f"experiments/{args.experiment.name}", "--data EPISODES --out RUN"]
     words += [f"--iterations {args.iterations}"] if args.iterations is not None else []
     words += [f"--minutes {args.minutes:g}"] if math.isfinite(args.minutes) else []

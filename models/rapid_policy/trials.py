@@ -1,10 +1,10 @@
 """Trials of a training's weights in the program while it continues: `rapid eval` on the simulated task.
 
 Owns RUN/evaluation and the child process that works there, of which there is one at most: it exports a copy of the
-checkpoint and then becomes the program. The training does not wait for it and draws no random number for it. It outlives
+checkpoint and then becomes the program. The training does not wait for it and draws no random number for it. It survives
 the child's failure. It ends the child when it ends, after SIGHUP, SIGINT and SIGTERM too; when it is killed, the kernel
-kills the child, which asks for that. Weights are chosen by these trials, so their seeds are none of those that results are
-reported of, and the scores that are compared are of as many trials.
+kills the child, which asks for that. Weights are chosen by these trials, so their seeds are none of those of reported
+results, and only scores of equally many trials are compared.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 from .checkpoint import BEST_SUCCESS, CHECKPOINT, Run, read_checkpoint
 from .progress import Board, recent
 
-# Demonstrations are recorded with seeds from 1,000 on; results are reported of those from 50,000 on (evaluation.py,
+# Demonstrations are recorded with seeds from 1,000 on; reported results use those from 50,000 on (evaluation.py,
 # ablation.py, the default of `rapid eval`).
 FIRST_SEED = 40_000
 MOST = 10_000
@@ -33,13 +33,13 @@ CONDITION = "full"
 PATIENCE = 10.0
 # Seconds until a wait for the child notices a signal to the training.
 NOTICE = 0.2
-# Of prctl(2): the signal that a process gets when its parent ends; it outlasts execve.
+# Of prctl(2): the signal that a process gets when its parent ends; it survives execve.
 PR_SET_PDEATHSIG = 1
 MODELS = Path(__file__).parents[1]
 
 
 class Trials:
-    """Evaluations of the averaged weights of `run`, every so many iterations, of `count` trials each."""
+    """Evaluations of the averaged weights of `run`, one every `every` iterations, of `count` trials each."""
 
     def __init__(self, run: Run, out: Path, rapid: str, every: int, count: int) -> None:
         self._run, self._out, self._folder = run, out.absolute(), out.absolute() / "evaluation"
@@ -50,21 +50,21 @@ class Trials:
     def step(self, board: Board) -> None:
         """After an iteration: takes the result of an evaluation that has ended, and starts the next if it is due.
 
-        What is due while another runs starts when that ends, with the weights of then.
+        One that falls due while another runs starts when that ends, with the weights of that time.
         """
         self._take(board)
         if self._child is None and self._run.iteration // self._every > self._started // self._every:
             self._start()
 
     def finish(self, board: Board, stopping: Callable[[], bool]) -> None:
-        """After the last iteration: waits for the evaluation that runs, and for one of the final weights."""
+        """After the last iteration: waits for the running evaluation, and for one of the final weights."""
         self._wait(board, stopping)
         if self._started < self._run.iteration and not stopping():
             self._start()
             self._wait(board, stopping)
 
     def end(self) -> None:
-        """Ends the evaluation that runs; its result is lost."""
+        """Ends the running evaluation; its result is lost."""
         if self._child is None:
             return
         self._child.terminate()
@@ -135,7 +135,7 @@ class Trials:
         print(f"{run.spec.name}: {self._started}/{run.iterations} {text}{', the best' if best else ''}", flush=True)
 
     def _read(self, code: int) -> dict[str, Any]:
-        """What the program printed of all trials, in plain numbers."""
+        """What the program printed about all trials, in plain numbers."""
         if code:
             last = (self._folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
             raise ValueError(": ".join([f"exit code {code}", *last]))
@@ -154,7 +154,7 @@ class Trials:
 
 
 def check_seeds(demonstrated: list[int] | None, count: int) -> None:
-    """A trial whose block was demonstrated shows nothing about others. `demonstrated`: first and last seed."""
+    """Refuses trials whose blocks were demonstrated: they show nothing about others. `demonstrated`: first and last seed."""
     if demonstrated and demonstrated[0] < FIRST_SEED + count and demonstrated[1] >= FIRST_SEED:
         cause = f"{FIRST_SEED} to {FIRST_SEED + count - 1}: seeds of trials that were demonstrated"
         fix = "leave --evaluate-every out, or data.seeds of the experiment chooses other episodes"
@@ -162,7 +162,7 @@ def check_seeds(demonstrated: list[int] | None, count: int) -> None:
 
 
 def check_count(checkpoint: Path, evaluations: list[dict[str, Any]], count: int) -> None:
-    """Scores of few trials vary more, so that the best of them would stay the best."""
+    """Refuses scores of another number of trials: those of few vary more, so that the best of them would stay the best."""
     # Older checkpoints do not state it.
     others = {found["trials"] for found in evaluations if "trials" in found} - {count}
     if others:
@@ -187,7 +187,7 @@ def main() -> None:
 
     from .export import export
 
-    # The training goes first.
+    # The training has priority.
     os.nice(10)
     torch.set_num_threads(1)
     export(read_checkpoint(Path(checkpoint)), Path(bundle))

@@ -1,5 +1,5 @@
 """Pictures of a video at given times. Each is the frame that LeRobot 0.4.4 takes with PyAV: the one nearest to the time, if
-it is less than `TOLERANCE` from it. Which part of which video is an episode's is what `lerobot_source` knows.
+it is less than `TOLERANCE` from it. `lerobot_source` knows which part of which video belongs to an episode.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 # Seconds.
 TOLERANCE = 1e-4
-# A key frame is sought by the time at which it is decoded, which is before that at which it is shown: without a margin the
-# first frames of a segment of HEVC are missed, by LeRobot too.
+# A key frame is found by the time at which it is decoded, which is before that at which it is shown: without a margin the
+# first frames of a segment of HEVC are missed, as they are by LeRobot.
 MARGIN = 1.0
 
 
@@ -23,7 +23,7 @@ class VideoError(Exception):
 
 
 def frames(file: Path, times: NDArray[np.float64]) -> Iterator[NDArray[np.uint8]]:
-    """The picture [H, W, 3], red first, of each of the times, which rise. Decodes only the part that has them, once."""
+    """The picture [H, W, 3], red first, at each of the ascending times. Decodes only the part that has them, once."""
     try:
         with av.open(str(file)) as container:
             if not container.streams.video:
@@ -43,7 +43,7 @@ def _shown(container: av.container.InputContainer, begin: float) -> Iterator[av.
 
 
 def _nearest(file: Path, shown: Iterator[av.VideoFrame], times: NDArray[np.float64]) -> Iterator[av.VideoFrame]:
-    # Data sets keep times within an episode in 32 bits, of which late ones have less than the tolerance.
+    # Data sets keep times within an episode in 32 bits, which for late ones are coarser than the tolerance.
     tolerance = TOLERANCE + float(np.spacing(np.float32(times[-1])))
     before = after = next(shown, None)
     for time in times:

@@ -1,5 +1,5 @@
-"""The networks of a bundle, back in PyTorch: the weights are taken from the graphs, so that the bundle is enough; and a
-training that begins with them.
+"""The networks of a bundle, back in PyTorch: the weights are taken from the graphs, so that the bundle is enough; and how
+a training begins with them.
 
 Invariant: a weight is given only to an input or action of the same meaning, whatever its place.
 """
@@ -50,7 +50,7 @@ class First:
             return cls(folder, described, load_policy(folder))
         except OSError as error:
             raise ValueError(f"{error.filename or folder}: {error.strerror or error}: name the folder of a bundle") from error
-        # What is no bundle fails in the reader of JSON, of the description or of a graph.
+        # What is not a bundle fails in the reader of JSON, of the description or of a graph.
         except Exception as error:
             reason = " ".join(str(error).split())[:120] or type(error).__name__
             raise ValueError(f"{folder}: not a bundle of rapid_policy.export: {type(error).__name__}: {reason}") from error
@@ -65,7 +65,7 @@ class First:
     def give(self, policy: Policy, described: dict[str, Any]) -> None:
         """Gives the weights to `policy`, whose `policy.json` is to be `described`.
 
-        Only what predicts outcomes may be missing, and histories: at first one remembers the last picture. Raises `ValueError`
+        Only histories, which at first remember the last picture, and what predicts outcomes may be missing. Raises `ValueError`
         where inputs, actions or networks differ otherwise.
         """
         self._check_meaning(described)
@@ -84,7 +84,7 @@ class First:
         policy.load_state_dict(weights)
 
     def _check_meaning(self, described: dict[str, Any]) -> None:
-        """The same key stands for the same input, and the actions are the same."""
+        """Raises `ValueError` unless the same key stands for the same input, and the actions are the same."""
         ours, theirs = ({o["key"]: o for o in of["observations"]} for of in (described, self.described))
         pairs = [(f"observation `{key}`", o, theirs[key]) for key, o in ours.items() if key in theirs]
         for what, ours, theirs in (*pairs, ("action", described["action"], self.described["action"])):
@@ -97,7 +97,7 @@ class First:
 
 
 def _places(policy: Policy) -> dict[str, torch.Tensor]:
-    """Of each history by its key: what the scores of its steps begin with."""
+    """By the key of each history: the biases of its steps' scores."""
     found, steps = {}, {o.key: o.history.steps for o in policy.spec.histories if o.history}
     for picture, pooling in policy.encoder.histories.items():
         keys = [key for key, _ in policy.encoder.history_keys[picture]]
@@ -107,7 +107,7 @@ def _places(policy: Policy) -> dict[str, torch.Tensor]:
 
 
 def _scores(policy: Policy, known: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The same as weights of `policy`, whose own are those of the histories that are not `known`."""
+    """These biases as weights of `policy`: the `known` ones, and its own for other histories."""
     own = _places(policy)
     keys = {picture: [key for key, _ in policy.encoder.history_keys[picture]] for picture in policy.encoder.histories}
     parts = {picture: [known.get(key, own[key]) for key in of] for picture, of in keys.items()}
@@ -119,12 +119,12 @@ _OTHERWISE = {"normalization", "required", "when_absent", "limits", "actuator"}
 
 
 def _sees_condition(name: str) -> bool:
-    """The layers of the denoisers whose last inputs are the condition, or a step of it."""
+    """Whether it is a layer of a denoiser whose last inputs are the condition, or a step of it."""
     return name.endswith(".film.1.weight") or name == "denoiser.observation.weight"
 
 
 def _rearranged(found: torch.Tensor, weight: torch.Tensor, old: Experiment, new: Experiment) -> torch.Tensor | None:
-    """The weights [outputs, inputs] of a layer whose last inputs are the condition, of all steps or of one."""
+    """The weights [outputs, inputs] of a layer whose last inputs are the condition, of all steps or of one, for that of `new`."""
     if found.dim() != 2 or len(found) != len(weight):
         return None
     columns, steps = _columns(old, new), new.policy.n_obs_steps
@@ -140,7 +140,7 @@ def _rearranged(found: torch.Tensor, weight: torch.Tensor, old: Experiment, new:
 
 
 def _columns(old: Experiment, new: Experiment) -> list[int] | None:
-    """Which number of a step of the old condition each number of one of the new is."""
+    """For each number in a step of the new condition, its place in a step of the old one; none if it lacks one."""
     known, at = {}, 0
     for key, length in _condition(old):
         known[key] = range(at, at + length)
@@ -154,7 +154,7 @@ def _columns(old: Experiment, new: Experiment) -> list[int] | None:
 
 
 def _condition(spec: Experiment) -> list[tuple[str, int]]:
-    """What a step of the condition has, in order, and how many numbers of each."""
+    """What a step of the condition consists of, in order, and how many numbers each part has."""
     pictures = [(o.key, spec.encoder.features) for o in spec.images]
     return [*((o.key, o.shape[0]) for o in spec.vectors), *pictures]
 
@@ -172,7 +172,7 @@ def _load(module: nn.Module, found: dict[str, torch.Tensor], path: Path) -> None
 
 
 def _spec(described: dict[str, Any], encoder: dict[str, torch.Tensor], denoiser: dict[str, torch.Tensor]) -> Experiment:
-    """The contents of `policy.json`, with the networks as it has them, otherwise as the weights show them."""
+    """The experiment that `policy.json` describes, with the networks as it has them, otherwise as the weights show them."""
     action = described["action"]
     network = described["training"].get("network") or _network(described, encoder, denoiser)
     horizon = ("n_obs_steps", "horizon", "n_action_steps", "control_hz", "mask_aware", "max_observation_age_ms")
