@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Runs the policies with a sensor that is pulled out, and writes the results beside the paper's table.
 
-    evaluation.py --rapid ../target/release/rapid [--runs runs/evaluation] [--trials 100] [--seeds-from 50000]
+    evaluation.py --rapid ../target/release/rapid [--runs runs/evaluation] [--trials 100] [--seeds-from 80000]
 
 Each run is a `rapid eval`, whose output is kept in RUNS/NAME.jsonl, below its command line and the hash of the program: a run
-whose output by the same program is there already is not repeated. The results, `results/eval.jsonl` (the conditions) and
+whose output by the same program is there already is not repeated. The results, `results/eval.jsonl` and
 `results/eval.md`, are those of the policies that are in the repository now: output of others is refused. With --seeds-from,
-results have the seed of the first trial in their names: `eval-60000.md`.
+results have the seed of the first trial in their names: `eval-90000.md`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from typing import Any
 from rapid_policy.results import wilson
 
 MODELS = Path(__file__).parent
-FIRST_SEED = 50_000
+# Versions before these ran on trials from 50000 and from 60000 on, and the training was changed after their results were seen.
+FIRST_SEED = 80_000
 PLAIN, MEMORY = "tactile-id", "tactile-id-memory"
 TITLES = {
     "full": "full",
@@ -76,7 +77,7 @@ def main() -> None:
         printed = {run.name: evaluate(run, args) for run in RUNS}
     except (OSError, ValueError, KeyError, EvaluationError, subprocess.CalledProcessError) as error:
         sys.exit(f"evaluation: {error}")
-    lines = [{"run": name, **line} for name, part in printed.items() for line in part if line["event"] == "condition"]
+    lines = [{"run": name, **kept(line)} for name, part in printed.items() for line in part if line["event"] in KEPT]
     text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
     name = named("eval", args.seeds_from)
     (args.out / f"{name}.jsonl").write_text(text, encoding="utf-8")
@@ -84,11 +85,19 @@ def main() -> None:
     print(f"{args.out / name}.jsonl and .md")
 
 
+KEPT = ("condition", "trial")
+
+
+def kept(line: dict[str, Any]) -> dict[str, Any]:
+    """A line of the results: that of a trial without what its run counted."""
+    return line if line["event"] == "condition" else {key: value for key, value in line.items() if key != "counts"}
+
+
 def seed(text: str) -> int:
-    """Reads the seed of a first trial. No demonstration and no evaluation while training has a seed that is allowed here."""
+    """Reads the seed of a first trial. No demonstration and no evaluation of an earlier policy has a seed that is allowed here."""
     number = int(text)
     if number < FIRST_SEED:
-        raise argparse.ArgumentTypeError(f"{number} is below {FIRST_SEED}: of demonstrations, or of evaluations while training")
+        raise argparse.ArgumentTypeError(f"{number} is below {FIRST_SEED}: of demonstrations, or of evaluations of earlier policies")
     return number
 
 
@@ -153,8 +162,9 @@ def between(values: list[int]) -> str:
 
 ORIGIN = [
     f"`{PLAIN}` continues the best of three seeds (trials from 40000 on), trained further with an outcome",
-    "([figures](README.md#seeds-and-the-length-of-training)); it was chosen before any trial below was run.",
-    f"`{MEMORY}` is one training, which began with its weights. The tables are of these trainings, and not of what",
+    "([figures](README.md#seeds-and-the-length-of-training)). Earlier versions, and these ones too, ran on trials from 50000 on and",
+    "from 60000 on, and the training was changed after their results were seen. No policy ran on the trials below before the weights were final.",
+    f"`{MEMORY}` is one training, which began with the weights of `{PLAIN}`. The tables are of these trainings, and not of what",
     "another one gives.",
 ]
 
@@ -225,9 +235,10 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int, first: int =
         "",
         f"Its error: `{next((t['failure'] for t in printed['static'] if t.get('failure')), 'none')}`. The paper's static software"
         " crashed in both as well. Status is read from the run:",
-        "crash if its loop failed, degraded if a sensor was absent at the end.",
+        "crash if its loop failed, degraded if a sensor was absent at the end, whatever the success. The paper's *Degraded* is a trial",
+        "that ended with reduced performance.",
         "",
-        f"Made with {made}, which runs, and keeps in `{named('eval', first)}.jsonl` without the lines of the trials:",
+        f"Made with {made}, which runs, and keeps in `{named('eval', first)}.jsonl`, of the trials without their counters:",
         "",
         *(f"    rapid {' '.join(run.command(trials, first))}" for run in RUNS),
         "",

@@ -21,4 +21,4 @@ def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
     share, spread = successes / trials, z * z / trials
     middle = (share + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(share * (1 - share) / trials + spread / (4 * trials))
-    return round(max(0.0, middle - half), 3), round(min(1.0, middle + half), 3)
+    return max(0.0, middle - half), min(1.0, middle + half)
