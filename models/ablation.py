@@ -21,7 +21,6 @@ import signal
 import statistics
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 from collections import Counter
@@ -392,7 +391,7 @@ def introduction(report: dict[str, Any]) -> list[str]:
     return [
         "# What each input is worth",
         "",
-        *paragraph(
+        *results.paragraph(
             f"{count} of the policy, each trained for {lengths(trainings)} iterations with {each}, and run by the program"
             f" (`rapid eval`) with everything plugged in: {trials_of_each(rows[0])} trials per training, from seed"
             f" {report['first_seed']} on, which no demonstration has; {rows[0]['triangular']:.0%} of the blocks are triangular, and"
@@ -438,20 +437,20 @@ def explanation(report: dict[str, Any]) -> list[str]:
     made_by_default = command(NAME, SEEDS, TRIALS, ITERATIONS, [c.name for c in CONFIGURATIONS])
     return [
         "",
-        *paragraph(
+        *results.paragraph(
             "Data: the paper's mixture of sizes (`mix`), or big blocks alone (`big`), with the number of demonstrations. Dropout:"
             " how often a picture is taken away in training; one is always left, so that row 2, which has 0.3 in the paper, has"
             " none here. Diff: the tactile picture, as difference to the first one of the episode; the paper's is of its"
             " `hand_view`. The paper calls a policy *biased* that puts every block to the same side: *left* would be 0 or 1."
         ),
         "",
-        *paragraph(
+        *results.paragraph(
             "A training that has the tactile picture and is near 0.5 has not learned to use it: see [what its length"
             " changes](README.md#seeds-and-the-length-of-training).",
             AIDED if any(row.get("outcome") for row in rows) else "",
         ),
         "",
-        *paragraph(
+        *results.paragraph(
             "The paper trains for 200 epochs of 72 demonstrations of some 100 to 170 frames: 1.4 to 2.4 million windows. Here"
             f" {lengths(trainings)} iterations of {trainings[0]['batch_windows']} windows are {windows(report):.2f} million,"
             f" {epochs(report)} of these demonstrations. Trained on {', '.join(sorted({t['hardware'] for t in trainings}))},"
@@ -466,11 +465,6 @@ def explanation(report: dict[str, Any]) -> list[str]:
         "",
         f"    {rows[0]['command']}",
     ]
-
-
-def paragraph(*sentences: str) -> list[str]:
-    """Its lines; links and words with hyphens stay whole."""
-    return textwrap.wrap(" ".join(filter(None, sentences)), 125, break_long_words=False, break_on_hyphens=False)
 
 
 def all_trainings(report: dict[str, Any]) -> list[dict[str, Any]]:

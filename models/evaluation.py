@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rapid_policy.results import wilson
+from rapid_policy.results import paragraph, wilson
 
 MODELS = Path(__file__).parent
 # Versions before these ran on trials from 50000 and from 60000 on, and the training was changed after their results were seen.
@@ -160,13 +160,13 @@ def between(values: list[int]) -> str:
     return f"step {ordered[0]} to {ordered[-1]}, median {ordered[len(ordered) // 2]}"
 
 
-ORIGIN = [
-    f"`{PLAIN}` continues the best of three seeds (trials from 40000 on), trained further with an outcome",
-    "([figures](README.md#seeds-and-the-length-of-training)). Earlier versions, and these ones too, ran on trials from 50000 on and",
-    "from 60000 on, and the training was changed after their results were seen. No policy ran on the trials below before the weights were final.",
-    f"`{MEMORY}` is one training, which began with the weights of `{PLAIN}`. The tables are of these trainings, and not of what",
-    "another one gives.",
-]
+ORIGIN = (
+    f"`{PLAIN}` continues the best of three seeds (trials from 40000 on), trained further with an outcome"
+    " ([figures](README.md#seeds-and-the-length-of-training)). Earlier versions, and these ones too, ran on trials from 50000 on and"
+    " from 60000 on, and the training was changed after their results were seen. No policy ran on the trials below before the"
+    f" weights were final. `{MEMORY}` is one training, which began with the weights of `{PLAIN}`. The tables are of these trainings,"
+    " and not of what another one gives."
+)
 
 
 def markdown(printed: dict[str, list[dict[str, Any]]], trials: int, first: int = FIRST_SEED) -> str:
@@ -195,11 +195,13 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int, first: int =
     lines = [
         "# The policies with a sensor that is pulled out",
         "",
-        f"{bundles}, {trials} trials a condition, seeds {first} to {first + trials - 1}, which no demonstration has;",
-        f"{triangular} of the blocks are triangular, {small} small. A trial counts when the block ends in the bin of its texture;",
-        "Wilson's interval.",
+        *paragraph(
+            f"{bundles}, {trials} trials per condition, seeds {first} to {first + trials - 1}, which no demonstration has;"
+            f" {triangular} of the blocks are triangular, {small} small. A trial counts when the block ends in the bin of its texture;"
+            " the interval is Wilson's.",
+        ),
         "",
-        *ORIGIN,
+        *paragraph(ORIGIN),
         "",
     ]
     for run in RUNS[:3]:

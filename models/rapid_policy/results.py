@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -22,3 +23,8 @@ def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
     middle = (share + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(share * (1 - share) / trials + spread / (4 * trials))
     return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def paragraph(*sentences: str) -> list[str]:
+    """The lines of a paragraph of a page; links and words with hyphens stay whole."""
+    return textwrap.wrap(" ".join(filter(None, sentences)), 125, break_long_words=False, break_on_hyphens=False)
