@@ -461,7 +461,7 @@ def explanation(report: dict[str, Any]) -> list[str]:
         "",
         f"    python {report['command']}",
         "",
-        "and that, for the trials of each,",
+        "and that, for the trials of each, whose lines are not kept here,",
         "",
         f"    {rows[0]['command']}",
     ]
