@@ -14,6 +14,7 @@ from unittest import mock
 from ablation import CONFIGURATIONS, ITERATIONS, MODELS, NAME, SEEDS, TRIALS, Training
 from ablation import carry_out, command, counted, markdown, summarize
 from rapid_policy.experiment_file import read_experiment
+from rapid_policy.results import wilson
 
 FACTS = {"episodes": 240, "frames": 25_600, "batch_windows": 64, "iterations": 400, "minutes": 2.0, "final_loss": 0.02}
 FACTS |= {"hardware": "a processor", "torch": "2"}
@@ -185,6 +186,12 @@ class Pages(unittest.TestCase):
 
 
 class Counting(unittest.TestCase):
+    def test_no_share_is_outside_its_interval(self):
+        for trials in (1, 2, 100, 300):
+            for successes in (0, 1, trials - 1, trials):
+                low, high = wilson(successes, trials)
+                self.assertTrue(0 <= low <= successes / trials <= high <= 1, (successes, trials, low, high))
+
     def test_left_is_the_bin_of_the_triangular_ones(self):
         trials = [trial(True, "success"), trial(False, "wrong_bin"), trial(False, "success"), trial(True, "incomplete")]
         shares = counted(trials)
