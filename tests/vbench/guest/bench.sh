@@ -56,6 +56,7 @@ property() { udevadm info --query=property --name="$1" | sed -n "s/^$2=//p"; }
 
 # rapid_start ARGUMENT...: rapid in the background; its output in rapid.jsonl, its log in rapid.log.
 rapid_start() {
+  rapid_marked=0
   "${rapid[@]}" "$@" >"$out/rapid.jsonl" 2>"$out/rapid.log" &
   rapid_pid=$!
 }
@@ -101,11 +102,12 @@ lan_rule() {
   udevadm control --reload
 }
 
-# mark WORD: writes the word to the emulator's log; later log lines come after it.
+# mark WORD: writes the word to the emulator's log; later log lines come after it, and later output of rapid does too.
 mark() {
   emu "say $1"
   wait_for 20 has_line "$out/emu.jsonl" "\"word\":\"$1\"" || fail "the emulator did not log $1"
   marked=$(wc -l <"$out/emu.jsonl")
+  rapid_marked=$(cat "$out/rapid.jsonl" 2>/dev/null | wc -l)
 }
 
 # logged ACTION [FRAGMENT...]: since the last mark the emulator's log has a line of this action with all fragments.
@@ -126,10 +128,10 @@ ordered() {
   done
 }
 
-# armed: the motors are not stopped by a fault. Those that an emulated processor answered too late are armed again, as a user
-# would, not for ever; armed_again has a line for each time.
+# armed: since the last mark and the start of rapid no fault has stopped the motors. Those that an emulated processor answered
+# too late are armed again, as a user would, not for ever; armed_again has a line for each time.
 armed() {
-  [[ $(grep -F '"event":"actuator"' $out/rapid.jsonl | tail -n 1) == *'"arming":"faulted"'* ]] || return 0
+  [[ $(tail -n "+$((${rapid_marked:-0} + 1))" "$out/rapid.jsonl" | grep -F '"event":"actuator"' | tail -n 1) == *'"arming":"faulted"'* ]] || return 0
   [ "$(cat $out/armed_again 2>/dev/null | wc -l)" -ge 12 ] || { echo again >>$out/armed_again; "${rapid[@]}" arm; }
   sleep 2
   return 1

@@ -34,7 +34,6 @@ again() {
   sleep 1
   mark $1
   arm
-  sleep 2
   wait_for 60 following || fail "they do not follow: $1"
   sleep 1
   wait_for 60 following || fail "they no longer follow: $1"
