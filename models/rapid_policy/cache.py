@@ -160,7 +160,7 @@ class Cache:
         return Decoded(self.folder, np.fromiter((self._lines[path] for path in paths), np.int64))
 
     def verify(self, entries: Iterable[Entry]) -> list[str]:
-        """Hashes every source and every decoded file. Returns a line for each that is not what the index says.
+        """Hashes every source and every decoded file. Returns a line for each that differs from the index.
 
         A decoded file that is damaged is removed, so that the next run makes it again.
         """

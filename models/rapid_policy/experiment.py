@@ -244,7 +244,7 @@ class Observation(Section):
 
     @property
     def valid(self) -> str:
-        """Of a history: name of the encoder's input that says which steps have a picture."""
+        """Of a history: name of the encoder's input that marks the steps that have a picture."""
         return f"{self.key}_valid"
 
     @property

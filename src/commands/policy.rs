@@ -307,7 +307,7 @@ fn observed(observation: &ObservationSpec, mask_aware: bool) -> String {
         ticks => format!(", a step every {ticks} ticks"),
     };
     let history = observation.history.as_ref().map_or(String::new(), |history| {
-        format!(", a history of {} steps (input {} says which are present)", history.steps, history.valid)
+        format!(", a history of {} steps (input {} marks those present)", history.steps, history.valid)
     });
     let kind = kind(observation);
     let shape = shape.join("x");
