@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation evaluation texture lerobot-loop lerobot-test fleet-test clean
+.PHONY: help setup setup-build setup-test demo picture quick one test features lint check bench fuzz train train-test ablation evaluation texture lerobot-loop lerobot-test fleet-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -29,10 +29,14 @@ help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | sed 's/[$$](SLOW)/$(SLOW)/' | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
 
 setup: ## everything that building, running and testing need; a second run changes nothing
-	@scripts/setup.sh build test
+	@scripts/setup.sh build test image
 
 setup-build: ## only what building and running need
 	@scripts/setup.sh build
+
+# The guest of the virtual bench is made by tests.sh, while the programs are compiled.
+setup-test:
+	@scripts/setup.sh build test
 
 # Built to be seen soon: in a profile of its own, and without what simulated devices do not need.
 demo: setup-build ## build, then the simulated rig and a policy: the monitor on a terminal, otherwise a 10 s episode
@@ -53,7 +57,7 @@ one: ## run one test by its name, with its output: TEST=name (of a test or of a 
 	@$(TESTED) scripts/one.sh '$(TEST)' $(TESTS)
 
 # `cargo test` builds the program as well, into this place: no build of its own goes before it.
-test: setup ## the whole truth: format, lints, all tests with the virtual bench, and a look at what they left behind
+test: setup-test ## the whole truth: format, lints, all tests with the virtual bench, and a look at what they left behind
 	cargo fmt --all --check
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Prepares a Debian or Ubuntu machine with git, make and a Rust toolchain for building, running and testing `rapid`.
 #
-#     setup.sh [build] [test] [fuzz]
+#     setup.sh [build] [test] [image] [fuzz]
 #
 # build: requirements of building and running, including the pinned onnxruntime library. test: the rest - lint tools,
-# the Python that reads episodes and topics from outside, the virtual bench with its guest image. fuzz: the build
-# requirements of libFuzzer.
+# the Python that reads episodes and topics from outside, the programs of the virtual bench. image: its guest. fuzz: the
+# build requirements of libFuzzer.
 #
 # Every step checks first and does nothing if it was done before. Downloads are stored outside the tree in
 # ${XDG_CACHE_HOME:-~/.cache}/rapid, checked against the hashes pinned in the tree, and get their final names last: an
@@ -44,14 +44,16 @@ main() {
         case "$part" in
             build) wanted+=("${BUILD_PACKAGES[@]}") ;;
             test) wanted+=("${TEST_PACKAGES[@]}") && mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages) ;;
+            image) mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages) ;;
             fuzz) wanted+=("${FUZZ_PACKAGES[@]}") ;;
-            *) die "unknown part '$part': build, test or fuzz" ;;
+            *) die "unknown part '$part': build, test, image or fuzz" ;;
         esac
     done
     toolchain
     packages "${wanted[@]}"
     [[ " $* " != *" build "* ]] || onnxruntime
-    [[ " $* " != *" test "* ]] || { lint_tools; python_venv; guest_image; }
+    [[ " $* " != *" test "* ]] || { lint_tools; python_venv; }
+    [[ " $* " != *" image "* ]] || guest_image
     if [[ $changed = 0 ]]; then report "nothing to do ($*)"; else report "done ($*)"; fi
 }
 
@@ -90,8 +92,11 @@ packages() {
         as_root=(sudo)
     fi
     change "installing with apt: ${missing[*]}"
+    # On a machine without these the crates are missing, too: fetched beside the packages. What fails here, the build reports.
+    cargo fetch --locked --quiet 2>/dev/null &
     "${as_root[@]}" apt-get update -q
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "${missing[@]}"
+    wait
 }
 
 # One whose packages cannot be imported is made anew, whatever its stamp names.
