@@ -210,7 +210,7 @@ def markdown(printed: dict[str, list[dict[str, Any]]], trials: int, first: int =
         lines.append("")
     low, high = wilson(sorted_unseen, max(1, len(unseen)))
     lines += [
-        "The policies have seen no robot: they are trained on demonstrations by hand. Of the blocks whose lattice has the period",
+        "The policies have seen no robot: they are trained on handheld demonstrations. Of the blocks whose lattice has the period",
         f"that no demonstration has, {PLAIN} sorts {sorted_unseen} of {len(unseen)} with everything plugged in ({low:.2f} to {high:.2f}).",
         "",
         "Where absent pictures are zeros (the paper's rule), a policy whose tactile sensor is pulled out after the touch guesses, as",

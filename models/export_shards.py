@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Exports many episodes as tasks of a Ray cluster, and merges what they make into one data set of LeRobot.
+"""Exports many episodes as tasks of a Ray cluster, and merges what they make into one LeRobot dataset.
 
     export_shards.py export /data/episodes --out /data/shards -- --state motor_state --verify
     export_shards.py merge /data/shards --out /data/blocks
@@ -11,7 +11,7 @@ dies, another one makes it again. The same command continues after any interrupt
 """
 
 # This file owns the folder of shards: `shards.jsonl`, the episodes of each shard, which never change once they are listed;
-# `shard-NNNNN`, a data set with few large files and `report.jsonl`, what `rapid export --json` printed.
+# `shard-NNNNN`, a dataset with few large files and `report.jsonl`, what `rapid export --json` printed.
 # Invariant: a folder without a leading dot is complete, whoever made it, and is made once.
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def parser() -> argparse.ArgumentParser:
     add("--rapid", metavar="PROGRAM", default="rapid", help="the program on each machine (default: rapid)")
     add("--address", help="address of the cluster (default: RAY_ADDRESS, or the one on this machine; without one: this machine)")
     add("--retries", metavar="N", type=int, default=3, help="retries of a shard whose machine died (default: 3)")
-    of_merge = commands.add_parser("merge", help="make one data set of the shards, with LeRobot", **plain)
+    of_merge = commands.add_parser("merge", help="make one dataset of the shards, with LeRobot", **plain)
     of_merge.add_argument("shards", metavar="SHARDS", type=Path, help="folder of the shards")
-    of_merge.add_argument("--out", metavar="SET", type=Path, required=True, help="the data set; must not exist")
+    of_merge.add_argument("--out", metavar="SET", type=Path, required=True, help="the dataset; must not exist")
     return out
 
 

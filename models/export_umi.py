@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Makes a replay buffer for UMI and diffusion_policy from a data set that `rapid export --to lerobot` wrote.
+"""Makes a replay buffer for UMI and diffusion_policy from a dataset that `rapid export --to lerobot` wrote.
 
     rapid export episodes --to lerobot --out blocks
     export_umi.py blocks blocks.zarr.zip --camera cam_wrist --size 224x224 --pose phone_pose --gripper motor_state.0
 
 COLUMNS are numbers of observation.state or action: `arm` (all of that sensor), `arm.3`, `arm.0-5`, `arm.hip.position` (a name
-in the data set), `action.0-3`, joined by commas. A pose is 6 of them (x y z in metres and a rotation vector), 7 (x y z and a
+in the dataset), `action.0-3`, joined by commas. A pose is 6 of them (x y z in metres and a rotation vector), 7 (x y z and a
 quaternion x y z w), or 16 (a 4x4 matrix, column by column, as phones send it). Each --camera, and each pair of --pose and
 --gripper, takes the next number in UMI's names: camera0_rgb, robot0_eef_pos ...
 
@@ -57,7 +57,7 @@ class Unfit(Exception):
 
 @dataclass(frozen=True)
 class Columns:
-    """Numbers of the data set: the feature of each and its place there, and the sensors that they belong to."""
+    """Numbers of the dataset: the feature of each and its place there, and the sensors that they belong to."""
 
     text: str
     places: list[tuple[str, int]]
@@ -72,13 +72,13 @@ class Buffer:
     arrays: dict[str, numpy.ndarray] = field(default_factory=dict)
     """By name, a row for each of the T rows."""
     pictures: dict[str, str] = field(default_factory=dict)
-    """The feature of the data set by the name of the array."""
+    """The feature of the dataset by the name of the array."""
     ends: list[int] = field(default_factory=list)
     """Row after the last one, by episode of the buffer."""
     sources: list[int] = field(default_factory=list)
-    """Episode of the data set, by episode of the buffer."""
+    """Episode of the dataset, by episode of the buffer."""
     chosen: numpy.ndarray | None = None
-    """[N] row of the buffer by row of the data set; -1 for those left out."""
+    """[N] row of the buffer by row of the dataset; -1 for those left out."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -94,7 +94,7 @@ def main(arguments: list[str] | None = None) -> int:
 def parser() -> argparse.ArgumentParser:
     out = commandline.parser(__doc__)
     add = out.add_argument
-    add("set", metavar="SET", type=Path, help="folder of the data set: LeRobot v3.0 without videos")
+    add("set", metavar="SET", type=Path, help="folder of the dataset: LeRobot v3.0 without videos")
     add("out", metavar="OUT", type=Path, help="the buffer, NAME.zarr.zip; must not exist")
     more = {"action": "append", "default": []}
     add("--camera", metavar="SENSOR", **more, help="the next camera; may be repeated")
@@ -137,7 +137,7 @@ def export(options: argparse.Namespace) -> None:
 
 
 def read_info(folder: Path) -> dict:
-    """The features of the data set."""
+    """The features of the dataset."""
     path = folder / "meta/info.json"
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
@@ -146,7 +146,7 @@ def read_info(folder: Path) -> dict:
             features[key]
         earlier = PLUGGED not in features
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise Unfit(f"{path}: not a data set that `rapid export --to lerobot` wrote: {error!r}") from error
+        raise Unfit(f"{path}: not a dataset that `rapid export --to lerobot` wrote: {error!r}") from error
     if earlier:
         raise Unfit(f"{path}: no {PLUGGED}: exported by an earlier version: export again")
     if version != "v3.0" or info.get("video_path"):
@@ -165,12 +165,12 @@ def read_numbers(files: list[Path], features: dict) -> dict:
             values = column.flatten() if hasattr(column, "flatten") and column.type.num_fields else column
             parts[key].append(values.to_numpy(zero_copy_only=False).reshape(len(table), -1))
     if not files:
-        raise Unfit("no data/chunk-*/file-*.parquet in the data set")
+        raise Unfit("no data/chunk-*/file-*.parquet in the dataset")
     return {key: numpy.concatenate(part) for key, part in parts.items()}
 
 
 def plan(options: argparse.Namespace, features: dict, numbers: dict) -> Buffer:
-    """Checks what is asked for against the data set, and chooses the rows."""
+    """Checks what is asked for against the dataset, and chooses the rows."""
     if len(options.pose) != len(options.gripper):
         raise Unfit(f"{len(options.pose)} --pose and {len(options.gripper)} --gripper: UMI needs one of each per gripper")
     if not (options.camera or options.pose or options.array):
@@ -180,7 +180,7 @@ def plan(options: argparse.Namespace, features: dict, numbers: dict) -> Buffer:
         key = f"{IMAGES}{sensor}"
         if key not in features:
             have = [k.removeprefix(IMAGES) for k in features if k.startswith(IMAGES)]
-            raise Unfit(f"--camera {sensor}: the cameras of the data set are {', '.join(have) or 'none'}")
+            raise Unfit(f"--camera {sensor}: the cameras of the dataset are {', '.join(have) or 'none'}")
         buffer.pictures[f"camera{number}_rgb"] = key
     poses = [columns("--pose", text, features) for text in options.pose]
     for pose in poses:
@@ -191,7 +191,7 @@ def plan(options: argparse.Namespace, features: dict, numbers: dict) -> Buffer:
     sensors = features[MASK]["names"]
     for sensor in options.require:
         if sensor not in sensors:
-            raise Unfit(f"--require {sensor}: the sensors of the data set are {', '.join(sensors)}")
+            raise Unfit(f"--require {sensor}: the sensors of the dataset are {', '.join(sensors)}")
     choose(buffer, numbers, sorted(required | {*options.require}, key=sensors.index), sensors, options.min_rows)
 
     rows = buffer.chosen >= 0
@@ -236,7 +236,7 @@ def columns(option: str, text: str, features: dict) -> Columns:
             names.sort(key=lambda column: int(column.rpartition(".")[2]))
         unknown = [column for column in names if column not in known] or ([] if names else [part])
         if unknown:
-            raise Unfit(f"{option} {text}: no {unknown[0]}; the data set has {', '.join(known) or 'no numbers'}")
+            raise Unfit(f"{option} {text}: no {unknown[0]}; the dataset has {', '.join(known) or 'no numbers'}")
         found += names
     places = [known[name] for name in found]
     return Columns(text, places, sorted({owners[place] for place in places if place in owners}))
@@ -330,7 +330,7 @@ def pictures(buffer: Buffer, files: list[Path], shape: tuple[int, int] | None) -
         try:
             picture = Image.open(io.BytesIO(content)).convert("RGB")
         except OSError as error:
-            raise Unfit(f"{name}, row {row}: {error}: `rapid export --verify` compares the data set") from error
+            raise Unfit(f"{name}, row {row}: {error}: `rapid export --verify` compares the dataset") from error
         if shape:
             picture = ImageOps.fit(picture, shape, Image.Resampling.BILINEAR)
         return name, row, numpy.asarray(picture)
@@ -377,18 +377,18 @@ def write(store, buffer: Buffer, features: dict, files: list[Path], shape: tuple
 
 
 def verify(store, buffer: Buffer, files: list[Path], shape: tuple[int, int] | None) -> None:
-    """Compares what was written with the data set; raises at the first difference."""
+    """Compares what was written with the dataset; raises at the first difference."""
     root = zarr.group(store)
     data = root["data"]
     for name, values in buffer.arrays.items():
         if data[name].dtype != values.dtype or not numpy.array_equal(data[name][:], values):
-            raise Unfit(f"data/{name} differs from the data set")
+            raise Unfit(f"data/{name} differs from the dataset")
     if root["meta/episode_ends"][:].tolist() != buffer.ends:
         raise Unfit("meta/episode_ends differs from what was written")
     for batch in pictures(buffer, files, shape):
         for name, row, picture in batch:
             if not numpy.array_equal(data[name][row], picture):
-                raise Unfit(f"data/{name}, row {row} differs from the data set")
+                raise Unfit(f"data/{name}, row {row} differs from the dataset")
 
 
 def size(text: str) -> tuple[int, int]:

@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def record(rapid: Path, folder: Path) -> Path:
-    """An episode as a data set of LeRobot."""
+    """An episode as a LeRobot dataset."""
     quiet = {"check": True, "stdout": subprocess.DEVNULL, "cwd": folder}
     words = ["--sim", "task", "--expert", "--record", "--episodes", "1", "--seed", str(SEED), "--out", "episodes"]
     subprocess.run([rapid, *words], **quiet)
@@ -114,8 +114,8 @@ def markdown(lines: list[dict[str, Any]]) -> str:
         *table(lines),
         "",
         "Everything is read from the run. An old picture: the loop was given the bytes that it was given the time before. Status:",
-        "crash if the loop raised, stale if it ended on an old picture, else normal. Frames kept: those of the episode that the data",
-        f"set has in the end. A loop that does not raise ends after {of['actions']} actions.",
+        "crash if the loop raised, stale if it ended on an old picture, else normal. Frames kept: those of the episode that the",
+        f"dataset has in the end. A loop that does not raise ends after {of['actions']} actions.",
         "",
         "## What was raised",
         "",
@@ -153,7 +153,7 @@ def markdown(lines: list[dict[str, Any]]) -> str:
 
 SOURCES = f"""## What is LeRobot's and what is not
 
-LeRobot's: the loop, `predict_action`, the policy and its processors, the data set that is written, `get_observation` and
+LeRobot's: the loop, `predict_action`, the policy and its processors, the dataset that is written, `get_observation` and
 `send_action` of `SOFollower`, and `OpenCVCamera` with its thread and its errors. Nothing of it is patched.
 
 Ours:
@@ -164,7 +164,7 @@ Ours:
 - the camera's rate and size, which are not set: OpenCV sets those of devices only;
 - `probesize` and `threads` of FFmpeg, so that no pictures are held back;
 - the policy: random weights (seed 0), normalised by the statistics of the episode. The question is whether the loop acts, not
-  how well. The episode is that of an arm: one by hand has no actions.
+  how well. The episode is that of an arm: a handheld one has no actions.
 
 Made with `make lerobot-loop`, which runs this, `lerobot_rig.py` in a process for each condition, and keeps its lines in
 `lerobot-loop.jsonl`:

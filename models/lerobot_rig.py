@@ -4,7 +4,7 @@
     lerobot_rig.py DATASET CONDITION OUT
 
 LeRobot's are the loop, the policy, `predict_action`, the cameras (`OpenCVCamera`: thread, timeouts, errors), the follower's
-`get_observation` and `send_action`, and the data set that is written. Ours is what LeRobot has no simulation of: the motors
+`get_observation` and `send_action`, and the dataset that is written. Ours is what LeRobot has no simulation of: the motors
 (`Motors`) and what OpenCV opens (`Source`), a named pipe with the JPEGs of an episode. Nothing of LeRobot's is patched.
 
 What is written to OUT, one JSON line, is read from the run: times of actions and of the event, the pictures that the loop was
@@ -53,7 +53,7 @@ from lerobot.scripts.lerobot_record import record_loop
 IMAGES = "observation.images."
 # The camera that fails.
 CAMERA = "tactile_tip"
-# Pictures a second; the loop runs at the rate of the data set.
+# Pictures a second; the loop runs at the rate of the dataset.
 CAMERA_HZ = 30
 # How many actions it fails after, and how many the episode ends after.
 EVENT_AT, ACTIONS = 20, 60
@@ -242,7 +242,7 @@ def main() -> None:
 
 
 def rig(data: Path, condition: str, log: Log, events: dict[str, bool]) -> Follower:
-    """The follower with a camera for each of the data set's; pipes and calibration are in the current folder."""
+    """The follower with a camera for each of the dataset's; pipes and calibration are in the current folder."""
     info = json.loads((data / "meta/info.json").read_text(encoding="utf-8"))["features"]
     names = [key.removeprefix(IMAGES) for key in info if key.startswith(IMAGES)]
     (file,) = (data / "data").glob("*/*.parquet")
@@ -260,7 +260,7 @@ def rig(data: Path, condition: str, log: Log, events: dict[str, bool]) -> Follow
 
 
 def recorder(data: Path, robot: Follower) -> tuple[LeRobotDataset, dict[str, Any]]:
-    """The data set that the loop writes, and the policy with its processors, made as LeRobot's `record` makes them."""
+    """The dataset that the loop writes, and the policy with its processors, made as LeRobot's `record` makes them."""
     source = LeRobotDatasetMetadata("rapid/loop", root=data)
     teleop, action, observation = make_default_processors()
     features = combine_feature_dicts(

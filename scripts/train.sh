@@ -9,7 +9,7 @@
 #     train.sh python ARGS...      that Python, run in models/
 #
 # RAPID is the program, default target/release/rapid. Demonstrations and checkpoints are in RUNS=models/runs; existing
-# ones are used again: a stopped training continues. EPISODES=240 and SEED=1000 of the demonstrations by hand (those with the arm
+# ones are used again: a stopped training continues. EPISODES=240 and SEED=1000 of the handheld demonstrations (those with the arm
 # are 480 from 1000 on: the experiments of the ablation say which of them); THREADS=2 of a training, MINUTES of one that is
 # no part of the ablation, EVALUATE iterations between two evaluations of one, START_FROM=BUNDLE whose weights it begins with
 # (tactile-id-memory: models/tactile-id); POLICY=tactile-id; JOBS=1 trainings of the

@@ -324,7 +324,7 @@ pub enum Command {
     /// List episodes by verdict, label, task, tag, sensor or date
     #[command(after_long_help = list::LIST)]
     List(ListArgs),
-    /// Export episodes as a data set of LeRobot
+    /// Export episodes as a LeRobot dataset
     #[cfg(feature = "export")]
     #[command(after_long_help = export::EXPORT)]
     Export(ExportArgs),

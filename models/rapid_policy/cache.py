@@ -60,7 +60,7 @@ class Entry:
     judged_by: str | None = None
     """The program that gave the verdict; none before it is judged."""
     described: str = ""
-    """The hash of its description in a data set of LeRobot; empty for a file of its own."""
+    """The hash of its description in a LeRobot dataset; empty for a file of its own."""
 
 
 class Cache:
@@ -316,7 +316,7 @@ def _entry(line: bytes) -> Entry:
 
 
 def sha256(path: Path) -> str:
-    """The hash of a file, in hexadecimal; for an episode of a data set of LeRobot, that of its files and of which part of
+    """The hash of a file, in hexadecimal; for an episode of a LeRobot dataset, that of its files and of which part of
     them it is."""
     if split(path)[1] is None:
         return _hashed(path, *_stat(path))
@@ -326,7 +326,7 @@ def sha256(path: Path) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _hashed(file: Path, _size: int, _changed_ns: int) -> str:
-    """The hash of one file, as it is now; kept, because each file of a data set has many episodes."""
+    """The hash of one file, as it is now; kept, because each file of a dataset has many episodes."""
     if not file.exists():
         return ""
     with file.open("rb") as opened:

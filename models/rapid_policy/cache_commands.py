@@ -92,7 +92,7 @@ def _rate(read, sizes: list[float], seconds: float) -> float:
 
 
 def _recorded(episode: Episode) -> float:
-    """Bytes of its file; for an episode of a data set of LeRobot, its share of each of its files."""
+    """Bytes of its file; for an episode of a LeRobot dataset, its share of each of its files."""
     file, index = split(episode.path)
     if index is None:
         return file.stat().st_size

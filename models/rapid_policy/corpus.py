@@ -111,7 +111,7 @@ def _unfit(spec: Experiment | Classification, episode: Episode) -> str | None:
 
 
 def _judge(cache: Cache, files: list[str]) -> None:
-    """Asks for the verdict of `rapid inspect`, once for each content and version of the program. A data set of LeRobot has
+    """Asks for the verdict of `rapid inspect`, once for each content and version of the program. A LeRobot dataset has
     none: all of its episodes are taken."""
     recorded = []
     for file in files:

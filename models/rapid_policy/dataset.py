@@ -90,7 +90,7 @@ class Dataset:
     A window belongs to a tick. It does not reach across a tick that lacks a required modality or an action, nor across a
     gap in the frame index: there one segment ends and another begins, and steps beyond either end repeat that end.
     Pictures stay in the episodes; numbers and windows are copied to unnamed files in `folder`, which vanish with the
-    data set. If that folder is in memory, as the system's temporary one may be, each tick costs memory.
+    dataset. If that folder is in memory, as the system's temporary one may be, each tick costs memory.
     """
 
     def __init__(self, spec: Experiment, episodes: Sequence[Episode], ranges: dict[str, MinMax] | None = None,
@@ -229,7 +229,7 @@ class Dataset:
         plan[f"seen {o.key}"], plan[f"valid {o.key}"] = rows, valid
 
     def _hold(self, plan: Plan, random: np.random.Generator) -> None:
-        """Some windows see a picture as it was before it left: from what has passed since then they are the same."""
+        """Some windows have an older picture, from up to `hold_last_ms` before: the policy sees the last one of an absent sensor."""
         starts = self._episode_spans(plan["tick"])[:, :1]
         for i, o in enumerate(self.spec.images):
             if not (o.dropout.held and o.when_absent):
@@ -555,7 +555,7 @@ class _Rows:
         """[T, Da] as recorded on /action."""
         actions, spec = np.asarray(self.episode.actions), self.spec.action
         if not self.episode.acted.any():
-            raise Unfit('no action: nothing on /action; a demonstration by hand trains with from = "pose"')
+            raise Unfit('no action: nothing on /action; a handheld demonstration trains with from = "pose"')
         if spec.columns is not None:
             if max(spec.columns) >= actions.shape[1]:
                 raise Unfit(f"/action: {actions.shape[1]} numbers, but number {max(spec.columns)} (from 0) is taken")

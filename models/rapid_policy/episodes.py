@@ -144,12 +144,12 @@ class Episode:
 
 
 def episode_files(folder: Path) -> list[Path]:
-    """The finished episodes of a folder, by name; for a data set of LeRobot, those in its files."""
+    """The finished episodes of a folder, by name; for a LeRobot dataset, those in its files."""
     if lerobot_source.is_dataset(folder):
         try:
             files = lerobot_source.episode_names(folder)
         except (DatasetError, OSError, ValueError, KeyError) as error:
-            raise EpisodeError(folder, f"not a data set that is read: {error}") from error
+            raise EpisodeError(folder, f"not a dataset that is read: {error}") from error
     else:
         files = sorted(folder.glob("*.mcap"))
     if not files:
@@ -215,7 +215,7 @@ def read_episode(path: Path, wanted: tuple[Source, ...]) -> Episode:
 
 
 def _read_rows(path: Path, wanted: tuple[Source, ...]) -> Episode:
-    """An episode of a data set of LeRobot."""
+    """An episode of a LeRobot dataset."""
     try:
         facts, rows = read_facts(path), lerobot_source.tables(path)
         count = len(rows["frame_index"])

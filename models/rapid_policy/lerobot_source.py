@@ -1,11 +1,11 @@
-"""Episodes of LeRobot data sets v3.0, as LeRobot and `rapid export --to lerobot` write them.
+"""Episodes of LeRobot datasets v3.0, as LeRobot and `rapid export --to lerobot` write them.
 
 An episode is named `FILE.parquet#INDEX`: a file has several. A modality NAME is, for pictures, the feature
 `observation.images.NAME` or `observation.NAME`; for numbers, the columns of `observation.state` that are named `NAME.0`,
-`NAME.1` ..., `NAME.pos` or just `NAME`, or the feature `observation.NAME` (so `state` is all of it). A data set of `rapid`
-lists the columns in `columns`, beside `names`, which are for people; in others the names count. Where the data set has
+`NAME.1` ..., `NAME.pos` or just `NAME`, or the feature `observation.NAME` (so `state` is all of it). A dataset of `rapid`
+lists the columns in `columns`, beside `names`, which are for people; in others the names count. Where the dataset has
 `rapid.mask` and `rapid.valid`, a sample is present if both are 1; in others every sample is. `rapid.plugged` is read if
-the data set has it.
+the dataset has it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NAMED = re.compile(r"(.+\.parquet)#(\d+)")
 
 
 class DatasetError(Exception):
-    """A data set, or a part of it, that is not read; the reason and the fix."""
+    """A dataset, or a part of it, that is not read; the reason and the fix."""
 
 
 class MissingPackage(DatasetError):
@@ -53,7 +53,7 @@ class Video:
 
 
 def is_dataset(folder: Path) -> bool:
-    """Whether the folder is a data set of LeRobot."""
+    """Whether the folder is a LeRobot dataset."""
     return (folder / DESCRIPTION).is_file()
 
 
@@ -64,7 +64,7 @@ def split(path: Path) -> tuple[Path, int | None]:
 
 
 def episode_names(folder: Path) -> list[Path]:
-    """The episodes of a data set."""
+    """The episodes of a dataset."""
     template, names = _described(folder)["data_path"], []
     for index, row in sorted(_episodes(folder).items()):
         # An episode for which meta/episodes names no video is refused here, before anything is decoded.
@@ -74,7 +74,7 @@ def episode_names(folder: Path) -> list[Path]:
 
 
 def rate(path: Path) -> float:
-    """Rows per second of an episode's data set."""
+    """Rows per second of an episode's dataset."""
     return float(_described(_folder(path))["fps"])
 
 
@@ -126,7 +126,7 @@ def _names(feature: dict[str, Any], names: Any) -> list[str]:
 
 
 def pictures(rows: dict[str, Any], modality: str) -> Iterator[NDArray[np.uint8] | None] | None:
-    """The pictures of a camera where it is present; none if the data set has no such camera. A damaged picture is none;
+    """The pictures of a camera where it is present; none if the dataset has no such camera. A damaged picture is none;
     nothing of a damaged video is used: frames after the damage may be wrong and look right."""
     feature = _camera(rows, modality)
     if feature is None:
@@ -163,7 +163,7 @@ def _picture(data: bytes | Path) -> NDArray[np.uint8] | None:
 
 
 def numbers(rows: dict[str, Any], modality: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """The numbers of a sensor [T, D], and [T] where it is present; none if the data set has no such sensor."""
+    """The numbers of a sensor [T, D], and [T] where it is present; none if the dataset has no such sensor."""
     columns = _columns(rows, modality)
     if columns and "observation.state" in rows:
         values = rows["observation.state"][:, columns]
@@ -190,7 +190,7 @@ def _columns(rows: dict[str, Any], modality: str) -> list[int]:
 
 
 def presence(rows: dict[str, Any], modality: str, count: int) -> dict[str, NDArray[np.bool_]]:
-    """[T] whether the device of a sensor is plugged in, and whether its bit is set. Where a data set does not record
+    """[T] whether the device of a sensor is plugged in, and whether its bit is set. Where a dataset does not record
     them, both hold for each sensor that it has."""
     running = _flags(rows, "rapid.mask", modality)
     running = np.full(count, _has(rows, modality)) if running is None else running
@@ -199,7 +199,7 @@ def presence(rows: dict[str, Any], modality: str, count: int) -> dict[str, NDArr
 
 
 def _has(rows: dict[str, Any], modality: str) -> bool:
-    """Whether the data set has the sensor."""
+    """Whether the dataset has the sensor."""
     return bool(_camera(rows, modality) or f"observation.{modality}" in rows or _columns(rows, modality))
 
 
@@ -215,7 +215,7 @@ def _flags(rows: dict[str, Any], feature: str, modality: str) -> NDArray[np.bool
 
 
 def _folder(path: Path) -> Path:
-    """The data set of an episode."""
+    """The dataset of an episode."""
     file, _ = split(path)
     found = next((folder for folder in file.parents if is_dataset(folder)), None)
     if found is None:
@@ -254,7 +254,7 @@ def _place(template: str, row: dict[str, Any], what: str, **names: str) -> str:
 
 
 def _episode(path: Path) -> dict[str, Any]:
-    """The description of an episode in the data set."""
+    """The description of an episode in the dataset."""
     return _episodes(_folder(path))[split(path)[1]]
 
 
@@ -282,7 +282,7 @@ def _parquet() -> Any:
     try:
         import pyarrow.parquet
     except ImportError as error:
-        raise MissingPackage(f"data sets of LeRobot need pyarrow ({error}): pip install pyarrow") from error
+        raise MissingPackage(f"LeRobot datasets need pyarrow ({error}): pip install pyarrow") from error
     return pyarrow.parquet
 
 
@@ -290,5 +290,5 @@ def _decoder() -> Any:
     try:
         from . import video
     except ImportError as error:
-        raise MissingPackage(f"data sets of LeRobot with videos need PyAV ({error}): pip install av") from error
+        raise MissingPackage(f"LeRobot datasets with videos need PyAV ({error}): pip install av") from error
     return video

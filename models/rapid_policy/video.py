@@ -43,7 +43,7 @@ def _shown(container: av.container.InputContainer, begin: float) -> Iterator[av.
 
 
 def _nearest(file: Path, shown: Iterator[av.VideoFrame], times: NDArray[np.float64]) -> Iterator[av.VideoFrame]:
-    # Data sets keep times within an episode in 32 bits, which for late ones are coarser than the tolerance.
+    # Datasets keep times within an episode in 32 bits, which for late ones are coarser than the tolerance.
     tolerance = TOLERANCE + float(np.spacing(np.float32(times[-1])))
     before = after = next(shown, None)
     for time in times:

@@ -89,7 +89,7 @@ def made_up(length: int, seed: int = 0) -> Episode:
 
 
 def by_hand(length: int, seed: int = 0, layout: str = "columns") -> Episode:
-    """A demonstration by hand: a pose that turns on its way, an opening, no arm and no action."""
+    """A handheld demonstration: a pose that turns on its way, an opening, no arm and no action."""
     episode = made_up(length, seed)
     poses = path(length, seed)
     numbers = {"columns": poses.transpose(0, 2, 1), "rows": poses}[layout].reshape(length, 16)

@@ -94,7 +94,7 @@ class LeftOut(Case):
             self.assertEqual(self.load().left_out, found.left_out)
 
     def rest(self, length: int) -> dict:
-        """The other modalities of a demonstration by hand."""
+        """The other modalities of a handheld demonstration."""
         return {
             "phone": ("rapid.Scalars", [{"values": np.eye(4).ravel()}] * length),
             "gripper": ("rapid.Scalars", [{"values": [0.5]}] * length),

@@ -1,4 +1,4 @@
-"""Data sets of LeRobot as a source: what `rapid export` made of episodes is learned from as the episodes are."""
+"""LeRobot datasets as a source: what `rapid export` made of episodes is learned from as the episodes are."""
 
 import io
 import json
@@ -44,7 +44,7 @@ class Present(unittest.TestCase):
         theirs["observation.images.cam"] = [b""] * 4
         for modality, there in (("arm", True), ("cam", True), ("film", True), ("tactile", False)):
             found = lerobot_source.presence(theirs, modality, 4)
-            # What is not in the data set is unplugged, which is no stall.
+            # What is not in the dataset is unplugged, which is no stall.
             for name in ("plugged", "running"):
                 self.assertEqual(found[name].tolist(), [there] * 4, (modality, name))
 
@@ -97,7 +97,7 @@ class Exported(Folder):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
-        # A data set has no tags: the experiment's seeds would choose none of its episodes.
+        # A dataset has no tags: the experiment's seeds would choose none of its episodes.
         cls.spec = experiment(data={"seeds": None})
         cls.episodes, cls.rows = cls.folder / "episodes", cls.folder / "rows"
         for words in (

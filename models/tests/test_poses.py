@@ -20,7 +20,7 @@ NAMES = {"none": 3, "rotation_6d": 7, "quaternion": 7}
 
 
 def posed(representation: str, rotation: str) -> Experiment:
-    """The experiment of demonstrations by hand, with other actions."""
+    """The experiment of handheld demonstrations, with other actions."""
     names = [f"n{i}" for i in range(NAMES[rotation] + 1)]
     action = {"representation": representation, "rotation": rotation, "names": names, "units": ["1"] * len(names)}
     action["gripper_squeeze"] = 0.0

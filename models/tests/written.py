@@ -144,7 +144,7 @@ def write(
 
 
 def by_hand(path: Path, track: np.ndarray, opening: np.ndarray, **about) -> Path:
-    """A demonstration by hand: two cameras, a phone, a gripper, no action."""
+    """A handheld demonstration: two cameras, a phone, a gripper, no action."""
     count = len(track)
     pictures = [jpeg(np.full((96, 96, 3), 10 * (t % 20), np.uint8)) for t in range(count)]
     samples = {

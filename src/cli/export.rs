@@ -29,10 +29,10 @@ pub struct ExportArgs {
     /// Episodes, or folders of them
     #[arg(required = true, value_name = "FILE|DIR", value_hint = ValueHint::AnyPath)]
     pub paths: Vec<PathBuf>,
-    /// Format of the data set: lerobot (v3.0)
+    /// Format of the dataset: lerobot (v3.0)
     #[arg(long, value_name = "FORMAT", hide_possible_values = true)]
     pub to: Layout,
-    /// Folder of the data set: a new one, or one to append to
+    /// Folder of the dataset: a new one, or one to append to
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: PathBuf,
     /// Also those that are BAD
@@ -60,14 +60,14 @@ pub struct ExportArgs {
     pub verify: bool,
 }
 
-/// A format of data sets.
+/// A format of datasets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Layout {
     /// LeRobot v3.0.
     Lerobot,
 }
 
-/// How a data set has its pictures.
+/// How a dataset has its pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum PictureForm {
     /// Each as it is, JPEG or PNG.

@@ -1,4 +1,4 @@
-//! `rapid export`: episodes become a data set, or are appended to one.
+//! `rapid export`: episodes become a dataset, or are appended to one.
 //!
 //! Episodes are surveyed in parallel, and so are their videos and rows written, each for the number that it has in the set if
 //! all before it fit; names are given one episode after the other.
@@ -35,7 +35,7 @@ pub enum ExportError {
     /// Nothing to export.
     #[error("no episodes in {0}")]
     NoEpisodes(String),
-    /// The data set.
+    /// The dataset.
     #[error(transparent)]
     Set(#[from] SetError),
     /// No episode fits.
@@ -44,7 +44,7 @@ pub enum ExportError {
     /// The user interrupted.
     #[error("interrupted; {} has {episodes}, and the same command continues", out.display())]
     Interrupted {
-        /// The data set.
+        /// The dataset.
         out: PathBuf,
         /// Its episodes.
         episodes: String,
@@ -128,11 +128,11 @@ struct Differing<'a> {
 }
 
 /// Exports the episodes that `args` names. A line for each goes to `out`, and to `err` for each that is left out; with
-/// `--json` all are objects on `out`. `stop` interrupts after the episode so far. Returns whether the data set is as the
+/// `--json` all are objects on `out`. `stop` interrupts after the episode so far. Returns whether the dataset is as the
 /// episodes, as far as that was requested.
 ///
 /// # Errors
-/// When no episode fits, the data set cannot be written, or `stop` was set.
+/// When no episode fits, the dataset cannot be written, or `stop` was set.
 pub fn export(
     args: &ExportArgs,
     format: Format,

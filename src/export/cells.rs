@@ -1,4 +1,4 @@
-//! The values of a row in a data set.
+//! The values of a row in a dataset.
 //!
 //! Invariant: of a modality that is not there, or whose sample cannot be used, pictures are black and numbers zero, and it
 //! is not valid.

@@ -1,4 +1,4 @@
-//! The features of a data set: what all of its episodes have in common, and `info.json` contains.
+//! The features of a dataset: what all of its episodes have in common, and `info.json` contains.
 //!
 //! The modalities of `rapid.mask`, `rapid.plugged`, `rapid.valid` and `rapid.age` are those of the registry, ascending by
 //! bit, also those whose samples are not exported. A feature whose name begins with `observation.` is an input of a policy in
@@ -29,7 +29,7 @@ pub(super) const AGE: &str = "rapid.age";
 pub(super) const TIME: &str = "rapid.time_ns";
 /// Of the state and the action: the parts of the choice that they follow from.
 const CHOSEN: &str = "chosen";
-/// What every data set of LeRobot has, as 64-bit integers but for the first, which is f32 and seconds.
+/// What every LeRobot dataset has, as 64-bit integers but for the first, which is f32 and seconds.
 pub(super) const OWN: [&str; 5] = ["timestamp", "frame_index", "episode_index", "index", "task_index"];
 
 /// Where the numbers of a column come from.
@@ -57,7 +57,7 @@ pub(super) struct Axis {
     pub(super) origin: Origin,
     /// The place of its number in a sample of the modality, or in an action.
     pub(super) at: usize,
-    /// Its name in the data set: that of the modality, a dot and the name or the place of the number; of the topic of
+    /// Its name in the dataset: that of the modality, a dot and the name or the place of the number; of the topic of
     /// actions the name of the axis alone.
     pub(super) name: String,
 }
@@ -122,7 +122,7 @@ impl Features {
                     features.cameras.push((place, shape));
                 }
                 Content::Vector { found, declared } => {
-                    // What a data set has may be a part of the numbers.
+                    // What a dataset has may be a part of the numbers.
                     let length = found.or_else(|| known.length(name).max(declared));
                     vectors.push(Vector { name: name.clone(), length, names: stream.names.clone() });
                     origins.push(Origin::Modality(place));
@@ -216,7 +216,7 @@ impl Features {
         self.videos().count()
     }
 
-    /// How the data set has its pictures.
+    /// How the dataset has its pictures.
     pub fn pictures(&self) -> Pictures {
         self.pictures
     }
@@ -241,7 +241,7 @@ impl Features {
         Value::Object(self.all().into_iter().map(of).collect())
     }
 
-    /// Those of a data set, from its `info.json`; `None` if it is not one that this module describes.
+    /// Those of a dataset, from its `info.json`; `None` if it is not one that this module describes.
     pub(super) fn of_set(info: &Value) -> Option<Self> {
         let features = info.get("features")?.as_object()?;
         let texts = |key: &str, of: &str| -> Option<Vec<String>> {
@@ -297,7 +297,7 @@ impl Features {
     pub fn check(&self, other: &Self) -> Result<(), Refusal> {
         if self.fps != other.fps {
             let (found, expected) = (other.fps, self.fps);
-            return Err(Refusal::Different(format!("{found} frames a second, and {expected} in the data set")));
+            return Err(Refusal::Different(format!("{found} frames a second, and {expected} in the dataset")));
         }
         let compared = |features: &Self| match features.json() {
             Value::Object(mut features) => {
@@ -316,7 +316,7 @@ impl Features {
             None => Ok(()),
             Some(key) => {
                 let (found, expected) = (described(theirs, key), described(mine, key));
-                Err(Refusal::Different(format!("{key} is {found}, and {expected} in the data set")))
+                Err(Refusal::Different(format!("{key} is {found}, and {expected} in the dataset")))
             }
         }
     }
@@ -403,7 +403,7 @@ impl Known {
         }
     }
 
-    /// What a data set has. Of a vector the columns up to the last that it has.
+    /// What a dataset has. Of a vector the columns up to the last that it has.
     pub fn of(features: &Features) -> Self {
         let name = |place: usize| features.modalities.get(place).cloned().unwrap_or_default();
         let camera =
@@ -584,7 +584,7 @@ mod tests {
         assert!(features().check(&features()).is_ok());
         let otherwise = choice(&["force.0", "arm.1", "arm.0"], &["/action.0-1"]);
         assert!(features().check(&Features { choice: otherwise, ..features() }).is_ok());
-        assert_eq!(refused(&Features { fps: 20, ..features() }), "20 frames a second, and 30 in the data set");
+        assert_eq!(refused(&Features { fps: 20, ..features() }), "20 frames a second, and 30 in the dataset");
         let mut wide = features();
         wide.cameras[0].1.width = 1280;
         let text = refused(&wide);

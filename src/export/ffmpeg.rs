@@ -1,4 +1,4 @@
-//! The user's `ffmpeg`, which encodes and decodes the videos of a data set.
+//! The user's `ffmpeg`, which encodes and decodes the videos of a dataset.
 //!
 //! Pictures go through its pipes as red, green, blue; a video is its standard input or output, a file that is open
 //! already, so that no file has a name which ffmpeg chose, and one that was left behind writes to nothing that matters.

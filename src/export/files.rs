@@ -1,4 +1,4 @@
-//! The files of a data set: their names, and how they get them.
+//! The files of a dataset: their names, and how they get them.
 //!
 //! Invariant: a file has its name once it is complete and on the disk; what a program leaves that is killed is called
 //! `.*.tmp`, and the next one removes it.
@@ -25,7 +25,7 @@ pub(super) const VIDEOS: &str = "videos";
 /// What the name of a file ends with that is not complete.
 const TEMPORARY: &str = ".tmp";
 
-/// The file of an episode in this folder of the data set.
+/// The file of an episode in this folder of the dataset.
 pub(super) fn numbered(folder: &str, episode: u64, extension: &str) -> String {
     format!("{folder}/chunk-{:03}/file-{:03}.{extension}", episode / CHUNK, episode % CHUNK)
 }
@@ -64,7 +64,7 @@ pub(super) fn write_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>)
     write(path, &written.map_err(|source| SetError::Parquet { path: path.to_owned(), source })?)
 }
 
-/// Removes what programs that were killed left in this data set, whichever episodes they worked on.
+/// Removes what programs that were killed left in this dataset, whichever episodes they worked on.
 pub(super) fn remove_leftovers(set: &Path) -> Result<(), SetError> {
     // A user's own folders are not touched.
     for (folder, prefix) in [("data", "chunk-"), (VIDEOS, IMAGES)] {

@@ -1,7 +1,7 @@
-//! Episodes as a data set of LeRobot v3.0: Parquet tables, one row for each tick of the frame index.
+//! Episodes as a LeRobot v3.0 dataset: Parquet tables, one row for each tick of the frame index.
 //!
 //! `rows` reads an episode tick by tick, `survey` finds out what it holds and whether it can be exported, `features` is
-//! what all episodes of a data set have in common, `cells` the values of one row, `table` and `set` the files, `video` and
+//! what all episodes of a dataset have in common, `cells` the values of one row, `table` and `set` the files, `video` and
 //! `ffmpeg` the videos, and `verify` compares all of it with the episodes again.
 //!
 //! The format is that of `lerobot` 0.4.4, `CODEBASE_VERSION` v3.0:

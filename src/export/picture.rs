@@ -1,4 +1,4 @@
-//! Pictures of a data set: a JPEG as the camera sent it, and what is not compressed as PNG, which loses nothing.
+//! Pictures of a dataset: a JPEG as the camera sent it, and what is not compressed as PNG, which loses nothing.
 //!
 //! Grey is written as three equal channels. YUYV becomes red, green and blue first, by the rule of `pixels`: LeRobot
 //! and its policies know no other pictures.
@@ -12,7 +12,7 @@ use crate::pixels::{LARGEST, Picture, PixelError, Pixels};
 use crate::record::is_whole_jpeg;
 use crate::sample::Encoding;
 
-/// How a data set has its pictures.
+/// How a dataset has its pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Pictures {
     /// A file of each, in the rows.

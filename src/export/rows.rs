@@ -61,7 +61,7 @@ pub enum Refusal {
     NoFrames,
     /// The rows would not be at equal distances.
     #[error(
-        "ticks {first} to {last} are missing from the frame index, and the rows of a data set must be evenly spaced"
+        "ticks {first} to {last} are missing from the frame index, and the rows of a dataset must be evenly spaced"
     )]
     Hole {
         /// The first tick that is missing.

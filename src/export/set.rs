@@ -1,4 +1,4 @@
-//! A data set on the disk: a file of rows and a file of facts for each episode, and what is true of all of them.
+//! A dataset on the disk: a file of rows and a file of facts for each episode, and what is true of all of them.
 //!
 //! | file | |
 //! |---|---|
@@ -52,7 +52,7 @@ const VERDICT: &str = "rapid/verdict";
 /// As pandas names an index without a name.
 const TASK: &str = "__index_level_0__";
 
-/// Why a data set cannot be read or written.
+/// Why a dataset cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum SetError {
     /// A folder.
@@ -77,10 +77,10 @@ pub enum SetError {
     /// A video.
     #[error(transparent)]
     Ffmpeg(FfmpegError),
-    /// The data set has its pictures otherwise.
+    /// The dataset has its pictures otherwise.
     #[error("{}: its pictures are {of_set}, and --pictures is {requested}: leave it out, or name another --out", folder.display())]
     Pictures {
-        /// The data set.
+        /// The dataset.
         folder: PathBuf,
         /// How it has them.
         of_set: Pictures,
@@ -88,7 +88,7 @@ pub enum SetError {
         requested: Pictures,
     },
     /// A file that this program did not write.
-    #[error("{}: {problem}; --out takes a new folder, or a data set that `rapid export` made", path.display())]
+    #[error("{}: {problem}; --out takes a new folder, or a dataset that `rapid export` made", path.display())]
     Foreign {
         /// The file or folder.
         path: PathBuf,
@@ -96,14 +96,14 @@ pub enum SetError {
         problem: String,
     },
     /// Another program writes to it.
-    #[error("{}: another `rapid export` writes to this data set: wait for its end", .0.display())]
+    #[error("{}: another `rapid export` writes to this dataset: wait for its end", .0.display())]
     Busy(PathBuf),
     /// The episode.
     #[error(transparent)]
     Refused(#[from] Refusal),
 }
 
-/// An episode of a data set.
+/// An episode of a dataset.
 #[derive(Debug, Clone)]
 pub(super) struct Entry {
     pub(super) source: String,
@@ -130,7 +130,7 @@ pub struct DataSet {
 }
 
 impl DataSet {
-    /// Opens the data set in `folder`, or prepares a new one: a folder that does not exist is created with the first
+    /// Opens the dataset in `folder`, or prepares a new one: a folder that does not exist is created with the first
     /// episode. What a program left that was killed is removed.
     ///
     /// # Errors
@@ -159,8 +159,7 @@ impl DataSet {
             .map_err(|source| SetError::Io { path: info.clone(), source })?;
         let value: Value = serde_json::from_str(&text).map_err(|error| foreign(&error.to_string()))?;
         let features = Features::of_set(&value);
-        set.features =
-            Some(features.ok_or_else(|| foreign("not the features of a data set of this version of rapid"))?);
+        set.features = Some(features.ok_or_else(|| foreign("not the features of a dataset of this version of rapid"))?);
         files::remove_leftovers(folder)?;
         set.read_tasks()?;
         while let Some(entry) = set.read_entry()? {
@@ -186,7 +185,7 @@ impl DataSet {
         let is_ours = |name: &OsStr| ["data", "meta", VIDEOS].iter().any(|ours| name == *ours);
         let other = entries.flatten().find(|entry| !is_ours(&entry.file_name()));
         match other {
-            Some(other) => Err(SetError::Foreign { path: other.path(), problem: "not of a data set".to_owned() }),
+            Some(other) => Err(SetError::Foreign { path: other.path(), problem: "not of a dataset".to_owned() }),
             None => Ok(self),
         }
     }
@@ -541,7 +540,7 @@ pub struct Prepared {
     encoded: Encoded,
 }
 
-/// Writes the rows of an episode for the data set in `folder`, as they are at `position`. Several may be prepared at a time,
+/// Writes the rows of an episode for the dataset in `folder`, as they are at `position`. Several may be prepared at a time,
 /// after [`DataSet::begin`], each for a position of its own.
 ///
 /// # Errors
@@ -582,7 +581,7 @@ fn write_rows(
     Ok(new)
 }
 
-/// The statistics of an episode, with those of the columns that every data set has.
+/// The statistics of an episode, with those of the columns that every dataset has.
 fn statistics(episode: &Survey, features: &Features, position: Position) -> Statistics {
     let mut statistics: Statistics = features.statistics(episode).into_iter().collect();
     let rows = 0..episode.rows as u64;

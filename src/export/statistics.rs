@@ -1,4 +1,4 @@
-//! Statistics of a column of a data set, as LeRobot normalises with them: over an episode, and of episodes together.
+//! Statistics of a column of a dataset, as LeRobot normalises with them: over an episode, and of episodes together.
 //!
 //! Those of several episodes are made of each episode's as `lerobot.datasets.compute_stats.aggregate_stats` does: exact
 //! but for the quantiles, which are the weighted mean of the episodes'.

@@ -29,7 +29,7 @@ pub struct Survey {
     pub file: PathBuf,
     /// Its size in bytes.
     pub bytes: u64,
-    /// SHA-256 of the file, hexadecimal: by it an episode is recognised in a data set.
+    /// SHA-256 of the file, hexadecimal: by it an episode is recognised in a dataset.
     pub sha256: String,
     /// The verdict on it.
     pub grade: Grade,
@@ -84,7 +84,7 @@ pub(super) enum Content {
 /// Looks at the episode at `path`; `sha256` is that of the file. One that is BAD is refused unless `include_bad`.
 ///
 /// # Errors
-/// When it cannot be exported, whatever the data set; also when `stop` is set.
+/// When it cannot be exported, whatever the dataset; also when `stop` is set.
 pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool) -> Result<Survey, Refusal> {
     let inspection = inspect::inspect(path)?;
     let grade = judged(&inspection, include_bad)?;
@@ -172,7 +172,7 @@ impl Found {
     fn take(&mut self, row: &Row<'_>) -> Result<(), Refusal> {
         self.time_ns.push(row.time_ns as f64);
         for (axis, value) in self.actions.iter_mut().zip(row.action) {
-            // In the precision of the data set.
+            // In the precision of the dataset.
             axis.push(f64::from(narrow(*value)));
         }
         for ((gatherer, slot), sample) in self.gatherers.iter_mut().zip(row.slots).zip(row.samples) {
@@ -191,7 +191,7 @@ impl Found {
     }
 }
 
-/// The nearest number of the precision that a data set has.
+/// The nearest number of the precision that a dataset has.
 pub(super) fn narrow(value: f64) -> f32 {
     #[expect(clippy::cast_possible_truncation, reason = "features of LeRobot are f32")]
     let narrow = value as f32;

@@ -32,7 +32,7 @@ const READ: usize = 64;
 /// What is in a file of Parquet about its writer.
 pub(super) const CREATED_BY: &str = concat!("rapid ", env!("CARGO_PKG_VERSION"));
 
-/// Where an episode is in a data set.
+/// Where an episode is in a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Position {
     pub(super) episode: u64,

@@ -1,4 +1,4 @@
-//! A data set against the episodes it was made of: every picture byte for byte, every number bit for bit, and every frame of
+//! A dataset against the episodes it was made of: every picture byte for byte, every number bit for bit, and every frame of
 //! a video within what an encoder loses.
 
 use std::fs::File;
@@ -34,7 +34,7 @@ pub struct Difference {
 /// What a comparison found.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Verified {
-    /// Rows of the data set.
+    /// Rows of the dataset.
     pub rows: usize,
     /// The differences, of many the first.
     pub differences: Vec<Difference>,
@@ -45,7 +45,7 @@ pub struct Verified {
 /// Compares the episode of this number with the file at `path`; `ffmpeg` decodes its videos.
 ///
 /// # Errors
-/// When the episode cannot be read, or the data set; also when `stop` is set.
+/// When the episode cannot be read, or the dataset; also when `stop` is set.
 pub fn verify(
     set: &DataSet,
     episode: usize,
@@ -65,7 +65,7 @@ pub fn verify(
     let names: Vec<&str> = index.modalities.iter().map(|modality| modality.name.as_str()).collect();
     if names != features.modalities {
         let (of_set, of_episode) = (features.modalities.join(", "), names.join(", "));
-        found.add(None, None, format!("sensors {of_set} of the data set, {of_episode} of the episode"));
+        found.add(None, None, format!("sensors {of_set} of the dataset, {of_episode} of the episode"));
         return Ok(found.verified);
     }
     let kinds = index.modalities.iter().map(|modality| modality.kind).collect();

@@ -87,7 +87,7 @@ impl Ends<'_> {
     }
 }
 
-/// Encodes the videos of an episode for the data set in `folder`; `frames` counts those of all cameras.
+/// Encodes the videos of an episode for the dataset in `folder`; `frames` counts those of all cameras.
 ///
 /// # Errors
 /// When ffmpeg fails, a file cannot be written, or the episode has changed since it was surveyed; also at its end by `ends`.

@@ -63,7 +63,7 @@ const NOT_RUN: &[(&str, &str)] = &[
     ),
     (
         "docs/policies.md",
-        "make train                                              # models/tactile-id, from 240 demonstrations by hand",
+        "make train                                              # models/tactile-id, from 240 handheld demonstrations",
     ),
     (
         "docs/policies.md",

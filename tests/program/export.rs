@@ -1,4 +1,4 @@
-//! `rapid export`: a data set of recorded episodes, read back; what is left out, continued, damaged and manipulated.
+//! `rapid export`: a dataset of recorded episodes, read back; what is left out, continued, damaged and manipulated.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -202,7 +202,7 @@ fn what_does_not_fit_is_named_and_the_rest_is_appended() {
     let outcome = |name: &str| found[name.rsplit('/').next().expect("a name")].as_str();
     assert_eq!(outcome(&first), "exported");
     assert!(outcome(&short).starts_with("left_out: BAD (") && outcome(&short).contains("--include-bad"), "{found:?}");
-    assert_eq!(outcome(&slow), "left_out: 20 frames a second, and 30 in the data set");
+    assert_eq!(outcome(&slow), "left_out: 20 frames a second, and 30 in the dataset");
     assert!(outcome(&odd).starts_with("left_out: 12.5 observations a second"), "{found:?}");
     assert!(outcome("holed.mcap").starts_with("left_out: damaged (1 damaged chunk"), "{found:?}");
     assert!(outcome("cut.mcap.partial").starts_with("left_out: "), "{found:?}");
@@ -231,7 +231,7 @@ fn what_does_not_fit_is_named_and_the_rest_is_appended() {
 }
 
 fn nothing_left(place: &Place, short: &str, slow: &str) {
-    // A different choice of columns is another data set.
+    // A different choice of columns is another dataset.
     let state = |words: &[&str]| {
         let common = ["export", slow, "--to", "lerobot", "--out", "other"];
         place.run(&[&common, words].concat())

@@ -1,5 +1,5 @@
-//! A camera with several streams, and pictures of distances: recorded byte for byte, replayed, shown and left out of data
-//! sets.
+//! A camera with several streams, and pictures of distances: recorded byte for byte, replayed, shown and left out of
+//! datasets.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 

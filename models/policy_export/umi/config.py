@@ -264,7 +264,7 @@ def representation(root: Keys) -> bool:
     if len(set(names.values())) > 1:
         raise found.wrong(
             "action_pose_repr",
-            f"{names['action_pose_repr']!r}, but obs_pose_repr is {names['obs_pose_repr']!r}: UMI's data set gives "
+            f"{names['action_pose_repr']!r}, but obs_pose_repr is {names['obs_pose_repr']!r}: UMI's dataset gives "
             "actions the representation of the observations, so that the policy learned another than it states",
         )
     return names["action_pose_repr"] == "relative"

@@ -127,10 +127,10 @@ class Buffer(Folder):
     def test_refusals(self) -> None:
         for words, expected in (
             ("", "nothing to export"),
-            ("--camera x", "the cameras of the data set are cam_wrist, tactile_tip"),
+            ("--camera x", "the cameras of the dataset are cam_wrist, tactile_tip"),
             ("--pose motor_state --gripper motor_state.0", "3 numbers, a pose is 6, 7 or 16"),
             ("--pose motor_state", "1 --pose and 0 --gripper"),
-            ("--array a=motor_state.0-7", "no motor_state.3; the data set has motor_state.0"),
+            ("--array a=motor_state.0-7", "no motor_state.3; the dataset has motor_state.0"),
             ("--array a/b=motor_state", "not NAME=COLUMNS"),
             ("--array a=action", "no action"),
             ("--require x --camera cam_wrist", "--require x: the sensors"),
@@ -140,7 +140,7 @@ class Buffer(Folder):
             self.assertEqual((status, expected in printed), (1, True), (words, printed))
         self.assertEqual(list(self.folder.glob("*none*")), [])
         status, printed = run(str(self.folder), str(self.out("none")), "--camera", "cam_wrist")
-        self.assertIn("meta/info.json: not a data set that `rapid export --to lerobot` wrote", printed)
+        self.assertIn("meta/info.json: not a dataset that `rapid export --to lerobot` wrote", printed)
         earlier = self.folder / "earlier"
         (earlier / "meta").mkdir(parents=True)
         info = json.loads((Path(self.set) / "meta/info.json").read_text(encoding="utf-8"))

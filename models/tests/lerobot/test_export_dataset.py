@@ -28,7 +28,7 @@ MODALITIES = ["cam_wrist", "tactile_tip", "motor_state"]
 
 
 class ExportedDataSet(Folder):
-    """A data set of two episodes, the tactile camera unplugged in the first; the second is appended."""
+    """A dataset of two episodes, the tactile camera unplugged in the first; the second is appended."""
 
     @classmethod
     def setUpClass(cls) -> None:

@@ -1,4 +1,4 @@
-"""Data sets that LeRobot writes itself are learned from (`make lerobot-test`): what is read of them is what LeRobot's own
+"""Datasets that LeRobot writes itself are learned from (`make lerobot-test`): what is read of them is what LeRobot's own
 reader gives, a training runs to its end, and what is damaged is left out.
 """
 
@@ -149,7 +149,7 @@ class Written(unittest.TestCase):
             self.assertTrue((self.folder / "runs" / form / "checkpoint.pt").is_file(), form)
 
     def copy(self, form: str) -> Path:
-        """A data set to damage."""
+        """A dataset to damage."""
         return Path(shutil.copytree(self.folder / form, self.folder / f"{self.id()}-{len(list(self.folder.iterdir()))}"))
 
     def left_out(self, folder: Path, episodes: int = 1) -> list[str]:

@@ -53,7 +53,7 @@ fn a_video_has_a_frame_for_each_row_and_what_differs_is_found() {
     assert_eq!((code, differences.len(), &summary["exported"]), (0, 0, &1.into()), "{differences:?}");
     assert!(summary["psnr_db"].as_f64().expect("dB") > 30.0, "{summary}");
 
-    // Another form is refused by name; without one it is that of the data set.
+    // Another form is refused by name; without one it is that of the dataset.
     let common = ["export", "out", "--include-bad", "--to", "lerobot", "--out"];
     let other = place.run(&[&common[..], &["set", "--pictures", "jpeg"]].concat());
     let text = String::from_utf8_lossy(&other.stderr).into_owned();

@@ -1,4 +1,4 @@
-//! An arm of six motors behind one adapter, moved by a policy that was trained on demonstrations by hand: its actions are
+//! An arm of six motors behind one adapter, moved by a policy that was trained on handheld demonstrations: its actions are
 //! places of the tip. The tactile camera is pulled out and plugged in again while it moves, and `rapid` is killed.
 
 use serde_json::Value;
