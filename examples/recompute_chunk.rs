@@ -1,4 +1,5 @@
-//! Computes the first chunk of actions that a policy gave in an episode once more, from the recording alone.
+//! Computes a chunk of actions that a policy gave in an episode once more, from the recording alone: the first one whose samples
+//! are all in it. Those of an episode that began while the policy was running may be older.
 //!
 //!     recompute_chunk EPISODE [POLICY]
 //!
@@ -71,34 +72,23 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args_os().skip(1);
     let file = arguments.next().ok_or("usage: recompute_chunk EPISODE [POLICY]")?;
     let bytes = std::fs::read(&file)?;
-    let chunk = first_chunk(&bytes)?.ok_or("the episode holds no chunk: no policy ran while it was recorded")?;
     let modalities = modalities(&bytes)?;
-
     let bundle = Bundle::open(arguments.next().as_deref().map(Path::new))?;
     let mut model = Model::load(&bundle, &Environment::open(None)?, Computing::default())?;
-    let mut request = Request::new(&bundle);
-    request.tick = chunk.tick;
-    request.seed = chunk.seed;
-    request.mask = PhysicalMask(u64::from_str_radix(chunk.mask.trim_start_matches("0x"), 16)?);
-    for (at, observed) in chunk.samples.iter().enumerate() {
-        let modality = modalities.iter().find(|modality| modality.name == observed.modality);
-        let modality = modality.ok_or_else(|| format!("{} is no modality of the episode", observed.modality))?;
-        let samples = samples(&bytes, &modality.topic, &observed.seqs)?;
-        // An absent modality has none.
-        request.set_present(at, !observed.seqs.is_empty());
-        for (step, seq) in observed.seqs.iter().enumerate() {
-            // In a new request a step of a history has no sample.
-            let Some(seq) = seq else { continue };
-            let payload = samples.get(seq).ok_or("a sample of the chunk is not in the episode: it began later")?;
-            let (encoding, width, height) = match *modality.shape.as_slice() {
-                [height, width] => (Encoding::Mjpeg, width, height),
-                _ => (Encoding::F64, 0, 0),
-            };
-            let header =
-                SampleHeader { seq: *seq, encoding: encoding as u32, width, height, ..SampleHeader::default() };
-            request.cell_mut(at, step).ok_or("the chunk is of another policy")?.set(&header, payload);
+    take_references(&bytes, &modalities, &bundle, &mut model)?;
+
+    let chunks = chunks(&bytes)?;
+    if chunks.is_empty() {
+        return Err("the episode holds no chunk: no policy ran while it was recorded".into());
+    }
+    let mut whole = None;
+    for chunk in &chunks {
+        if let Some(request) = request(&bytes, &modalities, &bundle, chunk)? {
+            whole = Some((chunk, request));
+            break;
         }
     }
+    let (chunk, request) = whole.ok_or("of each chunk a sample is not in the episode: it began later")?;
 
     let mut output = vec![0.0; model.chunk_len()];
     let mut noise = output.clone();
@@ -120,18 +110,83 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// The first chunk of the file.
-fn first_chunk(bytes: &[u8]) -> Result<Option<Chunk>, Box<dyn Error>> {
+/// The chunks of the file.
+fn chunks(bytes: &[u8]) -> Result<Vec<Chunk>, Box<dyn Error>> {
+    let mut chunks = Vec::new();
     for message in mcap::MessageStream::new(bytes)? {
         let message = message?;
         if message.channel.topic == "/rapid/event" {
             let event = EventMessage::decode(&*message.data)?;
             if event.kind == "chunk" {
-                return Ok(Some(serde_json::from_str(&event.json)?));
+                chunks.push(serde_json::from_str(&event.json)?);
             }
         }
     }
-    Ok(None)
+    Ok(chunks)
+}
+
+/// What the policy was asked for; `None` if a sample is not in the file.
+fn request(
+    bytes: &[u8],
+    modalities: &[Modality],
+    bundle: &Bundle,
+    chunk: &Chunk,
+) -> Result<Option<Request>, Box<dyn Error>> {
+    let mut request = Request::new(bundle);
+    request.tick = chunk.tick;
+    request.seed = chunk.seed;
+    request.mask = PhysicalMask(u64::from_str_radix(chunk.mask.trim_start_matches("0x"), 16)?);
+    for (at, observed) in chunk.samples.iter().enumerate() {
+        let modality = modality(modalities, &observed.modality)?;
+        let samples = samples(bytes, &modality.topic, &observed.seqs)?;
+        // An absent modality has none.
+        request.set_present(at, !observed.seqs.is_empty());
+        for (step, seq) in observed.seqs.iter().enumerate() {
+            // In a new request a step of a history has no sample.
+            let Some(seq) = seq else { continue };
+            let Some(payload) = samples.get(seq) else { return Ok(None) };
+            let header = SampleHeader { seq: *seq, ..header(modality) };
+            request.cell_mut(at, step).ok_or("the chunk is of another policy")?.set(&header, payload);
+        }
+    }
+    Ok(Some(request))
+}
+
+/// Shows the policy the samples from before the episode with which it compared later ones: attachments `reference/KEY`.
+fn take_references(
+    bytes: &[u8],
+    modalities: &[Modality],
+    bundle: &Bundle,
+    model: &mut Model,
+) -> Result<(), Box<dyn Error>> {
+    let summary = mcap::Summary::read(bytes)?.ok_or("the episode is not finished: run rapid recover")?;
+    for (at, observation) in bundle.observations.iter().enumerate() {
+        let name = format!("reference/{}", observation.key);
+        let Some(index) = summary.attachment_indexes.iter().find(|index| index.name == name) else { continue };
+        let message = SampleMessage::decode(&*mcap::read::attachment(bytes, index)?.data)?;
+        let header = header(modality(modalities, &observation.modality)?);
+        let mut request = Request::new(bundle);
+        request.set_present(at, true);
+        for step in 0..request.steps(at) {
+            request.cell_mut(at, step).ok_or("the policy has no such step")?.set(&header, &message.payload);
+        }
+        model.observe(&request)?;
+    }
+    Ok(())
+}
+
+fn modality<'a>(modalities: &'a [Modality], name: &str) -> Result<&'a Modality, Box<dyn Error>> {
+    let found = modalities.iter().find(|modality| modality.name == name);
+    Ok(found.ok_or_else(|| format!("{name} is no modality of the episode"))?)
+}
+
+/// How the samples of a modality are encoded.
+fn header(modality: &Modality) -> SampleHeader {
+    let (encoding, width, height) = match *modality.shape.as_slice() {
+        [height, width] => (Encoding::Mjpeg, width, height),
+        _ => (Encoding::F64, 0, 0),
+    };
+    SampleHeader { encoding: encoding as u32, width, height, ..SampleHeader::default() }
 }
 
 /// The modalities, from the metadata record `rapid`.

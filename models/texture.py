@@ -194,7 +194,8 @@ def cross_validate(pictures: Pictures, training: Training) -> dict[str, Any]:
     spec, seed = training.spec, training.spec.training.seed
     random, noises, pressures = np.random.default_rng(seed), spec.test.noises, spec.test.pressures
     answers = np.full((len(noises), len(pictures.labels)), -1)
-    for fold in deal(pictures, spec.test.folds, random):
+    for number, fold in enumerate(deal(pictures, spec.test.folds, random), 1):
+        begin = time.monotonic()
         tested = np.isin(pictures.episodes, fold)
         torch.manual_seed(seed)
         classifier = fit(pictures, np.flatnonzero(~tested), training, random)
@@ -202,6 +203,9 @@ def cross_validate(pictures: Pictures, training: Training) -> dict[str, Any]:
             # A picture is in -1..1 here, so that a full scale is 2; averaged pixels have less noise.
             noise = 2 * deviation / spec.encoder.pool
             answers[level, tested] = classify(classifier, pictures.pixels[tested], noise, training, random)
+        accuracy = (answers[0] == pictures.labels)[tested].mean()
+        done = f"fold {number} of {spec.test.folds} in {(time.monotonic() - begin) / 60:.1f} min"
+        print(f"{training.input.title}: {done}: {accuracy:.4f}", file=sys.stderr, flush=True)
     right = answers == pictures.labels
     edges = np.quantile(pictures.change, np.linspace(0, 1, pressures + 1)[1:-1])
     parts = np.digitize(pictures.change, edges)

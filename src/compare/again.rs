@@ -146,6 +146,7 @@ pub(super) fn compare(
         wanted,
         inputs: None,
     };
+    work.take_attached(survey);
     let mut waiting: VecDeque<&RecordedChunk> = VecDeque::new();
     for chunk in &survey.chunks {
         if !work.is_like(chunk) {
@@ -327,29 +328,30 @@ impl Work<'_> {
             if self.references.get(at) != Some(&Reference::Next) || has_samples.get(at) != Some(&true) {
                 continue;
             }
-            for other in 0..has_samples.len() {
-                self.request.set_empty(other);
-            }
-            let known = self.fill_with_first(chunk, at) && self.model.observe(&self.request).is_ok();
+            let number = chunk.samples.get(at).and_then(|samples| samples.seqs.iter().flatten().next());
+            let device = self.devices.get(at).copied().flatten();
+            let key = device.zip(number).map(|(device, number)| (device, number & SEQUENCE_BITS));
+            let sample = key.and_then(|key| self.samples.get(&key));
+            let is_known = sample.is_some_and(|(header, bytes)| {
+                let header = SampleHeader { seq: number.copied().unwrap_or_default(), ..*header };
+                observe_alone(self.model, &mut self.request, at, (&header, bytes))
+            });
             if let Some(reference) = self.references.get_mut(at) {
-                *reference = if known { Reference::Known } else { Reference::Lost };
+                *reference = if is_known { Reference::Known } else { Reference::Lost };
             }
         }
     }
 
-    /// Puts the first sample of observation `at` in all of its steps. Returns whether it is there.
-    fn fill_with_first(&mut self, chunk: &RecordedChunk, at: usize) -> bool {
-        let number = chunk.samples.get(at).and_then(|samples| samples.seqs.iter().flatten().next());
-        let device = self.devices.get(at).copied().flatten();
-        let (Some(number), Some(device)) = (number, device) else { return false };
-        let Some((header, bytes)) = self.samples.get(&(device, number & SEQUENCE_BITS)) else { return false };
-        for step in 0..self.request.steps(at) {
-            if let Some(cell) = self.request.cell_mut(at, step) {
-                cell.set(&SampleHeader { seq: *number, ..*header }, bytes);
-            }
+    /// References from before the episode, which are attached to it.
+    fn take_attached(&mut self, survey: &Survey) {
+        for (at, observation) in self.bundle.observations.iter().enumerate() {
+            let Some((header, bytes)) = survey.references.get(&observation.key) else { continue };
+            let Some(reference) = self.references.get_mut(at).filter(|reference| **reference != Reference::None) else {
+                continue;
+            };
+            let is_known = observe_alone(self.model, &mut self.request, at, (header, bytes));
+            *reference = if is_known { Reference::Known } else { Reference::Lost };
         }
-        self.request.set_present(at, true);
-        true
     }
 
     fn hold_against(&mut self, chunk: &RecordedChunk) {
@@ -362,6 +364,19 @@ impl Work<'_> {
             self.again.difference.take(tick, recorded, computed.iter().copied().map(f64::from));
         }
     }
+}
+
+/// Shows the model a sample in all steps of observation `at`, and nothing else. Returns whether it can be used: then it is the
+/// reference, if there was none.
+fn observe_alone(model: &mut Model, request: &mut Request, at: usize, (header, bytes): (&SampleHeader, &[u8])) -> bool {
+    request.clear();
+    for step in 0..request.steps(at) {
+        if let Some(cell) = request.cell_mut(at, step) {
+            cell.set(header, bytes);
+        }
+    }
+    request.set_present(at, true);
+    model.observe(request).is_ok()
 }
 
 /// The recorded actions compared with the recorded chunks.

@@ -10,7 +10,8 @@ use crate::action::ACTION_TOPIC;
 use crate::episode::ReadError;
 use crate::episode::decode::{Content, Sample, Scratch};
 use crate::episode::encode::EventText;
-use crate::episode::reader::{Item, Message, Reader};
+use crate::episode::reader::{Entry, Item, Message, Reader};
+use crate::episode::reference;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::Registry;
@@ -40,6 +41,8 @@ pub(super) struct Survey {
     pub(super) actions: Vec<RecordedAction>,
     /// Per topic, the numbers of its samples, ascending.
     pub(super) samples: BTreeMap<String, Vec<u32>>,
+    /// By the key of an observation, the sample from before the episode that later ones are compared with.
+    pub(super) references: BTreeMap<String, (SampleHeader, Vec<u8>)>,
     /// Which part of the file could not be read.
     pub(super) damage: Option<String>,
     /// Something before the first chunk could not be read: it may not be the first of the run.
@@ -101,7 +104,15 @@ impl Survey {
         let mut survey = Self::default();
         let mut first = None;
         while reader.advance()? {
-            let Item::Message(message) = reader.item() else { continue };
+            let message = match reader.item() {
+                Item::Message(message) => message,
+                Item::Other(Entry::Attachment(attachment)) => {
+                    let read = reference::read(&attachment);
+                    survey.references.extend(read.map(|(observation, header, bytes)| (observation, (header, bytes))));
+                    continue;
+                }
+                Item::Channel(_) | Item::Other(_) | Item::Unreadable => continue,
+            };
             let Some(content) = message.content(&mut scratch) else { continue };
             let topic = &message.channel.topic;
             match content {

@@ -105,8 +105,39 @@ impl Recorded {
     /// The file with its messages changed by `edit`, which decides which of them to keep, and its metadata by `about`.
     fn edited(
         &self,
+        edit: impl FnMut(&mut Message) -> bool,
+        about: impl Fn(&mut std::collections::BTreeMap<String, String>),
+    ) -> Vec<u8> {
+        self.edited_with(edit, about, None)
+    }
+
+    /// The file as if the recording had begun with the second chunk, with this attachment.
+    fn begun_later(&self, attachment: Option<&mcap::Attachment<'_>>) -> Vec<u8> {
+        let begin = self.messages().into_iter().filter(Message::is_chunk).nth(1).unwrap().log_time;
+        let about = |about: &mut std::collections::BTreeMap<String, String>| {
+            let number = |key: &str| about[key].parse::<u64>().unwrap();
+            let (wall, monotonic) = (number("begin_wall_ns"), number("begin_monotonic_ns"));
+            about.insert("begin_wall_ns".into(), begin.to_string());
+            about.insert("begin_monotonic_ns".into(), (monotonic + begin - wall).to_string());
+        };
+        self.edited_with(|message| message.log_time >= begin, about, attachment)
+    }
+
+    /// What is attached of the sample that is the reference of observation `key`: the message of its topic.
+    fn attached(&self, key: &str, topic: &str, number: u64) -> mcap::Attachment<'static> {
+        let is_it = |message: &Message| message.topic == topic && u64::from(message.sequence) == number;
+        let Message { log_time, data, .. } = self.messages().into_iter().find(is_it).unwrap();
+        let schema = if topic == ARM { "rapid.Scalars" } else { "foxglove.CompressedImage" };
+        let media_type = format!("application/protobuf; messageType={schema}");
+        let name = format!("reference/{key}");
+        mcap::Attachment { log_time, create_time: log_time, name, media_type, data: data.into() }
+    }
+
+    fn edited_with(
+        &self,
         mut edit: impl FnMut(&mut Message) -> bool,
         about: impl Fn(&mut std::collections::BTreeMap<String, String>),
+        attachment: Option<&mcap::Attachment<'_>>,
     ) -> Vec<u8> {
         let mut bytes = Vec::new();
         let mut writer = mcap::WriteOptions::new().compression(None).create(Cursor::new(&mut bytes)).unwrap();
@@ -118,6 +149,7 @@ impl Recorded {
                 writer.write_metadata(&metadata).unwrap();
             }
         }
+        attachment.into_iter().for_each(|attachment| writer.attach(attachment).unwrap());
         for message in mcap::MessageStream::new(&self.bytes).unwrap() {
             let mut message = message.unwrap();
             let (topic, data) = (message.channel.topic.clone(), message.data.to_vec());
@@ -249,19 +281,52 @@ fn the_reference_picture_is_the_first_one_or_unknown() {
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
 
     // The recording begins long after the policy.
-    let begin = recorded.messages().into_iter().filter(Message::is_chunk).nth(1).unwrap().log_time;
-    let keep = |message: &mut Message| message.log_time >= begin;
-    let about = |about: &mut std::collections::BTreeMap<String, String>| {
-        let number = |key: &str| about[key].parse::<u64>().unwrap();
-        let (wall, monotonic) = (number("begin_wall_ns"), number("begin_monotonic_ns"));
-        about.insert("begin_wall_ns".into(), begin.to_string());
-        about.insert("begin_monotonic_ns".into(), (monotonic + begin - wall).to_string());
-    };
-    let changed = recorded.again(&recorded.edited(keep, about));
+    let changed = recorded.again(&recorded.begun_later(None));
     assert_eq!(changed.chunks, total - 1);
     assert!(changed.reference_unknown > 0 && changed.compared > 0 && changed.actions.without_chunk == 0, "{changed:?}");
     assert_eq!(changed.compared, total - feeling.len() as u64, "{changed:?}");
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+}
+
+/// Of pictures, of pictures in a history and of numbers.
+#[test]
+fn a_reference_from_before_the_episode_is_attached_to_it() {
+    let first = onnx::Change { what: r#""slice": [0, 4],"#, with: r#""slice": [0, 4], "operation": "first_of_run","# };
+    let history = || Recorded::with(&onnx::encoder_of_history(onnx::HISTORY_STEPS), &[onnx::HISTORY]);
+    for (recorded, at, key, topic) in [
+        (Recorded::new(), 1, "tactile", TACTILE),
+        (history(), 1, "tactile", TACTILE),
+        (Recorded::of(&[first]), 2, "state", ARM),
+    ] {
+        let chunks = recorded.chunks();
+        let of_chunk = |chunk: &Value| {
+            let seqs = chunk["samples"][at]["seqs"].as_array().unwrap().clone();
+            seqs.iter().filter_map(Value::as_u64).collect::<Vec<u64>>()
+        };
+        let without = recorded.again(&recorded.begun_later(None));
+        assert!(without.reference_unknown > 2, "{key}: {without:?}");
+        let attached = recorded.attached(key, topic, of_chunk(&chunks[0])[0]);
+        let with = recorded.again(&recorded.begun_later(Some(&attached)));
+        assert_eq!(
+            (with.reference_unknown, with.compared),
+            (0, without.compared + without.reference_unknown),
+            "{key}: {with:?}"
+        );
+        assert!(with.difference.all.largest < 1e-6, "{key}: {with:?}");
+
+        // It is what is attached that counts, also where the first sample in the file would be another.
+        let last = chunks.iter().rev().find_map(|chunk| of_chunk(chunk).last().copied()).unwrap();
+        let wrong = recorded.again(&recorded.begun_later(Some(&recorded.attached(key, topic, last))));
+        assert!(wrong.difference.all.largest > 1e-5, "{key}: {wrong:?}");
+        // One that cannot be read is none, as is that of another policy's observation.
+        let (mut cut, mut foreign) = (recorded.attached(key, topic, last), attached);
+        cut.data.to_mut().truncate(9);
+        foreign.name = "reference/other".to_owned();
+        for none in [cut, foreign] {
+            let unknown = recorded.again(&recorded.begun_later(Some(&none)));
+            assert_eq!(unknown.reference_unknown, without.reference_unknown, "{key}: {unknown:?}");
+        }
+    }
 }
 
 #[test]

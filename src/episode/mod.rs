@@ -23,6 +23,7 @@ pub(crate) mod partial;
 pub(crate) mod reader;
 pub(crate) mod record_iter;
 pub mod recover;
+pub(crate) mod reference;
 mod resync;
 pub mod schema;
 mod source;

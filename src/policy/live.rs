@@ -23,7 +23,7 @@ use super::bundle::Bundle;
 use super::horizon::{Counts, WithoutMask};
 use super::model::Model;
 use super::pilot::{FIRST_TICK_AFTER, Pilot};
-use super::request::Request;
+use super::request::{Cell, Request};
 use crate::bus::{Inbox, Writer};
 use crate::fault;
 use crate::registry::Registry;
@@ -93,7 +93,7 @@ impl Live {
             requests,
             answers,
             devices: registry.devices.len(),
-            exchange: Some(Exchange { request, chunk, outcome: Ok(()), done: Stamp(0) }),
+            exchange: Some(Exchange { request, chunk, outcome: Ok(()), done: Stamp(0), firsts: Vec::new() }),
             payload: Vec::with_capacity(values * size_of::<f64>()),
             action: Vec::with_capacity(values),
             latencies: Histogram::new_with_bounds(1, LONGEST_US, 3).map_err(io::Error::other)?,
@@ -139,6 +139,8 @@ struct Exchange {
     chunk: Vec<f32>,
     outcome: Result<(), String>,
     done: Stamp,
+    /// New references: the position of the observation, and the sample.
+    firsts: Vec<(usize, Cell)>,
 }
 
 fn compute(mut model: Model, requests: &Receiver<Exchange>, answers: &SyncSender<Exchange>) {
@@ -151,6 +153,7 @@ fn compute(mut model: Model, requests: &Receiver<Exchange>, answers: &SyncSender
         fault::point("policy");
         let answer = model.answer(&exchange.request, &mut exchange.chunk);
         exchange.outcome = answer.map_err(|error| error.to_string());
+        exchange.firsts.extend(model.take_firsts());
         exchange.done = Stamp::now();
         if answers.send(exchange).is_err() {
             return;
@@ -255,12 +258,16 @@ impl Control {
 
     /// Takes the answer, if it has arrived; returns whether the thread `policy` still runs.
     fn take_answer(&mut self) -> bool {
-        let exchange = match self.answers.try_recv() {
+        let mut exchange = match self.answers.try_recv() {
             Ok(exchange) => exchange,
             Err(TryRecvError::Empty) => return true,
             // It panicked, and its request is lost.
             Err(TryRecvError::Disconnected) => return false,
         };
+        for (at, cell) in exchange.firsts.drain(..) {
+            let Some(observation) = self.options.bundle.observations.get(at) else { continue };
+            self.board.add_reference(cell.into_reference(observation));
+        }
         let request = &exchange.request;
         let latency = exchange.done.since(request.stamp);
         match &exchange.outcome {

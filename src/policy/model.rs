@@ -64,6 +64,8 @@ struct Lane {
     numbers: Vec<f64>,
     /// Of a vector that is its first sample: whether `numbers` are of that. `None` for all others.
     has_first: Option<bool>,
+    /// The sample with which all later ones are compared, or which stands for them, until it is reported.
+    first: Option<Cell>,
     /// Of a history, the sample whose numbers each of its steps in the tensors has.
     written: Vec<Option<SampleId>>,
 }
@@ -88,6 +90,7 @@ impl Model {
                 ObservationInput::Vector(vector) => vector.operation.map(|VectorOperation::FirstOfRun| false),
                 ObservationInput::Image(_) => None,
             },
+            first: None,
             written: vec![None; observation.history.as_ref().map_or(0, |history| history.steps)],
         });
         let sampler = Sampler::new(bundle, environment, computing)?;
@@ -126,9 +129,15 @@ impl Model {
         self.sampler.chunk_len()
     }
 
+    /// The samples that became references since the last call, each with the position of its observation.
+    pub fn take_firsts(&mut self) -> impl Iterator<Item = (usize, Cell)> {
+        self.lanes.iter_mut().enumerate().filter_map(|(at, lane)| Some((at, lane.first.take()?)))
+    }
+
     /// A new episode: the next sample of each modality is its first.
     pub fn reset(&mut self) {
         for lane in &mut self.lanes {
+            lane.first = None;
             lane.has_first = lane.has_first.map(|_| false);
             // They were compared with the reference of the last episode.
             lane.written.fill(None);
@@ -219,8 +228,13 @@ impl Lane {
         let encoding = cell.encoding.ok_or(SampleError::Encoding)?;
         if let Some(pictures) = &mut self.pictures {
             let Some(place) = tensors.step_mut(at, step) else { return Ok(()) };
+            let is_first = pictures.reference().is_some_and(|reference| !reference.is_taken());
             let picture = Picture { encoding, width: cell.width, height: cell.height, bytes: &cell.bytes };
-            return Ok(pictures.write(&picture, place)?);
+            pictures.write(&picture, place)?;
+            if is_first {
+                self.first = Some(cell.clone());
+            }
+            return Ok(());
         }
         if self.has_first != Some(true) {
             let (numbers, rest) = cell.bytes.as_chunks::<8>();
@@ -232,7 +246,10 @@ impl Lane {
         }
         tensors.write_vector(at, step, &self.numbers)?;
         // One that was refused is not the first.
-        self.has_first = self.has_first.map(|_| true);
+        if self.has_first.is_some_and(|has_first| !has_first) {
+            self.has_first = Some(true);
+            self.first = Some(cell.clone());
+        }
         Ok(())
     }
 }

@@ -68,6 +68,11 @@ impl Reference {
         Self { values: vec![0.0; len], taken: false }
     }
 
+    /// Whether there was a first picture.
+    pub const fn is_taken(&self) -> bool {
+        self.taken
+    }
+
     /// A new episode: the next picture is the reference.
     pub fn reset(&mut self) {
         self.taken = false;

@@ -8,7 +8,7 @@ use super::bundle::{Bundle, ObservationSpec};
 use super::horizon::ChunkError;
 use crate::mask::{PhysicalMask, SizedMask};
 use crate::sample::{Encoding, SampleHeader};
-use crate::status::{Chunk, ObservedSamples, What};
+use crate::status::{Chunk, ObservedSamples, ReferenceSample, What};
 use crate::time::Stamp;
 
 /// The samples of the steps of each observation, and what was present at the last of them.
@@ -68,6 +68,21 @@ impl Cell {
         (self.width, self.height) = (header.width, header.height);
         self.bytes.clear();
         self.bytes.extend_from_slice(bytes);
+    }
+
+    /// The sample, as the reference of an observation.
+    pub fn into_reference(self, observation: &ObservationSpec) -> ReferenceSample {
+        let header = SampleHeader {
+            seq: self.seq,
+            epoch: self.epoch,
+            capture_ns: self.capture_ns,
+            encoding: self.encoding.map_or(0, |encoding| encoding as u32),
+            width: self.width,
+            height: self.height,
+            ..SampleHeader::default()
+        };
+        let (observation, modality) = (observation.key.clone(), observation.modality.clone());
+        ReferenceSample { observation, modality, header, payload: self.bytes }
     }
 
     /// This step of a history has no sample. The memory is kept.
@@ -132,12 +147,19 @@ impl Request {
     }
 
     /// Sets that an observation has no sample at all.
-    pub fn set_empty(&mut self, observation: usize) {
+    fn set_empty(&mut self, observation: usize) {
         self.set_present(observation, false);
         for step in 0..self.steps(observation) {
             if let Some(cell) = self.cell_mut(observation, step) {
                 cell.clear();
             }
+        }
+    }
+
+    /// Sets that no observation has any sample.
+    pub fn clear(&mut self) {
+        for observation in 0..self.observations.len() {
+            self.set_empty(observation);
         }
     }
 

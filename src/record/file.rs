@@ -23,6 +23,7 @@ use crate::episode::encode::{self, EventText};
 use crate::episode::form::{Derived, TRANSFORM_TOPIC};
 use crate::episode::made::{MadeKind, Shown};
 use crate::episode::own::EpisodeId;
+use crate::episode::reference;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
 use crate::mask::{Bits, MASK_TOPIC};
@@ -30,7 +31,7 @@ use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::observation::Observation;
 use crate::registry::{Form, ModuleSpec, Registry, TransformSpec};
 use crate::sample::SampleHeader;
-use crate::status::Level;
+use crate::status::{Level, ReferenceSample};
 use crate::time::{Stamp, WallClock};
 
 /// See the module's comment.
@@ -275,6 +276,15 @@ impl EpisodeFile {
             self.show(MadeKind::Transform, log_time);
         }
         Ok(())
+    }
+
+    /// Attaches the sample from before the episode that the policy compares later ones with.
+    pub(super) fn reference(&mut self, reference: &ReferenceSample) -> io::Result<()> {
+        let ReferenceSample { observation, modality, header, payload } = reference;
+        let wall_ns = self.clock.wall_ns(Stamp(header.capture_ns));
+        let sample = (header, payload.as_slice());
+        let attachment = reference::attachment(&mut self.message, observation, modality, wall_ns, sample);
+        self.writer.attach(&attachment).map_err(io_error)
     }
 
     fn show(&self, kind: MadeKind, log_time: u64) {

@@ -76,6 +76,16 @@ fn qualities<'a>(registry: &'a Registry, measures: &Measures, end: Stamp) -> Vec
     registry.devices.iter().filter_map(quality).collect()
 }
 
+/// Attaches the references of the policy from number `from` on; returns how many there are. One that was captured in the episode
+/// is in it as any sample.
+fn attach_references(file: &mut EpisodeFile, board: &Board, from: usize, begin: Stamp) -> io::Result<usize> {
+    let references = board.references();
+    for reference in references.iter().skip(from).filter(|reference| reference.header.capture_ns < begin.0) {
+        file.reference(reference)?;
+    }
+    Ok(references.len())
+}
+
 fn judged<'a>(qualities: &'a [(&DeviceSpec, Quality)]) -> Vec<Judged<'a>> {
     let judged =
         |(device, quality): &'a (&DeviceSpec, Quality)| Judged { name: &device.name, quality, limits: device.verdict };
@@ -101,6 +111,8 @@ pub(super) struct OpenEpisode {
     logs: u64,
     events: u64,
     units: Units,
+    /// References of the policy that were considered.
+    references: usize,
     /// How long a tick waits for its samples, in addition to the window.
     settle: Duration,
     /// As last judged.
@@ -135,6 +147,7 @@ impl OpenEpisode {
             file.mask(header, *bits, *sequence)?;
             measures.mask(header.capture_ns, bits.mask);
         }
+        let references = attach_references(&mut file, &board, 0, begin)?;
         // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
         let kept = |device: &DeviceSpec| device.depth.saturating_add(RING_SLACK);
@@ -157,6 +170,7 @@ impl OpenEpisode {
             logs: 0,
             events: 0,
             units,
+            references,
             settle,
             outlook: Outlook::default(),
             failed: None,
@@ -347,7 +361,9 @@ impl OpenEpisode {
         };
         let closed = match self.failed {
             None => {
-                let finished = self.file.finish(metadata::end(&ending));
+                // Those that the policy took while the episode began.
+                let attached = attach_references(&mut self.file, &self.board, self.references, self.begin);
+                let finished = attached.and_then(|_| self.file.finish(metadata::end(&ending)));
                 finished.and_then(|()| episode_path::keep(&self.path))
             }
             Some(error) => Err(error),

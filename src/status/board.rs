@@ -77,6 +77,19 @@ pub struct EpisodeEnd {
     pub verdict: Verdict,
 }
 
+/// The sample that a policy compares all later ones of an observation with, or that stands for them.
+#[derive(Debug, Clone)]
+pub struct ReferenceSample {
+    /// Key of the observation.
+    pub observation: String,
+    /// Name of the modality.
+    pub modality: String,
+    /// As received.
+    pub header: SampleHeader,
+    /// As the device sent it.
+    pub payload: Vec<u8>,
+}
+
 /// The episodes of a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct EpisodeCounts {
@@ -159,6 +172,7 @@ pub struct Board {
     recording: Mutex<Option<RecordingStatus>>,
     not_started: Mutex<Option<String>>,
     policy: Mutex<Option<PolicyStatus>>,
+    references: Mutex<Vec<Arc<ReferenceSample>>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     session: Mutex<Option<SessionStatus>>,
     disk_free: Mutex<Option<u64>>,
@@ -219,6 +233,7 @@ impl Board {
             recording: Mutex::new(None),
             not_started: Mutex::new(None),
             policy: Mutex::new(None),
+            references: Mutex::new(Vec::new()),
             last_episode: Mutex::new(None),
             session: Mutex::new(None),
             disk_free: Mutex::new(None),
@@ -313,6 +328,16 @@ impl Board {
     /// Reports the policy's status, or that there is no policy.
     pub fn set_policy(&self, policy: Option<PolicyStatus>) {
         *lock(&self.policy) = policy;
+    }
+
+    /// Reports a sample that the policy compares all later ones with, until it ends.
+    pub fn add_reference(&self, reference: ReferenceSample) {
+        lock(&self.references).push(Arc::new(reference));
+    }
+
+    /// Those of the policy, in the order in which it took them.
+    pub fn references(&self) -> Vec<Arc<ReferenceSample>> {
+        lock(&self.references).clone()
     }
 
     /// Reports the last finished file.

@@ -32,7 +32,7 @@ use detail::DeviceDetail;
 use preview::Preview;
 use session::{Answered, SessionRequest, SessionStatus};
 
-pub use board::{Board, EpisodeCounts, EpisodeEnd};
+pub use board::{Board, EpisodeCounts, EpisodeEnd, ReferenceSample};
 pub use event::Description;
 pub use event::{Event, Provenance, What};
 

@@ -8,7 +8,7 @@ use std::path::Path;
 use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::support::{self, Episode, EventMessage, Place, events};
+use crate::support::{self, Episode, EventMessage, Place, events, until};
 
 /// What the policy observes. A replugged device may be started at once.
 const REGISTRY: &str = r#"
@@ -55,6 +55,10 @@ motors = [
 /// The tactile sensor is pulled out for a second.
 const PULLED: &str = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
                       [[event]]\nat = \"3s\"\nunplug = \"tactile_tip\"\n[[event]]\nat = \"5s\"\nplug = \"tactile_tip\"\n";
+
+/// All sensors stay.
+const PLUGGED: &str =
+    "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n";
 
 /// The folder of the policy of the repository.
 const BUNDLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id");
@@ -337,6 +341,36 @@ fn a_held_sensor_is_observed_as_it_was_and_then_not_at_all() {
     let error = String::from_utf8_lossy(&observed.stderr).into_owned();
     assert!(!observed.status.success() && error.contains("choose another file with --to"), "{error}");
     assert_eq!(std::fs::read(&file).expect("the episode"), before);
+}
+
+/// The picture with which the policy compares all later ones of the fingertip is from before the episode.
+#[test]
+fn chunks_of_an_episode_that_begins_while_the_policy_acts_can_be_computed_again() {
+    let place = Place::new();
+    let registry = place.write("rig.toml", REGISTRY).display().to_string();
+    let scenario = place.write("play.toml", PLUGGED).display().to_string();
+    let arguments = ["--json", "--infer", BUNDLE, "--config", &registry, "--sim", &scenario, "--out", "out"];
+    let running = place.start(&arguments, "\"event\":\"act\"");
+    let chunks = || running.reported().iter().filter(|line| line["event"] == "chunk").count();
+    let ask = |words: &[&str]| {
+        let output = place.run(words);
+        assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+    };
+    until("the policy has answered", || chunks() > 0);
+    ask(&["episode", "start"]);
+    let before = chunks();
+    until("it has answered in the episode", || chunks() > before + 4);
+    ask(&["episode", "stop"]);
+    running.signal(Signal::INT);
+    let (code, printed, stderr) = running.end();
+    assert_eq!(code, support::recorded_code(&printed), "{stderr}");
+
+    let file = place.path("out").join(&place.episodes("out")[0]).display().to_string();
+    let replayed = place.run(&["--json", "replay", &file, "--infer", BUNDLE, "--tolerance", "1e-5"]);
+    assert_eq!(replayed.status.code(), Some(0), "{}", String::from_utf8_lossy(&replayed.stderr));
+    let again: Value = serde_json::from_slice(&replayed.stdout).expect("an object");
+    assert!(again["compared"].as_u64() >= Some(3), "{again}");
+    assert_eq!(again["reference_unknown"], 0, "{again}");
 }
 
 #[test]

@@ -6,6 +6,7 @@ use super::super::provenance::Attached;
 use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
 use crate::provenance::UnplugSource;
+use crate::status::ReferenceSample;
 use crate::text::counted;
 use crate::time::WallClock;
 
@@ -61,6 +62,34 @@ fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
     assert_eq!(report.error, None);
     let read = read(&report.file);
     assert_eq!(read.on(crate::mask::MASK_TOPIC).map(|message| message.1).collect::<Vec<_>>(), [5, 6, 7, 8]);
+}
+
+/// Those that the policy has when the episode begins, and those captured before it that it takes later: what was captured in the
+/// episode is in it.
+#[test]
+fn references_of_the_policy_from_before_the_episode_are_attached() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let take = |observation: &str, capture_ms| {
+        board.add_reference(ReferenceSample {
+            observation: observation.to_owned(),
+            modality: "tof".to_owned(),
+            header: scalars(3, capture_ms, capture_ms),
+            payload: 1.5_f64.to_le_bytes().to_vec(),
+        });
+    };
+    take("known", 500);
+    let masks = MaskHistory::new();
+    let mut open = open(folder.path(), &board, &masks);
+    let attached = |path: &Path| -> Vec<String> { read(path).attachments.into_keys().collect() };
+    take("taken_late", 999);
+    take("of_the_episode", 1001);
+    open.end_at(Stamp(1100 * MS));
+    let report = open.finish(Stamp(1300 * MS), &masks, None, &[]);
+    assert_eq!(report.error, None);
+    assert_eq!(attached(&report.file), ["devices.toml", "reference/known", "reference/taken_late"]);
+    let message = &read(&report.file).attachments["reference/known"];
+    assert_eq!(crate::episode::decode("rapid.Scalars", message).unwrap().0, 1.5_f64.to_le_bytes());
 }
 
 #[test]
