@@ -1,5 +1,5 @@
 //! Computes a chunk of actions that a policy gave in an episode once more, from the recording alone: the first one whose samples
-//! are all in it. Those of an episode that began while the policy was running may be older.
+//! are all in it. In an episode that began while the policy was running, those of its first chunks may be from before it.
 //!
 //!     recompute_chunk EPISODE [POLICY]
 //!
@@ -15,7 +15,7 @@ use std::path::Path;
 
 use prost::Message;
 use rapid::mask::PhysicalMask;
-use rapid::policy::bundle::Bundle;
+use rapid::policy::bundle::{Bundle, ObservationInput};
 use rapid::policy::compose::Composer;
 use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
@@ -50,7 +50,8 @@ struct Chunk {
     mask: String,
     seed: u64,
     samples: Vec<Observed>,
-    actions: Vec<f32>,
+    /// Null where the answer of the policy gave none.
+    actions: Vec<Option<f32>>,
 }
 
 #[derive(Deserialize)]
@@ -75,20 +76,18 @@ fn main() -> Result<(), Box<dyn Error>> {
     let modalities = modalities(&bytes)?;
     let bundle = Bundle::open(arguments.next().as_deref().map(Path::new))?;
     let mut model = Model::load(&bundle, &Environment::open(None)?, Computing::default())?;
-    take_references(&bytes, &modalities, &bundle, &mut model)?;
-
     let chunks = chunks(&bytes)?;
     if chunks.is_empty() {
         return Err("the episode holds no chunk: no policy ran while it was recorded".into());
     }
-    let mut whole = None;
-    for chunk in &chunks {
-        if let Some(request) = request(&bytes, &modalities, &bundle, chunk)? {
-            whole = Some((chunk, request));
-            break;
-        }
+    let held = held(&bytes)?;
+    let whole = chunks.iter().find(|chunk| chunk.is_whole(&modalities, &held));
+    let chunk = whole.ok_or("no chunk has all of its samples in the episode")?;
+    let has_all_references = take_references(&bytes, &modalities, &bundle, &mut model)?;
+    if !has_all_references && chunk.tick > 0 {
+        return Err("a reference of the policy is not attached: its first sample may be another one".into());
     }
-    let (chunk, request) = whole.ok_or("of each chunk a sample is not in the episode: it began later")?;
+    let request = request(&bytes, &modalities, &bundle, chunk)?;
 
     let mut output = vec![0.0; model.chunk_len()];
     let mut noise = output.clone();
@@ -101,10 +100,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     if computed.len() != chunk.actions.len() {
         return Err("the chunk is of another policy".into());
     }
-    let apart = computed.iter().zip(&chunk.actions).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
+    let recorded: Vec<f32> = chunk.actions.iter().copied().flatten().collect();
+    let apart = computed.iter().zip(&recorded).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
     println!("tick {}, mask {}, seed {}", chunk.tick, chunk.mask, chunk.seed);
     println!("noise begins {:?}", &noise[..noise.len().min(4)]);
-    println!("action 0, recorded {:?}", &chunk.actions[..bundle.action.len()]);
+    println!("action 0, recorded {:?}", &recorded[..bundle.action.len()]);
     println!("action 0, computed {:?}", &computed[..bundle.action.len()]);
     println!("largest difference of {} numbers: {apart:e}", computed.len());
     Ok(())
@@ -125,13 +125,32 @@ fn chunks(bytes: &[u8]) -> Result<Vec<Chunk>, Box<dyn Error>> {
     Ok(chunks)
 }
 
-/// What the policy was asked for; `None` if a sample is not in the file.
-fn request(
-    bytes: &[u8],
-    modalities: &[Modality],
-    bundle: &Bundle,
-    chunk: &Chunk,
-) -> Result<Option<Request>, Box<dyn Error>> {
+impl Chunk {
+    /// Whether all of its actions are numbers, and all of its samples in the file.
+    fn is_whole(&self, modalities: &[Modality], held: &BTreeSet<(String, u32)>) -> bool {
+        let is_held = |observed: &Observed| {
+            let topic = modality(modalities, &observed.modality).map(|modality| modality.topic.clone());
+            topic.is_ok_and(|topic| {
+                observed.seqs.iter().flatten().all(|seq| held.contains(&(topic.clone(), lower(*seq))))
+            })
+        };
+        self.actions.iter().all(Option::is_some) && self.samples.iter().all(is_held)
+    }
+}
+
+/// The part of a sample's number that its message has.
+fn lower(seq: u64) -> u32 {
+    u32::try_from(seq & 0xffff_ffff).unwrap_or_default()
+}
+
+/// Topic and number of all messages.
+fn held(bytes: &[u8]) -> Result<BTreeSet<(String, u32)>, Box<dyn Error>> {
+    let messages = mcap::MessageStream::new(bytes)?;
+    messages.map(|message| message.map(|m| (m.channel.topic.clone(), m.sequence)).map_err(Into::into)).collect()
+}
+
+/// What the policy was asked for.
+fn request(bytes: &[u8], modalities: &[Modality], bundle: &Bundle, chunk: &Chunk) -> Result<Request, Box<dyn Error>> {
     let mut request = Request::new(bundle);
     request.tick = chunk.tick;
     request.seed = chunk.seed;
@@ -144,25 +163,33 @@ fn request(
         for (step, seq) in observed.seqs.iter().enumerate() {
             // In a new request a step of a history has no sample.
             let Some(seq) = seq else { continue };
-            let Some(payload) = samples.get(seq) else { return Ok(None) };
+            let payload = samples.get(seq).ok_or("a sample of the chunk is not in the episode")?;
             let header = SampleHeader { seq: *seq, ..header(modality) };
             request.cell_mut(at, step).ok_or("the chunk is of another policy")?.set(&header, payload);
         }
     }
-    Ok(Some(request))
+    Ok(request)
 }
 
-/// Shows the policy the samples from before the episode with which it compared later ones: attachments `reference/KEY`.
+/// Shows the policy the samples with which it compared later ones, attachments `reference/KEY`. Returns whether each observation
+/// that needs one has one.
 fn take_references(
     bytes: &[u8],
     modalities: &[Modality],
     bundle: &Bundle,
     model: &mut Model,
-) -> Result<(), Box<dyn Error>> {
+) -> Result<bool, Box<dyn Error>> {
+    let mut has_all = true;
     let summary = mcap::Summary::read(bytes)?.ok_or("the episode is not finished: run rapid recover")?;
     for (at, observation) in bundle.observations.iter().enumerate() {
         let name = format!("reference/{}", observation.key);
-        let Some(index) = summary.attachment_indexes.iter().find(|index| index.name == name) else { continue };
+        let Some(index) = summary.attachment_indexes.iter().find(|index| index.name == name) else {
+            has_all &= match &observation.input {
+                ObservationInput::Image(image) => image.operation.is_none(),
+                ObservationInput::Vector(vector) => vector.operation.is_none(),
+            };
+            continue;
+        };
         let message = SampleMessage::decode(&*mcap::read::attachment(bytes, index)?.data)?;
         let header = header(modality(modalities, &observation.modality)?);
         let mut request = Request::new(bundle);
@@ -172,7 +199,7 @@ fn take_references(
         }
         model.observe(&request)?;
     }
-    Ok(())
+    Ok(has_all)
 }
 
 fn modality<'a>(modalities: &'a [Modality], name: &str) -> Result<&'a Modality, Box<dyn Error>> {
@@ -207,7 +234,7 @@ fn samples(bytes: &[u8], topic: &str, seqs: &[Option<u64>]) -> Result<BTreeMap<u
     let mut found = BTreeMap::new();
     for message in mcap::MessageStream::new(bytes)? {
         let message = message?;
-        let seq = wanted.iter().find(|seq| **seq & 0xffff_ffff == u64::from(message.sequence));
+        let seq = wanted.iter().find(|seq| lower(**seq) == message.sequence);
         if let (Some(seq), true) = (seq, message.channel.topic == topic) {
             found.entry(*seq).or_insert(SampleMessage::decode(&*message.data)?.payload);
         }

@@ -93,10 +93,13 @@ packages() {
     fi
     change "installing with apt: ${missing[*]}"
     # On a machine without these the crates are missing, too: fetched beside the packages. What fails here, the build reports.
-    cargo fetch --locked --quiet 2>/dev/null &
+    cargo fetch --locked --quiet --target "$(rustc -vV | sed -n 's/^host: //p')" 2>/dev/null 9>&- &
+    # shellcheck disable=SC2064  # the process of now, not of then
+    trap "kill $! 2>/dev/null || true" EXIT
     "${as_root[@]}" apt-get update -q
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "${missing[@]}"
     wait
+    trap - EXIT
 }
 
 # One whose packages cannot be imported is made anew, whatever its stamp names.

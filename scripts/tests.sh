@@ -21,17 +21,25 @@ idle() {
     if chrt --idle 0 true 2>/dev/null; then chrt --idle 0 "$@"; else nice -n 19 "$@"; fi
 }
 
-# Most of a minute on a fresh machine, and nothing on another.
-"${0%/*}/setup.sh" image &
-readonly image=$!
-trap 'kill "$image" 2>/dev/null || true' EXIT
+# The guest: most of a minute on a fresh machine, and nothing on another. Who is not root may be asked for a password, which
+# nothing else may hide. In its own process group, as the bench below; in a folder for temporary files that stays.
+image=
+if [[ $(id -u) = 0 ]]; then
+    set -m
+    env -u TMPDIR "${0%/*}/setup.sh" image </dev/null &
+    image=$!
+    set +m
+    trap 'kill -- "-$image" 2>/dev/null && wait "$image" || true' EXIT
+else
+    "${0%/*}/setup.sh" image
+fi
 
 # With any test of a package its programs are built, too. The unit tests are the longest compilation: here it is beside that
 # of the library, which takes one processor, and beside the guests it would take as long as they do. The examples are those
 # that guests run: `cargo test` gives them their place only when everything else is built.
 guest=$(programs "$@" --lib --test guest --test layering | grep /guest-) || { echo "tests.sh: the tests of $package are not built" >&2; exit 1; }
 "$1" build "${@:3}" --example process_node --example publish_action
-wait "$image" || { echo "tests.sh: the virtual bench has no guest" >&2; exit 1; }
+[[ -z $image ]] || wait "$image" || { echo "tests.sh: the virtual bench has no guest" >&2; exit 1; }
 # These run when nothing else does. rapid stops motors that answer too late, and on a machine that stands still for a second they
 # do; what a camera's latency is measured by, and what the bench shows of itself, is when samples come; a chunk of the policy
 # takes all of an emulated processor for seconds.

@@ -159,8 +159,8 @@ fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result
         ),
         (
             again.reference_unknown,
-            "not compared: the recording started after the policy, and the first sample, the reference for all others, \
-             is not in the file",
+            "not compared: the first sample of the run, the reference for all others, is neither attached nor known to be \
+             in the file",
         ),
         (again.unlike, "not compared: their observations or length differ from this policy's"),
         (again.unreadable, "not compared: their events cannot be read"),
@@ -174,7 +174,7 @@ fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result
     if actions.recorded > 0 {
         let recorded = text::counted(actions.recorded, "action");
         writeln!(out, "\n{recorded}, {} compared with those of the chunks", actions.compared)?;
-        print_others(&[(actions.without_chunk, "not compared: no chunk in the file covers their tick")], None, out)?;
+        print_others(&[(actions.without_chunk, "not compared: of a chunk that is not in the file")], None, out)?;
         if actions.compared > 0 {
             table(&actions.difference, out)?;
         }

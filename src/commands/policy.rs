@@ -41,8 +41,8 @@ pub enum ShowError {
     #[error(
         "{}: it has no chunk {number} of this policy, or not all samples that the chunk was computed from: name the \
          folder of the policy that ran, or another chunk with --chunk. In an episode that began while the policy was \
-         running, samples may be missing from the first chunks, and the first picture, with which others are compared, \
-         from all of them: `rapid replay --infer` counts the reasons",
+         running, samples may be missing from the first chunks and, if an earlier version recorded it, the reference from \
+         all of them: `rapid replay --infer` counts the reasons",
         file.display()
     )]
     NoChunk {

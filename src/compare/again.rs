@@ -1,8 +1,8 @@
 //! The chunks of a recorded policy, recomputed from the samples that their events name.
 //!
-//! Chunks are processed in the order in which the policy produced them, so that the reference picture that later ones
-//! are compared with is the same. A request without an answer left no event: had it been the first with a picture, the
-//! reference differs here, and the difference shows it.
+//! Chunks are processed in the order in which the policy produced them. The reference that later samples are compared with is
+//! the attached one. In a file of an earlier version, which has none, it is the first sample that a chunk names: had an earlier
+//! request been without an answer, and so without an event, the reference differs here, and the difference shows it.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -30,7 +30,7 @@ pub struct Again {
     pub compared: u64,
     /// Those with samples missing from the file: captured before the episode began, or lost.
     pub samples_missing: u64,
-    /// Those with a picture that is compared with one from before the beginning of the episode.
+    /// Those with a reference that is neither attached nor known to be in the file.
     pub reference_unknown: u64,
     /// Those with other observations or another length than the policy's: from another policy.
     pub unlike: u64,
@@ -51,7 +51,8 @@ pub struct Again {
 pub struct Actions {
     /// Actions in the file.
     pub recorded: u64,
-    /// Those whose tick a chunk covers. Where an old chunk and a new one do, the nearest counts.
+    /// Those whose tick a chunk covers, and no chunk from before the episode. Where an old chunk and a new one do, the nearest
+    /// counts.
     pub compared: u64,
     /// The others.
     pub without_chunk: u64,
@@ -342,7 +343,7 @@ impl Work<'_> {
         }
     }
 
-    /// References from before the episode, which are attached to it.
+    /// The references that are attached to the episode.
     fn take_attached(&mut self, survey: &Survey) {
         for (at, observation) in self.bundle.observations.iter().enumerate() {
             let Some((header, bytes)) = survey.references.get(&observation.key) else { continue };
@@ -384,10 +385,12 @@ fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
     let mut actions = Actions { difference: Difference::new(&bundle.action), ..Actions::default() };
     let chunks: BTreeMap<u64, &RecordedChunk> =
         survey.chunks.iter().map(|chunk| (chunk.tick & SEQUENCE_BITS, chunk)).collect();
+    let known_from = known_from(survey, bundle);
     for action in &survey.actions {
         actions.recorded += 1;
         let tick = u64::from(action.sequence);
-        let covering = chunks.range(tick.saturating_sub(bundle.horizon as u64)..=tick);
+        let is_known = tick >= known_from;
+        let covering = chunks.range(tick.saturating_sub(bundle.horizon as u64)..=tick).filter(|_| is_known);
         let planned = covering.filter_map(|(_, chunk)| planned(chunk, action, bundle));
         let apart = |planned: &Vec<f64>| {
             planned.iter().zip(&action.values).map(|(one, other)| distance(*one, *other)).fold(0.0, f64::max)
@@ -401,6 +404,16 @@ fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
         }
     }
     actions
+}
+
+/// The tick from which on all actions are of chunks in the file. Before it they may be of one from before the episode.
+fn known_from(survey: &Survey, bundle: &Bundle) -> u64 {
+    if holds_every_chunk(survey, bundle) {
+        return 0;
+    }
+    // The action of an observation's own tick is of an earlier chunk: its own is not computed yet.
+    let begins = |chunk: &RecordedChunk| (chunk.tick & SEQUENCE_BITS).saturating_add(chunk.skipped).saturating_add(1);
+    survey.chunks.iter().find(|chunk| chunk.used != Some(false)).map_or(u64::MAX, begins)
 }
 
 /// The action of `chunk` for the tick of `action`, within the limits.

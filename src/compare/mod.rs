@@ -94,7 +94,7 @@ pub struct Compared {
 /// What the file holds, and the registry that it was recorded with, which the policy suits.
 fn examined(file: &Path, bundle: &Bundle) -> Result<(Survey, Registry), CompareError> {
     let name = || file.display().to_string();
-    let survey = Survey::read(file)?;
+    let survey = Survey::read(file, &bundle.observations)?;
     let registry = survey.registry.as_deref().filter(|text| !text.is_empty());
     let wrong = |why: String| CompareError::Registry { file: name(), why };
     let text = registry.ok_or_else(|| wrong("holds no registry: it was not recorded by rapid".to_owned()))?;

@@ -14,6 +14,7 @@ use crate::episode::reader::{Entry, Item, Message, Reader};
 use crate::episode::reference;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
+use crate::policy::bundle::ObservationSpec;
 use crate::registry::Registry;
 use crate::sample::{Encoding, Epoch, SampleHeader};
 
@@ -41,7 +42,7 @@ pub(super) struct Survey {
     pub(super) actions: Vec<RecordedAction>,
     /// Per topic, the numbers of its samples, ascending.
     pub(super) samples: BTreeMap<String, Vec<u32>>,
-    /// By the key of an observation, the sample from before the episode that later ones are compared with.
+    /// By the key of an observation, the attached sample that later ones are compared with.
     pub(super) references: BTreeMap<String, (SampleHeader, Vec<u8>)>,
     /// Which part of the file could not be read.
     pub(super) damage: Option<String>,
@@ -62,6 +63,11 @@ pub(super) struct RecordedChunk {
     pub(super) seed: u64,
     /// The samples of each observation.
     pub(super) samples: Vec<RecordedSamples>,
+    /// Whether any of its actions was to be executed.
+    pub(super) used: Option<bool>,
+    /// How many of its actions were late.
+    #[serde(default)]
+    pub(super) skipped: u64,
     /// Values that are not numbers are null.
     pub(super) actions: Vec<Option<f32>>,
 }
@@ -98,8 +104,8 @@ struct PolicyEvent {
 }
 
 impl Survey {
-    /// Reads the whole file.
-    pub(super) fn read(file: &Path) -> Result<Self, ReadError> {
+    /// Reads the whole file, for a policy with these observations.
+    pub(super) fn read(file: &Path, observations: &[ObservationSpec]) -> Result<Self, ReadError> {
         let (mut reader, mut scratch) = (Reader::open(file)?, Scratch::default());
         let mut survey = Self::default();
         let mut first = None;
@@ -107,8 +113,13 @@ impl Survey {
             let message = match reader.item() {
                 Item::Message(message) => message,
                 Item::Other(Entry::Attachment(attachment)) => {
-                    let read = reference::read(&attachment);
-                    survey.references.extend(read.map(|(observation, header, bytes)| (observation, (header, bytes))));
+                    if let Some(key) = reference::observation(&attachment)
+                        && observations.iter().any(|observation| observation.key == key)
+                        && !survey.references.contains_key(key)
+                        && let Some(sample) = reference::sample(&attachment)
+                    {
+                        survey.references.insert(key.to_owned(), sample);
+                    }
                     continue;
                 }
                 Item::Channel(_) | Item::Other(_) | Item::Unreadable => continue,

@@ -108,11 +108,11 @@ impl Recorded {
         edit: impl FnMut(&mut Message) -> bool,
         about: impl Fn(&mut std::collections::BTreeMap<String, String>),
     ) -> Vec<u8> {
-        self.edited_with(edit, about, None)
+        self.edited_with(edit, about, &[])
     }
 
-    /// The file as if the recording had begun with the second chunk, with this attachment.
-    fn begun_later(&self, attachment: Option<&mcap::Attachment<'_>>) -> Vec<u8> {
+    /// The file as if the recording had begun with the second chunk, with these attachments.
+    fn begun_later(&self, attachments: &[mcap::Attachment<'_>]) -> Vec<u8> {
         let begin = self.messages().into_iter().filter(Message::is_chunk).nth(1).unwrap().log_time;
         let about = |about: &mut std::collections::BTreeMap<String, String>| {
             let number = |key: &str| about[key].parse::<u64>().unwrap();
@@ -120,7 +120,7 @@ impl Recorded {
             about.insert("begin_wall_ns".into(), begin.to_string());
             about.insert("begin_monotonic_ns".into(), (monotonic + begin - wall).to_string());
         };
-        self.edited_with(|message| message.log_time >= begin, about, attachment)
+        self.edited_with(|message| message.log_time >= begin, about, attachments)
     }
 
     /// What is attached of the sample that is the reference of observation `key`: the message of its topic.
@@ -137,7 +137,7 @@ impl Recorded {
         &self,
         mut edit: impl FnMut(&mut Message) -> bool,
         about: impl Fn(&mut std::collections::BTreeMap<String, String>),
-        attachment: Option<&mcap::Attachment<'_>>,
+        attachments: &[mcap::Attachment<'_>],
     ) -> Vec<u8> {
         let mut bytes = Vec::new();
         let mut writer = mcap::WriteOptions::new().compression(None).create(Cursor::new(&mut bytes)).unwrap();
@@ -149,7 +149,7 @@ impl Recorded {
                 writer.write_metadata(&metadata).unwrap();
             }
         }
-        attachment.into_iter().for_each(|attachment| writer.attach(attachment).unwrap());
+        attachments.iter().for_each(|attachment| writer.attach(attachment).unwrap());
         for message in mcap::MessageStream::new(&self.bytes).unwrap() {
             let mut message = message.unwrap();
             let (topic, data) = (message.channel.topic.clone(), message.data.to_vec());
@@ -281,7 +281,7 @@ fn the_reference_picture_is_the_first_one_or_unknown() {
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
 
     // The recording begins long after the policy.
-    let changed = recorded.again(&recorded.begun_later(None));
+    let changed = recorded.again(&recorded.begun_later(&[]));
     assert_eq!(changed.chunks, total - 1);
     assert!(changed.reference_unknown > 0 && changed.compared > 0 && changed.actions.without_chunk == 0, "{changed:?}");
     assert_eq!(changed.compared, total - feeling.len() as u64, "{changed:?}");
@@ -299,31 +299,34 @@ fn a_reference_from_before_the_episode_is_attached_to_it() {
         (Recorded::of(&[first]), 2, "state", ARM),
     ] {
         let chunks = recorded.chunks();
-        let of_chunk = |chunk: &Value| {
+        let of_chunk = |chunk: &Value, at: usize| {
             let seqs = chunk["samples"][at]["seqs"].as_array().unwrap().clone();
             seqs.iter().filter_map(Value::as_u64).collect::<Vec<u64>>()
         };
-        let without = recorded.again(&recorded.begun_later(None));
+        // The other reference of the third policy.
+        let tactile = || recorded.attached("tactile", TACTILE, of_chunk(&chunks[0], 1)[0]);
+        let again = |attachment| recorded.again(&recorded.begun_later(&[attachment, tactile()]));
+        let without = recorded.again(&recorded.begun_later(&[]));
         assert!(without.reference_unknown > 2, "{key}: {without:?}");
-        let attached = recorded.attached(key, topic, of_chunk(&chunks[0])[0]);
-        let with = recorded.again(&recorded.begun_later(Some(&attached)));
+        let attached = recorded.attached(key, topic, of_chunk(&chunks[0], at)[0]);
+        let with = again(attached);
         assert_eq!(
             (with.reference_unknown, with.compared),
             (0, without.compared + without.reference_unknown),
             "{key}: {with:?}"
         );
-        assert!(with.difference.all.largest < 1e-6, "{key}: {with:?}");
+        assert!(with.largest().unwrap() < 1e-6, "{key}: {with:?}");
 
         // It is what is attached that counts, also where the first sample in the file would be another.
-        let last = chunks.iter().rev().find_map(|chunk| of_chunk(chunk).last().copied()).unwrap();
-        let wrong = recorded.again(&recorded.begun_later(Some(&recorded.attached(key, topic, last))));
+        let last = chunks.iter().rev().find_map(|chunk| of_chunk(chunk, at).last().copied()).unwrap();
+        let wrong = again(recorded.attached(key, topic, last));
         assert!(wrong.difference.all.largest > 1e-5, "{key}: {wrong:?}");
         // One that cannot be read is none, as is that of another policy's observation.
-        let (mut cut, mut foreign) = (recorded.attached(key, topic, last), attached);
+        let [mut cut, mut foreign] = [(); 2].map(|()| recorded.attached(key, topic, last));
         cut.data.to_mut().truncate(9);
         foreign.name = "reference/other".to_owned();
         for none in [cut, foreign] {
-            let unknown = recorded.again(&recorded.begun_later(Some(&none)));
+            let unknown = recorded.again(&recorded.begun_later(&[none]));
             assert_eq!(unknown.reference_unknown, without.reference_unknown, "{key}: {unknown:?}");
         }
     }

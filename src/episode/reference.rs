@@ -1,5 +1,6 @@
-//! The attachments `reference/KEY`: the sample from before the episode that a policy compares all later ones of its observation
-//! KEY with. The data are the message that the topic of the sample would have; the media type names its schema.
+//! The attachments `reference/KEY`: the sample that a policy compares all later ones of its observation KEY with, or that stands
+//! for them. The episode may have begun after it. The data are the bytes of a message on the sample's topic; the media type
+//! names its schema.
 
 use mcap::Attachment;
 
@@ -30,9 +31,13 @@ pub(crate) fn attachment<'a>(
     }
 }
 
-/// The observation, and the sample as far as its message contains it; `None` if this is another attachment.
-pub(crate) fn read(attachment: &Attachment<'_>) -> Option<(String, SampleHeader, Vec<u8>)> {
-    let observation = attachment.name.strip_prefix(PREFIX)?;
+/// The key of the observation; `None` if this is another attachment.
+pub(crate) fn observation<'a>(attachment: &'a Attachment<'_>) -> Option<&'a str> {
+    attachment.name.strip_prefix(PREFIX)
+}
+
+/// The sample as far as its message contains it; `None` if it cannot be read.
+pub(crate) fn sample(attachment: &Attachment<'_>) -> Option<(SampleHeader, Vec<u8>)> {
     let schema = SampleSchema::named(attachment.media_type.strip_prefix(MEDIA)?)?;
     let mut scratch = Scratch::default();
     let Content::Sample(sample) = decode::content(Kind::Sample(schema), &attachment.data, &mut scratch)? else {
@@ -45,7 +50,7 @@ pub(crate) fn read(attachment: &Attachment<'_>) -> Option<(String, SampleHeader,
         height: sample.height,
         ..SampleHeader::default()
     };
-    Some((observation.to_owned(), header, sample.payload.to_vec()))
+    Some((header, sample.payload.to_vec()))
 }
 
 #[cfg(test)]
@@ -63,8 +68,8 @@ mod tests {
             let header = SampleHeader { encoding: encoding as u32, width, height, ..SampleHeader::default() };
             let mut message = Vec::new();
             let mut attached = attachment(&mut message, "touch", "tip", 77, (&header, &payload));
-            let (observation, read_header, read_payload) = read(&attached).unwrap();
-            assert_eq!((observation.as_str(), read_payload), ("touch", payload));
+            let (read_header, read_payload) = sample(&attached).unwrap();
+            assert_eq!((observation(&attached), read_payload), (Some("touch"), payload));
             assert_eq!((read_header.encoding, read_header.capture_ns), (encoding as u32, 77));
             if header.height > 0 {
                 assert_eq!((read_header.width, read_header.height), (width, height));
@@ -73,13 +78,13 @@ mod tests {
             for cut in 1..whole.len() {
                 // Any bytes: an error or another sample, no panic.
                 attached.data = whole[..cut].to_vec().into();
-                let _ = read(&attached);
+                let _ = sample(&attached);
             }
             attached.data = whole;
             attached.media_type = "application/protobuf; messageType=another".to_owned();
-            assert!(read(&attached).is_none());
+            assert!(sample(&attached).is_none());
             attached.name = "devices.toml".to_owned();
-            assert!(read(&attached).is_none());
+            assert!(observation(&attached).is_none());
         }
     }
 }

@@ -278,7 +278,7 @@ impl EpisodeFile {
         Ok(())
     }
 
-    /// Attaches the sample from before the episode that the policy compares later ones with.
+    /// Attaches a sample that the policy compares later ones with.
     pub(super) fn reference(&mut self, reference: &ReferenceSample) -> io::Result<()> {
         let ReferenceSample { observation, modality, header, payload } = reference;
         let wall_ns = self.clock.wall_ns(Stamp(header.capture_ns));

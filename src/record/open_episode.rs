@@ -76,13 +76,11 @@ fn qualities<'a>(registry: &'a Registry, measures: &Measures, end: Stamp) -> Vec
     registry.devices.iter().filter_map(quality).collect()
 }
 
-/// Attaches the references of the policy from number `from` on; returns how many there are. One that was captured in the episode
-/// is in it as any sample.
-fn attach_references(file: &mut EpisodeFile, board: &Board, from: usize, begin: Stamp) -> io::Result<usize> {
+/// Attaches the references of the policy from number `from` on; returns how many the policy has. One that was captured in the
+/// episode, too: which of the samples it was, no chunk need show.
+fn attach_references(file: &mut EpisodeFile, board: &Board, from: usize) -> io::Result<usize> {
     let references = board.references();
-    for reference in references.iter().skip(from).filter(|reference| reference.header.capture_ns < begin.0) {
-        file.reference(reference)?;
-    }
+    references.iter().skip(from).try_for_each(|reference| file.reference(reference))?;
     Ok(references.len())
 }
 
@@ -111,7 +109,7 @@ pub(super) struct OpenEpisode {
     logs: u64,
     events: u64,
     units: Units,
-    /// References of the policy that were considered.
+    /// References of the policy that are attached.
     references: usize,
     /// How long a tick waits for its samples, in addition to the window.
     settle: Duration,
@@ -147,7 +145,7 @@ impl OpenEpisode {
             file.mask(header, *bits, *sequence)?;
             measures.mask(header.capture_ns, bits.mask);
         }
-        let references = attach_references(&mut file, &board, 0, begin)?;
+        let references = attach_references(&mut file, &board, 0)?;
         // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
         let kept = |device: &DeviceSpec| device.depth.saturating_add(RING_SLACK);
@@ -361,8 +359,8 @@ impl OpenEpisode {
         };
         let closed = match self.failed {
             None => {
-                // Those that the policy took while the episode began.
-                let attached = attach_references(&mut self.file, &self.board, self.references, self.begin);
+                // Those that the policy has taken since the episode began.
+                let attached = attach_references(&mut self.file, &self.board, self.references);
                 let finished = attached.and_then(|_| self.file.finish(metadata::end(&ending)));
                 finished.and_then(|()| episode_path::keep(&self.path))
             }

@@ -330,7 +330,7 @@ impl Board {
         *lock(&self.policy) = policy;
     }
 
-    /// Reports a sample that the policy compares all later ones with, until it ends.
+    /// Reports a sample that the policy compares all later ones with. A run has one policy.
     pub fn add_reference(&self, reference: ReferenceSample) {
         lock(&self.references).push(Arc::new(reference));
     }

@@ -64,10 +64,9 @@ fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
     assert_eq!(read.on(crate::mask::MASK_TOPIC).map(|message| message.1).collect::<Vec<_>>(), [5, 6, 7, 8]);
 }
 
-/// Those that the policy has when the episode begins, and those captured before it that it takes later: what was captured in the
-/// episode is in it.
+/// Those that the policy has when the episode begins, and those that it takes later.
 #[test]
-fn references_of_the_policy_from_before_the_episode_are_attached() {
+fn references_of_the_policy_are_attached() {
     let folder = tempfile::tempdir().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let take = |observation: &str, capture_ms| {
@@ -87,7 +86,8 @@ fn references_of_the_policy_from_before_the_episode_are_attached() {
     open.end_at(Stamp(1100 * MS));
     let report = open.finish(Stamp(1300 * MS), &masks, None, &[]);
     assert_eq!(report.error, None);
-    assert_eq!(attached(&report.file), ["devices.toml", "reference/known", "reference/taken_late"]);
+    let expected = ["devices.toml", "reference/known", "reference/of_the_episode", "reference/taken_late"];
+    assert_eq!(attached(&report.file), expected);
     let message = &read(&report.file).attachments["reference/known"];
     assert_eq!(crate::episode::decode("rapid.Scalars", message).unwrap().0, 1.5_f64.to_le_bytes());
 }
