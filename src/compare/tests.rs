@@ -149,7 +149,9 @@ impl Recorded {
                 writer.write_metadata(&metadata).unwrap();
             }
         }
-        attachments.iter().for_each(|attachment| writer.attach(attachment).unwrap());
+        for attachment in attachments {
+            writer.attach(attachment).unwrap();
+        }
         for message in mcap::MessageStream::new(&self.bytes).unwrap() {
             let mut message = message.unwrap();
             let (topic, data) = (message.channel.topic.clone(), message.data.to_vec());
