@@ -1,5 +1,5 @@
 //! Computes a chunk of actions that a policy gave in an episode once more, from the recording alone: the first one whose samples
-//! are all in it. In an episode that began while the policy was running, those of its first chunks may be from before it.
+//! are all in it. If the policy was already running when the episode began, some samples of the first chunks are not in it.
 //!
 //!     recompute_chunk EPISODE [POLICY]
 //!
@@ -83,9 +83,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let held = held(&bytes)?;
     let whole = chunks.iter().find(|chunk| chunk.is_whole(&modalities, &held));
     let chunk = whole.ok_or("no chunk has all of its samples in the episode")?;
-    let has_all_references = take_references(&bytes, &modalities, &bundle, &mut model)?;
+    let has_all_references = take_references(&bytes, &modalities, &bundle, chunk, &mut model)?;
     if !has_all_references && chunk.tick > 0 {
-        return Err("a reference of the policy is not attached: its first sample may be another one".into());
+        return Err(
+            "the reference of an observation of this chunk is not attached, and may be from before the episode".into(),
+        );
     }
     let request = request(&bytes, &modalities, &bundle, chunk)?;
 
@@ -171,12 +173,13 @@ fn request(bytes: &[u8], modalities: &[Modality], bundle: &Bundle, chunk: &Chunk
     Ok(request)
 }
 
-/// Shows the policy the samples with which it compared later ones, attachments `reference/KEY`. Returns whether each observation
-/// that needs one has one.
+/// Gives the policy its references, the attachments `reference/KEY`. Returns whether every observation of `chunk` that needs one
+/// has one.
 fn take_references(
     bytes: &[u8],
     modalities: &[Modality],
     bundle: &Bundle,
+    chunk: &Chunk,
     model: &mut Model,
 ) -> Result<bool, Box<dyn Error>> {
     let mut has_all = true;
@@ -184,10 +187,12 @@ fn take_references(
     for (at, observation) in bundle.observations.iter().enumerate() {
         let name = format!("reference/{}", observation.key);
         let Some(index) = summary.attachment_indexes.iter().find(|index| index.name == name) else {
-            has_all &= match &observation.input {
-                ObservationInput::Image(image) => image.operation.is_none(),
-                ObservationInput::Vector(vector) => vector.operation.is_none(),
+            let is_used = chunk.samples.get(at).is_some_and(|observed| observed.seqs.iter().any(Option::is_some));
+            let needs_one = match &observation.input {
+                ObservationInput::Image(image) => image.operation.is_some(),
+                ObservationInput::Vector(vector) => vector.operation.is_some(),
             };
+            has_all &= !(is_used && needs_one);
             continue;
         };
         let message = SampleMessage::decode(&*mcap::read::attachment(bytes, index)?.data)?;

@@ -30,7 +30,7 @@ trap 'rm -rf "$temporary"' EXIT
 before=$(shared)
 
 code=0
-TMPDIR=$temporary "$@" || code=$?
+RAPID_OUTER_TMPDIR=${TMPDIR:-/tmp} TMPDIR=$temporary "$@" || code=$?
 
 left=$(find "$temporary" -mindepth 1 -maxdepth 1 -printf '%p\n' | sort)
 while IFS= read -r path; do

@@ -92,7 +92,7 @@ packages() {
         as_root=(sudo)
     fi
     change "installing with apt: ${missing[*]}"
-    # On a machine without these the crates are missing, too: fetched beside the packages. What fails here, the build reports.
+    # A machine without these packages has no crates either: they are fetched meanwhile. If that fails, the build reports it.
     cargo fetch --locked --quiet --target "$(rustc -vV | sed -n 's/^host: //p')" 2>/dev/null 9>&- &
     # shellcheck disable=SC2064  # the process of now, not of then
     trap "kill $! 2>/dev/null || true" EXIT

@@ -2,6 +2,7 @@
 # Builds and runs the tests of the workspace, those of the virtual bench in parallel with everything else: they take the
 # longest and need only the programs, so they begin as soon as these are built. What is built later leaves the processors
 # to the emulated machines. The bench's output is printed after that of the others.
+# Its guest is built before all that, if it is missing; for root, while the programs are compiled.
 #
 #     tests.sh cargo test --locked --workspace
 #
@@ -21,17 +22,19 @@ idle() {
     if chrt --idle 0 true 2>/dev/null; then chrt --idle 0 "$@"; else nice -n 19 "$@"; fi
 }
 
-# The guest: most of a minute on a fresh machine, and nothing on another. Who is not root may be asked for a password, which
-# nothing else may hide. In its own process group, as the bench below; in a folder for temporary files that stays.
+# Building the guest takes most of a minute on a fresh machine; later runs find it built. A user who is not root may be asked for
+# a password, which the output of cargo would hide: for them it is built first. It has its own process group, as the bench
+# below, and not the folder for temporary files that leftovers.sh removes.
+make_guest() { TMPDIR=${RAPID_OUTER_TMPDIR:-/tmp} "${0%/*}/setup.sh" image; }
 image=
 if [[ $(id -u) = 0 ]]; then
     set -m
-    env -u TMPDIR "${0%/*}/setup.sh" image </dev/null &
+    make_guest </dev/null &
     image=$!
     set +m
     trap 'kill -- "-$image" 2>/dev/null && wait "$image" || true' EXIT
 else
-    "${0%/*}/setup.sh" image
+    make_guest
 fi
 
 # With any test of a package its programs are built, too. The unit tests are the longest compilation: here it is beside that
@@ -39,7 +42,7 @@ fi
 # that guests run: `cargo test` gives them their place only when everything else is built.
 guest=$(programs "$@" --lib --test guest --test layering | grep /guest-) || { echo "tests.sh: the tests of $package are not built" >&2; exit 1; }
 "$1" build "${@:3}" --example process_node --example publish_action
-[[ -z $image ]] || wait "$image" || { echo "tests.sh: the virtual bench has no guest" >&2; exit 1; }
+[[ -z $image ]] || wait "$image" || { echo "tests.sh: the guest of the virtual bench could not be built: see the lines above that begin with 'vbench image:' or 'setup:'" >&2; exit 1; }
 # These run when nothing else does. rapid stops motors that answer too late, and on a machine that stands still for a second they
 # do; what a camera's latency is measured by, and what the bench shows of itself, is when samples come; a chunk of the policy
 # takes all of an emulated processor for seconds.

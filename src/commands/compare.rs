@@ -174,7 +174,11 @@ fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result
     if actions.recorded > 0 {
         let recorded = text::counted(actions.recorded, "action");
         writeln!(out, "\n{recorded}, {} compared with those of the chunks", actions.compared)?;
-        print_others(&[(actions.without_chunk, "not compared: of a chunk that is not in the file")], None, out)?;
+        print_others(
+            &[(actions.without_chunk, "not compared: no chunk in the file is known to be theirs")],
+            None,
+            out,
+        )?;
         if actions.compared > 0 {
             table(&actions.difference, out)?;
         }

@@ -40,9 +40,9 @@ pub enum ShowError {
     /// It has no such chunk of this policy, or not all that it was computed from.
     #[error(
         "{}: it has no chunk {number} of this policy, or not all samples that the chunk was computed from: name the \
-         folder of the policy that ran, or another chunk with --chunk. In an episode that began while the policy was \
-         running, samples may be missing from the first chunks and, if an earlier version recorded it, the reference from \
-         all of them: `rapid replay --infer` counts the reasons",
+         folder of the policy that ran, or another chunk with --chunk. If the policy was already running when the \
+         episode began, samples of the first chunks may be missing and, in a file of an earlier version, the reference of \
+         all chunks: `rapid replay --infer` counts the reasons",
         file.display()
     )]
     NoChunk {

@@ -1,8 +1,9 @@
 //! The chunks of a recorded policy, recomputed from the samples that their events name.
 //!
 //! Chunks are processed in the order in which the policy produced them. The reference that later samples are compared with is
-//! the attached one. In a file of an earlier version, which has none, it is the first sample that a chunk names: had an earlier
-//! request been without an answer, and so without an event, the reference differs here, and the difference shows it.
+//! the attached sample. Files of earlier versions and of `rapid eval` have none, and a recovered file may lack one; there it is
+//! the first sample that a chunk names. If an earlier request got no answer, and so left no event, the reference may differ
+//! here, and the difference shows it.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -51,8 +52,8 @@ pub struct Again {
 pub struct Actions {
     /// Actions in the file.
     pub recorded: u64,
-    /// Those whose tick a chunk covers, and no chunk from before the episode. Where an old chunk and a new one do, the nearest
-    /// counts.
+    /// Those whose tick a chunk in the file covers, and which cannot be of a chunk from before the episode. If several chunks
+    /// cover it, the nearest counts.
     pub compared: u64,
     /// The others.
     pub without_chunk: u64,
@@ -350,8 +351,10 @@ impl Work<'_> {
             let Some(reference) = self.references.get_mut(at).filter(|reference| **reference != Reference::None) else {
                 continue;
             };
-            let is_known = observe_alone(self.model, &mut self.request, at, (header, bytes));
-            *reference = if is_known { Reference::Known } else { Reference::Lost };
+            // One that this policy cannot use is none.
+            if observe_alone(self.model, &mut self.request, at, (header, bytes)) {
+                *reference = Reference::Known;
+            }
         }
     }
 
@@ -407,7 +410,7 @@ fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
 }
 
 /// The tick from which on all actions are of chunks in the file. Before it they may be of one from before the episode.
-fn known_from(survey: &Survey, bundle: &Bundle) -> u64 {
+pub(super) fn known_from(survey: &Survey, bundle: &Bundle) -> u64 {
     if holds_every_chunk(survey, bundle) {
         return 0;
     }

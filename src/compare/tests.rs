@@ -334,6 +334,32 @@ fn a_reference_from_before_the_episode_is_attached_to_it() {
     }
 }
 
+/// Before the first chunk of such an episode is used, actions are of one that is not in it.
+#[test]
+fn actions_of_a_chunk_from_before_the_episode_are_not_compared() {
+    let folder = tempfile::tempdir().unwrap();
+    onnx::write_bundle(folder.path(), &[]);
+    let bundle = Bundle::load(folder.path()).unwrap();
+    let known_from = |chunks: &[(u64, bool, u64)], policy: Option<(String, String)>| {
+        let chunk = |(tick, used, skipped): &(u64, bool, u64)| {
+            serde_json::from_value(serde_json::json!({
+                "tick": tick, "observed_ns": tick * 100_000_000, "mask": "0x07", "seed": 1, "samples": [], "actions": [],
+                "used": used, "skipped": skipped,
+            }))
+            .unwrap()
+        };
+        let chunks = chunks.iter().map(chunk).collect();
+        let survey = Survey { begin_monotonic_ns: Some(3_900_000_000), chunks, policy, ..Survey::default() };
+        again::known_from(&survey, &bundle)
+    };
+    assert_eq!(known_from(&[(40, true, 0)], None), 41, "the action of its own tick is of the chunk before");
+    assert_eq!(known_from(&[(40, true, 3), (48, true, 0)], None), 44, "so late");
+    assert_eq!(known_from(&[(40, false, 0), (48, true, 1)], None), 50, "not used");
+    assert_eq!(known_from(&[(40, false, 0)], None), u64::MAX);
+    assert_eq!(known_from(&[(40, true, 0)], Some(("name".into(), "hash".into()))), 0, "it began in the episode");
+    assert_eq!(known_from(&[(0, true, 0)], None), 0, "the first of the run");
+}
+
 #[test]
 fn chunks_of_a_history_are_recomputed_with_its_gaps() {
     let recorded = Recorded::with(&onnx::encoder_of_history(onnx::HISTORY_STEPS), &[onnx::HISTORY]);

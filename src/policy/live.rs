@@ -7,7 +7,8 @@
 //! The grid begins a few milliseconds after the capture of the last sample that completed the first observation:
 //! samples of devices that run at the rate of the grid are then fresh at each tick.
 //!
-//! Invariant: between two ticks nothing here allocates, locks or logs; a chunk is announced as an event.
+//! Invariant: between two ticks nothing here allocates, locks or logs. An answer is taken at a tick: its chunk is announced as
+//! an event, and a new reference is reported to the board.
 //! Invariant: once the handle is stopped, nothing more is published.
 
 use std::io;

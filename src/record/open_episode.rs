@@ -76,8 +76,8 @@ fn qualities<'a>(registry: &'a Registry, measures: &Measures, end: Stamp) -> Vec
     registry.devices.iter().filter_map(quality).collect()
 }
 
-/// Attaches the references of the policy from number `from` on; returns how many the policy has. One that was captured in the
-/// episode, too: which of the samples it was, no chunk need show.
+/// Attaches the policy's references from number `from` on; returns how many the policy has. Those captured in the episode are
+/// attached, too: its chunks do not always show which sample was the reference.
 fn attach_references(file: &mut EpisodeFile, board: &Board, from: usize) -> io::Result<usize> {
     let references = board.references();
     references.iter().skip(from).try_for_each(|reference| file.reference(reference))?;
