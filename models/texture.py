@@ -311,6 +311,7 @@ def plot(rows: dict[str, Any], to: Path) -> None:
     for axes in (noise, pressure):
         axes.axhline(0.5, color="grey", linewidth=0.8)
         axes.grid(alpha=0.3)
+        axes.locator_params(axis="x", nbins=5)
     figure.tight_layout()
     figure.savefig(to, dpi=110)
 
