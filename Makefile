@@ -16,7 +16,7 @@ BUILT = $(firstword $(wildcard $(TARGET)/release/rapid $(TARGET)/debug/rapid))
 LINTED := RUSTC_WORKSPACE_WRAPPER=clippy-driver CLIPPY_ARGS=-Dwarnings__CLIPPY_HACKERY__
 # A fresh clone builds faster and in half the space without the state of incremental builds and without line tables. Where
 # there is such state, someone is at work, and changing the setting would rebuild the workspace.
-INCREMENTAL := $(if $(wildcard $(TARGET)/debug/incremental),,CARGO_INCREMENTAL=0 CARGO_PROFILE_DEV_DEBUG=false)
+INCREMENTAL := $(if $(wildcard $(TARGET)/debug/incremental/*),,CARGO_INCREMENTAL=0 CARGO_PROFILE_DEV_DEBUG=false)
 # Most tests wait most of their time, for clocks and for programs: more of them than processors run side by side.
 TEST_THREADS := RUST_TEST_THREADS=$(shell echo $$((2 * $$(nproc))))
 TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
