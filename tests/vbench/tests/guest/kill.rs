@@ -94,7 +94,8 @@ fn a_killed_recording_is_repaired_at_the_next_start() {
     let held_up = Duration::from_nanos(number("held_up"));
     let killed = number("killed_mono");
     let from = killed.saturating_sub(lost.as_nanos().try_into().expect("seconds"));
-    let halted = Rhythm::between(&outcome, from, killed).expect("the sampler saw it").halted_tenths;
+    // Too short a time for the sampler has no halt that would excuse a loss.
+    let halted = Rhythm::between(&outcome, from, killed).map_or(0, |rhythm| rhythm.halted_tenths);
     let halted = Duration::from_millis(100) * u32::try_from(halted).expect("few");
     println!("the last {lost:?} are missing; threads of rapid were held up {held_up:?}, the guest {halted:?}");
     assert!(lost <= Duration::from_secs(1) + held_up + halted, "{lost:?} are missing");
