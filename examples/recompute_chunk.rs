@@ -9,7 +9,7 @@
 
 #![expect(clippy::print_stdout, reason = "a program's output is for its caller")]
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::error::Error;
 use std::path::Path;
 
@@ -76,20 +76,18 @@ fn main() -> Result<(), Box<dyn Error>> {
     let modalities = modalities(&bytes)?;
     let bundle = Bundle::open(arguments.next().as_deref().map(Path::new))?;
     let mut model = Model::load(&bundle, &Environment::open(None)?, Computing::default())?;
-    let chunks = chunks(&bytes)?;
+    let (chunks, samples) = contents(&bytes, &modalities)?;
     if chunks.is_empty() {
         return Err("the episode holds no chunk: no policy ran while it was recorded".into());
     }
-    let held = held(&bytes)?;
-    let whole = chunks.iter().find(|chunk| chunk.is_whole(&modalities, &held));
-    let chunk = whole.ok_or("no chunk has all of its samples in the episode")?;
+    let whole = chunks.iter().find_map(|chunk| Some((chunk, request(chunk, &samples, &modalities, &bundle)?)));
+    let (chunk, request) = whole.ok_or("no chunk of this policy has all of its samples in the episode")?;
     let has_all_references = take_references(&bytes, &modalities, &bundle, chunk, &mut model)?;
     if !has_all_references && chunk.tick > 0 {
         return Err(
             "the reference of an observation of this chunk is not attached, and may be from before the episode".into(),
         );
     }
-    let request = request(&bytes, &modalities, &bundle, chunk)?;
 
     let mut output = vec![0.0; model.chunk_len()];
     let mut noise = output.clone();
@@ -112,65 +110,49 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// The chunks of the file.
-fn chunks(bytes: &[u8]) -> Result<Vec<Chunk>, Box<dyn Error>> {
-    let mut chunks = Vec::new();
+/// By modality and the number in the message, the payload of each sample.
+type Samples = BTreeMap<(String, u32), Vec<u8>>;
+
+/// The chunks and the samples of the file.
+fn contents(bytes: &[u8], modalities: &[Modality]) -> Result<(Vec<Chunk>, Samples), Box<dyn Error>> {
+    let (mut chunks, mut samples) = (Vec::new(), Samples::new());
     for message in mcap::MessageStream::new(bytes)? {
         let message = message?;
-        if message.channel.topic == "/rapid/event" {
+        let topic = &message.channel.topic;
+        if let Some(modality) = modalities.iter().find(|modality| modality.topic == *topic) {
+            // A raw picture is another message: as if it were not there.
+            let Ok(sample) = SampleMessage::decode(&*message.data) else { continue };
+            samples.entry((modality.name.clone(), message.sequence)).or_insert(sample.payload);
+        } else if topic == "/rapid/event" {
             let event = EventMessage::decode(&*message.data)?;
             if event.kind == "chunk" {
                 chunks.push(serde_json::from_str(&event.json)?);
             }
         }
     }
-    Ok(chunks)
+    Ok((chunks, samples))
 }
 
-impl Chunk {
-    /// Whether all of its actions are numbers, and all of its samples in the file.
-    fn is_whole(&self, modalities: &[Modality], held: &BTreeSet<(String, u32)>) -> bool {
-        let is_held = |observed: &Observed| {
-            let topic = modality(modalities, &observed.modality).map(|modality| modality.topic.clone());
-            topic.is_ok_and(|topic| {
-                observed.seqs.iter().flatten().all(|seq| held.contains(&(topic.clone(), lower(*seq))))
-            })
-        };
-        self.actions.iter().all(Option::is_some) && self.samples.iter().all(is_held)
-    }
-}
-
-/// The part of a sample's number that its message has.
-fn lower(seq: u64) -> u32 {
-    u32::try_from(seq & 0xffff_ffff).unwrap_or_default()
-}
-
-/// Topic and number of all messages.
-fn held(bytes: &[u8]) -> Result<BTreeSet<(String, u32)>, Box<dyn Error>> {
-    let messages = mcap::MessageStream::new(bytes)?;
-    messages.map(|message| message.map(|m| (m.channel.topic.clone(), m.sequence)).map_err(Into::into)).collect()
-}
-
-/// What the policy was asked for.
-fn request(bytes: &[u8], modalities: &[Modality], bundle: &Bundle, chunk: &Chunk) -> Result<Request, Box<dyn Error>> {
+/// What the policy was asked for; `None` if a sample is not in the file, an action is no number, or the chunk is of another policy.
+fn request(chunk: &Chunk, samples: &Samples, modalities: &[Modality], bundle: &Bundle) -> Option<Request> {
     let mut request = Request::new(bundle);
     request.tick = chunk.tick;
     request.seed = chunk.seed;
-    request.mask = PhysicalMask(u64::from_str_radix(chunk.mask.trim_start_matches("0x"), 16)?);
+    request.mask = PhysicalMask(u64::from_str_radix(chunk.mask.trim_start_matches("0x"), 16).ok()?);
     for (at, observed) in chunk.samples.iter().enumerate() {
-        let modality = modality(modalities, &observed.modality)?;
-        let samples = samples(bytes, &modality.topic, &observed.seqs)?;
         // An absent modality has none.
         request.set_present(at, !observed.seqs.is_empty());
         for (step, seq) in observed.seqs.iter().enumerate() {
             // In a new request a step of a history has no sample.
             let Some(seq) = seq else { continue };
-            let payload = samples.get(seq).ok_or("a sample of the chunk is not in the episode")?;
-            let header = SampleHeader { seq: *seq, ..header(modality) };
-            request.cell_mut(at, step).ok_or("the chunk is of another policy")?.set(&header, payload);
+            // A message has the lower 32 bits of a sample's number.
+            let number = u32::try_from(seq & 0xffff_ffff).ok()?;
+            let payload = samples.get(&(observed.modality.clone(), number))?;
+            let header = SampleHeader { seq: *seq, ..header(modalities, &observed.modality)? };
+            request.cell_mut(at, step)?.set(&header, payload);
         }
     }
-    Ok(request)
+    chunk.actions.iter().all(Option::is_some).then_some(request)
 }
 
 /// Gives the policy its references, the attachments `reference/KEY`. Returns whether every observation of `chunk` that needs one
@@ -196,7 +178,7 @@ fn take_references(
             continue;
         };
         let message = SampleMessage::decode(&*mcap::read::attachment(bytes, index)?.data)?;
-        let header = header(modality(modalities, &observation.modality)?);
+        let header = header(modalities, &observation.modality).ok_or("the policy is of another rig")?;
         let mut request = Request::new(bundle);
         request.set_present(at, true);
         for step in 0..request.steps(at) {
@@ -207,18 +189,14 @@ fn take_references(
     Ok(has_all)
 }
 
-fn modality<'a>(modalities: &'a [Modality], name: &str) -> Result<&'a Modality, Box<dyn Error>> {
-    let found = modalities.iter().find(|modality| modality.name == name);
-    Ok(found.ok_or_else(|| format!("{name} is no modality of the episode"))?)
-}
-
 /// How the samples of a modality are encoded.
-fn header(modality: &Modality) -> SampleHeader {
+fn header(modalities: &[Modality], name: &str) -> Option<SampleHeader> {
+    let modality = modalities.iter().find(|modality| modality.name == name)?;
     let (encoding, width, height) = match *modality.shape.as_slice() {
         [height, width] => (Encoding::Mjpeg, width, height),
         _ => (Encoding::F64, 0, 0),
     };
-    SampleHeader { encoding: encoding as u32, width, height, ..SampleHeader::default() }
+    Some(SampleHeader { encoding: encoding as u32, width, height, ..SampleHeader::default() })
 }
 
 /// The modalities, from the metadata record `rapid`.
@@ -231,18 +209,4 @@ fn modalities(bytes: &[u8]) -> Result<Vec<Modality>, Box<dyn Error>> {
         }
     }
     Err("no metadata: the file is no episode".into())
-}
-
-/// The payloads of these samples of a topic. A message has the lower 32 bits of a sample's number.
-fn samples(bytes: &[u8], topic: &str, seqs: &[Option<u64>]) -> Result<BTreeMap<u64, Vec<u8>>, Box<dyn Error>> {
-    let wanted: BTreeSet<u64> = seqs.iter().copied().flatten().collect();
-    let mut found = BTreeMap::new();
-    for message in mcap::MessageStream::new(bytes)? {
-        let message = message?;
-        let seq = wanted.iter().find(|seq| lower(**seq) == message.sequence);
-        if let (Some(seq), true) = (seq, message.channel.topic == topic) {
-            found.entry(*seq).or_insert(SampleMessage::decode(&*message.data)?.payload);
-        }
-    }
-    Ok(found)
 }
