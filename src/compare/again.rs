@@ -1,8 +1,8 @@
 //! The chunks of a recorded policy, recomputed from the samples that their events name.
 //!
 //! Chunks are processed in the order in which the policy produced them. The reference that later samples are compared with is
-//! the attached sample. Files of earlier versions and of `rapid eval` have none, and a recovered file may lack one; there it is
-//! the first sample that a chunk names. If an earlier request got no answer, and so left no event, the reference may differ
+//! the attached sample. Files of earlier versions and of `rapid eval` have none; there it is the first sample that a chunk
+//! names. If an earlier request got no answer, and so left no event, the reference may differ
 //! here, and the difference shows it.
 
 use std::collections::{BTreeMap, VecDeque};

@@ -76,12 +76,14 @@ fn qualities<'a>(registry: &'a Registry, measures: &Measures, end: Stamp) -> Vec
     registry.devices.iter().filter_map(quality).collect()
 }
 
-/// Attaches the policy's references from number `from` on; returns how many the policy has. Those captured in the episode are
-/// attached, too: its chunks do not always show which sample was the reference.
-fn attach_references(file: &mut EpisodeFile, board: &Board, from: usize) -> io::Result<usize> {
-    let references = board.references();
-    references.iter().skip(from).try_for_each(|reference| file.reference(reference))?;
-    Ok(references.len())
+/// Attaches the references that the policy has taken since the `attached` first ones, and counts them. Those captured in the
+/// episode are attached, too: its chunks do not always show which sample was the reference.
+fn attach_references(file: &mut EpisodeFile, board: &Board, attached: &mut usize) -> io::Result<()> {
+    for reference in board.references(*attached) {
+        file.reference(&reference)?;
+        *attached += 1;
+    }
+    Ok(())
 }
 
 fn judged<'a>(qualities: &'a [(&DeviceSpec, Quality)]) -> Vec<Judged<'a>> {
@@ -145,7 +147,8 @@ impl OpenEpisode {
             file.mask(header, *bits, *sequence)?;
             measures.mask(header.capture_ns, bits.mask);
         }
-        let references = attach_references(&mut file, &board, 0)?;
+        let mut references = 0;
+        attach_references(&mut file, &board, &mut references)?;
         // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
         let kept = |device: &DeviceSpec| device.depth.saturating_add(RING_SLACK);
@@ -303,7 +306,8 @@ impl OpenEpisode {
     /// Passes the written data to the kernel and starts its writeback without waiting for it.
     pub(super) fn flush(&mut self) {
         if self.failed.is_none() {
-            self.failed = self.file.flush().err();
+            let attached = attach_references(&mut self.file, &self.board, &mut self.references);
+            self.failed = attached.and_then(|()| self.file.flush()).err();
         }
         if self.writeback.as_ref().is_some_and(|writeback| writeback.ask().is_none()) {
             self.end_writeback();
@@ -359,9 +363,8 @@ impl OpenEpisode {
         };
         let closed = match self.failed {
             None => {
-                // Those that the policy has taken since the episode began.
-                let attached = attach_references(&mut self.file, &self.board, self.references);
-                let finished = attached.and_then(|_| self.file.finish(metadata::end(&ending)));
+                let attached = attach_references(&mut self.file, &self.board, &mut self.references);
+                let finished = attached.and_then(|()| self.file.finish(metadata::end(&ending)));
                 finished.and_then(|()| episode_path::keep(&self.path))
             }
             Some(error) => Err(error),

@@ -335,9 +335,9 @@ impl Board {
         lock(&self.references).push(Arc::new(reference));
     }
 
-    /// Those of the policy, in the order in which it took them.
-    pub fn references(&self) -> Vec<Arc<ReferenceSample>> {
-        lock(&self.references).clone()
+    /// Those of the policy from number `from` on, in the order in which it took them.
+    pub fn references(&self, from: usize) -> Vec<Arc<ReferenceSample>> {
+        lock(&self.references).get(from..).unwrap_or_default().to_vec()
     }
 
     /// Reports the last finished file.

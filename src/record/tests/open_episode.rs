@@ -83,11 +83,25 @@ fn references_of_the_policy_are_attached() {
     let attached = |path: &Path| -> Vec<String> { read(path).attachments.into_keys().collect() };
     take("taken_late", 999);
     take("of_the_episode", 1001);
+    open.flush();
+    let partial: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let [partial] = &partial[..] else { panic!("{partial:?}") };
+    let written = std::fs::read(partial).unwrap();
+    for name in ["reference/known", "reference/taken_late", "reference/of_the_episode"] {
+        assert!(
+            written.windows(name.len()).any(|window| window == name.as_bytes()),
+            "{name}: it would be lost in a kill"
+        );
+    }
+    take("at_the_end", 1050);
     open.end_at(Stamp(1100 * MS));
     let report = open.finish(Stamp(1300 * MS), &masks, None, &[]);
     assert_eq!(report.error, None);
-    let expected = ["devices.toml", "reference/known", "reference/of_the_episode", "reference/taken_late"];
-    assert_eq!(attached(&report.file), expected);
+    let each_once = ["at_the_end", "known", "of_the_episode", "taken_late"].map(|name| format!("reference/{name}"));
+    assert_eq!(attached(&report.file)[1..], each_once);
+    let whole = std::fs::read(&report.file).unwrap();
+    let summary = mcap::Summary::read(&whole).unwrap().unwrap();
+    assert_eq!(summary.attachment_indexes.len(), 5, "with the registry");
     let message = &read(&report.file).attachments["reference/known"];
     assert_eq!(crate::episode::decode("rapid.Scalars", message).unwrap().0, 1.5_f64.to_le_bytes());
 }
