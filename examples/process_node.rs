@@ -44,6 +44,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         std::thread::spawn(|| {
             for line in 0_u64.. {
                 eprintln!("flood {line}");
+                // A flood for any reader; without a pause it would stop a clock that waits for programs to wait.
+                if line % 100 == 0 {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
             }
         });
     }

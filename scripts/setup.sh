@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Prepares a Debian or Ubuntu machine with git, make and a Rust toolchain for building, running and testing `rapid`.
 #
-#     setup.sh [build] [test] [image] [fuzz]
+#     setup.sh [build] [test] [image] [qemu] [fuzz]
 #
 # build: requirements of building and running, including the pinned onnxruntime library. test: the rest - lint tools,
-# the Python that reads episodes and topics from outside, the programs of the virtual bench. image: its guest. fuzz: the
-# build requirements of libFuzzer.
+# the Python that reads episodes and topics from outside, the programs of the virtual bench. image: its guest. qemu: its guest
+# for an emulated machine. fuzz: the build requirements of libFuzzer.
 #
 # Every step checks first and does nothing if it was done before. Downloads are stored outside the tree in
 # ${XDG_CACHE_HOME:-~/.cache}/rapid, checked against the hashes pinned in the tree, and get their final names last: an
@@ -43,17 +43,19 @@ main() {
     for part in "$@"; do
         case "$part" in
             build) wanted+=("${BUILD_PACKAGES[@]}") ;;
-            test) wanted+=("${TEST_PACKAGES[@]}") && mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages) ;;
-            image) mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages) ;;
+            test) wanted+=("${TEST_PACKAGES[@]}") && mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages uml) ;;
+            image) mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages uml) ;;
+            qemu) mapfile -t -O "${#wanted[@]}" wanted < <(bench_packages qemu) ;;
             fuzz) wanted+=("${FUZZ_PACKAGES[@]}") ;;
-            *) die "unknown part '$part': build, test, image or fuzz" ;;
+            *) die "unknown part '$part': build, test, image, qemu or fuzz" ;;
         esac
     done
     toolchain
     packages "${wanted[@]}"
     [[ " $* " != *" build "* ]] || onnxruntime
     [[ " $* " != *" test "* ]] || { lint_tools; python_venv; }
-    [[ " $* " != *" image "* ]] || guest_image
+    [[ " $* " != *" image "* ]] || guest
+    [[ " $* " != *" qemu "* ]] || guest_of qemu
     if [[ $changed = 0 ]]; then report "nothing to do ($*)"; else report "done ($*)"; fi
 }
 
@@ -68,11 +70,8 @@ lint_tools() {
     rustup component add rustfmt clippy
 }
 
-# The packages of the virtual bench, one per line.
-bench_packages() {
-    local list=tests/vbench/image/packages.txt
-    [[ ! -f $list ]] || sed 's/#.*//' "$list" | tr -s '[:space:]' '\n' | sed '/^$/d'
-}
+# The packages of the virtual bench for this kind of guest, one per line.
+bench_packages() { sed 's/#.*//' "tests/vbench/image/$1/packages.txt" | tr -s '[:space:]' '\n' | sed '/^$/d'; }
 
 # Installs the missing packages; asks for root only if there are any.
 packages() {
@@ -157,13 +156,31 @@ checked() {
     [[ -n $want && ${have%% *} = "$want" ]]
 }
 
-# The virtual bench has its own builder, which knows the contents of its image.
-guest_image() {
-    local build=tests/vbench/image/build.sh
-    [[ -x $build ]] || return 0
-    "$build" --check >/dev/null 2>&1 && return
-    change "building the guest image of the virtual bench"
-    "$build" >/dev/null
+# The virtual bench has its own builder, which knows what a guest is made of.
+readonly GUEST=tests/vbench/image/build.sh
+guest_of() {
+    "$GUEST" --check "$1" >/dev/null 2>&1 && return
+    change "building the guest of the virtual bench ($1)"
+    "$GUEST" "$1" >/dev/null
+}
+
+# Where there can be no User-Mode Linux (its builder's exit code 4), it is an emulated machine.
+guest() {
+    local said code=0
+    if said=$("$GUEST" --check 2>&1 >/dev/null); then
+        [[ -z $said ]] || report "$said"
+        return
+    fi
+    guest_of uml || code=$?
+    case $code in
+        0) return ;;
+        4) ;;
+        *) exit "$code" ;;
+    esac
+    local wanted
+    mapfile -t wanted < <(bench_packages qemu)
+    packages "${wanted[@]}"
+    guest_of qemu
 }
 
 main "$@"

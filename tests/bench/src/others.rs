@@ -45,7 +45,7 @@ pub(crate) fn deaf(bench: &Bench) -> Result<Vec<Figure>, Failure> {
 }
 
 fn vbench(bench: &Bench, name: &str, arguments: &[OsString]) -> Result<Vec<Figure>, Failure> {
-    match Image::locate() {
+    match Image::emulated() {
         Err(error @ GuestError::NoImage(_)) => return Err(Absent(format!("guest image: {error}")).into()),
         located => located?,
     };

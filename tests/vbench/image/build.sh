@@ -1,74 +1,150 @@
 #!/bin/bash
-# Builds the guest of the virtual USB bench: a stock Debian kernel, a small Debian with the real systemd-udevd, and an
-# initramfs that joins them. Everything lands in one directory of the cache, named by the hash of these scripts, so that
-# a build is either whole or absent and a second call does nothing.
+# Builds the guest of the virtual USB bench: a small Debian with the real systemd-udevd, and a kernel for it.
 #
-#   build.sh           builds what is missing, prints the directory last
-#   build.sh --check   prints the directory when it is built, otherwise names what to run and exits 3
+#   build.sh uml | qemu       builds this one, if it is missing, and describes it
+#   build.sh --check [KIND]   describes it when it is built, otherwise names what to run and exits 3. Without KIND it is User-Mode
+#                             Linux, or QEMU where a build has found that there can be none
 #
-# Needs the packages of packages.txt and root, or unprivileged user namespaces with a range of ids, or sudo.
+# A description is lines `KEY VALUE`: `backend uml`, and where its parts are. Every part is one folder of the cache, named by
+# the hash of what it is made of, so that it is either whole or absent and a second call does nothing. The kernel of User-Mode
+# Linux is a part of its own: it takes minutes, and a change of the Debian in it does not rebuild it.
+#
+# uml:  Linux as a process, its time is virtual (uml/kernel.sh). Needs uml/packages.txt, and ptrace.
+# qemu: an emulated machine with the distribution's own kernel, for a second opinion. Needs qemu/packages.txt.
+# Both need root, or unprivileged user namespaces with a range of ids, or sudo.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cache=${RAPID_VBENCH_DIR:-${XDG_CACHE_HOME:-$HOME/.cache}/rapid/vbench}
+export PATH=$PATH:/sbin:/usr/sbin
 
 # The guest runs binaries built on this host, so it is the same Debian where the host is one.
 suite=$(. /etc/os-release; [ "${ID:-}" = debian ] && echo "${VERSION_CODENAME:-bookworm}" || echo bookworm)
-key=$(cd "$here" && sha256sum build.sh rootfs.sh kernel.sh disk.sh guest-init.sh initramfs-init.sh guest-packages.txt modules.txt \
-  | sha256sum | cut -c1-12)
-image=$cache/$suite-$key
-
-if [ "${1:-}" = --check ]; then
-  [ -f "$image/manifest" ] && { echo "$image"; exit 0; }
-  echo "the guest image $image is not built: run \`make setup\` (or $here/build.sh)" >&2
-  exit 3
-fi
+# shellcheck disable=SC2068  # with the pattern qemu/*
+key() { (cd "$here" && sha256sum $@ | sha256sum | cut -c1-12); }
+readonly root=$cache/root-$suite-$(key rootfs.sh uml/root.sh guest-init.sh guest-packages.txt)
+readonly kernel=$cache/kernel-$(key uml/kernel.sh uml/kernel.config)
+readonly machine=$cache/qemu-$suite-$(key rootfs.sh guest-init.sh guest-packages.txt 'qemu/*')
+# Why there is no User-Mode Linux on this machine; removed by hand, or by a change of what it is made of.
+readonly impossible=$cache/no-${kernel##*/}
 
 step() { echo "vbench image: $*" >&2; }
 die() { step "error: $*"; exit 1; }
 
-for tool in qemu-system-x86_64 busybox mmdebstrap modprobe depmod cpio mke2fs xz; do
-  PATH=$PATH:/sbin:/usr/sbin command -v "$tool" >/dev/null || die "$tool is missing: install the packages of $here/packages.txt"
-done
-export PATH=$PATH:/sbin:/usr/sbin
+has_uml() { [ -d "$root" ] && [ -d "$kernel" ]; }
+has_qemu() { [ -d "$machine" ]; }
 
-mkdir -p "$cache"
-exec 9>"$cache/.lock"
-flock -n 9 || { step "another build is running, waiting for it"; flock 9; }
-if [ -f "$image/manifest" ]; then
-  step "up to date (kernel $(sed -n 's/^kernel //p' "$image/manifest"))"
-  echo "$image"
-  exit 0
+describe() {
+  case $1 in
+    uml) printf 'backend uml\nsuite %s\nroot %s\nkernel %s\nmodules %s\n' "$suite" "$root" "$kernel/linux" "$kernel/modules" ;;
+    qemu) printf 'backend qemu\nsuite %s\ndirectory %s\n' "$suite" "$machine" ;;
+  esac
+}
+
+# Which kind is meant without a name.
+usual() { if [ -f "$impossible" ]; then echo qemu; else echo uml; fi; }
+
+if [ "${1:-}" = --check ]; then
+  kind=${2:-${RAPID_VBENCH_BACKEND:-$(usual)}}
+  case $kind in uml | qemu) ;; *) die "no such guest: $kind (uml or qemu)" ;; esac
+  if "has_$kind"; then
+    [ -n "${2:-}${RAPID_VBENCH_BACKEND:-}" ] || [ "$kind" = uml ] || step "QEMU is used: $(head -n 1 "$impossible")"
+    describe "$kind"
+    exit 0
+  fi
+  echo "the guest of the virtual bench ($kind) is not built: run \`make setup\` (or $here/build.sh $kind)" >&2
+  exit 3
 fi
+
+require() {
+  local list=$1 tool; shift
+  for tool in "$@"; do
+    command -v "$tool" >/dev/null || die "$tool is missing: install the packages of $here/$list"
+  done
+}
 
 # `as_root` runs a command that must see root-owned files, `bootstrap` one that makes a system of many owners: plainly as
 # root, inside user namespaces (the second kind wants a range of ids of the user's own), or through sudo.
 as_root=() bootstrap=()
-if [ "$(id -u)" != 0 ]; then
+rights() {
+  [ "$(id -u)" != 0 ] || return 0
   if unshare -r true 2>/dev/null && command -v newuidmap >/dev/null && grep -q "^$(id -un):" /etc/subuid 2>/dev/null; then
     as_root=(unshare -r)
   elif command -v sudo >/dev/null; then as_root=(sudo) bootstrap=(sudo)
   else die "needs sudo, or user namespaces: package uidmap and a line for $(id -un) in /etc/subuid"; fi
-fi
+}
 
+# The newest two of a part stay: another checkout may be one step behind this one.
+keep_two() { ls -1dt "$cache/$1"-* 2>/dev/null | tail -n +3 | while read -r old; do "${as_root[@]}" rm -rf "$old"; done; }
+
+# Errors are passed on by hand from here to `refuse`: bash does not end a script for them where a caller looks at the code.
+build_root() {
+  step "installing Debian $suite ($(tr '\n' ' ' <"$here/guest-packages.txt"))"
+  "${bootstrap[@]}" "$here/rootfs.sh" "$suite" "$work" && "$here/uml/root.sh" "$work" && mv -T "$work/root" "$root" && keep_two root
+}
+
+# Prints why there is none.
+build_kernel() {
+  step "building the kernel of User-Mode Linux (some minutes, once; $cache/kernel.log)"
+  mkdir "$work/kernel"
+  "$here/uml/kernel.sh" "$work/kernel" "$cache/kernel.log" && mv -T "$work/kernel" "$kernel" && keep_two kernel
+}
+
+# Starts it with a program that ends at once: a machine may forbid ptrace, or lack what it was linked with.
+kernel_starts() {
+  local console
+  console=$(timeout -s KILL 60 env TMPDIR="$([ -d /dev/shm ] && echo /dev/shm || echo /tmp)" "$kernel/linux" mem=128M uml_dir="$work" \
+    root=/dev/root rootfstype=hostfs rootflags="$root" ro init=/bin/true con=null con0=null,fd:1 panic=-1 2>&1 </dev/null || true)
+  [[ $console == *"exitcode=0x00000000"* ]] || { tail -n 5 <<<"$console" >&2; echo "the kernel does not start"; return 1; }
+}
+
+build_uml() {
+  local why making=
+  rm -f "$impossible"
+  require uml/packages.txt mmdebstrap
+  # Beside the kernel: one takes processors, the other the network.
+  [ -d "$root" ] || { build_root >&2 & making=$!; }
+  if [ ! -d "$kernel" ] && ! why=$(build_kernel); then
+    refuse "${why:-building its kernel failed: see $cache/kernel.log}"
+    [ -z "$making" ] || wait "$making" || true
+    return 4
+  fi
+  [ -z "$making" ] || wait "$making" || die "the guest's Debian could not be installed"
+  why=$(kernel_starts) || { rm -rf "$kernel"; refuse "$why"; return 4; }
+}
+
+# The exit code is 4. Remembered, so that the next run does not compile for minutes to find the same.
+refuse() {
+  echo "$1" >"$impossible"
+  step "no User-Mode Linux on this machine (${1%%$'\n'*}): QEMU is used instead, which is slower; remove $impossible to try again"
+}
+
+build_qemu() {
+  require qemu/packages.txt qemu-system-x86_64 busybox mmdebstrap modprobe depmod cpio mke2fs xz
+  mkdir "$work/out"
+  step "installing Debian $suite with its kernel ($(tr '\n' ' ' <"$here/guest-packages.txt"))"
+  "${bootstrap[@]}" "$here/rootfs.sh" "$suite" "$work" kernel
+  step "unpacking the kernel"
+  local version
+  version=$("$here/qemu/kernel.sh" "$work")
+  step "packing the disk and the initramfs (kernel $version)"
+  "${as_root[@]}" "$here/qemu/disk.sh" "$version" "$work"
+  chmod 755 "$work/out"
+  mv -T "$work/out" "$machine"
+  keep_two qemu
+}
+
+mkdir -p "$cache"
+exec 9>"$cache/.lock"
+flock -n 9 || { step "another build is running, waiting for it"; flock 9; }
+kind=${1:-}
+case $kind in uml | qemu) ;; *) die "which guest: uml or qemu?" ;; esac
+if "has_$kind"; then step "up to date ($kind)"; describe "$kind"; exit 0; fi
+rights
 # A build that was cut off leaves only such a directory; holding the lock, every one of them is dead.
 "${as_root[@]}" rm -rf "$cache"/.build.*
 work=$(mktemp -d "$cache/.build.XXXXXX")
 trap '"${as_root[@]}" rm -rf "$work"' EXIT
-mkdir "$work/out"
 started=$SECONDS
-
-step "installing Debian $suite with its kernel ($(tr '\n' ' ' <"$here/guest-packages.txt"))"
-"${bootstrap[@]}" "$here/rootfs.sh" "$suite" "$work"
-step "unpacking the kernel"
-kernel=$("$here/kernel.sh" "$work")
-step "packing the disk and the initramfs (kernel $kernel)"
-"${as_root[@]}" "$here/disk.sh" "$kernel" "$work"
-
-printf 'suite %s\nkernel %s\nscripts %s\n' "$suite" "$kernel" "$key" >"$work/out/manifest"
-chmod 755 "$work/out"
-mv -T "$work/out" "$image"
-
-# The newest two stay: another checkout may be one step behind this one.
-ls -1dt "$cache"/*-*/manifest | tail -n +3 | while read -r old; do "${as_root[@]}" rm -rf "$(dirname "$old")"; done
-step "done in $((SECONDS - started)) s: $(du -sh "$image" | cut -f1) in $image"
-echo "$image"
+"build_$kind"
+step "done in $((SECONDS - started)) s ($kind)"
+describe "$kind"

@@ -3,7 +3,9 @@
 //! Invariant: a failed check panics and prints the value found, as `assert!` does; it is never merely reported.
 
 use std::io::{self, Write};
-use std::ops::RangeBounds;
+use std::ops::{RangeBounds, RangeInclusive};
+
+use serde_json::Value;
 
 use crate::outcome::Outcome;
 use crate::recording::{Edge, Recording, missing, rises};
@@ -14,25 +16,59 @@ pub fn play(scenario: Scenario) -> Outcome {
     let name = scenario.name().to_owned();
     let outcome = scenario.run().unwrap_or_else(|error| panic!("{error}"));
     // Past the capture of the test's output: what takes long is known from every run.
-    let _shown = writeln!(io::stderr(), "guest {name}: {:.0} s", outcome.wall.as_secs_f64());
+    let _shown = writeln!(
+        io::stderr(),
+        "guest {name}: {:.0} s for {:.2} s of its own",
+        outcome.wall.as_secs_f64(),
+        outcome.inside.as_secs_f64()
+    );
     outcome
 }
 
 /// Plays a scenario in which `rapid` records to the end, without an error on any side.
 pub fn recorded(scenario: Scenario) -> Outcome {
+    recorded_with(scenario, |_| false)
+}
+
+/// As [`recorded`], but these reasons against the episode are expected.
+pub fn recorded_with(scenario: Scenario, is_expected: impl Fn(&str) -> bool) -> Outcome {
     let outcome = play(scenario);
-    ended(&outcome);
+    ended_with(&outcome, is_expected);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
     assert!(outcome.rapid.iter().any(|line| line["event"] == "episode"), "no episode was announced");
     outcome
 }
 
-/// The guest's script and `rapid` ended without an error. The scenario judges a BAD episode; the exit code must report
-/// it.
+/// The guest's script and `rapid` ended without an error, and no episode has a reason against it that is not
+/// [of the machine](of_the_machine). The exit code reports a BAD one.
 pub fn ended(outcome: &Outcome) {
+    ended_with(outcome, |_| false);
+}
+
+/// As [`ended`], but these reasons against an episode are expected.
+pub fn ended_with(outcome: &Outcome, is_expected: impl Fn(&str) -> bool) {
     assert_eq!(outcome.code, 0, "the guest's script: {}", outcome.log);
-    let is_bad = outcome.rapid.iter().any(|line| line["event"] == "episode" && line["verdict"] == "BAD");
+    let episodes: Vec<&Value> = outcome.rapid.iter().filter(|line| line["event"] == "episode").collect();
+    for episode in &episodes {
+        let others: Vec<&str> =
+            unexpected(outcome, episode).into_iter().filter(|reason| !is_expected(reason)).collect();
+        assert!(others.is_empty(), "reasons against the episode: {others:?}: {episode}");
+    }
+    let is_bad = episodes.iter().any(|line| line["verdict"] == "BAD");
     assert_eq!(outcome.rapid_code, Some(if is_bad { 4 } else { 0 }), "rapid's exit code: {}", outcome.log);
+}
+
+/// The reasons against an episode in this line, but for those of the machine.
+pub fn unexpected<'a>(outcome: &Outcome, episode: &'a Value) -> Vec<&'a str> {
+    let reasons = episode["reasons"].as_array().into_iter().flatten().filter_map(Value::as_str);
+    reasons.filter(|reason| !of_the_machine(outcome, reason)).collect()
+}
+
+/// Asserts a time that is the same in each run, ms; where processors are emulated only that it is not below.
+pub fn within(outcome: &Outcome, what: &str, ms: f64, expected: RangeInclusive<f64>) {
+    println!("{what}: {ms:.3} ms");
+    assert!(ms >= *expected.start(), "{what}: {ms:.3} ms, expected {expected:?}");
+    assert!(!outcome.is_virtual || expected.contains(&ms), "{what}: {ms:.3} ms, expected {expected:?}");
 }
 
 /// The only episode; there must be exactly one.
@@ -68,10 +104,11 @@ pub fn assert_lines(episode: &Recording, topic: &str) {
 }
 
 /// Whether an emulated processor that has others beside it is to blame for this reason of a verdict; no limit turns it off.
-pub fn is_of_the_machine(reason: &str) -> bool {
-    ["publications of the mask are not in the file", "events are not in the file", "valid"]
-        .iter()
-        .any(|known| reason.contains(known))
+fn of_the_machine(outcome: &Outcome, reason: &str) -> bool {
+    !outcome.is_virtual
+        && ["publications of the mask are not in the file", "events are not in the file", "valid"]
+            .iter()
+            .any(|known| reason.contains(known))
 }
 
 /// Times after `after` at which `bit` rose.
@@ -88,4 +125,9 @@ pub fn only(times: &[u64]) -> u64 {
 /// From one time to a later one, ms.
 pub fn ms(later: u64, earlier: u64) -> u64 {
     later.saturating_sub(earlier) / 1_000_000
+}
+
+/// The same with its fraction, negative if the later one is earlier.
+pub fn exact_ms(later: u64, earlier: u64) -> f64 {
+    (i128::from(later) - i128::from(earlier)) as f64 / 1e6
 }

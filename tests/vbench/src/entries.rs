@@ -5,8 +5,8 @@ pub fn registry(entries: &[String]) -> String {
     format!("[rig]\nname = \"vbench\"\n\n{}", entries.join("\n"))
 }
 
-/// `[verdict]` without the checks that compare with the speed of the machine, which is an emulated one here and may be busy.
-pub fn without_limits_of_time() -> String {
+/// `[verdict]` without the checks that compare with the speed of the machine: for one that is emulated and may be busy.
+pub(crate) fn without_limits_of_time() -> String {
     const OFF: [&str; 10] =
         ["lost", "dropped", "repeated", "frozen", "late", "gap", "clock", "rate", "opening", "duplicate"];
     let off: String = OFF.iter().map(|check| format!("{check} = \"off\"\n")).collect();

@@ -40,8 +40,12 @@ pub struct Outcome {
     pub code: i32,
     /// Exit code of `rapid`, if it ran and ended.
     pub rapid_code: Option<i32>,
-    /// From the start of QEMU to its end.
+    /// From the start of the guest to its end, in the host's time.
     pub wall: Duration,
+    /// The same by the guest's clock.
+    pub inside: Duration,
+    /// Whether that clock is virtual, so that a time in the guest is the same in each run.
+    pub is_virtual: bool,
     /// Output of the guest's script.
     pub log: String,
     /// The emulator's log.
@@ -61,6 +65,8 @@ impl Outcome {
             code: boot.code,
             rapid_code: text(&out.join("rapid.rc")).trim().parse().ok(),
             wall: boot.wall,
+            inside: boot.inside,
+            is_virtual: boot.is_virtual,
             log: text(&share.join("out.log")),
             emu: json_lines(&text(&out.join("emu.jsonl"))),
             rapid: json_lines(&text(&out.join("rapid.jsonl"))),

@@ -62,7 +62,7 @@ udevadm settle
         )
     };
     let script = format!("{}{}emu_quit\nexit 0\n", read("nokhwa"), read("rapid"));
-    let scenario = Scenario::new("capture").device(camera).example("capture").script(&script);
+    let scenario = Scenario::new("capture").emulated().device(camera).example("capture").script(&script);
     let outcome = scenario.run()?;
     if outcome.code != 0 {
         return Err(outcome.diagnosis().into());

@@ -135,7 +135,7 @@ exit 0
             self.timeline(500, PLAIN_IN_MS, PLAIN_OUT_MS, ["plug 0", "unplug 0"]),
         );
         let limit = Duration::from_secs(seconds + plain_seconds + 180);
-        Scenario::new("cycles").device(camera).registry(REGISTRY).script(&script).limit(limit)
+        Scenario::new("cycles").emulated().device(camera).registry(REGISTRY).script(&script).limit(limit)
     }
 
     /// The emulator's commands: two per cycle, the second `between_ms` after the first, the next cycle `rest_ms` later.

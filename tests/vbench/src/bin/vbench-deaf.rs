@@ -23,7 +23,7 @@ fn run() -> Result<(), Box<dyn std::error::Error>> {
         Some("--json") => true,
         Some(_) => return Err("usage: vbench-deaf [--json]".into()),
     };
-    let outcome = deaf::scenario().run()?;
+    let outcome = deaf::scenario().emulated().run()?;
     if !matches!(outcome.rapid_code, Some(0 | 4)) {
         return Err(outcome.diagnosis().into());
     }

@@ -183,6 +183,7 @@ exit 0
     let camera =
         |serial, width, height| DeviceSpec::uvc(0x046d, 0x0825).serial(serial).mode(Format::Mjpg, width, height, &[30]);
     Scenario::new("sweep")
+        .emulated()
         .device(camera("CAM1", 640, 480))
         .device(DeviceSpec::can(Protocol::GsUsb).serial("CAN1").motor(0x05, 0x15, "DM4310"))
         .device(camera("TAC1", 320, 240))

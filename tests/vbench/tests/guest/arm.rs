@@ -12,9 +12,7 @@ use vbench::proto;
 use vbench::recording::{Message, Recording, falls};
 use vbench::scenario::Scenario;
 
-use crate::policy::{
-    ACTION_STEPS, CHUNKS, CONTROL_HZ, OLDEST_OBSERVATION_MS, TACTILE, WRIST, bundle, demonstration, pictures,
-};
+use crate::policy::{CHUNKS, TACTILE, WRIST, bundle, demonstration, pictures};
 
 const CAMERAS: &str = include_str!("../../../../src/registry/task_cameras.toml");
 /// The arm of the unit tests, beside its table: straight up it has no way anywhere, so that its motors' zeros are a pose with
@@ -37,24 +35,17 @@ const REACHED: f64 = 0.02;
 /// So far apart, at least, are two such actions between which the tip must be seen to go, m: the policy's actions are, within
 /// any few of them, and the tip comes much nearer to each.
 const APART: f64 = 0.01;
-const DENOISING_STEPS: &str = "2";
 
 const SCRIPT: &str = r#"
 # all ACTION: since the last mark every motor has logged this.
 all() { for motor in 1 2 3 4 5 6; do logged $1 "\"motor\":$motor" || return 1; done; }
 off() { ordered disabled 1 2 3 4 5 6; }
 # moving: every motor follows.
-moving() { all commands_begin && return; armed; sleep 2; return 1; }
-# acting N MASK: there are more than N such chunks, and the arm is not stopped.
-acting() { armed && more_than "$1" "$2"; }
-await_acting() { wait_for 120 acting "$1" "$2" || fail "$(used "$2") chunks with the mask $2, or the arm stays stopped"; }
+moving() { all commands_begin; }
 begin() {
-  rapid_start --infer /tmp/bench/bundle --arm --wait --denoising-steps $(cat /tmp/bench/steps) --record --out $out/$1 \
+  rapid_start --infer /tmp/bench/bundle --arm --wait --record --out $out/$1 \
     --config /tmp/bench/devices.toml --json
 }
-touch $out/armed_again
-# A motor does not share a processor with the rig.
-for task in /proc/$emu_pid/task/*; do renice -n -10 -p ${task##*/} || fail 'no priority'; done >/dev/null
 emu plug 0 1 2
 wait_for 120 attached 0 1 || fail 'not attached'
 udevadm settle
@@ -62,24 +53,27 @@ udevadm settle
 begin first
 await_rapid 180 '"event":"act"' || fail 'the policy does not act'
 wait_for 60 moving || fail 'the arm does not move'
-await_acting 1 0x07
+await_used 1 0x07
 mark killed
 awk '{ printf "%.0f\n", $1 * 1e9 }' /proc/uptime >$out/killed
 kill -KILL $rapid_pid
 wait_for 60 off || fail 'a motor stays on'
 wait $rapid_pid
+# It disables them for a moment longer, and a bus that another program commands is none to move motors on.
+gone() { ! pgrep -x motor-guard >/dev/null; }
+wait_for 5 gone || fail 'the guard is left'
 "${rapid[@]}" recover $out/first >$out/recover.txt 2>&1 || fail "not repaired: $(cat $out/recover.txt)"
 "${rapid[@]}" inspect --json $out/first/*.mcap >$out/inspect.json
 mark again
 begin rec
 await_rapid 180 '"event":"act"' || fail 'the policy does not act again'
 wait_for 60 moving || fail 'the arm does not move again'
-await_acting 2 0x07
+await_used 2 0x07
 emu unplug 1
-await_acting 2 0x05
+await_used 2 0x05
 seen=$(used 0x07)
 emu plug 1
-await_acting $((seen + 2)) 0x07
+await_used $((seen + 2)) 0x07
 mark end
 rapid_stop
 wait_for 30 off || fail 'a motor stays on at the end'
@@ -104,7 +98,7 @@ fn a_policy_moves_an_arm_by_its_tip_without_its_tactile_camera_too() {
         let off = off.and_then(|line| line["mono_ns"].as_u64()).unwrap_or_else(|| panic!("{name} is not disabled"));
         println!("{name}: off {} ms after the kill", ms(off, killed));
     }
-    println!("{}armed again: {} times", outcome.file("recover.txt"), outcome.file("armed_again").lines().count());
+    println!("{}", outcome.file("recover.txt"));
     let repaired: Value = serde_json::from_str(&outcome.file("inspect.json")).expect("one object");
     let whole = [&repaired["end"], &repaired["damaged_chunks"], &repaired["recovered"]["lossless"]];
     assert_eq!(whole, [&Value::from("finished"), &Value::from(0), &Value::from("true")], "{repaired}");
@@ -242,7 +236,7 @@ fn between<'a>(outcome: &'a Outcome, from: &str, to: &str) -> &'a [Value] {
     &outcome.emu[from..to]
 }
 
-/// The rig: the cameras of the task, and the arm. An emulated processor is late now and then: time limits are wide.
+/// The rig: the cameras of the task, and the arm. Every limit of time is the product's own.
 fn registry() -> String {
     let motor = |(at, name): (usize, &&str)| {
         let (slave, master) = (at + 1, at + 0x11);
@@ -253,8 +247,7 @@ fn registry() -> String {
     };
     let motors: Vec<_> = MOTORS.iter().enumerate().map(motor).collect();
     let bus = format!(
-        "protocol = \"damiao\"\nhz = 50\ndeadman = \"10s\"\ndisable_after = \"never\"\ntimeout = \"6s\"\n\
-         silent_after = \"3s\"\nmotors = [\n{}\n]\n[device.arm.effector]\nurdf = \"arm.urdf\"\ntip = \"tool\"\n\
+        "protocol = \"damiao\"\nmotors = [\n{}\n]\n[device.arm.effector]\nurdf = \"arm.urdf\"\ntip = \"tool\"\n\
          rotation = [0, 1, 0, 0]\nyaw = \"free\"\ngripper = \"jaw\"\nclosed = 0.0\nopen = 1.2\n\
          min = [-1.1, -1.0, 0.03]\nmax = [1.0, 1.0, 0.9]",
         motors.join(",\n")
@@ -280,12 +273,8 @@ fn scenario(demonstration: &Recording) -> Scenario {
         .file("arm.urdf", urdf)
         .file("wrist", feed::pack(pictures(demonstration, WRIST)))
         .file("tactile", feed::pack(pictures(demonstration, TACTILE)))
-        .file("steps", DENOISING_STEPS)
         .script(&[CHUNKS, SCRIPT].concat());
     bundle(scenario, |policy| {
-        policy["control_hz"] = CONTROL_HZ.into();
-        policy["n_action_steps"] = ACTION_STEPS.into();
-        policy["max_observation_age_ms"] = OLDEST_OBSERVATION_MS.into();
         for observation in policy["observations"].as_array_mut().expect("observations") {
             if observation["modality"] == "arm" {
                 observation["slice"] = vec![TIP, TIP + 4].into();

@@ -12,12 +12,8 @@ use vbench::scenario::Scenario;
 /// How long the brake takes to engage, by the registry.
 const ENGAGES_IN_MS: u64 = 200;
 
-/// An emulated processor is late by tens of ms now and then: time limits of this bus are wide.
 const BUS: &str = r#"adapter = "damiao"
 protocol = "damiao"
-hz = 50
-timeout = "8s"
-silent_after = "3s"
 disable_after = "never"
 [[device.arm.can.motors]]
 name = "joint"

@@ -3,7 +3,7 @@
 //! `vhci_hcd` knows devices in ports of its root hub and none behind a hub of their own, so there is no emulated hub: all ports
 //! are emptied within a millisecond or so, which is what the kernel makes of a hub that left.
 
-use vbench::check::{assert_accounted, assert_whole, episode, ms, only, recorded, rises_after};
+use vbench::check::{assert_accounted, assert_whole, episode, ms, only, recorded_with, rises_after};
 use vbench::emu::log::Moment;
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
@@ -21,7 +21,9 @@ const NUMBERS: f64 = 1_000_000.0;
 #[test]
 fn a_pulled_hub_takes_all_bits_and_brings_them_back() {
     let small = |serial| DeviceSpec::uvc(0x046d, 0x0825).serial(serial).mode(Format::Mjpg, 320, 240, &[30]);
-    let outcome = recorded(
+    // The kernel reports the ports one after the other, and the driver of FTDI chips no sooner.
+    let waits = |reason: &str| reason.starts_with("force: no sample for ");
+    let outcome = recorded_with(
         Scenario::new("hub")
             .device(small("CAM00A1"))
             .device(small("CAM00B2"))
@@ -46,6 +48,7 @@ fn a_pulled_hub_takes_all_bits_and_brings_them_back() {
             .until("states 2 tof streaming")
             .until("states 2 force streaming")
             .until("is 0x0f published mask"),
+        waits,
     );
     let episode = episode(&outcome);
     let edges = episode.mask_edges();

@@ -1,14 +1,12 @@
 //! `kill -9` while `rapid` records a camera and a sensor: the next start makes the episode whole, and reports it.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
-use vbench::check::{assert_lines, assert_whole, ended, play};
+use vbench::check::{assert_lines, assert_whole, ended, exact_ms, play, within};
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
 use vbench::outcome::{Outcome, json_lines};
 use vbench::recording::Recording;
-use vbench::rhythm::Rhythm;
 use vbench::scenario::Scenario;
 
 const WRIST: &str = "/rapid/camera/wrist";
@@ -28,22 +26,15 @@ wait_for 60 attached 0 1 || fail 'not attached'
 udevadm settle
 record
 streaming
-"${usbemu[@]}" --watch-mask >$out/mask.jsonl &
-watch_pid=$!
 partial=$(echo $out/rec/*.partial)
 # Some seconds of the episode, and then the moment just before more of it would be written.
 for _ in 1 2 3 4 5 6 7 8; do
   wait_for 60 larger_than "$(stat -c %s "$partial")" "$partial" || fail 'the file does not grow'
 done
 sleep 0.3
-# Stopped first: its threads wait no longer while it is written down how long they did.
-kill -STOP $rapid_pid
 date +%s%N >$out/killed
-awk '{ printf "%.0f\n", $1 * 1e9 }' /proc/uptime >$out/killed_mono
-cat /proc/$rapid_pid/task/*/schedstat | awk '{ waited += $2 } END { printf "%.0f\n", waited }' >$out/held_up
 kill -9 $rapid_pid
 wait $rapid_pid
-kill $watch_pid
 stat -c '%n %s' $out/rec/* >$out/left
 record
 streaming
@@ -86,19 +77,11 @@ fn a_killed_recording_is_repaired_at_the_next_start() {
     assert_whole(&episode, WRIST, ..);
     assert_lines(&episode, TOF);
 
-    // What was published until the kill is there but for its last second, longer by the time in which the machine ran
-    // neither: the guest's processors, or in the guest the threads of rapid.
-    let number = |name: &str| outcome.file(name).trim().parse::<u64>().expect("a number");
+    // What was published until the kill is there but for its last second: here, what came since the file last grew, which the
+    // script's poll saw within 100 ms.
+    let killed: u64 = outcome.file("killed").trim().parse().expect("a number");
     let last = episode.topic("/rapid/mask").map(|message| message.log_time).max().expect("a mask");
-    let lost = Duration::from_nanos(number("killed").saturating_sub(last));
-    let held_up = Duration::from_nanos(number("held_up"));
-    let killed = number("killed_mono");
-    let from = killed.saturating_sub(lost.as_nanos().try_into().expect("seconds"));
-    // Too short a time for the sampler has no halt that would excuse a loss.
-    let halted = Rhythm::between(&outcome, from, killed).map_or(0, |rhythm| rhythm.halted_tenths);
-    let halted = Duration::from_millis(100) * u32::try_from(halted).expect("few");
-    println!("the last {lost:?} are missing; threads of rapid were held up {held_up:?}, the guest {halted:?}");
-    assert!(lost <= Duration::from_secs(1) + held_up + halted, "{lost:?} are missing");
+    within(&outcome, "lost by the kill", exact_ms(killed, last), 300.0..=420.0);
 
     // The emulator counts the frames it sent, on across runs: those of the second run come after.
     let next = open(&outcome, files[1]);

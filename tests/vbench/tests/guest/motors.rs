@@ -1,7 +1,7 @@
 //! `rapid` with motors behind a CAN adapter: they move after an arm and at no other time, and each way out disables them.
 
 use serde_json::Value;
-use vbench::check::{ended, episode, ms, play};
+use vbench::check::{ended_with, episode, ms, play};
 use vbench::emu::can::adapter::Protocol;
 use vbench::emu::spec::DeviceSpec;
 use vbench::entries::{can, registry};
@@ -10,13 +10,8 @@ use vbench::recording::{falls, rises};
 use vbench::scenario::Scenario;
 
 const ARM: &str = "/rapid/arm_state";
-/// An emulated processor is late by tens of ms now and then: time limits of this bus are wide.
+/// Every limit of time is the product's own.
 const BUS: &str = r#"protocol = "damiao"
-hz = 100
-deadman = "1s"
-disable_after = "30s"
-timeout = "600ms"
-silent_after = "400ms"
 motors = [
     { name = "shoulder", slave = 0x05, master = 0x15, type = "DMH3510", mode = "position", position = [-1.0, 1.0], slew = 2.0, first_target = 2, other_fault = "limp" },
     { name = "gripper", slave = 0x06, master = 0x16, type = "DM4310", mode = "position", position = [-1.0, 1.0], slew = 2.0, first_target = 2, other_fault = "limp" },
@@ -28,18 +23,17 @@ arm() { "${rapid[@]}" arm || fail 'rapid takes no order'; }
 both() { logged $1 '"motor":5' && logged $1 '"motor":6'; }
 actuator() { has_line $out/rapid.jsonl '"event":"actuator"' "\"arming\":\"$1\""; }
 # following: both are enabled and get commands.
-following() { armed && ordered enabled 5 6 && both commands_begin; }
+following() { ordered enabled 5 6 && both commands_begin; }
 # again WORD: marks, arms, and waits until both follow.
 again() {
   sleep 1
   mark $1
   arm
-  wait_for 60 following || fail "they do not follow: $1"
+  wait_for 5 following || fail "they do not follow: $1"
   sleep 1
-  wait_for 60 following || fail "they no longer follow: $1"
+  following || fail "they no longer follow: $1"
 }
 
-touch $out/armed_again
 rapid_start --headless --record --arm --out $out/rec --config /tmp/bench/devices.toml --json
 await_rapid 60 '"event":"recording"' || fail 'not recording'
 # Remembered, though nothing is there that could move: it outweighs --arm.
@@ -51,7 +45,7 @@ publisher=$!
 sleep 3
 again armed
 sleep 3
-wait_for 60 following || fail 'they no longer follow'
+following || fail 'they no longer follow'
 mark moving
 emu unplug 0
 wait_for 20 states 1 arm absent || fail 'still there'
@@ -112,9 +106,8 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
             .example("publish_action")
             .script(SCRIPT),
     );
-    ended(&outcome);
+    ended_with(&outcome, |reason| reason.starts_with("arm: no sample for 1.1 s"));
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
-    println!("armed again: {} times", outcome.file("armed_again").lines().count());
     let log = &outcome.emu[..];
 
     // The adapter came up by itself, at the bus's rate; the motors' own time limit was set before anything moved.

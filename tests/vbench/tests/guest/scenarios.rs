@@ -2,7 +2,7 @@
 //!
 //! Wall-clock times in a recording are compared with the emulator's: both run in one guest, on one clock.
 
-use vbench::check::{assert_lines, assert_whole, episode, ms, only, play, recorded, rises_after};
+use vbench::check::{assert_lines, assert_whole, episode, ms, only, play, recorded, recorded_with, rises_after};
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
 use vbench::recording::{Edge, falls, missing};
@@ -269,16 +269,15 @@ fn identical_units_keep_their_entries() {
 /// A camera that stops sending without leaving is stalled, not absent: the mask shows plugs, not data.
 #[test]
 fn silence_is_not_absence() {
-    let outcome = recorded(
-        Scenario::new("silence")
-            .device(vga("CAM00A1"))
-            .registry(&registry(&[camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480))]))
-            .record(2, &["cam_wrist"])
-            .at(2_000, "silent 0 1")
-            .when("states 1 cam_wrist stalled")
-            .at(1_000, "silent 0 0")
-            .until("states 2 cam_wrist streaming"),
-    );
+    let scenario = Scenario::new("silence")
+        .device(vga("CAM00A1"))
+        .registry(&registry(&[camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480))]))
+        .record(2, &["cam_wrist"])
+        .at(2_000, "silent 0 1")
+        .when("states 1 cam_wrist stalled")
+        .at(1_000, "silent 0 0")
+        .until("states 2 cam_wrist streaming");
+    let outcome = recorded_with(scenario, |reason| reason.starts_with("cam_wrist: no sample for 1."));
     let episode = episode(&outcome);
     assert_eq!(falls(&episode.mask_edges(), 0), NONE, "silence cleared the bit");
     let states = outcome.states("cam_wrist");

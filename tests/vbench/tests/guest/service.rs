@@ -1,10 +1,10 @@
 //! The unit that `rapid artifacts --install` writes, under a real systemd: installed as a user would, a user of its group
 //! lets it record a camera, a CAN bus and a device on the network, over a restart, an unplug, a kill and a hang.
 
-use vbench::check::{assert_whole, is_of_the_machine, play};
+use vbench::check::{assert_whole, play, unexpected};
 use vbench::emu::can::adapter::Protocol;
 use vbench::emu::spec::{DeviceSpec, Format};
-use vbench::entries::{camera, can, lan, registry, without_limits_of_time};
+use vbench::entries::{camera, can, lan, registry};
 use vbench::outcome::{Outcome, json_lines};
 use vbench::recording::{Recording, falls, rises};
 use vbench::scenario::Scenario;
@@ -34,10 +34,12 @@ cp $unit $out/rapid.service
 cd /tmp/bench
 eval "$(sed -n 's/^# *\(useradd .*\)/\1/p; s/^# *\(install .*\)/\1/p; s/^# *\(usermod .*\) YOUR_NAME$/\1 keeper/p' $unit)" ||
   fail 'the preparations that the unit names'
-# Longer than a slow machine keeps a rapid that runs from feeding it, or from its start.
-mkdir -p $unit.d
-printf '[Service]\nWatchdogSec=60\n' >$unit.d/watchdog.conf
-systemctl daemon-reload || fail 'daemon-reload'
+# Longer than emulated processors keep a rapid that runs from feeding it, or from its start.
+if [ "$slowest" != 0 ]; then
+  mkdir -p $unit.d
+  printf '[Service]\nWatchdogSec=60\n' >$unit.d/watchdog.conf
+  systemctl daemon-reload || fail 'daemon-reload'
+fi
 systemctl enable --now rapid || fail 'systemctl enable --now rapid'
 systemd-analyze security --no-pager --threshold=20 rapid.service >$out/exposure 2>&1
 echo $? >$out/exposure.rc
@@ -103,8 +105,6 @@ fed_since() { [ "$(fed)" -gt "$before" ]; }
 wait_for 60 fed_since || give_up 'the watchdog is not fed'
 is "$hung" main || give_up 'a rapid that runs was killed'
 kill -STOP "$hung"
-# As if it had asked for so little time itself: a minute of waiting shows no more than some seconds.
-NOTIFY_SOCKET=/run/systemd/notify systemd-notify --pid="$hung" WATCHDOG_USEC=5000000 || give_up 'systemd-notify'
 rm -f /dev/shm/rapid_hardware_mask.json
 wait_for 90 is 2 restarts || give_up 'a rapid that hangs is left so'
 journalctl -u rapid --no-pager -q | grep -m 1 -i 'watchdog timeout' >$out/watchdog
@@ -132,7 +132,6 @@ fn the_installed_unit_records_cameras_buses_and_the_network() {
         wrist,
         can("bus", BUS, 1, "1d50:606f", "CAN1", "protocol = \"raw\""),
         lan("lidar", LIDAR, 2, "2672:0059", "VLP16", "protocol = \"udp\"\nport = 2368"),
-        without_limits_of_time(),
     ]);
     // A picture each 100 ms is in the window of every tick.
     let entries = entries.replace("[rig]\n", "[rig]\nsync_window = \"60ms\"\n");
@@ -173,8 +172,7 @@ fn exposure(outcome: &Outcome) {
     for line in ["Result=success", "NRestarts=2"] {
         assert!(result.lines().any(|found| found == line), "{line} not in {result}");
     }
-    // 4 is an episode that is BAD, which on a busy machine is true.
-    assert!(result.lines().any(|found| ["ExecMainStatus=0", "ExecMainStatus=4"].contains(&found)), "{result}");
+    assert!(result.lines().any(|found| found == "ExecMainStatus=0"), "{result}");
 }
 
 /// Everybody reads the mask; the recordings are for the group, which the script tried.
@@ -226,8 +224,7 @@ fn episodes(outcome: &Outcome) {
         let edges = episode.mask_edges();
         let (fell, rose) = (falls(&edges, 0), rises(&edges, 0));
         assert_eq!((falls(&edges, 1).len(), falls(&edges, 2).len()), (0, 0), "{edges:?}");
-        let reasons: Vec<&str> =
-            verdict["reasons"].as_array().into_iter().flatten().filter_map(serde_json::Value::as_str).collect();
+        let reasons = unexpected(outcome, verdict);
         if index == 1 {
             assert!(fell.len() == 1 && rose.iter().any(|rose| *rose > fell[0]), "{edges:?}");
         } else {
@@ -236,9 +233,7 @@ fn episodes(outcome: &Outcome) {
         }
         let is_expected = |reason: &&str| {
             // The second one lost its camera; it and the third were killed, and repaired by the next start.
-            (index == 1 && reason.starts_with("wrist: "))
-                || (index > 0 && reason.starts_with("the file is not whole"))
-                || is_of_the_machine(reason)
+            (index == 1 && reason.starts_with("wrist: ")) || (index > 0 && reason.starts_with("the file is not whole"))
         };
         assert!(reasons.iter().all(is_expected), "{verdict}");
         assert!(verdict["verdict"] == "GOOD" || !reasons.is_empty(), "{verdict}");

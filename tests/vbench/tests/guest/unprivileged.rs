@@ -3,7 +3,7 @@
 
 use vbench::check::{assert_lines, assert_whole, play};
 use vbench::emu::spec::{DeviceSpec, Format};
-use vbench::entries::{camera, registry, scalars, without_limits_of_time};
+use vbench::entries::{camera, registry, scalars};
 use vbench::outcome::{Outcome, json_lines};
 use vbench::recording::{Recording, falls, rises};
 use vbench::scenario::Scenario;
@@ -136,7 +136,6 @@ fn an_ordinary_user_of_the_named_groups_needs_no_root() {
             .registry(&registry(&[
                 camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (320, 240)),
                 scalars("tof", TOF, 1, "2e8a:000a", "TOF1"),
-                without_limits_of_time(),
             ]))
             .script(SCRIPT),
     );

@@ -23,7 +23,7 @@ target=$root/usr/lib/modules/$version
 for file in $(closure "${all[@]}"); do install -D -m 644 "$file" "$target/${file#*/lib/modules/"$version"/}"; done
 cp "$kernel/lib/modules/$version"/modules.{builtin,builtin.modinfo,order} "$target/"
 depmod -b "$root" "$version"
-install -m 755 "$here/guest-init.sh" "$root/usr/sbin/bench-init"
+install -m 755 "$here/../guest-init.sh" "$root/usr/sbin/bench-init"
 # A third of slack over what the files take: names and small files cost whole blocks.
 size=$(du -sm "$root" | cut -f1)
 mke2fs -q -t ext4 -O ^has_journal -m 0 -d "$root" "$work/out/root.ext4" "$((size * 4 / 3 + 32))M" >/dev/null
