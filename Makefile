@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build setup-test demo picture quick one test features lint check bench fuzz train train-test ablation evaluation texture lerobot-loop lerobot-test fleet-test clean
+.PHONY: help setup setup-build setup-test setup-all demo picture quick one test test-all features lint check bench fuzz train train-test ablation evaluation texture lerobot-loop lerobot-test fleet-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -38,6 +38,10 @@ setup-build: ## only what building and running need
 setup-test:
 	@scripts/setup.sh build test
 
+# The guest on an emulated machine, too.
+setup-all:
+	@scripts/setup.sh build test image qemu fuzz
+
 # Built to be seen soon: in a profile of its own, and without what simulated devices do not need.
 demo: setup-build ## build, then the simulated rig and a policy: the monitor on a terminal, otherwise a 10 s episode
 	cargo build --locked --profile demo --no-default-features --features policy --bin rapid
@@ -61,6 +65,10 @@ test: setup-test ## the whole truth: format, lints, all tests with the virtual b
 	cargo fmt --all --check
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
+# Each part is run even if one before it failed; the last lines are a table.
+test-all: setup-all test ## before a release and at night: make test, then guests on an emulated machine, 90 cycles, features, fuzzing and more
+	$(TESTED) scripts/tests-all.sh $(TESTS)
+
 features: ## compile the program with no cargo feature, and with each alone
 	$(TESTED) scripts/features.sh '' export foxglove lan motors policy web
 
@@ -73,7 +81,7 @@ check: setup-build lint ## lints, documentation, licences, bans, sources and kno
 	RUSTDOCFLAGS='-D warnings' cargo doc --locked --workspace --no-deps
 	scripts/deny.sh
 
-bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --only sync"); fails if one is not measured
+bench: setup-all ## print figures beside their baselines (JSON=1; BENCH="--quick --only sync"); fails if one is not measured
 	cargo build --release --locked --bin rapid --example unplug_latency --example capture
 	cargo build --release --locked -p vbench -p rapid-bench --bins
 	RAPID_BIN='$(TARGET)/release/rapid' '$(TARGET)/release/rapid-bench' $(if $(JSON),--json) $(BENCH)

@@ -75,6 +75,11 @@ impl Outcome {
         }
     }
 
+    /// The scenario's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// When the emulator applied `action` to `device`, in order.
     pub fn actions(&self, action: &str, device: usize) -> Vec<Moment> {
         let of_device = |line: &&Value| line["action"] == action && line["device"] == device;

@@ -13,6 +13,10 @@ fn misbehaving_programs_do_not_delay_the_mask() {
     for span in [Span::Idle, Span::Prompt, Span::Deaf, Span::Crashing, Span::Flooding] {
         let rhythm = rhythm(&outcome, span).expect("the sampler saw it");
         println!("{span:?}: {rhythm:?}");
+        assert!(
+            !outcome.is_virtual || rhythm.longest_ms < 3.0,
+            "{span:?}: published every 2 ms, seen every 0.5: {rhythm:?}"
+        );
         assert_eq!(rhythm.silent_tenths, 0, "{span:?}: {rhythm:?}");
     }
     // `make bench` measures by the same run.

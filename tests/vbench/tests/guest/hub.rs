@@ -3,7 +3,7 @@
 //! `vhci_hcd` knows devices in ports of its root hub and none behind a hub of their own, so there is no emulated hub: all ports
 //! are emptied within a millisecond or so, which is what the kernel makes of a hub that left.
 
-use vbench::check::{assert_accounted, assert_whole, episode, ms, only, recorded_with, rises_after};
+use vbench::check::{assert_accounted, assert_whole, episode, ms, only, recorded_with, rises_after, takes};
 use vbench::emu::log::Moment;
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
@@ -65,11 +65,10 @@ fn a_pulled_hub_takes_all_bits_and_brings_them_back() {
         let rose = only(&rises_after(&edges, bit, fell));
         let replugged = act("plug", bit as usize).real_ns;
         assert!(rose >= replugged, "bit {bit} rose before its device was back");
-        println!(
-            "bit {bit}: cleared after {} ms, set {} ms after the return",
-            ms(fell, first_out),
-            ms(rose, replugged)
-        );
+        // The kernel empties the ports one after the other; uvcvideo reports the end of its stream, if it is not the first, then.
+        let waited = 200.0 * f64::from(bit);
+        takes(&outcome, &format!("{topic}: hub out to bit"), first_out, fell, (waited - 20.0).max(0.0)..=waited + 20.0);
+        takes(&outcome, &format!("{topic}: hub in to bit"), replugged, rose, 2_100.0..=2_180.0);
         assert_eq!(episode.channels(topic).len(), 1, "{topic} came back on another channel");
         gone.push((fell, replugged));
     }
@@ -121,12 +120,12 @@ fn a_pulled_hub_takes_all_bits_and_brings_them_back() {
     published.sort_unstable();
     assert_accounted(&episode, "/rapid/mask", published.iter().map(|(sequence, _)| *sequence).collect());
     let empty_from = gone.iter().map(|(fell, _)| *fell).max().expect("four devices");
-    // How often is the machine's affair; that it continues through all of the time is not.
     let quarter = (back - empty_from) / 4;
     for begun in (0..4).map(|part| empty_from + part * quarter) {
         let count = published.iter().filter(|(_, time)| (begun..begun + quarter).contains(time)).count();
         println!("{count} masks published in {} ms while nothing was plugged", quarter / 1_000_000);
-        assert!(count > 0, "no mask for a quarter of the time in which nothing was plugged");
+        let least = if outcome.is_virtual { quarter as usize / 2_000_000 - 1 } else { 1 };
+        assert!(count >= least, "{count} masks in a quarter of the time in which nothing was plugged");
     }
     for name in ["cam_wrist", "cam_side", "tof", "force"] {
         assert!(!outcome.states(name).contains(&"failed"), "{name}: {:?}", outcome.states(name));

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use vbench::check::{assert_lines, assert_whole, ended, exact_ms, play, within};
+use vbench::check::{assert_lines, assert_whole, ended, play, takes};
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
 use vbench::outcome::{Outcome, json_lines};
@@ -81,7 +81,7 @@ fn a_killed_recording_is_repaired_at_the_next_start() {
     // script's poll saw within 100 ms.
     let killed: u64 = outcome.file("killed").trim().parse().expect("a number");
     let last = episode.topic("/rapid/mask").map(|message| message.log_time).max().expect("a mask");
-    within(&outcome, "lost by the kill", exact_ms(killed, last), 300.0..=420.0);
+    takes(&outcome, "lost by a kill -9", last, killed, 300.0..=420.0);
 
     // The emulator counts the frames it sent, on across runs: those of the second run come after.
     let next = open(&outcome, files[1]);

@@ -1,7 +1,7 @@
 //! `rapid` with devices behind USB network adapters: a GoPro that records by itself, a LiDAR whose packets are recorded.
 
 use serde_json::Value;
-use vbench::check::{assert_accounted, ended, episode, ms, play, rises_after};
+use vbench::check::{assert_accounted, ended, episode, play, rises_after, takes};
 use vbench::emu::lan::{gopro, lidar};
 use vbench::emu::spec::DeviceSpec;
 use vbench::entries::{lan, registry};
@@ -114,11 +114,8 @@ fn packets(outcome: &Outcome, episode: &Recording) {
     };
     let (down, up) = (printed("down"), printed("up"));
     assert_eq!(fell.len(), 2, "the adapter was pulled, and then its cable: {edges:?}");
-    println!(
-        "the bit fell {} ms after the adapter was pulled, {} ms after its cable",
-        ms(fell[0], pulled),
-        ms(fell[1], down)
-    );
+    takes(outcome, "adapter pulled to bit", pulled, fell[0], 0.0..=2.5);
+    takes(outcome, "cable pulled to bit", down, fell[1], 0.0..=130.0);
     assert!(fell[0] >= pulled && fell[1] >= down && fell[1] < up, "{edges:?}");
     let rose = rises_after(&edges, 1, fell[0]);
     assert!(rose.len() == 2 && rose[0] < down && rose[1] >= up, "it rose with each return: {edges:?}");

@@ -1,7 +1,7 @@
 //! `rapid` with motors behind a CAN adapter: they move after an arm and at no other time, and each way out disables them.
 
 use serde_json::Value;
-use vbench::check::{ended_with, episode, ms, play};
+use vbench::check::{ended_with, episode, ms, play, takes};
 use vbench::emu::can::adapter::Protocol;
 use vbench::emu::spec::DeviceSpec;
 use vbench::entries::{can, registry};
@@ -147,12 +147,22 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
     let edges = episode.mask_edges();
     let (fell, rose) = (falls(&edges, 0), rises(&edges, 0));
     assert!(fell[0] >= pulled.real_ns, "the bit fell before the pull");
-    println!("the bit fell {} ms after the pull", ms(fell[0], pulled.real_ns));
+    takes(&outcome, "unplug to bit", pulled.real_ns, fell[0], 0.0..=2.5);
     assert!(rose.last().is_some_and(|rose| *rose >= outcome.actions("plug", 0)[1].real_ns), "{edges:?}");
 
     // Each trouble disables both, and nothing enables them before the next arm.
-    for (trouble, arm) in [("fault", "faulted"), ("silence", "answered"), ("heat", "cooled")] {
+    let troubles = [
+        ("fault", "faulted", 0.0..=15.0),
+        // `silent_after`, and two cycles.
+        ("silence", "answered", 40.0..=55.0),
+        ("heat", "cooled", 0.0..=15.0),
+    ];
+    for (trouble, arm, within) in troubles {
         let lines = between(&outcome, trouble, arm);
+        let time = |line: &&Value| line["mono_ns"].as_u64().expect("a time");
+        let begun = lines.iter().find(|line| line["action"] == "order").map(|line| time(&line)).expect("an order");
+        let off = lines.iter().find(|line| line["action"] == "motor_disabled" && line["motor"] == 5);
+        takes(&outcome, &format!("{trouble} of one motor to the other off"), begun, time(&off.expect("off")), within);
         assert_eq!(actions(lines, "motor_enabled"), Vec::<&Value>::new(), "{trouble}");
         for motor in [5, 6] {
             // A silent one receives nothing either, and times out by itself.

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 use serde_json::Value;
-use vbench::check::{ended, episode, ms, only, play, rises_after};
+use vbench::check::{ended, episode, only, play, rises_after, takes};
 use vbench::emu::feed;
 use vbench::emu::frame;
 use vbench::emu::spec::{DeviceSpec, Format};
@@ -89,7 +89,8 @@ fn a_policy_continues_without_the_tactile_camera_and_uses_it_again() {
     let fell = only(&falls(&edges, TACTILE_BIT));
     let rose = only(&rises_after(&edges, TACTILE_BIT, fell));
     assert!((unplugged..replugged).contains(&fell) && rose > replugged, "{edges:?}");
-    println!("bit cleared {} ms after the unplug, set {} ms after the plug", ms(fell, unplugged), ms(rose, replugged));
+    takes(&outcome, "unplug to bit", unplugged, fell, 0.0..=2.5);
+    takes(&outcome, "plug to bit within the cooldown", replugged, rose, 500.0..=1_400.0);
     for (bit, name) in BITS.iter().filter(|(bit, _)| *bit != TACTILE_BIT) {
         assert!(falls(&edges, *bit).is_empty(), "the bit of {name} fell: {edges:?}");
     }

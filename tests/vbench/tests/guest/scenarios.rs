@@ -2,7 +2,9 @@
 //!
 //! Wall-clock times in a recording are compared with the emulator's: both run in one guest, on one clock.
 
-use vbench::check::{assert_lines, assert_whole, episode, ms, only, play, recorded, recorded_with, rises_after};
+use vbench::check::{
+    assert_lines, assert_whole, episode, first_sample, only, play, recorded, recorded_with, rises_after, takes,
+};
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
 use vbench::recording::{Edge, falls, missing};
@@ -133,11 +135,12 @@ fn unplugging_one_device_leaves_the_others_whole() {
 
     let fell = only(&falls(&edges, 1));
     assert!(fell >= unplugged, "the bit fell {} ms before the unplug", (unplugged - fell) / 1_000_000);
-    println!("bit cleared {} ms after the unplug", (fell - unplugged) / 1_000_000);
+    takes(&outcome, "unplug to bit", unplugged, fell, 0.0..=2.5);
     assert!(fell < replugged, "the bit fell only after the replug");
     let rose = only(&rises_after(&edges, 1, fell));
     assert!(rose >= replugged, "the bit rose before the replug");
-    println!("bit set {} ms after the replug", (rose - replugged) / 1_000_000);
+    takes(&outcome, "plug to bit", replugged, rose, 530.0..=590.0);
+    takes(&outcome, "plug to first picture", replugged, first_sample(&episode, SIDE, fell), 530.0..=590.0);
 
     assert_eq!(episode.channels(SIDE).len(), 1, "the camera came back on another channel");
     assert_whole(&episode, SIDE, ..fell);
@@ -215,11 +218,9 @@ fn a_quick_replug_is_not_lost() {
         assert!(*fell >= unplugged.real_ns);
         let rose = *rises_after(&edges, 0, *fell).first().expect("the bit came back");
         assert!(rose >= replugged.real_ns);
-        println!(
-            "out for 300 ms: cleared after {} ms, set {} ms after the replug",
-            ms(*fell, unplugged.real_ns),
-            ms(rose, replugged.real_ns)
-        );
+        takes(&outcome, "unplug to bit", unplugged.real_ns, *fell, 0.0..=2.5);
+        // The rest of the cooldown of 2 s, and the camera's start.
+        takes(&outcome, "plug to bit within the cooldown", replugged.real_ns, rose, 1_700.0..=1_770.0);
     }
     assert_eq!(episode.channels(WRIST).len(), 1);
     assert_whole(&episode, WRIST, ..unplugs[0].real_ns);
@@ -289,6 +290,9 @@ fn silence_is_not_absence() {
     for gone in ["absent", "backoff", "failed"] {
         assert_eq!(place(gone, streaming), None, "{states:?}");
     }
+    let stalled = outcome.rapid.iter().find(|line| line["state"] == "stalled");
+    let stalled = stalled.and_then(|line| line["stamp"].as_u64()).expect("a stamp");
+    takes(&outcome, "silence to stalled", outcome.actions("silent", 0)[0].mono_ns, stalled, 450.0..=550.0);
     let silent: Vec<u64> = outcome.actions("silent", 0).iter().map(|moment| moment.real_ns).collect();
     assert_whole(&episode, WRIST, ..silent[0]);
     assert_whole(&episode, WRIST, silent[1]..);
