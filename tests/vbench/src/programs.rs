@@ -7,6 +7,8 @@ use std::process::Command;
 
 use thiserror::Error;
 
+use crate::guest::Image;
+
 /// Why a program cannot be given to the guest.
 #[derive(Debug, Error)]
 pub enum ProgramError {
@@ -71,28 +73,32 @@ fn newest(name: &'static str, variable: &'static str, candidates: Vec<PathBuf>) 
 ///
 /// If host and guest are the same Debian release, the guest's own libraries are used. Otherwise the host's are copied
 /// and its loader is used, because a binary built against a newer glibc does not start on an older one.
-pub fn install(program: &Path, share: &Path, guest_suite: &str) -> Result<Vec<String>, ProgramError> {
+pub fn install(program: &Path, share: &Path, guest: &Image) -> Result<Vec<String>, ProgramError> {
     let name = program.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let target = share.join("bin").join(&name);
-    copy_stripped(program, &target)?;
+    let placed = fs::create_dir_all(target.parent().unwrap_or(&target));
+    let placed =
+        placed.and_then(|()| if guest.is_virtual() { link(program, &target) } else { strip(program, &target) });
+    placed.map_err(|error| ProgramError::Copy(program.into(), error))?;
     let inside = format!("/tmp/bench/bin/{name}");
-    if host_suite().as_deref() == Some(guest_suite) {
+    if host_suite().as_deref() == Some(guest.suite()) {
         return Ok(vec![inside]);
     }
     let loader = copy_libraries(program, &share.join("lib"))?;
     Ok(vec![format!("/tmp/bench/lib/{loader}"), "--library-path".into(), "/tmp/bench/lib".into(), inside])
 }
 
-/// Debug information would cost the guest memory and start-up time. Without `strip` the program is copied unchanged.
-fn copy_stripped(program: &Path, target: &Path) -> Result<(), ProgramError> {
-    let failed = |error| ProgramError::Copy(program.into(), error);
-    fs::create_dir_all(target.parent().unwrap_or(target)).map_err(failed)?;
-    let stripped =
-        Command::new("strip").arg("-o").arg(target).arg(program).status().is_ok_and(|status| status.success());
-    if !stripped {
-        fs::copy(program, target).map_err(failed)?;
-    }
-    Ok(())
+/// For a guest that reads of a program what it uses.
+fn link(program: &Path, target: &Path) -> io::Result<()> {
+    // Not on another file system.
+    fs::hard_link(program, target).or_else(|_| fs::copy(program, target).map(drop))
+}
+
+/// For a guest that keeps programs in memory, where debug information would cost start-up time, too. Without `strip` the program is
+/// copied unchanged.
+fn strip(program: &Path, target: &Path) -> io::Result<()> {
+    let stripped = Command::new("strip").arg("-o").arg(target).arg(program).status();
+    if stripped.is_ok_and(|status| status.success()) { Ok(()) } else { fs::copy(program, target).map(drop) }
 }
 
 fn host_suite() -> Option<String> {

@@ -206,7 +206,7 @@ impl Scenario {
         };
         let share = fresh_folder(&self.name)?;
         let inside = share.join("in");
-        let install = |program: &Path| programs::install(program, &inside, image.suite());
+        let install = |program: &Path| programs::install(program, &inside, &image);
         let usbemu = install(&usbemu)?;
         let rapid = rapid.as_deref().map(install).transpose()?.unwrap_or_default();
         let write = |name: &str, contents: &[u8]| {

@@ -26,8 +26,8 @@ larger_than() { [ "$(stat -c %s "$2")" -gt "$1" ]; }
 # Some pictures more than now.
 grown() { wait_for 60 larger_than $(($(stat -c %s "$1") + 500000)) "$1" || fail "$1 does not grow"; }
 # wait_for goes by the clock, which is set here.
-patiently() { for _ in $(seq 3000); do "$@" >/dev/null 2>&1 && return; sleep 0.1; done; return 1; }
-steps() { grep -c '"event":"clock_step"' $out/rapid.jsonl; }
+patiently() { for _ in $(seq 3000); do "$@" && return; pause 0.1; done; return 1; }
+steps() { has_lines $1 $out/rapid.jsonl '"event":"clock_step"'; }
 kept() { cp $out/rapid.jsonl $out/$1.jsonl; cp $out/rapid.rc $out/$1.rc; cp -r $2 $out/$1; }
 refused() { "${rapid[@]}" --headless --record --duration 1s --out $2 --config $config >$out/$1.txt 2>&1; echo $? >$out/$1.rc; }
 emu plug 0 1
@@ -36,9 +36,9 @@ udevadm settle
 
 record /tmp/clock
 date -s '1 hour' >/dev/null
-patiently is 1 steps || fail 'the step forward is not reported'
+patiently steps 1 || fail 'the step forward is not reported'
 date -s '3 hours ago' >/dev/null
-patiently is 2 steps || fail 'the step back is not reported'
+patiently steps 2 || fail 'the step back is not reported'
 sleep 1
 rapid_stop
 date -s '2 hours' >/dev/null

@@ -45,7 +45,7 @@ stop_is() { has_line $out/rapid.jsonl '"event":"stop"' "\"stop\":\"$1\"" "\"stat
 # What was last reported of them.
 inputs() { grep -F '"event":"stop"' $out/rapid.jsonl | tail -n 3; }
 # stops N STOP STATE: this state of the stop was reported N times at least.
-stops() { [ "$(grep -F '"event":"stop"' $out/rapid.jsonl | grep -F "\"stop\":\"$2\"" | grep -cF "\"state\":\"$3\"")" -ge "$1" ]; }
+stops() { has_lines "$1" $out/rapid.jsonl '"event":"stop"' "\"stop\":\"$2\"" "\"state\":\"$3\""; }
 # arm WORD: what follows is of this round.
 arm() {
   mark $1

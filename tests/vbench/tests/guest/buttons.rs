@@ -32,6 +32,7 @@ modprobe -a uinput evdev
 mkfifo /tmp/pedal /tmp/remote
 exec 8<>/tmp/pedal 9<>/tmp/remote
 pedal_plug() {
+  : >$out/pedal
   "${usbemu[@]}" --keys 'bench pedal' KEY_A KEY_C </tmp/pedal >$out/pedal 2>&1 8>&- 9>&- &
   pedal=$!
   wait_for 30 has_line $out/pedal ready || fail "no pedal: $(cat $out/pedal)"
@@ -40,7 +41,7 @@ pedal() { echo "$1 $2" >&8; }
 "${usbemu[@]}" --keys 'bench remote' KEY_B </tmp/remote >$out/remote 2>&1 &
 wait_for 30 has_line $out/remote ready || fail "no remote: $(cat $out/remote)"
 in_log() { has_line $out/rapid.jsonl '"event":"log"' "$1"; }
-event_times() { [ "$(grep -cF "\"event\":\"$2\"" $out/rapid.jsonl)" -ge "$1" ]; }
+event_times() { has_lines "$1" $out/rapid.jsonl "\"event\":\"$2\""; }
 echo 'SUBSYSTEM=="gpio", KERNEL=="gpiochip*", ATTRS{serial}=="GPIO1", SYMLINK+="panel"' >/etc/udev/rules.d/90-bench-gpio.rules
 udevadm control --reload
 pedal_plug

@@ -90,26 +90,26 @@ grown
 # What a kill leaves behind is in no way of the next start.
 systemctl kill --signal=KILL rapid || give_up 'systemctl kill'
 rm -f /dev/shm/rapid_hardware_mask.json
-wait_for 60 is 1 restarts || give_up 'systemd does not start it again'
+every=1 wait_for 60 is 1 restarts || give_up 'systemd does not start it again'
 wait_for 60 streams || give_up 'not everything streams after the kill'
 record
 wait_for 60 is 3 count || give_up 'no third episode'
 grown
-wait_for 180 is 1 partials || give_up 'the killed episode is not repaired'
+every=1 wait_for 180 is 1 partials || give_up 'the killed episode is not repaired'
 
 # One that runs feeds the watchdog; one that hangs is killed by it and started again, and its episode is repaired.
 main() { systemctl show rapid --property=MainPID --value; }
 fed() { systemctl show rapid --property=WatchdogTimestampMonotonic --value; }
 hung=$(main) before=$(fed)
 fed_since() { [ "$(fed)" -gt "$before" ]; }
-wait_for 60 fed_since || give_up 'the watchdog is not fed'
+every=1 wait_for 60 fed_since || give_up 'the watchdog is not fed'
 is "$hung" main || give_up 'a rapid that runs was killed'
 kill -STOP "$hung"
 rm -f /dev/shm/rapid_hardware_mask.json
-wait_for 90 is 2 restarts || give_up 'a rapid that hangs is left so'
+every=1 wait_for 90 is 2 restarts || give_up 'a rapid that hangs is left so'
 journalctl -u rapid --no-pager -q | grep -m 1 -i 'watchdog timeout' >$out/watchdog
 wait_for 60 streams || give_up 'not everything streams after the watchdog'
-wait_for 180 is 0 partials || give_up 'the episode of the hang is not repaired'
+every=1 wait_for 180 is 0 partials || give_up 'the episode of the hang is not repaired'
 systemctl stop rapid || give_up 'systemctl stop rapid'
 systemctl show rapid --property=Result,ExecMainStatus,NRestarts >$out/result
 journal

@@ -108,6 +108,7 @@ exec prlimit --rtprio=$(key LimitRTPRIO) env -i PATH=/usr/bin --default-signal=I
   setpriv --reuid=$(key User) --regid=$(key User) --groups="$(getent group $(key SupplementaryGroups) | cut -d: -f3 | paste -sd,)" \
   --inh-caps=-all --bounding-set=-all --no-new-privs $(key ExecStart) --json
 END
+: >$out/rapid.jsonl
 unshare --mount bash /tmp/as-unit.sh >$out/rapid.jsonl 2>$out/rapid.log & rapid_pid=$!
 await_rapid 60 '"device":"cam_wrist"' '"state":"streaming"' || fail 'cam_wrist does not stream under the unit'
 await_rapid 60 '"device":"tof"' '"state":"streaming"' || fail 'tof does not stream under the unit'
