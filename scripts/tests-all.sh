@@ -16,7 +16,7 @@ cache=${XDG_CACHE_HOME:-$HOME/.cache}/rapid
 # processor does not keep; `buses` has motors without `rapid`.
 readonly second=(
     scenarios::bench_shows       # MJPG and YUYV, CDC-ACM, FTDI
-    scenarios::unplugging_one    # cameras and lines under rapid
+    scenarios::an_unplug    # cameras and lines under rapid
     buses::                      # gs_usb, slcan and a vendor's line, CDC-Ethernet
     lan::                        # CDC-Ethernet under rapid
     streams::                    # Z16, several cameras in one device
