@@ -40,7 +40,7 @@ impl Drop for Responder {
 }
 
 #[test]
-#[ignore = "a part of the test below, in a process of its own"]
+#[ignore = "run by an_announced_device_leaves_by_goodbye_and_by_lease"]
 fn announce_a_service() {
     let what = std::env::var("ANNOUNCE").expect("run by the test below");
     let (service, port) = what.split_once(' ').expect("service and port");
