@@ -36,6 +36,7 @@ use rapid::time::Stamp;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
+use crate::skip::skipped;
 use crate::{COUNT, COUNTING, alone, own_allocations};
 
 /// What a device sends has the size the registry lets it have: a picture, and a vector of numbers.
@@ -160,7 +161,7 @@ fn a_packet_of_the_network_does_not_allocate() {
                 Ok(driver) => driver,
                 // Only root may bind a socket to an interface.
                 Err(error) => {
-                    println!("NOT CHECKED: {}: {error}", node.label());
+                    skipped(&format!("for {}: {error}", node.label()));
                     return 0;
                 }
             };
