@@ -69,6 +69,9 @@ pub mod rotation;
 pub mod sample;
 pub mod session;
 pub mod simulation;
+#[cfg(test)]
+#[path = "../tests/support/skip.rs"]
+mod skip;
 pub mod status;
 pub mod sync;
 pub mod text;

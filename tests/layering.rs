@@ -239,6 +239,49 @@ fn the_lock_of_rapid_remote_has_what_every_program_needs() {
     );
 }
 
+/// A test that the harness leaves out would be missed by nobody: whatever is left out is a part of another test, which runs
+/// it in a process of its own.
+#[test]
+fn a_test_that_is_ignored_is_run_by_another_one() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut files = BTreeMap::new();
+    for folder in ["src", "tests", "examples"] {
+        collect(root, &root.join(folder), &mut files).unwrap();
+    }
+    let hidden: Vec<_> = files.iter().flat_map(|(path, text)| hidden(text).map(move |reason| (path, reason))).collect();
+    assert!(hidden.is_empty(), "ignored, and not with the reason `run by NAME` of a test of that file: {hidden:#?}");
+}
+
+/// The reasons of tests in a file that are ignored and that no other test of it runs.
+fn hidden(text: &str) -> impl Iterator<Item = String> {
+    let mut reasons = Vec::new();
+    ignored(TokenStream::from_str(text).unwrap_or_else(|error| panic!("{error}")), &mut reasons);
+    reasons.into_iter().filter(move |reason| {
+        let runner = reason.strip_prefix("run by ").filter(|name| text.contains(&format!("fn {name}()")));
+        runner.is_none() || !text.contains("\"--ignored\"")
+    })
+}
+
+/// The reasons of all `#[ignore]`; of one without a reason, or that depends on something, the attribute.
+fn ignored(tokens: TokenStream, reasons: &mut Vec<String>) {
+    let tokens: Vec<TokenTree> = tokens.into_iter().collect();
+    for (at, token) in tokens.iter().enumerate() {
+        let TokenTree::Group(group) = token else { continue };
+        let attribute: Vec<TokenTree> = group.stream().into_iter().collect();
+        let is_attribute = at > 0 && is_punct(tokens.get(at - 1), '#') && group.delimiter() == Delimiter::Bracket;
+        let text = group.stream().to_string();
+        if !is_attribute {
+            ignored(group.stream(), reasons);
+        } else if let [TokenTree::Ident(word), TokenTree::Punct(_), TokenTree::Literal(reason)] = &attribute[..]
+            && word == "ignore"
+        {
+            reasons.push(reason.to_string().trim_matches('"').to_owned());
+        } else if text == "ignore" || text.starts_with("cfg_attr") && text.contains("ignore") {
+            reasons.push(text);
+        }
+    }
+}
+
 /// Something that breaks a rule, and which.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Violation {
@@ -657,6 +700,23 @@ mod the_check_itself {
         finds("mask.rs", "use tokio::sync::watch;", &["1: crate `tokio`"]);
         finds("time.rs", "use rustix::time::ClockId;", &[]);
         finds("sample.rs", "use rustix::time::ClockId;", &["1: crate `rustix`"]);
+    }
+
+    #[test]
+    fn ignored_tests_are_found() {
+        let found = |attribute: &str, runner: &str| {
+            let text =
+                format!("mod tests {{ #[test]\n{attribute}\nfn a() {{}}\n#[test]\nfn b() {{ run({runner}); }} }}");
+            hidden(&text).collect::<Vec<_>>()
+        };
+        let runner = "\"--ignored\"";
+        assert_eq!(found("#[ignore = \"run by b\"]", runner), [] as [&str; 0]);
+        assert_eq!(found("#[ignore = \"run by b\"]", ""), ["run by b"]);
+        assert_eq!(found("#[ignore = \"run by c\"]", runner), ["run by c"]);
+        assert_eq!(found("#[ignore = \"slow\"]", runner), ["slow"]);
+        assert_eq!(found("#[ignore]", runner), ["ignore"]);
+        assert_eq!(found("#[cfg_attr(debug_assertions, ignore)]", runner).len(), 1);
+        assert_eq!(found("// #[ignore]", runner), [] as [&str; 0]);
     }
 
     #[test]

@@ -18,6 +18,7 @@ from .episodes import ABSENCES, Episode, EpisodeError, Facts, episode_files, pic
 from .experiment import Data, Experiment
 from .judgement import AT_ONCE, JudgementError, judge, program
 from .lerobot_source import MissingPackage, split
+from .rows import unfit
 
 SHOWN = 20
 
@@ -104,9 +105,6 @@ def _absences(spec: Experiment | Classification, episodes: Sequence[Episode]) ->
 def _unfit(spec: Experiment | Classification, episode: Episode) -> str | None:
     if isinstance(spec, Classification):
         return spec.unfit(episode.facts.tags)
-    # Torch is imported only where it is used: decoding does not need it.
-    from .dataset import unfit
-
     return unfit(spec, episode)
 
 

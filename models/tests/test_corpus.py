@@ -13,7 +13,7 @@ from made_up import Experiment, experiment, path
 
 from rapid_policy import cache as module
 from rapid_policy import corpus
-from rapid_policy.cache_commands import bench, verify
+from rapid_policy.cache_commands import verify
 from rapid_policy.corpus import Corpus, divide, load
 from rapid_policy.episodes import ABSENCES, EpisodeError, read_episode, sources
 from rapid_policy.judgement import Judgement
@@ -289,11 +289,6 @@ class Decoded(Case):
         (episode,) = self.load(Experiment.from_text(described)).training
         self.assertEqual(episode.value("cam_wrist resize 48x48").shape, (20, 48, 48, 3))
         self.assertEqual(len(self.files()), 2)
-
-    def test_the_bench_measures(self):
-        self.write("a")
-        report = bench(SPEC, self.load().training, seconds=0.05)
-        self.assertGreater(report["cache_times"], 1)
 
 
 class Maps(Case):

@@ -9,8 +9,9 @@ import torch
 from made_up import POLICIES, by_hand, experiment, made_up, observed, small, twelve_steps
 
 from rapid_policy import dataset as module
-from rapid_policy.dataset import Dataset, drop, inputs, unfit
+from rapid_policy.dataset import Dataset, drop, inputs
 from rapid_policy.experiment import Experiment
+from rapid_policy.rows import unfit
 
 CPU = torch.device("cpu")
 

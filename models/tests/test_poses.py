@@ -10,9 +10,10 @@ from made_up import by_hand, experiment, path
 
 from rapid_policy import poses
 from rapid_policy.bundle import DENOISER, ENCODER, policy_json
-from rapid_policy.dataset import Dataset, unfit
+from rapid_policy.dataset import Dataset
 from rapid_policy.episodes import read_episode, sources
 from rapid_policy.experiment import Experiment
+from rapid_policy.rows import unfit
 
 # Numbers of a pose that are learned, and that are executed.
 LEARNED = {"none": 3, "rotation_6d": 9, "quaternion": 7}

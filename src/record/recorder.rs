@@ -7,6 +7,9 @@
 //! Invariant: an episode in progress is finished whatever ends the thread: the last handle dropped,
 //! an error of the disk, a panic.
 
+#[cfg(test)]
+mod tests;
+
 use std::any::Any;
 use std::fs::File;
 use std::io;

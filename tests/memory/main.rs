@@ -4,6 +4,9 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
+#[path = "../support/skip.rs"]
+mod skip;
+
 mod hostile_alloc;
 mod stream_alloc;
 

@@ -36,6 +36,7 @@ use rapid::time::Stamp;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
+use crate::skip::skipped;
 use crate::{COUNT, COUNTING, alone, own_allocations};
 
 /// What a device sends has the size the registry lets it have: a picture, and a vector of numbers.
@@ -75,8 +76,8 @@ hz = 1000
 const WORKERS: usize = 2;
 const WARM_UP: usize = 200;
 const SAMPLES: usize = 1000;
-/// Samples of a stretch: at 1,500 a second, some 30 ms.
-const STRETCH: usize = 50;
+/// Samples of a stretch: at 1,500 a second, some 13 ms.
+const STRETCH: usize = 20;
 /// How often the rig writes its JSON file.
 const JSON_PERIOD: Duration = Duration::from_secs(1);
 
@@ -160,7 +161,7 @@ fn a_packet_of_the_network_does_not_allocate() {
                 Ok(driver) => driver,
                 // Only root may bind a socket to an interface.
                 Err(error) => {
-                    println!("NOT CHECKED: {}: {error}", node.label());
+                    skipped(&format!("for {}: {error}", node.label()));
                     return 0;
                 }
             };
@@ -199,11 +200,18 @@ fn an_observation_does_not_allocate() {
     let alignment = Alignment::new(&registry, bus.queues().unwrap(), writer(TopicId::Observation), board);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let stop = CancellationToken::new();
+    let mut observations = bus.queues().unwrap();
+    observations.add(bus.observations().unwrap().unwrap());
     let feed = async {
-        let mut before = 0;
-        for seq in 0..(WARM_UP + SAMPLES) as u64 {
-            if seq == WARM_UP as u64 {
+        let (mut before, mut observed) = (0, 0);
+        // Until there were so many observations: how long that takes depends on the machine.
+        for seq in 0.. {
+            let warm = observed >= WARM_UP;
+            observations.drain(&mut |topic, _, _| observed += usize::from(topic == TopicId::Observation)).unwrap();
+            if !warm && observed >= WARM_UP {
                 before = own_allocations();
+            } else if observed >= WARM_UP + SAMPLES {
+                break;
             }
             let now = Stamp::now().0;
             let header = SampleHeader { seq, capture_ns: now, recv_ns: now, epoch: 1, ..SampleHeader::default() };
@@ -217,8 +225,7 @@ fn an_observation_does_not_allocate() {
     };
     let (published, allocated) = runtime.block_on(async { tokio::join!(alignment.run(stop.clone()), feed) });
     assert_eq!(allocated, 0, "allocations for {published} observations");
-    assert!(published > SAMPLES as u64 / 2, "{published} observations in {SAMPLES} ms");
-    drop((state, mask));
+    drop((state, mask, observations));
 }
 
 fn whole_rig(registry: &Registry, scenario: Scenario) {
@@ -247,7 +254,13 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
     let begun = Stamp::now();
     let mut counts = [0; 3];
     let (mut stretches, mut noisy) = (0, 0);
-    while counts[0] < SAMPLES || counts[1] < SAMPLES {
+    // A file may fall between two stretches or be cut by their border, and a worker may have had no
+    // sample while it was warming up.
+    let files = || Stamp::now().since(begun).as_secs() / JSON_PERIOD.as_secs() + 1;
+    let allowed = || 2 * files() + WORKERS as u64;
+    // On a slow machine more files fall into as many samples: then it takes more of them to judge.
+    while counts[0] < SAMPLES || counts[1] < SAMPLES || stretches <= 2 * allowed() {
+        assert!(files() < 180, "{stretches} stretches in three minutes are too few to judge");
         let end = counts[0] + counts[1] + STRETCH;
         COUNT.store(0, Ordering::Relaxed);
         COUNTING.store(true, Ordering::Relaxed);
@@ -258,17 +271,12 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
         stretches += 1;
         noisy += u64::from(COUNT.load(Ordering::Relaxed) > 0);
     }
-    let elapsed = Stamp::now().since(begun);
+    let (files, allowed) = (files(), allowed());
     stop.cancel();
     runtime.block_on(task).unwrap();
     drop((commands, inbox, bus));
 
-    // A file may fall between two stretches or be cut by their border, and a worker may have had no
-    // sample while it was warming up.
-    let files = elapsed.as_secs() / JSON_PERIOD.as_secs() + 1;
-    let allowed = 2 * files + WORKERS as u64;
-    assert!(noisy <= allowed, "{noisy} of {stretches} stretches allocated, {files} JSON files in {elapsed:?}");
-    assert!(stretches > 2 * allowed, "{stretches} stretches in {elapsed:?} are too few to judge");
+    assert!(noisy <= allowed, "{noisy} of {stretches} stretches allocated, with {files} JSON files");
     assert!(counts[2] > 0, "no mask came");
 }
 

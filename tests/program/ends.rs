@@ -9,6 +9,7 @@ use std::io::Read;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
+use crate::support::skip::skipped;
 use crate::support::terminal::OnTerminal;
 use crate::support::{self, Episode, PATIENCE, Place, recorded_code, until};
 use rustix::process::{Pid, Signal, kill_process};
@@ -155,7 +156,7 @@ fn a_small_disk_that_fills_up_ends_the_run_with_a_whole_file_and_a_message() {
     const MOUNT: &str = "mount -t tmpfs -o size=8m tmpfs out && \"$@\"; code=$?; cp out/* saved; exit $code";
     let may = Command::new("unshare").args(["-Urm", "true"]).output().is_ok_and(|output| output.status.success());
     if !may {
-        eprintln!("SKIPPED: no disk can be mounted here (unshare -Urm)");
+        skipped("no disk can be mounted here (unshare -Urm)");
         return;
     }
     let place = Place::new();

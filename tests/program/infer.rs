@@ -73,6 +73,36 @@ fn infer(place: &Place, bundle: &str, scenario: &str, more: &[&str]) -> (Option<
     (output.status.code(), events(&text), String::from_utf8_lossy(&output.stderr).into_owned())
 }
 
+/// The same, interrupted once what it has reported is enough: how long that takes depends on the machine.
+fn infer_until(
+    place: &Place,
+    bundle: &str,
+    scenario: &str,
+    more: &[&str],
+    is_enough: impl Fn(&[Value]) -> bool,
+) -> (Option<i32>, Vec<Value>, String) {
+    let registry = place.write("rig.toml", REGISTRY).display().to_string();
+    let scenario = place.write("play.toml", scenario).display().to_string();
+    let arguments = ["--json", "--infer", bundle, "--config", &registry, "--sim", &scenario];
+    let running = place.start(&[&arguments[..], more].concat(), "\"event\":");
+    until("what is needed", || is_enough(&running.reported()));
+    running.signal(Signal::INT);
+    let (code, printed, stderr) = running.end();
+    (code, events(&printed), stderr)
+}
+
+/// Has a chunk been computed with this mask, after `events[..from]`? The place of the first.
+fn asked(events: &[Value], mask: &str, from: usize) -> Option<usize> {
+    (from..events.len()).find(|at| events[*at]["event"] == "chunk" && events[*at]["mask"] == mask)
+}
+
+/// Has it been asked with all sensors, without one, and with all again?
+fn pulled_and_back(events: &[Value]) -> bool {
+    let with = asked(events, "0x07", 0);
+    let without = with.and_then(|at| asked(events, "0x05", at));
+    without.and_then(|at| asked(events, "0x07", at)).is_some()
+}
+
 /// The same, interrupted once the policy acts: how long it takes to load depends on the machine.
 fn infer_until_it_acts(place: &Place, arguments: &[&str]) -> (Option<i32>, Vec<Value>, String) {
     let running = place.start(&[&["--json", "--infer"], arguments].concat(), "\"event\":\"act\"");
@@ -126,7 +156,7 @@ pub(crate) fn paced(place: &Place, executed: u32, hz: f64) -> String {
 #[test]
 fn a_pulled_sensor_is_left_out_at_the_next_tick_and_actions_continue() {
     let place = Place::new();
-    let (code, printed, stderr) = infer(&place, BUNDLE, PULLED, &["--record", "--duration", "8s", "--out", "out"]);
+    let (code, printed, stderr) = infer_until(&place, BUNDLE, PULLED, &["--record", "--out", "out"], pulled_and_back);
     assert_eq!(code, recorded_code(&printed), "{stderr}");
     let policy = of(&printed, "policy").next().expect("an event of the policy");
     assert_eq!((&policy["policy"], &policy["dry_run"]), (&"tactile-id".into(), &false.into()));
@@ -191,7 +221,8 @@ fn without_required_modalities_it_does_not_start_unless_it_may_wait() {
     assert!(stderr.contains("the policy needs arm") && stderr.contains("--wait"), "{stderr}");
     assert_eq!(of(&printed, "policy").count(), 0);
 
-    let (code, printed, stderr) = infer(&place, BUNDLE, arm_later, &["--duration", "10s", "--wait"]);
+    let (code, printed, stderr) =
+        infer_until(&place, BUNDLE, arm_later, &["--wait"], |events| of(events, "act").count() > 0);
     assert_eq!(code, Some(0), "{stderr}");
     let waits = |printed: &Value| printed["event"] == "log" && printed["text"] == "the policy waits for arm";
     assert!(printed.iter().any(waits) && of(&printed, "act").count() > 0, "{printed:?}");
@@ -213,7 +244,11 @@ fn a_dry_run_computes_and_moves_nothing() {
 fn a_policy_not_trained_without_a_sensor_holds_until_it_is_back_or_ignored() {
     let place = Place::new();
     let bundle = changed(&place, "\"mask_aware\": true", "\"mask_aware\": false");
-    let (code, printed, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s"]);
+    let continues = |events: &[Value]| {
+        let held = events.iter().position(|event| event["event"] == "hold" && event["device"] == "tactile_tip");
+        held.is_some_and(|held| of(&events[held..], "act").count() > 0)
+    };
+    let (code, printed, stderr) = infer_until(&place, &bundle, PULLED, &[], continues);
     assert_eq!(code, Some(0), "{stderr}");
     let [hold] = holds(&printed)[..] else { panic!("{:?}", holds(&printed)) };
     assert_eq!(hold["device"], "tactile_tip");
@@ -221,7 +256,7 @@ fn a_policy_not_trained_without_a_sensor_holds_until_it_is_back_or_ignored() {
     let stopped = printed.iter().position(|event| std::ptr::eq(event, hold));
     assert!(acted > stopped, "it continues when the sensor is back");
 
-    let (code, printed, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s", "--ignore-missing"]);
+    let (code, printed, stderr) = infer_until(&place, &bundle, PULLED, &["--ignore-missing"], pulled_and_back);
     assert_eq!(code, Some(0), "{stderr}");
     assert!(holds(&printed).is_empty(), "{:?}", holds(&printed));
     assert!(of(&printed, "chunk").any(|chunk| chunk["mask"] == "0x05"));
@@ -295,7 +330,7 @@ fn the_policy_continues_without_the_wrist_camera_and_holds_without_both() {
     let place = Place::new();
     let pulled = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
                   [[event]]\nat = \"4s\"\nunplug = \"cam_wrist\"\n[[event]]\nat = \"8s\"\nunplug = \"tactile_tip\"\n";
-    let (code, printed, stderr) = infer(&place, BUNDLE, pulled, &["--duration", "12s"]);
+    let (code, printed, stderr) = infer_until(&place, BUNDLE, pulled, &[], |events| !holds(events).is_empty());
     assert_eq!(code, Some(0), "{stderr}");
     assert!(of(&printed, "chunk").any(|chunk| chunk["mask"] == "0x06"), "it is asked without the wrist camera");
     let [hold] = holds(&printed)[..] else { panic!("{:?}", holds(&printed)) };
@@ -309,8 +344,13 @@ fn the_policy_continues_without_the_wrist_camera_and_holds_without_both() {
 #[test]
 fn a_held_sensor_is_observed_as_it_was_and_then_not_at_all() {
     let place = Place::new();
-    let options = ["--hold-last", "1s", "--record", "--duration", "6s", "--out", "out"];
-    let (code, printed, stderr) = infer(&place, BUNDLE, PULLED, &options);
+    let options = ["--hold-last", "1s", "--record", "--out", "out"];
+    let ns = |chunk: &Value| chunk["observed_ns"].as_u64().expect("a time");
+    let is_gone = |events: &[Value]| {
+        let away = || of(events, "chunk").filter(|chunk| chunk["mask"] == "0x05").map(ns);
+        away().max() > away().min().map(|first| first + 1_100_000_000)
+    };
+    let (code, printed, stderr) = infer_until(&place, BUNDLE, PULLED, &options, is_gone);
     assert_eq!(code, recorded_code(&printed), "{stderr}");
     let seqs = |chunk: &Value| {
         let samples = chunk["samples"].as_array().expect("samples");
@@ -318,7 +358,6 @@ fn a_held_sensor_is_observed_as_it_was_and_then_not_at_all() {
         tactile["seqs"].as_array().expect("numbers").iter().filter_map(Value::as_u64).collect::<Vec<_>>()
     };
     let away: Vec<&Value> = of(&printed, "chunk").filter(|chunk| chunk["mask"] == "0x05").collect();
-    let ns = |chunk: &Value| chunk["observed_ns"].as_u64().expect("a time");
     let first = away.first().expect("it is asked without the sensor");
     let (held, gone): (Vec<&Value>, Vec<&Value>) = away.iter().partition(|chunk| ns(chunk) - ns(first) < 900_000_000);
     assert!(!held.is_empty() && !gone.is_empty(), "{away:?}");

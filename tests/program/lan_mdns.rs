@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use crate::support::Place;
 use crate::support::lan::{RIG, RUN, Server, camera, camera_entry, free_ports, life_of, stop, wait_for};
+use crate::support::skip::skipped;
 use mdns_sd::{ServiceDaemon, ServiceInfo};
 
 /// Announces a service until it is asked to send a goodbye or is killed: a process of its own, so that it can
@@ -40,7 +41,7 @@ impl Drop for Responder {
 }
 
 #[test]
-#[ignore = "a part of the test below, in a process of its own"]
+#[ignore = "run by an_announced_device_leaves_by_goodbye_and_by_lease"]
 fn announce_a_service() {
     let what = std::env::var("ANNOUNCE").expect("run by the test below");
     let (service, port) = what.split_once(' ').expect("service and port");
@@ -72,7 +73,7 @@ fn multicast_works() -> std::io::Result<()> {
 #[test]
 fn an_announced_device_leaves_by_goodbye_and_by_lease() {
     if let Err(error) = multicast_works() {
-        eprintln!("NOT CHECKED: multicast does not work on this machine ({error}), so nothing is found by mDNS");
+        skipped(&format!("multicast does not work on this machine ({error}), so nothing is found by mDNS"));
         return;
     }
     let (place, [port]) = (Place::new(), free_ports());
@@ -105,7 +106,7 @@ fn an_announced_device_leaves_by_goodbye_and_by_lease() {
 #[test]
 fn an_announced_device_is_found_when_its_entry_comes_later() {
     if let Err(error) = multicast_works() {
-        eprintln!("NOT CHECKED: multicast does not work on this machine ({error}), so nothing is found by mDNS");
+        skipped(&format!("multicast does not work on this machine ({error}), so nothing is found by mDNS"));
         return;
     }
     let (place, [port]) = (Place::new(), free_ports());

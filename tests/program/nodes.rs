@@ -4,11 +4,12 @@
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 
-use crate::support::{self, Episode, Place, events, logged};
+use crate::support::{self, Episode, Place, events, logged, until};
 use rapid::sample::Encoding;
 use rustix::process::Signal;
+use serde_json::Value;
 
 const SIM: [&str; 6] = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json"];
 /// Samples a second.
@@ -30,24 +31,38 @@ fn example(path: &str) -> PathBuf {
 }
 
 /// Records a program that counts and is replugged: what it publishes arrives, in order and on the clock of `rapid`.
-/// Each time it has 9 s or more to begin: Python takes seconds on a busy machine.
+/// A program that takes longer to begin than it is plugged in at first has half a minute at the next time.
 fn check_counter(place: &Place) {
-    place.write(
-        "sim.toml",
-        "[[event]]\nat = \"10s\"\nunplug = \"counter\"\n[[event]]\nat = \"11s\"\nplug = \"counter\"\n",
-    );
-    let output = place.run(&[&SIM[..], &["--record", "--out", "out", "--duration", "20s"]].concat());
-    let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
-    assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
-    let reported = events(&String::from_utf8_lossy(&output.stdout));
-    let states: Vec<&str> = reported.iter().filter_map(|event| event["state"].as_str()).collect();
-    assert_eq!(states, ["opening", "streaming", "absent", "opening", "streaming"], "{reported:#?}");
-    assert_eq!(logged(&reported, "counter: reads sim:").len(), 2, "{reported:#?}");
+    let events_of = "[[event]]\nat = \"3s\"\nunplug = \"counter\"\n[[event]]\nat = \"4s\"\nplug = \"counter\"\n";
+    place.write("sim.toml", &format!("repeat = \"30s\"\n{events_of}"));
+    let running = place.start(&[&SIM[..], &["--record", "--out", "out"]].concat(), "\"event\":\"recording\"");
+    let states = |reported: &[Value]| -> Vec<String> {
+        reported.iter().filter_map(|event| event["state"].as_str().map(str::to_owned)).collect()
+    };
+    let streams = |states: &[String]| states.iter().filter(|state| *state == "streaming").count();
+    until("two programs that were read", || streams(&states(&running.reported())) == 2);
+    // The second sends for a while, too.
+    let begun = place.published();
+    until("a second", || place.published() > begun + 500);
+    running.signal(Signal::INT);
+    let (code, output, errors) = running.end();
+    assert_eq!(code, support::recorded_code(&output), "{errors}");
+    let reported = events(&output);
+    let states = states(&reported);
+    assert_eq!((states[0].as_str(), streams(&states)), ("opening", 2), "{reported:#?}");
+    for pair in states.windows(2) {
+        let next: &[&str] = match pair[0].as_str() {
+            "opening" => &["streaming", "absent"],
+            "streaming" => &["absent"],
+            _ => &["opening"],
+        };
+        assert!(next.contains(&pair[1].as_str()), "{reported:#?}");
+    }
+    assert!(logged(&reported, "counter: reads sim:").len() >= 2, "{reported:#?}");
     assert!(logged(&reported, "was killed").is_empty(), "it ends on SIGTERM: {reported:#?}");
 
     let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
     let samples: Vec<_> = episode.topic("/rapid/counter").collect();
-    assert!(samples.len() > 100, "{} samples", samples.len());
     assert!(samples.windows(2).all(|pair| pair[1].sequence == pair[0].sequence + 1), "a hole in the samples");
     let numbers: Vec<[f64; 2]> = samples
         .iter()
@@ -76,6 +91,32 @@ fn a_program_in_python_reads_a_device() {
     check_counter(&place(&node, "channels = 2"));
 }
 
+/// A program that asks an actuator to go to 0.25, until dropped.
+#[cfg(target_arch = "x86_64")]
+struct Acting(std::process::Child);
+
+#[cfg(target_arch = "x86_64")]
+impl Acting {
+    fn start(python: &Path, place: &Place) -> Self {
+        let mut act = Command::new(python);
+        act.arg(example("python/act.py")).args(["600", "0.25"]).env("RAPID_INSTANCE", &place.instance);
+        Self(act.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("python"))
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Drop for Acting {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+fn position(payload: &[u8]) -> f64 {
+    f64::from_le_bytes(payload.try_into().expect("one number"))
+}
+
 #[test]
 #[cfg(target_arch = "x86_64")]
 fn an_actuator_in_python_follows_the_targets_of_another_program() {
@@ -85,22 +126,20 @@ fn an_actuator_in_python_follows_the_targets_of_another_program() {
     let place = place(&format!("node = \"process\"\non_attach = [{python:?}, {script:?}]"), action);
     place.write("sim.toml", "");
     let running = place.start(&[&SIM[..], &["--record", "--out", "out"]].concat(), "\"event\":\"recording\"");
-    let acted = Command::new(&python)
-        .arg(example("python/act.py"))
-        .args(["3", "0.25"])
-        .env("RAPID_INSTANCE", &place.instance)
-        .output()
-        .expect("python");
-    assert!(acted.status.success(), "{acted:?}");
+    let acting = Acting::start(&python, &place);
+    let partial = place.path("out").join(&place.files("out")[0]);
+    until("the target is reached", || {
+        let last = support::last_written(&partial, "/rapid/counter");
+        last.is_some_and(|last| (position(&last.payload()) - 0.25).abs() < 1e-9)
+    });
+    drop(acting);
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
     assert_eq!(code, support::recorded_code(&output), "{errors}");
     assert!(logged(&events(&output), "does not move").is_empty(), "the rig leaves it to the program: {output}");
 
     let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
-    let actions: Vec<_> = episode.topic("/action").collect();
-    assert!(actions.len() > 20, "{} actions in 3 s at 50 Hz", actions.len());
-    let position = |payload: &[u8]| f64::from_le_bytes(payload.try_into().expect("one number"));
+    assert!(episode.topic("/action").count() > 0);
     let positions: Vec<f64> = episode.topic("/rapid/counter").map(|sample| position(&sample.payload())).collect();
     let (first, last) = (positions.first().expect("samples"), positions.last().expect("samples"));
     assert!(*first < 0.2 && (last - 0.25).abs() < 1e-9, "from {first} to {last}");

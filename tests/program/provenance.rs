@@ -3,7 +3,8 @@
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
-use crate::support::{self, Episode, Place};
+use crate::support::{self, Episode, Place, until};
+use rustix::process::Signal;
 use serde_json::{Value, json};
 
 /// Two equal cameras, of which one is configured as late by three of its pictures, and a serial line.
@@ -52,11 +53,16 @@ fn recorded(place: &Place) -> Episode {
     let scenario = "[[device]]\nname = \"cam_wrist\"\nfirmware = \"2.07\"\n[[device]]\nname = \"cam_top\"\n\
                     serial = \"\"\n[[device]]\nname = \"motor_state\"\nserial = \"MOT-9\"\n";
     let scenario = place.write("play.toml", scenario).display().to_string();
-    let arguments =
-        ["--config", &registry, "--sim", &scenario, "--headless", "--record", "--duration", "3s", "--out", "out"];
-    let output = place.run(&[&arguments[..], &["--task", "place block", "--tag", "finger=soft"]].concat());
-    let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
-    assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
+    let arguments = ["--config", &registry, "--sim", &scenario, "--headless", "--json", "--record", "--out", "out"];
+    let arguments = [&arguments[..], &["--task", "place block", "--tag", "finger=soft"]].concat();
+    let running = place.start(&arguments, "\"event\":\"recording\"");
+    let streaming = || running.reported().iter().filter(|event| event["state"] == "streaming").count();
+    until("all three are streaming", || streaming() == 3);
+    let begun = place.published();
+    until("two seconds", || place.published() > begun + 1000);
+    running.signal(Signal::INT);
+    let (code, output, errors) = running.end();
+    assert_eq!(code, support::recorded_code(&output), "{errors}");
     let files = place.files("out");
     let [file] = files.as_slice() else { panic!("{files:?}") };
     Episode::read(&place.path("out").join(file))
@@ -116,38 +122,55 @@ fn an_episode_names_unit_driver_format_controls_latency_registry_and_software() 
     }
 }
 
+/// A picture of the file: its number, and when it was captured and received, wall clock, ns.
+struct Picture {
+    seq: u64,
+    captured: u64,
+    received: u64,
+}
+
 #[test]
 fn frames_take_samples_of_a_camera_with_latency_from_later() {
-    const PERIOD_NS: i64 = 1_000_000_000 / 30;
+    const LATENCY_NS: u64 = 100_000_000;
+    /// The recorder waits so long for samples of a frame, at least.
+    const WAITS_NS: u64 = 100_000_000;
     let place = Place::new();
     let episode = recorded(&place);
-    let registry = [("cam_top", 0_u32), ("cam_wrist", 4)];
-    // Where the sample that a frame names was captured, seen from the frame's moment.
-    let offsets = registry.map(|(name, bit)| {
-        let captured: std::collections::BTreeMap<u64, u64> = episode
+    let mut taken = [Vec::new(), Vec::new()];
+    for (taken, (name, bit, latency)) in taken.iter_mut().zip([("cam_top", 0, 0), ("cam_wrist", 4, LATENCY_NS)]) {
+        let pictures: Vec<Picture> = episode
             .topic(&format!("/rapid/camera/{name}"))
-            .map(|message| (u64::from(message.sequence), message.log_time))
+            .map(|picture| Picture {
+                seq: picture.sequence.into(),
+                captured: picture.log_time,
+                received: picture.publish_time,
+            })
             .collect();
-        let mut offsets = Vec::new();
         for (message, frame) in episode.frames() {
             let slot = frame.modalities.iter().find(|slot| slot.bit == bit).expect("every modality is in every frame");
-            let Some(capture) = slot.seq.filter(|_| slot.valid).and_then(|seq| captured.get(&seq)) else { continue };
-            offsets.push((message.log_time, capture.cast_signed() - message.log_time.cast_signed()));
+            let Some(seq) = slot.seq.filter(|_| slot.valid) else { continue };
+            // Nearest to the frame's moment, or to 100 ms after it; the file keeps the capture times.
+            let wanted = message.log_time + latency;
+            let nearest = pictures.iter().min_by_key(|picture| picture.captured.abs_diff(wanted)).expect("a picture");
+            // One that a busy machine delivered too late for it is in no frame.
+            if nearest.seq != seq && nearest.received > wanted + WAITS_NS {
+                continue;
+            }
+            let chosen = pictures.iter().find(|picture| picture.seq == seq).expect("it is in the file");
+            assert_eq!(
+                chosen.captured.abs_diff(wanted),
+                nearest.captured.abs_diff(wanted),
+                "{name}: frame at {}: picture {seq}, and {} is the nearest",
+                message.log_time,
+                nearest.seq
+            );
+            taken.push((message.log_time, chosen.captured));
         }
-        assert!(offsets.len() >= 60, "{name}: {} frames of 3 s at 30 Hz", offsets.len());
-        offsets
-    });
-    let [on_time, late] = &offsets;
-    // Nearest to the frame's moment, or to 100 ms after it; the file keeps the capture times.
-    for (frames, latency) in [(on_time, 0_i64), (late, 100_000_000)] {
-        let near = frames.iter().filter(|(_, offset)| (offset - latency).abs() <= PERIOD_NS / 2 + 1);
-        assert!(near.count() * 10 >= frames.len() * 9, "{latency} ns: {frames:?}");
+        assert!(!taken.is_empty(), "no frame has a picture of {name}");
     }
-    // Both cameras take their pictures at the same moments: those of a frame are three pictures apart.
-    let apart = on_time.iter().filter_map(|(tick, first)| {
-        let (_, second) = late.iter().find(|(other, _)| other == tick)?;
-        Some(second - first)
-    });
-    let (three, others): (Vec<i64>, Vec<i64>) = apart.partition(|apart| (apart - 3 * PERIOD_NS).abs() < 1_000);
-    assert!(three.len() >= 60 && three.len() >= 9 * others.len(), "{} frames, and {others:?}", three.len());
+    // What is late shows the same moment in a picture of later.
+    let [on_time, late] = &taken;
+    let both =
+        on_time.iter().filter_map(|(tick, first)| Some((first, late.iter().find(|(other, _)| other == tick)?.1)));
+    assert!(both.clone().count() > 0 && both.clone().all(|(first, second)| second > *first), "no frame has both");
 }

@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use crate::support::skip::skipped;
 use crate::support::tmux::{PROMPT, Pane, Tmux};
 use crate::support::{Episode, Place, Running, until};
 use rustix::process::{Signal, kill_process};
@@ -227,7 +228,7 @@ fn episodes_are_discarded_taken_back_repeated_marked_labelled_and_noted() {
 fn a_disk_that_fills_up_is_seen_and_the_monitor_stays() {
     let may = std::process::Command::new("unshare").args(["-Urm", "true"]).output();
     if !may.is_ok_and(|output| output.status.success()) {
-        eprintln!("SKIPPED: no disk can be mounted here (unshare -Urm)");
+        skipped("no disk can be mounted here (unshare -Urm)");
         return;
     }
     let place = place();

@@ -2,7 +2,7 @@
 //!
 //! Tests with a `/dev/shm` of their own mount one in a namespace of their own, which needs root.
 
-#![allow(clippy::expect_used, clippy::print_stdout, reason = "what fails here fails a test, or names what is missing")]
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
 use std::fs::File;
 use std::io::Write;
@@ -11,6 +11,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use crate::support::skip::skipped;
 use crate::support::{self, Episode, Place, Running, python, until};
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::process::Signal;
@@ -60,7 +61,7 @@ fn may_mount() -> bool {
     let tried = Command::new("unshare").args(["-m", "mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]).output();
     let may = tried.is_ok_and(|tried| tried.status.success());
     if !may {
-        println!("NOT CHECKED: a /dev/shm of its own needs root");
+        skipped("a /dev/shm of its own needs root");
     }
     may
 }

@@ -72,6 +72,11 @@ impl Server {
         });
         Self { stop, connections, thread: Some(thread) }
     }
+
+    /// How many connections there have been.
+    pub(crate) fn connections(&self) -> usize {
+        self.connections.lock().expect("no panic").len()
+    }
 }
 
 impl Drop for Server {

@@ -4,6 +4,8 @@
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
 pub(crate) mod lan;
+pub(crate) mod onnx;
+pub(crate) mod skip;
 pub(crate) mod terminal;
 pub(crate) mod tmux;
 
@@ -30,6 +32,16 @@ pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
         assert!(begun.elapsed() < PATIENCE, "{what}: not met in time");
         std::thread::sleep(Duration::from_millis(5));
     }
+}
+
+/// Waits for what `found` gives.
+pub(crate) fn wait_for<T>(what: &str, mut found: impl FnMut() -> Option<T>) -> T {
+    let mut there = None;
+    until(what, || {
+        there = found();
+        there.is_some()
+    });
+    there.expect(what)
 }
 
 /// The Python of `make setup`.
@@ -112,6 +124,16 @@ impl Place {
 
     pub(crate) fn mask_file(&self) -> PathBuf {
         PathBuf::from(format!("/dev/shm/rapid_hardware_mask.{}", self.instance))
+    }
+
+    /// The number of the last mask that a run in this place has published: there are 500 in a second.
+    pub(crate) fn published(&self) -> u64 {
+        wait_for("whole mask record", || {
+            let record = std::fs::read(self.mask_file()).ok()?;
+            // Odd while it is being written.
+            (record.len() == 32 && record[6] % 2 == 0)
+                .then(|| u64::from_le_bytes(record[24..].try_into().expect("eight bytes")))
+        })
     }
 
     /// Names of the bus's files in shared memory that belong to this instance: iceoryx2 starts all of them with the
@@ -274,6 +296,26 @@ pub(crate) struct Message {
     pub(crate) log_time: u64,
     pub(crate) publish_time: u64,
     pub(crate) data: Vec<u8>,
+}
+
+/// The last message of a topic in a file that is being written, read up to where it is not whole.
+pub(crate) fn last_written(partial: &Path, topic: &str) -> Option<Message> {
+    let bytes = std::fs::read(partial).expect("a file");
+    let unfinished = mcap::read::Options::IgnoreEndMagic.into();
+    let records = mcap::read::ChunkFlattener::new_with_options(&bytes, unfinished).ok()?;
+    let (mut channel, mut last) = (None, None);
+    for record in records.map_while(Result::ok) {
+        match record {
+            mcap::records::Record::Channel(found) if found.topic == topic => channel = Some(found.id),
+            mcap::records::Record::Message { header, data } if Some(header.channel_id) == channel => {
+                last = Some((header, data.into_owned()));
+            }
+            _ => {}
+        }
+    }
+    let (header, data) = last?;
+    let mcap::records::MessageHeader { sequence, log_time, publish_time, .. } = header;
+    Some(Message { topic: topic.to_owned(), sequence, log_time, publish_time, data })
 }
 
 impl Episode {

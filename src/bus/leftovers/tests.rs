@@ -46,8 +46,9 @@ fn a_file_name_identifies_its_owner() {
 
 /// Not a test of its own: a process on the bus `RAPID_TEST_BUS`, which stays there or ends.
 #[test]
+#[ignore = "run by files_of_a_living_process_are_kept_and_damage_to_them_is_reported"]
 fn helper() {
-    let Ok(name) = std::env::var("RAPID_TEST_BUS") else { return };
+    let name = std::env::var("RAPID_TEST_BUS").unwrap();
     let registry = registry(16);
     let opened = Bus::open(&registry, Some(&name)).and_then(|bus| Ok((bus.inbox()?, bus)));
     match opened {
@@ -65,7 +66,7 @@ fn helper() {
 
 fn member(name: &str, stays: bool) -> (Child, String) {
     let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["--exact", "bus::leftovers::tests::helper", "--nocapture"]).env("RAPID_TEST_BUS", name);
+    command.args(["--exact", "bus::leftovers::tests::helper", "--ignored", "--nocapture"]).env("RAPID_TEST_BUS", name);
     if stays {
         command.env("RAPID_TEST_STAY", "");
     }
