@@ -23,7 +23,7 @@ TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' R
 TESTS := cargo test --locked --workspace
 # What `make quick` runs, and what it leaves out: of the unit tests those that try every byte of a file or hundreds of pictures,
 # of the tests of the program those that wait for long, or need Python or C.
-QUICK := --lib --test layering --test library --test memory --test guard --test short
+QUICK := --exclude rapid-node --lib --test layering --test library --test memory --test guard --test short
 EXHAUSTIVE := compare::tests damage::an_index damage::a_file_inside damage::every_message damaged_files_never_panic \
 	every_flipped_bit a_flipped_bit_loses unread_bytes_are a_truncated_or_damaged_file touch::tests::no
 SLOW := calibrate compare demonstrate docs ends export hooks infer json kill lan lan_gopro many_devices nodes observe plot process python scenarios screen second_run shared_memory stops task verdict web
@@ -57,7 +57,7 @@ picture: setup ## take docs/monitor.svg and docs/device.svg again, from the prog
 
 quick: setup-build ## by habit: format, lints, unit tests, layering, registry, the fast tests of the program; leaves out $(SLOW)
 	cargo fmt --all --check
-	$(TESTED) $(TESTS) $(QUICK) -- $(EXHAUSTIVE:%=--skip=%)
+	$(TESTED) RUST_TEST_THREADS=$$((4 * $$(nproc))) $(TESTS) $(QUICK) -- $(EXHAUSTIVE:%=--skip=%)
 	$(TESTED) RUST_TEST_THREADS=$$((4 * $$(nproc))) $(TESTS) --test program -- $(SLOW:%=--skip=%::)
 
 one: ## run one test by its name, with its output: TEST=name (of a test or of a module, the virtual bench's too)
