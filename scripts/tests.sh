@@ -6,6 +6,7 @@
 # 3. The tests of the host run, which wait more than they compute.
 #
 # Guests are judged by virtual time and need no idle machine; the tests of the host judge no time, but are waited for less on one.
+# At the end it lists which tests were skipped.
 #
 #     tests.sh cargo test --locked --workspace
 #
@@ -31,11 +32,14 @@ idle() {
 make_guest() { TMPDIR=${RAPID_OUTER_TMPDIR:-/tmp} "$here/setup.sh" image; }
 jobs=()
 output=$(mktemp)
+# Tests add lines to it (tests/support/skip.rs).
+RAPID_SKIPPED=$(mktemp)
+export RAPID_SKIPPED
 finish() {
     local job
     for job in "${jobs[@]}"; do kill -- "-$job" 2>/dev/null && wait "$job" || true; done
     cat "$output"
-    rm -f "$output"
+    rm -f "$output" "$RAPID_SKIPPED"
 }
 trap finish EXIT
 # In process groups of their own: a signal that ends this script also ends the bench and its machines.
@@ -71,4 +75,8 @@ wait "$bench" || code=1
 for unit in $units; do
     (cd "$package" && "$unit") || { code=1; echo "error: $unit failed"; }
 done
+"$here/models-tests.sh" || code=1
+cat "$output"
+: >"$output"
+"$here/skips.sh" "$RAPID_SKIPPED" || code=1
 exit "$code"

@@ -58,6 +58,9 @@ fn printed(outcome: &Outcome, word: &str) -> u64 {
 
 #[test]
 fn a_full_bus_is_recorded_and_disturbs_no_other_device() {
+    if crate::lacks_virtual_time() {
+        return;
+    }
     let adapter = |protocol, serial| DeviceSpec::can(protocol).serial(serial);
     let outcome = play(
         Scenario::new("adapters")

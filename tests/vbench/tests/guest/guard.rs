@@ -60,6 +60,9 @@ fn round<'a>(outcome: &'a Outcome, device: u64, word: &str) -> Vec<&'a Value> {
 
 #[test]
 fn motors_of_a_killed_program_stop_before_their_own_time_limit() {
+    if crate::lacks_virtual_time() {
+        return;
+    }
     let adapter = |protocol, serial| DeviceSpec::can(protocol).serial(serial).motor(0x05, 0x15, "DM4310");
     let kinds = [("socketcan", "1d50:606f", "CAN1"), ("slcan", "ad50:60c4", "CAN2"), ("damiao", "2e88:4603", "CAN3")];
     let mut scenario = Scenario::new("guard")

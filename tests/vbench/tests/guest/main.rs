@@ -1,6 +1,6 @@
 //! Scenarios of the virtual bench, each in a boot of the guest unless its file describes another way.
 //!
-//! They wait for each other: one guest runs at a time ([`vbench::guest`]). While it does, another one is prepared or judged.
+//! As many run at a time as the kind of guest permits ([`vbench::guest`]). While they do, others are prepared or judged.
 
 mod accidents;
 mod adapters;
@@ -20,6 +20,20 @@ mod motors;
 mod policy;
 mod scenarios;
 mod service;
+#[path = "../../../support/skip.rs"]
+mod skip;
 mod streams;
 mod strings;
 mod unprivileged;
+
+use vbench::guest::Image;
+
+/// Whether a scenario whose motors or policy have the product's own limits of time cannot be run here, which is then reported: an
+/// emulated processor does not keep them.
+fn lacks_virtual_time() -> bool {
+    let guest = Image::locate().unwrap_or_else(|error| panic!("{error}"));
+    if !guest.is_virtual() {
+        skip::skipped("needs virtual time, and guests here are emulated machines");
+    }
+    !guest.is_virtual()
+}

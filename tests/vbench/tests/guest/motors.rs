@@ -98,6 +98,9 @@ fn actions<'a>(lines: &'a [Value], action: &str) -> Vec<&'a Value> {
 
 #[test]
 fn motors_move_after_an_arm_and_at_no_other_time() {
+    if crate::lacks_virtual_time() {
+        return;
+    }
     let adapter = DeviceSpec::can(Protocol::GsUsb).serial("CAN1");
     let outcome = play(
         Scenario::new("motors")

@@ -73,6 +73,9 @@ exit 0
 
 #[test]
 fn a_policy_continues_without_the_tactile_camera_and_uses_it_again() {
+    if crate::lacks_virtual_time() {
+        return;
+    }
     let demonstration = demonstration();
     let feeds = [(WRIST, pictures(&demonstration, WRIST)), (TACTILE, pictures(&demonstration, TACTILE))];
     let outcome = play(scenario(&demonstration, &feeds));
