@@ -36,10 +36,8 @@ part() { # NAME COMMAND...
 skip() { table+=("skipped  $1: $2"); }
 
 "$@" --no-run --test guest --test smoke
-guests() { RAPID_VBENCH_BACKEND=$1 "${cargo[@]}" --test guest -- --test-threads=2 "${@:2}"; }
-cargo=("$@")
-part "guests on an emulated machine" guests qemu "${second[@]}"
-part "90 cycles" guests uml --ignored
+part "guests on an emulated machine" env RAPID_VBENCH_BACKEND=qemu "$@" --test guest -- --test-threads=2 "${second[@]}"
+part "90 cycles" "$@" --test guest -- --ignored
 part "sections of make bench on a guest" "$@" -p rapid-bench --test smoke -- --ignored
 part "cargo features" scripts/features.sh '' export foxglove lan motors policy web
 part "fuzzing" env FUZZ_SECONDS="${FUZZ_SECONDS:-20}" scripts/fuzz.sh

@@ -239,8 +239,31 @@ fn the_lock_of_rapid_remote_has_what_every_program_needs() {
     );
 }
 
-/// A test that the harness leaves out would be missed by nobody: whatever is left out is a part of another test, which runs
-/// it in a process of its own.
+/// Tests in documentation are not compiled (`doctest = false`): an example in Rust belongs to `examples/`, or is a test.
+#[test]
+fn no_comment_has_an_example_in_rust() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut files = BTreeMap::new();
+    for folder in ["src", "tests", "examples"] {
+        collect(root, &root.join(folder), &mut files).unwrap();
+    }
+    let found: Vec<_> = files.iter().flat_map(|(path, text)| examples(text).map(move |line| (path, line))).collect();
+    assert!(found.is_empty(), "examples that nothing compiles: {found:#?}");
+}
+
+/// The lines at which an example in Rust begins, in the documentation of a file.
+fn examples(text: &str) -> impl Iterator<Item = usize> {
+    let fences = text.lines().enumerate().filter_map(|(at, line)| {
+        let line = line.trim_start();
+        let comment = line.strip_prefix("///").or_else(|| line.strip_prefix("//!"))?;
+        Some((at + 1, comment.trim().strip_prefix("```")?))
+    });
+    // Every second one is an end.
+    fences.step_by(2).filter(|(_, language)| !["text", "toml", "mermaid"].contains(language)).map(|(line, _)| line)
+}
+
+/// A test that the harness leaves out would be missed by no one: whatever is left out is a part of another test, which runs
+/// it in a process of its own, or is run by `make test-all`.
 #[test]
 fn a_test_that_is_ignored_is_run_by_another_one() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -248,8 +271,19 @@ fn a_test_that_is_ignored_is_run_by_another_one() {
     for folder in ["src", "tests", "examples"] {
         collect(root, &root.join(folder), &mut files).unwrap();
     }
+    let nightly = fs::read_to_string(root.join("scripts/tests-all.sh")).unwrap();
+    let is_nightly = |path: &Path, reason: &str| reason == "run by make test-all" && runs_ignored(&nightly, path);
     let hidden: Vec<_> = files.iter().flat_map(|(path, text)| hidden(text).map(move |reason| (path, reason))).collect();
+    let hidden: Vec<_> = hidden.into_iter().filter(|(path, reason)| !is_nightly(path, reason)).collect();
     assert!(hidden.is_empty(), "ignored, and not with the reason `run by NAME` of a test of that file: {hidden:#?}");
+}
+
+/// Whether this script runs what the test program with this file ignores.
+fn runs_ignored(script: &str, file: &Path) -> bool {
+    // tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
+    let program = file.iter().skip_while(|part| *part != "tests").skip(1).skip_while(|part| *part != "tests").nth(1);
+    let program = program.map(|name| Path::new(name).file_stem().unwrap().to_string_lossy()).unwrap_or_default();
+    script.lines().any(|line| line.contains(&format!("--test {program} ")) && line.contains("--ignored"))
 }
 
 /// The reasons of tests in a file that are ignored and that no other test of it runs.
@@ -700,6 +734,13 @@ mod the_check_itself {
         finds("mask.rs", "use tokio::sync::watch;", &["1: crate `tokio`"]);
         finds("time.rs", "use rustix::time::ClockId;", &[]);
         finds("sample.rs", "use rustix::time::ClockId;", &["1: crate `rustix`"]);
+    }
+
+    #[test]
+    fn examples_are_found() {
+        let text = "//! ```text\n//! a\n//! ```\nfn f() {}\n/// ```\n/// f();\n/// ```\n/// ```rust\n/// ```\n// ```\n";
+        assert_eq!(examples(text).collect::<Vec<_>>(), [5, 8]);
+        assert_eq!(examples("/// ```toml\n/// ```\n").count(), 0);
     }
 
     #[test]

@@ -42,7 +42,8 @@ fn every_section_that_needs_no_guest_measures() {
 }
 
 #[test]
-#[ignore = "its guests are emulated machines: make test-all"]
+// Its guests are emulated machines.
+#[ignore = "run by make test-all"]
 fn the_sections_on_the_virtual_bench_measure() {
     measured(&["cycles", "sweep"]);
 }

@@ -19,7 +19,8 @@ const SEED: u64 = 0x5eed_2026;
 
 /// 90 cycles over three devices in three stretches after a warm-up; two of the devices end plugged, one unplugged.
 #[test]
-#[ignore = "too long for every day: make test-all"]
+// Too long for every day.
+#[ignore = "run by make test-all"]
 fn ninety_cycles_leave_a_correct_mask_and_nothing_else() {
     let mut random = Random(SEED);
     let script = (1..=6).fold(SCRIPT.to_owned(), |script, number| {
