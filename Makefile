@@ -25,7 +25,7 @@ TESTS := cargo test --locked --workspace
 # of the tests of the program those that wait for long, or need Python or C; whole programs of tests that allocate or time motors.
 QUICK := --exclude rapid-node --lib --test layering --test library
 EXHAUSTIVE := compare::tests damage::an_index damage::a_file_inside damage::every_message damaged_files_never_panic \
-	every_flipped_bit a_flipped_bit_loses unread_bytes_are a_truncated_or_damaged_file touch::tests::no
+	every_flipped_bit a_flipped_bit_loses unread_bytes_are a_truncated_or_damaged_file
 SLOW := alone calibrate compare demonstrate docs ends export foxglove hooks infer json kill lan lan_gopro lan_hostile lan_mdns many_devices nodes observe plot process python scenarios screen second_run shared_memory stops task verdict web
 
 help: ## this list

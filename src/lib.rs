@@ -21,6 +21,9 @@ pub mod device;
 pub mod disk;
 pub mod dispatch;
 pub mod driver;
+#[cfg(test)]
+#[path = "../tests/support/effort.rs"]
+mod effort;
 pub mod episode;
 #[cfg(feature = "export")]
 pub mod export;

@@ -280,10 +280,12 @@ fn a_test_that_is_ignored_is_run_by_another_one() {
 
 /// Whether this script runs what the test program with this file ignores.
 fn runs_ignored(script: &str, file: &Path) -> bool {
-    // tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
+    // src/simulation/task/touch.rs, tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
     let program = file.iter().skip_while(|part| *part != "tests").skip(1).skip_while(|part| *part != "tests").nth(1);
-    let program = program.map(|name| Path::new(name).file_stem().unwrap().to_string_lossy()).unwrap_or_default();
-    script.lines().any(|line| line.contains(&format!("--test {program} ")) && line.contains("--ignored"))
+    let program =
+        program.map(|name| format!("--test {} ", Path::new(name).file_stem().unwrap_or(name).to_string_lossy()));
+    let program = program.unwrap_or_else(|| "--lib ".to_owned());
+    script.lines().any(|line| line.contains(&program) && line.contains("--ignored"))
 }
 
 /// The reasons of tests in a file that are ignored and that no other test of it runs.

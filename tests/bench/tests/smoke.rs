@@ -28,6 +28,8 @@ fn measured(sections: &[&str]) -> Vec<serde_json::Value> {
 }
 
 #[test]
+// Minutes of an unoptimised program.
+#[ignore = "run by make test-all"]
 fn every_section_that_needs_no_guest_measures() {
     let sections = [
         "start", "infer", "sync", "picture", "policy", "control", "motors", "safety", "disarm", "can", "eval",
