@@ -48,7 +48,7 @@ done
 
 # shellcheck disable=SC2206 # a target is a word or two
 targets=(${targets[*]})
-[[ -z $guest ]] || { export RUST_TEST_THREADS=2; echo "one.sh: this boots the guest of the virtual bench (about a minute)" >&2; }
+[[ -z $guest ]] || { RUST_TEST_THREADS=$(nproc); export RUST_TEST_THREADS; }
 if [[ $all ]]; then "$@" --no-run; elif [[ ${#beside[@]} -gt 0 ]]; then "$@" --no-run "${targets[@]}" "${beside[@]}"; fi
 output=$(mktemp)
 trap 'rm -f "$output"' EXIT

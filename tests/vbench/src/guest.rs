@@ -140,11 +140,12 @@ impl Image {
     }
 
     /// Runs the guest with `share` as its share, and waits until its script has ended and the machine is off. The script may
-    /// take `limit` by the guest's clock.
-    pub fn run(&self, share: &Path, init: Init, limit: Duration) -> Result<Boot, GuestError> {
+    /// take `limit` by the guest's clock. Where that is virtual, the guest is ended after `wall` of the host's time: a limit of a
+    /// clock that stands still never comes.
+    pub fn run(&self, share: &Path, init: Init, limit: Duration, wall: Duration) -> Result<Boot, GuestError> {
         write(share.join("limit"), &limit.as_secs().max(1).to_string())?;
         let ran = match &self.backend {
-            Backend::Uml(uml) => uml.run(share, init)?,
+            Backend::Uml(uml) => uml.run(share, init, wall)?,
             Backend::Qemu(qemu) => qemu.run(share, init, limit)?,
         };
         let number = |name: &str| fs::read_to_string(share.join(name)).ok();

@@ -23,9 +23,6 @@ use rustix::thread::{CpuSet, sched_getaffinity};
 
 use super::{GuestError, Init, LOOKS_EVERY, Ran, lock, wait};
 
-/// The longest that a guest may take of the host's time. Those of `make test` take 3 to 30 s of a processor, and on a machine whose
-/// processors have ten other programs each, without a priority, ten times as long.
-const WALL: Duration = Duration::from_mins(15);
 /// `usbcore.autosuspend=-1`: resuming an emulated camera resets it, which can look like a replug.
 const KERNEL_ARGUMENTS: [&str; 16] = [
     "time-travel=inf-cpu",
@@ -57,12 +54,12 @@ pub(super) struct Uml {
 }
 
 impl Uml {
-    pub(super) fn run(&self, share: &Path, init: Init) -> Result<Ran, GuestError> {
+    pub(super) fn run(&self, share: &Path, init: Init, limit: Duration) -> Result<Ran, GuestError> {
         let processor = Processor::take(self.root.parent().unwrap_or(&self.root))?;
         let started = Instant::now();
         let mut machine = Machine::start(self.command(share, init, processor.number)?)?;
-        let ended = wait(&mut machine.kernel.0, WALL);
-        Ok(Ran { wall: started.elapsed(), limit: WALL, ended })
+        let ended = wait(&mut machine.kernel.0, limit);
+        Ok(Ran { wall: started.elapsed(), limit, ended })
     }
 
     fn command(&self, share: &Path, init: Init, processor: usize) -> Result<Command, GuestError> {

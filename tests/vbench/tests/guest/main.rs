@@ -11,6 +11,7 @@ mod buttons;
 mod calibrate;
 mod commands;
 mod deaf_child;
+mod endless;
 mod endurance;
 mod guard;
 mod hub;

@@ -11,15 +11,18 @@ use vbench::outcome::Outcome;
 use vbench::recording::{Edge, falls, missing};
 use vbench::scenario::Scenario;
 
-/// Two cameras of different formats and both serial kinds: nodes, udev properties, frames, and the way back.
+/// Two cameras of different formats, both serial kinds, a chip with lines, a virtual CAN bus: nodes, udev properties, frames, and the
+/// way back.
 #[test]
 fn bench_shows_the_guest_real_devices() {
     let script = r#"
-emu plug 0 1 2 3
-wait_for 60 attached 0 1 2 3 || fail 'not attached'
-wait_for 30 test -e /dev/video2 -a -e /dev/ttyACM0 -a -e /dev/ttyUSB0
+emu plug 0 1 2 3 4
+wait_for 60 attached 0 1 2 3 4 || fail 'not attached'
+wait_for 30 test -e /dev/video2 -a -e /dev/ttyACM0 -a -e /dev/ttyUSB0 -a -c /dev/gpiochip0 || fail "not all nodes: $(ls /dev)"
 udevadm settle
-for node in video0 video2 ttyACM0 ttyUSB0; do
+modprobe vcan
+ip link add vcan0 type vcan && ip link set vcan0 up || fail 'no vcan'
+for node in video0 video1 video2 ttyACM0 ttyUSB0; do
   echo "$node $(property /dev/$node ID_SERIAL_SHORT) $(property /dev/$node ID_VENDOR_ID):$(property /dev/$node ID_MODEL_ID) $(property /dev/$node ID_V4L_CAPABILITIES)"
 done >$out/nodes
 "${usbemu[@]}" --read /dev/video0 90 >$out/mjpg.json
@@ -36,10 +39,10 @@ done
 wait $silent
 emu silent 0 0
 "${usbemu[@]}" --read /dev/video0 5 >$out/again.json
-emu unplug 0 1 2 3
-wait_for 30 detached 0 1 2 3 || fail 'still attached'
+emu unplug 0 1 2 3 4
+wait_for 30 detached 0 1 2 3 4 || fail 'still attached'
 udevadm settle
-ls /dev | grep -E '^(video|ttyACM|ttyUSB)' >$out/left
+ls /dev | grep -E '^(video|ttyACM|ttyUSB|gpiochip)' >$out/left
 emu port 0 6
 emu plug 0
 wait_for 30 attached 6 || fail 'not in the other port'
@@ -52,13 +55,20 @@ exit 0
             .device(DeviceSpec::uvc(0x046d, 0x0825).mode(Format::Yuyv, 320, 240, &[15]))
             .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"))
             .device(DeviceSpec::ftdi(0x0403, 0x6001, 50.0).serial("FT1"))
+            .device(DeviceSpec::gpio().serial("GPIO1"))
             .script(script),
     );
     assert_eq!(outcome.code, 0, "{}", outcome.log);
     assert!(outcome.emulator_errors().is_empty());
 
     let nodes = outcome.file("nodes");
-    for line in ["video0 CAM00A1 046d:0825 :capture:", "ttyACM0 TOF1 2e8a:000a ", "ttyUSB0 FT1 0403:6001 "] {
+    // The second node of a camera is for metadata.
+    for line in [
+        "video0 CAM00A1 046d:0825 :capture:",
+        "video1 CAM00A1 046d:0825 :",
+        "ttyACM0 TOF1 2e8a:000a ",
+        "ttyUSB0 FT1 0403:6001 ",
+    ] {
         assert!(nodes.lines().any(|found| found == line), "{line} not in:\n{nodes}");
     }
     // A device without a serial descriptor has no short serial either.
