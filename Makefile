@@ -68,7 +68,7 @@ test: setup-test ## the whole truth: format, lints, all tests with the virtual b
 	cargo fmt --all --check
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
-# Each part is run even if one before it failed; the last lines are a table.
+# Each part after `test` is run even if one before it failed; the last lines are a table.
 test-all: setup-all test ## before a release and at night: make test, then guests on an emulated machine, 90 cycles, features, fuzzing and more
 	$(TESTED) scripts/tests-all.sh $(TESTS)
 

@@ -171,7 +171,7 @@ guest() {
         [[ -z $said ]] || report "$said"
         return
     fi
-    guest_of uml || code=$?
+    guest_of "${RAPID_VBENCH_BACKEND:-uml}" || code=$?
     case $code in
         0) return ;;
         4) ;;

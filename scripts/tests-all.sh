@@ -39,8 +39,8 @@ skip() { table+=("skipped  $1: $2"); }
 part "guests on an emulated machine" env RAPID_VBENCH_BACKEND=qemu "$@" --test guest -- --test-threads=2 "${second[@]}"
 part "90 cycles" "$@" --test guest -- --ignored
 part "sections of make bench" "$@" --test smoke -- --ignored
-part "unit tests, each case of them" env RAPID_THOROUGH=1 "$@" --lib --package rapid
-part "statistics of the simulated touch" "$@" --lib --package rapid -- --ignored touch::
+part "unit tests, each case of them" env RAPID_THOROUGH=1 "$@" --lib
+part "statistics of the simulated touch" "$@" --lib -- --ignored touch::
 part "cargo features" scripts/features.sh '' export foxglove lan motors policy web
 part "fuzzing" env FUZZ_SECONDS="${FUZZ_SECONDS:-20}" scripts/fuzz.sh
 if [[ -x $cache/train-venv/bin/python ]]; then part "train-test" make train-test; else skip train-test "its Python is not there: make train-test fetches 6 GB"; fi

@@ -280,12 +280,14 @@ fn a_test_that_is_ignored_is_run_by_another_one() {
 
 /// Whether this script runs what the test program with this file ignores.
 fn runs_ignored(script: &str, file: &Path) -> bool {
-    // src/simulation/task/touch.rs, tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
-    let program = file.iter().skip_while(|part| *part != "tests").skip(1).skip_while(|part| *part != "tests").nth(1);
-    let program =
-        program.map(|name| format!("--test {} ", Path::new(name).file_stem().unwrap_or(name).to_string_lossy()));
-    let program = program.unwrap_or_else(|| "--lib ".to_owned());
-    script.lines().any(|line| line.contains(&program) && line.contains("--ignored"))
+    // src/simulation/task/touch.rs, tests/program/x.rs, tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
+    let parts: Vec<String> = file.with_extension("").iter().map(|part| part.to_string_lossy().into_owned()).collect();
+    let program = parts.iter().rposition(|part| part == "tests").and_then(|last| parts.get(last + 1));
+    let program = program.filter(|_| parts.iter().all(|part| part != "src"));
+    script.lines().filter(|line| line.contains("--ignored")).any(|line| match program {
+        Some(program) => line.contains(&format!("--test {program} ")),
+        None => line.contains("--lib ") && parts.last().is_some_and(|module| line.ends_with(&format!(" {module}::"))),
+    })
 }
 
 /// The reasons of tests in a file that are ignored and that no other test of it runs.

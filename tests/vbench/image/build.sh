@@ -13,6 +13,8 @@
 # qemu: an emulated machine with the distribution's own kernel, for a second opinion. Needs qemu/packages.txt.
 # Both need root, or unprivileged user namespaces with a range of ids, or sudo.
 set -euo pipefail
+# Ordinary users of the guest read its root.
+umask 022
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cache=${RAPID_VBENCH_DIR:-${XDG_CACHE_HOME:-$HOME/.cache}/rapid/vbench}
 export PATH=$PATH:/sbin:/usr/sbin
@@ -24,34 +26,51 @@ key() { (cd "$here" && sha256sum $@ | sha256sum | cut -c1-12); }
 readonly root=$cache/root-$suite-$(key rootfs.sh uml/root.sh guest-init.sh guest-packages.txt)
 readonly kernel=$cache/kernel-$(key uml/kernel.sh uml/kernel.config)
 readonly machine=$cache/qemu-$suite-$(key rootfs.sh guest-init.sh guest-packages.txt 'qemu/*')
-# Why there is no User-Mode Linux on this machine; removed by hand, or by a change of what it is made of.
-readonly impossible=$cache/no-${kernel##*/}
+# Why there is no User-Mode Linux on this machine. What may be otherwise later (a network that is down) counts for an hour.
+readonly impossible=$cache/no-${kernel##*/} for_now=$cache/no-${kernel##*/}-now
 
 step() { echo "vbench image: $*" >&2; }
 die() { step "error: $*"; exit 1; }
+
+[[ $cache != *[[:space:]]* ]] || die "the kernel's command line takes no folder with a space: set RAPID_VBENCH_DIR to another one than $cache"
 
 has_uml() { [ -d "$root" ] && [ -d "$kernel" ]; }
 has_qemu() { [ -d "$machine" ]; }
 
 describe() {
   case $1 in
-    uml) printf 'backend uml\nsuite %s\nroot %s\nkernel %s\nmodules %s\n' "$suite" "$root" "$kernel/linux" "$kernel/modules" ;;
+    # A part that is used is not one of the oldest.
+    uml) touch "$root" "$kernel" && printf 'backend uml\nsuite %s\nroot %s\nkernel %s\nmodules %s\nmemory %s\n' "$suite" "$root" "$kernel/linux" "$kernel/modules" "$(memory)" ;;
     qemu) printf 'backend qemu\nsuite %s\ndirectory %s\n' "$suite" "$machine" ;;
   esac
 }
 
+# Where the memory of a guest is a file: programs are mapped from it, and 160 MB of it are used.
+memory() {
+  local folder
+  for folder in /dev/shm /tmp; do
+    [ -d $folder ] && [[ ,$(findmnt -no OPTIONS -T $folder), != *,noexec,* ]] || continue
+    [ "$(df --output=avail -k $folder | tail -n 1)" -ge 400000 ] && { echo $folder; return; }
+  done
+  echo "${TMPDIR:-/tmp}"
+}
+
+# Why there is none, if that is known and still holds.
+why_not() { cat "$impossible" 2>/dev/null || { [ -n "$(find "$for_now" -mmin -60 2>/dev/null)" ] && cat "$for_now"; }; }
 # Which kind is meant without a name.
-usual() { if [ -f "$impossible" ]; then echo qemu; else echo uml; fi; }
+usual() { if why_not >/dev/null; then echo qemu; else echo uml; fi; }
 
 if [ "${1:-}" = --check ]; then
   kind=${2:-${RAPID_VBENCH_BACKEND:-$(usual)}}
   case $kind in uml | qemu) ;; *) die "no such guest: $kind (uml or qemu)" ;; esac
   if "has_$kind"; then
-    [ -n "${2:-}${RAPID_VBENCH_BACKEND:-}" ] || [ "$kind" = uml ] || step "QEMU is used: $(head -n 1 "$impossible")"
+    [ -n "${2:-}${RAPID_VBENCH_BACKEND:-}" ] || [ "$kind" = uml ] || step "QEMU is used: $(why_not | head -n 1)"
     describe "$kind"
     exit 0
   fi
-  echo "the guest of the virtual bench ($kind) is not built: run \`make setup\` (or $here/build.sh $kind)" >&2
+  target=setup
+  [ "$kind" = uml ] || [ "$kind" = "$(usual)" ] || target=setup-all
+  echo "the guest of the virtual bench ($kind) is not built: run \`make $target\` (or $here/build.sh $kind)" >&2
   exit 3
 fi
 
@@ -82,7 +101,7 @@ build_root() {
   "${bootstrap[@]}" "$here/rootfs.sh" "$suite" "$work" && "$here/uml/root.sh" "$work" && mv -T "$work/root" "$root" && keep_two root
 }
 
-# Prints why there is none.
+# Prints why there is none; the exit code is 4 if that does not change.
 build_kernel() {
   step "building the kernel of User-Mode Linux (some minutes, once; $cache/kernel.log)"
   mkdir "$work/kernel"
@@ -92,30 +111,31 @@ build_kernel() {
 # Starts it with a program that ends at once: a machine may forbid ptrace, or lack what it was linked with.
 kernel_starts() {
   local console
-  console=$(timeout -s KILL 60 env TMPDIR="$([ -d /dev/shm ] && echo /dev/shm || echo /tmp)" "$kernel/linux" mem=128M uml_dir="$work" \
+  console=$(timeout -s KILL 120 env TMPDIR="$(memory)" "$kernel/linux" mem=128M uml_dir="$work" \
     root=/dev/root rootfstype=hostfs rootflags="$root" ro init=/bin/true con=null con0=null,fd:1 panic=-1 2>&1 </dev/null || true)
   [[ $console == *"exitcode=0x00000000"* ]] || { tail -n 5 <<<"$console" >&2; echo "the kernel does not start"; return 1; }
 }
 
 build_uml() {
-  local why making=
-  rm -f "$impossible"
+  local why code=0
+  rm -f "$impossible" "$for_now"
   require uml/packages.txt mmdebstrap
   # Beside the kernel: one takes processors, the other the network.
   [ -d "$root" ] || { build_root >&2 & making=$!; }
-  if [ ! -d "$kernel" ] && ! why=$(build_kernel); then
-    refuse "${why:-building its kernel failed: see $cache/kernel.log}"
+  [ -d "$kernel" ] || why=$(build_kernel) || code=$?
+  if [ $code != 0 ]; then
     [ -z "$making" ] || wait "$making" || true
+    refuse "$([ $code = 4 ] && echo "$impossible" || echo "$for_now")" "${why:-building its kernel failed: see $cache/kernel.log}"
     return 4
   fi
   [ -z "$making" ] || wait "$making" || die "the guest's Debian could not be installed"
-  why=$(kernel_starts) || { rm -rf "$kernel"; refuse "$why"; return 4; }
+  why=$(kernel_starts) || { refuse "$for_now" "$why"; return 4; }
 }
 
-# The exit code is 4. Remembered, so that the next run does not compile for minutes to find the same.
+# refuse FILE REASON: remembered, so that the next run does not compile for minutes to find the same.
 refuse() {
-  echo "$1" >"$impossible"
-  step "no User-Mode Linux on this machine (${1%%$'\n'*}): QEMU is used instead, which is slower; remove $impossible to try again"
+  echo "$2" >"$1"
+  step "no User-Mode Linux on this machine (${2%%$'\n'*}): QEMU is used instead, which is slower; remove $1 to try again"
 }
 
 build_qemu() {
@@ -143,7 +163,9 @@ rights
 # A build that was cut off leaves only such a directory; holding the lock, every one of them is dead.
 "${as_root[@]}" rm -rf "$cache"/.build.*
 work=$(mktemp -d "$cache/.build.XXXXXX")
-trap '"${as_root[@]}" rm -rf "$work"' EXIT
+# What is made in the background ends before its folder goes.
+making=
+trap '[ -z "$making" ] || { kill "$making" && wait "$making"; } 2>/dev/null || true; "${as_root[@]}" rm -rf "$work"' EXIT
 started=$SECONDS
 "build_$kind"
 step "done in $((SECONDS - started)) s ($kind)"

@@ -53,6 +53,8 @@ pub fn ended_with(outcome: &Outcome, is_expected: impl Fn(&str) -> bool) {
         let others: Vec<&str> =
             unexpected(outcome, episode).into_iter().filter(|reason| !is_expected(reason)).collect();
         assert!(others.is_empty(), "reasons against the episode: {others:?}: {episode}");
+        let is_judged = episode["reasons"].as_array().is_some_and(|reasons| !reasons.is_empty());
+        assert!(is_judged || episode["verdict"] == "GOOD", "a verdict without a reason: {episode}");
     }
     let is_bad = episodes.iter().any(|line| line["verdict"] == "BAD");
     assert_eq!(outcome.rapid_code, Some(if is_bad { 4 } else { 0 }), "rapid's exit code: {}", outcome.log);
@@ -60,7 +62,7 @@ pub fn ended_with(outcome: &Outcome, is_expected: impl Fn(&str) -> bool) {
 
 /// The reasons against an episode in this line, but for those of the machine.
 pub fn unexpected<'a>(outcome: &Outcome, episode: &'a Value) -> Vec<&'a str> {
-    let reasons = episode["reasons"].as_array().into_iter().flatten().filter_map(Value::as_str);
+    let reasons = episode["reasons"].as_array().expect("reasons").iter().filter_map(Value::as_str);
     reasons.filter(|reason| !of_the_machine(outcome, reason)).collect()
 }
 

@@ -18,7 +18,7 @@ const CRASH_MS: u64 = 19_000;
 const FLOOD_MS: u64 = 25_000;
 /// Time until the end of the last span.
 const SECONDS: u32 = 31;
-/// Between the first and the fifth crash are 7.5 s of waiting and four starts, which take seconds in the guest.
+/// Between the first and the fifth crash are 7.5 s of waiting, and four starts, which emulated processors take seconds for.
 const CRASHED: &str = r#"has_lines 5 $out/rapid.jsonl 'crashes after 50 samples'"#;
 const REGISTRY: &str = r#"
 [rig]

@@ -1,6 +1,6 @@
 //! The guest: what `image/build.sh` has built, and one run of it.
 //!
-//! Invariant: a run ends when the guest's script has ended, or after its limit; nothing of it survives the process that started it.
+//! Invariant: a run ends when the guest's script has ended, or after its limit.
 //! Invariant: where time is virtual ([`Image::is_virtual`]) a scenario lasts as long, by the guest's clocks, on any machine under
 //! any load. Elsewhere processors are emulated and slow: only order and minimum times mean something.
 
@@ -35,8 +35,11 @@ pub enum GuestError {
     #[error("image/build.sh --check names no {0}")]
     NoPart(&'static str),
     /// A program was not found.
-    #[error("{0} does not start: {1}: run `make setup`")]
+    #[error("{0} does not start: {1}: run `make setup-all`")]
     NoProgram(String, #[source] io::Error),
+    /// The name of a guest's share has a space.
+    #[error("{0}: a guest takes no folder with a space in its name: set TMPDIR to another one")]
+    Space(PathBuf),
     /// A file of the bench could not be read or written.
     #[error("{0}: {1}")]
     Io(PathBuf, #[source] io::Error),
@@ -123,6 +126,7 @@ impl Image {
                 root: part("root")?.into(),
                 kernel: part("kernel")?.into(),
                 modules: part("modules")?.into(),
+                memory: part("memory")?.into(),
             }),
             _ => Backend::Qemu(Qemu { directory: part("directory")?.into() }),
         };

@@ -11,11 +11,13 @@ out=$1 log=$2
 readonly package=linux-source-6.1
 export PATH=$PATH:/sbin:/usr/sbin
 
+# The exit code is 4 for what will not be otherwise the next time.
 fail() { echo "$*"; exit 1; }
-made() { "$@" >>"$log" 2>&1 || fail "$* failed: see $log"; }
+never() { echo "$*"; exit 4; }
+made() { "$@" >>"$log" 2>&1 || never "$* failed: see $log"; }
 
 : >"$log"
-[ "$(uname -m)" = x86_64 ] || fail "it runs on x86-64 processors, and this is $(uname -m)"
+[ "$(uname -m)" = x86_64 ] || never "it runs on x86-64 processors, and this is $(uname -m)"
 for tool in gcc make flex bison bc xz depmod; do command -v "$tool" >/dev/null || fail "$tool is missing"; done
 work=$(mktemp -d "$out/../source.XXXXXX")
 trap 'rm -rf "$work"' EXIT
@@ -45,11 +47,11 @@ cd "$work"/linux-source-*/
 
 # Room for the floating-point state of a process: a processor with AMX has 11,008 bytes of it, and this kernel expects at most 2,696.
 sed -i 's/DEFINE_LONGS(HOST_FP_SIZE, 2696)/DEFINE_LONGS(HOST_FP_SIZE, 12288)/' arch/x86/um/user-offsets.c
-grep -q 'HOST_FP_SIZE, 12288' arch/x86/um/user-offsets.c || fail "$package has another HOST_FP_SIZE than 2696"
+grep -q 'HOST_FP_SIZE, 12288' arch/x86/um/user-offsets.c || never "$package has another HOST_FP_SIZE than 2696"
 made make -s ARCH=um KCONFIG_ALLCONFIG="$here/kernel.config" allnoconfig
 # An option that this kernel lacks, or whose condition is missing, is dropped without a word.
 while read -r option; do
-  grep -qx "$option" .config || fail "$package does not take the option $option"
+  grep -qx "$option" .config || never "$package does not take the option $option"
 done < <(grep '^CONFIG_' "$here/kernel.config")
 made make -s ARCH=um -j"$(nproc)" linux modules
 made make -s ARCH=um INSTALL_MOD_PATH="$work/installed" modules_install

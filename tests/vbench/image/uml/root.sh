@@ -6,7 +6,7 @@ here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 root=$1/root
 mkdir "$root"
 # The kernel fills /dev; a user cannot make device nodes.
-tar -xf "$1/rootfs.tar" -C "$root" --no-same-owner --exclude='./dev/*'
+tar -xf "$1/rootfs.tar" -C "$root" --no-same-owner --same-permissions --exclude='./dev/*'
 rm -rf "$root"/var/cache/apt/* "$root"/var/lib/apt/lists/*
 # The kernel's modules are mounted here.
 mkdir -p "$root/usr/lib/modules"

@@ -3,7 +3,7 @@
 //! The kernel and its programs take turns on one processor by ptrace. The guest's clocks stand still while anything in it computes and
 //! jump to the next timer when everything waits, so a scenario takes as long as its computing, and nothing in it is late.
 //!
-//! Invariant: one guest per processor, pinned to it: on two, each system call would wake the other one, which takes three times as
+//! Invariant: one guest of this cache per processor, pinned to it: on two, each system call would wake the other one, which takes three times as
 //! long. Ahead of other programs where that is allowed: each system call is two switches, and each would wait for others to
 //! have had their share.
 //! Invariant: a guest that computes for ever, in which virtual time stands still, ends at a limit of the host's time.
@@ -51,10 +51,16 @@ pub(super) struct Uml {
     pub(super) kernel: PathBuf,
     /// Its modules: what is mounted as /lib/modules.
     pub(super) modules: PathBuf,
+    /// Where the guest's memory is a file.
+    pub(super) memory: PathBuf,
 }
 
 impl Uml {
     pub(super) fn run(&self, share: &Path, init: Init, limit: Duration) -> Result<Ran, GuestError> {
+        // The kernel's command line ends a name there.
+        if share.to_string_lossy().contains(char::is_whitespace) {
+            return Err(GuestError::Space(share.into()));
+        }
         let processor = Processor::take(self.root.parent().unwrap_or(&self.root))?;
         let started = Instant::now();
         let mut machine = Machine::start(self.command(share, init, processor.number)?)?;
@@ -79,8 +85,7 @@ impl Uml {
             .arg(format!("bench.share={}", share.display()))
             .arg(format!("bench.modules={}", self.modules.display()))
             .args((init == Init::Systemd).then_some("bench.systemd"))
-            // Its memory is a file there, of which it uses a sixth.
-            .env("TMPDIR", if Path::new("/dev/shm").is_dir() { "/dev/shm" } else { "/tmp" })
+            .env("TMPDIR", &self.memory)
             .stdin(Stdio::null())
             .stdout(console)
             .stderr(errors);
@@ -100,7 +105,7 @@ fn may_be_first() -> bool {
     })
 }
 
-/// A processor that no other guest has, whichever process started it.
+/// A processor that no other guest of this cache has, whichever process started it.
 struct Processor {
     number: usize,
     _lock: File,
@@ -130,8 +135,8 @@ impl Processor {
     }
 }
 
-/// The kernel and a shell that kills it when this process is gone. The guard ends first: the number of the group is free for others
-/// once the kernel has been waited for.
+/// The kernel and a shell that kills it when this process is gone. The guard ends first: the number of the group may be another's soon
+/// after the kernel has been waited for.
 struct Machine {
     _guard: Guard,
     kernel: Group,

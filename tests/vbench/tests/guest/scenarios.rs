@@ -171,7 +171,7 @@ fn assert_stalled(outcome: &Outcome) {
     let states = outcome.states("cam_wrist");
     let from = states.iter().position(|state| *state == "streaming").expect("streaming at first");
     assert_eq!(states[from..], ["streaming", "stalled", "streaming"]);
-    let stalled = outcome.rapid.iter().find(|line| line["state"] == "stalled");
+    let stalled = outcome.rapid.iter().find(|line| line["state"] == "stalled" && line["device"] == "cam_wrist");
     let stalled = stalled.and_then(|line| line["stamp"].as_u64()).expect("a stamp");
     takes(outcome, "silence to stalled", outcome.actions("silent", 0)[0].mono_ns, stalled, 450.0..=550.0);
 }
