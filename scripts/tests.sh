@@ -87,13 +87,13 @@ cat "$output"
 
 set -m
 run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /program- <<<"$hosted")" >"$output" 2>&1 &
-readonly program=$!
+readonly waiting=$!
 set +m
-jobs+=("$program")
+jobs+=("$waiting")
 run nice -n 10 <<<"$(grep -v /program- <<<"$hosted")" || code=1
 "$here/models-tests.sh" || code=1
 echo "     Waiting for the tests of the program"
-wait "$program" || code=1
+wait "$waiting" || code=1
 jobs=()
 cat "$output"
 : >"$output"

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use vbench::emu::spec::DeviceSpec;
 use vbench::guest::GuestError;
 use vbench::scenario::{Scenario, ScenarioError};
 
@@ -17,7 +18,8 @@ fn a_guest_that_computes_for_ever_is_ended_and_leaves_no_process() {
         return;
     }
     let script = "touch /mnt/share/begun\nwhile :; do :; done";
-    match Scenario::new("endless").script(script).wall(WALL).run() {
+    let device = DeviceSpec::acm(0x2e8a, 0x000a, 100.0);
+    match Scenario::new("endless").device(device).script(script).wall(WALL).run() {
         Err(ScenarioError::Guest(GuestError::Unfinished { machine, .. })) => assert_eq!(machine, "killed"),
         other => panic!("{other:?}"),
     }
