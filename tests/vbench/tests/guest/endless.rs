@@ -10,7 +10,7 @@ use vbench::guest::GuestError;
 use vbench::scenario::{Scenario, ScenarioError};
 
 /// A busy machine takes some of it for the boot.
-const WALL: Duration = Duration::from_secs(30);
+const WALL: Duration = Duration::from_secs(15);
 
 #[test]
 fn a_guest_that_computes_for_ever_is_ended_and_leaves_no_process() {
