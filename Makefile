@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build setup-test setup-all demo picture quick one test test-all features lint check bench fuzz train train-test ablation evaluation texture lerobot-loop lerobot-test fleet-test clean
+.PHONY: help setup setup-build setup-test setup-all demo picture quick one test test-all guests features lint check bench fuzz train train-test ablation evaluation texture lerobot-loop lerobot-test fleet-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -67,6 +67,11 @@ one: ## run one test by its name, with its output: TEST=name (of a test or of a 
 test: setup-test ## the whole truth: format, lints, all tests with the virtual bench, and a look at what they left behind
 	cargo fmt --all --check
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
+
+# Beside busy loops: scripts/busy.sh 4 make guests
+guests: setup ## the guests of the virtual bench, TIMES=10 times, and how far their times differ among the runs
+	$(TESTED) cargo build --locked --workspace --bin rapid --bin usbemu --example process_node --example publish_action
+	$(TESTED) scripts/guests.sh $(or $(TIMES),10) $(TESTS)
 
 # Each part after `test` is run even if one before it failed; the last lines are a table.
 test-all: setup-all test ## before a release and at night: make test, then guests on an emulated machine, 90 cycles, features, fuzzing and more

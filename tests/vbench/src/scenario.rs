@@ -328,8 +328,12 @@ fn fresh_folder(name: &str) -> Result<PathBuf, ScenarioError> {
         .map(|number| base.join(format!("vbench-{name}-{}-{number}", std::process::id())))
         .find(|path: &PathBuf| !Path::exists(path))
         .expect("one of endless names is free");
-    for folder in ["in", "out"] {
-        fs::create_dir_all(path.join(folder)).map_err(|error| ScenarioError::Share(path.clone(), error))?;
+    // The guest's ordinary users run programs from it.
+    let open = |path: &Path| {
+        fs::create_dir_all(path).and_then(|()| fs::set_permissions(path, PermissionsExt::from_mode(0o755)))
+    };
+    for folder in [path.clone(), path.join("in"), path.join("out")] {
+        open(&folder).map_err(|error| ScenarioError::Share(folder, error))?;
     }
     Ok(path)
 }

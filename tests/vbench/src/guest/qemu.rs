@@ -167,7 +167,7 @@ fn not_found(error: std::io::Error) -> GuestError {
     GuestError::NoProgram(QEMU.into(), error)
 }
 
-/// A running QEMU, killed with the process that started it.
+/// A running QEMU, killed when it is dropped.
 struct Machine(Child);
 
 impl Machine {
