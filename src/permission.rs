@@ -121,18 +121,26 @@ impl Permission {
         }
         self.interlocks.check()?;
         self.slot.give(arm);
-        // A stop in the meantime may have been given to the slot before this.
-        let blocked = self.interlocks.check();
-        if let Err(blocked) = blocked {
-            // Not always a disarm: a joint that is to hold at an emergency stop must not fall.
-            self.slot.give(self.interlocks.order(blocked.index).unwrap_or(Order::Disarm));
-            return Err(blocked.into());
-        }
-        if self.is_overtaken(given) {
-            self.slot.give(Order::Disarm);
-            return Err(Void::Overtaken);
+        // What stopped the actuator in the meantime may have been given to the slot before this.
+        if let Some((void, stop)) = self.stopped_since(|| self.is_overtaken(given)) {
+            self.slot.give(stop);
+            return Err(void);
         }
         Ok(())
+    }
+
+    /// What makes void an arm that has just been given, and the order that has to follow it. `is_overtaken`: a time of
+    /// [`Self::disarmed`] counts that was not there before the arm was given.
+    ///
+    /// The time is read before the states: a stop stores its state first, and is then the one that is seen here. Its
+    /// order is not always a disarm: a joint that is to hold at an emergency stop must not fall.
+    fn stopped_since(&self, is_overtaken: impl FnOnce() -> bool) -> Option<(Void, Order)> {
+        let is_overtaken = is_overtaken();
+        if let Err(blocked) = self.interlocks.check() {
+            let stop = self.interlocks.order(blocked.index).unwrap_or(Order::Disarm);
+            return Some((blocked.into(), stop));
+        }
+        is_overtaken.then_some((Void::Overtaken, Order::Disarm))
     }
 
     fn is_overtaken(&self, given: Stamp) -> bool {
@@ -169,15 +177,15 @@ impl Attended {
             return Ok(Some(blocked));
         }
         give(Order::Arm).inspect_err(|_| self.was_not_armed())?;
-        // A stop in the meantime may have been carried out before the arm.
-        if let Err(blocked) = interlocks.check() {
-            give(interlocks.order(blocked.index).unwrap_or(Order::Disarm))?;
-            return Ok(Some(blocked));
+        // What stopped the actuator in the meantime may have been carried out before the arm.
+        let Some((void, stop)) = self.0.stopped_since(|| disarmed.load(Ordering::SeqCst) != before) else {
+            return Ok(None);
+        };
+        give(stop)?;
+        match void {
+            Void::Blocked(blocked) => Ok(Some(blocked)),
+            _ => Ok(None),
         }
-        if disarmed.load(Ordering::SeqCst) != before {
-            give(Order::Disarm)?;
-        }
-        Ok(None)
     }
 
     /// Names of the emergency stops that an order may refer to.

@@ -127,14 +127,11 @@ proptest! {
 
 #[test]
 fn a_disarm_wins_against_a_concurrent_arm() {
-    for _ in 0..2_000 {
+    for _ in 0..20_000 {
         let permission = Arc::new(Permission::new(false));
         let attended = permission.attend();
         let given = Stamp::now();
-        std::thread::scope(|scope| {
-            scope.spawn(|| permission.arm(given, Stamp::now()));
-            scope.spawn(|| permission.disarm(Stamp::now()));
-        });
+        concurrently(|| permission.arm(given, Stamp::now()), || permission.disarm(Stamp::now()));
         assert_eq!(attended.take().last(), Some(Disarm));
     }
 }
@@ -254,18 +251,61 @@ proptest! {
     }
 }
 
+/// What overtakes an arm is seen with its own order, at whatever instant it does: a disarm in its place would let fall
+/// what is to hold.
+#[test]
+fn a_stop_that_overtakes_an_arm_is_given_as_what_it_is() {
+    for (index, kind) in STOPS.into_iter().enumerate() {
+        for state in [InputState::Stopped, InputState::Lost] {
+            let permission = with_stops(false);
+            all_run(&permission);
+            let (void, order) = permission.stopped_since(|| permission.report(index, state, at(2))).unwrap();
+            assert!(matches!(void, Void::Blocked(blocked) if (blocked.index, blocked.state) == (index, state)));
+            let trip = Trip { stop: u8::try_from(index).unwrap(), is_lost: state == InputState::Lost };
+            assert_eq!(order, if kind == StopKind::Emergency { Order::Emergency(trip) } else { Disarm });
+        }
+    }
+    let permission = with_stops(false);
+    all_run(&permission);
+    let disarmed = permission.stopped_since(|| {
+        permission.disarm(at(2));
+        true
+    });
+    assert_eq!(disarmed, Some((Void::Overtaken, Disarm)));
+    assert_eq!(permission.stopped_since(|| false), None);
+}
+
 #[test]
 fn a_trip_wins_against_a_concurrent_arm() {
-    for _ in 0..2_000 {
+    for _ in 0..20_000 {
         let permission = with_stops(false);
         let attended = permission.attend();
         all_run(&permission);
         let given = Stamp::now();
-        std::thread::scope(|scope| {
-            scope.spawn(|| permission.arm(given, Stamp::now()));
-            scope.spawn(|| permission.report(0, InputState::Stopped, Stamp::now()));
-        });
+        concurrently(
+            || permission.arm(given, Stamp::now()),
+            || permission.report(0, InputState::Stopped, Stamp::now()),
+        );
         let orders: Vec<Order> = attended.take().collect();
         assert_eq!(orders, [Order::Emergency(Trip { stop: 0, is_lost: false })]);
     }
+}
+
+/// Both at once, on two processors if there are: neither begins before the other could.
+fn concurrently<A, B>(one: impl FnOnce() -> A + Send, other: impl FnOnce() -> B + Send) {
+    let ready = AtomicUsize::new(0);
+    let meet = || {
+        ready.fetch_add(1, Ordering::SeqCst);
+        while ready.load(Ordering::SeqCst) < 2 {
+            std::thread::yield_now();
+        }
+    };
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            meet();
+            one();
+        });
+        meet();
+        other();
+    });
 }
