@@ -4,17 +4,14 @@
 //!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
 
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::zune_core::bytestream::ZCursor;
-use zune_jpeg::zune_core::colorspace::ColorSpace;
-use zune_jpeg::zune_core::options::DecoderOptions;
+use rapid_jpeg::{DecodeError, Decoder};
 
 use crate::sample::Encoding;
 
 /// Values of a pixel.
 pub const CHANNELS: usize = 3;
 /// Pixels a picture may have along a side, as in the registry.
-pub(crate) const LARGEST: usize = 8192;
+pub(crate) const LARGEST: usize = rapid_jpeg::LARGEST;
 
 /// Why a payload has no pixels.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -39,6 +36,12 @@ pub enum PixelError {
     },
 }
 
+impl From<DecodeError> for PixelError {
+    fn from(error: DecodeError) -> Self {
+        Self::Damaged(error.to_string())
+    }
+}
+
 /// A picture as received from the bus.
 #[derive(Debug, Clone, Copy)]
 pub struct Picture<'a> {
@@ -55,8 +58,7 @@ pub struct Picture<'a> {
 /// Memory for the pixels of one picture, reused for the next; only the JPEG decoder allocates for every picture.
 #[derive(Debug, Default)]
 pub struct Pixels {
-    /// The picture with the marker that its decoder requires.
-    jpeg: Vec<u8>,
+    decoder: Decoder,
     values: Vec<u8>,
 }
 
@@ -95,7 +97,7 @@ impl Pixels {
                 self.values.clear();
                 self.values.extend(picture.bytes.as_chunks::<2>().0.iter().flat_map(|count| [shade(*count); CHANNELS]));
             }
-            Encoding::Mjpeg => self.decode_jpeg(picture.bytes, [height, width], jpeg_options())?,
+            Encoding::Mjpeg => self.decoder.rgb(picture.bytes, [height, width], &mut self.values)?,
             other => return Err(PixelError::NoPicture(other)),
         }
         Ok([height, width])
@@ -104,44 +106,6 @@ impl Pixels {
     /// The pixels of the picture decoded last: red, green, blue, row by row.
     pub fn values(&self) -> &[u8] {
         &self.values
-    }
-
-    fn decode_jpeg(
-        &mut self,
-        bytes: &[u8],
-        [height, width]: [usize; 2],
-        options: DecoderOptions,
-    ) -> Result<(), PixelError> {
-        with_mark(bytes, &mut self.jpeg);
-        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.jpeg), options);
-        let damaged = |error: zune_jpeg::errors::DecodeErrors| PixelError::Damaged(error.to_string());
-        decoder.decode_headers().map_err(damaged)?;
-        if decoder.dimensions() != Some((width, height)) {
-            let (wide, high) = decoder.dimensions().unwrap_or_default();
-            return Err(PixelError::Damaged(format!("{wide}x{high} pixels in a sample of {width}x{height}")));
-        }
-        self.values.resize(CHANNELS * width * height, 0);
-        decoder.decode_into(&mut self.values).map_err(damaged)
-    }
-}
-
-/// Strict: a truncated picture is refused, not padded with grey.
-fn jpeg_options() -> DecoderOptions {
-    DecoderOptions::default()
-        .jpeg_set_out_colorspace(ColorSpace::RGB)
-        .set_max_width(LARGEST)
-        .set_max_height(LARGEST)
-        .set_strict_mode(true)
-}
-
-/// Sets `marked` to the picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the
-/// Huffman tables and imply those of the standard (ITU-T T.81 K.3); with the mark, the decoder uses these in place of
-/// the missing ones.
-pub(crate) fn with_mark(jpeg: &[u8], marked: &mut Vec<u8>) {
-    let (start, rest) = jpeg.split_at(jpeg.len().min(2));
-    marked.clear();
-    for part in [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest] {
-        marked.extend_from_slice(part);
     }
 }
 

@@ -129,12 +129,12 @@ const HOMES: &[(&str, &[&str])] = &[
     ("image", &["tui/picture"]),
     ("indicatif", &["commands/progress"]),
     ("jiff", &["time"]),
-    ("jpeg_encoder", &["driver/sim", "simulation/task", "plot", "web"]),
     ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "inputs"]),
     ("k", &["kinematics"]),
     ("lz4", &["episode"]),
     ("mcap", &["episode", "record/file"]),
     ("mdns_sd", &["hotplug/lan"]),
+    ("memchr", &["driver/lan"]),
     ("nix", &["driver/datagram", "driver/lan/udp", "driver/can/socket"]),
     ("nokhwa", &["driver/camera"]),
     ("ort", &["policy/library", "policy/graphs"]),
@@ -144,6 +144,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("qrcodegen", &["qr"]),
     ("rand_distr", &["random"]),
     ("rand_pcg", &["random"]),
+    ("rapid_jpeg", &["pixels", "calibration/brightness", "driver/sim", "simulation/task", "plot", "web"]),
     ("ratatui", &["tui"]),
     ("ratatui_core", &["tui"]),
     ("ratatui_image", &["tui/picture"]),
@@ -171,7 +172,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("v4l", &["driver/camera"]),
     ("zip", &["commands/policy"]),
     ("zstd", &["episode", "policy/library"]),
-    ("zune_jpeg", &["calibration/brightness", "pixels"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
@@ -203,6 +203,10 @@ fn the_sources_follow_the_architecture() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut files = BTreeMap::new();
     collect(&root, &root, &mut files).unwrap();
+    // A folder with a manifest is a crate of its own: what it may see is in that.
+    files.retain(|path, _| {
+        !path.ancestors().skip(1).any(|folder| folder != Path::new("") && root.join(folder).join("Cargo.toml").exists())
+    });
     assert!(files.contains_key(Path::new("lib.rs")), "no src/lib.rs under {}", root.display());
 
     let violations = check_tree(&files);

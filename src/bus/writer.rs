@@ -3,6 +3,7 @@
 //! Invariant: a pool whose first page is lost or overwritten is not written to: it holds iceoryx2's write position.
 
 use std::fs::File;
+use std::mem::{ManuallyDrop, MaybeUninit};
 use std::os::unix::fs::FileExt;
 
 use iceoryx2::identifiers::UniquePublisherId;
@@ -10,12 +11,17 @@ use iceoryx2::port::LoanError;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::*;
+use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::sample_mut_uninit::SampleMutUninit;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
 use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, leftovers, room, sigbus};
 use crate::modality::MAX_MODALITIES;
 use crate::sample::SampleHeader;
+
+type Loan = SampleMutUninit<Service, [MaybeUninit<u8>], SampleHeader>;
+type Filled = SampleMut<Service, [u8], SampleHeader>;
 
 /// The one writer of a topic.
 pub struct Writer {
@@ -98,10 +104,10 @@ impl Writer {
     }
 
     fn send(&self, header: SampleHeader, payload: &[u8]) -> Result<(), BusError> {
-        let mut sample =
+        let sample =
             self.publisher.loan_slice_uninit(payload.len()).map_err(|error| self.transfer(&describe(error)))?;
-        *sample.user_header_mut() = header;
-        sample.write_from_slice(payload).send().map_err(|error| self.transfer(&format!("{error:?}")))?;
+        let sample = filled(sample, header, payload)?;
+        sample.send().map_err(|error| self.transfer(&format!("{error:?}")))?;
         for wake in &self.wakes {
             // A consumer that cannot be woken polls soon after; the sample is not lost.
             let _ = wake.notify();
@@ -111,6 +117,25 @@ impl Writer {
 
     fn transfer(&self, reason: &str) -> BusError {
         BusError::Transfer { topic: self.topic.clone(), reason: reason.to_owned() }
+    }
+}
+
+/// A loaned sample with this content.
+///
+/// Its length is in shared memory, where another program may have overwritten it since the loan. iceoryx2 panics over that,
+/// and again when the panic drops the sample, which ends the process: such a sample is never dropped.
+fn filled(loan: Loan, header: SampleHeader, payload: &[u8]) -> Result<Filled, BusError> {
+    let mut loan = ManuallyDrop::new(loan);
+    *loan.user_header_mut() = header;
+    let place = loan.payload_mut();
+    if place.len() != payload.len() {
+        sigbus::damaged();
+        return Err(sigbus::error());
+    }
+    // SAFETY: both are as long as checked, and a loan is no one else's. Every byte is written before it counts as such.
+    unsafe {
+        std::ptr::copy_nonoverlapping(payload.as_ptr(), place.as_mut_ptr().cast(), payload.len());
+        Ok(ManuallyDrop::into_inner(loan).assume_init())
     }
 }
 
@@ -126,5 +151,41 @@ fn describe(error: LoanError) -> String {
     match error {
         LoanError::OutOfMemory => "the pool is exhausted: a subscriber holds too many samples".to_owned(),
         other => format!("{other:?}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::fd::AsRawFd as _;
+
+    use super::super::Bus;
+    use super::super::tests::registry;
+    use super::*;
+
+    /// Not a test of its own: its effect on the process is permanent.
+    #[test]
+    #[ignore = "run by a_sample_whose_memory_is_overwritten_before_it_is_filled_ends_the_use_of_the_bus"]
+    fn helper() {
+        let registry = registry(16);
+        let bus = Bus::open(&registry, Some(&format!("busw{}", std::process::id()))).unwrap();
+        let writer = bus.writer(TopicId::Mask).unwrap();
+        let loan = writer.publisher.loan_slice_uninit(24).unwrap();
+        let segment = format!("/proc/self/fd/{}", writer.pool.as_ref().unwrap().as_raw_fd());
+        let segment = File::options().write(true).open(segment).unwrap();
+        segment.write_all_at(&[0; 4096], 0).unwrap();
+        let error = contained(|| filled(loan, SampleHeader::default(), &[7; 24]).map(drop)).flatten().unwrap_err();
+        assert!(matches!(&error, BusError::Lost { file } if file.to_string_lossy().ends_with(".data")), "{error}");
+        assert!(sigbus::happened() && writer.publish(SampleHeader::default(), &[7; 24]).is_err());
+    }
+
+    #[test]
+    fn a_sample_whose_memory_is_overwritten_before_it_is_filled_ends_the_use_of_the_bus() {
+        let ended = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "bus::writer::tests::helper", "--ignored", "--nocapture"])
+            .output()
+            .unwrap();
+        // Of a name that fits no test nothing runs, and nothing fails.
+        let passed = String::from_utf8_lossy(&ended.stdout).contains("1 passed");
+        assert!(ended.status.success() && passed, "{ended:?}");
     }
 }

@@ -1,15 +1,8 @@
 //! The mean brightness of a picture.
 
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::zune_core::bytestream::ZCursor;
-use zune_jpeg::zune_core::colorspace::ColorSpace;
-use zune_jpeg::zune_core::options::DecoderOptions;
+use rapid_jpeg::{DecodeError, Decoder};
 
-use crate::pixels::with_mark;
 use crate::sample::Encoding;
-
-/// Pixels a picture may have along a side, as in the registry.
-const LARGEST: usize = 8192;
 
 /// Why a picture has no brightness.
 #[derive(Debug, thiserror::Error)]
@@ -22,6 +15,12 @@ pub enum BrightnessError {
     Damaged(String),
 }
 
+impl From<DecodeError> for BrightnessError {
+    fn from(error: DecodeError) -> Self {
+        Self::Damaged(error.to_string())
+    }
+}
+
 /// The mean luminance of a picture, 0 (black) to 255 (white).
 ///
 /// # Errors
@@ -31,17 +30,7 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
         Encoding::Grey => mean(bytes.iter()),
         // Y0 U Y1 V: every other byte is luminance.
         Encoding::Yuyv => mean(bytes.iter().step_by(2)),
-        Encoding::Mjpeg => {
-            let mut marked = Vec::new();
-            with_mark(bytes, &mut marked);
-            let options = DecoderOptions::default()
-                .jpeg_set_out_colorspace(ColorSpace::Luma)
-                .set_max_width(LARGEST)
-                .set_max_height(LARGEST);
-            let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&marked), options);
-            let pixels = decoder.decode().map_err(|error| BrightnessError::Damaged(error.to_string()))?;
-            mean(pixels.iter())
-        }
+        Encoding::Mjpeg => mean(Decoder::default().luminance(bytes)?.iter()),
         Encoding::Bytes | Encoding::F64 | Encoding::Mask | Encoding::Depth => Err(BrightnessError::NoPicture),
     }
 }
@@ -57,14 +46,14 @@ fn mean<'a>(luminance: impl Iterator<Item = &'a u8>) -> Result<f64, BrightnessEr
 
 #[cfg(test)]
 mod tests {
-    use jpeg_encoder::{ColorType, Encoder};
     use proptest::prelude::*;
+    use rapid_jpeg::{Values, encode};
 
     use super::*;
 
     fn jpeg(shade: u8) -> Vec<u8> {
         let mut jpeg = Vec::new();
-        Encoder::new(&mut jpeg, 80).encode(&[shade; 3 * 64 * 48], 64, 48, ColorType::Rgb).unwrap();
+        encode(&[shade; 3 * 64 * 48], [48, 64], Values::Rgb, 80, &mut jpeg).unwrap();
         jpeg
     }
 

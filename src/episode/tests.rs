@@ -3,7 +3,7 @@
 use super::op;
 use super::record_iter::{FileEnd, Integrity, MAGIC, RecordIter};
 use super::testing::{episode, layouts, mutated, mutations};
-use crate::effort::every;
+use crate::effort::{cases, every};
 use proptest::prelude::*;
 
 /// A record's opcode and content.
@@ -46,12 +46,12 @@ fn a_whole_file_is_sound_and_every_flipped_bit_of_it_is_noticed() {
         let (whole, found) = integrity(&bytes).unwrap();
         assert!(found.sound && found.end == FileEnd::Finished && found.bytes == bytes.len() as u64);
         assert_eq!(whole.iter().filter(|(opcode, _)| *opcode == op::MESSAGE).count(), 200);
-        for at in (0..bytes.len()).step_by(every(5)) {
+        for at in (0..bytes.len()).step_by(every(15)) {
             let mut flipped = bytes.clone();
             flipped[at] ^= 1 << (at % 8);
             assert!(integrity(&flipped).is_none_or(|(_, found)| !found.sound), "bit {} of byte {at}", at % 8);
         }
-        for cut in (0..bytes.len()).step_by(every(7)) {
+        for cut in (0..bytes.len()).step_by(every(13)) {
             assert!(integrity(&bytes[..cut]).is_none_or(|(_, found)| !found.sound && found.end != FileEnd::Finished));
         }
         let (_, found) = integrity(&[&bytes[..], b"more"].concat()).unwrap();
@@ -169,7 +169,7 @@ fn decompression_is_bounded_by_the_size_of_the_file() {
 
 #[test]
 fn mutated_bytes_never_panic() {
-    let config = ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() };
+    let config = ProptestConfig { cases: cases(400), failure_persistence: None, ..ProptestConfig::default() };
     for bytes in layouts().map(episode) {
         proptest!(config.clone(), |(mutations in mutations())| {
             integrity(&mutated(&bytes, &mutations));

@@ -180,7 +180,7 @@ mod tests {
         let picture =
             |bytes: &[u8]| Payload::Picture { encoding: Encoding::Mjpeg, width: 8, height: 4, bytes: bytes.to_vec() };
         let mut jpeg = Vec::new();
-        jpeg_encoder::Encoder::new(&mut jpeg, 90).encode(&[9; 32], 8, 4, jpeg_encoder::ColorType::Luma).unwrap();
+        rapid_jpeg::encode(&[9; 32], [4, 8], rapid_jpeg::Values::Grey, 90, &mut jpeg).unwrap();
         let whole = picture(&jpeg);
         assert_eq!(shape(&whole), Some(Shape { height: 4, width: 8, channels: 1 }));
         assert_eq!(file(&whole, &mut Pixels::default()).unwrap(), jpeg);

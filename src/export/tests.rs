@@ -102,7 +102,7 @@ fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
         recording.frame(number, [(number < 2).then_some(number.into()), None]);
     }
     let mut jpeg = Vec::new();
-    jpeg_encoder::Encoder::new(&mut jpeg, 90).encode(&[200; 8], 4, 2, jpeg_encoder::ColorType::Luma).unwrap();
+    rapid_jpeg::encode(&[200; 8], [2, 4], rapid_jpeg::Values::Grey, 90, &mut jpeg).unwrap();
     recording.sample(Some(0), 0, Encoding::Mjpeg, &jpeg);
     // With its beginning, its size and its end, but without the pixels.
     let scan = jpeg.windows(2).position(|mark| mark == [0xff, 0xda]).unwrap();

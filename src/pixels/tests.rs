@@ -86,9 +86,10 @@ fn pictures_differ_from_those_of_training_by_no_more_than_documented() {
         let (jpeg, file) = (read("jpg"), read("ppm"));
         let (size, rgb) = ppm(&file);
         // With the instructions that this processor has, and as on one that has none of them.
-        for options in [jpeg_options(), jpeg_options().set_use_unsafe(false)] {
-            let mut pixels = Pixels::default();
-            pixels.decode_jpeg(&jpeg, size, options).unwrap();
+        for decoder in [Decoder::default(), Decoder::portable()] {
+            let mut pixels = Pixels { decoder, ..Pixels::default() };
+            let [height, width] = size.map(|side| u32::try_from(side).unwrap());
+            pixels.decode(&Picture { encoding: Encoding::Mjpeg, width, height, bytes: &jpeg }).unwrap();
             let found = Apart::of(pixels.values(), rgb, size);
             println!("{name}: {found:?}");
             assert!(found.is_within(&bound), "{name}: {found:?}, not within {bound:?}");

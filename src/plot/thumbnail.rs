@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use jpeg_encoder::{ColorType, Encoder};
+use rapid_jpeg::Values;
 
 use crate::pixels::{CHANNELS, Picture, Pixels};
 
@@ -46,7 +46,7 @@ impl Thumbnails {
         let small = mean(self.pixels.values(), size, [height, width]);
         let mut jpeg = Vec::new();
         let (columns, rows) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
-        Encoder::new(&mut jpeg, QUALITY).encode(&small, columns, rows, ColorType::Rgb).ok()?;
+        rapid_jpeg::encode(&small, [rows, columns], Values::Rgb, QUALITY, &mut jpeg).ok()?;
         Some(Thumbnail { share, aspect: width as f64 / height as f64, jpeg })
     }
 }

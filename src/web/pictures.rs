@@ -6,7 +6,7 @@
 //! Invariant: a picture is encoded once, however many pages show it. A damaged one is none.
 
 use hyper::body::Bytes;
-use jpeg_encoder::{ColorType, Encoder};
+use rapid_jpeg::Values;
 
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::pixels::{self, Pixels};
@@ -48,8 +48,8 @@ impl Pictures {
         let (width, height, rgb) = pixels::every(step, [height, width], self.pixels.values());
         let side = |side: usize| u16::try_from(side).unwrap_or(u16::MAX);
         let mut jpeg = Vec::new();
-        let encoder = Encoder::new(&mut jpeg, QUALITY);
-        encoder.encode(&rgb, side(width), side(height), ColorType::Rgb).map_err(|error| error.to_string())?;
+        rapid_jpeg::encode(&rgb, [side(height), side(width)], Values::Rgb, QUALITY, &mut jpeg)
+            .map_err(|error| error.to_string())?;
         Ok(jpeg.into())
     }
 }

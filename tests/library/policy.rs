@@ -288,9 +288,7 @@ fn a_jpeg_allocates_only_the_buffers_of_the_decoder() {
     };
     let mut preprocessor = Preprocessor::new(spec, &rapid::policy::bundle::Normalization::Identity);
     let mut jpeg = Vec::new();
-    jpeg_encoder::Encoder::new(&mut jpeg, 85)
-        .encode(&vec![90; 3 * 320 * 240], 320, 240, jpeg_encoder::ColorType::Rgb)
-        .unwrap();
+    rapid_jpeg::encode(&vec![90; 3 * 320 * 240], [240, 320], rapid_jpeg::Values::Rgb, 85, &mut jpeg).unwrap();
     let picture = Picture { encoding: Encoding::Mjpeg, width: 320, height: 240, bytes: &jpeg };
     let mut out = vec![0.0; preprocessor.output_len()];
     let mut write = || preprocessor.write(&picture, &mut out).unwrap();

@@ -27,8 +27,6 @@ use rapid::registry::task::PARTS;
 use rapid::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid::simulation::task::layout;
 use rapid::time::Stamp;
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::zune_core::bytestream::ZCursor;
 
 /// Between two ticks.
 const PERIOD: Duration = Duration::from_millis(100);
@@ -286,8 +284,7 @@ fn a_step_of_the_horizon_never_allocates() {
 fn jpeg(side: u16, color: u8) -> Vec<u8> {
     let mut jpeg = Vec::new();
     let pixels = vec![color; 3 * usize::from(side) * usize::from(side)];
-    let encoder = jpeg_encoder::Encoder::new(&mut jpeg, 90);
-    encoder.encode(&pixels, side, side, jpeg_encoder::ColorType::Rgb).unwrap();
+    rapid_jpeg::encode(&pixels, [side; 2], rapid_jpeg::Values::Rgb, 90, &mut jpeg).unwrap();
     jpeg
 }
 
@@ -311,11 +308,8 @@ fn an_answer_allocates_only_for_the_decoder_of_its_pictures() {
         }
     }
     let mut pixels = vec![0; 3 * usize::from(SIDE) * usize::from(SIDE)];
-    let mut decode = |picture: &Vec<u8>| {
-        let mut decoder = JpegDecoder::new(ZCursor::new(picture));
-        decoder.decode_headers().unwrap();
-        decoder.decode_into(&mut pixels).unwrap();
-    };
+    let mut decoder = rapid_jpeg::Decoder::default();
+    let mut decode = |picture: &Vec<u8>| decoder.rgb(picture, [usize::from(SIDE); 2], &mut pixels).unwrap();
     pictures.iter().for_each(&mut decode);
     let decoder = allocations(|| pictures.iter().for_each(&mut decode)) * STEPS as u64;
     assert!(decoder > 0, "the decoder is not counted");

@@ -44,8 +44,7 @@ fn push(pilot: &mut Pilot, registry: &Registry, tick: u64) {
             (Encoding::F64, 0)
         } else {
             let color = u8::try_from(40 + 20 * tick).unwrap();
-            let encoder = jpeg_encoder::Encoder::new(&mut bytes, 90);
-            encoder.encode(&vec![color; 3 * 96 * 96], 96, 96, jpeg_encoder::ColorType::Rgb).unwrap();
+            rapid_jpeg::encode(&vec![color; 3 * 96 * 96], [96; 2], rapid_jpeg::Values::Rgb, 90, &mut bytes).unwrap();
             (Encoding::Mjpeg, 96)
         };
         let header = SampleHeader {

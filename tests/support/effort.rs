@@ -4,3 +4,8 @@
 pub(crate) fn every(n: usize) -> usize {
     if std::env::var_os("RAPID_THOROUGH").is_some() { 1 } else { n }
 }
+
+/// Of the random cases of such a test a third, and with `RAPID_THOROUGH` all.
+pub(crate) fn cases(all: u32) -> u32 {
+    if every(3) == 1 { all } else { all / 3 }
+}

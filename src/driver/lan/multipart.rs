@@ -10,6 +10,8 @@
 //! Invariant: memory is bounded by the largest permitted body and [`LONGEST_HEAD`], whatever the input.
 //! Invariant: parts cause no allocation once the largest one has been seen.
 
+use memchr::memchr;
+
 /// Header lines of a part, bytes: those of a camera are under 200.
 pub(super) const LONGEST_HEAD: usize = 8 << 10;
 /// A boundary has 70 characters at most (RFC 2046, 5.1.1).
@@ -119,7 +121,7 @@ impl Multipart {
 
     /// Lines are checked as they arrive: the boundary line was not part of the body.
     fn take_unsized(&mut self, bytes: &[u8]) -> (usize, Cut) {
-        let end = bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1);
+        let end = memchr(b'\n', bytes).map(|at| at + 1);
         let count = end.unwrap_or(bytes.len());
         // The boundary's own line, and the line end before it, do not belong to the body.
         if self.body.len() + count > self.largest.saturating_add(LONGEST_LINE + b"\r\n".len()) {
@@ -152,7 +154,7 @@ impl Multipart {
     }
 
     fn take_line(&mut self, bytes: &[u8]) -> (usize, Cut) {
-        let end = bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1);
+        let end = memchr(b'\n', bytes).map(|at| at + 1);
         let count = end.unwrap_or(bytes.len());
         if self.state == State::Head {
             self.head += count;

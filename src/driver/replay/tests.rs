@@ -3,7 +3,7 @@ use std::io::Write as _;
 use proptest::prelude::*;
 
 use super::*;
-use crate::effort::every;
+use crate::effort::{cases, every};
 use crate::episode::testing::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
 use crate::mask::PhysicalMask;
 use crate::registry::scenario::ScenarioAction;
@@ -127,7 +127,7 @@ async fn unplayable_files_are_errors() {
 fn damaged_files_never_panic() {
     for options in layouts() {
         let whole = episode(options);
-        for at in (0..whole.len()).step_by(11 * every(5)) {
+        for at in (0..whole.len()).step_by(11 * every(9)) {
             let mut bytes = whole.clone();
             bytes[at] ^= 1 << (at % 8);
             if at % 7 == 0 {
@@ -144,10 +144,10 @@ fn damaged_files_never_panic() {
             }
             let _ = scenario(file.path());
         }
-        for cut in (0..whole.len()).step_by(every(7)) {
+        for cut in (0..whole.len()).step_by(every(13)) {
             read_bytes(&whole[..cut]);
         }
-        let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
+        let config = ProptestConfig { cases: cases(300), failure_persistence: None, ..ProptestConfig::default() };
         proptest!(config, |(mutations in mutations())| read_bytes(&mutated(&whole, &mutations)));
     }
 }

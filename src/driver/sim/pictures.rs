@@ -1,6 +1,6 @@
 //! The pictures of a simulated camera: encoded once, and numbered when they are sent.
 
-use jpeg_encoder::{ColorType, Encoder};
+use rapid_jpeg::Values;
 
 use super::super::DriverError;
 
@@ -93,15 +93,29 @@ pub(super) fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec
 
 /// A gradient tinted by the seed, with a bright square that moves from picture to picture.
 pub(super) fn encode(width: u32, height: u32, seed: u64, index: u32) -> Result<Vec<u8>, DriverError> {
+    let height_and_width = sides(width, height)?;
     let side = (width.min(height) / 4).max(1);
-    let left = (width - side.min(width)) * index / PICTURES;
+    let left = (width - side) * index / PICTURES;
     let top = height / 3;
     let tint = seed.to_le_bytes()[0];
-    jpeg(width, height, |x, y| {
-        let inside = (left..left + side).contains(&x) && (top..top + side).contains(&y);
-        let [across, down] = [x * 255 / width, y * 255 / height].map(|share| share.to_le_bytes()[0]);
-        if inside { [255, 240, 32] } else { [across, down, tint] }
-    })
+    let share = |at: u32, of: u32| (at * 255 / of).to_le_bytes()[0];
+    let mut row: Vec<[u8; 3]> = (0..width).map(|x| [share(x, width), 0, tint]).collect();
+    let square = vec![[255, 240, 32]; side as usize];
+    let mut pixels = Vec::with_capacity(3 * (width * height) as usize);
+    for y in 0..height {
+        let down = share(y, height);
+        for [_, green, _] in &mut row {
+            *green = down;
+        }
+        pixels.extend_from_slice(row.as_flattened());
+        let place = pixels.len() - 3 * (width - left) as usize;
+        if (top..top + side).contains(&y)
+            && let Some(covered) = pixels.get_mut(place..place + 3 * side as usize)
+        {
+            covered.copy_from_slice(square.as_flattened());
+        }
+    }
+    jpeg(&pixels, height_and_width)
 }
 
 /// A floor from 0.5 m to 2 m in mm, a nearer square that moves across it, and columns without a distance at its left, as a
@@ -128,26 +142,21 @@ pub(super) fn write_depth((width, height): (u32, u32), seed: u64, sequence: u32,
 
 /// The light fills the picture.
 fn white(width: u32, height: u32) -> Result<Vec<u8>, DriverError> {
-    jpeg(width, height, |_, _| [255; 3])
+    let size = sides(width, height)?;
+    jpeg(&vec![255; 3 * (width * height) as usize], size)
 }
 
-fn jpeg(width: u32, height: u32, colour: impl Fn(u32, u32) -> [u8; 3]) -> Result<Vec<u8>, DriverError> {
-    let unmade = || DriverError::Fatal(format!("a simulated picture cannot be {width}x{height}: use 1..=8192 pixels"));
-    let (Ok(narrow_width), Ok(narrow_height)) = (u16::try_from(width), u16::try_from(height)) else {
-        return Err(unmade());
-    };
-    if !(1..=8192).contains(&width) || !(1..=8192).contains(&height) {
-        return Err(unmade());
-    }
-    let mut pixels = Vec::with_capacity((width * height * 3) as usize);
-    for y in 0..height {
-        for x in 0..width {
-            pixels.extend_from_slice(&colour(x, y));
-        }
-    }
+/// Height and width, if a picture can have these.
+fn sides(width: u32, height: u32) -> Result<[u16; 2], DriverError> {
+    let side = |side: u32| u16::try_from(side).ok().filter(|side| (1..=8192).contains(side));
+    side(height).zip(side(width)).map(Into::into).ok_or_else(|| {
+        DriverError::Fatal(format!("a simulated picture cannot be {width}x{height}: use 1..=8192 pixels"))
+    })
+}
+
+fn jpeg(pixels: &[u8], size: [u16; 2]) -> Result<Vec<u8>, DriverError> {
     let mut encoded = Vec::new();
-    Encoder::new(&mut encoded, JPEG_QUALITY)
-        .encode(&pixels, narrow_width, narrow_height, ColorType::Rgb)
-        .map_err(|_| unmade())?;
+    rapid_jpeg::encode(pixels, size, Values::Rgb, JPEG_QUALITY, &mut encoded)
+        .map_err(|error| DriverError::Fatal(format!("a simulated picture: {error}")))?;
     Ok(encoded)
 }

@@ -245,8 +245,12 @@ fn curve(page: &mut Svg, band: &Band, row: &Row, timeline: &Timeline, y: f64) {
 /// How much of a step something was present, and where that begins and ends: in a step with an unplug, the rate is that
 /// of the rest. A step without any presence counts as a whole.
 fn overlap(present: Option<&[(f64, f64)]>, from: f64, to: f64) -> (f64, f64, f64) {
-    let spans = present.unwrap_or_default().iter().map(|(begin, end)| (begin.max(from), end.min(to)));
+    let present = present.unwrap_or_default();
+    // They follow each other: a recording that flaps has thousands, and only those of the step count.
+    let first = present.partition_point(|(_, end)| *end <= from);
+    let spans = present.iter().skip(first).take_while(|(begin, _)| *begin < to);
     let (sum, begin, end) = spans
+        .map(|(begin, end)| (begin.max(from), end.min(to)))
         .filter(|(begin, end)| begin < end)
         .fold((0.0, to, from), |(sum, first, last), (begin, end)| (sum + end - begin, first.min(begin), last.max(end)));
     if sum > 0.0 { (sum, begin, end) } else { (to - from, from, to) }

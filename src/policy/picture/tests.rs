@@ -1,5 +1,5 @@
-use jpeg_encoder::{ColorType, Encoder};
 use proptest::prelude::*;
+use rapid_jpeg::Values;
 
 use super::*;
 use crate::sample::Encoding;
@@ -19,7 +19,7 @@ fn picture(encoding: Encoding, [height, width]: [usize; 2], bytes: &[u8]) -> Pic
 fn jpeg(pixels: &[u8], [height, width]: [usize; 2]) -> Vec<u8> {
     let mut jpeg = Vec::new();
     let side = |side: usize| u16::try_from(side).unwrap();
-    Encoder::new(&mut jpeg, 100).encode(pixels, side(width), side(height), ColorType::Rgb).unwrap();
+    rapid_jpeg::encode(pixels, [side(height), side(width)], Values::Rgb, 100, &mut jpeg).unwrap();
     jpeg
 }
 

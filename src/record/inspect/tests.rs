@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::effort::every;
+use crate::effort::{cases, every};
 use crate::episode::testing;
 use crate::mask::{PhysicalMask, SizedMask};
 use crate::palette::Palette;
@@ -80,7 +80,7 @@ async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
     let whole = of(&bytes).unwrap();
     assert!(bytes.len() > 20_000);
     let mut before = 0;
-    for cut in (0..bytes.len()).step_by(61 * every(3)) {
+    for cut in (0..bytes.len()).step_by(61 * every(5)) {
         let Some(report) = of(&bytes[..cut]) else {
             assert!(cut < mcap::MAGIC.len());
             continue;
@@ -92,7 +92,7 @@ async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
     }
     assert_eq!(before, whole.messages);
     let mut noticed = 0;
-    for at in (0..bytes.len()).step_by(37 * every(3)) {
+    for at in (0..bytes.len()).step_by(37 * every(5)) {
         let mut flipped = bytes.clone();
         flipped[at] ^= 1 << (at % 8);
         if let Some(report) = of(&flipped) {
@@ -101,12 +101,12 @@ async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
         }
     }
     // Whatever lies in a chunk is under its CRC, and chunks are most of the file.
-    assert!(noticed * 37 * every(3) > bytes.len() / 2, "{noticed}");
+    assert!(noticed * 37 * every(5) > bytes.len() / 2, "{noticed}");
 }
 
 #[test]
 fn any_damaged_file_has_a_report() {
-    let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
+    let config = ProptestConfig { cases: cases(300), failure_persistence: None, ..ProptestConfig::default() };
     for bytes in testing::layouts().map(testing::episode) {
         proptest!(config.clone(), |(mutations in testing::mutations())| {
             if let Some(report) = inspect_bytes(&testing::mutated(&bytes, &mutations)) {

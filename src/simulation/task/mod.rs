@@ -12,7 +12,7 @@ mod world;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use jpeg_encoder::{ColorType, Encoder, EncodingError, SamplingFactor};
+use rapid_jpeg::{EncodeError, Values};
 
 pub use expert::Expert;
 pub use looks::{Looks, SIDE, SIDE_PIXELS};
@@ -29,7 +29,7 @@ const SIDE_U16: u16 = 96;
 /// A picture of the task cannot be encoded.
 #[derive(Debug, thiserror::Error)]
 #[error("a picture of the simulated task: {0}")]
-pub struct PictureError(#[from] EncodingError);
+pub struct PictureError(#[from] EncodeError);
 
 /// Encoding of the samples of `part`, with width and height of the header.
 pub const fn layout(part: TaskPart) -> (Encoding, u32, u32) {
@@ -164,9 +164,7 @@ impl Trial {
         if part.numbers().is_some() {
             return Ok(());
         }
-        let mut encoder = Encoder::new(payload, JPEG_QUALITY);
-        encoder.set_sampling_factor(SamplingFactor::F_1_1);
-        Ok(encoder.encode(&self.picture, SIDE_U16, SIDE_U16, ColorType::Rgb)?)
+        Ok(rapid_jpeg::encode(&self.picture, [SIDE_U16; 2], Values::Rgb, JPEG_QUALITY, payload)?)
     }
 }
 

@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use jpeg_encoder::{ColorType, Encoder, EncodingError};
+use rapid_jpeg::{EncodeError, Values};
 
 use super::spec::CAMERAS;
 
@@ -58,11 +58,11 @@ impl FrameId {
 }
 
 /// The JPEGs a camera of this size cycles through.
-pub fn jpegs(width: u16, height: u16) -> Result<Vec<Vec<u8>>, EncodingError> {
+pub fn jpegs(width: u16, height: u16) -> Result<Vec<Vec<u8>>, EncodeError> {
     (0..PICTURES)
         .map(|picture| {
             let mut jpeg = Vec::new();
-            Encoder::new(&mut jpeg, 80).encode(&gray(width, height, picture), width, height, ColorType::Luma)?;
+            rapid_jpeg::encode(&gray(width, height, picture), [height, width], Values::Grey, 80, &mut jpeg)?;
             Ok(jpeg)
         })
         .collect()

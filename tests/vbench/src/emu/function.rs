@@ -40,7 +40,7 @@ pub enum ContentError {
         /// Pixels down.
         height: u16,
         /// Why.
-        source: jpeg_encoder::EncodingError,
+        source: rapid_jpeg::EncodeError,
     },
     /// The feed cannot be read.
     #[error(transparent)]

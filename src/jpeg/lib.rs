@@ -1,0 +1,132 @@
+//! JPEG pictures (ITU-T T.81) as pixels, and pixels as JPEG pictures: 8 bits a value, row by row from the top.
+//!
+//! A crate of its own, because both libraries are generic: their code is compiled with the crate that calls it, and the
+//! programs of tests, in which nothing else is optimised, decode and encode ten thousands of pictures.
+//!
+//! Invariant: no bytes cause a panic, and a picture that is not whole is refused where that is asked for.
+
+use jpeg_encoder::{ColorType, Encoder, EncodingError};
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::errors::DecodeErrors;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+/// Pixels a picture may have along a side.
+pub const LARGEST: usize = 8192;
+/// Values of a pixel of three colours.
+const CHANNELS: usize = 3;
+
+/// The values of a pixel that is encoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Values {
+    /// One, its luminance.
+    Grey,
+    /// Red, green and blue; below quality 90 the colours have half the resolution.
+    Rgb,
+}
+
+/// Why pixels could not be encoded.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+pub struct EncodeError(#[from] EncodingError);
+
+/// Appends the picture of these pixels to `out`; `size`: height and width, 1 to 65,535; `quality`: 1 to 100.
+///
+/// # Errors
+/// When there are fewer pixels than `size` needs, or a side is 0.
+pub fn encode(
+    pixels: &[u8],
+    size: [u16; 2],
+    values: Values,
+    quality: u8,
+    out: &mut Vec<u8>,
+) -> Result<(), EncodeError> {
+    let [height, width] = size;
+    let colors = match values {
+        Values::Grey => ColorType::Luma,
+        Values::Rgb => ColorType::Rgb,
+    };
+    Ok(Encoder::new(out, quality).encode(pixels, width, height, colors)?)
+}
+
+/// Why a picture has no pixels.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DecodeError {
+    /// The decoder's words.
+    #[error("{0}")]
+    Damaged(String),
+    /// It is whole, and of another size.
+    #[error("{wide}x{high} pixels in a sample of {width}x{height}")]
+    Size {
+        /// Pixels per row of the picture.
+        wide: usize,
+        /// Rows of the picture.
+        high: usize,
+        /// Pixels per row that were expected.
+        width: usize,
+        /// Rows that were expected.
+        height: usize,
+    },
+}
+
+impl From<DecodeErrors> for DecodeError {
+    fn from(error: DecodeErrors) -> Self {
+        Self::Damaged(error.to_string())
+    }
+}
+
+/// Memory of one picture, used again for the next; the library itself allocates for every picture.
+#[derive(Debug, Default)]
+pub struct Decoder {
+    /// The picture with the mark that the library requires.
+    marked: Vec<u8>,
+    is_portable: bool,
+}
+
+impl Decoder {
+    /// One that uses no vector instructions, as on a processor without those that the library knows.
+    #[must_use]
+    pub fn portable() -> Self {
+        Self { is_portable: true, ..Self::default() }
+    }
+
+    /// Replaces `values` by red, green and blue of each pixel of a picture with this height and width.
+    ///
+    /// # Errors
+    /// When the picture is damaged, truncated or of another size; `values` are then meaningless.
+    pub fn rgb(&mut self, jpeg: &[u8], [height, width]: [usize; 2], values: &mut Vec<u8>) -> Result<(), DecodeError> {
+        // Strict: a truncated picture is refused, not padded with grey.
+        let mut decoder = self.decoder(jpeg, options(ColorSpace::RGB).set_strict_mode(true));
+        decoder.decode_headers()?;
+        if decoder.dimensions() != Some((width, height)) {
+            let (wide, high) = decoder.dimensions().unwrap_or_default();
+            return Err(DecodeError::Size { wide, high, width, height });
+        }
+        values.resize(CHANNELS * width * height, 0);
+        Ok(decoder.decode_into(values)?)
+    }
+
+    /// The luminance of each pixel of a picture of any size; where it is truncated, that of grey.
+    ///
+    /// # Errors
+    /// When the picture is damaged.
+    pub fn luminance(&mut self, jpeg: &[u8]) -> Result<Vec<u8>, DecodeError> {
+        Ok(self.decoder(jpeg, options(ColorSpace::Luma)).decode()?)
+    }
+
+    /// With the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the Huffman tables and imply those
+    /// of the standard (ITU-T T.81 K.3); with the mark, the library uses these in place of the missing ones.
+    fn decoder(&mut self, jpeg: &[u8], options: DecoderOptions) -> JpegDecoder<ZCursor<&Vec<u8>>> {
+        let (start, rest) = jpeg.split_at(jpeg.len().min(2));
+        self.marked.clear();
+        for part in [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest] {
+            self.marked.extend_from_slice(part);
+        }
+        JpegDecoder::new_with_options(ZCursor::new(&self.marked), options.set_use_unsafe(!self.is_portable))
+    }
+}
+
+fn options(colors: ColorSpace) -> DecoderOptions {
+    DecoderOptions::default().jpeg_set_out_colorspace(colors).set_max_width(LARGEST).set_max_height(LARGEST)
+}
