@@ -3,7 +3,7 @@
 #
 # 1. The programs that guests of the virtual bench need are compiled, and beside them the guest and its kernel, if they are missing.
 # 2. The guests run, one per processor, ahead of everything else where that is allowed, while the remaining tests are compiled.
-# 3. The tests of the host run: the unit tests and those of memory, which wait for stretches without noise, and then those of the
+# 3. The tests of the host run: the unit tests, those of memory, which wait for stretches without noise, and then those of the
 #    program, which wait more than they compute, beside all others.
 #    The unit tests make files of killed processes, which each start of the program removes: those two are never side by side.
 #
@@ -34,9 +34,9 @@ run() {
     return "$code"
 }
 
-# What runs beside a guest takes only what the guest leaves of the processors.
-idle() {
-    if chrt --idle 0 true 2>/dev/null; then chrt --idle 0 "$@"; else nice -n 19 "$@"; fi
+# What runs beside guests takes what they leave of the processors. Not less: beside other programs it has to end, too.
+beside() {
+    if chrt --rr 1 true 2>/dev/null; then "$@"; else nice -n 5 "$@"; fi
 }
 
 # A user who is not root may be asked for a password, which the output of cargo would hide: for them the guest is built first.
@@ -81,13 +81,14 @@ readonly bench=$!
 set +m
 jobs+=("$bench")
 code=0
-hosted=$(programs idle "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
+hosted=$(programs beside "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
 echo "     Waiting for the virtual bench"
 wait "$bench" || code=1
 jobs=()
 cat "$output"
 
-run env <<<"$(grep -e /deps/rapid- -e /memory- <<<"$hosted")" || code=1
+run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /deps/rapid- <<<"$hosted")" || code=1
+run env <<<"$(grep /memory- <<<"$hosted")" || code=1
 set -m
 run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /program- <<<"$hosted")" >"$output" 2>&1 &
 readonly waiting=$!
