@@ -144,7 +144,10 @@ const HOMES: &[(&str, &[&str])] = &[
     ("qrcodegen", &["qr"]),
     ("rand_distr", &["random"]),
     ("rand_pcg", &["random"]),
-    ("rapid_jpeg", &["pixels", "calibration/brightness", "driver/sim", "simulation/task", "plot", "web"]),
+    (
+        "rapid_jpeg",
+        &["pixels", "calibration/brightness", "driver/sim", "export/video", "simulation/task", "plot", "web"],
+    ),
     ("ratatui", &["tui"]),
     ("ratatui_core", &["tui"]),
     ("ratatui_image", &["tui/picture"]),

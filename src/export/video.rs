@@ -130,11 +130,7 @@ pub fn encode(
 
 /// How near a frame is to the picture that it was made of: the ratio of signal to noise, dB; 100 if they are equal.
 pub(super) fn psnr(found: &[u8], expected: &[u8]) -> f64 {
-    let mut squares = 0;
-    for (found, expected) in found.iter().zip(expected) {
-        let apart = u64::from(found.abs_diff(*expected));
-        squares += apart * apart;
-    }
+    let squares = rapid_jpeg::squares(found, expected);
     (10.0 * (255.0_f64.powi(2) * expected.len() as f64 / squares as f64).log10()).min(100.0)
 }
 

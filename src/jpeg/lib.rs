@@ -127,6 +127,11 @@ impl Decoder {
     }
 }
 
+/// The sum of the squares of the differences between pixels and those that a lossy encoder made of them.
+pub fn squares(found: &[u8], expected: &[u8]) -> u64 {
+    found.iter().zip(expected).map(|(found, expected)| u64::from(found.abs_diff(*expected)).pow(2)).sum()
+}
+
 fn options(colors: ColorSpace) -> DecoderOptions {
     DecoderOptions::default().jpeg_set_out_colorspace(colors).set_max_width(LARGEST).set_max_height(LARGEST)
 }

@@ -359,13 +359,15 @@ fn a_held_sensor_is_observed_as_it_was_and_then_not_at_all() {
     };
     let away: Vec<&Value> = of(&printed, "chunk").filter(|chunk| chunk["mask"] == "0x05").collect();
     let first = away.first().expect("it is asked without the sensor");
-    let (held, gone): (Vec<&Value>, Vec<&Value>) = away.iter().partition(|chunk| ns(chunk) - ns(first) < 900_000_000);
-    assert!(!held.is_empty() && !gone.is_empty(), "{away:?}");
     let last = seqs(first);
     assert_eq!(last.len(), 2, "{first}");
+    // A second after the last tick at which it was there: that is one between the last chunk with it and the first without.
+    let with = of(&printed, "chunk").filter(|chunk| chunk["mask"] == "0x07" && ns(chunk) < ns(first)).map(ns).max();
+    let with = with.expect("it is asked with the sensor");
+    let (held, gone): (Vec<&Value>, Vec<&Value>) = away.iter().partition(|chunk| !seqs(chunk).is_empty());
     assert!(held.iter().all(|chunk| seqs(chunk) == last), "the same samples again: {held:?}");
-    let late: Vec<&&Value> = gone.iter().filter(|chunk| ns(chunk) - ns(first) > 1_100_000_000).collect();
-    assert!(!late.is_empty() && late.iter().all(|chunk| seqs(chunk).is_empty()), "{gone:?}");
+    assert!(held.iter().all(|chunk| ns(chunk) - ns(first) < 1_000_000_000), "{held:?}");
+    assert!(!gone.is_empty() && gone.iter().all(|chunk| ns(chunk) - with > 1_000_000_000), "{gone:?}");
 
     // What was held can be computed again from the recording.
     let file = place.path("out").join(&place.files("out")[0]).display().to_string();

@@ -21,6 +21,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use super::{GuestError, Init, Ran, lock, tail, wait, write};
 
 const QEMU: &str = "qemu-system-x86_64";
+/// Of a test that is killed, no machine is left that computes on.
+const WITH_ITS_PARENT: [&str; 4] = ["setpriv", "--pdeathsig", "KILL", "--"];
 /// Added to the script's own limit: boot, copying, power off.
 const OVERHEAD: Duration = Duration::from_mins(5);
 /// A boot, and writing the machine's memory to a file.
@@ -61,6 +63,7 @@ pub(super) struct Qemu {
 impl Qemu {
     pub(super) fn run(&self, share: &Path, init: Init, limit: Duration) -> Result<Ran, GuestError> {
         let _alone = lock(self.directory.with_file_name(".one-guest"))?;
+        let identity = identity()?;
         let mut qemu = match init {
             Init::Systemd => {
                 let mut qemu = self.command(share, "bench.systemd");
@@ -68,7 +71,7 @@ impl Qemu {
                 qemu
             }
             Init::Script => {
-                let saved = self.saved()?;
+                let saved = self.saved(identity)?;
                 let mut qemu = self.command(share, "");
                 qemu.args(["-serial", "stdio", "-incoming"]).arg(format!("exec:cat '{}'", saved.display()));
                 qemu
@@ -83,9 +86,9 @@ impl Qemu {
         Ok(Ran { wall: started.elapsed(), limit: limit + OVERHEAD, ended })
     }
 
-    /// The file of the saved machine; boots one and saves it if there is none. Requires the lock.
-    fn saved(&self) -> Result<PathBuf, GuestError> {
-        let path = self.directory.join(format!("saved-{:016x}", identity()?));
+    /// The file of the saved machine with this identity; boots one and saves it if there is none. Requires the lock.
+    fn saved(&self, identity: u64) -> Result<PathBuf, GuestError> {
+        let path = self.directory.join(format!("saved-{identity:016x}"));
         if path.is_file() {
             return Ok(path);
         }
@@ -130,8 +133,11 @@ impl Qemu {
 
     /// The machine with its disk and `share`, but for its second serial line.
     fn command(&self, share: &Path, argument: &str) -> Command {
-        let mut qemu = Command::new(QEMU);
-        qemu.args(MACHINE)
+        let [first, options @ ..] = WITH_ITS_PARENT;
+        let mut qemu = Command::new(first);
+        qemu.args(options)
+            .arg(QEMU)
+            .args(MACHINE)
             .arg("-serial")
             .arg(format!("file:{}", share.join("console.log").display()))
             .arg("-kernel")
