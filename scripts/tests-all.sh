@@ -36,10 +36,11 @@ part() { # NAME COMMAND...
 skip() { table+=("skipped  $1: $2"); }
 
 second_opinion() {
-    local filter
+    local filter all
+    all=$("$@" --test guest -- --list) || return 1
     for filter in "${second[@]}"; do
         # The name of a scenario that was renamed would select none, and nothing would fail.
-        grep -q "$filter.*: test$" < <("$@" --test guest -- --list) || { echo "tests-all.sh: no guest is called $filter" >&2; return 1; }
+        grep -q "$filter.*: test$" <<<"$all" || { echo "tests-all.sh: no guest is called $filter" >&2; return 1; }
     done
     RAPID_VBENCH_BACKEND=qemu "$@" --test guest -- --test-threads=2 "${second[@]}"
 }

@@ -34,7 +34,7 @@ run() {
     return "$code"
 }
 
-# What runs beside guests takes what they leave of the processors. Not less: beside other programs it has to end, too.
+# What runs beside guests takes what they leave of the processors. Not the idle class: on a busy machine it would never end.
 beside() {
     if chrt --rr 1 true 2>/dev/null; then "$@"; else nice -n 5 "$@"; fi
 }
@@ -94,7 +94,7 @@ run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /program- <<<"$hosted")
 readonly waiting=$!
 set +m
 jobs+=("$waiting")
-run nice -n 10 <<<"$(grep -v -e /program- -e /deps/rapid- -e /memory- <<<"$hosted")" || code=1
+run env <<<"$(grep -v -e /program- -e /deps/rapid- -e /memory- <<<"$hosted")" || code=1
 "$here/models-tests.sh" || code=1
 echo "     Waiting for the tests of the program"
 wait "$waiting" || code=1

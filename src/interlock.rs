@@ -177,6 +177,14 @@ impl Interlocks {
         one.state.swap(code, Ordering::SeqCst) != code
     }
 
+    /// An input that has stopped, or was lost, after this time, whatever it reports now; an emergency stop before an enabling
+    /// switch.
+    pub(crate) fn stopped_after(&self, last: u64) -> Option<usize> {
+        let is_after = |one: &Interlock| one.stopped.load(Ordering::SeqCst) > last;
+        let stopped = |kind| self.all.iter().position(|one| one.kind == kind && is_after(one));
+        stopped(StopKind::Emergency).or_else(|| stopped(StopKind::Enabling))
+    }
+
     /// The order that results from an input that does not run.
     pub(crate) fn order(&self, index: usize) -> Option<Order> {
         let trip =

@@ -75,7 +75,7 @@ impl Permission {
         let is_news = self.interlocks.set(index, state, now);
         if is_news && state != InputState::Runs {
             self.at_first_plug.store(false, Ordering::SeqCst);
-            // Before it is given: see `arm`.
+            // After the input's state, and before the order: see `stopped_since`.
             self.disarmed.fetch_max(now.0.max(1), Ordering::SeqCst);
             self.slot.give(self.interlocks.order(index).unwrap_or(Order::Disarm));
         }
@@ -85,7 +85,7 @@ impl Permission {
     /// The actuator may not move, from `now` on. Returns whether one is plugged in.
     pub fn disarm(&self, now: Stamp) -> bool {
         self.at_first_plug.store(false, Ordering::SeqCst);
-        // Before it is given: see `arm`.
+        // Before the order: see `stopped_since`.
         self.disarmed.fetch_max(now.0.max(1), Ordering::SeqCst);
         self.slot.give(Order::Disarm);
         self.actuators.load(Ordering::SeqCst) > 0
@@ -122,25 +122,28 @@ impl Permission {
         self.interlocks.check()?;
         self.slot.give(arm);
         // What stopped the actuator in the meantime may have been given to the slot before this.
-        if let Some((void, stop)) = self.stopped_since(|| self.is_overtaken(given)) {
+        if let Some((void, stop)) = self.stopped_since(given.0.saturating_sub(1)) {
             self.slot.give(stop);
             return Err(void);
         }
         Ok(())
     }
 
-    /// What makes void an arm that has just been given, and the order that has to follow it. `is_overtaken`: a time of
-    /// [`Self::disarmed`] counts that was not there before the arm was given.
+    /// What makes void an arm that has just been given, and the order that has to follow it: whatever has stopped the
+    /// actuator after `last`.
     ///
-    /// The time is read before the states: a stop stores its state first, and is then the one that is seen here. Its
-    /// order is not always a disarm: a joint that is to hold at an emergency stop must not fall.
-    fn stopped_since(&self, is_overtaken: impl FnOnce() -> bool) -> Option<(Void, Order)> {
-        let is_overtaken = is_overtaken();
+    /// The time of the last disarm is read before the states: an input stores its state and its time before that one, and
+    /// is then seen here. Its order is not always a disarm: a joint that is to hold at an emergency stop must not fall.
+    fn stopped_since(&self, last: u64) -> Option<(Void, Order)> {
+        let is_overtaken = self.disarmed.load(Ordering::SeqCst) > last;
+        let order = |index| self.interlocks.order(index).unwrap_or(Order::Disarm);
         if let Err(blocked) = self.interlocks.check() {
-            let stop = self.interlocks.order(blocked.index).unwrap_or(Order::Disarm);
+            let stop = order(blocked.index);
             return Some((blocked.into(), stop));
         }
-        is_overtaken.then_some((Void::Overtaken, Order::Disarm))
+        // An input that runs again has stopped the actuator nevertheless.
+        let stop = || self.interlocks.stopped_after(last).map_or(Order::Disarm, order);
+        is_overtaken.then(|| (Void::Overtaken, stop()))
     }
 
     fn is_overtaken(&self, given: Stamp) -> bool {
@@ -170,7 +173,8 @@ impl Attended {
         let Permission { at_first_plug, disarmed, interlocks, .. } = &*self.0;
         // Before the swap: a disarm stores its time after it has reverted the flag.
         let before = disarmed.load(Ordering::SeqCst);
-        if !at_first_plug.swap(false, Ordering::SeqCst) {
+        // Another actuator may have set the flag just before such a disarm reverts it.
+        if !at_first_plug.swap(false, Ordering::SeqCst) || before != 0 {
             return Ok(None);
         }
         if let Err(blocked) = interlocks.check() {
@@ -178,7 +182,7 @@ impl Attended {
         }
         give(Order::Arm).inspect_err(|_| self.was_not_armed())?;
         // What stopped the actuator in the meantime may have been carried out before the arm.
-        let Some((void, stop)) = self.0.stopped_since(|| disarmed.load(Ordering::SeqCst) != before) else {
+        let Some((void, stop)) = self.0.stopped_since(before) else {
             return Ok(None);
         };
         give(stop)?;

@@ -132,7 +132,7 @@ fn filled(loan: Loan, header: SampleHeader, payload: &[u8]) -> Result<Filled, Bu
         sigbus::damaged();
         return Err(sigbus::error());
     }
-    // SAFETY: both are as long as checked, and a loan is no one else's. Every byte is written before it counts as such.
+    // SAFETY: both are as long as checked, and a loan is no one else's. Every byte is written before it is assumed to be.
     unsafe {
         std::ptr::copy_nonoverlapping(payload.as_ptr(), place.as_mut_ptr().cast(), payload.len());
         Ok(ManuallyDrop::into_inner(loan).assume_init())
@@ -162,30 +162,58 @@ mod tests {
     use super::super::tests::registry;
     use super::*;
 
-    /// Not a test of its own: its effect on the process is permanent.
-    #[test]
-    #[ignore = "run by a_sample_whose_memory_is_overwritten_before_it_is_filled_ends_the_use_of_the_bus"]
-    fn helper() {
-        let registry = registry(16);
-        let bus = Bus::open(&registry, Some(&format!("busw{}", std::process::id()))).unwrap();
-        let writer = bus.writer(TopicId::Mask).unwrap();
-        let loan = writer.publisher.loan_slice_uninit(24).unwrap();
+    const DEPTH: usize = 16;
+
+    /// A writer whose loan or sample is overwritten, at a moment that `publish` cannot be stopped at.
+    fn overwritten(name: &str, work: impl FnOnce(&Writer, &dyn Fn()) -> Result<(), BusError>) {
+        let registry = registry(DEPTH);
+        let bus = Bus::open(&registry, Some(&format!("{name}{}", std::process::id()))).unwrap();
+        let _inbox = bus.inbox().unwrap();
+        let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).unwrap();
+        // More than the consumer's queue holds: the next sample pushes one out of it, which returns to the pool.
+        for _ in 0..2 * DEPTH {
+            writer.publish(SampleHeader::default(), &[7; 24]).unwrap();
+        }
         let segment = format!("/proc/self/fd/{}", writer.pool.as_ref().unwrap().as_raw_fd());
         let segment = File::options().write(true).open(segment).unwrap();
-        segment.write_all_at(&[0; 4096], 0).unwrap();
-        let error = contained(|| filled(loan, SampleHeader::default(), &[7; 24]).map(drop)).flatten().unwrap_err();
+        let error =
+            contained(|| work(&writer, &|| segment.write_all_at(&[0; 4096], 0).unwrap())).flatten().unwrap_err();
         assert!(matches!(&error, BusError::Lost { file } if file.to_string_lossy().ends_with(".data")), "{error}");
         assert!(sigbus::happened() && writer.publish(SampleHeader::default(), &[7; 24]).is_err());
     }
 
+    /// Not a test of its own: its effect on the process is permanent.
     #[test]
-    fn a_sample_whose_memory_is_overwritten_before_it_is_filled_ends_the_use_of_the_bus() {
-        let ended = std::process::Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "bus::writer::tests::helper", "--ignored", "--nocapture"])
-            .output()
-            .unwrap();
-        // Of a name that fits no test nothing runs, and nothing fails.
-        let passed = String::from_utf8_lossy(&ended.stdout).contains("1 passed");
-        assert!(ended.status.success() && passed, "{ended:?}");
+    #[ignore = "run by a_sample_whose_memory_is_overwritten_ends_the_use_of_the_bus_and_not_the_process"]
+    fn before_it_is_filled() {
+        overwritten("busw", |writer, overwrite| {
+            let loan = writer.publisher.loan_slice_uninit(24).unwrap();
+            overwrite();
+            filled(loan, SampleHeader::default(), &[7; 24]).map(drop)
+        });
+    }
+
+    /// As above.
+    #[test]
+    #[ignore = "run by a_sample_whose_memory_is_overwritten_ends_the_use_of_the_bus_and_not_the_process"]
+    fn before_it_is_sent() {
+        overwritten("busx", |writer, overwrite| {
+            let sample = filled(writer.publisher.loan_slice_uninit(24).unwrap(), SampleHeader::default(), &[7; 24])?;
+            overwrite();
+            sample.send().map_err(|error| writer.transfer(&format!("{error:?}"))).map(drop)
+        });
+    }
+
+    #[test]
+    fn a_sample_whose_memory_is_overwritten_ends_the_use_of_the_bus_and_not_the_process() {
+        for name in ["before_it_is_filled", "before_it_is_sent"] {
+            let ended = std::process::Command::new(std::env::current_exe().unwrap())
+                .args(["--exact", &format!("bus::writer::tests::{name}"), "--ignored", "--nocapture"])
+                .output()
+                .unwrap();
+            // Of a name that fits no test nothing runs, and nothing fails.
+            let passed = String::from_utf8_lossy(&ended.stdout).contains("1 passed");
+            assert!(ended.status.success() && passed, "{name}: {ended:?}");
+        }
     }
 }

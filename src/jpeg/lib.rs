@@ -1,7 +1,7 @@
 //! JPEG pictures (ITU-T T.81) as pixels, and pixels as JPEG pictures: 8 bits a value, row by row from the top.
 //!
-//! A crate of its own, because both libraries are generic: their code is compiled with the crate that calls it, and the
-//! programs of tests, in which nothing else is optimised, decode and encode ten thousands of pictures.
+//! A crate of its own, because both libraries are generic: their code is compiled with the crate that calls it. This one is
+//! optimised in tests, too, which decode and encode tens of thousands of pictures; so what goes through every pixel is here.
 //!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused where that is asked for.
 
@@ -56,7 +56,7 @@ pub enum DecodeError {
     /// The decoder's words.
     #[error("{0}")]
     Damaged(String),
-    /// It is whole, and of another size.
+    /// Its header states another size.
     #[error("{wide}x{high} pixels in a sample of {width}x{height}")]
     Size {
         /// Pixels per row of the picture.
@@ -81,16 +81,9 @@ impl From<DecodeErrors> for DecodeError {
 pub struct Decoder {
     /// The picture with the mark that the library requires.
     marked: Vec<u8>,
-    is_portable: bool,
 }
 
 impl Decoder {
-    /// One that uses no vector instructions, as on a processor without those that the library knows.
-    #[must_use]
-    pub fn portable() -> Self {
-        Self { is_portable: true, ..Self::default() }
-    }
-
     /// Replaces `values` by red, green and blue of each pixel of a picture with this height and width.
     ///
     /// # Errors
@@ -123,7 +116,7 @@ impl Decoder {
         for part in [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest] {
             self.marked.extend_from_slice(part);
         }
-        JpegDecoder::new_with_options(ZCursor::new(&self.marked), options.set_use_unsafe(!self.is_portable))
+        JpegDecoder::new_with_options(ZCursor::new(&self.marked), options)
     }
 }
 

@@ -71,7 +71,8 @@ fn an_arm_at_the_first_plug_is_given_once_and_not_after_an_order() {
 fn a_stop_during_the_arm_at_the_first_plug_is_given_after_it() {
     let disarm = |permission: &Permission| permission.disarm(at(1));
     let lose = |permission: &Permission| permission.report(0, InputState::Lost, at(1));
-    for stop in [disarm as fn(&Permission) -> bool, lose] {
+    let trip = Order::Emergency(Trip { stop: 0, is_lost: true });
+    for (stop, expected) in [(disarm as fn(&Permission) -> bool, Disarm), (lose, trip)] {
         let permission = with_stops(true);
         all_run(&permission);
         let attended = permission.attend();
@@ -86,7 +87,7 @@ fn a_stop_during_the_arm_at_the_first_plug_is_given_after_it() {
             Ok::<_, ()>(())
         };
         let _ = attended.arm_at_first_plug(give);
-        assert!(given.len() == 2 && given[0] == Arm && given[1] != Arm, "{given:?}");
+        assert_eq!(given, [Arm, expected]);
     }
 }
 
@@ -251,28 +252,32 @@ proptest! {
     }
 }
 
-/// What overtakes an arm is seen with its own order, at whatever instant it does: a disarm in its place would let fall
-/// what is to hold.
+/// What overtakes an arm is seen with its own order, also if its input runs again by then: a disarm in its place would let
+/// fall what is to hold.
 #[test]
 fn a_stop_that_overtakes_an_arm_is_given_as_what_it_is() {
     for (index, kind) in STOPS.into_iter().enumerate() {
         for state in [InputState::Stopped, InputState::Lost] {
             let permission = with_stops(false);
             all_run(&permission);
-            let (void, order) = permission.stopped_since(|| permission.report(index, state, at(2))).unwrap();
+            assert_eq!(permission.stopped_since(at(2).0), None);
+            permission.report(index, state, at(3));
+            let (void, order) = permission.stopped_since(at(2).0).unwrap();
             assert!(matches!(void, Void::Blocked(blocked) if (blocked.index, blocked.state) == (index, state)));
-            let trip = Trip { stop: u8::try_from(index).unwrap(), is_lost: state == InputState::Lost };
-            assert_eq!(order, if kind == StopKind::Emergency { Order::Emergency(trip) } else { Disarm });
+            let stop = u8::try_from(index).unwrap();
+            let expected = |is_lost| match kind {
+                StopKind::Emergency => Order::Emergency(Trip { stop, is_lost }),
+                StopKind::Enabling => Disarm,
+            };
+            assert_eq!(order, expected(state == InputState::Lost));
+            permission.report(index, InputState::Runs, at(4));
+            assert_eq!(permission.stopped_since(at(2).0), Some((Void::Overtaken, expected(false))));
+            assert_eq!(permission.stopped_since(at(3).0), None);
+            // An operator's, after it.
+            permission.disarm(at(5));
+            assert_eq!(permission.stopped_since(at(4).0), Some((Void::Overtaken, Disarm)));
         }
     }
-    let permission = with_stops(false);
-    all_run(&permission);
-    let disarmed = permission.stopped_since(|| {
-        permission.disarm(at(2));
-        true
-    });
-    assert_eq!(disarmed, Some((Void::Overtaken, Disarm)));
-    assert_eq!(permission.stopped_since(|| false), None);
 }
 
 #[test]

@@ -27,6 +27,8 @@ use rapid::registry::task::PARTS;
 use rapid::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid::simulation::task::layout;
 use rapid::time::Stamp;
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
 
 /// Between two ticks.
 const PERIOD: Duration = Duration::from_millis(100);
@@ -308,8 +310,11 @@ fn an_answer_allocates_only_for_the_decoder_of_its_pictures() {
         }
     }
     let mut pixels = vec![0; 3 * usize::from(SIDE) * usize::from(SIDE)];
-    let mut decoder = rapid_jpeg::Decoder::default();
-    let mut decode = |picture: &Vec<u8>| decoder.rgb(picture, [usize::from(SIDE); 2], &mut pixels).unwrap();
+    let mut decode = |picture: &Vec<u8>| {
+        let mut decoder = JpegDecoder::new(ZCursor::new(picture));
+        decoder.decode_headers().unwrap();
+        decoder.decode_into(&mut pixels).unwrap();
+    };
     pictures.iter().for_each(&mut decode);
     let decoder = allocations(|| pictures.iter().for_each(&mut decode)) * STEPS as u64;
     assert!(decoder > 0, "the decoder is not counted");

@@ -1,7 +1,7 @@
 //! `rapid --foxglove`: a client that shares no code with the server gets the bytes that are recorded, and one that does
 //! not read costs the recording nothing.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
 use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant, SystemTime};
@@ -542,15 +542,18 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
     let running = place.start(&options, "\"event\":\"recording\"");
     let mut client = Client::connect(&address(&running));
     client.read_until("messages", |client| client.count("/rapid/camera/wrist") > 5 && client.count("/rapid/mask") > 50);
-    // It does not read until messages were left out for it, and then not for some seconds: pictures are left out first, and
-    // masks only when what the kernel holds for the client, and what may wait for it, is full of them.
-    let log = || String::from_utf8_lossy(&place.run(&["logs"]).stdout).into_owned();
-    until("a word on it", || {
-        let log = log();
-        log.contains("reads slowly: ") && log.contains(" messages left out for newer ones")
-    });
-    let slow = place.published();
-    until("the masks of six seconds", || place.published() > slow + 3000);
+    // It does not read until far more was left out for it than there are pictures: masks, too. The server's thread is not urgent:
+    // how long that takes depends on the machine.
+    let left_out = || {
+        let log = String::from_utf8_lossy(&place.run(&["logs"]).stdout).into_owned();
+        let reports = log.lines().filter_map(|line| {
+            let count = line.split_once(" reads slowly: ")?.1.split_once(" messages left out for newer ones")?.0;
+            let digits: String = count.chars().filter(char::is_ascii_digit).collect();
+            Some(digits.parse::<u64>().expect("a number"))
+        });
+        reports.sum::<u64>()
+    };
+    until("two thousand messages are left out", || left_out() > 2000);
     // What waits for it is bounded, and the newest is in it; then it continues.
     let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).expect("after 1970").as_nanos();
     client
@@ -560,15 +563,17 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
     let file = good(&place, running);
     client.compare(&place, &file);
     let masks = client.received.iter().filter(|message| client.channels[&message.channel].topic == "/rapid/mask");
-    let times: Vec<_> = masks.map(|message| message.log_time).collect();
-    let largest = times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).max().expect("two masks");
-    assert!(largest > 1_000_000_000, "it was never stuck: the masks of {largest} ns were left out at a time");
-
+    let times: BTreeSet<_> = masks.map(|message| message.log_time).collect();
     // The mask in the file has no hole. How even its rhythm is, `make bench` measures.
     let episode = Episode::read(&place.path(&file));
     let masks: Vec<_> = episode.topic("/rapid/mask").collect();
     assert!(masks.len() > 1000, "{}", masks.len());
     assert!(masks.windows(2).all(|pair| pair[1].sequence == pair[0].sequence + 1));
+    let (first, last) = (times.first().expect("a mask"), times.last().expect("a mask"));
+    let missing =
+        masks.iter().filter(|mask| (first..last).contains(&&mask.log_time) && !times.contains(&mask.log_time));
+    let missing = missing.count();
+    assert!(missing > 500, "{missing} masks were left out");
 }
 
 #[test]

@@ -106,15 +106,15 @@ fn the_latency_is_found_to_a_few_milliseconds() {
 
 #[test]
 fn the_uncertainty_interval_nearly_always_contains_the_true_value() {
-    let (mut held, mut cases) = (0, 0);
+    let (mut held, mut tried) = (0, 0);
     for seed in (0..60).step_by(every(3)) {
         let camera = Camera { seed, latency_ms: seed as f64 * 5.3, noise: 0.04, exposure: 0.3, ..CAMERA };
         let estimate = measure(camera);
-        cases += 1;
+        tried += 1;
         held += u64::from((estimate.latency_ms - camera.latency_ms).abs() <= estimate.uncertainty_ms);
         assert!(estimate.uncertainty_ms < 8.0, "{estimate:?}");
     }
-    assert!(held * 100 >= cases * 90, "{held} of {cases}");
+    assert!(held * 100 >= tried * 90, "{held} of {tried}");
 }
 
 #[test]

@@ -322,6 +322,8 @@ impl Collected {
         }
         spans.extend(since.map(|begin| (begin, seconds)));
         spans.retain(|(begin, end)| begin < end);
+        // The times of a damaged file go anywhere.
+        spans.sort_by(|one, other| one.0.total_cmp(&other.0));
         spans
     }
 }

@@ -21,7 +21,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use super::{GuestError, Init, Ran, lock, tail, wait, write};
 
 const QEMU: &str = "qemu-system-x86_64";
-/// Of a test that is killed, no machine is left that computes on.
+/// QEMU is killed when the test that started it ends, however: at the end of the thread that did, which waits for it.
 const WITH_ITS_PARENT: [&str; 4] = ["setpriv", "--pdeathsig", "KILL", "--"];
 /// Added to the script's own limit: boot, copying, power off.
 const OVERHEAD: Duration = Duration::from_mins(5);
@@ -63,6 +63,7 @@ pub(super) struct Qemu {
 impl Qemu {
     pub(super) fn run(&self, share: &Path, init: Init, limit: Duration) -> Result<Ran, GuestError> {
         let _alone = lock(self.directory.with_file_name(".one-guest"))?;
+        // Also shows whether there is a QEMU: of what starts it only `setpriv` may then be missing.
         let identity = identity()?;
         let mut qemu = match init {
             Init::Systemd => {
@@ -80,7 +81,7 @@ impl Qemu {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         write(share.join("now"), &format!("{}.{:09}", now.as_secs(), now.subsec_nanos()))?;
         let started = Instant::now();
-        let mut machine = Machine(qemu.stdin(Stdio::piped()).spawn().map_err(not_found)?);
+        let mut machine = Machine(qemu.stdin(Stdio::piped()).spawn().map_err(not_started)?);
         machine.release(&share.join("now"), limit);
         let ended = wait(&mut machine.0, limit + OVERHEAD);
         Ok(Ran { wall: started.elapsed(), limit: limit + OVERHEAD, ended })
@@ -105,7 +106,7 @@ impl Qemu {
         let reports = share.join("monitor.log");
         let monitor = File::create(&reports).map_err(|error| GuestError::Io(reports.clone(), error))?;
         qemu.args(["-serial", "null", "-monitor", "stdio"]).stdin(Stdio::piped()).stdout(monitor);
-        let mut machine = Machine(qemu.spawn().map_err(not_found)?);
+        let mut machine = Machine(qemu.spawn().map_err(not_started)?);
         let begun = Instant::now();
         while !fs::read_to_string(&console).unwrap_or_default().contains(WAITING) && begun.elapsed() < SAVED_WITHIN {
             thread::sleep(Duration::from_millis(50));
@@ -171,6 +172,10 @@ fn identity() -> Result<u64, GuestError> {
 
 fn not_found(error: std::io::Error) -> GuestError {
     GuestError::NoProgram(QEMU.into(), error)
+}
+
+fn not_started(error: std::io::Error) -> GuestError {
+    GuestError::NoProgram(WITH_ITS_PARENT[0].into(), error)
 }
 
 /// A running QEMU, killed when it is dropped.
