@@ -39,7 +39,8 @@ done < <(comm -13 <(printf '%s\n' "$before") <(shared))
 left=$(sed '/^$/d' <<<"$left")
 if [[ -n $left ]]; then
     echo "left behind by: $*" >&2
-    sed 's/^/    /' <<<"$left" >&2
+    # With what is in a folder: its name says nothing of who made it.
+    while IFS= read -r path; do find "$path" 2>/dev/null | head -n 20 | sed 's/^/    /' >&2; done <<<"$left"
     [[ $code != 0 ]] || code=1
 fi
 exit "$code"
