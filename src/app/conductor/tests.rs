@@ -118,6 +118,11 @@ impl Bench {
         Self { conductor, running, keys, board, out }
     }
 
+    /// Waits for thread `session`, which would write into a folder that is being removed.
+    async fn end(mut self) {
+        self.conductor.collection.close().await.unwrap();
+    }
+
     /// Files of episodes, finished or not.
     fn files(&self) -> Vec<String> {
         let mut names = self.names();
@@ -170,6 +175,7 @@ async fn the_time_of_a_run_begins_when_its_policy_is_loaded() {
     let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), loading);
     outcome.unwrap();
     assert!((11 * length..12 * length).contains(&begun.elapsed()), "{:?}", begun.elapsed());
+    bench.end().await;
 }
 
 #[tokio::test(start_paused = true)]
@@ -195,6 +201,7 @@ async fn keys_pressed_while_an_episode_ends_are_handled_in_order() {
     bench.conductor.finish_episode().await.unwrap();
     let files = bench.files();
     assert!(files.len() == 2 && !files.iter().any(|file| file.contains("partial")), "{files:?}");
+    bench.end().await;
 }
 
 #[tokio::test(start_paused = true)]
@@ -212,6 +219,7 @@ async fn a_key_pressed_while_devices_settle_begins_exactly_one_episode() {
     outcome.unwrap();
     bench.conductor.finish_episode().await.unwrap();
     assert_eq!(bench.files().len(), 1, "{:?}", bench.files());
+    bench.end().await;
 }
 
 #[tokio::test]
@@ -227,6 +235,7 @@ async fn the_last_episode_whose_file_fails_is_an_error_of_the_run() {
     let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
     assert!(error.contains("_002.mcap.partial") && error.contains("lost"), "{error}");
     assert!(error.contains("`rapid recover ") && error.matches("_002").count() == 2, "{error}");
+    bench.end().await;
 }
 
 fn ended(error: Option<&str>) -> What {
@@ -258,6 +267,7 @@ async fn an_end_among_missed_events_still_ends_the_run() {
         let conducted = tokio::time::timeout(PATIENCE, bench.conductor.conduct(&mut bench.running)).await;
         let error_text = conducted.expect("an end").err().map(|error| error.to_string());
         assert_eq!(error_text.as_deref(), error.map(|_| "a.mcap: torn"));
+        bench.end().await;
     }
 }
 
@@ -274,6 +284,7 @@ async fn an_end_during_shutdown_is_found_before_and_after_missed_events() {
         }
         let error = bench.conductor.finish_episode().await.unwrap_err();
         assert_eq!(error.to_string(), "a.mcap: torn");
+        bench.end().await;
     }
 }
 
