@@ -50,29 +50,14 @@ pub fn encode(
     Ok(Encoder::new(out, quality).encode(pixels, width, height, colors)?)
 }
 
-/// Why a picture has no pixels.
+/// Why a picture has no pixels, as text.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum DecodeError {
-    /// The decoder's words.
-    #[error("{0}")]
-    Damaged(String),
-    /// Its header states another size.
-    #[error("{wide}x{high} pixels in a sample of {width}x{height}")]
-    Size {
-        /// Pixels per row of the picture.
-        wide: usize,
-        /// Rows of the picture.
-        high: usize,
-        /// Pixels per row that were expected.
-        width: usize,
-        /// Rows that were expected.
-        height: usize,
-    },
-}
+#[error("{0}")]
+pub struct DecodeError(String);
 
 impl From<DecodeErrors> for DecodeError {
     fn from(error: DecodeErrors) -> Self {
-        Self::Damaged(error.to_string())
+        Self(error.to_string())
     }
 }
 
@@ -94,7 +79,7 @@ impl Decoder {
         decoder.decode_headers()?;
         if decoder.dimensions() != Some((width, height)) {
             let (wide, high) = decoder.dimensions().unwrap_or_default();
-            return Err(DecodeError::Size { wide, high, width, height });
+            return Err(DecodeError(format!("{wide}x{high} pixels in a sample of {width}x{height}")));
         }
         values.resize(CHANNELS * width * height, 0);
         Ok(decoder.decode_into(values)?)
