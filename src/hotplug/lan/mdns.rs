@@ -28,10 +28,11 @@ const MOST_INSTANCES: usize = 64;
 const MOST_ADDRESSES: usize = 8;
 /// The name of an instance has at most 63 bytes (RFC 6763, 4.1.1).
 const LONGEST_NAME: usize = 63;
-/// The library reports a missing answer at the end of the lease, give or take this.
+/// The library reports a missing answer at the end of the lease, at most this much earlier by our clock.
 const MARGIN: Duration = Duration::from_millis(100);
-/// From the end of a lease to the next query, so that a report on one is not attributed to the other.
-const PAUSE: Duration = Duration::from_millis(200);
+/// From the end of a lease to the next query: a report on a missing answer may be as late, on a machine with other work, and is not
+/// attributed to the next one, in whose lease it would be a goodbye.
+const PAUSE: Duration = Duration::from_secs(1);
 /// The service that the phone app searches for, to know where to connect.
 const VIO_SERVER: &str = "_vioserver._tcp.local.";
 
@@ -250,7 +251,7 @@ impl Wanted {
     /// The evidence that its device is gone: a missing answer, or a goodbye.
     fn source(&self, now: Stamp) -> UnplugSource {
         match self.asked {
-            Some(asked) if now.since(asked).abs_diff(self.watch.length) <= MARGIN => UnplugSource::Lease,
+            Some(asked) if now.since(asked) + MARGIN >= self.watch.length => UnplugSource::Lease,
             _ => UnplugSource::Goodbye,
         }
     }
