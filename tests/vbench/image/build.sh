@@ -24,7 +24,7 @@ suite=$(. /etc/os-release; [ "${ID:-}" = debian ] && echo "${VERSION_CODENAME:-b
 # shellcheck disable=SC2068  # with the pattern qemu/*
 key() { (cd "$here" && sha256sum $@ | sha256sum | cut -c1-12); }
 readonly root=$cache/root-$suite-$(key rootfs.sh uml/root.sh guest-init.sh guest-packages.txt)
-readonly kernel=$cache/kernel-$(key uml/kernel.sh uml/kernel.config)
+readonly kernel=$cache/kernel-$(key uml/kernel.sh uml/kernel.config uml/kernel.patch)
 readonly machine=$cache/qemu-$suite-$(key rootfs.sh guest-init.sh guest-packages.txt 'qemu/*')
 # Why there is no User-Mode Linux on this machine. What may be otherwise later (a network that is down) counts for an hour.
 readonly impossible=$cache/no-${kernel##*/} for_now=$cache/no-${kernel##*/}-now
