@@ -20,28 +20,24 @@ wait_for() {
   done
 }
 
-# read_text FILE: its content in $text, empty if there is no file.
-read_text() { text=; IFS= read -rd '' text 2>/dev/null <"$1" || true; }
+# read_lines FILE: its lines in $lines, none if there is no file.
+read_lines() { lines=(); [ ! -e "$1" ] || mapfile -t lines <"$1"; }
 
-# lines_with FRAGMENT...: how many lines of $text contain every fragment, in $found; the last of them in $last. The first fragment should
-# be one that few lines have.
+# lines_with N FRAGMENT...: how many of the last lines contain every fragment, in $found, at most N; the last of them in $last. The last
+# line may not be written whole yet. The first fragment should be one that few lines have: it costs 2 us a line.
 lines_with() {
-  local first=$1 rest=$text line fragment; shift
+  local most=$1 at fragment; shift
   found=0 last=
-  for fragment; do [[ $rest == *"$fragment"* ]] || return 0; done
-  while [[ $rest == *"$first"* ]]; do
-    line=${rest%%"$first"*} rest=${rest#*"$first"}
-    line=${line##*$'\n'}$first${rest%%$'\n'*}
-    # A line that is not yet written whole is the last.
-    [[ $rest == *$'\n'* ]] && rest=${rest#*$'\n'} || rest=
-    for fragment; do [[ $line == *"$fragment"* ]] || continue 2; done
-    found=$((found + 1)) last=$line
+  for ((at = ${#lines[@]} - 1; at >= ${after:-0}; at--)); do
+    for fragment; do [[ ${lines[at]} == *"$fragment"* ]] || continue 2; done
+    ((found++)) || last=${lines[at]}
+    ((found < most)) || break
   done
 }
 
 # has_line FILE FRAGMENT...: one line of FILE contains every fragment. has_lines N FILE FRAGMENT...: N lines do.
 has_line() { has_lines 1 "$@"; }
-has_lines() { local least=$1; read_text "$2"; lines_with "${@:3}"; [ $found -ge "$least" ]; }
+has_lines() { read_lines "$2"; lines_with "$1" "${@:3}"; ((found >= $1)); }
 
 # emu_start SPEC...: the emulator. It also opens its FIFO for writing: at its end it would unplug everything and quit.
 emu_start() {
@@ -49,8 +45,11 @@ emu_start() {
   "${usbemu[@]}" "$@" 0<>/tmp/emu.ctl >"$out/emu.jsonl" 2>"$out/emu.err" &
   emu_pid=$!
   exec 7>/tmp/emu.ctl
-  wait_for 30 has_line "$out/emu.jsonl" '"action":"ready"' || fail "the emulator did not start: $(cat "$out/emu.err")"
+  answered 30 '"action":"ready"' || fail "the emulator did not start: $(cat "$out/emu.err")"
 }
+
+# answered SECONDS FRAGMENT...: until the emulator's log has this line. Asked more often than others: times begin with its answers.
+answered() { every=0.01 wait_for "$1" has_line "$out/emu.jsonl" "${@:2}"; }
 
 # emu COMMAND...: one line to the emulator.
 emu() { echo "$*" >&7; }
@@ -59,7 +58,7 @@ emu() { echo "$*" >&7; }
 emu_done() {
   emu_asked=$((${emu_asked:-0} + 1))
   emu "say done-$emu_asked"
-  wait_for "$1" has_line "$out/emu.jsonl" "\"word\":\"done-$emu_asked\"" || fail "the emulator is not done: $(tail -n 1 "$out/emu.jsonl")"
+  answered "$1" "\"word\":\"done-$emu_asked\"" || fail "the emulator is not done: $(tail -n 1 "$out/emu.jsonl")"
 }
 
 # emu_quit: devices still plugged in are unplugged, and the log is complete.
@@ -99,8 +98,8 @@ rapid_stop() { kill -TERM "$rapid_pid"; rapid_wait; }
 
 # published KEY: a value of the mask's JSON file, or the state of a device: `published mask`, `published cam_wrist`.
 published() {
-  local text
-  read_text /dev/shm/rapid_hardware_mask.json
+  local text=
+  IFS= read -rd '' text 2>/dev/null </dev/shm/rapid_hardware_mask.json || true
   text=${text//[[:space:]]/}
   [[ $text =~ \"$1\":\"([^\"]*)\" || $text =~ \"name\":\"$1\"[^}]*\"state\":\"([^\"]*)\" ]] && echo "${BASH_REMATCH[1]}"
 }
@@ -123,18 +122,14 @@ lan_rule() {
 # mark WORD: writes the word to the emulator's log; later log lines come after it.
 mark() {
   emu "say $1"
-  wait_for 20 has_line "$out/emu.jsonl" "\"word\":\"$1\"" || fail "the emulator did not log $1"
-  read_text "$out/emu.jsonl"
-  marked=${#text}
+  answered 20 "\"word\":\"$1\"" || fail "the emulator did not log $1"
+  marked=${#lines[@]}
 }
 
 # logged ACTION [FRAGMENT...]: since the last mark the emulator's log has a line of this action with all fragments.
 logged() {
-  local action=$1; shift
-  read_text "$out/emu.jsonl"
-  text=${text:${marked:-0}}
-  lines_with "\"action\":\"$action\"" "$@"
-  [ $found -gt 0 ]
+  local after=${marked:-0} action=$1; shift
+  has_line "$out/emu.jsonl" "\"action\":\"$action\"" "$@"
 }
 
 # states N DEVICE STATE: rapid has reported this state of the device at least N times.
@@ -143,7 +138,7 @@ states() { has_lines "$1" $out/rapid.jsonl "\"state\":\"$3\"" "\"device\":\"$2\"
 # ordered enabled|disabled MOTOR...: the last that each of these motors was ordered, is this.
 ordered() {
   local order=$1 motor on off; shift
-  read_text $out/emu.jsonl
+  read_lines $out/emu.jsonl
   for motor; do
     last_order enabled; on=$at
     last_order disabled; off=$at
@@ -151,7 +146,7 @@ ordered() {
   done
 }
 last_order() {
-  lines_with "\"action\":\"motor_$1\"" "\"motor\":$motor,"
+  lines_with 1 "\"action\":\"motor_$1\"" "\"motor\":$motor,"
   [[ $last =~ \"mono_ns\":([0-9]+) ]] && at=${BASH_REMATCH[1]} || at=0
 }
 

@@ -42,7 +42,7 @@ for round in 0:socketcan:KILL 1:slcan:KILL 2:damiao:KILL 0:socketcan:STOP; do
   gone() { ! pgrep -x motor-guard >/dev/null; }
   wait_for 30 gone || fail "$kind: its guard is left"
   emu unplug $device
-  emu_done $device
+  emu_done 20
 done
 # Longer than the motor's own limit: it is on its bus without its adapter, too.
 sleep 7

@@ -47,7 +47,7 @@ const TOLERANCE: f64 = 1e-4;
 /// Functions of scripts that wait for chunks.
 pub(crate) const CHUNKS: &str = r#"
 # used MASK: how many chunks were computed with this mask and used. await_used N MASK: until there are more than N.
-chunks() { read_text $out/rapid.jsonl; lines_with '"event":"chunk"' '"used":true' "\"mask\":\"$1\""; }
+chunks() { read_lines $out/rapid.jsonl; lines_with 1000000 '"event":"chunk"' '"used":true' "\"mask\":\"$1\""; }
 used() { chunks $1; echo $found; }
 more_than() { chunks "$2"; [ $found -gt "$1" ]; }
 await_used() { wait_for 120 more_than "$1" "$2" || fail "$(used "$2") chunks with the mask $2"; }
