@@ -52,9 +52,9 @@ motors = [
 ]
 "#;
 
-/// The tactile sensor is pulled out for a second.
+/// The tactile sensor is pulled out for five seconds: a busy machine computes for more than one of them before it acts.
 const PULLED: &str = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
-                      [[event]]\nat = \"3s\"\nunplug = \"tactile_tip\"\n[[event]]\nat = \"5s\"\nplug = \"tactile_tip\"\n";
+                      [[event]]\nat = \"3s\"\nunplug = \"tactile_tip\"\n[[event]]\nat = \"8s\"\nplug = \"tactile_tip\"\n";
 
 /// All sensors stay.
 const PLUGGED: &str =
