@@ -3,9 +3,8 @@
 #
 # 1. The programs that guests of the virtual bench need are compiled, and beside them the guest and its kernel, if they are missing.
 # 2. The guests run, one per processor, ahead of everything else where that is allowed, while the remaining tests are compiled.
-# 3. The tests of the host run: the unit tests, those of memory, which wait for stretches without noise, and then those of the
-#    program, which wait more than they compute, beside all others.
-#    The unit tests make files of killed processes, which each start of the program removes: those two are never side by side.
+# 3. The tests of the host run: those of the program, which wait more than they compute, beside all others. The unit tests of
+#    bus::leftovers make files of killed processes, which each start of the program removes: they run before.
 #
 # Guests are judged by virtual time and need no idle machine; the tests of the host judge no time, but are waited for less on one.
 # At the end it lists which tests were skipped.
@@ -33,6 +32,9 @@ run() {
     done
     return "$code"
 }
+
+# with ARGUMENT... PROGRAM: a test program with these arguments.
+with() { "${@: -1}" "${@:1:$# - 1}"; }
 
 # What runs beside guests takes what they leave of the processors. Not the idle class: on a busy machine it would never end.
 beside() {
@@ -87,14 +89,15 @@ wait "$bench" || code=1
 jobs=()
 cat "$output"
 
-run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /deps/rapid- <<<"$hosted")" || code=1
-run env <<<"$(grep /memory- <<<"$hosted")" || code=1
+unit=$(grep /deps/rapid- <<<"$hosted")
+run with bus::leftovers <<<"$unit" || code=1
 set -m
 run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /program- <<<"$hosted")" >"$output" 2>&1 &
 readonly waiting=$!
 set +m
 jobs+=("$waiting")
-run env <<<"$(grep -v -e /program- -e /deps/rapid- -e /memory- <<<"$hosted")" || code=1
+run with --skip bus::leftovers <<<"$unit" || code=1
+run env <<<"$(grep -v -e /program- -e /deps/rapid- <<<"$hosted")" || code=1
 "$here/models-tests.sh" || code=1
 echo "     Waiting for the tests of the program"
 wait "$waiting" || code=1
