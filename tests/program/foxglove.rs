@@ -93,7 +93,7 @@ impl Client {
     fn read_until(&mut self, what: &str, mut holds: impl FnMut(&Self) -> bool) {
         let begun = Instant::now();
         while !holds(self) {
-            assert!(self.is_open && begun.elapsed() < PATIENCE, "{what}: not met in time");
+            assert!(self.is_open && begun.elapsed() < PATIENCE, "{what}: not met in time: {:?}", self.of_topics());
             self.read_one();
         }
     }
@@ -188,6 +188,11 @@ impl Client {
 
     fn count(&self, topic: &str) -> usize {
         self.counts.iter().filter(|(channel, _)| self.channels[channel].topic == topic).map(|(_, count)| count).sum()
+    }
+
+    /// How many messages of each topic it has.
+    fn of_topics(&self) -> Vec<(&str, usize)> {
+        self.counts.iter().map(|(channel, count)| (self.channels[channel].topic.as_str(), *count)).collect()
     }
 
     /// Asserts that what was received and belongs to an episode is what its file holds, and returns how many messages
