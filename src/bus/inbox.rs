@@ -181,19 +181,36 @@ impl Queues {
     /// The first topic that cannot be read; the others are still handed over. Nothing is handed over once bus memory is
     /// lost.
     pub fn drain(&self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), BusError> {
+        self.drain_some(usize::MAX, take).map(drop)
+    }
+
+    /// The same, but at most `most` samples of each topic; whether there may be more of one. For who has other work, which must
+    /// not wait until the longest queue is empty.
+    ///
+    /// # Errors
+    /// As [`Self::drain`].
+    pub fn drain_some(
+        &self,
+        most: usize,
+        take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8]),
+    ) -> Result<bool, BusError> {
         if let Some(error) = self.lost() {
             return Err(error);
         }
-        let mut result = Ok(());
+        let mut result = Ok(false);
         for topic in &self.topics {
             // No more than this are queued at any time: a topic that is filled faster than `take` empties it must not
             // hold up the others or the caller.
-            for _ in 0..topic.depth {
+            let most = most.min(topic.depth);
+            for number in 1..=most {
                 match contained(|| topic.subscriber.receive())? {
                     Ok(Some(sample)) => {
                         let sample = Guarded::new(sample);
                         if !topic.is_foreign(sample.header().publisher_id()) || topic.id == TopicId::Action {
                             take(topic.id, sample.user_header(), sample.payload());
+                        }
+                        if number == most {
+                            result = result.map(|_| true);
                         }
                     }
                     Ok(None) => break,

@@ -94,6 +94,27 @@ fn a_slow_consumer_loses_the_oldest_samples_and_sees_the_gap() {
     assert_eq!(got, (84..100).collect::<Vec<_>>());
 }
 
+/// Whoever is slow gets some of each topic, in order, and learns that there is more.
+#[test]
+fn a_consumer_may_take_some_of_each_topic() {
+    let (registry, bus) = open("some", 16);
+    let inbox = bus.inbox().expect("inbox");
+    let topics = [TopicId::Modality(registry.devices[0].id), TopicId::Mask];
+    for topic in topics {
+        let writer = bus.writer(topic).expect("writer");
+        for seq in 0..10 {
+            writer.publish(SampleHeader { seq, ..SampleHeader::default() }, &[1; 16]).expect("publish");
+        }
+    }
+    let mut taken: Vec<(TopicId, u64)> = Vec::new();
+    for (numbers, is_more) in [(0..4, true), (4..8, true), (8..10, false), (0..0, false)] {
+        taken.clear();
+        let more = inbox.drain_some(4, &mut |id, header, _| taken.push((id, header.seq))).expect("drain");
+        let expected: Vec<_> = topics.iter().flat_map(|topic| numbers.clone().map(|seq| (*topic, seq))).collect();
+        assert_eq!((&taken, more), (&expected, is_more));
+    }
+}
+
 #[test]
 fn a_slow_consumer_does_not_exhaust_the_pool_of_a_fast_one() {
     let (registry, bus) = open("c", 16);

@@ -8,6 +8,8 @@
 //!
 //! Invariant: nothing else waits for this thread: a client that reads slowly, or not at all, gets the newest of each topic
 //! when it reads ([`relay`]).
+//! Invariant: a turn is short, whatever waits on the bus: on a busy machine the connections would wait for its end, and of all that it
+//! sends a client gets the last topics alone.
 //! Invariant: nothing is encoded for a topic to which no client subscribes.
 //! Invariant: whatever ends the thread, the run continues.
 
@@ -27,7 +29,7 @@ use foxglove::websocket::{ChannelView, Client, ServerListener, Status};
 use foxglove::{Context, FoxgloveError, WebSocketServerHandle};
 use tokio::sync::broadcast::{self, error::TryRecvError};
 use tokio::sync::{oneshot, watch};
-use tokio::task::JoinHandle as TaskHandle;
+use tokio::task::{JoinHandle as TaskHandle, yield_now};
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
@@ -49,6 +51,9 @@ const CLIENTS: usize = 8;
 /// Time between two looks at the bus, with clients and without.
 const TURN: Duration = Duration::from_millis(5);
 const IDLE_TURN: Duration = Duration::from_millis(50);
+/// Samples of a topic that a turn sends at most: of the topics of a rig together less than the server's
+/// queue for a client holds, 1,024.
+const IN_A_TURN: usize = 12;
 /// A client gets the end of the connection within this time, or it is closed.
 const LAST: Duration = Duration::from_millis(500);
 /// Shortest time between two lines of the log about what was left out.
@@ -272,9 +277,13 @@ impl Server {
         let served = async {
             let Ok(mut feed) = feed.await else { return };
             loop {
+                if self.turn(&mut feed) {
+                    // The connections are others' work on this thread.
+                    yield_now().await;
+                    continue;
+                }
                 let is_idle = self.handle.client_count() == 0;
                 sleep(if is_idle { IDLE_TURN } else { TURN }).await;
-                self.turn(&mut feed);
             }
         };
         tokio::select! {
@@ -290,7 +299,8 @@ impl Server {
         let _ = timeout(LAST, ended).await;
     }
 
-    fn turn(&mut self, feed: &mut Feed) {
+    /// Whether more waits on the bus.
+    fn turn(&mut self, feed: &mut Feed) -> bool {
         fault::point("foxglove");
         let Self { topics, .. } = self;
         while let Ok((device, subscription)) = feed.additions.try_recv() {
@@ -299,7 +309,7 @@ impl Server {
         }
         let Feed { queues, events, clock, made, .. } = feed;
         // After the capture of whatever is taken below: an episode's clock is in force before it begins.
-        let drained = queues.drain(&mut |topic, header, payload| {
+        let drained = queues.drain_some(IN_A_TURN, &mut |topic, header, payload| {
             topics.take(topic, header, payload, *clock.borrow());
         });
         topics.send_pictures();
@@ -314,7 +324,9 @@ impl Server {
                 Err(TryRecvError::Empty | TryRecvError::Closed) => break,
             }
         }
+        let is_more = matches!(drained, Ok(true));
         self.report(drained.err());
+        is_more
     }
 
     /// Reports what was left out, now and then.
