@@ -142,9 +142,9 @@ pub struct ObserveArgs {
     /// Folder of the policy [default: the one built into rapid]
     #[arg(value_hint = ValueHint::DirPath)]
     pub bundle: Option<PathBuf>,
-    /// Which of its chunks, from 0
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    pub chunk: usize,
+    /// Which of its chunks, from 0 [default: the first one whose samples are all in the episode]
+    #[arg(long, value_name = "N")]
+    pub chunk: Option<usize>,
     /// File to write [default: that of the episode, with .npz]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub to: Option<PathBuf>,

@@ -39,17 +39,19 @@ pub enum ShowError {
     Compare(#[from] CompareError),
     /// It has no such chunk of this policy, or not all that it was computed from.
     #[error(
-        "{}: it has no chunk {number} of this policy, or not all samples that the chunk was computed from: name the \
-         folder of the policy that ran, or another chunk with --chunk. If the policy was already running when the \
+        "{}: it has no {} of this policy, or not all samples that the chunk was computed from: name the \
+         folder of the policy that ran{}. If the policy was already running when the \
          episode began, samples of the first chunks may be missing and, in a file of an earlier version, the reference of \
          all chunks: `rapid replay --infer` counts the reasons",
-        file.display()
+        file.display(),
+        number.map_or_else(|| "chunk".to_owned(), |number| format!("chunk {number}")),
+        if number.is_some() { ", or another chunk with --chunk" } else { "" },
     )]
     NoChunk {
         /// The episode.
         file: PathBuf,
-        /// The number.
-        number: usize,
+        /// The number, if one was asked for.
+        number: Option<usize>,
     },
     /// The file of arrays.
     #[error("{}: {source}{}", file.display(), fix(source))]
@@ -90,20 +92,25 @@ pub fn observe(args: &ObserveArgs, format: Format, out: &mut dyn Write) -> Resul
     let inputs = compare::inputs(&args.file, &bundle, &environment, computing, args.chunk)?;
     let inputs = inputs.ok_or_else(|| ShowError::NoChunk { file: args.file.clone(), number: args.chunk })?;
     let to = args.to.clone().unwrap_or_else(|| args.file.with_extension("npz"));
+    let number = inputs.number;
     let arrays = arrays(inputs, &bundle);
     write(&to, &arrays).map_err(|source| ShowError::Arrays { file: to.clone(), source })?;
     match format {
         Format::Json => {
             let shapes: serde_json::Map<String, Value> =
                 arrays.iter().map(|array| (array.name.clone(), json!(array.shape))).collect();
-            writeln!(out, "{}", json!({"event": "policy_inputs", "file": to.to_string_lossy(), "arrays": shapes}))?;
+            writeln!(
+                out,
+                "{}",
+                json!({"event": "policy_inputs", "file": to.to_string_lossy(), "chunk": number, "arrays": shapes})
+            )?;
         }
         Format::Text => {
             for Array { name, shape, .. } in &arrays {
                 let shape: Vec<String> = shape.iter().map(ToString::to_string).collect();
                 writeln!(out, "{:<12} {}", text::plain(name), shape.join(" x "))?;
             }
-            writeln!(out, "{}", text::plain(&to.to_string_lossy()))?;
+            writeln!(out, "{}: chunk {number}", text::plain(&to.to_string_lossy()))?;
         }
     }
     Ok(())
@@ -117,7 +124,7 @@ struct Array {
 }
 
 fn arrays(inputs: ChunkInputs, bundle: &Bundle) -> Vec<Array> {
-    let ChunkInputs { observations, mask, noise, step_noise, recorded } = inputs;
+    let ChunkInputs { number: _, observations, mask, noise, step_noise, recorded } = inputs;
     let chunk = [bundle.horizon, bundle.action.outputs()];
     let mut arrays: Vec<Array> =
         observations.into_iter().map(|(name, shape, values)| Array { name, shape, values }).collect();

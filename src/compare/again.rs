@@ -91,14 +91,26 @@ struct Work<'a> {
     again: Again,
     /// Chunks that were tried.
     tried: usize,
-    /// The number of a chunk whose inputs are wanted.
-    wanted: Option<usize>,
+    wanted: Wanted,
     inputs: Option<ChunkInputs>,
+}
+
+/// What is computed of an episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Wanted {
+    /// All chunks.
+    Comparison,
+    /// The inputs of the first chunk that can be computed.
+    FirstInputs,
+    /// The inputs of the chunk with this number, from 0.
+    Inputs(usize),
 }
 
 /// What a chunk is computed from, as the graphs take it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChunkInputs {
+    /// Its number among the chunks of the policy in the episode, from 0.
+    pub number: usize,
     /// The observations by key, each with its shape and its numbers; behind one with a history which of its steps have
     /// a sample, by the name of that input.
     pub observations: Vec<(String, Vec<usize>, Vec<f32>)>,
@@ -112,13 +124,13 @@ pub struct ChunkInputs {
     pub recorded: Vec<f32>,
 }
 
-/// Computes the chunks again, up to number `wanted` if one is given, whose inputs are returned if it can be computed.
+/// Computes the chunks again, up to the one whose inputs are wanted: they are returned if it can be computed.
 pub(super) fn compare(
     file: &Path,
     survey: &Survey,
     (bundle, registry): (&Bundle, &Registry),
     model: &mut Model,
-    wanted: Option<usize>,
+    wanted: Wanted,
     ended: &mut Ended<'_>,
 ) -> Result<(Again, Option<ChunkInputs>), CompareError> {
     let device = |name: &str| registry.devices.iter().position(|device| device.name == name);
@@ -166,14 +178,16 @@ pub(super) fn compare(
     let total = waiting.len();
     let (mut reader, mut scratch) = (Reader::open(file)?, Scratch::default());
     loop {
-        while let Some(chunk) = waiting.front().copied().filter(|chunk| work.is_ready(chunk)) {
+        while let Some(chunk) =
+            waiting.front().copied().filter(|chunk| !work.has_what_is_wanted() && work.is_ready(chunk))
+        {
             if !ended.advance(total - waiting.len(), total) {
                 return Ok((work.again, None));
             }
             work.compute(chunk);
             waiting.pop_front();
         }
-        if waiting.is_empty() || wanted.is_some_and(|wanted| work.tried > wanted) {
+        if waiting.is_empty() || work.has_what_is_wanted() {
             return Ok((work.again, work.inputs));
         }
         if !reader.advance()? {
@@ -226,6 +240,15 @@ impl Work<'_> {
         self.keys(chunk).iter().all(|key| self.samples.contains_key(key) || !self.uses.contains_key(key))
     }
 
+    /// Whether later chunks add nothing.
+    fn has_what_is_wanted(&self) -> bool {
+        match self.wanted {
+            Wanted::Comparison => false,
+            Wanted::FirstInputs => self.inputs.is_some(),
+            Wanted::Inputs(number) => self.tried > number,
+        }
+    }
+
     fn compute(&mut self, chunk: &RecordedChunk) {
         let whole = self.fill(chunk);
         let uses = |reference: &Reference, request: &Request, at: usize, wanted: Reference| {
@@ -249,7 +272,7 @@ impl Work<'_> {
                     // One that gives no actions is NaN, in the file too.
                     let _ = self.composer.compose(&self.request, &self.output, &mut self.chunk);
                     self.hold_against(chunk);
-                    if self.wanted == Some(self.tried) {
+                    if matches!(self.wanted, Wanted::FirstInputs) || self.wanted == Wanted::Inputs(self.tried) {
                         self.inputs = Some(self.inputs(chunk));
                     }
                 }
@@ -287,6 +310,7 @@ impl Work<'_> {
         }
         let (noise, step_noise) = self.model.noise(chunk.seed);
         ChunkInputs {
+            number: self.tried,
             observations,
             mask: bundle.mask.as_ref().map(|mask| (mask.input.clone(), tensors.mask().to_vec())),
             noise,

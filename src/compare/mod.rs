@@ -18,6 +18,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use self::again::Wanted;
 pub use self::again::{Again, ChunkInputs};
 pub use self::beside::Beside;
 pub use self::difference::{AxisDifference, Difference, Spread};
@@ -111,7 +112,8 @@ fn examined(file: &Path, bundle: &Bundle) -> Result<(Survey, Registry), CompareE
     Ok((survey, registry))
 }
 
-/// What chunk `number` of an episode, from 0, was computed from; `None` if the file does not hold all of it.
+/// What chunk `number` of an episode, from 0, was computed from, or the first chunk of which the file holds all; `None` if the
+/// file does not hold all of it.
 ///
 /// # Errors
 /// As [`compare`].
@@ -120,12 +122,13 @@ pub fn inputs(
     bundle: &Bundle,
     environment: &Environment,
     computing: Computing,
-    number: usize,
+    number: Option<usize>,
 ) -> Result<Option<ChunkInputs>, CompareError> {
     let (survey, registry) = examined(file, bundle)?;
     let mut model = Model::load(bundle, environment, computing)?;
     let mut ended = Ended { watcher: &mut Unwatched, interrupted: false };
-    let (_, inputs) = again::compare(file, &survey, (bundle, &registry), &mut model, Some(number), &mut ended)?;
+    let wanted = number.map_or(Wanted::FirstInputs, Wanted::Inputs);
+    let (_, inputs) = again::compare(file, &survey, (bundle, &registry), &mut model, wanted, &mut ended)?;
     Ok(inputs)
 }
 
@@ -144,7 +147,8 @@ pub fn compare(
     let mut model = Model::load(bundle, environment, computing)?;
     let mut ended = Ended { watcher, interrupted: false };
     let comparison = if survey.is_of_a_policy() {
-        let (again, _) = again::compare(file, &survey, (bundle, &registry), &mut model, None, &mut ended)?;
+        let (again, _) =
+            again::compare(file, &survey, (bundle, &registry), &mut model, Wanted::Comparison, &mut ended)?;
         Comparison::Again(again)
     } else {
         Comparison::Beside(beside::compare(file, &survey, bundle, &registry, &mut model, &mut ended)?)

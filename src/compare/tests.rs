@@ -254,10 +254,27 @@ fn recorded_chunks_are_recomputed_and_changes_are_found() {
     // Without them it cannot be computed, but the others can.
     let keep = |message: &mut Message| message.topic != ARM || u64::from(message.sequence) != number;
     let changed = recorded.again(&recorded.edited(keep, |_| {}));
-    let made_of = |chunk: &&Value| chunk["samples"][2]["seqs"].as_array().unwrap().contains(&number.into());
-    let missing = chunks.iter().filter(made_of).count() as u64;
+    let missing = chunks.iter().filter(|chunk| made_of_arm(chunk, number)).count() as u64;
     assert_eq!((changed.samples_missing, changed.compared), (missing, whole.compared - missing), "{changed:?}");
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+
+    // The inputs that are written without a number are those of the first chunk that is whole.
+    let number = Recorded::sample(&chunks[0], 2).unwrap();
+    let first = chunks.iter().position(|chunk| !made_of_arm(chunk, number)).unwrap();
+    let keep = |message: &mut Message| message.topic != ARM || u64::from(message.sequence) != number;
+    let file = recorded.file(&recorded.edited(keep, |_| {}));
+    let inputs = |number| {
+        inputs(&file, &recorded.bundle, &recorded.environment, Computing::default(), number)
+            .unwrap()
+            .map(|it| it.number)
+    };
+    assert!(first > 0);
+    assert_eq!((inputs(None), inputs(Some(0)), inputs(Some(first))), (Some(first), None, Some(first)));
+}
+
+/// Whether a chunk was computed from sample `number` of the arm.
+fn made_of_arm(chunk: &Value, number: u64) -> bool {
+    chunk["samples"][2]["seqs"].as_array().unwrap().contains(&number.into())
 }
 
 #[test]
@@ -385,7 +402,8 @@ fn chunks_of_a_history_are_recomputed_with_its_gaps() {
 
     // What the graphs are given: zeros for each step without a sample, and which these are.
     let file = recorded.file(&recorded.bytes);
-    let inputs = inputs(&file, &recorded.bundle, &recorded.environment, Computing::default(), gone).unwrap().unwrap();
+    let inputs =
+        inputs(&file, &recorded.bundle, &recorded.environment, Computing::default(), Some(gone)).unwrap().unwrap();
     let of = |key: &str| inputs.observations.iter().find(|(name, _, _)| name == key).unwrap().clone();
     let (_, shape, valid) = of("tactile_valid");
     let expected: Vec<f32> = all[gone].iter().map(|seq| f32::from(u8::from(seq.is_some()))).collect();
