@@ -121,12 +121,21 @@ fn a_box_of_buttons_begins_ends_marks_and_discards_episodes_and_is_found_again()
 
     send(&port, "again\n");
     wait_for(&running, "twice: label success");
-    next_press();
-    send(&port, "again\n");
-    std::thread::sleep(std::time::Duration::from_millis(100));
-    send(&port, "again\n");
-    wait_for(&running, "twice: discard episode");
-    until("it is discarded", || count(&running, "discarded") == 1);
+    // On a busy machine the two may be read as one press, or as two that are far apart: then they label once more.
+    let decided = || logged(&running.reported(), "twice: ").len();
+    until("it is discarded", || {
+        let before = decided();
+        next_press();
+        send(&port, "again\n");
+        std::thread::sleep(std::time::Duration::from_millis(100));
+        send(&port, "again\n");
+        until("what the presses mean is decided", || decided() > before);
+        let is_double = !logged(&running.reported(), "twice: discard episode").is_empty();
+        if is_double {
+            until("it is discarded", || count(&running, "discarded") == 1);
+        }
+        is_double
+    });
 
     // Unplugged, and plugged in again: a line of the log each, and the episode continues.
     send(&port, "go\n");
