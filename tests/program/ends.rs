@@ -393,7 +393,7 @@ fn a_headless_run_that_ends_with_a_bad_episode_exits_with_code_4() {
         (FINE, "--json", Some(0)),
         (FINE, "--headless", Some(0)),
     ] {
-        let place = Place::new();
+        let place = Place::lenient();
         place.write("play.toml", scenario);
         let run = ["--sim", "play.toml", "--headless", "--record", "--out", "out", "--duration", "3s"];
         let more: &[&str] = if screen == "--json" { &["--json"] } else { &[] };

@@ -3,7 +3,7 @@
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
-use crate::support::{self, Episode, Place, events};
+use crate::support::{self, Episode, LENIENT, Place, events};
 use rapid::driver::sim;
 use rapid::registry::Registry;
 use rapid::registry::scenario::Scenario;
@@ -55,7 +55,7 @@ struct Raw {
 #[test]
 fn distances_are_recorded_replayed_and_shown() {
     let place = Place::new();
-    place.write("devices.toml", RIG);
+    place.write("devices.toml", &[RIG, LENIENT].concat());
     // The scenario has a clock of its own: the stream is gone until the recording shows it gone.
     place.write("play.toml", "[[device]]\nname = \"d435\"\n[[device]]\nname = \"d435_depth\"\n");
     let run = |options: &[&str]| {
@@ -103,7 +103,7 @@ fn distances_are_recorded_replayed_and_shown() {
 #[test]
 fn a_data_set_has_the_other_stream_alone() {
     let place = Place::new();
-    place.write("devices.toml", RIG);
+    place.write("devices.toml", &[RIG, LENIENT].concat());
     let run = |options: &[&str]| {
         let output = place.run(options);
         assert!(output.status.success(), "{options:?}: {}", String::from_utf8_lossy(&output.stderr));

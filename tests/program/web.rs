@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
-use crate::support::{LENIENT, PATIENCE, Place, Running, events, logged, until};
+use crate::support::{PATIENCE, Place, Running, events, logged, until};
 
 /// A port that is free: the kernel chooses it.
 const ANY: &str = "127.0.0.1:0";
@@ -130,12 +130,6 @@ fn link(running: &Running) -> (String, String) {
     (address.to_owned(), token.trim_start_matches('#').to_owned())
 }
 
-fn lenient_place() -> Place {
-    let place = Place::new();
-    place.write("devices.toml", &[include_str!("../../devices.toml"), LENIENT].concat());
-    place
-}
-
 fn start(place: &Place, options: &[&str]) -> Running {
     place.start(&[&RUN[..], options].concat(), "\"event\":\"begin\"")
 }
@@ -153,7 +147,7 @@ fn file_of(view: &Value) -> String {
 
 #[test]
 fn the_page_does_what_keys_do() {
-    let place = lenient_place();
+    let place = Place::lenient();
     let running = start(&place, &["--task", "pour tea", "--foxglove", ANY]);
     let client = Client::of(&running);
     let mut page = client.events();
@@ -211,7 +205,7 @@ fn the_page_does_what_keys_do() {
 
 #[test]
 fn pictures_are_small_and_as_old_as_they_are() {
-    let place = lenient_place();
+    let place = Place::lenient();
     let running = start(&place, &[]);
     let client = Client::of(&running);
     let mut picture = client.get("/picture/0");
@@ -302,7 +296,7 @@ fn pages_of_other_sites_and_other_names_are_refused() {
 
 #[test]
 fn without_the_token_there_is_nothing_but_the_page() {
-    let place = lenient_place();
+    let place = Place::lenient();
     let with_token = ["--record", "--web-token", "page.token"];
     let running = start(&place, &with_token);
     let (_, token) = link(&running);
@@ -377,7 +371,7 @@ fn an_address_of_the_network_needs_a_token_that_is_new_each_time() {
 
 #[test]
 fn clients_that_stick_send_garbage_or_are_many_cost_the_recording_nothing() {
-    let place = lenient_place();
+    let place = Place::lenient();
     let running = start(&place, &["--record"]);
     let client = Client::of(&running);
     let mut page = client.events();
@@ -434,7 +428,7 @@ fn clients_that_stick_send_garbage_or_are_many_cost_the_recording_nothing() {
 
 #[test]
 fn a_port_in_use_is_an_error_with_a_fix_and_a_panic_ends_no_run() {
-    let place = lenient_place();
+    let place = Place::lenient();
     let order = place.path("strike");
     let mut command = place.command(&[&RUN[..], &["--record"]].concat());
     command.env("RAPID_FAULT", format!("web:{}", order.display()));

@@ -112,6 +112,13 @@ impl Place {
         }
     }
 
+    /// With the rig of the repository, whose verdicts do not depend on how fast the machine is: see [`LENIENT`].
+    pub(crate) fn lenient() -> Self {
+        let place = Self::new();
+        place.write("devices.toml", &[include_str!("../../devices.toml"), LENIENT].concat());
+        place
+    }
+
     pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
