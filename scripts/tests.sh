@@ -89,7 +89,7 @@ wait "$bench" || code=1
 jobs=()
 cat "$output"
 
-unit=$(grep /deps/rapid- <<<"$hosted")
+unit=$(grep /deps/rapid- <<<"$hosted") || { echo "tests.sh: the unit tests are not built" >&2; exit 1; }
 run with bus::leftovers <<<"$unit" || code=1
 set -m
 run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /program- <<<"$hosted")" >"$output" 2>&1 &

@@ -181,11 +181,11 @@ impl Queues {
     /// The first topic that cannot be read; the others are still handed over. Nothing is handed over once bus memory is
     /// lost.
     pub fn drain(&self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), BusError> {
-        self.drain_some(usize::MAX, take).map(drop)
+        self.drain_some(usize::MAX, take).1
     }
 
-    /// The same, but at most `most` samples of each topic; whether there may be more of one. For who has other work, which must
-    /// not wait until the longest queue is empty.
+    /// The same, but at most `most` samples of each topic; whether there may be more of one that can be read. For a thread with
+    /// other work, which must not wait until the longest queue is empty.
     ///
     /// # Errors
     /// As [`Self::drain`].
@@ -193,25 +193,27 @@ impl Queues {
         &self,
         most: usize,
         take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8]),
-    ) -> Result<bool, BusError> {
+    ) -> (bool, Result<(), BusError>) {
         if let Some(error) = self.lost() {
-            return Err(error);
+            return (false, Err(error));
         }
-        let mut result = Ok(false);
+        let (mut is_more, mut result) = (false, Ok(()));
         for topic in &self.topics {
             // No more than this are queued at any time: a topic that is filled faster than `take` empties it must not
             // hold up the others or the caller.
             let most = most.min(topic.depth);
             for number in 1..=most {
-                match contained(|| topic.subscriber.receive())? {
+                let received = match contained(|| topic.subscriber.receive()) {
+                    Ok(received) => received,
+                    Err(error) => return (false, Err(error)),
+                };
+                match received {
                     Ok(Some(sample)) => {
                         let sample = Guarded::new(sample);
                         if !topic.is_foreign(sample.header().publisher_id()) || topic.id == TopicId::Action {
                             take(topic.id, sample.user_header(), sample.payload());
                         }
-                        if number == most {
-                            result = result.map(|_| true);
-                        }
+                        is_more |= number == most;
                     }
                     Ok(None) => break,
                     Err(error) => {
@@ -222,7 +224,7 @@ impl Queues {
                 }
             }
         }
-        result
+        (is_more, result)
     }
 
     /// Reports which other programs have published on the rig's topics since the last call, as far as drained.

@@ -109,7 +109,8 @@ fn a_consumer_may_take_some_of_each_topic() {
     let mut taken: Vec<(TopicId, u64)> = Vec::new();
     for (numbers, is_more) in [(0..4, true), (4..8, true), (8..10, false), (0..0, false)] {
         taken.clear();
-        let more = inbox.drain_some(4, &mut |id, header, _| taken.push((id, header.seq))).expect("drain");
+        let (more, drained) = inbox.drain_some(4, &mut |id, header, _| taken.push((id, header.seq)));
+        drained.expect("drain");
         let expected: Vec<_> = topics.iter().flat_map(|topic| numbers.clone().map(|seq| (*topic, seq))).collect();
         assert_eq!((&taken, more), (&expected, is_more));
     }

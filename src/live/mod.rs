@@ -51,8 +51,8 @@ const CLIENTS: usize = 8;
 /// Time between two looks at the bus, with clients and without.
 const TURN: Duration = Duration::from_millis(5);
 const IDLE_TURN: Duration = Duration::from_millis(50);
-/// Samples of a topic that a turn sends at most: of the topics of a rig together less than the server's
-/// queue for a client holds, 1,024.
+/// Samples of a topic that a turn sends at most. Of the topics of most rigs, and what is derived from them, these are fewer than
+/// the server's queue for a client holds, 1,024; of a rig with so many more, a client that cannot keep up misses the oldest.
 const IN_A_TURN: usize = 12;
 /// A client gets the end of the connection within this time, or it is closed.
 const LAST: Duration = Duration::from_millis(500);
@@ -309,7 +309,7 @@ impl Server {
         }
         let Feed { queues, events, clock, made, .. } = feed;
         // After the capture of whatever is taken below: an episode's clock is in force before it begins.
-        let drained = queues.drain_some(IN_A_TURN, &mut |topic, header, payload| {
+        let (is_more, drained) = queues.drain_some(IN_A_TURN, &mut |topic, header, payload| {
             topics.take(topic, header, payload, *clock.borrow());
         });
         topics.send_pictures();
@@ -324,7 +324,6 @@ impl Server {
                 Err(TryRecvError::Empty | TryRecvError::Closed) => break,
             }
         }
-        let is_more = matches!(drained, Ok(true));
         self.report(drained.err());
         is_more
     }

@@ -108,10 +108,13 @@ fn pulled_and_back(events: &[Value]) -> bool {
 }
 
 /// Has it, without the sensor, acted on a chunk until it was asked for the next one, and was it asked with all sensors later?
+/// Between two absences the sensor sends for at least ten seconds.
 fn acted_without(events: &[Value]) -> bool {
     let chunks: Vec<_> = of(events, "chunk").collect();
     let is_out = |chunk: &Value| chunk["mask"] == "0x05";
-    let acted = chunks.windows(2).position(|pair| is_out(pair[0]) && is_out(pair[1]) && pair[0]["used"] == true);
+    let ticks = |pair: &[&Value]| pair[1]["tick"].as_u64().zip(pair[0]["tick"].as_u64()).map(|(next, one)| next - one);
+    let is_one_absence = |pair: &[&Value]| pair.iter().all(|chunk| is_out(chunk)) && ticks(pair) < Some(100);
+    let acted = chunks.windows(2).position(|pair| is_one_absence(pair) && pair[0]["used"] == true);
     acted.is_some_and(|acted| chunks[acted..].iter().any(|chunk| !is_out(chunk)))
 }
 

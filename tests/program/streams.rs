@@ -92,7 +92,9 @@ fn distances_are_recorded_replayed_and_shown() {
     let replayed: Vec<Raw> = again.topic("/rapid/camera/d435/depth").map(support::Message::decode).collect();
     let places = replayed.iter().map(|picture| pictures.iter().position(|recorded| recorded == picture));
     let places: Vec<usize> = places.collect::<Option<_>>().expect("each was recorded");
-    assert!(!places.is_empty() && places.is_sorted_by(|one, next| one < next), "{places:?}");
+    assert!(places.is_sorted_by(|one, next| one < next), "{places:?}");
+    // A busy machine loses some.
+    assert!(2 * places.len() > pictures.len(), "{} of {}", places.len(), pictures.len());
     // A picture for people has them as shades.
     run(&["inspect", &file, "--plot=plot.svg"]);
     let svg = std::fs::read_to_string(place.path("plot.svg")).expect("a picture");

@@ -1,8 +1,8 @@
 //! Devices that announce a service (mDNS, RFC 6762; DNS-SD, RFC 6763).
 //!
 //! The library keeps announcements until they expire, by default after two minutes. So a device from which its driver
-//! receives nothing is queried again once per lease (RFC 6762, 10.4), and one that does not answer by the end of the
-//! next lease is reported as removed. A goodbye is reported after one second: the library follows RFC 6762, 10.1, which
+//! receives nothing is queried again once per lease and a pause (RFC 6762, 10.4), and one that does not answer by the end of the
+//! lease after its query is reported as removed. A goodbye is reported after one second: the library follows RFC 6762, 10.1, which
 //! gives another host that time to object. mdns-sd 0.21 cannot query again an instance with a dot in its name: such a
 //! device is gone when it sends a goodbye, when its driver receives nothing more, or after two minutes.
 //!
@@ -30,8 +30,8 @@ const MOST_ADDRESSES: usize = 8;
 const LONGEST_NAME: usize = 63;
 /// The library reports a missing answer at the end of the lease, at most this much earlier by our clock.
 const MARGIN: Duration = Duration::from_millis(100);
-/// From the end of a lease to the next query: a report on a missing answer may be as late, on a machine with other work, and is not
-/// attributed to the next one, in whose lease it would be a goodbye.
+/// From the end of a lease to the next query, or a third of the lease if that is shorter: a report on a missing answer may be as late,
+/// on a machine with other work, and is not attributed to the next query, in whose lease it would be a goodbye.
 const PAUSE: Duration = Duration::from_secs(1);
 /// The service that the phone app searches for, to know where to connect.
 const VIO_SERVER: &str = "_vioserver._tcp.local.";
@@ -221,7 +221,7 @@ impl Service {
             let length = wanted.watch.length;
             let announced = wanted.current.as_ref().and_then(|full| self.known.get_key_value(full));
             if let (Some((full, found)), true) = (announced, wanted.watch.is_there()) {
-                let is_due = wanted.asked.is_none_or(|asked| now.since(asked) >= length + PAUSE);
+                let is_due = wanted.asked.is_none_or(|asked| now.since(asked) >= length + pause(length));
                 // See the module's comment.
                 let can_be_asked = !found.name.contains(['.', '\\']);
                 if is_due && can_be_asked && !wanted.watch.is_sending(length, now) {
@@ -251,10 +251,20 @@ impl Wanted {
     /// The evidence that its device is gone: a missing answer, or a goodbye.
     fn source(&self, now: Stamp) -> UnplugSource {
         match self.asked {
-            Some(asked) if now.since(asked) + MARGIN >= self.watch.length => UnplugSource::Lease,
+            // An answer is not reported: what is reported later is not about this query.
+            Some(asked) if is_about_a_missing_answer(now.since(asked), self.watch.length) => UnplugSource::Lease,
             _ => UnplugSource::Goodbye,
         }
     }
+}
+
+fn pause(lease: Duration) -> Duration {
+    PAUSE.min(lease / 3)
+}
+
+/// Is a report this long after a query about its missing answer?
+fn is_about_a_missing_answer(waited: Duration, lease: Duration) -> bool {
+    waited + MARGIN >= lease && waited <= lease + pause(lease)
 }
 
 fn found(service: &ResolvedService, domain: &str) -> Option<(String, Found)> {

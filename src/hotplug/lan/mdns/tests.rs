@@ -2,7 +2,7 @@ use tokio::sync::mpsc;
 
 use super::super::super::HotplugEvent;
 use super::*;
-use crate::device::{DeviceNode, Unit};
+use crate::device::{Attachment, DeviceNode, Unit};
 
 const LEASE: Duration = Duration::from_secs(3);
 
@@ -37,6 +37,15 @@ impl Bench {
         let found = Found { name: name.into(), addresses };
         self.service.announced(format!("{name}._s._tcp.local."), found, self.now).await;
         self.reported()
+    }
+
+    /// Instance a was announced so long ago: what its driver receives has the machine's time.
+    async fn attached(&mut self, ago: Duration) -> Attachment {
+        self.now = Stamp::now().before(ago);
+        let found = Found { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
+        self.service.announced("a._s._tcp.local.".into(), found, self.now).await;
+        let Ok(HotplugEvent::Added(attachment)) = self.reported.try_recv() else { panic!("not reported") };
+        attachment
     }
 
     async fn removed(&mut self, name: &str) -> Vec<String> {
@@ -103,12 +112,27 @@ async fn announced_instances_are_queried_again_and_silence_ends_the_lease() {
 #[tokio::test]
 async fn a_late_report_of_a_missing_answer_is_no_goodbye() {
     let lease = u64::try_from(LEASE.as_millis()).expect("short");
-    for late in (0..=1000).step_by(100) {
+    for waited in (lease - 100..lease + 1000).step_by(100) {
         let mut bench = Bench::new(&[("phone", None)]);
         bench.announced("a", &["127.0.0.1:5"]).await;
         // Queried in the first 100 ms.
-        assert_eq!(bench.pass(100 + lease + late - 100).await.0, 1, "{late} ms late");
-        assert_eq!(bench.removed("a").await, ["-/lan/phone lease"], "{late} ms late");
+        assert_eq!(bench.pass(100 + waited).await.0, 1, "{waited} ms after the query");
+        assert_eq!(bench.removed("a").await, ["-/lan/phone lease"], "{waited} ms after the query");
+    }
+}
+
+/// One that was queried once, answered and sends data is not queried again: its goodbye is one whenever it comes.
+#[tokio::test]
+async fn a_goodbye_is_one_before_and_after_the_lease_of_a_query() {
+    let lease = u64::try_from(LEASE.as_millis()).expect("short");
+    for waited in (0..lease - 100).step_by(100).chain((lease + 1100..5 * lease).step_by(100)) {
+        let mut bench = Bench::new(&[("phone", None)]);
+        let attachment = bench.attached(10 * LEASE).await;
+        assert_eq!(bench.pass(100).await.0, 1);
+        bench.now = bench.now.after(Duration::from_millis(waited));
+        let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
+        last_received.now();
+        assert_eq!(bench.removed("a").await, ["-/lan/phone goodbye"], "{waited} ms after the query");
     }
 }
 
@@ -116,10 +140,7 @@ async fn a_late_report_of_a_missing_answer_is_no_goodbye() {
 async fn data_received_by_the_driver_outlasts_a_lost_announcement_and_not_a_goodbye() {
     for goodbye in [false, true] {
         let mut bench = Bench::new(&[("phone", None)]);
-        bench.now = Stamp::now().before(Duration::from_secs(10));
-        let found = Found { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
-        bench.service.announced("a._s._tcp.local.".into(), found, bench.now).await;
-        let Ok(HotplugEvent::Added(attachment)) = bench.reported.try_recv() else { panic!("not reported") };
+        let attachment = bench.attached(Duration::from_secs(10)).await;
         let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
         bench.service.wanted[0].asked = Some(bench.now);
         bench.now = bench.now.after(if goodbye { LEASE / 2 } else { LEASE });
