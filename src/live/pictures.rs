@@ -1,4 +1,4 @@
-//! Which pictures of a camera are sent: no more than [`MOST_HZ`] a second, and of those that wait the newest.
+//! Which pictures of a camera are sent: no more than [`MOST_HZ`] a second, and of those that a turn takes the newest.
 //!
 //! Invariant: a camera at [`MOST_HZ`] or slower loses none by its jitter.
 
