@@ -2,8 +2,10 @@
 //!
 //! The library keeps announcements until they expire, by default after two minutes. So a device from which its driver
 //! receives nothing is queried again once per lease and a pause (RFC 6762, 10.4), and one that does not answer by the end of the
-//! lease after its query is reported as removed. A goodbye is reported after one second: the library follows RFC 6762, 10.1, which
-//! gives another host that time to object. mdns-sd 0.21 cannot query again an instance with a dot in its name: such a
+//! lease after its query is reported as removed. The library reports a missing answer and a goodbye alike, and the former late on a
+//! machine with other work: a device that was silent for its lease is gone by lease; while its driver receives, only a report at
+//! the end of a query's lease is about a missing answer. A goodbye is reported after one second: the library follows RFC 6762,
+//! 10.1, which gives another host that time to object. mdns-sd 0.21 cannot query again an instance with a dot in its name: such a
 //! device is gone when it sends a goodbye, when its driver receives nothing more, or after two minutes.
 //!
 //! Invariant: only names and numbers of an announcement are used, each bounded.
@@ -30,8 +32,8 @@ const MOST_ADDRESSES: usize = 8;
 const LONGEST_NAME: usize = 63;
 /// The library reports a missing answer at the end of the lease, at most this much earlier by our clock.
 const MARGIN: Duration = Duration::from_millis(100);
-/// From the end of a lease to the next query, or a third of the lease if that is shorter: a report on a missing answer may be as late,
-/// on a machine with other work, and is not attributed to the next query, in whose lease it would be a goodbye.
+/// From the end of a lease to the next query, or a third of the lease if that is shorter: a report on a missing answer may be as
+/// late if the driver receives again.
 const PAUSE: Duration = Duration::from_secs(1);
 /// The service that the phone app searches for, to know where to connect.
 const VIO_SERVER: &str = "_vioserver._tcp.local.";
@@ -51,6 +53,8 @@ pub(super) struct Wanted {
     port: Option<u16>,
     /// The instance that is the entry's device now.
     current: Option<String>,
+    /// Since when it is.
+    since: Stamp,
     /// When the device was queried again.
     asked: Option<Stamp>,
 }
@@ -106,7 +110,7 @@ impl Drop for Browser {
 
 impl Wanted {
     pub(super) fn new(watch: Watch, instance: Option<String>, lan: &LanSpec) -> Self {
-        Self { watch, instance, port: lan.port(), current: None, asked: None }
+        Self { watch, instance, port: lan.port(), current: None, since: Stamp::default(), asked: None }
     }
 }
 
@@ -153,12 +157,12 @@ impl Service {
             return;
         }
         self.cut.remove(&full);
-        self.known.insert(full.clone(), found);
-        self.assign(Some(&full), now).await;
+        self.known.insert(full, found);
+        self.assign(now).await;
     }
 
-    /// Assigns the known instances to the entries, one each. `announced` was announced just now: its lease restarts.
-    async fn assign(&mut self, announced: Option<&str>, now: Stamp) {
+    /// Assigns the known instances to the entries, one each.
+    async fn assign(&mut self, now: Stamp) {
         for index in 0..self.wanted.len() {
             let Some(wanted) = self.wanted.get(index) else { continue };
             let full = wanted.current.clone().filter(|full| self.known.contains_key(full)).or_else(|| {
@@ -186,8 +190,9 @@ impl Service {
             // Announcements come in parts: an address that is good enough is kept.
             let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
             let Some(wanted) = self.wanted.get_mut(index) else { continue };
-            if wanted.current != full || announced == full.as_deref() {
-                wanted.asked = None;
+            // One that is announced again keeps its query: the library may still report that no answer came.
+            if wanted.current != full {
+                (wanted.since, wanted.asked) = (now, None);
             }
             wanted.current = full;
             wanted.watch.found(address, Some(&found.name), now).await;
@@ -211,7 +216,7 @@ impl Service {
             wanted.current = None;
             wanted.watch.gone(source, now).await;
         }
-        self.assign(None, now).await;
+        self.assign(now).await;
     }
 
     /// Checks leases and links; returns which instances must be queried again, and how long they have.
@@ -241,30 +246,28 @@ impl Service {
         let before = self.cut.len();
         self.cut.retain(|_, link| link.state() != LinkState::Up);
         if self.cut.len() != before {
-            self.assign(None, now).await;
+            self.assign(now).await;
         }
         questions
     }
 }
 
 impl Wanted {
-    /// The evidence that its device is gone: a missing answer, or a goodbye.
+    /// The evidence that its device is gone: a missing answer, or a goodbye. See the module's comment.
     fn source(&self, now: Stamp) -> UnplugSource {
-        match self.asked {
-            // An answer is not reported: what is reported later is not about this query.
-            Some(asked) if is_about_a_missing_answer(now.since(asked), self.watch.length) => UnplugSource::Lease,
-            _ => UnplugSource::Goodbye,
+        let (lease, received) = (self.watch.length, self.watch.last_received.at());
+        let was_silent = now.since(self.since.max(received)) + MARGIN >= lease;
+        let is_about_it = |waited: Duration| waited + MARGIN >= lease && waited <= lease + pause(lease);
+        if was_silent || self.asked.is_some_and(|asked| is_about_it(now.since(asked))) {
+            UnplugSource::Lease
+        } else {
+            UnplugSource::Goodbye
         }
     }
 }
 
 fn pause(lease: Duration) -> Duration {
     PAUSE.min(lease / 3)
-}
-
-/// Is a report this long after a query about its missing answer?
-fn is_about_a_missing_answer(waited: Duration, lease: Duration) -> bool {
-    waited + MARGIN >= lease && waited <= lease + pause(lease)
 }
 
 fn found(service: &ResolvedService, domain: &str) -> Option<(String, Found)> {
