@@ -256,7 +256,7 @@ impl Wanted {
     /// The evidence that its device is gone: a missing answer, or a goodbye. See the module's comment.
     fn source(&self, now: Stamp) -> UnplugSource {
         let (lease, received) = (self.watch.length, self.watch.last_received.at());
-        let was_silent = now.since(self.since.max(received)) + MARGIN >= lease;
+        let was_silent = now.since(self.since.max(received)) >= lease;
         let is_about_it = |waited: Duration| waited + MARGIN >= lease && waited <= lease + pause(lease);
         if was_silent || self.asked.is_some_and(|asked| is_about_it(now.since(asked))) {
             UnplugSource::Lease

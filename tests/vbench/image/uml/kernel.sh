@@ -18,7 +18,7 @@ made() { "$@" >>"$log" 2>&1 || never "$* failed: see $log"; }
 
 : >"$log"
 [ "$(uname -m)" = x86_64 ] || never "it runs on x86-64 processors, and this is $(uname -m)"
-for tool in gcc make flex bison bc xz depmod patch; do command -v "$tool" >/dev/null || fail "$tool is missing"; done
+for tool in gcc make flex bison bc xz depmod; do command -v "$tool" >/dev/null || fail "$tool is missing"; done
 work=$(mktemp -d "$out/../source.XXXXXX")
 trap 'rm -rf "$work"' EXIT
 
@@ -48,18 +48,23 @@ cd "$work"/linux-source-*/
 # Room for the floating-point state of a process: a processor with AMX has 11,008 bytes of it, and this kernel expects at most 2,696.
 sed -i 's/DEFINE_LONGS(HOST_FP_SIZE, 2696)/DEFINE_LONGS(HOST_FP_SIZE, 12288)/' arch/x86/um/user-offsets.c
 grep -q 'HOST_FP_SIZE, 12288' arch/x86/um/user-offsets.c || never "$package has another HOST_FP_SIZE than 2696"
-# Only faster: a later version of the series that it does not fit is built without it.
-if patch -p1 --dry-run -s -i "$here/kernel.patch" >>"$log" 2>&1; then
-  made patch -p1 -s -i "$here/kernel.patch"
-else
-  echo "vbench image: kernel.patch does not fit this version of $package: guests take longer (see $log)" >&2
-fi
 made make -s ARCH=um KCONFIG_ALLCONFIG="$here/kernel.config" allnoconfig
 # An option that this kernel lacks, or whose condition is missing, is dropped without a word.
 while read -r option; do
   grep -qx "$option" .config || never "$package does not take the option $option"
 done < <(grep '^CONFIG_' "$here/kernel.config")
-made make -s ARCH=um -j"$(nproc)" linux modules
+
+compile() { make -s ARCH=um -j"$(nproc)" linux modules; }
+# The patch makes guests faster, and nothing else of them: a version of the series that it does not fit, or that does not compile
+# with it, is built without it.
+compile_patched() {
+  patch -p1 -s -F0 --dry-run -i "$here/kernel.patch" && patch -p1 -s -F0 -i "$here/kernel.patch" || return
+  compile || { patch -p1 -s -R -i "$here/kernel.patch"; return 1; }
+}
+compile_patched >>"$log" 2>&1 || {
+  echo "vbench image: $package is built without kernel.patch, so guests take longer (why: $log)" >&2
+  made compile
+}
 made make -s ARCH=um INSTALL_MOD_PATH="$work/installed" modules_install
 version=$(make -s ARCH=um kernelrelease)
 rm -f "$work/installed/lib/modules/$version"/{build,source}
