@@ -2,11 +2,13 @@
 //!
 //! The library keeps announcements until they expire, by default after two minutes. So a device from which its driver
 //! receives nothing is queried again once per lease and a pause (RFC 6762, 10.4), and one that does not answer by the end of the
-//! lease after its query is reported as removed. The library reports a missing answer and a goodbye alike, and the former late on a
-//! machine with other work: a device that was silent for its lease is gone by lease; while its driver receives, only a report at
-//! the end of a query's lease is about a missing answer. A goodbye is reported after one second: the library follows RFC 6762,
-//! 10.1, which gives another host that time to object. mdns-sd 0.21 cannot query again an instance with a dot in its name: such a
-//! device is gone when it sends a goodbye, when its driver receives nothing more, or after two minutes.
+//! lease after its query is reported as removed. The library reports a missing answer, maybe late, and a goodbye with the same event:
+//! a device from which the driver received nothing for a lease is gone by lease; of one that sends, only a report at the end of a
+//! query's lease is about a missing answer, and does not count. A goodbye is reported after one second: the library follows RFC
+//! 6762, 10.1, which gives another host that time to object. What else the library takes for the end of an announcement (its
+//! interface goes away, the machine's clock is set forward, it is not renewed in time) counts as a goodbye. mdns-sd 0.21 cannot
+//! query again an instance with a dot in its name: such a device is gone when it sends a goodbye, when its driver receives nothing
+//! more, or after two minutes.
 //!
 //! Invariant: only names and numbers of an announcement are used, each bounded.
 
@@ -32,8 +34,8 @@ const MOST_ADDRESSES: usize = 8;
 const LONGEST_NAME: usize = 63;
 /// The library reports a missing answer at the end of the lease, at most this much earlier by our clock.
 const MARGIN: Duration = Duration::from_millis(100);
-/// From the end of a lease to the next query, or a third of the lease if that is shorter: a report on a missing answer may be as
-/// late if the driver receives again.
+/// From the end of a lease to the next query, or a third of the lease if that is shorter. A report that is later, about a device that
+/// sends again, is taken for a goodbye.
 const PAUSE: Duration = Duration::from_secs(1);
 /// The service that the phone app searches for, to know where to connect.
 const VIO_SERVER: &str = "_vioserver._tcp.local.";
@@ -165,6 +167,11 @@ impl Service {
     async fn assign(&mut self, now: Stamp) {
         for index in 0..self.wanted.len() {
             let Some(wanted) = self.wanted.get(index) else { continue };
+            // Its announcement expired, but its driver receives from it.
+            let is_kept = |full: &String| wanted.watch.is_there() && !self.known.contains_key(full);
+            if wanted.current.as_ref().is_some_and(is_kept) {
+                continue;
+            }
             let full = wanted.current.clone().filter(|full| self.known.contains_key(full)).or_else(|| {
                 let is_free = |full: &&String| {
                     !self.cut.contains_key(*full)
@@ -191,7 +198,7 @@ impl Service {
             let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
             let Some(wanted) = self.wanted.get_mut(index) else { continue };
             // One that is announced again keeps its query: the library may still report that no answer came.
-            if wanted.current != full {
+            if wanted.current != full || wanted.watch.address != Some(address) {
                 (wanted.since, wanted.asked) = (now, None);
             }
             wanted.current = full;
@@ -221,7 +228,7 @@ impl Service {
 
     /// Checks leases and links; returns which instances must be queried again, and how long they have.
     async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
-        let mut questions = Vec::new();
+        let (mut questions, mut was_freed) = (Vec::new(), false);
         for wanted in &mut self.wanted {
             let length = wanted.watch.length;
             let announced = wanted.current.as_ref().and_then(|full| self.known.get_key_value(full));
@@ -236,16 +243,20 @@ impl Service {
                 wanted.watch.renew(now);
             }
             wanted.watch.look(now).await;
-            if !wanted.watch.is_there()
-                && let Some(full) = wanted.current.take()
-                && self.known.contains_key(&full)
-            {
+            if wanted.watch.is_there() {
+                continue;
+            }
+            let Some(full) = wanted.current.take() else { continue };
+            if self.known.contains_key(&full) {
                 self.cut.insert(full, wanted.watch.link.clone());
+            } else {
+                // It was kept; another instance may wait.
+                was_freed = true;
             }
         }
         let before = self.cut.len();
         self.cut.retain(|_, link| link.state() != LinkState::Up);
-        if self.cut.len() != before {
+        if was_freed || self.cut.len() != before {
             self.assign(now).await;
         }
         questions

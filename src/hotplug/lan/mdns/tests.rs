@@ -128,16 +128,31 @@ async fn a_late_report_of_a_missing_answer_is_no_goodbye() {
 #[tokio::test]
 async fn a_missing_answer_is_one_whatever_was_announced_since_the_query() {
     let lease = u64::try_from(LEASE.as_millis()).expect("short");
-    for announced in (100..lease).step_by(100) {
+    for (announced, late) in (100..lease).step_by(100).zip([0, 300, 900].into_iter().cycle()) {
         let mut bench = Bench::new(&[("phone", None)]);
-        let attachment = bench.attached(2 * LEASE).await;
+        let attachment = bench.attached(3 * LEASE).await;
         assert_eq!(bench.pass(announced).await.0, 1);
         assert!(bench.announced("a", &["127.0.0.1:5", "127.0.0.2:5"]).await.is_empty());
         let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
         last_received.now();
-        assert_eq!(bench.pass(100 + lease - announced).await.0, 0, "announced {announced} ms after the query");
-        assert!(bench.removed("a").await.is_empty(), "announced {announced} ms after the query");
+        assert_eq!(bench.pass(100 + lease - announced + late).await.0, 0, "announced {announced} ms after the query");
+        assert!(bench.removed("a").await.is_empty(), "announced {announced} ms after the query, {late} ms late");
     }
+}
+
+#[tokio::test]
+async fn a_device_that_sends_keeps_its_entry_although_another_is_announced() {
+    let mut bench = Bench::new(&[("phone", None)]);
+    let attachment = bench.attached(2 * LEASE).await;
+    assert!(bench.announced("b", &["127.0.0.2:5"]).await.is_empty());
+    bench.service.wanted[0].asked = Some(bench.now);
+    bench.now = bench.now.after(LEASE);
+    let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
+    last_received.now();
+    assert!(bench.removed("a").await.is_empty());
+    assert!(bench.announced("b", &["127.0.0.2:5", "127.0.0.3:5"]).await.is_empty());
+    // Silent for longer than its lease: the other takes its place.
+    assert_eq!(bench.pass(12_000).await.1, ["-/lan/phone lease", "+phone b 127.0.0.2:5"]);
 }
 
 /// One that was queried once, answered and sends data is not queried again: its goodbye is one whenever it comes.

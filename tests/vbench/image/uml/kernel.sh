@@ -54,16 +54,17 @@ while read -r option; do
   grep -qx "$option" .config || never "$package does not take the option $option"
 done < <(grep '^CONFIG_' "$here/kernel.config")
 
-compile() { make -s ARCH=um -j"$(nproc)" linux modules; }
-# The patch makes guests faster, and nothing else of them: a version of the series that it does not fit, or that does not compile
-# with it, is built without it.
+compile() { make -s ARCH=um -j"$1" linux modules; }
+# The patch only makes guests faster: a version of the series whose lines around a change differ, or that does not compile with it,
+# is built without it. Twice, because a compiler may have been ended for want of memory.
 compile_patched() {
-  patch -p1 -s -F0 --dry-run -i "$here/kernel.patch" && patch -p1 -s -F0 -i "$here/kernel.patch" || return
-  compile || { patch -p1 -s -R -i "$here/kernel.patch"; return 1; }
+  patch -p1 -s -F0 --dry-run -i "$here/kernel.patch" || return
+  patch -p1 -s -F0 -i "$here/kernel.patch" || exit
+  compile "$(nproc)" || compile 1 || { patch -p1 -s -R -i "$here/kernel.patch" || exit; return 1; }
 }
 compile_patched >>"$log" 2>&1 || {
   echo "vbench image: $package is built without kernel.patch, so guests take longer (why: $log)" >&2
-  made compile
+  made compile "$(nproc)"
 }
 made make -s ARCH=um INSTALL_MOD_PATH="$work/installed" modules_install
 version=$(make -s ARCH=um kernelrelease)
