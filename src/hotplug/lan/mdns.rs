@@ -32,7 +32,8 @@ const MOST_INSTANCES: usize = 64;
 const MOST_ADDRESSES: usize = 8;
 /// The name of an instance has at most 63 bytes (RFC 6763, 4.1.1).
 const LONGEST_NAME: usize = 63;
-/// The library reports a missing answer at the end of the lease, at most this much earlier by our clock.
+/// The library reports a missing answer at the end of the lease, at most this much earlier by our clock; earlier only if the
+/// announcement itself expires in the lease, which needs a lease of more than 24 s (a fifth of two minutes).
 const MARGIN: Duration = Duration::from_millis(100);
 /// From the end of a lease to the next query, or a third of the lease if that is shorter. A report that is later, about a device that
 /// sends again, is taken for a goodbye.
