@@ -194,8 +194,12 @@ impl Service {
                 address.set_port(wanted.port.unwrap_or(address.port()));
                 address
             };
-            let kept = wanted.watch.address.filter(|kept| found.addresses.iter().any(|found| at(found) == *kept));
-            // Announcements come in parts: an address that is good enough is kept.
+            // Announcements come in parts: an address that is good enough is kept, as is one that the driver receives from.
+            let is_good = |kept: &SocketAddr| {
+                found.addresses.iter().any(|found| at(found) == *kept)
+                    || wanted.watch.is_sending(wanted.watch.length, now)
+            };
+            let kept = wanted.watch.address.filter(is_good);
             let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
             let Some(wanted) = self.wanted.get_mut(index) else { continue };
             // One that is announced again keeps its query: the library may still report that no answer came.
@@ -229,7 +233,7 @@ impl Service {
 
     /// Checks leases and links; returns which instances must be queried again, and how long they have.
     async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
-        let (mut questions, mut was_freed) = (Vec::new(), false);
+        let mut questions = Vec::new();
         for wanted in &mut self.wanted {
             let length = wanted.watch.length;
             let announced = wanted.current.as_ref().and_then(|full| self.known.get_key_value(full));
@@ -250,16 +254,11 @@ impl Service {
             let Some(full) = wanted.current.take() else { continue };
             if self.known.contains_key(&full) {
                 self.cut.insert(full, wanted.watch.link.clone());
-            } else {
-                // It was kept; another instance may wait.
-                was_freed = true;
             }
         }
-        let before = self.cut.len();
         self.cut.retain(|_, link| link.state() != LinkState::Up);
-        if was_freed || self.cut.len() != before {
-            self.assign(now).await;
-        }
+        // Another instance or address may wait for what was kept while the driver received from it.
+        self.assign(now).await;
         questions
     }
 }

@@ -155,6 +155,19 @@ async fn a_device_that_sends_keeps_its_entry_although_another_is_announced() {
     assert_eq!(bench.pass(12_000).await.1, ["-/lan/phone lease", "+phone b 127.0.0.2:5"]);
 }
 
+/// An announcement over one link of several replaces those of the others: the library then names fewer addresses.
+#[tokio::test]
+async fn a_device_that_sends_keeps_its_address_although_only_another_is_announced() {
+    let mut bench = Bench::new(&[("phone", None)]);
+    let attachment = bench.attached(2 * LEASE).await;
+    let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
+    last_received.now();
+    assert!(bench.announced("a", &["127.0.0.2:5"]).await.is_empty());
+    assert!(bench.pass(3000).await.1.is_empty());
+    // Silent for longer than its lease: it has moved there.
+    assert_eq!(bench.pass(12_000).await.1, ["+phone a 127.0.0.2:5"]);
+}
+
 /// One that was queried once, answered and sends data is not queried again: its goodbye is one whenever it comes.
 #[tokio::test]
 async fn a_goodbye_is_one_before_and_after_the_lease_of_a_query() {
