@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
 # Builds and runs the tests of the workspace, in three steps:
 #
-# 1. The programs that guests of the virtual bench need are compiled, and beside them the guest and its kernel, if they are missing.
-# 2. The guests run, one per processor, ahead of everything else where that is allowed, while the remaining tests are compiled.
-# 3. The tests of the host run: those of the program, which wait more than they compute, beside all others. The unit tests of
-#    bus::leftovers make files of killed processes, which each start of the program removes: they run before.
+# 1. All programs are compiled, and beside them the guest of the virtual bench and its kernel, if they are missing.
+# 2. The guests run, one per processor.
+# 3. The tests of the host run, side by side: those of the program, which wait more than they compute, the unit tests, and all
+#    others. The unit tests of bus::leftovers make files of killed processes, which each start of the program removes: they run
+#    before.
 #
 # Guests are judged by virtual time and need no idle machine; the tests of the host judge no time, but are waited for less on one.
 # At the end it lists which tests were skipped.
@@ -39,73 +40,66 @@ with() { "${@: -1}" "${@:1:$# - 1}"; }
 # The same for tests that compute, beside some that wait for clocks and for programs.
 behind() { nice -n 5 "${@: -1}" "${@:1:$# - 1}"; }
 
-# What runs beside guests takes what they leave of the processors. Not the idle class: on a busy machine it would never end.
-beside() {
-    if chrt --rr 1 true 2>/dev/null; then "$@"; else nice -n 5 "$@"; fi
-}
-
-# A user who is not root may be asked for a password, which the output of cargo would hide: for them the guest is built first.
-# It has its own process group, as the jobs below, and not the folder for temporary files that leftovers.sh removes.
-make_guest() { TMPDIR=${RAPID_OUTER_TMPDIR:-/tmp} "$here/setup.sh" image; }
 jobs=()
-output=$(mktemp)
+outputs=$(mktemp -d)
 # Tests add lines to it (tests/support/skip.rs).
 RAPID_SKIPPED=$(mktemp)
 export RAPID_SKIPPED
+# What ran beside something else, as far as it got.
+show() { find "$outputs" -type f -exec cat {} + -delete; }
 finish() {
     local job
     for job in "${jobs[@]}"; do kill -- "-$job" 2>/dev/null && wait "$job" || true; done
-    cat "$output"
-    rm -f "$output" "$RAPID_SKIPPED"
+    show
+    rm -rf "$outputs" "$RAPID_SKIPPED"
 }
 trap finish EXIT
-image=
-if [[ $(id -u) = 0 ]]; then
-    # In process groups of their own: a signal that ends this script also ends them and their machines.
+
+# Begins a job in a process group of its own: a signal that ends this script also ends it and its machines.
+aside() {
     set -m
-    make_guest </dev/null &
-    image=$!
+    "$@" &
     set +m
-    jobs+=("$image")
-else
-    make_guest
-fi
+    jobs+=("$!")
+}
 
-# With any test of a package its programs are built, too. The unit tests are the longest compilation: here it is beside that
-# of the library, which takes one processor. The examples are those that guests run: `cargo test` gives them their place only
-# when everything else is built.
-guest=$(programs "$@" --lib --test guest --test layering | grep /guest-) || { echo "tests.sh: the tests of the virtual bench are not built" >&2; exit 1; }
-"$1" build "${@:3}" --example process_node --example publish_action
-[[ -z $image ]] || wait "$image" || { echo "tests.sh: the guest of the virtual bench could not be built: see the lines above that begin with 'vbench image:' or 'setup:'" >&2; exit 1; }
-# Only those that run: another program may get the number of one that has ended.
-jobs=()
+# Waits for all jobs; fails if one did. Another program may get the number of one that has ended: they are forgotten.
+ended() {
+    local job code=0
+    for job in "${jobs[@]}"; do wait "$job" || code=1; done
+    jobs=()
+    return "$code"
+}
 
-set -m
-run env RUST_TEST_THREADS="$(nproc)" <<<"$guest" >"$output" 2>&1 &
-readonly bench=$!
-set +m
-jobs+=("$bench")
+# A user who is not root may be asked for a password, which the output of cargo would hide: for them the guest is built first.
+# Not in the folder for temporary files that leftovers.sh removes.
+make_guest() { TMPDIR=${RAPID_OUTER_TMPDIR:-/tmp} "$here/setup.sh" image; }
+if [[ $(id -u) = 0 ]]; then aside make_guest </dev/null; else make_guest; fi
+
+built=$(programs "$@") || { echo "tests.sh: not built" >&2; exit 1; }
+ended || { echo "tests.sh: the guest of the virtual bench could not be built: see the lines above that begin with 'vbench image:' or 'setup:'" >&2; exit 1; }
+
+# of PATTERN: the test programs whose lines contain it; there is one.
+of() { grep -e "$1" <<<"$built" || { echo "tests.sh: no $1 among what was built" >&2; exit 1; }; }
+guest=$(of /guest-)
+program=$(of /program-)
+unit=$(of /deps/rapid-)
+others() {
+    local code=0
+    run env <<<"$(grep -v -e /guest- -e /program- -e /deps/rapid- <<<"$built")" || code=1
+    "$here/models-tests.sh" || code=1
+    return "$code"
+}
+
 code=0
-hosted=$(programs beside "$@" | grep -v /guest-) || { echo "tests.sh: not built" >&2; exit 1; }
-echo "     Waiting for the virtual bench"
-wait "$bench" || code=1
-jobs=()
-cat "$output"
-
-unit=$(grep /deps/rapid- <<<"$hosted") || { echo "tests.sh: the unit tests are not built" >&2; exit 1; }
+aside run env RUST_TEST_THREADS="$(nproc)" <<<"$guest"
+ended || code=1
 run with bus::leftovers <<<"$unit" || code=1
-set -m
-run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$(grep /program- <<<"$hosted")" >"$output" 2>&1 &
-readonly waiting=$!
-set +m
-jobs+=("$waiting")
+aside run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$program" >"$outputs/program" 2>&1
+aside others >"$outputs/others" 2>&1
 run behind --skip bus::leftovers <<<"$unit" || code=1
-run env <<<"$(grep -v -e /program- -e /deps/rapid- <<<"$hosted")" || code=1
-"$here/models-tests.sh" || code=1
 echo "     Waiting for the tests of the program"
-wait "$waiting" || code=1
-jobs=()
-cat "$output"
-: >"$output"
+ended || code=1
+show
 "$here/skips.sh" "$RAPID_SKIPPED" || code=1
 exit "$code"
