@@ -193,9 +193,16 @@ impl Scene {
         Err(if dark >= WHITE { Refusal::Saturated } else { Refusal::Flat { brightness: self.mean } })
     }
 
-    /// How long the light was on until a moment.
-    fn lit_until(&self, at: f64) -> f64 {
-        let next = self.flips.partition_point(|(flip, ..)| *flip <= at);
+    /// How long the light was on until a moment. `next` is the first flip after the moment that was asked for before: the
+    /// search begins there, because the next one is nearly always near it, and a fit asks for thousands.
+    fn lit_until(&self, at: f64, next: &mut usize) -> f64 {
+        let is_past = |index: usize| self.flips.get(index).is_some_and(|(flip, ..)| *flip <= at);
+        while is_past(*next) {
+            *next += 1;
+        }
+        while next.checked_sub(1).is_some_and(|last| !is_past(last)) {
+            *next -= 1;
+        }
         match next.checked_sub(1).and_then(|last| self.flips.get(last)) {
             Some((flip, lit, before)) => before + if *lit { at - flip } else { 0.0 },
             // Before the first flip: lit if that one turned it dark.
@@ -203,17 +210,20 @@ impl Scene {
         }
     }
 
-    fn light(&self, at: f64, exposure: f64) -> f64 {
+    /// The mean of the light over an exposure; `next` as in [`Self::lit_until`], for its begin and its end.
+    fn light(&self, at: f64, exposure: f64, next: &mut [usize; 2]) -> f64 {
         // A single moment is treated as an exposure too short to matter.
         let half = exposure.max(1e-6) / 2.0;
-        (self.lit_until(at + half) - self.lit_until(at - half)) / (2.0 * half)
+        let [begin, end] = next;
+        (self.lit_until(at + half, end) - self.lit_until(at - half, begin)) / (2.0 * half)
     }
 
     fn fit(&self, latency: f64, exposure: f64) -> Fit {
         let mut before = None;
+        let mut next = [0; 2];
         let (mut light_power, mut together) = (0.0, 0.0);
         for (at, step) in self.times.iter().zip(std::iter::once(&0.0).chain(&self.steps)) {
-            let light = self.light(at - latency, exposure);
+            let light = self.light(at - latency, exposure, &mut next);
             if let Some(before) = before.replace(light) {
                 let change: f64 = light - before;
                 light_power += change * change;
