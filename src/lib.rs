@@ -61,7 +61,6 @@ pub mod points;
 pub mod policy;
 pub mod provenance;
 pub mod qr;
-pub mod random;
 pub mod realtime;
 pub mod record;
 pub mod registration;
@@ -82,3 +81,5 @@ pub mod time;
 pub mod tui;
 #[cfg(feature = "web")]
 pub mod web;
+
+pub use rapid_random as random;

@@ -31,7 +31,6 @@ const LAYERS: &[&[&str]] = &[
         "action",
         "interlock",
         "permission",
-        "random",
         "provenance",
         "flash",
         "points",
@@ -142,12 +141,12 @@ const HOMES: &[(&str, &[&str])] = &[
     ("parquet", &["export"]),
     ("png", &["export"]),
     ("qrcodegen", &["qr"]),
-    ("rand_distr", &["random"]),
-    ("rand_pcg", &["random"]),
     (
         "rapid_jpeg",
         &["pixels", "calibration/brightness", "driver/sim", "export/video", "simulation/task", "plot", "web"],
     ),
+    ("rapid_random", &[ANYWHERE]),
+    ("rapid_world", &["simulation/task"]),
     ("ratatui", &["tui"]),
     ("ratatui_core", &["tui"]),
     ("ratatui_image", &["tui/picture"]),
@@ -287,7 +286,7 @@ fn a_test_that_is_ignored_is_run_by_another_one() {
 
 /// Whether this script runs what the test program with this file ignores.
 fn runs_ignored(script: &str, file: &Path) -> bool {
-    // src/simulation/task/touch.rs, tests/program/x.rs, tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
+    // src/episode/chunk.rs, tests/program/x.rs, tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
     let parts: Vec<String> = file.with_extension("").iter().map(|part| part.to_string_lossy().into_owned()).collect();
     let program = parts.iter().rposition(|part| part == "tests").and_then(|last| parts.get(last + 1));
     let program = program.filter(|_| parts.iter().all(|part| part != "src"));

@@ -5,19 +5,14 @@
 //! Invariant: the samples of its devices are a function of the seed, the actions and the number of the step; the time
 //! and order of reads have no effect.
 
-mod expert;
-mod looks;
-mod touch;
-mod world;
-
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rapid_jpeg::{EncodeError, Values};
 
-pub use expert::Expert;
-pub use looks::{Looks, SIDE, SIDE_PIXELS};
-pub use touch::{Touch, UNSEEN_PERIOD};
-pub use world::{AXES, AXIS_COUNT, MAX_STEPS, Outcome, STEP_HZ, Size, Texture, World};
+pub use rapid_world::{
+    AXES, AXIS_COUNT, Expert, Looks, MAX_STEPS, Outcome, SIDE, SIDE_PIXELS, STEP_HZ, Size, Texture, Touch,
+    UNSEEN_PERIOD, World,
+};
 
 use super::TaskPart;
 use crate::sample::Encoding;

@@ -7,7 +7,7 @@ use std::f64::consts::TAU;
 
 use super::touch::{Touch, pixels};
 use super::world::{Texture, World, stream};
-use crate::random::Random;
+use rapid_random::Random;
 
 /// Pixels per side.
 pub const SIDE_PIXELS: u32 = 96;

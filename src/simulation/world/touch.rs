@@ -18,7 +18,7 @@ use std::sync::LazyLock;
 
 use super::looks::{PIXELS, SIDE, narrow, offset};
 use super::world::{Texture, stream};
-use crate::random::Random;
+use rapid_random::Random;
 
 /// Distances of the lattice's lines, pixels. Each block has one of them.
 const PERIODS: [f64; 5] = [13.0, 15.0, 17.0, 19.0, 21.0];

@@ -1,7 +1,7 @@
 //! The expert: a script that knows the block's position and texture, and demonstrates the task.
 
 use super::world::{AXES, World, stream};
-use crate::random::Random;
+use rapid_random::Random;
 
 /// Phase of the demonstration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
