@@ -46,7 +46,12 @@ outputs=$(mktemp -d)
 RAPID_SKIPPED=$(mktemp)
 export RAPID_SKIPPED
 # What ran beside something else, as far as it got.
-show() { find "$outputs" -type f -exec cat {} + -delete; }
+show() {
+    local file
+    for file in "$outputs"/*; do
+        [[ ! -f $file ]] || { cat "$file"; rm "$file"; }
+    done
+}
 finish() {
     local job
     for job in "${jobs[@]}"; do kill -- "-$job" 2>/dev/null && wait "$job" || true; done
