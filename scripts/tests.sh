@@ -3,9 +3,9 @@
 #
 # 1. All programs are compiled, and beside them the guest of the virtual bench and its kernel, if they are missing.
 # 2. The guests run, one per processor.
-# 3. The tests of the host run, side by side: those of the program, which wait more than they compute, the unit tests, and all
-#    others. The unit tests of bus::leftovers make files of killed processes, which each start of the program removes: they run
-#    before.
+# 3. The tests of the host run: those of the program, which wait more than they compute, beside all others, of which the unit
+#    tests are the last: they compute most. The unit tests of bus::leftovers make files of killed processes, which each start of
+#    the program removes: they run before.
 #
 # Guests are judged by virtual time and need no idle machine; the tests of the host judge no time, but are waited for less on one.
 # At the end it lists which tests were skipped.
@@ -41,22 +41,16 @@ with() { "${@: -1}" "${@:1:$# - 1}"; }
 behind() { nice -n 5 "${@: -1}" "${@:1:$# - 1}"; }
 
 jobs=()
-outputs=$(mktemp -d)
+# Of what runs beside something else.
+output=$(mktemp)
 # Tests add lines to it (tests/support/skip.rs).
 RAPID_SKIPPED=$(mktemp)
 export RAPID_SKIPPED
-# What ran beside something else, as far as it got.
-show() {
-    local file
-    for file in "$outputs"/*; do
-        [[ ! -f $file ]] || { cat "$file"; rm "$file"; }
-    done
-}
 finish() {
     local job
     for job in "${jobs[@]}"; do kill -- "-$job" 2>/dev/null && wait "$job" || true; done
-    show
-    rm -rf "$outputs" "$RAPID_SKIPPED"
+    cat "$output"
+    rm -f "$output" "$RAPID_SKIPPED"
 }
 trap finish EXIT
 
@@ -78,33 +72,38 @@ ended() {
 
 # A user who is not root may be asked for a password, which the output of cargo would hide: for them the guest is built first.
 # Not in the folder for temporary files that leftovers.sh removes.
-make_guest() { TMPDIR=${RAPID_OUTER_TMPDIR:-/tmp} "$here/setup.sh" image; }
+make_guest() {
+    TMPDIR=${RAPID_OUTER_TMPDIR:-/tmp} "$here/setup.sh" image && return
+    echo "tests.sh: the guest of the virtual bench could not be built: see the lines above that begin with 'vbench image:' or 'setup:'" >&2
+    return 1
+}
 if [[ $(id -u) = 0 ]]; then aside make_guest </dev/null; else make_guest; fi
 
 built=$(programs "$@") || { echo "tests.sh: not built" >&2; exit 1; }
-ended || { echo "tests.sh: the guest of the virtual bench could not be built: see the lines above that begin with 'vbench image:' or 'setup:'" >&2; exit 1; }
+ended || exit 1
 
-# of PATTERN: the test programs whose lines contain it; there is one.
-of() { grep -e "$1" <<<"$built" || { echo "tests.sh: no $1 among what was built" >&2; exit 1; }; }
-guest=$(of /guest-)
-program=$(of /program-)
-unit=$(of /deps/rapid-)
-others() {
-    local code=0
-    run env <<<"$(grep -v -e /guest- -e /program- -e /deps/rapid- <<<"$built")" || code=1
-    "$here/models-tests.sh" || code=1
-    return "$code"
+# of NAME: the test program of this name.
+of() {
+    local found
+    found=$(grep -c "/deps/$1-[0-9a-f]*$" <<<"$built") || true
+    [[ $found = 1 ]] || { echo "tests.sh: $found test programs of the name $1 were built, not one" >&2; exit 1; }
+    grep "/deps/$1-[0-9a-f]*$" <<<"$built"
 }
+guest=$(of guest)
+program=$(of program)
+unit=$(of rapid)
 
 code=0
 aside run env RUST_TEST_THREADS="$(nproc)" <<<"$guest"
 ended || code=1
 run with bus::leftovers <<<"$unit" || code=1
-aside run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$program" >"$outputs/program" 2>&1
-aside others >"$outputs/others" 2>&1
+aside run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$program" >"$output" 2>&1
+run env <<<"$(grep -vE '/deps/(guest|program|rapid)-[0-9a-f]*$' <<<"$built")" || code=1
+"$here/models-tests.sh" || code=1
 run behind --skip bus::leftovers <<<"$unit" || code=1
 echo "     Waiting for the tests of the program"
 ended || code=1
-show
+cat "$output"
+: >"$output"
 "$here/skips.sh" "$RAPID_SKIPPED" || code=1
 exit "$code"
