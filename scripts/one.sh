@@ -33,7 +33,12 @@ for file in "${files[@]}"; do
         tests/vbench/tests/*) target="--test guest" guest=yes beside+=(--test program) ;;
         tests/bench/tests/*) target="--test smoke" all=yes ;;
         tests/bench/src/*) target="--bin rapid-bench" ;;
-        tests/vbench/src/* | tests/fuzz/src/* | examples/c/*.rs | src/*) target=--lib ;;
+        tests/vbench/src/* | tests/fuzz/src/* | examples/c/*.rs) target=--lib ;;
+        src/*)
+            target=--lib
+            # In a crate of its own the names of tests begin below it.
+            [[ -z $filter || ! -e ${file%/*}/Cargo.toml ]] || filter=$last
+            ;;
         # They start examples, which cargo builds only together with all others.
         tests/program/process.rs | tests/program/docs.rs) target="--test program" all=yes ;;
         tests/support/*) target="--test program" ;;

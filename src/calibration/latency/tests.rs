@@ -53,6 +53,18 @@ fn flips(seconds: u64) -> Vec<Flip> {
         .collect()
 }
 
+#[test]
+fn the_light_is_the_same_wherever_the_search_begins() {
+    let scene = Scene::new(&flips(20), &seen(CAMERA, 20)).expect("a scene");
+    let mut state = 7;
+    let mut next = 0;
+    for _ in 0..10_000 {
+        let at = 24.0 * random(&mut state) - 2.0;
+        assert_eq!(scene.lit_until(at, &mut next).to_bits(), scene.lit_until(at, &mut 0).to_bits(), "{at} s");
+        assert_eq!(next, scene.flips.partition_point(|(flip, ..)| *flip <= at), "{at} s");
+    }
+}
+
 fn seen(camera: Camera, seconds: u64) -> Vec<Seen> {
     let mut state = camera.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let phase = random(&mut state) / camera.fps;

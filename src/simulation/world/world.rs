@@ -257,12 +257,12 @@ impl World {
 
 /// Random streams of one seed.
 pub(super) mod stream {
-    pub(in super::super) const LAYOUT: u64 = 0;
-    pub(in super::super) const DYNAMICS: u64 = 1;
-    pub(in super::super) const LOOKS: u64 = 2;
-    pub(in super::super) const WRIST_NOISE: u64 = 3;
-    pub(in super::super) const TACTILE_NOISE: u64 = 4;
-    pub(in super::super) const EXPERT: u64 = 5;
-    pub(in super::super) const TOUCH: u64 = 6;
-    pub(in super::super) const SIZE: u64 = 7;
+    pub(crate) const LAYOUT: u64 = 0;
+    pub(crate) const DYNAMICS: u64 = 1;
+    pub(crate) const LOOKS: u64 = 2;
+    pub(crate) const WRIST_NOISE: u64 = 3;
+    pub(crate) const TACTILE_NOISE: u64 = 4;
+    pub(crate) const EXPERT: u64 = 5;
+    pub(crate) const TOUCH: u64 = 6;
+    pub(crate) const SIZE: u64 = 7;
 }
