@@ -29,8 +29,12 @@ chmod 1777 "$temporary"
 trap 'rm -rf "$temporary"' EXIT
 before=$(shared)
 
+# In the background: a signal ends the command at once, and then this script, which looks at what it left.
+RAPID_OUTER_TMPDIR=${TMPDIR:-/tmp} TMPDIR=$temporary "$@" <&0 &
+readonly command=$!
+trap 'kill "$command" 2>/dev/null || true' HUP INT TERM
 code=0
-RAPID_OUTER_TMPDIR=${TMPDIR:-/tmp} TMPDIR=$temporary "$@" || code=$?
+until wait "$command" && code=0 || code=$?; ! kill -0 "$command" 2>/dev/null; do :; done
 
 left=$(find "$temporary" -mindepth 1 -maxdepth 1 -printf '%p\n' | sort)
 while IFS= read -r path; do

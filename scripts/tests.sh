@@ -41,8 +41,10 @@ with() { "${@: -1}" "${@:1:$# - 1}"; }
 behind() { nice -n 5 "${@: -1}" "${@:1:$# - 1}"; }
 
 jobs=()
+jobs=()
 # Of what runs beside something else.
 output=$(mktemp)
+list=$(mktemp)
 # Tests add lines to it (tests/support/skip.rs).
 RAPID_SKIPPED=$(mktemp)
 export RAPID_SKIPPED
@@ -50,11 +52,11 @@ finish() {
     local job
     for job in "${jobs[@]}"; do kill -- "-$job" 2>/dev/null && wait "$job" || true; done
     cat "$output"
-    rm -f "$output" "$RAPID_SKIPPED"
+    rm -f "$output" "$list" "$RAPID_SKIPPED"
 }
 trap finish EXIT
 
-# Begins a job in a process group of its own: a signal that ends this script also ends it and its machines.
+# Begins a job. Each has a process group of its own: a signal that ends this script also ends all that it runs.
 aside() {
     set -m
     "$@" &
@@ -78,30 +80,35 @@ make_guest() {
     return 1
 }
 if [[ $(id -u) = 0 ]]; then aside make_guest </dev/null; else make_guest; fi
-
-built=$(programs "$@") || { echo "tests.sh: not built" >&2; exit 1; }
-ended || exit 1
+aside programs "$@" </dev/null >"$list"
+ended || { echo "tests.sh: not built" >&2; exit 1; }
 
 # of NAME: the test program of this name.
 of() {
     local found
-    found=$(grep -c "/deps/$1-[0-9a-f]*$" <<<"$built") || true
+    found=$(grep -c "/deps/$1-[0-9a-f]*$" "$list") || true
     [[ $found = 1 ]] || { echo "tests.sh: $found test programs of the name $1 were built, not one" >&2; exit 1; }
-    grep "/deps/$1-[0-9a-f]*$" <<<"$built"
+    grep "/deps/$1-[0-9a-f]*$" "$list"
 }
 guest=$(of guest)
 program=$(of program)
 unit=$(of rapid)
+others() {
+    local code=0
+    run env <<<"$(grep -vE '/deps/(guest|program|rapid)-[0-9a-f]*$' "$list")" || code=1
+    "$here/models-tests.sh" || code=1
+    run behind --skip bus::leftovers <<<"$unit" || code=1
+    echo "     Waiting for the tests of the program"
+    return "$code"
+}
 
 code=0
 aside run env RUST_TEST_THREADS="$(nproc)" <<<"$guest"
 ended || code=1
-run with bus::leftovers <<<"$unit" || code=1
+aside run with bus::leftovers <<<"$unit"
+ended || code=1
 aside run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$program" >"$output" 2>&1
-run env <<<"$(grep -vE '/deps/(guest|program|rapid)-[0-9a-f]*$' <<<"$built")" || code=1
-"$here/models-tests.sh" || code=1
-run behind --skip bus::leftovers <<<"$unit" || code=1
-echo "     Waiting for the tests of the program"
+aside others </dev/null
 ended || code=1
 cat "$output"
 : >"$output"
