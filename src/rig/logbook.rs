@@ -65,7 +65,7 @@ impl Logbook {
         Self::in_folder(folder, Arc::clone(board))
     }
 
-    fn in_folder(folder: PathBuf, board: Arc<Board>) -> Self {
+    pub(super) fn in_folder(folder: PathBuf, board: Arc<Board>) -> Self {
         let (pages, inbox) = sync_channel(DEPTH);
         let missing: Arc<AtomicU64> = Arc::default();
         let files = Files { folder, open: HashMap::new(), largest: LARGEST };

@@ -3,6 +3,7 @@
 //! Invariant: the lines of a child are bounded in length and in rate; omitted lines are counted and reported. A child
 //! that prints faster blocks on its pipe, as at a slow terminal, and costs the rig a few reads each [`PAUSE`].
 
+use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -64,8 +65,8 @@ impl Output {
         loop {
             let [out, err] = self.lines.each_ref().map(|lines| !lines.closed);
             tokio::select! {
-                result = stdout.readable(), if out => self.look(0, result.is_ok().then_some(stdout)),
-                result = stderr.readable(), if err => self.look(1, result.is_ok().then_some(stderr)),
+                result = stdout.readable(), if out => self.look(0, |chunk| result.and_then(|()| stdout.try_read(chunk))),
+                result = stderr.readable(), if err => self.look(1, |chunk| result.and_then(|()| stderr.try_read(chunk))),
                 () = sleep(TELL_EVERY.saturating_sub(Stamp::now().since(self.reported))), if self.left_out > 0 => {
                     self.notify();
                 }
@@ -82,7 +83,8 @@ impl Output {
         for (index, pipe) in [stdout, stderr].into_iter().enumerate() {
             // At most one pipe's capacity: a pipe that is still written to would never end.
             for _ in 0..4 {
-                self.look(index, Some(pipe));
+                // The end of the child may be seen before what it printed last: `try_read` asks the runtime, not the pipe.
+                self.look(index, |chunk| Ok(rustix::io::read(pipe, chunk)?));
             }
             if let Some(lines) = self.lines.get_mut(index)
                 && let Some(line) = lines.rest()
@@ -93,13 +95,13 @@ impl Output {
         self.notify();
     }
 
-    /// Reads once; does nothing without a pipe.
-    fn look(&mut self, index: usize, pipe: Option<&Receiver>) {
+    /// Reads once.
+    fn look(&mut self, index: usize, read: impl FnOnce(&mut [u8]) -> io::Result<usize>) {
         let mut chunk = [0; CHUNK];
-        let read = match pipe.map(|pipe| pipe.try_read(&mut chunk)) {
-            Some(Ok(read)) => read,
-            Some(Err(error)) if error.kind() == std::io::ErrorKind::WouldBlock => return,
-            Some(Err(_)) | None => 0,
+        let read = match read(&mut chunk) {
+            Ok(read) => read,
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => return,
+            Err(_) => 0,
         };
         let Some(lines) = self.lines.get_mut(index) else { return };
         lines.closed = read == 0;
@@ -212,6 +214,39 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+
+    /// A child that has ended, before the runtime has noticed that its pipe can be read.
+    #[tokio::test]
+    async fn what_a_child_prints_last_is_logged_however_soon_it_ends() {
+        use std::io::Write as _;
+        let folder = tempfile::tempdir().unwrap();
+        let board = Arc::new(Board::new(&crate::registry::Registry::builtin()));
+        let mut events = board.events();
+        let now = Stamp::now();
+        let mut output = Output {
+            device: "motor".to_owned(),
+            whose: String::new(),
+            logbook: Logbook::in_folder(folder.path().to_owned(), Arc::clone(&board)),
+            board,
+            lines: [Lines::default(), Lines::default()],
+            limit: Limit::new(now),
+            left_out: 0,
+            reported: now,
+        };
+        let pipes = ["out", "err"].map(|text| {
+            let (reader, mut writer) = io::pipe().unwrap();
+            writer.write_all(text.as_bytes()).unwrap();
+            Receiver::from_owned_fd(reader.into()).unwrap()
+        });
+        // The runtime has not looked at it yet.
+        assert_eq!(pipes[0].try_read(&mut [0; 8]).unwrap_err().kind(), io::ErrorKind::WouldBlock);
+        output.finish(&pipes[0], &pipes[1]);
+        let printed = [(); 2].map(|()| match events.try_recv().unwrap().what {
+            What::Printed { text, .. } => text,
+            other => panic!("{other:?}"),
+        });
+        assert_eq!(printed, ["motor: out", "motor: err"]);
+    }
 
     #[test]
     fn lines_are_cut_and_sanitized() {
