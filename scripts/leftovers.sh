@@ -33,8 +33,11 @@ before=$(shared)
 RAPID_OUTER_TMPDIR=${TMPDIR:-/tmp} TMPDIR=$temporary "$@" <&0 &
 readonly command=$!
 trap 'kill "$command" 2>/dev/null || true' HUP INT TERM
-code=0
-until wait "$command" && code=0 || code=$?; ! kill -0 "$command" 2>/dev/null; do :; done
+while :; do
+    code=0
+    wait "$command" || code=$?
+    kill -0 "$command" 2>/dev/null || break
+done
 
 left=$(find "$temporary" -mindepth 1 -maxdepth 1 -printf '%p\n' | sort)
 while IFS= read -r path; do

@@ -4,8 +4,8 @@
 # 1. All programs are compiled, and beside them the guest of the virtual bench and its kernel, if they are missing.
 # 2. The guests run, one per processor.
 # 3. The tests of the host run: those of the program, which wait more than they compute, beside all others, of which the unit
-#    tests are the last: they compute most. The unit tests of bus::leftovers make files of killed processes, which each start of
-#    the program removes: they run before.
+#    tests are the last: they compute most. Those that count allocations take four times as long beside the program: they begin.
+#    The unit tests of bus::leftovers make files of killed processes, which each start of the program removes: they run before.
 #
 # Guests are judged by virtual time and need no idle machine; the tests of the host judge no time, but are waited for less on one.
 # At the end it lists which tests were skipped.
@@ -40,7 +40,6 @@ with() { "${@: -1}" "${@:1:$# - 1}"; }
 # The same for tests that compute, beside some that wait for clocks and for programs.
 behind() { nice -n 5 "${@: -1}" "${@:1:$# - 1}"; }
 
-jobs=()
 jobs=()
 # Of what runs beside something else.
 output=$(mktemp)
@@ -81,7 +80,8 @@ make_guest() {
 }
 if [[ $(id -u) = 0 ]]; then aside make_guest </dev/null; else make_guest; fi
 aside programs "$@" </dev/null >"$list"
-ended || { echo "tests.sh: not built" >&2; exit 1; }
+wait "${jobs[-1]}" || { echo "tests.sh: not built" >&2; exit 1; }
+ended || exit 1
 
 # of NAME: the test program of this name.
 of() {
@@ -91,11 +91,18 @@ of() {
     grep "/deps/$1-[0-9a-f]*$" "$list"
 }
 guest=$(of guest)
+memory=$(of memory)
 program=$(of program)
 unit=$(of rapid)
-others() {
+waiting() {
     local code=0
-    run env <<<"$(grep -vE '/deps/(guest|program|rapid)-[0-9a-f]*$' "$list")" || code=1
+    run env <<<"$memory" || code=1
+    run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$program" || code=1
+    return "$code"
+}
+computing() {
+    local code=0
+    run env <<<"$(grep -vE '/deps/(guest|memory|program|rapid)-[0-9a-f]*$' "$list")" || code=1
     "$here/models-tests.sh" || code=1
     run behind --skip bus::leftovers <<<"$unit" || code=1
     echo "     Waiting for the tests of the program"
@@ -107,8 +114,8 @@ aside run env RUST_TEST_THREADS="$(nproc)" <<<"$guest"
 ended || code=1
 aside run with bus::leftovers <<<"$unit"
 ended || code=1
-aside run env RUST_TEST_THREADS="$((4 * $(nproc)))" <<<"$program" >"$output" 2>&1
-aside others </dev/null
+aside waiting </dev/null >"$output" 2>&1
+aside computing </dev/null
 ended || code=1
 cat "$output"
 : >"$output"

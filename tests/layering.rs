@@ -286,7 +286,7 @@ fn a_test_that_is_ignored_is_run_by_another_one() {
 
 /// Whether this script runs what the test program with this file ignores.
 fn runs_ignored(script: &str, file: &Path) -> bool {
-    // src/episode/chunk.rs, tests/program/x.rs, tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
+    // src/simulation/world/touch.rs, tests/program/x.rs, tests/bench/tests/smoke.rs, tests/vbench/tests/guest/endurance.rs
     let parts: Vec<String> = file.with_extension("").iter().map(|part| part.to_string_lossy().into_owned()).collect();
     let program = parts.iter().rposition(|part| part == "tests").and_then(|last| parts.get(last + 1));
     let program = program.filter(|_| parts.iter().all(|part| part != "src"));

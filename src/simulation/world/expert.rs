@@ -1,7 +1,8 @@
 //! The expert: a script that knows the block's position and texture, and demonstrates the task.
 
-use super::world::{AXES, World, stream};
 use rapid_random::Random;
+
+use super::world::{AXES, World, stream};
 
 /// Phase of the demonstration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -5,9 +5,10 @@
 
 use std::f64::consts::TAU;
 
+use rapid_random::Random;
+
 use super::touch::{Touch, pixels};
 use super::world::{Texture, World, stream};
-use rapid_random::Random;
 
 /// Pixels per side.
 pub const SIDE_PIXELS: u32 = 96;

@@ -16,9 +16,10 @@
 use std::f64::consts::{PI, TAU};
 use std::sync::LazyLock;
 
+use rapid_random::Random;
+
 use super::looks::{PIXELS, SIDE, narrow, offset};
 use super::world::{Texture, stream};
-use rapid_random::Random;
 
 /// Distances of the lattice's lines, pixels. Each block has one of them.
 const PERIODS: [f64; 5] = [13.0, 15.0, 17.0, 19.0, 21.0];
