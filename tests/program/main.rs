@@ -47,6 +47,7 @@ mod register;
 mod reload;
 mod scenarios;
 mod screen;
+mod scripts;
 mod second_run;
 mod session;
 mod shared_memory;

@@ -1,0 +1,108 @@
+//! What `make test` calls, `scripts/tests.sh` within `scripts/leftovers.sh`, with small programs in place of the tests: no
+//! failure and no line of a test gets lost, and a signal leaves nothing running.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+
+use crate::support::{Place, until, wait_for};
+
+/// Test programs: those that tests.sh runs in a way of their own, and any other.
+const PROGRAMS: [&str; 5] = ["guest", "memory", "program", "rapid", "other"];
+/// What runs: the programs, and the three that tests.sh calls besides.
+const STEPS: [&str; 8] = ["guest", "memory", "program", "rapid", "other", "setup.sh", "models-tests.sh", "cargo"];
+/// It says that it runs, and its name, for which a step may be exchanged.
+const PASSES: &str = "echo \"$(basename \"$0\") runs\"\n";
+
+/// `scripts/tests.sh` among programs that pass.
+fn prepared() -> Place {
+    let place = Place::new();
+    for name in ["tests.sh", "leftovers.sh"] {
+        let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts").join(name));
+        script(&place, name, &text.expect("the script"));
+    }
+    let root = place.folder.path().display();
+    let built = PROGRAMS.map(|name| {
+        script(&place, &file(name), PASSES);
+        let program = format!("\"profile\":{{\"test\":true}},\"executable\":\"{root}/{}\"", file(name));
+        format!("echo '{{\"manifest_path\":\"{root}/Cargo.toml\",{program}}}'\n")
+    });
+    script(&place, "cargo", &built.concat());
+    for name in ["setup.sh", "models-tests.sh", "skips.sh"] {
+        script(&place, name, PASSES);
+    }
+    place
+}
+
+/// An executable in the folder of `place`.
+fn script(place: &Place, name: &str, text: &str) {
+    let path = place.path(name);
+    std::fs::create_dir_all(path.parent().expect("a folder")).expect("made");
+    std::fs::write(&path, format!("#!/bin/bash\n{text}")).expect("written");
+    std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).expect("made executable");
+}
+
+/// The file of a step.
+fn file(step: &str) -> String {
+    if PROGRAMS.contains(&step) { format!("deps/{step}-1f") } else { step.to_owned() }
+}
+
+#[test]
+fn a_failure_of_any_test_program_is_that_of_make_test_and_no_line_is_lost() {
+    for failing in
+        [None, Some("guest"), Some("memory"), Some("program"), Some("rapid"), Some("other"), Some("skips.sh")]
+    {
+        let place = prepared();
+        if let Some(failing) = failing {
+            script(&place, &file(failing), &format!("{PASSES}exit 101\n"));
+        }
+        let mut tests = Command::new(place.path("tests.sh"));
+        let output = tests.arg(place.path("cargo")).arg("test").output().expect("bash");
+        let printed = String::from_utf8_lossy(&output.stdout);
+        assert_eq!(output.status.code(), Some(i32::from(failing.is_some())), "{failing:?}: {printed}");
+        for name in PROGRAMS {
+            // Some of the unit tests run before the rest.
+            let count = 1 + usize::from(name == "rapid");
+            assert_eq!(printed.matches(&format!("{name}-1f runs")).count(), count, "{failing:?}: {printed}");
+            let failures = if failing == Some(name) { count } else { 0 };
+            assert_eq!(printed.matches(&format!("{name}-1f failed")).count(), failures, "{failing:?}: {printed}");
+        }
+        assert_eq!(printed.matches("models-tests.sh runs").count(), 1, "{failing:?}: {printed}");
+    }
+}
+
+#[test]
+fn what_is_not_built_is_an_error_before_any_test() {
+    for (step, text) in [("cargo", "exit 101\n"), ("setup.sh", "exit 1\n"), ("cargo", "true\n")] {
+        let place = prepared();
+        script(&place, step, text);
+        let output = Command::new(place.path("tests.sh")).arg(place.path("cargo")).arg("test").output().expect("bash");
+        let printed = String::from_utf8_lossy(&output.stdout);
+        assert!(output.status.code() == Some(1) && !printed.contains("1f runs"), "{step} {text}: {printed}");
+    }
+}
+
+#[test]
+fn a_signal_ends_all_that_make_test_runs() {
+    // For another user than root the guest is built in the foreground, where a password can be asked for.
+    let is_root = rustix::process::geteuid().is_root();
+    for step in STEPS.into_iter().filter(|step| is_root || *step != "setup.sh") {
+        let place = prepared();
+        script(&place, &file(step), "echo \"$$\" >running\nmv running runs\nexec sleep 600\n");
+        let mut tests = Command::new(place.path("leftovers.sh"));
+        let tests = tests.args(["tests.sh", "cargo", "test"].map(|name| place.path(name)));
+        let tests =
+            tests.current_dir(place.folder.path()).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let mut tests = tests.spawn().expect("bash");
+        let running =
+            wait_for(step, || Pid::from_raw(std::fs::read_to_string(place.path("runs")).ok()?.trim().parse().ok()?));
+        let script = Pid::from_child(&tests);
+        kill_process(script, Signal::TERM).expect("a signal");
+        assert_eq!(tests.wait().expect("ends").code(), Some(143), "{step}");
+        until(step, || test_kill_process(running).is_err());
+    }
+}
