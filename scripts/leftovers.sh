@@ -46,8 +46,8 @@ done < <(comm -13 <(printf '%s\n' "$before") <(shared))
 left=$(sed '/^$/d' <<<"$left")
 if [[ -n $left ]]; then
     echo "left behind by: $*" >&2
-    # With what is in a folder: its name says nothing of who made it.
-    while IFS= read -r path; do find "$path" 2>/dev/null | head -n 20 | sed 's/^/    /' >&2; done <<<"$left"
+    # With what is in a folder: its name says nothing of who made it. It may be long, or gone by now: find then fails.
+    while IFS= read -r path; do { find "$path" 2>/dev/null || true; } | head -n 20 | sed 's/^/    /' >&2; done <<<"$left"
     [[ $code != 0 ]] || code=1
 fi
 exit "$code"

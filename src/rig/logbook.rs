@@ -61,11 +61,16 @@ impl Logbook {
             let logs = state.join("logs");
             instance.map_or(logs.clone(), |instance| logs.join(instance))
         });
-        let Some(folder) = folder else { return Self { pages: None, missing: Arc::default() } };
+        let Some(folder) = folder else { return Self::without_folder() };
         Self::in_folder(folder, Arc::clone(board))
     }
 
-    pub(super) fn in_folder(folder: PathBuf, board: Arc<Board>) -> Self {
+    /// Writes nothing: there is no state directory.
+    pub(super) fn without_folder() -> Self {
+        Self { pages: None, missing: Arc::default() }
+    }
+
+    fn in_folder(folder: PathBuf, board: Arc<Board>) -> Self {
         let (pages, inbox) = sync_channel(DEPTH);
         let missing: Arc<AtomicU64> = Arc::default();
         let files = Files { folder, open: HashMap::new(), largest: LARGEST };

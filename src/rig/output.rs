@@ -219,14 +219,13 @@ mod tests {
     #[tokio::test]
     async fn what_a_child_prints_last_is_logged_however_soon_it_ends() {
         use std::io::Write as _;
-        let folder = tempfile::tempdir().unwrap();
         let board = Arc::new(Board::new(&crate::registry::Registry::builtin()));
         let mut events = board.events();
         let now = Stamp::now();
         let mut output = Output {
             device: "motor".to_owned(),
             whose: String::new(),
-            logbook: Logbook::in_folder(folder.path().to_owned(), Arc::clone(&board)),
+            logbook: Logbook::without_folder(),
             board,
             lines: [Lines::default(), Lines::default()],
             limit: Limit::new(now),

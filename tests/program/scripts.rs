@@ -86,6 +86,19 @@ fn what_is_not_built_is_an_error_before_any_test() {
     }
 }
 
+/// A folder of so many files that those who list it are not read to the end.
+#[test]
+fn what_is_left_behind_is_a_failure_and_hides_no_other() {
+    let place = prepared();
+    for (code, expected) in [(0, 1), (3, 3)] {
+        let command = format!("mkdir $TMPDIR/left; touch $TMPDIR/left/{{1..9999}}; exit {code}");
+        let mut leftovers = Command::new(place.path("leftovers.sh"));
+        let output = leftovers.args(["bash", "-c", &command]).output().expect("bash");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(expected) && printed.contains("/left/"), "{:?}: {printed}", output.status);
+    }
+}
+
 #[test]
 fn a_signal_ends_all_that_make_test_runs() {
     // For another user than root the guest is built in the foreground, where a password can be asked for.
