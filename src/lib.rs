@@ -52,6 +52,9 @@ pub mod orders;
 pub mod outlet;
 pub mod palette;
 pub mod panics;
+#[cfg(test)]
+#[path = "../tests/support/patience.rs"]
+mod patience;
 pub mod peer;
 pub mod permission;
 pub mod pixels;

@@ -1,6 +1,7 @@
 use super::*;
 use crate::action::{ActionSource, MAX_ACTION, NoAction};
 use crate::modality::ModalityId;
+use crate::patience::PATIENCE;
 use crate::registry::{
     DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
 };
@@ -75,7 +76,7 @@ fn a_sample_arrives_whole_with_its_header_and_wakes_the_consumer() {
     let writer = bus.writer(TopicId::Modality(device.id)).expect("writer");
     let header = SampleHeader { seq: 7, capture_ns: 11, id: 3, width: 3, ..SampleHeader::default() };
     writer.publish(header, b"abc").expect("publish");
-    inbox.wait(Duration::from_secs(5)).expect("wait");
+    inbox.wait(PATIENCE).expect("wait");
     let mut seen = Vec::new();
     inbox.drain(&mut |id, header, bytes| seen.push((id, *header, bytes.to_vec()))).expect("drain");
     assert_eq!(seen, [(TopicId::Modality(device.id), header, b"abc".to_vec())]);

@@ -9,12 +9,10 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use super::*;
 use crate::action::{Order, Trip};
 use crate::inputs::{lost_at_a_panic, tap};
+use crate::patience::PATIENCE;
 use crate::permission::Attended;
 use crate::sample::Encoding;
 use crate::status::{Event, StopStatus, What};
-
-/// How long a condition may take before a test gives up; no requirement.
-const PATIENCE: Duration = Duration::from_secs(20);
 
 const DEVICES: &str = r#"
 [device.arm]

@@ -25,6 +25,7 @@ use tokio::io::AsyncWriteExt as _;
 use tokio_serial::{SerialPort as _, SerialStream};
 
 use crate::support::allocations::of_this_thread;
+use crate::support::motors::PATIENCE;
 
 const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 200, seed: 3, bytes: 0 };
 const SERIAL: SimSource = SimSource::Serial { channels: 4, hz: 500, seed: 3 };
@@ -124,7 +125,7 @@ async fn read_interrupted(driver: &mut Driver, count: usize) -> Vec<Vec<u8>> {
 
 async fn assert_gone(driver: &mut Driver) {
     // Samples that had arrived before may still come.
-    let gone = tokio::time::timeout(Duration::from_secs(30), async {
+    let gone = tokio::time::timeout(PATIENCE, async {
         loop {
             match driver.read().await {
                 Ok(_) => {}

@@ -260,7 +260,7 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
     let allowed = || 2 * files() + WORKERS as u64;
     // On a slow machine more files fall into as many samples: then it takes more of them to judge.
     while counts[0] < SAMPLES || counts[1] < SAMPLES || stretches <= 2 * allowed() {
-        assert!(files() < 180, "{stretches} stretches in three minutes are too few to judge");
+        assert!(files() < 600, "{stretches} stretches in ten minutes are too few to judge");
         let end = counts[0] + counts[1] + STRETCH;
         COUNT.store(0, Ordering::Relaxed);
         COUNTING.store(true, Ordering::Relaxed);

@@ -7,9 +7,9 @@ use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use crate::support::Place;
 use crate::support::lan::{RIG, RUN, Server, camera, camera_entry, free_ports, life_of, stop, wait_for};
 use crate::support::skip::skipped;
+use crate::support::{PATIENCE, Place};
 use mdns_sd::{ServiceDaemon, ServiceInfo};
 
 /// Announces a service until it is asked to send a goodbye or is killed: a process of its own, so that it can
@@ -55,7 +55,7 @@ fn announce_a_service() {
     daemon.register(info).expect("announced");
     let _ = std::io::stdin().read_to_end(&mut Vec::new());
     let done = daemon.unregister(&name).expect("unannounced");
-    let _ = done.recv_timeout(Duration::from_secs(5));
+    let _ = done.recv_timeout(PATIENCE);
 }
 
 /// Does a packet to a multicast group come back to this machine? Asked of the machine, and of no program for

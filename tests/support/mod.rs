@@ -5,6 +5,7 @@
 
 pub(crate) mod lan;
 pub(crate) mod onnx;
+mod patience;
 pub(crate) mod skip;
 pub(crate) mod terminal;
 pub(crate) mod tmux;
@@ -16,9 +17,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-/// How long a test waits for a condition before it gives up. Not a requirement: a slow machine only makes the test
-/// slow.
-pub(crate) const PATIENCE: Duration = Duration::from_mins(3);
+pub(crate) use patience::PATIENCE;
 
 /// Lines of a registry. A busy machine is no defect of the program, and a simulated camera that it delays loses pictures: what
 /// remains is what the recorder drops, and damage.

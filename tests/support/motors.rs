@@ -6,6 +6,8 @@
 #[path = "motor_spec.rs"]
 #[allow(clippy::duplicate_mod, reason = "`motor_world` has it too")]
 pub(crate) mod motor_spec;
+#[path = "patience.rs"]
+mod patience;
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -16,6 +18,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+pub(crate) use patience::PATIENCE;
 use rapid::action::{ActionSource, MAX_ACTION, NoAction};
 use rapid::bell::Bell;
 use rapid::registry::{CanAdapter, DamiaoSpec, MotorMode, MotorSpec};
@@ -55,9 +58,6 @@ impl ActionSource for Hand {
         Ok(Some((place, tick)))
     }
 }
-
-/// Upper limit for all waits.
-pub(crate) const PATIENCE: Duration = Duration::from_mins(2);
 
 /// An adapter with motors behind it. Dropping it unplugs it.
 pub(crate) struct Adapter {

@@ -10,15 +10,13 @@ use super::super::streaming::Streaming;
 use super::*;
 use crate::bus::TopicId;
 use crate::interlocks::Watched;
+use crate::patience::PATIENCE;
 use crate::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use crate::registry::Registry;
 use crate::sample::{Epoch, SampleHeader};
 use crate::session::journal::Plan;
 use crate::status::session::{Label, SessionRequest};
 use crate::status::{Grade, Level, Snapshot, Verdict};
-
-/// How long a condition may take to hold.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A bus on which nothing is published.
 struct Quiet;

@@ -12,9 +12,7 @@ use super::*;
 use crate::bus::Bus;
 use crate::bus::home::Home;
 use crate::bus::tests::registry;
-
-/// Upper limit for waiting for a condition; not a requirement.
-const PATIENCE: Duration = Duration::from_mins(1);
+use crate::patience::PATIENCE;
 
 const HASH: &str = "0354a209029e7d094a819e2d4030ea331e6caaf0";
 /// A port of process 25769.

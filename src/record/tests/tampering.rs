@@ -6,9 +6,8 @@ use std::time::Instant;
 
 use super::*;
 use crate::episode::recover;
+use crate::patience::PATIENCE;
 
-/// How long a condition may take before a test gives up; no requirement.
-const PATIENCE: Duration = Duration::from_secs(30);
 /// Bytes that are in the kernel's hands before the file is touched.
 const ENOUGH: u64 = 200_000;
 

@@ -13,6 +13,7 @@ use super::*;
 use crate::action::Order;
 use crate::device::{DeviceNode, UsbIdentity};
 use crate::hotplug::{HotplugError, HotplugEvent};
+use crate::patience::PATIENCE;
 use crate::provenance::UnplugSource;
 use crate::registry::{
     ExportSpec, Framing, IdentitySpec, InferenceSpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec,
@@ -25,9 +26,6 @@ use crate::status::Event;
 mod actuator;
 
 const CHANNELS: usize = 2;
-/// Upper limit for waiting for a condition; not a requirement.
-const PATIENCE: Duration = Duration::from_secs(30);
-
 /// Two interchangeable entries, `a` and `b`.
 fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
     let serial = SerialSpec { baud: 115_200, framing: Framing::Line, parse: Parse::Csv, channels: CHANNELS };

@@ -9,6 +9,7 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
 use super::*;
 use crate::driver::can::slcan;
+use crate::patience::PATIENCE;
 
 /// The adapter's end of a line, and the path of the host's.
 fn terminal() -> (File, PathBuf) {
@@ -50,7 +51,7 @@ pub(in crate::driver::can) fn damiao_link() -> (Link, File) {
 }
 
 fn soon() -> Stamp {
-    Stamp::now().after(Duration::from_secs(10))
+    Stamp::now().after(PATIENCE)
 }
 
 pub(in crate::driver::can) fn received(frame: &CanFrame) -> Vec<u8> {
@@ -205,7 +206,7 @@ async fn a_task_gets_all_pending_frames_and_then_the_end() {
     }
     assert_eq!(count, 6);
     drop(adapter);
-    let ended = tokio::time::timeout(Duration::from_secs(10), link.recv(&mut into)).await.unwrap();
+    let ended = tokio::time::timeout(PATIENCE, link.recv(&mut into)).await.unwrap();
     assert_eq!(ended, Err(LinkError::Gone));
 }
 
@@ -227,7 +228,7 @@ async fn a_task_gets_the_frame_that_came_with_the_end() {
         }
         theirs.write_all(&received(&frame)).unwrap();
         drop(theirs);
-        let found = tokio::time::timeout(Duration::from_secs(10), waiting).await.unwrap();
+        let found = tokio::time::timeout(PATIENCE, waiting).await.unwrap();
         assert_eq!(found, Ok(1));
     }
     assert_eq!(into[0].frame, frame);

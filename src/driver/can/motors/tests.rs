@@ -17,14 +17,12 @@ use crate::control::damiao::parameter::{Parameter, Reply, Value};
 use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
 use crate::interlock::{InputState, Interlocks, StopKind};
+use crate::patience::PATIENCE;
 use crate::permission::Permission;
 use crate::registry::{
     EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, TipRotation, WatchSpec,
 };
 use crate::time::Stamp;
-
-/// The longest that a condition is waited for.
-const PATIENCE: Duration = Duration::from_secs(20);
 
 fn spec(count: u16, hz: u32) -> DamiaoSpec {
     let motor = |slave: u16| MotorSpec {

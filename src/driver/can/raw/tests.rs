@@ -4,13 +4,14 @@ use std::net::UdpSocket;
 use super::*;
 use crate::control::can::CanFrame;
 use crate::driver::can::{link, socket};
+use crate::patience::PATIENCE;
 
 fn raw(link: Link) -> Raw {
     Raw::on(link, Format::Messages { baud: None, channels: 0, hz: None }).unwrap()
 }
 
 async fn read(raw: &mut Raw) -> Result<(Vec<u8>, Stamp, u64), DriverError> {
-    let reading = tokio::time::timeout(Duration::from_secs(10), raw.read()).await.unwrap()?;
+    let reading = tokio::time::timeout(PATIENCE, raw.read()).await.unwrap()?;
     assert_eq!((reading.encoding, reading.width, reading.height), (Encoding::Bytes, 0, 0));
     Ok((reading.bytes.to_vec(), reading.captured, reading.lost))
 }

@@ -6,6 +6,7 @@ use std::os::fd::OwnedFd;
 
 use super::*;
 use crate::driver::can::link::Link;
+use crate::patience::PATIENCE;
 
 pub(in crate::driver::can) fn bus() -> (Link, UdpSocket) {
     let (ours, theirs) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
@@ -23,7 +24,7 @@ pub(in crate::driver::can) fn bytes(frame: &CanFrame) -> [u8; 16] {
 }
 
 fn soon() -> Stamp {
-    Stamp::now().after(Duration::from_secs(10))
+    Stamp::now().after(PATIENCE)
 }
 
 #[test]

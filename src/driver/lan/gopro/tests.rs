@@ -11,6 +11,7 @@ use super::answer::Name;
 use super::clip::Failure;
 use super::*;
 use crate::device::{DeviceNode, LastReceived};
+use crate::patience::PATIENCE;
 
 /// A camera that has a clip and interrupts it this many times; with counts of requests.
 async fn camera(clip: Vec<u8>, breaks: usize) -> (Server, Arc<AtomicUsize>) {
@@ -329,7 +330,7 @@ impl Bench {
         let begun = Instant::now();
         while !is_so(self) {
             let asked = self.fake.asked.lock().expect("no panic").clone();
-            assert!(begun.elapsed() < Duration::from_secs(20), "{what}: {asked:?}; {}", self.books());
+            assert!(begun.elapsed() < PATIENCE, "{what}: {asked:?}; {}", self.books());
             if let Some(gopro) = &mut self.gopro {
                 let _ = tokio::time::timeout(Duration::from_millis(10), gopro.read()).await;
             }

@@ -3,6 +3,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use super::*;
+use crate::patience::PATIENCE;
 use crate::registry::{CanProtocol, CanSpec, NodeSpec, Registry};
 
 /// The arm of the tests, as `tests/arm/devices.toml` declares it.
@@ -48,7 +49,7 @@ fn next(targets: &Arc<dyn ActionSource>) -> Taken {
         if let Some((found, tick)) = targets.newest(&mut action)? {
             return Ok((found.to_vec(), tick));
         }
-        assert!(begun.elapsed() < Duration::from_mins(3), "no target");
+        assert!(begun.elapsed() < PATIENCE, "no target");
         std::thread::sleep(Duration::from_millis(1));
     }
 }
@@ -222,7 +223,7 @@ fn before_the_first_sample_there_is_no_target() {
     actions.add(Ok((vec![0.4, 0.0, 0.4, 1.0], Stamp(1))));
     let begun = Instant::now();
     while !actions.0.lock().unwrap_or_else(PoisonError::into_inner).is_empty() {
-        assert!(begun.elapsed() < Duration::from_mins(3), "it is not taken");
+        assert!(begun.elapsed() < PATIENCE, "it is not taken");
         std::thread::sleep(Duration::from_millis(1));
     }
     drop(effector);
