@@ -98,6 +98,13 @@ impl Client {
         }
     }
 
+    /// Reads until a sample is newer than this time: what is read first may have waited long.
+    fn read_past(&mut self, time_ns: u128) {
+        self.read_until("what is so new", |client| {
+            client.received.last().is_some_and(|last| u128::from(last.log_time) > time_ns)
+        });
+    }
+
     /// At most one message: there is always a next one.
     fn read_one(&mut self) {
         match self.socket.read() {
@@ -497,14 +504,9 @@ fn where_a_sensor_sat_in_an_earlier_episode_is_shown_no_more() {
     assert!(place.run(&["episode", "next"]).status.success());
     // What was on its way until then may be of the first episode.
     let next = now_ns();
-    let reach = |client: &mut Client, time: u128| {
-        client.read_until("what is so new", |client| {
-            client.received.last().is_some_and(|last| u128::from(last.log_time) > time)
-        });
-    };
-    reach(&mut client, next + 1_000_000_000);
+    client.read_past(next + 1_000_000_000);
     let shown = client.count("/tf");
-    reach(&mut client, next + 4_000_000_000);
+    client.read_past(next + 4_000_000_000);
     assert_eq!(client.count("/tf"), shown, "the camera is not on that mount any more");
     running.signal(Signal::INT);
     let (_, output, errors) = running.end();
@@ -579,9 +581,7 @@ fn a_client_that_does_not_read_costs_the_recording_nothing() {
     };
     until("two thousand messages are left out", || left_out() > 2000);
     // What waits for it is bounded, and the newest is in it; then it continues.
-    let now = now_ns();
-    client
-        .read_until("what is new", |client| client.received.last().is_some_and(|last| u128::from(last.log_time) > now));
+    client.read_past(now_ns());
     let resumed = client.received.len();
     client.read_until("more", |client| client.received.len() > resumed + 100);
     let file = good(&place, running);
@@ -742,8 +742,8 @@ fn a_client_controls_a_run_only_if_that_was_allowed() {
     assert_eq!((&set["task"], &set["tags"]), (&json!("pour tea"), &json!({ "finger": "soft" })));
     let begun = client.call("/rapid/start");
     assert!(begun.contains("pour-tea_001.mcap"), "{begun}");
-    let recorded = client.count("/rapid/mask");
-    client.read_until("an episode", |client| client.count("/rapid/mask") > recorded + 500);
+    // An episode of less than half a second is BAD.
+    client.read_past(now_ns() + 1_000_000_000);
     let ended = client.call("/rapid/stop");
     assert!(ended.contains("001.mcap"), "{ended}");
     assert_eq!(client.call("/rapid/arm"), "no actuator is plugged in: plug it in, then arm it");
