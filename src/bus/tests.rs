@@ -6,7 +6,7 @@ use crate::registry::{
     DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
 };
 use crate::sample::Encoding;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 pub(super) fn registry(depth: usize) -> Registry {
     let id = ModalityId::new(3).expect("below 64");
@@ -76,7 +76,9 @@ fn a_sample_arrives_whole_with_its_header_and_wakes_the_consumer() {
     let writer = bus.writer(TopicId::Modality(device.id)).expect("writer");
     let header = SampleHeader { seq: 7, capture_ns: 11, id: 3, width: 3, ..SampleHeader::default() };
     writer.publish(header, b"abc").expect("publish");
+    let begun = Instant::now();
     inbox.wait(PATIENCE).expect("wait");
+    assert!(begun.elapsed() < PATIENCE, "not woken");
     let mut seen = Vec::new();
     inbox.drain(&mut |id, header, bytes| seen.push((id, *header, bytes.to_vec()))).expect("drain");
     assert_eq!(seen, [(TopicId::Modality(device.id), header, b"abc".to_vec())]);
