@@ -25,6 +25,9 @@ pub mod driver;
 #[path = "../tests/support/effort.rs"]
 mod effort;
 pub mod episode;
+#[cfg(all(test, feature = "export"))]
+#[path = "../tests/support/executable.rs"]
+mod executable;
 #[cfg(feature = "export")]
 pub mod export;
 pub mod fault;

@@ -405,15 +405,12 @@ impl Packets {
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::PermissionsExt;
-
     use super::*;
 
     /// A program that is none.
     fn script(folder: &Path, body: &str) -> Ffmpeg {
         let program = folder.join("ffmpeg");
-        std::fs::write(&program, format!("#!/bin/sh\n{body}\n")).unwrap();
-        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        crate::executable::script(&program, &format!("#!/bin/sh\n{body}\n"));
         Ffmpeg { program, codec: Codec::Av1, patience: PATIENCE }
     }
 

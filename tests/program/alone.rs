@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use crate::support::skip::skipped;
-use crate::support::{self, Episode, Place, events};
+use crate::support::{self, Episode, Place, events, executable};
 
 /// What the README names; the loader is part of libc.
 const LINKED: [&str; 5] = ["ld-linux", "libc.so", "libgcc_s.so", "libm.so", "libudev.so"];
@@ -30,14 +30,14 @@ fn root(place: &Place) -> PathBuf {
     for folder in ["proc", "dev", "tmp", "data/in/a/folder"] {
         std::fs::create_dir_all(root.join(folder)).expect("folder");
     }
-    std::fs::copy(program, root.join("rapid")).expect("the program");
+    executable::copy(program, &root.join("rapid"));
     let libraries = linked_with(program);
     let libc = libraries.iter().find(|library| library.ends_with("libc.so.6")).expect("libc").clone();
     let parts = PARTS_OF_LIBC.map(|part| libc.with_file_name(part));
     for library in libraries.into_iter().chain(parts) {
         let to = root.join(library.strip_prefix("/").expect("an absolute path"));
         std::fs::create_dir_all(to.parent().expect("a folder")).expect("folder");
-        std::fs::copy(&library, to).expect("a library");
+        executable::copy(&library, &to);
     }
     root
 }

@@ -22,7 +22,7 @@ use rapid::cli::Cli;
 use rapid::registry::Registry;
 use rapid::registry::scenario::Scenario;
 
-use crate::support::{Place, python};
+use crate::support::{Place, executable, python};
 
 /// Blocks that cannot be run in a test: the page and the first line of each.
 const NOT_RUN: &[(&str, &str)] = &[
@@ -349,12 +349,7 @@ fn commands_in_the_text_are_understood() {
 fn stage(place: &Place) -> PathBuf {
     let bin = place.path("bin");
     std::fs::create_dir(&bin).expect("a folder");
-    let script = |name: &str, text: String| {
-        use std::os::unix::fs::PermissionsExt;
-        let path = bin.join(name);
-        std::fs::write(&path, text).expect("a script");
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).expect("its mode");
-    };
+    let script = |name: &str, text: String| executable::script(&bin.join(name), &text);
     // A machine that is too busy may spoil a simulated episode: 4 reports that it is BAD, and no more. A signal is passed on.
     let text = format!(
         "#!/bin/sh\ntrap 'kill $child' TERM\n{} \"$@\" &\nchild=$!\nwait $child\ncode=$?\n\

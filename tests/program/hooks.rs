@@ -41,9 +41,7 @@ fn hooks(place: &Place) -> Vec<String> {
 }
 
 fn script(place: &Place, name: &str, text: &str) {
-    use std::os::unix::fs::PermissionsExt;
-    let path = place.write(name, text);
-    std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).expect("an executable");
+    support::executable::script(&place.path(name), text);
 }
 
 /// An entry for a simulated motor with these hooks.

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use crate::support::skip::skipped;
-use crate::support::{self, Episode, EventMessage, Place, events};
+use crate::support::{self, Episode, EventMessage, Place, events, executable};
 
 /// A serial number that no registry can name: it moves the cursor, turns the line and ends it.
 const CURSED: &str = "\u{1b}[2J\u{1b}]0;owned\u{7}\u{9b}31m\r\nnode = \"x\"\0\u{202e}\u{feff}\u{2028}end";
@@ -153,10 +153,7 @@ impl Shared {
         let place = Place::new();
         fs::set_permissions(place.folder.path(), PermissionsExt::from_mode(0o755)).expect("mode");
         let program = place.path("rapid");
-        // By another process: a child that a test beside this one starts would inherit the file open for writing, and
-        // what others may write to cannot be run.
-        let copied = Command::new("cp").arg(env!("CARGO_BIN_EXE_rapid")).arg(&program).status().expect("cp");
-        assert!(copied.success(), "{copied}");
+        executable::copy(Path::new(env!("CARGO_BIN_EXE_rapid")), &program);
         Some(Self { place, program })
     }
 

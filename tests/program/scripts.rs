@@ -1,15 +1,14 @@
 //! What `make test` calls, `scripts/tests.sh` within `scripts/leftovers.sh`, with small programs in place of the tests: no
-//! failure and no line of a test gets lost, and a signal leaves nothing running.
+//! failure and no line of a test gets lost, and a signal leaves nothing running. Scripts that tests write.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 
-use crate::support::{Place, until, wait_for};
+use crate::support::{Place, executable, until, wait_for};
 
 /// Test programs: those that tests.sh runs in a way of their own, and any other.
 const PROGRAMS: [&str; 5] = ["guest", "memory", "program", "rapid", "other"];
@@ -40,10 +39,13 @@ fn prepared() -> Place {
 
 /// An executable in the folder of `place`.
 fn script(place: &Place, name: &str, text: &str) {
-    let path = place.path(name);
-    std::fs::create_dir_all(path.parent().expect("a folder")).expect("made");
-    std::fs::write(&path, format!("#!/bin/bash\n{text}")).expect("written");
-    std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).expect("made executable");
+    executable::script(
+        &place.path(name),
+        &format!(
+            "#!/bin/bash
+{text}"
+        ),
+    );
 }
 
 /// The file of a step.
@@ -118,4 +120,23 @@ fn a_signal_ends_all_that_make_test_runs() {
         assert_eq!(tests.wait().expect("ends").code(), Some(143), "{step}");
         until(step, || test_kill_process(running).is_err());
     }
+}
+
+/// With a file written by the test itself, some of these are refused as "Text file busy".
+#[test]
+fn a_script_can_be_run_at_once_while_other_tests_start_programs() {
+    let place = Place::new();
+    let run = |name: usize| {
+        for count in 0..40 {
+            let path = place.path(&format!("{name}-{count}"));
+            executable::script(&path, "#!/bin/sh\nexit 7\n");
+            let status = Command::new(&path).status().expect("it runs");
+            assert_eq!(status.code(), Some(7));
+        }
+    };
+    std::thread::scope(|scope| {
+        for name in 0..4 {
+            scope.spawn(move || run(name));
+        }
+    });
 }

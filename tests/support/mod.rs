@@ -3,6 +3,7 @@
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
+pub(crate) mod executable;
 pub(crate) mod lan;
 pub(crate) mod onnx;
 mod patience;

@@ -1,7 +1,6 @@
 //! Pictures as videos: read back, damaged, made by an ffmpeg that fails, hangs or is killed, and continued.
 
 use std::fmt::Write as _;
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -9,7 +8,7 @@ use arrow_array::types::Float64Type;
 use rustix::process::Signal;
 
 use super::*;
-use crate::support::until;
+use crate::support::{executable, until};
 
 const WRIST: &str = "observation.images.cam_wrist";
 const TACTILE: &str = "observation.images.tactile_tip";
@@ -125,8 +124,8 @@ fn replaced(place: &Place, run: &dyn Fn(&[&str]) -> Outcome) {
 /// A program before ffmpeg: `encoding` is what it does in place of encoding; what it is otherwise called for, ffmpeg does.
 fn wrapped(place: &Place, encoding: &str) -> String {
     let text = format!("#!/bin/sh\ncase \"$*\" in *pipe:0*) {encoding} ;; *) exec ffmpeg \"$@\" ;; esac\n");
-    let path = place.write("wrapped", &text);
-    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).expect("made executable");
+    let path = place.path("wrapped");
+    executable::script(&path, &text);
     path.to_string_lossy().into_owned()
 }
 
@@ -170,8 +169,7 @@ fn an_ffmpeg_that_fails_leaves_nothing_and_the_next_one_continues() {
     let absent = place.run(&[&words[..], &["/no/such/ffmpeg"]].concat());
     let text = String::from_utf8_lossy(&absent.stderr).into_owned();
     assert!(absent.status.code() == Some(2) && text.contains("apt install ffmpeg"), "{text}");
-    let other = place.write("other", "#!/bin/sh\necho V..... libsvtav1\n");
-    std::fs::set_permissions(&other, std::fs::Permissions::from_mode(0o755)).expect("made executable");
+    executable::script(&place.path("other"), "#!/bin/sh\necho V..... libsvtav1\n");
     let other = place.run(&[&words[..], &["./other"]].concat());
     let text = String::from_utf8_lossy(&other.stderr).into_owned();
     assert!(other.status.code() == Some(2) && text.contains("no encoder libx264"), "{text}");
