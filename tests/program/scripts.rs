@@ -1,8 +1,10 @@
 //! What `make test` calls, `scripts/tests.sh` within `scripts/leftovers.sh`, with small programs in place of the tests: no
-//! failure and no line of a test gets lost, and a signal leaves nothing running. Scripts that tests write.
+//! failure and no line of a test gets lost, and a signal leaves nothing running. Scripts that tests write, and the one that
+//! makes the root of a guest.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -139,4 +141,23 @@ fn a_script_can_be_run_at_once_while_other_tests_start_programs() {
             scope.spawn(move || run(name));
         }
     });
+}
+
+/// The owner of all files of a guest is whoever built it. A program with the bit would run as that user, and a guest that an
+/// ordinary user built could not mount anything.
+#[test]
+fn no_program_of_a_guest_runs_as_another_user_than_the_one_who_starts_it() {
+    let place = Place::new();
+    let pack = "mkdir -p tree/usr/bin tree/usr/sbin tree/tmp && cd tree && touch usr/bin/mount usr/bin/wall usr/bin/true && \
+        chmod 4755 usr/bin/mount && chmod 2755 usr/bin/wall && chmod 755 usr/bin/true && chmod 1777 tmp && \
+        tar -cf ../rootfs.tar .";
+    let packed = Command::new("bash").args(["-ec", pack]).current_dir(place.folder.path()).status().expect("bash");
+    assert!(packed.success());
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vbench/image/uml/root.sh");
+    let made = Command::new(root).arg(place.folder.path()).status().expect("root.sh");
+    assert!(made.success());
+    for (file, mode) in [("usr/bin/mount", 0o755), ("usr/bin/wall", 0o755), ("usr/bin/true", 0o755), ("tmp", 0o1777)] {
+        let found = std::fs::metadata(place.path("root").join(file)).expect(file).mode() & 0o7777;
+        assert_eq!(found, mode, "{file}: {found:o}");
+    }
 }
