@@ -20,8 +20,8 @@ readonly VENV="$CACHE/venv"
 # pkg-config, libudev-dev: crate udev. libclang-dev: the V4L2 bindings. libstdc++6: onnxruntime at run time. python3,
 # python3-venv: pip, which fetches onnxruntime; the program itself needs neither.
 readonly BUILD_PACKAGES=(gcc libc6-dev pkg-config libudev-dev libclang-dev libstdc++6 python3 python3-venv)
-# tmux: the terminals in which tests use the monitor. ffmpeg: the videos of datasets.
-readonly TEST_PACKAGES=(ffmpeg tmux)
+# tmux: the terminals in which tests use the monitor. ffmpeg: the videos of datasets. systemd: its judgement of our units.
+readonly TEST_PACKAGES=(ffmpeg tmux systemd)
 readonly FUZZ_PACKAGES=(g++)
 
 changed=0
