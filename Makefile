@@ -22,13 +22,13 @@ TEST_THREADS := RUST_TEST_THREADS=$(shell echo $$((2 * $$(nproc))))
 TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
 TESTS := cargo test --locked --workspace
 # What `make quick` runs, and what it leaves out: of the unit tests those that try every byte of a file, hundreds of pictures or
-# a million steps, of the tests of the program those that wait for long, or need Python or C; whole programs of tests that
-# allocate or time motors.
+# a million steps, of the tests of the program those that wait for long, need Python or C, or test scripts; whole programs of
+# tests that allocate or time motors.
 QUICK := --exclude rapid-node --lib --test layering --test library
-EXHAUSTIVE := compare::tests damage::an_index damage::a_file_inside damage::every_message damaged_files_never_panic \
-	every_flipped_bit a_flipped_bit_loses unread_bytes_are a_truncated_or_damaged_file chunks_of_other_writers \
-	a_million_random_steps the_picture_is_bounded the_mark_is_found
-SLOW := alone calibrate compare demonstrate docs ends export foxglove hooks infer json kill lan lan_gopro lan_hostile lan_mdns many_devices nodes observe plot process python scenarios screen second_run shared_memory stops task verdict web
+EXHAUSTIVE := every_state_of_damage compare::tests damage::an_index damage::a_file_inside damage::every_message \
+	damaged_files_never_panic every_flipped_bit a_flipped_bit_loses unread_bytes_are a_truncated_or_damaged_file \
+	chunks_of_other_writers a_million_random_steps the_picture_is_bounded the_mark_is_found
+SLOW := alone calibrate compare demonstrate docs ends export foxglove hooks infer json kill lan lan_gopro lan_hostile lan_mdns many_devices nodes observe plot process python scenarios screen scripts second_run shared_memory stops task verdict web
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | sed 's/[$$](SLOW)/$(SLOW)/' | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
