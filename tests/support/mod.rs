@@ -362,11 +362,17 @@ impl Episode {
         record.metadata.get(key).unwrap_or_else(|| panic!("no {key} in {name}"))
     }
 
-    /// The changes of the recorded mask: log time and value.
+    /// The changes of the recorded mask: log time and value, from the one in force at the beginning. On a busy machine others
+    /// from before it arrive after it, and are in the file.
     pub(crate) fn mask_edges(&self) -> Vec<(u64, u64)> {
+        let number = |key| self.value("rapid", key).parse::<i128>().expect("a number");
+        let begin = number("begin_monotonic_ns") + number("wall_minus_monotonic_ns");
         let mut edges: Vec<(u64, u64)> = Vec::new();
         for message in self.topic("/rapid/mask") {
             let mask = message.decode::<MaskMessage>().mask;
+            if i128::from(message.log_time) <= begin {
+                edges.clear();
+            }
             if edges.last().is_none_or(|(_, last)| *last != mask) {
                 edges.push((message.log_time, mask));
             }
