@@ -243,7 +243,10 @@ fn a_disk_that_fills_up_is_seen_and_the_monitor_stays() {
     let registry = std::fs::read_to_string(place.path("devices.toml")).expect("the registry");
     place.write("devices.toml", &registry.replacen("[rig]\n", "[rig]\ndisk_reserve = \"6MiB\"\n", 1));
     let tmux = Tmux::new(&place);
-    let mount = format!("unshare -Urm sh -c 'mount -t tmpfs -o size=8m tmpfs out && exec {RIG}'");
+    // As the user of the test again: root would not trust a registry in folders of others.
+    let (user, group) = (rustix::process::geteuid().as_raw(), rustix::process::getegid().as_raw());
+    let back = format!("exec unshare --user --map-user={user} --map-group={group} {RIG}");
+    let mount = format!("unshare -Urm sh -c 'mount -t tmpfs -o size=8m tmpfs out && {back}'");
     let pane = streaming(&tmux, "disk", USUAL, &mount);
     begin(&pane);
     pane.shows(&["▲ disk full in 00:"]);
