@@ -84,6 +84,7 @@ pub mod status;
 pub mod sync;
 pub mod text;
 pub mod time;
+pub mod tty;
 pub mod tui;
 #[cfg(feature = "web")]
 pub mod web;

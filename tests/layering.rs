@@ -56,6 +56,7 @@ const LAYERS: &[&[&str]] = &[
         "control",
         "kinematics",
         "gpio",
+        "tty",
         "pixels",
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "inputs", "interlocks", "sync", "calibration"],

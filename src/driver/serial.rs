@@ -12,7 +12,7 @@
 //! (`arrival`): stamps always increase.
 
 use std::fmt;
-use std::os::fd::{FromRawFd as _, IntoRawFd as _, OwnedFd};
+use std::os::fd::{AsFd as _, AsRawFd as _, BorrowedFd, FromRawFd as _, IntoRawFd as _, OwnedFd};
 use std::path::Path;
 
 use serde::de::{DeserializeSeed, Deserializer, Error as _, IgnoredAny, MapAccess, SeqAccess, Visitor};
@@ -24,6 +24,7 @@ use crate::provenance::{Format, Negotiated};
 use crate::registry::{Framing, Parse, SerialSpec};
 use crate::sample::Encoding;
 use crate::time::Stamp;
+use crate::tty;
 
 /// Bytes read from the kernel at once.
 const INBOX: usize = 4096;
@@ -227,6 +228,8 @@ pub fn decode<'p>(
 
 fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {
     let stream = SerialStream::open(&line(path, baud)?).map_err(|error| open_error(path, baud, &error))?;
+    // SAFETY: the stream, which outlives the borrowed descriptor, keeps it open.
+    held(unsafe { BorrowedFd::borrow_raw(stream.as_raw_fd()) }, path)?;
     // Bytes waiting in the kernel precede this opening.
     let _ = stream.clear(ClearBuffer::Input);
     Ok(stream)
@@ -239,9 +242,15 @@ pub(super) fn open_raw(path: &Path, baud: u32) -> Result<OwnedFd, DriverError> {
     let _ = port.clear(ClearBuffer::All);
     // SAFETY: the port hands over its descriptor and does not close it.
     let fd = unsafe { OwnedFd::from_raw_fd(port.into_raw_fd()) };
+    held(fd.as_fd(), path)?;
     rustix::fs::fcntl_setfl(&fd, rustix::fs::OFlags::NONBLOCK)
         .map_err(|error| DriverError::Retry(format!("{}: {error}", path.display())))?;
     Ok(fd)
+}
+
+/// See [`tty`]; the crate that opened the line has locked it.
+fn held(line: BorrowedFd<'_>, path: &Path) -> Result<(), DriverError> {
+    tty::release_if_pseudo(line).map_err(|error| DriverError::Retry(format!("{}: {error}", path.display())))
 }
 
 fn line(path: &Path, baud: u32) -> Result<SerialPortBuilder, DriverError> {

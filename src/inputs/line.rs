@@ -8,12 +8,13 @@
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::Duration;
 
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+use rustix::fs::{Mode, OFlags, open};
 use rustix::io::Errno;
-use rustix::termios::{ControlModes, OptionalActions, QueueSelector, ioctl_tiocexcl, tcflush, tcgetattr, tcsetattr};
+use rustix::termios::{ControlModes, OptionalActions, QueueSelector, tcflush, tcgetattr, tcsetattr};
 
 use crate::registry::{LineInput, LineOff};
 use crate::text::not_opened;
+use crate::tty;
 
 /// Longest line that is evaluated; a longer one cannot be one of the meaningful lines.
 const LONGEST: usize = 128;
@@ -37,8 +38,7 @@ impl Lines {
         let fail = |error: Errno| not_opened(&shown, "dialout", &error.into());
         let flags = OFlags::RDONLY | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let fd = open(&spec.path, flags, Mode::empty()).map_err(fail)?;
-        flock(&fd, FlockOperation::NonBlockingLockExclusive).map_err(fail)?;
-        ioctl_tiocexcl(&fd).map_err(fail)?;
+        tty::hold(&fd).map_err(fail)?;
         let mut settings = tcgetattr(&fd).map_err(fail)?;
         settings.make_raw();
         settings.control_modes |= ControlModes::CREAD | ControlModes::CLOCAL;

@@ -143,10 +143,12 @@ fn a_line_is_opened_exclusively_and_hangs_up_once() {
     let missing = Link::open_damiao(Path::new("/dev/no-such-tty")).unwrap_err();
     assert_eq!(missing, LinkError::Gone);
     let (_adapter, path) = terminal();
-    let _first = Link::open_damiao(&path).unwrap();
+    let first = Link::open_damiao(&path).unwrap();
     // Root may open what TIOCEXCL keeps from others; the lock keeps it from all.
     let second = Link::open_damiao(&path).unwrap_err();
     assert!(matches!(&second, LinkError::Retry(text) if text.contains("another program")), "{second}");
+    drop(first);
+    Link::open_damiao(&path).unwrap();
 }
 
 #[test]
