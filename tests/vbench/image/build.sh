@@ -113,7 +113,7 @@ kernel_starts() {
   local console
   console=$(timeout -s KILL 120 env TMPDIR="$(memory)" "$kernel/linux" mem=128M uml_dir="$work" \
     root=/dev/root rootfstype=hostfs rootflags="$root" ro init=/bin/true con=null con0=null,fd:1 panic=-1 2>&1 </dev/null || true)
-  [[ $console == *"exitcode=0x00000000"* ]] || { tail -n 5 <<<"$console" >&2; echo "the kernel does not start"; return 1; }
+  [[ $console == *"exitcode=0x00000000"* ]] || { tail -n 5 <<<"$console" >&2; echo "the kernel does not start: ${console##*$'\n'}"; return 1; }
 }
 
 build_uml() {
