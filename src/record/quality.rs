@@ -202,8 +202,9 @@ impl Measures {
         // No frame waits for a sample between the windows: it has the deadline that its own frame would have.
         let due = if shown.abs_diff(tick) <= self.window_ns { tick } else { shown };
         let deadline = due.saturating_add(self.wait_ns);
+        let was_away = self.presence.was_away(id, lane.meter.latest_ns, seen.capture_ns);
         let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
-        let Some((from, to)) = lane.meter.sample(seen, deadline) else { return };
+        let Some((from, to)) = lane.meter.sample(seen, deadline, was_away) else { return };
         if to - from > lane.longest_gap_ns {
             if lane.pending.len() >= MOST_PENDING {
                 lane.settle(&self.presence);
@@ -400,8 +401,9 @@ impl Meter {
         Self { latest_ns: begin_ns, begin_ns, run_began_ns: begin_ns, compares, ..Self::default() }
     }
 
-    /// Takes a sample whose frame waits until `deadline_ns`. Returns the interval since the previous sample.
-    fn sample(&mut self, seen: &SampleFacts<'_>, deadline_ns: u64) -> Option<(u64, u64)> {
+    /// Takes a sample whose frame waits until `deadline_ns`; `was_away`: the modality was absent since the previous one. Returns
+    /// the interval since the previous sample.
+    fn sample(&mut self, seen: &SampleFacts<'_>, deadline_ns: u64, was_away: bool) -> Option<(u64, u64)> {
         let first = self.seq.is_none();
         self.counts.samples += 1;
         self.counts.bytes += seen.payload.len() as u64;
@@ -414,7 +416,7 @@ impl Meter {
         self.seq = Some(seen.seq);
         self.counts.late += u64::from(seen.recv_ns > deadline_ns);
         self.time(seen);
-        self.compare(seen);
+        self.compare(seen, was_away);
         let before = self.latest_ns;
         self.latest_ns = before.max(seen.capture_ns);
         (before < seen.capture_ns).then_some((before, seen.capture_ns))
@@ -439,7 +441,8 @@ impl Meter {
         self.drift.push(seen.recv_ns.saturating_sub(self.begin_ns), signed(lateness).saturating_sub(signed(ahead)));
     }
 
-    fn compare(&mut self, seen: &SampleFacts<'_>) {
+    /// What is the same after an absence as before it says nothing of the time between.
+    fn compare(&mut self, seen: &SampleFacts<'_>, was_away: bool) {
         if !self.compares {
             return;
         }
@@ -449,7 +452,7 @@ impl Meter {
             let newest = Some((seen.payload.len(), hasher.finish()));
             std::mem::replace(&mut self.newest, newest) == newest
         });
-        if repeated && self.counts.samples > 1 {
+        if repeated && !was_away && self.counts.samples > 1 {
             self.counts.repeated += 1;
             self.run.samples += 1;
             self.run.length_ns = seen.capture_ns.saturating_sub(self.run_began_ns);
@@ -503,6 +506,12 @@ impl PresenceHistory {
     /// Is anything known of the mask?
     fn is_known(&self) -> bool {
         !self.edges.is_empty()
+    }
+
+    /// Was the bit of `id` cleared after `from`, and until `to`?
+    fn was_away(&self, id: ModalityId, from: u64, to: u64) -> bool {
+        let since = self.edges.iter().rev().take_while(|(at, _)| *at > from);
+        since.skip_while(|(at, _)| *at > to).any(|(_, mask)| !mask.contains(id))
     }
 
     /// The spans between `from` and `to` in which the bit of `id` was set, ascending, none empty.

@@ -147,6 +147,29 @@ fn equal_pictures_are_frozen_and_equal_numbers_are_not() {
 }
 
 #[test]
+fn a_picture_that_is_the_same_after_an_absence_is_not_frozen() {
+    // Masks (ms, bit 0) between pictures at 0, 100, 2,600 and 2,700 ms; longest frozen, ms.
+    for (masks, frozen_samples, frozen) in [
+        (&[(0, 1)][..], 3, 2.7),
+        (&[(0, 1), (500, 0), (2500, 1)], 1, 0.1),
+        (&[(0, 1), (500, 3), (2500, 1)], 3, 2.7),
+        (&[(0, 1), (2800, 0)], 3, 2.7),
+    ] {
+        let mut measures = measures(ModalityKind::Image);
+        let mut masks = masks.iter().peekable();
+        for (n, at) in [0, 100, 2600, 2700].into_iter().enumerate() {
+            while let Some((at, mask)) = masks.next_if(|(mask_at, _)| *mask_at <= at) {
+                measures.mask(BEGIN + at * MS, PhysicalMask(*mask));
+            }
+            measures.sample(id(0), &seen(n as u64, at, 1, b"aa"));
+        }
+        let report = quality_at(&measures, 3000);
+        assert_eq!(report.frozen_samples, frozen_samples);
+        assert!((report.frozen - frozen).abs() < 1e-9, "{}", report.frozen);
+    }
+}
+
+#[test]
 fn late_samples_miss_the_deadline_of_the_nearest_tick() {
     // Ticks at 0, 33.3, 66.7 ms; each waits 125 ms.
     for (at, late_by, late) in
