@@ -75,10 +75,10 @@ impl Announced {
                 *reported = count;
             }
         }
-        let still = frozen.is_some_and(|limit| meter.run.length_ns > nanoseconds(limit));
+        let still = frozen.is_some_and(|limit| meter.runs.newest.length_ns > nanoseconds(limit));
         match (still, self.frozen) {
             (true, false) => {
-                let seconds = meter.run.length_ns as f64 / 1e9;
+                let seconds = meter.runs.newest.length_ns as f64 / 1e9;
                 news.push(format!("frozen, the same bytes for {seconds:.1} s"));
             }
             (false, true) => news.push("no longer frozen".to_owned()),

@@ -22,7 +22,7 @@ use crate::registry::{DeviceSpec, Registry, VerdictSpec};
 use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
 
-/// Room for intervals without a sample until the mask of their time is known. A reader that is further behind waits for
+/// Room for intervals without a sample, or between equal ones, until the mask of their time is known. A reader that is further behind waits for
 /// a stalled disk, and may allocate.
 const PENDING: usize = 32;
 /// Most of these intervals; beyond, they are judged by the known masks. A sensor at 1 kHz has this many in four
@@ -97,7 +97,7 @@ pub struct Quality {
     pub repeated: u64,
     /// Repetitions in the longest run of such samples.
     pub frozen_samples: u64,
-    /// Length of that run, seconds.
+    /// Length of that run while it was present, seconds.
     pub frozen: f64,
     /// Samples received after their frame's deadline.
     pub late: u64,
@@ -202,9 +202,11 @@ impl Measures {
         // No frame waits for a sample between the windows: it has the deadline that its own frame would have.
         let due = if shown.abs_diff(tick) <= self.window_ns { tick } else { shown };
         let deadline = due.saturating_add(self.wait_ns);
-        let was_away = self.presence.was_away(id, lane.meter.latest_ns, seen.capture_ns);
         let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
-        let Some((from, to)) = lane.meter.sample(seen, deadline, was_away) else { return };
+        if lane.meter.repeats.len() >= MOST_PENDING {
+            lane.settle(&self.presence);
+        }
+        let Some((from, to)) = lane.meter.sample(seen, deadline) else { return };
         if to - from > lane.longest_gap_ns {
             if lane.pending.len() >= MOST_PENDING {
                 lane.settle(&self.presence);
@@ -289,12 +291,13 @@ impl Measures {
             .fold(*longest_gap_ns, |longest, (from, to)| longest.max(without_samples(&self.presence, id, from, to)));
         let length = end_ns.saturating_sub(self.begin_ns) as f64 / 1e9;
         let known = self.presence.is_known();
-        let together: u64 = self.presence.spans(id, self.begin_ns, end_ns).map(|(from, to)| to - from).sum();
         let plugged = plugged.time(&self.presence, id, self.begin_ns, end_ns);
-        let present = if known { together as f64 / 1e9 } else { length };
+        let mut runs = meter.runs;
+        meter.repeats.iter().for_each(|repeat| runs.take(*repeat, &self.presence, id));
+        let present = self.presence.time(id, self.begin_ns, end_ns) as f64 / 1e9;
         Some(Quality {
-            frozen_samples: meter.longest_run.samples,
-            frozen: meter.longest_run.length_ns as f64 / 1e9,
+            frozen_samples: runs.longest.samples,
+            frozen: runs.longest.length_ns as f64 / 1e9,
             lateness: meter.lateness.spread(),
             clock_drift: meter.drift.over_the_episode().map(|ns| ns as f64 / 1e6),
             clock_ahead: meter.ahead_ns as f64 / 1e6,
@@ -324,6 +327,9 @@ impl Lane {
         for (from, to) in self.pending.drain(..) {
             let gap = without_samples(presence, self.measured.id, from, to);
             self.longest_gap_ns = self.longest_gap_ns.max(gap);
+        }
+        for repeat in self.meter.repeats.drain(..) {
+            self.meter.runs.take(repeat, presence, self.measured.id);
         }
     }
 }
@@ -360,8 +366,34 @@ pub(super) struct SampleFacts<'a> {
 pub(super) struct Run {
     /// Repetitions of the first one.
     pub(super) samples: u64,
-    /// From the first one to the last, ns.
+    /// From the first one to the last while it was present, ns.
     pub(super) length_ns: u64,
+}
+
+/// The interval between two such samples; `None`: the next sample differed.
+type Repeat = Option<(u64, u64)>;
+
+/// Runs of samples, as far as the mask of their time is known.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Runs {
+    /// The one in progress.
+    pub(super) newest: Run,
+    longest: Run,
+}
+
+impl Runs {
+    /// What is the same after an absence as before it says nothing of the time between.
+    fn take(&mut self, repeat: Repeat, presence: &PresenceHistory, id: ModalityId) {
+        let Some((from, to)) = repeat else {
+            self.newest = Run::default();
+            return;
+        };
+        self.newest.samples += 1;
+        self.newest.length_ns = self.newest.length_ns.saturating_add(presence.time(id, from, to));
+        if self.newest.length_ns >= self.longest.length_ns {
+            self.longest = self.newest;
+        }
+    }
 }
 
 /// What is counted of one modality, sample by sample. Taking a sample neither allocates nor locks nor logs.
@@ -369,9 +401,9 @@ pub(super) struct Run {
 pub(super) struct Meter {
     /// The part of the quality that is counted per sample and frame.
     pub(super) counts: Quality,
-    /// The run that the newest sample belongs to.
-    pub(super) run: Run,
-    pub(super) longest_run: Run,
+    pub(super) runs: Runs,
+    /// Until the mask of their time is known.
+    repeats: Vec<Repeat>,
     /// Receipt minus capture.
     pub(super) lateness: DurationHistogram,
     /// Largest excess of a capture time over its receipt, ns.
@@ -386,7 +418,6 @@ pub(super) struct Meter {
     pub(super) latest_ns: u64,
     begin_ns: u64,
     seq: Option<u64>,
-    run_began_ns: u64,
     /// Are samples compared with the previous one?
     compares: bool,
     /// Length and hash of the bytes of the newest sample, unless the source of samples compares them. Equal samples
@@ -398,12 +429,12 @@ impl Meter {
     /// A meter of an episode that begins at `begin_ns`. `compares`: payloads are compared with the
     /// previous one.
     fn new(begin_ns: u64, compares: bool) -> Self {
-        Self { latest_ns: begin_ns, begin_ns, run_began_ns: begin_ns, compares, ..Self::default() }
+        let repeats = Vec::with_capacity(PENDING);
+        Self { latest_ns: begin_ns, begin_ns, compares, repeats, ..Self::default() }
     }
 
-    /// Takes a sample whose frame waits until `deadline_ns`; `was_away`: the modality was absent since the previous one. Returns
-    /// the interval since the previous sample.
-    fn sample(&mut self, seen: &SampleFacts<'_>, deadline_ns: u64, was_away: bool) -> Option<(u64, u64)> {
+    /// Takes a sample whose frame waits until `deadline_ns`. Returns the interval since the previous sample.
+    fn sample(&mut self, seen: &SampleFacts<'_>, deadline_ns: u64) -> Option<(u64, u64)> {
         let first = self.seq.is_none();
         self.counts.samples += 1;
         self.counts.bytes += seen.payload.len() as u64;
@@ -416,7 +447,7 @@ impl Meter {
         self.seq = Some(seen.seq);
         self.counts.late += u64::from(seen.recv_ns > deadline_ns);
         self.time(seen);
-        self.compare(seen, was_away);
+        self.compare(seen);
         let before = self.latest_ns;
         self.latest_ns = before.max(seen.capture_ns);
         (before < seen.capture_ns).then_some((before, seen.capture_ns))
@@ -441,8 +472,7 @@ impl Meter {
         self.drift.push(seen.recv_ns.saturating_sub(self.begin_ns), signed(lateness).saturating_sub(signed(ahead)));
     }
 
-    /// What is the same after an absence as before it says nothing of the time between.
-    fn compare(&mut self, seen: &SampleFacts<'_>, was_away: bool) {
+    fn compare(&mut self, seen: &SampleFacts<'_>) {
         if !self.compares {
             return;
         }
@@ -452,17 +482,13 @@ impl Meter {
             let newest = Some((seen.payload.len(), hasher.finish()));
             std::mem::replace(&mut self.newest, newest) == newest
         });
-        if repeated && !was_away && self.counts.samples > 1 {
-            self.counts.repeated += 1;
-            self.run.samples += 1;
-            self.run.length_ns = seen.capture_ns.saturating_sub(self.run_began_ns);
-            if self.run.length_ns >= self.longest_run.length_ns {
-                self.longest_run = self.run;
-            }
-            return;
+        let repeated = repeated && self.counts.samples > 1;
+        self.counts.repeated += u64::from(repeated);
+        if repeated {
+            self.repeats.push(Some((self.latest_ns, seen.capture_ns.max(self.latest_ns))));
+        } else if self.repeats.last().map_or(self.runs.newest.samples > 0, Option::is_some) {
+            self.repeats.push(None);
         }
-        self.run = Run::default();
-        self.run_began_ns = seen.capture_ns;
     }
 }
 
@@ -508,10 +534,12 @@ impl PresenceHistory {
         !self.edges.is_empty()
     }
 
-    /// Was the bit of `id` cleared after `from`, and until `to`?
-    fn was_away(&self, id: ModalityId, from: u64, to: u64) -> bool {
-        let since = self.edges.iter().rev().take_while(|(at, _)| *at > from);
-        since.skip_while(|(at, _)| *at > to).any(|(_, mask)| !mask.contains(id))
+    /// The time between `from` and `to` in which the bit of `id` was set; all of it without a mask.
+    fn time(&self, id: ModalityId, from: u64, to: u64) -> u64 {
+        if !self.is_known() {
+            return to.saturating_sub(from);
+        }
+        self.spans(id, from, to).map(|(begin, end)| end - begin).sum()
     }
 
     /// The spans between `from` and `to` in which the bit of `id` was set, ascending, none empty.
