@@ -19,8 +19,7 @@ const PSEUDO: std::ops::RangeInclusive<u32> = 136..=143;
 /// `EAGAIN` where it is locked, otherwise what the kernel reports.
 pub fn hold(port: impl AsFd) -> Result<()> {
     flock(&port, FlockOperation::NonBlockingLockExclusive)?;
-    ioctl_tiocexcl(&port)?;
-    release_if_pseudo(port)
+    if is_pseudo(&port)? { Ok(()) } else { ioctl_tiocexcl(port) }
 }
 
 /// For a port that is held already, by its lock and by `TIOCEXCL`.
@@ -28,16 +27,26 @@ pub fn hold(port: impl AsFd) -> Result<()> {
 /// # Errors
 /// What the kernel reports.
 pub fn release_if_pseudo(port: impl AsFd) -> Result<()> {
-    if PSEUDO.contains(&major(fstat(&port)?.st_rdev)) {
-        ioctl_tiocnxcl(port)?;
+    if is_pseudo(&port)? { ioctl_tiocnxcl(port) } else { Ok(()) }
+}
+
+fn is_pseudo(port: impl AsFd) -> Result<bool> {
+    Ok(PSEUDO.contains(&major(fstat(port)?.st_rdev)))
+}
+
+/// Whether a program without the capability to ignore `TIOCEXCL` may open the port.
+#[cfg(test)]
+pub(crate) fn may_be_opened(path: &std::path::Path) -> bool {
+    let mut shell = std::process::Command::new("setpriv");
+    if rustix::process::geteuid().is_root() {
+        shell.arg("--bounding-set=-sys_admin");
     }
-    Ok(())
+    shell.args(["sh", "-c", ": <\"$0\""]).arg(path).status().is_ok_and(|status| status.success())
 }
 
 #[cfg(test)]
 mod tests {
     use std::path::Path;
-    use std::process::Command;
 
     use rustix::fs::{Mode, OFlags, open};
     use rustix::io::Errno;
@@ -45,33 +54,25 @@ mod tests {
 
     use super::*;
 
-    /// Without the capability that `TIOCEXCL` does not bind.
-    fn may_open(path: &str) -> bool {
-        let mut shell = Command::new("setpriv");
-        if rustix::process::geteuid().is_root() {
-            shell.arg("--bounding-set=-sys_admin");
-        }
-        shell.args(["sh", "-c", ": <\"$0\"", path]).status().unwrap().success()
-    }
-
     #[test]
     fn a_pseudo_terminal_can_be_opened_again_once_its_holder_has_closed_it() {
         let ours = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
         grantpt(&ours).unwrap();
         unlockpt(&ours).unwrap();
         let path = ptsname(&ours, Vec::new()).unwrap().into_string().unwrap();
-        let opened = || open(Path::new(&path), OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty()).unwrap();
+        let path = Path::new(&path);
+        let opened = || open(path, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty()).unwrap();
         let port = opened();
         hold(&port).unwrap();
         assert_eq!(hold(opened()), Err(Errno::AGAIN));
         drop(port);
-        assert!(may_open(&path));
+        assert!(may_be_opened(path));
         hold(opened()).unwrap();
 
         // As it is without an exception for it.
         let port = opened();
         ioctl_tiocexcl(&port).unwrap();
         drop(port);
-        assert!(!may_open(&path));
+        assert!(!may_be_opened(path));
     }
 }
