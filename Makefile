@@ -22,8 +22,8 @@ TEST_THREADS := RUST_TEST_THREADS=$(shell echo $$((2 * $$(nproc))))
 TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
 TESTS := cargo test --locked --workspace
 # What `make quick` runs, and what it leaves out: of the unit tests those that try every byte of a file, hundreds of pictures or
-# a million steps, of the tests of the program those that wait for long, need Python or C, or test scripts; whole programs of
-# tests that allocate or time motors.
+# a million steps, or each state that a file may be left in; of the tests of the program those that wait for long, need Python or
+# C, or run the scripts of tests; whole programs of tests that allocate or time motors.
 QUICK := --exclude rapid-node --lib --test layering --test library
 EXHAUSTIVE := every_state_of_damage compare::tests damage::an_index damage::a_file_inside damage::every_message \
 	damaged_files_never_panic every_flipped_bit a_flipped_bit_loses unread_bytes_are a_truncated_or_damaged_file \

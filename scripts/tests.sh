@@ -71,14 +71,15 @@ ended() {
     return "$code"
 }
 
-# Whoever may be asked for a password, which the output of cargo would hide, has the guest built first.
+# Whoever may be asked for a password, now or when a cached one has expired, has the guest built first: the output of cargo would
+# hide the question.
 # Not in the folder for temporary files that leftovers.sh removes.
 make_guest() {
     TMPDIR=${RAPID_OUTER_TMPDIR:-/tmp} "$here/setup.sh" image && return
     echo "tests.sh: the guest of the virtual bench could not be built: see the lines above that begin with 'vbench image:' or 'setup:'" >&2
     return 1
 }
-if [[ $(id -u) = 0 ]] || sudo -n true 2>/dev/null; then aside make_guest </dev/null; else make_guest; fi
+if [[ $(id -u) = 0 ]] || sudo -k -n true 2>/dev/null; then aside make_guest </dev/null; else make_guest; fi
 aside programs "$@" </dev/null >"$list"
 wait "${jobs[-1]}" || { echo "tests.sh: not built" >&2; exit 1; }
 ended || exit 1

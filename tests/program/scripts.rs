@@ -36,6 +36,7 @@ fn prepared() -> Place {
     for name in ["setup.sh", "models-tests.sh", "skips.sh"] {
         script(&place, name, PASSES);
     }
+    script(&place, "sudo", "exit 1\n");
     place
 }
 
@@ -48,6 +49,14 @@ fn script(place: &Place, name: &str, text: &str) {
 {text}"
         ),
     );
+}
+
+/// A script of `place`. `sudo` would ask for a password.
+fn command(place: &Place, name: &str) -> Command {
+    let path = format!("{}:{}", place.folder.path().display(), std::env::var("PATH").unwrap_or_default());
+    let mut command = Command::new(place.path(name));
+    command.env("PATH", path);
+    command
 }
 
 /// The file of a step.
@@ -64,7 +73,7 @@ fn a_failure_of_any_test_program_is_that_of_make_test_and_no_line_is_lost() {
         if let Some(failing) = failing {
             script(&place, &file(failing), &format!("{PASSES}exit 101\n"));
         }
-        let mut tests = Command::new(place.path("tests.sh"));
+        let mut tests = command(&place, "tests.sh");
         let output = tests.arg(place.path("cargo")).arg("test").output().expect("bash");
         let printed = String::from_utf8_lossy(&output.stdout);
         assert_eq!(output.status.code(), Some(i32::from(failing.is_some())), "{failing:?}: {printed}");
@@ -84,7 +93,7 @@ fn what_is_not_built_is_an_error_before_any_test() {
     for (step, text) in [("cargo", "exit 101\n"), ("setup.sh", "exit 1\n"), ("cargo", "true\n")] {
         let place = prepared();
         script(&place, step, text);
-        let output = Command::new(place.path("tests.sh")).arg(place.path("cargo")).arg("test").output().expect("bash");
+        let output = command(&place, "tests.sh").arg(place.path("cargo")).arg("test").output().expect("bash");
         let printed = String::from_utf8_lossy(&output.stdout);
         assert!(output.status.code() == Some(1) && !printed.contains("1f runs"), "{step} {text}: {printed}");
     }
@@ -95,9 +104,9 @@ fn what_is_not_built_is_an_error_before_any_test() {
 fn what_is_left_behind_is_a_failure_and_hides_no_other() {
     let place = prepared();
     for (code, expected) in [(0, 1), (3, 3)] {
-        let command = format!("mkdir $TMPDIR/left; touch $TMPDIR/left/{{1..9999}}; exit {code}");
-        let mut leftovers = Command::new(place.path("leftovers.sh"));
-        let output = leftovers.args(["bash", "-c", &command]).output().expect("bash");
+        let left = format!("mkdir $TMPDIR/left; touch $TMPDIR/left/{{1..9999}}; exit {code}");
+        let mut leftovers = command(&place, "leftovers.sh");
+        let output = leftovers.args(["bash", "-c", &left]).output().expect("bash");
         let printed = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.code() == Some(expected) && printed.contains("/left/"), "{:?}: {printed}", output.status);
     }
@@ -105,12 +114,12 @@ fn what_is_left_behind_is_a_failure_and_hides_no_other() {
 
 #[test]
 fn a_signal_ends_all_that_make_test_runs() {
-    // For another user than root the guest is built in the foreground, where a password can be asked for.
+    // For whoever may be asked for a password the guest is built in the foreground.
     let is_root = rustix::process::geteuid().is_root();
     for step in STEPS.into_iter().filter(|step| is_root || *step != "setup.sh") {
         let place = prepared();
         script(&place, &file(step), "echo \"$$\" >running\nmv running runs\nexec sleep 600\n");
-        let mut tests = Command::new(place.path("leftovers.sh"));
+        let mut tests = command(&place, "leftovers.sh");
         let tests = tests.args(["tests.sh", "cargo", "test"].map(|name| place.path(name)));
         let tests =
             tests.current_dir(place.folder.path()).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());

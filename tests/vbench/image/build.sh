@@ -110,10 +110,15 @@ build_kernel() {
 
 # Starts it with a program that ends at once: a machine may forbid ptrace, or lack what it was linked with.
 kernel_starts() {
-  local console
+  local console why code=0
   console=$(timeout -s KILL 120 env TMPDIR="$(memory)" "$kernel/linux" mem=128M uml_dir="$work" \
-    root=/dev/root rootfstype=hostfs rootflags="$root" ro init=/bin/true con=null con0=null,fd:1 panic=-1 2>&1 </dev/null || true)
-  [[ $console == *"exitcode=0x00000000"* ]] || { tail -n 5 <<<"$console" >&2; echo "the kernel does not start: ${console##*$'\n'}"; return 1; }
+    root=/dev/root rootfstype=hostfs rootflags="$root" ro init=/bin/true con=null con0=null,fd:1 panic=-1 2>&1 </dev/null) || code=$?
+  [[ $console != *"exitcode=0x00000000"* ]] || return 0
+  tail -n 5 <<<"$console" >&2
+  why=${console##*$'\n'}
+  [ $code != 137 ] || why="it did not end within 120 s"
+  echo "the kernel does not start: ${why:-it ended with code $code}"
+  return 1
 }
 
 build_uml() {
