@@ -4,8 +4,11 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::process::{Child, Command};
+use std::time::Instant;
 
-use super::Place;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::{PATIENCE, Place};
 
 /// A terminal with `rapid` in its own session on it.
 pub(crate) struct OnTerminal {
@@ -48,28 +51,39 @@ impl OnTerminal {
 
     /// Reads the output until this appears, and returns it.
     pub(crate) fn read_until(&mut self, word: &str) -> String {
-        let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
-        let (mut shown, mut piece) = (Vec::new(), [0; 4096]);
-        while !String::from_utf8_lossy(&shown).contains(word) {
-            let count = file.read(&mut piece).expect("output");
-            shown.extend_from_slice(&piece[..count]);
-        }
-        String::from_utf8_lossy(&shown).into_owned()
+        let shown = self.read(word, |shown| shown.contains(word));
+        assert!(shown.contains(word), "it ended without {word:?}: {shown}");
+        shown
     }
 
     /// Reads the output until the program has ended, and returns it.
     pub(crate) fn read_to_end(&mut self) -> String {
+        self.read("the end of the program", |_| false)
+    }
+
+    /// Until what was read is enough, or the other end has been closed, by all who had it.
+    fn read(&mut self, what: &str, is_enough: impl Fn(&str) -> bool) -> String {
         let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
         let (mut shown, mut piece) = (Vec::new(), [0; 4096]);
+        let begun = Instant::now();
         loop {
+            let text = String::from_utf8_lossy(&shown);
+            if is_enough(&text) {
+                return text.into_owned();
+            }
+            let second = Timespec { tv_sec: 1, tv_nsec: 0 };
+            if poll(&mut [PollFd::new(&file, PollFlags::IN)], Some(&second)).expect("output") == 0 {
+                assert!(begun.elapsed() < PATIENCE, "{what}: not met in time: {text}");
+                continue;
+            }
             match file.read(&mut piece) {
                 Ok(count) => shown.extend_from_slice(&piece[..count]),
-                // The other end has been closed, by all who had it.
-                Err(error) if error.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error()) => break,
+                Err(error) if error.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error()) => {
+                    return text.into_owned();
+                }
                 Err(error) => panic!("output: {error}"),
             }
         }
-        String::from_utf8_lossy(&shown).into_owned()
     }
 
     /// Types this.
