@@ -42,13 +42,7 @@ fn prepared() -> Place {
 
 /// An executable in the folder of `place`.
 fn script(place: &Place, name: &str, text: &str) {
-    executable::script(
-        &place.path(name),
-        &format!(
-            "#!/bin/bash
-{text}"
-        ),
-    );
+    executable::script(&place.path(name), &format!("#!/bin/bash\n{text}"));
 }
 
 /// A script of `place`. `sudo` would ask for a password.
