@@ -22,8 +22,8 @@ use crate::registry::{DeviceSpec, Registry, VerdictSpec};
 use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
 
-/// Room for intervals without a sample, or between equal ones, until the mask of their time is known. A reader that is further behind waits for
-/// a stalled disk, and may allocate.
+/// Room for intervals without a sample, or between equal ones, until the mask of their time is known. A reader that is
+/// further behind waits for a stalled disk, and may allocate.
 const PENDING: usize = 32;
 /// Most of these intervals; beyond, they are judged by the known masks. A sensor at 1 kHz has this many in four
 /// seconds, in which the mask is published two thousand times.
@@ -382,7 +382,7 @@ pub(super) struct Runs {
 }
 
 impl Runs {
-    /// What is the same after an absence as before it says nothing of the time between.
+    /// The time of an absence does not count, whatever came before and after it.
     fn take(&mut self, repeat: Repeat, presence: &PresenceHistory, id: ModalityId) {
         let Some((from, to)) = repeat else {
             self.newest = Run::default();
