@@ -2,15 +2,47 @@
 
 use std::time::Duration;
 
-use crate::status::{Board, SlotState};
+use crate::status::{Board, DeviceStatus, SlotState, Snapshot};
 
 /// Every attached device delivers by then, or is not waited for.
 pub(super) const LIMIT: Duration = Duration::from_secs(3);
 /// Devices that are attached at the start are known after this time.
 const LEAST: Duration = Duration::from_millis(100);
 
-/// Whether, so long after the start, every attached device has delivered its first sample.
+/// Whether, so long after the start, every attached device has delivered its first sample and is in the published mask:
+/// an episode that begins before that mask has frames without the device.
 pub(super) fn has_settled(board: &Board, waited: Duration) -> bool {
-    let is_opening = || board.snapshot().devices.iter().any(|device| device.state == SlotState::Opening);
-    waited >= LIMIT || (waited >= LEAST && !is_opening())
+    waited >= LIMIT || (waited >= LEAST && is_everything_published(&board.snapshot()))
+}
+
+fn is_everything_published(snapshot: &Snapshot) -> bool {
+    let published = |device: &DeviceStatus| {
+        device.state != SlotState::Opening && device.state.is_present() == snapshot.mask.contains(device.id)
+    };
+    snapshot.devices.iter().all(published)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mask::PhysicalMask;
+    use crate::status::literal::{device, id, snapshot};
+
+    #[test]
+    fn a_device_is_waited_for_until_the_published_mask_says_what_its_state_says() {
+        for (state, without, with) in [
+            (SlotState::Absent, true, false),
+            (SlotState::Opening, false, false),
+            (SlotState::Streaming, false, true),
+            (SlotState::Stalled, false, true),
+            (SlotState::Backoff, true, false),
+            (SlotState::Failed, true, false),
+        ] {
+            let mut snapshot = snapshot(vec![device(0, "tip", SlotState::Streaming, ""), device(3, "cam", state, "")]);
+            for (bit, settled) in [(false, without), (true, with)] {
+                snapshot.mask = PhysicalMask(1).with(id(3), bit);
+                assert_eq!(is_everything_published(&snapshot), settled, "{state:?}, its bit is {bit}");
+            }
+        }
+    }
 }

@@ -38,8 +38,7 @@ struct DevicePresence {
 
 impl DevicePresence {
     fn set(&mut self, state: SlotState, at: Stamp) {
-        // A stalled device is attached and running: its bit in the mask stays.
-        let running = matches!(state, SlotState::Streaming | SlotState::Stalled);
+        let running = state.is_present();
         if running {
             self.stalled = state == SlotState::Stalled;
         }

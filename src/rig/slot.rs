@@ -118,7 +118,7 @@ impl<A: Clone> Slot<A> {
 
     /// Its bit in the physical mask.
     pub const fn is_present(&self) -> bool {
-        matches!(self.state, SlotState::Streaming | SlotState::Stalled)
+        self.state.is_present()
     }
 
     /// What hot-plug reported as attached.
@@ -152,7 +152,7 @@ impl<A: Clone> Slot<A> {
     }
 
     const fn is_running(&self) -> bool {
-        matches!(self.state, SlotState::Opening | SlotState::Streaming | SlotState::Stalled)
+        self.is_present() || matches!(self.state, SlotState::Opening)
     }
 
     fn attach(&mut self, attachment: A, now: Stamp) -> Effects<A> {

@@ -23,7 +23,7 @@ pub(crate) fn id(bit: u8) -> ModalityId {
 }
 
 pub(crate) fn device(bit: u8, name: &str, state: SlotState, detail: &str) -> DeviceStatus {
-    let running = matches!(state, SlotState::Streaming | SlotState::Stalled);
+    let running = state.is_present();
     let age = if state == SlotState::Stalled { 2345 } else { 12 + u64::from(bit) };
     DeviceStatus {
         name: name.to_owned(),
@@ -42,9 +42,7 @@ pub(crate) fn device(bit: u8, name: &str, state: SlotState, detail: &str) -> Dev
 
 /// A snapshot of these devices; the mask follows from their states.
 pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
-    let mask = devices.iter().fold(PhysicalMask::EMPTY, |mask, device| {
-        mask.with(device.id, matches!(device.state, SlotState::Streaming | SlotState::Stalled))
-    });
+    let mask = devices.iter().fold(PhysicalMask::EMPTY, |mask, device| mask.with(device.id, device.state.is_present()));
     Snapshot {
         rig: "bench-1".to_owned(),
         taken: TAKEN,

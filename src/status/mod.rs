@@ -79,6 +79,12 @@ words! {
 }
 
 impl SlotState {
+    /// Whether the bit of such a device is set in the physical mask. A stalled device is attached and running.
+    #[must_use]
+    pub const fn is_present(self) -> bool {
+        matches!(self, Self::Streaming | Self::Stalled)
+    }
+
     /// Severity of a change to this state.
     pub const fn level(self) -> Level {
         match self {

@@ -180,7 +180,7 @@ fn row(
     theme: Theme,
 ) -> Line<'static> {
     let reading = model.reading(device.id);
-    let running = matches!(device.state, SlotState::Streaming | SlotState::Stalled);
+    let running = device.state.is_present();
     let none = theme.symbol("–", "-").to_owned();
     let rate = if running { text::hertz(reading.hz) } else { none.clone() };
     let age = reading.age.filter(|_| running).map_or(none, text::age);

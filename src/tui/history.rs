@@ -107,7 +107,7 @@ impl History {
         }
         for device in &snapshot.devices {
             if let Some(lane) = self.lanes.get_mut(device.id.index()) {
-                lane.was_absent |= !matches!(device.state, SlotState::Streaming | SlotState::Stalled);
+                lane.was_absent |= !device.state.is_present();
                 if is_over || elapsed.is_zero() {
                     let cell = lane.end(device, elapsed);
                     if is_over && let Some(place) = lane.cells.get_mut(self.seconds % SECONDS) {
