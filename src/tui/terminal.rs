@@ -6,8 +6,10 @@
 
 use std::fs::File;
 use std::io::{self, IsTerminal, Write};
+use std::os::fd::{AsFd as _, BorrowedFd};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use crossterm::cursor::{Hide, Show};
@@ -240,7 +242,11 @@ pub(super) fn writer() -> io::Result<Box<dyn Write>> {
     if io::stdout().is_terminal() {
         return Ok(Box::new(io::stdout()));
     }
-    Ok(Box::new(File::options().read(true).write(true).open("/dev/tty")?))
+    Ok(Box::new(controlling()?))
+}
+
+fn controlling() -> io::Result<File> {
+    File::options().read(true).write(true).open("/dev/tty")
 }
 
 /// Switches the terminal to raw mode, until [`restore`].
@@ -271,9 +277,8 @@ pub(super) fn restore() {
         }
         let _ = done.send(());
     };
-    // A stopped terminal accepts nothing: the program exits anyway.
     let left = std::thread::Builder::new().name("screen".to_owned()).spawn(leave).is_ok()
-        && is_done.recv_timeout(LAST_FRAME).is_ok();
+        && is_sent(&is_done, LAST_FRAME / LOOKS, accepts);
     let _ = disable_raw_mode();
     let messages = panics::release();
     if left {
@@ -281,6 +286,37 @@ pub(super) fn restore() {
             let _ = writeln!(io::stderr(), "{message}");
         }
     }
+}
+
+/// Looks at a terminal in [`LAST_FRAME`].
+const LOOKS: u32 = 5;
+
+/// Waits until it is sent; false if the terminal accepts nothing in [`LOOKS`] looks one after the other, `every` so long: the
+/// program exits anyway. One that accepts is waited for: on a busy machine the thread has not run yet, and what is printed
+/// next is all that says what happened.
+fn is_sent(done: &mpsc::Receiver<()>, every: Duration, accepts: impl Fn() -> bool) -> bool {
+    let mut refused = 0;
+    while refused < LOOKS {
+        match done.recv_timeout(every) {
+            Ok(()) => return true,
+            // A write in progress refuses others, too.
+            Err(RecvTimeoutError::Timeout) => refused = if accepts() { 0 } else { refused + 1 },
+            Err(RecvTimeoutError::Disconnected) => return false,
+        }
+    }
+    false
+}
+
+/// Whether the terminal accepts bytes now: not while it is stopped or full, or a write waits for that to end.
+fn accepts() -> bool {
+    let is_ready = |terminal: BorrowedFd<'_>| {
+        let now = Timespec::default();
+        matches!(rustix::event::poll(&mut [PollFd::from_borrowed_fd(terminal, PollFlags::OUT)], Some(&now)), Ok(1..))
+    };
+    if io::stdout().is_terminal() {
+        return is_ready(io::stdout().as_fd());
+    }
+    controlling().is_ok_and(|terminal| is_ready(terminal.as_fd()))
 }
 
 /// The bytes of the frame being drawn.
@@ -338,6 +374,27 @@ mod tests {
         // Who presses Alt+P is not locked out.
         let pressed = alt('P').into_iter().chain(plain(&"x".repeat(70))).collect();
         assert_eq!(typed(pressed).await.len(), 6);
+    }
+
+    #[test]
+    fn a_terminal_that_accepts_bytes_is_waited_for_and_no_other() {
+        let (done, is_done) = mpsc::channel();
+        let looked = std::cell::Cell::new(0);
+        // Accepts in every fifth look until the one of this number, in which `then` happens.
+        let sent = |last: u32, then: &dyn Fn()| {
+            looked.set(0);
+            is_sent(&is_done, Duration::from_millis(1), || {
+                looked.set(looked.get() + 1);
+                if looked.get() == last {
+                    then();
+                }
+                looked.get() <= last && looked.get().is_multiple_of(LOOKS)
+            })
+        };
+        assert!(sent(20, &|| done.send(()).unwrap()), "late");
+        assert_eq!(looked.get(), 20);
+        assert!(!sent(20, &|| ()), "stopped in between");
+        assert_eq!(looked.get(), 20 + LOOKS);
     }
 
     #[test]
