@@ -5,7 +5,7 @@ use std::io::{Read as _, Seek, SeekFrom};
 use std::time::Instant;
 
 use super::*;
-use crate::episode::recover;
+use crate::episode::{recover, testing};
 use crate::patience::PATIENCE;
 
 /// Bytes that are in the kernel's hands before the file is touched.
@@ -53,13 +53,20 @@ async fn recorded(
 
 #[tokio::test]
 async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_and_is_bad() {
-    let deeds: [(&str, &str, Deed); 6] = [
+    let deeds: [(&str, &str, Deed); 7] = [
         ("cut to nothing", "another program cut it while it was recorded", |file| {
             cut(file, |_| 0);
             None
         }),
         ("cut to a third", "another program cut it while it was recorded", |file| {
             cut(file, |size| size / 3);
+            None
+        }),
+        ("cut to a third, and filled up but for a byte", "another program cut it while it was recorded", |file| {
+            let file = writable(file);
+            let size = file.metadata().unwrap().len();
+            file.set_len(size / 3).unwrap();
+            file.set_len(size - 1).unwrap();
             None
         }),
         ("emptied by opening it, as a shell does", "another program cut it while it was recorded", |file| {
@@ -140,18 +147,35 @@ async fn a_file_modified_while_it_is_recorded_is_not_called_good() {
     }
 }
 
-/// Is there a whole chunk in the file? Read without any of the code under test.
+/// Is there a whole chunk in the file? Read without any of the code under test. A chunk that is being written while the
+/// file is cut is continued behind the cut: of such a length, but not whole.
 fn has_chunk(bytes: &[u8]) -> bool {
     let mut at = 8;
     while let Some(length) = bytes.get(at + 1..at + 9) {
         let end = u64::from_le_bytes(length.try_into().unwrap()).saturating_add(at as u64 + 9);
         match usize::try_from(end) {
-            Ok(end) if end <= bytes.len() && bytes[at] == crate::episode::op::CHUNK => return true,
+            Ok(end) if end <= bytes.len() && bytes[at] == crate::episode::op::CHUNK => {
+                // Two times, the size, the check value, no compression, and the size again.
+                let (head, records) = bytes[at + 9..end].split_at(40);
+                let check = u32::from_le_bytes(head[24..28].try_into().unwrap());
+                if crc32fast::hash(records) == check {
+                    return true;
+                }
+                at = end;
+            }
             Ok(end) if end <= bytes.len() => at = end,
             _ => return false,
         }
     }
     false
+}
+
+#[test]
+fn a_chunk_that_is_only_as_long_as_a_whole_one_is_not_whole() {
+    let bytes = testing::episode(testing::options().compression(None));
+    let mut end = (0..bytes.len()).find(|end| has_chunk(&bytes[..*end])).map(|end| bytes[..end].to_vec()).unwrap();
+    *end.last_mut().unwrap() ^= 1;
+    assert!(!has_chunk(&end));
 }
 
 /// The recorder's judgement is found again by every reader of the file, and in what a repair makes of it.
