@@ -35,6 +35,9 @@ const COUNTER: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.glob
 const SERVICE_KEY: &str = "messaging_pattern";
 /// Interval of checks whether a file has been filled.
 const LOOK: Duration = Duration::from_millis(20);
+/// A process has files in the folder of its node after this time, in seconds, also where its id says nothing: in another
+/// namespace.
+const FILLED_WITHIN: u64 = 10;
 /// Permissions of group and others.
 const OTHERS: u32 = 0o077;
 
@@ -168,6 +171,18 @@ impl Files {
                 }
             }
         }
+        self.clear_empty();
+    }
+
+    /// Removes the empty folders of nodes of dead processes, of whichever bus: one was killed when it had just made its
+    /// folder, or had emptied it.
+    fn clear_empty(&self) {
+        for Entry { path, used } in list(&self.root.join("nodes"), |name| number(name).map(Use::Node)) {
+            if matches!(used, Use::Node(node) if is_abandoned(node)) {
+                // Refused if it is not empty or not ours.
+                let _ = std::fs::remove_dir(path);
+            }
+        }
     }
 
     fn entries(&self) -> Vec<Entry> {
@@ -281,13 +296,27 @@ const fn process(number: u128) -> u32 {
 
 /// Whether the process that created this node lives. A later process with the same id started after the node's creation
 /// time, which is in the lowest 32 bits, in seconds of `CLOCK_MONOTONIC`.
-#[expect(clippy::cast_possible_truncation, reason = "the lowest 32 bits")]
 fn has_lived_since(node: u128) -> bool {
     let Some(begun) = begin(process(node)) else { return false };
-    let seconds = |clock| clock_gettime(clock).tv_sec.unsigned_abs();
     // A process's start time includes the time that the machine was suspended.
     let suspended = seconds(ClockId::Boottime).saturating_sub(seconds(ClockId::Monotonic));
-    begun <= u64::from(node as u32) + suspended
+    begun <= created(node) + suspended
+}
+
+/// Whether the process that created this node is dead, and no starting process of another namespace may be meant.
+fn is_abandoned(node: u128) -> bool {
+    // One of the future was created before the machine was started.
+    let age = seconds(ClockId::Monotonic).checked_sub(created(node));
+    !has_lived_since(node) && age.is_none_or(|age| age > FILLED_WITHIN)
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "the lowest 32 bits")]
+fn created(node: u128) -> u64 {
+    u64::from(node as u32)
+}
+
+fn seconds(clock: ClockId) -> u64 {
+    clock_gettime(clock).tv_sec.unsigned_abs()
 }
 
 /// Start time of a process in seconds since the machine was booted, see proc(5).

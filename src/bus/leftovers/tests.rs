@@ -242,6 +242,29 @@ fn a_start_removes_files_of_dead_processes_of_other_instances_and_none_of_living
     Files::new(format!("iox2_{living}_"), PathBuf::from("/tmp/iceoryx2")).clear(Duration::ZERO).unwrap();
 }
 
+#[test]
+fn an_empty_folder_of_a_dead_process_is_removed_and_no_other() {
+    let root = tempfile::tempdir().unwrap();
+    let nodes = root.path().join("nodes");
+    let now = seconds(ClockId::Monotonic);
+    // No process has this id.
+    let (own, dead) = (std::process::id(), u32::MAX);
+    let folder = |process: u32, created: u64| {
+        let path = nodes.join(((u128::from(process) << 64) | u128::from(created)).to_string());
+        std::fs::create_dir_all(&path).unwrap();
+        path
+    };
+    let gone = [folder(dead, 0), folder(dead, now - FILLED_WITHIN - 1), folder(dead, now + 1000)];
+    let (full, foreign) = (folder(dead, 1), nodes.join("notes"));
+    std::fs::write(full.join("x"), "").unwrap();
+    std::fs::create_dir(&foreign).unwrap();
+    // The second may be of a process that is starting in another namespace.
+    let stays = [folder(own, now), folder(dead, now), full, foreign];
+    Files::new("iox2_test_".to_owned(), root.path().to_owned()).clear_others();
+    assert_eq!(gone.map(|folder| folder.exists()), [false; 3]);
+    assert_eq!(stays.map(|folder| folder.exists()), [true; 4]);
+}
+
 /// A file that is restored on drop.
 struct Kept {
     path: PathBuf,
