@@ -21,8 +21,8 @@ INCREMENTAL := $(if $(wildcard $(TARGET)/debug/incremental/*),,CARGO_INCREMENTAL
 TEST_THREADS := RUST_TEST_THREADS=$(shell echo $$((2 * $$(nproc))))
 TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
 TESTS := cargo test --locked --workspace
-# What `make quick` runs, and what it leaves out: of the unit tests those that try every byte of a file, hundreds of pictures or
-# a million steps, or each state that a file may be left in; of the tests of the program those that wait for long, need Python or
+# What `make quick` runs, and what it leaves out: of the unit tests those that try every byte of a file, each state that it may be
+# left in, hundreds of pictures or a million steps; of the tests of the program those that wait for long, need Python or
 # C, or run the scripts of tests; whole programs of tests that allocate or time motors.
 QUICK := --exclude rapid-node --lib --test layering --test library
 EXHAUSTIVE := every_state_of_damage compare::tests damage::an_index damage::a_file_inside damage::every_message \
