@@ -35,8 +35,8 @@ const COUNTER: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.glob
 const SERVICE_KEY: &str = "messaging_pattern";
 /// Interval of checks whether a file has been filled.
 const LOOK: Duration = Duration::from_millis(20);
-/// A process has files in the folder of its node after this time, in seconds, also where its id says nothing: in another
-/// namespace.
+/// A process has files in the folder of its node after this time, in seconds. Until then the folder may belong to one in
+/// another namespace of process ids, which looks dead from here.
 const FILLED_WITHIN: u64 = 10;
 /// Permissions of group and others.
 const OTHERS: u32 = 0o077;
@@ -177,11 +177,10 @@ impl Files {
     /// Removes the empty folders of nodes of dead processes, of whichever bus: one was killed when it had just made its
     /// folder, or had emptied it.
     fn clear_empty(&self) {
-        for Entry { path, used } in list(&self.root.join("nodes"), |name| number(name).map(Use::Node)) {
-            if matches!(used, Use::Node(node) if is_abandoned(node)) {
-                // Refused if it is not empty or not ours.
-                let _ = std::fs::remove_dir(path);
-            }
+        let abandoned = |name: &str| number(name).filter(|node| is_abandoned(*node)).map(Use::Node);
+        for Entry { path, .. } in list(&self.root.join("nodes"), abandoned) {
+            // Refused if it is not empty or not ours.
+            let _ = std::fs::remove_dir(path);
         }
     }
 
@@ -303,7 +302,7 @@ fn has_lived_since(node: u128) -> bool {
     begun <= created(node) + suspended
 }
 
-/// Whether the process that created this node is dead, and no starting process of another namespace may be meant.
+/// Whether the process that created this node is dead, in whichever namespace it was: see [`FILLED_WITHIN`].
 fn is_abandoned(node: u128) -> bool {
     // One of the future was created before the machine was started.
     let age = seconds(ClockId::Monotonic).checked_sub(created(node));
