@@ -29,7 +29,7 @@ mod tests {
     use crate::status::literal::{device, id, snapshot};
 
     #[test]
-    fn a_device_is_waited_for_until_the_published_mask_says_what_its_state_says() {
+    fn a_device_is_waited_for_until_the_published_mask_agrees_with_its_state() {
         for (state, without, with) in [
             (SlotState::Absent, true, false),
             (SlotState::Opening, false, false),

@@ -288,12 +288,12 @@ pub(super) fn restore() {
     }
 }
 
-/// Looks at a terminal in [`LAST_FRAME`].
+/// How many looks at a terminal [`LAST_FRAME`] is divided into.
 const LOOKS: u32 = 5;
 
-/// Waits until it is sent; false if the terminal accepts nothing in [`LOOKS`] looks one after the other, `every` so long: the
-/// program exits anyway. One that accepts is waited for: on a busy machine the thread has not run yet, and what is printed
-/// next is all that says what happened.
+/// Waits until it is sent; false once the terminal has accepted nothing in [`LOOKS`] consecutive looks, one `every` so long: the
+/// program exits anyway. A terminal that accepts bytes is waited for: on a busy machine the thread has not run yet, and the
+/// messages printed afterwards are the only report of what happened.
 fn is_sent(done: &mpsc::Receiver<()>, every: Duration, accepts: impl Fn() -> bool) -> bool {
     let mut refused = 0;
     while refused < LOOKS {
