@@ -4,7 +4,7 @@
 //! terminal, not bytes or characters.
 //!
 //! Invariant: no text is cut within a character, and nothing that moves a cursor or turns the
-//! direction of writing leaves [`plain`] or [`json`].
+//! direction of writing leaves [`plain`], [`escaped`] or [`json`].
 
 use std::borrow::Cow;
 use std::io;
@@ -50,6 +50,20 @@ pub fn width(text: &str) -> usize {
 /// becomes a space.
 pub fn plain(text: &str) -> Cow<'_, str> {
     if text.contains(is_unsafe) { Cow::Owned(text.replace(is_unsafe, " ")) } else { Cow::Borrowed(text) }
+}
+
+/// `text` with the characters that [`plain`] removes, except line ends, written as escapes (`\u{d}`), so that
+/// the mistake in a file stays visible.
+pub fn escaped(text: &str) -> Cow<'_, str> {
+    let is_hidden = |c: char| is_unsafe(c) && c != '\n';
+    if !text.contains(is_hidden) {
+        return Cow::Borrowed(text);
+    }
+    let mut shown = String::with_capacity(text.len() + 8);
+    for c in text.chars() {
+        if is_hidden(c) { shown.extend(c.escape_unicode()) } else { shown.push(c) }
+    }
+    Cow::Owned(shown)
 }
 
 /// `value` as one line of JSON, without a line end, in which the characters that [`plain`] removes are

@@ -67,7 +67,7 @@ const LAYERS: &[&[&str]] = &[
 
 /// Imports within a layer. All nouns of layer 0 may also import each other.
 const SIDEWAYS: &[(&str, &[&str])] = &[
-    ("registry", &["folder", "device", "simulation"]),
+    ("registry", &["folder", "device", "simulation", "text"]),
     ("device", &["simulation"]),
     ("status", &["registry", "device", "text"]),
     ("palette", &["status"]),

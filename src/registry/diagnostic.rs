@@ -7,6 +7,8 @@ use std::fmt;
 
 use serde::Serialize;
 
+use crate::text::escaped;
+
 /// One problem of a configuration or scenario file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Diagnostic {
@@ -26,17 +28,17 @@ pub struct Diagnostic {
 
 impl fmt::Display for Diagnostic {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.file)?;
+        write!(f, "{}", escaped(&self.file))?;
         if self.line > 0 {
             write!(f, ":{}:{}", self.line, self.column)?;
         }
         write!(f, ": ")?;
         if let Some(entry) = &self.entry {
-            write!(f, "[{entry}] ")?;
+            write!(f, "[{}] ", escaped(entry))?;
         }
-        write!(f, "{}", self.message)?;
+        write!(f, "{}", escaped(&self.message))?;
         if let Some(fix) = &self.fix {
-            write!(f, "\n    fix: {fix}")?;
+            write!(f, "\n    fix: {}", escaped(fix))?;
         }
         Ok(())
     }
@@ -85,5 +87,20 @@ pub(crate) fn did_you_mean<S: AsRef<str>>(given: &str, known: impl IntoIterator<
     match nearest(given, known.iter().copied()) {
         Some(name) => format!("did you mean \"{name}\"?"),
         None => format!("{what}: {}", known.join(", ")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_text_of_a_file_reaches_the_terminal_unescaped() {
+        let hostile = "a\r\u{1b}[2J\u{9b}\u{202e}\u{200b}\u{7f}b".to_owned();
+        let (file, message) = (hostile.clone(), hostile.clone());
+        let diagnostic =
+            Diagnostic { file, line: 1, column: 1, entry: Some(hostile.clone()), message, fix: Some(hostile) };
+        let shown = r"a\u{d}\u{1b}[2J\u{9b}\u{202e}\u{200b}\u{7f}b";
+        assert_eq!(diagnostic.to_string(), format!("{shown}:1:1: [{shown}] {shown}\n    fix: {shown}"));
     }
 }
