@@ -28,7 +28,7 @@ QUICK := --exclude rapid-node --lib --test layering --test library
 EXHAUSTIVE := every_state_of_damage compare::tests damage::an_index damage::a_file_inside damage::every_message \
 	damaged_files_never_panic every_flipped_bit a_flipped_bit_loses unread_bytes_are a_truncated_or_damaged_file \
 	chunks_of_other_writers a_million_random_steps the_picture_is_bounded the_mark_is_found
-SLOW := alone calibrate compare demonstrate docs ends export foxglove hooks infer json kill lan lan_gopro lan_hostile lan_mdns many_devices nodes observe plot process python scenarios screen scripts second_run shared_memory stops task verdict web
+SLOW := alone buttons calibrate compare demonstrate docs ends export foxglove hooks infer json kill lan lan_gopro lan_hostile lan_mdns many_devices nodes observe plot process python scenarios screen scripts second_run shared_memory stops task verdict web
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | sed 's/[$$](SLOW)/$(SLOW)/' | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
