@@ -9,8 +9,9 @@ use std::time::Duration;
 
 use rapid::device::DeviceNode;
 use rapid::driver::{Driver, DriverError, camera};
-use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec, WhenStale};
-use rapid::time::Stamp;
+use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec};
+use rapid_core::sync::WhenStale;
+use rapid_core::time::Stamp;
 
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -76,7 +77,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
     };
     Ok(DeviceSpec {
         name: "camera".to_owned(),
-        id: rapid::modality::ModalityId::new(0).ok_or("bit")?,
+        id: rapid_core::modality::ModalityId::new(0).ok_or("bit")?,
         identity: IdentitySpec::Usb(UsbSpec { vid: 0, pid: 0, serial: None, port: None }),
         node: NodeSpec::Camera(camera),
         topic: "/camera".to_owned(),
@@ -90,7 +91,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         action: None,
         hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
-            rapid::modality::ModalityKind::Image,
+            rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             None,
         ),

@@ -17,7 +17,7 @@ use nokhwa::utils::{
 use rapid::device::DeviceNode;
 use rapid::driver::{Driver, DriverError};
 use rapid::registry::Registry;
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::json;
 use tokio::runtime::{Builder, Runtime};

@@ -9,17 +9,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid::headless::{self, HeadlessOptions};
-use rapid::mask::{PhysicalMask, SizedMask};
-use rapid::modality::ModalityId;
 use rapid::registry::{
     CameraSpec, DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec,
-    WhenStale,
 };
-use rapid::sample::Epoch;
 use rapid::status::session::SessionRequest;
 use rapid::status::{Board, Command, Level, Outlook, RecordingStatus, SlotState, What};
-use rapid::time::Stamp;
 use rapid::tui::{self, ScreenOptions};
+use rapid_core::mask::{PhysicalMask, SizedMask};
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::Epoch;
+use rapid_core::sync::WhenStale;
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -81,7 +81,7 @@ fn registry(count: u8) -> Registry {
             depth: 8,
             when_stale: WhenStale::Hold,
             verdict: rapid::registry::VerdictSpec::of(
-                rapid::modality::ModalityKind::Image,
+                rapid_core::modality::ModalityKind::Image,
                 std::time::Duration::from_millis(500),
                 None,
             ),

@@ -15,17 +15,18 @@ use std::time::Duration;
 
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
-use rapid::observation::{OBSERVATION_TOPIC, Observation, ObservationSlot};
+use rapid::bus::Header;
 use rapid::pixels::{CHANNELS, Picture, Pixels};
-use rapid::sample::{Encoding, FLAG_ERROR, SampleHeader};
-use rapid::time::Stamp;
+use rapid_core::observation::{OBSERVATION_TOPIC, Observation, ObservationSlot};
+use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
+use rapid_core::time::Stamp;
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_millis(2);
 /// Samples of a topic that are kept until an observation names one of them.
 const KEPT: usize = 64;
 
-type Inbox = Subscriber<ipc::Service, [u8], SampleHeader>;
+type Inbox = Subscriber<ipc::Service, [u8], Header>;
 
 /// A topic of which each observation has an array.
 struct Topic {
@@ -63,7 +64,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .create::<ipc::Service>()?;
     let inbox = |topic: &str| -> Result<Inbox, Box<dyn Error>> {
         let service = node.service_builder(&ServiceName::new(topic)?).publish_subscribe::<[u8]>();
-        Ok(service.user_header::<SampleHeader>().open()?.subscriber_builder().create()?)
+        Ok(service.user_header::<Header>().open()?.subscriber_builder().create()?)
     };
     // The observations last: fewer of them name samples from before the subscription.
     let topic = |argument: String| -> Result<Topic, Box<dyn Error>> {
@@ -80,7 +81,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             node.wait(LOOK)?;
             continue;
         };
-        let header = *tick.user_header();
+        let header = tick.user_header().0;
         let observation = Observation::decode(Stamp(header.capture_ns), tick.payload()).ok_or("no observation")?;
         let mut line = format!("tick {} mask {:#04x}", header.seq, observation.mask.0);
         for topic in &mut topics {
@@ -100,7 +101,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 impl Topic {
     fn receive(&mut self) -> Result<(), Box<dyn Error>> {
         while let Some(sample) = self.inbox.receive()? {
-            let header = *sample.user_header();
+            let header = sample.user_header().0;
             self.bit = Some(header.id);
             self.kept.push_back((header, sample.payload().to_vec()));
             if self.kept.len() > KEPT {

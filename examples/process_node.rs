@@ -24,8 +24,9 @@ use std::str::FromStr;
 use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::*;
-use rapid::sample::{Encoding, SampleHeader};
-use rapid::time::Stamp;
+use rapid::bus::Header;
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::Stamp;
 
 /// Reports SIGTERM and keeps running.
 extern "C" fn on_sigterm(_: libc::c_int) {
@@ -65,7 +66,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<ipc::Service>()?;
     let name = ServiceName::new(&topic)?;
-    let samples = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<SampleHeader>().open()?;
+    let samples = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<Header>().open()?;
     let publisher = samples.publisher_builder().initial_max_slice_len(8 * options.channels).create()?;
     // Without a notification a sample is found a little later.
     let wake = node.service_builder(&name).event().open()?.notifier_builder().create()?;
@@ -88,7 +89,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         values[0] = f64::from(seq);
         let payload: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         let mut sample = publisher.loan_slice_uninit(payload.len())?;
-        *sample.user_header_mut() = SampleHeader { seq: seq.into(), capture_ns: Stamp::now().0, ..header };
+        *sample.user_header_mut() = Header(SampleHeader { seq: seq.into(), capture_ns: Stamp::now().0, ..header });
         sample.write_from_slice(&payload).send()?;
         wake.notify()?;
         let due = begun + Duration::from_secs_f64(f64::from(seq + 1) / options.rate);

@@ -16,9 +16,10 @@ use std::f64::consts::TAU;
 use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::*;
-use rapid::action::ACTION_TOPIC;
-use rapid::sample::{Encoding, SampleHeader};
-use rapid::time::Stamp;
+use rapid::bus::Header;
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::Stamp;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::from_arguments()?;
@@ -35,7 +36,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<ipc::Service>()?;
     let name = ServiceName::new(ACTION_TOPIC)?;
-    let actions = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<SampleHeader>().open()?;
+    let actions = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<Header>().open()?;
     let publisher = actions.publisher_builder().initial_max_slice_len(8 * options.axes).create()?;
     // Without a notification an action is found with the actuator's next cycle.
     let wake = node.service_builder(&name).event().open()?.notifier_builder().create()?;
@@ -50,12 +51,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         let value = options.amplitude * (TAU * seconds / options.period).sin();
         let payload = value.to_le_bytes().repeat(options.axes);
         let mut sample = publisher.loan_slice_uninit(payload.len())?;
-        *sample.user_header_mut() = SampleHeader {
+        *sample.user_header_mut() = Header(SampleHeader {
             seq: seq.into(),
             capture_ns: Stamp::now().0,
             encoding: Encoding::F64 as u32,
             ..SampleHeader::default()
-        };
+        });
         sample.write_from_slice(&payload).send()?;
         wake.notify()?;
         let due = begun + Duration::from_secs_f64(f64::from(seq + 1) / options.rate);

@@ -14,7 +14,6 @@ use std::error::Error;
 use std::path::Path;
 
 use prost::Message;
-use rapid::mask::PhysicalMask;
 use rapid::policy::bundle::{Bundle, ObservationInput};
 use rapid::policy::compose::Composer;
 use rapid::policy::library::Environment;
@@ -22,7 +21,8 @@ use rapid::policy::model::Model;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;
 use rapid::random::Random;
-use rapid::sample::{Encoding, SampleHeader};
+use rapid_core::mask::PhysicalMask;
+use rapid_core::sample::{Encoding, SampleHeader};
 use serde::Deserialize;
 
 /// The stream of the seed that noise is drawn from: ASCII "policy".

@@ -10,8 +10,9 @@ use std::error::Error;
 use std::time::Duration;
 
 use iceoryx2::prelude::*;
-use rapid::sample::SampleHeader;
-use rapid::time::Stamp;
+use rapid::bus::Header;
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::Stamp;
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_millis(1);
@@ -33,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<ipc::Service>()?;
     let name = ServiceName::new(&topic)?;
-    let samples = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<SampleHeader>().open()?;
+    let samples = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<Header>().open()?;
     let subscriber = samples.subscriber_builder().create()?;
 
     let mut newest: Option<SampleHeader> = None;
@@ -42,7 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             node.wait(LOOK)?;
             continue;
         };
-        let header = *sample.user_header();
+        let header = sample.user_header().0;
         if let Some(before) = newest {
             let missing = header.seq.wrapping_sub(before.seq + 1);
             if missing > 0 {

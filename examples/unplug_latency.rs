@@ -21,7 +21,7 @@ use rapid::registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence, read_mask};
 use rapid::status::Board;
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 use tokio_util::sync::CancellationToken;
 
 /// From one unplug to the next; the device comes back in between.

@@ -1,6 +1,6 @@
 //! Synchronisation of a running rig: at each tick of the observation grid, which sample of each modality belongs to it.
 //!
-//! It is published on [`OBSERVATION_TOPIC`](crate::observation::OBSERVATION_TOPIC), so that no other program has to align
+//! It is published on [`OBSERVATION_TOPIC`](rapid_core::observation::OBSERVATION_TOPIC), so that no other program has to align
 //! samples. An observation holds what was known at its tick, as a policy sees it; the frames of an episode are made a
 //! tenth of a second later, and also know samples that were in transit.
 //!
@@ -11,19 +11,19 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::mask::Bits;
+use rapid_core::modality::ModalityId;
+use rapid_core::observation::{HEAD_BYTES, SLOT_BYTES};
+use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
+use rapid_core::sync::{Grid, SyncModality, SyncSample, Synchronizer};
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
 
 use crate::bus::{BusError, Queues, Subscription, TopicId, Writer};
-use crate::mask::Bits;
-use crate::modality::ModalityId;
-use crate::observation::{HEAD_BYTES, SLOT_BYTES};
 use crate::registry::{DeviceSpec, Registry};
-use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::Board;
-use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
-use crate::time::Stamp;
 
 /// Changes of the mask that are remembered between two ticks.
 const MASKS: usize = 64;
@@ -112,7 +112,7 @@ impl Alignment {
 }
 
 fn modality(device: &DeviceSpec) -> SyncModality {
-    SyncModality::of(device, device.depth + SLACK)
+    device.synchronised(device.depth + SLACK)
 }
 
 /// The samples and masks so far, and the observation they give.
@@ -183,8 +183,9 @@ impl Aligner {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::PhysicalMask;
+
     use super::*;
-    use crate::mask::PhysicalMask;
 
     const REGISTRY: &str = "[device.cam]\nvid = \"1209\"\npid = \"0001\"\nnode = \"camera\"\nbit = 0\n\
         [device.tof]\nvid = \"1209\"\npid = \"0002\"\nnode = \"serial\"\nbit = 3\ntty = { channels = 1 }\n";

@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use rapid_core::provenance::KernelDriver;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
-use crate::provenance::KernelDriver;
 use crate::simulation::{SimDevice, SimSource};
-use crate::time::Stamp;
 
 /// The identity that a USB device reports, and where it is plugged in.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize)]

@@ -18,13 +18,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use rapid_core::action::Order;
+use rapid_core::text;
+use rapid_core::time::Zone;
 use tokio_util::sync::CancellationToken;
 
 use self::registry::{
     connected, devices, find_registry, load, print_warning, register, registry_or_builtin, registry_path, unregister,
     usual_places,
 };
-use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Calibration, Cli, Command, Global, LatencyArgs, LevelArg, PolicyArgs, RunArgs, SessionCommand};
 use crate::commands::devices::Formats;
@@ -34,6 +36,7 @@ use crate::commands::mask::MaskOptions;
 use crate::commands::{self, CommandStatus, Format};
 use crate::driver::replay;
 use crate::hotplug::HotplugError;
+use crate::outlet;
 use crate::palette::Palette;
 use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError};
@@ -43,9 +46,7 @@ use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::session::journal::Plan;
 use crate::status::Level;
 use crate::status::session::SessionRequest;
-use crate::time::Zone;
 use crate::tui::ScreenOptions;
-use crate::{outlet, text};
 
 #[cfg(feature = "policy")]
 use crate::commands::compare::CompareFailure;
@@ -286,7 +287,7 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
                 interrupted.cancel();
             }
         });
-        Ok(commands::mask::run(read, names, crate::time::realtime_ns, options, stop, io::stdout()).await?)
+        Ok(commands::mask::run(read, names, rapid_core::time::realtime_ns, options, stop, io::stdout()).await?)
     })?
 }
 

@@ -15,10 +15,9 @@ use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Component, Path, PathBuf};
 
+use rapid_core::time::realtime_ns;
 use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, RenameFlags, Stat};
 use rustix::io::Errno;
-
-use crate::time::realtime_ns;
 
 /// Links on one path before it is taken for a loop; as in Linux, see `path_resolution(7)`.
 const MOST_LINKS: usize = 40;

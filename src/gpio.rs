@@ -12,12 +12,12 @@ use std::time::Duration;
 use gpiocdev::Request;
 use gpiocdev::line::{Bias, Value};
 use gpiocdev_uapi::v2::{LineValues, get_line_values, set_line_values};
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use rustix::io::Errno;
 use rustix::pipe::{PipeFlags, pipe_with};
 
 use crate::realtime::{CONTROL_PRIORITY, use_fifo};
-use crate::text;
-use crate::time::Stamp;
 
 /// A line is read again after this: a chip on USB takes about 1 ms.
 const POLL: Duration = Duration::from_millis(5);

@@ -5,10 +5,8 @@
     allow(dead_code, unused_imports, unused_variables, clippy::match_same_arms, clippy::needless_pass_by_value)
 )]
 
-pub mod action;
 pub mod alignment;
 pub mod app;
-pub mod bell;
 pub mod bus;
 pub mod calibration;
 pub mod cli;
@@ -37,7 +35,6 @@ pub mod gpio;
 pub mod headless;
 pub mod hotplug;
 pub mod inputs;
-pub mod interlock;
 pub mod interlocks;
 #[cfg(feature = "motors")]
 pub mod kinematics;
@@ -48,9 +45,6 @@ pub mod live;
 #[cfg(feature = "policy")]
 pub mod lockstep;
 pub mod logging;
-pub mod mask;
-pub mod modality;
-pub mod observation;
 pub mod orders;
 pub mod outlet;
 pub mod palette;
@@ -59,31 +53,22 @@ pub mod panics;
 #[path = "../tests/support/patience.rs"]
 mod patience;
 pub mod peer;
-pub mod permission;
 pub mod pixels;
 pub mod plot;
-pub mod points;
 #[cfg(feature = "policy")]
 pub mod policy;
-pub mod provenance;
 pub mod qr;
 pub mod realtime;
 pub mod record;
 pub mod registration;
 pub mod registry;
-pub mod remote;
 pub mod rig;
-pub mod rotation;
-pub mod sample;
 pub mod session;
 pub mod simulation;
 #[cfg(test)]
 #[path = "../tests/support/skip.rs"]
 mod skip;
 pub mod status;
-pub mod sync;
-pub mod text;
-pub mod time;
 pub mod tty;
 pub mod tui;
 #[cfg(feature = "web")]

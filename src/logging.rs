@@ -17,6 +17,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::realtime_ns;
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Subscriber};
@@ -31,8 +33,6 @@ use crate::outlet::Outlet;
 use crate::palette::Palette;
 use crate::panics;
 use crate::status::{Board, Level};
-use crate::text;
-use crate::time::realtime_ns;
 
 /// What is logged without `RAPID_LOG`. iceoryx2 warns of errors that it then handles; of the Foxglove server only what it
 /// drops is of interest, every half minute, and no client that has gone.
@@ -166,11 +166,11 @@ impl StderrSink {
 
     fn render(&self, line: &LogLine) -> String {
         if self.form == Stderr::Json {
-            let time = crate::time::rfc3339(line.wall_ns);
+            let time = rapid_core::time::rfc3339(line.wall_ns);
             let object = serde_json::json!({ "event": "log", "level": line.level, "text": line.text, "time": time });
             return format!("{}\n", text::json(&object).unwrap_or_default());
         }
-        let time = self.palette.faint(&crate::time::time_of_day(line.wall_ns));
+        let time = self.palette.faint(&rapid_core::time::time_of_day(line.wall_ns));
         let level = format!("{:5}", line.level.word());
         format!("{}{time}  {}  {}\n", self.before, self.palette.level(line.level, &level), line.text)
     }

@@ -4,9 +4,8 @@
 //!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
 
+use rapid_core::sample::Encoding;
 use rapid_jpeg::{DecodeError, Decoder};
-
-use crate::sample::Encoding;
 
 /// Values of a pixel.
 pub const CHANNELS: usize = 3;

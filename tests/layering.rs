@@ -7,6 +7,8 @@
 //! What is read are tokens, not text: comments and strings do not count, macros do. Items under
 //! `#[cfg(test)]` are left out: a test may build its subject from whatever it likes.
 //!
+//! A folder of src/ with a manifest is a crate: what it may see is said there, and the compiler keeps it to that.
+//!
 //! A new module gets a line in [`LAYERS`], a new dependency one in [`HOMES`]; if a change needs more
 //! than that to pass, the change is what is wrong.
 
@@ -21,22 +23,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &[
-        "modality",
-        "observation",
-        "mask",
-        "sample",
-        "time",
-        "bell",
-        "action",
-        "interlock",
-        "permission",
-        "provenance",
-        "flash",
-        "points",
-        "remote",
-        "rotation",
-    ],
+    &["flash"],
     &[
         "registry",
         "device",
@@ -45,7 +32,6 @@ const LAYERS: &[&[&str]] = &[
         "status",
         "palette",
         "qr",
-        "text",
         "outlet",
         "folder",
         "disk",
@@ -59,23 +45,22 @@ const LAYERS: &[&[&str]] = &[
         "tty",
         "pixels",
     ],
-    &["hotplug", "episode", "driver", "bus", "orders", "inputs", "interlocks", "sync", "calibration"],
+    &["hotplug", "episode", "driver", "bus", "orders", "inputs", "interlocks", "calibration"],
     &["rig", "alignment", "record", "session", "policy", "registration", "live", "web"],
     &["app", "lockstep", "compare", "export", "plot", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
-/// Imports within a layer. All nouns of layer 0 may also import each other.
+/// Imports within a layer.
 const SIDEWAYS: &[(&str, &[&str])] = &[
-    ("registry", &["folder", "device", "simulation", "text"]),
+    ("registry", &["folder", "device", "simulation"]),
     ("device", &["simulation"]),
-    ("status", &["registry", "device", "text"]),
+    ("status", &["registry", "device"]),
     ("palette", &["status"]),
     ("control", &["registry"]),
     ("kinematics", &["registry"]),
-    ("gpio", &["text", "realtime"]),
-    ("episode", &["sync"]),
-    ("driver", &["episode", "sync"]),
+    ("gpio", &["realtime"]),
+    ("driver", &["episode"]),
     ("interlocks", &["inputs"]),
     ("app", &["tui", "headless", "logging"]),
     // Without a screen the log is lines among the lines of the run.
@@ -89,15 +74,11 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
 const NARROW: &[(&str, &[&str], &str)] = &[
     (
         "tui",
-        &["status", "registry", "palette", "text", "outlet", "panics", "pixels", "qr"],
+        &["status", "registry", "palette", "outlet", "panics", "pixels", "qr"],
         "a screen knows snapshots and commands, no stage",
     ),
-    (
-        "headless",
-        &["status", "registry", "palette", "qr", "text", "outlet"],
-        "a screen knows snapshots and commands, no stage",
-    ),
-    ("logging", &["status", "palette", "text", "outlet", "panics"], "the log goes to the board and knows no stage"),
+    ("headless", &["status", "registry", "palette", "qr", "outlet"], "a screen knows snapshots and commands, no stage"),
+    ("logging", &["status", "palette", "outlet", "panics"], "the log goes to the board and knows no stage"),
 ];
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).
@@ -128,7 +109,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("if_addrs", &["driver/lan", "web"]),
     ("image", &["tui/picture"]),
     ("indicatif", &["commands/progress"]),
-    ("jiff", &["time"]),
     ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "inputs"]),
     ("k", &["kinematics"]),
     ("lz4", &["episode"]),
@@ -146,12 +126,13 @@ const HOMES: &[(&str, &[&str])] = &[
         "rapid_jpeg",
         &["pixels", "calibration/brightness", "driver/sim", "export/video", "simulation/task", "plot", "web"],
     ),
+    ("rapid_core", &[ANYWHERE]),
     ("rapid_random", &[ANYWHERE]),
     ("rapid_world", &["simulation/task"]),
     ("ratatui", &["tui"]),
     ("ratatui_core", &["tui"]),
     ("ratatui_image", &["tui/picture"]),
-    ("rustix", &["time", "bell", ABOVE_NOUNS]),
+    ("rustix", &[ABOVE_NOUNS]),
     ("sd_notify", &["app/watchdog"]),
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
@@ -170,8 +151,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("tracing_subscriber", &["logging"]),
     ("urdf_rs", &["kinematics"]),
     ("udev", &["hotplug/udev"]),
-    ("unicode_segmentation", &["text"]),
-    ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
     ("zip", &["commands/policy"]),
     ("zstd", &["episode", "policy/library"]),
@@ -207,12 +186,14 @@ fn the_sources_follow_the_architecture() {
     let mut files = BTreeMap::new();
     collect(&root, &root, &mut files).unwrap();
     // A folder with a manifest is a crate of its own: what it may see is in that.
-    files.retain(|path, _| {
-        !path.ancestors().skip(1).any(|folder| folder != Path::new("") && root.join(folder).join("Cargo.toml").exists())
-    });
+    let is_of_crate = |path: &Path| {
+        path.ancestors().skip(1).any(|folder| folder != Path::new("") && root.join(folder).join("Cargo.toml").exists())
+    };
+    let of_crates = files.extract_if(.., |path, _| is_of_crate(path)).collect();
     assert!(files.contains_key(Path::new("lib.rs")), "no src/lib.rs under {}", root.display());
 
-    let violations = check_tree(&files);
+    let mut violations = check_tree(&files, check);
+    violations.extend(check_tree(&of_crates, check_crate));
     let list: Vec<String> = violations.iter().map(ToString::to_string).collect();
     assert!(list.is_empty(), "{} violations of the table in tests/layering.rs:\n{}", list.len(), list.join("\n"));
 }
@@ -355,7 +336,7 @@ fn collect(root: &Path, dir: &Path, files: &mut BTreeMap<PathBuf, String>) -> io
     Ok(())
 }
 
-fn check_tree(files: &BTreeMap<PathBuf, String>) -> Vec<Violation> {
+fn check_tree(files: &BTreeMap<PathBuf, String>, check: fn(&Source) -> Vec<Violation>) -> Vec<Violation> {
     let read: Vec<Source> = files.iter().map(|(path, text)| Source::read(path, text)).collect();
     let tests: BTreeSet<&Vec<String>> = read.iter().flat_map(|source| &source.test_modules).collect();
     let mut violations: Vec<Violation> = read
@@ -543,6 +524,10 @@ impl Source {
         })
     }
 
+    fn violations(&self, rules: Vec<(usize, String)>) -> Vec<Violation> {
+        rules.into_iter().map(|(line, rule)| Violation { file: self.file.clone(), line, rule }).collect()
+    }
+
     fn leave_out(&mut self, item: &[TokenTree], module: &[String]) {
         if let [.., TokenTree::Ident(word), TokenTree::Ident(name), TokenTree::Punct(_)] = item
             && word == "mod"
@@ -583,20 +568,31 @@ fn is_after_generics(tokens: &[TokenTree], at: usize) -> bool {
     at >= 3 && is_path_sep(tokens, at - 2) && is_punct(tokens.get(at - 3), '>') && !arrow
 }
 
+/// What the manifest of a crate and its lints cannot say.
+fn check_crate(source: &Source) -> Vec<Violation> {
+    source.violations(locks(source))
+}
+
+fn locks(source: &Source) -> Vec<(usize, String)> {
+    let place = source.module.join("/");
+    if LOCK_HOMES.iter().any(|(allowed, _)| is_within(&place, allowed)) {
+        return Vec::new();
+    }
+    let lock = |path: &[String]| path.iter().find(|name| LOCKS.contains(&name.as_str())).cloned();
+    let found = source.paths.iter().filter_map(|(line, path)| Some((*line, lock(path)?)));
+    found
+        .map(|(line, lock)| (line, format!("`{lock}`: nothing between a device and the file waits for another thread")))
+        .collect()
+}
+
 fn check(source: &Source) -> Vec<Violation> {
-    let mut rules: Vec<(usize, String)> = Vec::new();
+    let mut rules = locks(source);
     let place = source.module.join("/");
     let home = source.module.first().map(String::as_str);
 
     for line in &source.unsafe_lines {
         if !UNSAFE_HOMES.iter().any(|allowed| is_within(&place, allowed)) {
             rules.push((*line, format!("`unsafe` outside {}", UNSAFE_HOMES.join("/ and ") + "/")));
-        }
-    }
-    for (line, path) in &source.paths {
-        let lock = path.iter().find(|name| LOCKS.contains(&name.as_str()));
-        if let (Some(lock), false) = (lock, LOCK_HOMES.iter().any(|(allowed, _)| is_within(&place, allowed))) {
-            rules.push((*line, format!("`{lock}`: nothing between a device and the file waits for another thread")));
         }
     }
     for (line, word) in &source.prints {
@@ -613,7 +609,7 @@ fn check(source: &Source) -> Vec<Violation> {
             }
         }
     }
-    rules.into_iter().map(|(line, rule)| Violation { file: source.file.clone(), line, rule }).collect()
+    source.violations(rules)
 }
 
 fn layer(module: &str) -> Option<usize> {
@@ -667,7 +663,7 @@ mod the_check_itself {
     /// The violations of one file, as `line: rule`.
     fn found(file: &str, text: &str) -> Vec<String> {
         let files = BTreeMap::from([(PathBuf::from(file), text.to_owned())]);
-        check_tree(&files).into_iter().map(|v| format!("{}: {}", v.line, v.rule)).collect()
+        check_tree(&files, check).into_iter().map(|v| format!("{}: {}", v.line, v.rule)).collect()
     }
 
     #[track_caller]
@@ -681,8 +677,12 @@ mod the_check_itself {
 
     #[test]
     fn imports_upwards_and_sideways_are_found() {
-        finds("mask.rs", "use crate::modality::ModalityId;", &[]);
-        finds("mask.rs", "use crate::registry::Registry;", &["1: `mask` (layer 0) imports `registry` (layer 1): imp"]);
+        finds("flash.rs", "use rapid_core::modality::ModalityId;", &[]);
+        finds(
+            "flash.rs",
+            "use crate::registry::Registry;",
+            &["1: `flash` (layer 0) imports `registry` (layer 1): imp"],
+        );
         finds("bus/mod.rs", "use crate::driver::Reading;", &["1: `bus` (layer 2) imports `driver` (layer 2): mod"]);
         finds("rig/stream.rs", "\n\nuse crate::record::Writer;", &["3: `rig` (layer 3) imports `record`"]);
         finds("status/mod.rs", "use crate::registry::Registry;", &[]);
@@ -697,35 +697,35 @@ mod the_check_itself {
         let nested =
             "use crate::{\n    time::Stamp,\n    registry::{\n        Registry,\n        spec as other,\n    },\n};";
         finds(
-            "sample.rs",
+            "flash.rs",
             nested,
-            &["4: `sample` (layer 0) imports `registry`", "5: `sample` (layer 0) imports `registry`"],
+            &["4: `flash` (layer 0) imports `registry`", "5: `flash` (layer 0) imports `registry`"],
         );
-        finds("sample.rs", "fn f() { let b = crate::status::Board::new(); }", &["1: `sample`"]);
-        finds("sample.rs", "type A = Vec<crate::status::Board>;", &["1: `sample`"]);
-        finds("sample.rs", "fn f() { select! { _ = async { crate::rig::run().await } => {} } }", &["1: `sample`"]);
-        finds("sample.rs", "use super::status::Board;", &["1: `sample`"]);
+        finds("flash.rs", "fn f() { let b = crate::status::Board::new(); }", &["1: `flash`"]);
+        finds("flash.rs", "type A = Vec<crate::status::Board>;", &["1: `flash`"]);
+        finds("flash.rs", "fn f() { select! { _ = async { crate::rig::run().await } => {} } }", &["1: `flash`"]);
+        finds("flash.rs", "use super::status::Board;", &["1: `flash`"]);
         finds("driver/serial.rs", "use super::super::orders::Orders;", &["1: `driver`"]);
         finds("driver/serial.rs", "use super::camera::Camera; use self::inner::X;", &[]);
         finds("driver/mod.rs", "mod inner { fn f() { super::super::bus::open() } }", &["1: `driver`"]);
-        finds("sample.rs", "pub use crate::status::*;", &["1: `sample`"]);
+        finds("flash.rs", "pub use crate::status::*;", &["1: `flash`"]);
         finds("main.rs", "use rapid::app; fn f() { rapid::commands::run() }", &[]);
     }
 
     #[test]
     fn comments_strings_and_tests_do_not_count() {
         finds(
-            "sample.rs",
+            "flash.rs",
             "// use crate::rig::Rig;\n/// [`crate::rig::Rig`]\nconst A: &str = \"crate::rig::Rig unsafe\";",
             &[],
         );
-        finds("sample.rs", "#[cfg(test)]\nmod tests {\n use crate::rig::Rig;\n fn f() { println!() }\n}", &[]);
-        finds("sample.rs", "#[cfg(not(test))]\nmod x { use crate::rig::Rig; }", &["2: `sample`"]);
+        finds("flash.rs", "#[cfg(test)]\nmod tests {\n use crate::rig::Rig;\n fn f() { println!() }\n}", &[]);
+        finds("flash.rs", "#[cfg(not(test))]\nmod x { use crate::rig::Rig; }", &["2: `flash`"]);
         let files = BTreeMap::from([
-            (PathBuf::from("sync/grid.rs"), "#[cfg(test)]\nmod tests;".to_owned()),
-            (PathBuf::from("sync/grid/tests.rs"), "use crate::rig::Rig;".to_owned()),
+            (PathBuf::from("episode/grid.rs"), "#[cfg(test)]\nmod tests;".to_owned()),
+            (PathBuf::from("episode/grid/tests.rs"), "use crate::rig::Rig;".to_owned()),
         ]);
-        assert_eq!(check_tree(&files), []);
+        assert_eq!(check_tree(&files, check), []);
     }
 
     #[test]
@@ -742,9 +742,9 @@ mod the_check_itself {
         finds("driver/camera/capture.rs", "use v4l::Device;", &[]);
         finds("driver/camerax.rs", "use v4l::Device;", &["1: crate `v4l`"]);
         finds("rig/mod.rs", "use {iceoryx2::prelude::*, std::io};", &["1: crate `iceoryx2`"]);
-        finds("mask.rs", "use tokio::sync::watch;", &["1: crate `tokio`"]);
-        finds("time.rs", "use rustix::time::ClockId;", &[]);
-        finds("sample.rs", "use rustix::time::ClockId;", &["1: crate `rustix`"]);
+        finds("flash.rs", "use tokio::sync::watch;", &["1: crate `tokio`"]);
+        finds("disk.rs", "use rustix::time::ClockId;", &[]);
+        finds("flash.rs", "use rustix::time::ClockId;", &["1: crate `rustix`"]);
     }
 
     #[test]
@@ -778,7 +778,9 @@ mod the_check_itself {
         finds("rig/mod.rs", "fn f() { if a { println!(\"x\") } }", &["1: `println!`"]);
         finds("status/board.rs", "use std::sync::{Arc, Mutex};", &[]);
         finds("rig/stream.rs", "use std::sync::{Arc, Mutex};", &["1: `Mutex`"]);
-        finds("sync/grid.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
+        finds("episode/grid.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
+        let files = BTreeMap::from([(PathBuf::from("core/mask.rs"), "use std::sync::Mutex;".to_owned())]);
+        assert_eq!(check_tree(&files, check_crate).len(), 1);
         finds("utils.rs", "", &["1: module `utils` has no layer"]);
     }
 }

@@ -14,7 +14,7 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 
-/// Stands beside every payload; `rapid::sample::SampleHeader`.
+/// Stands beside every payload; `rapid_core::sample::SampleHeader`.
 #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
 #[type_name("RapidSampleHeader")]
 #[repr(C)]

@@ -11,17 +11,17 @@ mod press;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
+use rapid_core::permission::Permission;
+use rapid_core::time::Stamp;
 use tokio::sync::{mpsc, oneshot};
 
 use super::conductor::reached;
 use super::requests::Request;
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
-use crate::permission::Permission;
 use crate::registry::{ButtonAction, ButtonSpec, Registry};
 use crate::status::session::{Label, Phase, SessionRequest};
 use crate::status::{Board, Level, What};
-use crate::time::Stamp;
 use press::{Gesture, Presses, Rules};
 
 /// Reads the buttons until it is dropped.

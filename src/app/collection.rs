@@ -7,6 +7,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use rapid_core::time::{Stamp, realtime_ns, rfc3339};
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender};
 use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
@@ -23,7 +24,6 @@ use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
 use crate::session::{Answer, Effect, Session};
 use crate::status::session::{Answered, Phase, SessionRequest, SessionStatus};
 use crate::status::{Board, EpisodeEnd, Level, Verdict, What};
-use crate::time::{Stamp, realtime_ns, rfc3339};
 
 /// Answers that wait for an episode to begin, or to end.
 type Waiting = Vec<oneshot::Sender<Result<String, String>>>;

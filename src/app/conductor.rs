@@ -7,6 +7,8 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::sample::Epoch;
+use rapid_core::time::Stamp;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
@@ -19,9 +21,7 @@ use super::{AppError, Request, Running, Screen};
 use crate::bus;
 use crate::fault;
 use crate::record::{RecordError, Recorder, RecorderConfig, Source};
-use crate::sample::Epoch;
 use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
-use crate::time::Stamp;
 
 /// Interval at which devices that are still opening are looked for.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);

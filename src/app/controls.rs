@@ -5,10 +5,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use rapid_core::modality::ModalityId;
 use tokio::task::spawn_blocking;
 
 use crate::driver::camera;
-use crate::modality::ModalityId;
 use crate::status::{Board, Level, What};
 
 /// Sets a control, and reports what came of it in the log, which the episode in progress contains.

@@ -7,6 +7,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
@@ -14,8 +16,6 @@ use super::AppError;
 use super::settling;
 use super::stage::Stage;
 use crate::bus::{Bus, Inbox, TopicId, Writer};
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
 use crate::policy::library::Environment;
 use crate::policy::live::{Live, LiveOptions};
 use crate::policy::model::Model;

@@ -2,6 +2,8 @@
 
 use std::sync::{Arc, mpsc};
 
+use rapid_core::permission::Permission;
+use rapid_core::time::WallClock;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::watch;
 
@@ -10,10 +12,8 @@ use super::requests::Request;
 use super::stage::Stage;
 use crate::bus::{Bus, Subscription};
 use crate::episode::made::Made;
-use crate::permission::Permission;
 use crate::registry::{DeviceSpec, Registry};
 use crate::status::Board;
-use crate::time::WallClock;
 
 /// No server can be requested.
 #[derive(Debug, Clone, Copy)]

@@ -13,6 +13,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use rapid_core::time::Stamp;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_blocking;
 
@@ -26,7 +27,6 @@ use crate::registry::{DeviceSpec, Difference, ModuleSpec, Registry};
 use crate::rig::{Addition, RigCommand};
 use crate::status::session::Answered;
 use crate::status::{Board, Level, RegistryRequest, What};
-use crate::time::Stamp;
 
 /// The answer when the rest of the run is gone.
 const ENDING: &str = "the run is ending";

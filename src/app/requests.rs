@@ -1,10 +1,11 @@
 //! Requests of the screen and of other programs, sorted by receiver.
 //!
 //! Invariant: a request to the rig never waits for a file: it does not pass through the conductor, which waits for
-//! files to be closed. Nor does one about the registry. Orders to the actuator take a separate path ([`crate::permission`]).
+//! files to be closed. Nor does one about the registry. Orders to the actuator take a separate path ([`rapid_core::permission`]).
 
 use std::sync::Arc;
 
+use rapid_core::time::Stamp;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::spawn_blocking;
 
@@ -14,7 +15,6 @@ use crate::orders::receive::{Arrival, Wanted};
 use crate::rig::RigCommand;
 use crate::status::session::{Asker, SessionRequest};
 use crate::status::{Command, RegistryRequest};
-use crate::time::Stamp;
 
 /// Receives the answer to a request: what was done, or why it was refused.
 pub(super) type Reply = Option<oneshot::Sender<Result<String, String>>>;
@@ -96,8 +96,9 @@ pub(super) fn sorted(
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::modality::ModalityId;
+
     use super::*;
-    use crate::modality::ModalityId;
     use crate::status::literal::board;
 
     #[tokio::test]

@@ -4,6 +4,7 @@ use std::io::IsTerminal;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::permission::Permission;
 use tokio::sync::{broadcast, mpsc};
 
 use super::stage::Stage;
@@ -11,7 +12,6 @@ use super::{AppError, Screen};
 use crate::fault;
 use crate::headless::{self, HeadlessOptions};
 use crate::palette::Palette;
-use crate::permission::Permission;
 use crate::status::{Board, Command, Event};
 use crate::tui::{self, ScreenOptions, TuiError};
 

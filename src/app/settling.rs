@@ -24,8 +24,9 @@ fn is_everything_published(snapshot: &Snapshot) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::PhysicalMask;
+
     use super::*;
-    use crate::mask::PhysicalMask;
     use crate::status::literal::{device, id, snapshot};
 
     #[test]

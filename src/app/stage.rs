@@ -12,7 +12,7 @@
 //! | page            | waits for its thread                               | thread `web`                                 |
 //!
 //! Recording and inference do not wait for the observations of synchronisation: they apply the same rules
-//! ([`crate::sync`]) at their own ticks, the recorder once the samples in transit have arrived, the policy on its own
+//! ([`rapid_core::sync`]) at their own ticks, the recorder once the samples in transit have arrived, the policy on its own
 //! grid, and neither loses an observation because another task is late.
 //!
 //! Invariant: a stage reports once how it ended, whether it was stopped or not; a panic is an end like any other.

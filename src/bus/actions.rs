@@ -12,15 +12,15 @@ use iceoryx2::identifiers::UniquePublisherId;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
+use rapid_core::action::{ActionSource, MAX_ACTION, NoAction};
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
-use super::{BusError, EventFactory, Service, TopicFactory, TopicSpec, Writer, sigbus};
-use crate::action::{ActionSource, MAX_ACTION, NoAction};
-use crate::sample::{Encoding, SampleHeader};
-use crate::time::Stamp;
+use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicSpec, Writer, sigbus};
 
 /// An event for a task to wait for; `None` where the system cannot watch it and the caller must poll.
 pub fn watch(bell: BorrowedFd<'_>) -> Option<AsyncFd<OwnedFd>> {
@@ -33,7 +33,7 @@ pub fn watch(bell: BorrowedFd<'_>) -> Option<AsyncFd<OwnedFd>> {
 pub struct Actions {
     topic: String,
     depth: usize,
-    subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
+    subscriber: Guarded<Subscriber<Service, [u8], Header>>,
     listener: Guarded<Listener<Service>>,
     /// Publisher of this process.
     writer: UniquePublisherId,

@@ -6,12 +6,12 @@
 use std::fmt::Debug;
 use std::path::PathBuf;
 
+use rapid_core::text;
 use rustix::process::{Resource, getrlimit};
 
 use super::leftovers::Files;
 use super::room;
 use crate::registry::MAX_SUBSCRIBERS;
-use crate::text;
 
 /// With fewer free descriptors than this, the failure is attributed to their limit: iceoryx2 closes the descriptors of
 /// the failed step before it returns.

@@ -15,11 +15,11 @@ use iceoryx2::identifiers::UniquePublisherId;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
+use rapid_core::sample::SampleHeader;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
-use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
-use crate::sample::SampleHeader;
+use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
 
 /// The samples of every topic but that of observations, which this process makes for others. They wait in shared memory
 /// until they are drained.
@@ -39,7 +39,7 @@ pub struct Subscription {
     name: String,
     /// Maximum number of samples in the queue.
     depth: usize,
-    subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
+    subscriber: Guarded<Subscriber<Service, [u8], Header>>,
     /// Publisher id of the topic's one writer.
     writer: UniquePublisherId,
     /// The writer has published since this inbox was opened.

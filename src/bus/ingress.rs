@@ -15,14 +15,14 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
+use rapid_core::sample::SampleHeader;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
-use super::{BusError, MAX_NODES, Service, service_name};
+use super::{BusError, Header, MAX_NODES, Service, service_name};
 use crate::registry::DeviceSpec;
-use crate::sample::SampleHeader;
 
 /// Prefix of an ingress topic's name; the modality's topic follows.
 const PREFIX: &str = "/rapid/ingress";
@@ -40,7 +40,7 @@ const LARGE: usize = 64 << 10;
 pub struct Ingress {
     topic: String,
     depth: usize,
-    subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
+    subscriber: Guarded<Subscriber<Service, [u8], Header>>,
     listener: Guarded<Listener<Service>>,
 }
 
@@ -59,7 +59,7 @@ impl Ingress {
         let samples = node
             .service_builder(&name)
             .publish_subscribe::<[u8]>()
-            .user_header::<SampleHeader>()
+            .user_header::<Header>()
             .max_publishers(PUBLISHERS)
             .max_subscribers(1)
             .max_nodes(MAX_NODES)
@@ -96,7 +96,7 @@ impl Ingress {
         match contained(|| self.subscriber.receive())? {
             Ok(sample) => {
                 let sample = sample.map(Guarded::new);
-                Ok(sample.map(|sample| Given { header: *sample.user_header(), sample }))
+                Ok(sample.map(|sample| Given { header: sample.user_header().0, sample }))
             }
             Err(error) => Err(BusError::Transfer { topic: self.topic.clone(), reason: format!("{error:?}") }),
         }
@@ -127,7 +127,7 @@ impl Ingress {
 /// A sample as its program published it; nothing in it has been checked.
 pub struct Given {
     header: SampleHeader,
-    sample: Guarded<Sample<Service, [u8], SampleHeader>>,
+    sample: Guarded<Sample<Service, [u8], Header>>,
 }
 
 impl std::fmt::Debug for Given {

@@ -33,15 +33,16 @@ mod sigbus;
 mod topic;
 mod writer;
 
+use std::ops::Deref;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::SampleHeader;
 
-use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
-use crate::sample::SampleHeader;
 
 use error::topic_error;
 use guard::{Guarded, contained};
@@ -58,23 +59,36 @@ pub use sigbus::lost;
 pub use topic::{TopicId, TopicSpec};
 pub use writer::Writer;
 
-type TopicFactory = iceoryx2::service::port_factory::publish_subscribe::PortFactory<Service, [u8], SampleHeader>;
+type TopicFactory = iceoryx2::service::port_factory::publish_subscribe::PortFactory<Service, [u8], Header>;
 
 /// Name of the event service that wakes consumers.
 const WAKE_SERVICE: &str = "/rapid/wake";
 /// A notifier for each modality and for actions, and those of other programs.
-const WAKE_NOTIFIERS: usize = crate::modality::MAX_MODALITIES + 1 + MAX_NODES;
+const WAKE_NOTIFIERS: usize = rapid_core::modality::MAX_MODALITIES + 1 + MAX_NODES;
 /// Maximum number of processes on the bus: `rapid`, and subscribers or publishers of other programs.
 const MAX_NODES: usize = 32;
 
 /// Address space that a run needs besides the bus: stacks and heaps of its threads.
 const OTHER_ADDRESSES: u64 = 512 << 20;
 
+/// A [`SampleHeader`] as the user header of a topic.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(transparent)]
+pub struct Header(pub SampleHeader);
+
 // SAFETY: `SampleHeader` is `repr(C)`, holds only integers, no padding and no pointers.
-unsafe impl ZeroCopySend for SampleHeader {
+unsafe impl ZeroCopySend for Header {
     unsafe fn type_name() -> &'static str {
         // The name under which other languages describe the same 56 bytes.
         "RapidSampleHeader"
+    }
+}
+
+impl Deref for Header {
+    type Target = SampleHeader;
+
+    fn deref(&self) -> &SampleHeader {
+        &self.0
     }
 }
 
@@ -287,7 +301,7 @@ fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Guard
     let factory = node
         .service_builder(&service_name(&spec.name)?)
         .publish_subscribe::<[u8]>()
-        .user_header::<SampleHeader>()
+        .user_header::<Header>()
         .max_publishers(2)
         .max_subscribers(MAX_SUBSCRIBERS)
         .max_nodes(MAX_NODES)

@@ -1,11 +1,13 @@
+use rapid_core::action::{ActionSource, MAX_ACTION, NoAction};
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::Encoding;
+use rapid_core::sync::WhenStale;
+
 use super::*;
-use crate::action::{ActionSource, MAX_ACTION, NoAction};
-use crate::modality::ModalityId;
 use crate::patience::PATIENCE;
 use crate::registry::{
-    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale,
+    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec,
 };
-use crate::sample::Encoding;
 use std::time::{Duration, Instant};
 
 pub(super) fn registry(depth: usize) -> Registry {
@@ -43,7 +45,7 @@ pub(super) fn registry(depth: usize) -> Registry {
             action: None,
             hooks: crate::registry::Hooks::default(),
             verdict: crate::registry::VerdictSpec::of(
-                crate::modality::ModalityKind::Image,
+                rapid_core::modality::ModalityKind::Image,
                 Duration::from_millis(500),
                 Some(30.0),
             ),
@@ -157,7 +159,7 @@ fn a_late_consumer_gets_only_what_is_published_from_then_on() {
 }
 
 /// A subscriber of the one device's topic that keeps the samples it receives.
-fn holder(registry: &Registry, bus: &Bus) -> iceoryx2::port::subscriber::Subscriber<Service, [u8], SampleHeader> {
+fn holder(registry: &Registry, bus: &Bus) -> iceoryx2::port::subscriber::Subscriber<Service, [u8], Header> {
     let id = TopicId::Modality(registry.devices[0].id);
     let (_, factory) = bus.topics.iter().find(|(spec, _)| spec.id == id).expect("topic");
     factory.subscriber_builder().create().expect("subscriber")
@@ -272,14 +274,14 @@ fn a_topic_filled_faster_than_it_is_emptied_does_not_trap_the_consumer() {
 }
 
 /// Another publisher on a topic of `bus`, like a program of the same user.
-fn stranger(bus: &Bus, id: TopicId) -> iceoryx2::port::publisher::Publisher<Service, [u8], SampleHeader> {
+fn stranger(bus: &Bus, id: TopicId) -> iceoryx2::port::publisher::Publisher<Service, [u8], Header> {
     let (_, factory) = bus.topics.iter().find(|(spec, _)| spec.id == id).expect("topic");
     factory.publisher_builder().initial_max_slice_len(64).create().expect("publisher")
 }
 
-fn give(stranger: &iceoryx2::port::publisher::Publisher<Service, [u8], SampleHeader>, seq: u64) {
+fn give(stranger: &iceoryx2::port::publisher::Publisher<Service, [u8], Header>, seq: u64) {
     let mut sample = stranger.loan_slice_uninit(8).expect("loan");
-    *sample.user_header_mut() = SampleHeader { seq, encoding: Encoding::F64 as u32, ..SampleHeader::default() };
+    *sample.user_header_mut() = Header(SampleHeader { seq, encoding: Encoding::F64 as u32, ..SampleHeader::default() });
     sample.write_from_slice(&[0; 8]).send().expect("send");
 }
 

@@ -1,10 +1,11 @@
 //! Topics: name, depth and memory of each, derived once from the registry.
 
+use rapid_core::action::{ACTION_TOPIC, MAX_ACTION};
+use rapid_core::mask::{MASK_TOPIC, PAYLOAD_LEN};
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::observation::{HEAD_BYTES, OBSERVATION_TOPIC, SLOT_BYTES};
+
 use super::room::BOOKS;
-use crate::action::{ACTION_TOPIC, MAX_ACTION};
-use crate::mask::{MASK_TOPIC, PAYLOAD_LEN};
-use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::observation::{HEAD_BYTES, OBSERVATION_TOPIC, SLOT_BYTES};
 use crate::registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
 /// 4 s of mask at 500 Hz: how long a consumer may be held up without losing a sample.
@@ -93,7 +94,7 @@ impl TopicSpec {
 
     /// Bytes of the pool.
     pub fn pool_bytes(&self) -> u64 {
-        let sample = self.max_bytes + size_of::<crate::sample::SampleHeader>();
+        let sample = self.max_bytes + size_of::<rapid_core::sample::SampleHeader>();
         (self.pool_samples() as u64).saturating_mul(sample as u64)
     }
 }

@@ -13,21 +13,21 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::*;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::sample_mut_uninit::SampleMutUninit;
+use rapid_core::modality::MAX_MODALITIES;
+use rapid_core::sample::SampleHeader;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
-use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, leftovers, room, sigbus};
-use crate::modality::MAX_MODALITIES;
-use crate::sample::SampleHeader;
+use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, leftovers, room, sigbus};
 
-type Loan = SampleMutUninit<Service, [MaybeUninit<u8>], SampleHeader>;
-type Filled = SampleMut<Service, [u8], SampleHeader>;
+type Loan = SampleMutUninit<Service, [MaybeUninit<u8>], Header>;
+type Filled = SampleMut<Service, [u8], Header>;
 
 /// The one writer of a topic.
 pub struct Writer {
     topic: String,
     max_bytes: usize,
-    publisher: Guarded<Publisher<Service, [u8], SampleHeader>>,
+    publisher: Guarded<Publisher<Service, [u8], Header>>,
     /// The publisher's segment, to check its first page.
     pool: Option<File>,
     /// First the actuator's, which is the most urgent, then those of all consumers.
@@ -126,7 +126,7 @@ impl Writer {
 /// and again when the panic drops the sample, which ends the process: such a sample is never dropped.
 fn filled(loan: Loan, header: SampleHeader, payload: &[u8]) -> Result<Filled, BusError> {
     let mut loan = ManuallyDrop::new(loan);
-    *loan.user_header_mut() = header;
+    *loan.user_header_mut() = Header(header);
     let place = loan.payload_mut();
     if place.len() != payload.len() {
         sigbus::damaged();

@@ -1,8 +1,7 @@
 //! The mean brightness of a picture.
 
+use rapid_core::sample::Encoding;
 use rapid_jpeg::{DecodeError, Decoder};
-
-use crate::sample::Encoding;
 
 /// Why a picture has no brightness.
 #[derive(Debug, thiserror::Error)]

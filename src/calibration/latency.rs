@@ -10,7 +10,7 @@
 //! latencies weighted by the likelihood of the measurements (Gaussian noise of the size of the best
 //! fit's residual, uniform prior), and the uncertainty follows from their spread.
 
-use crate::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// Range of latencies considered, seconds. Below zero: a stamp taken before the exposure.
 const EARLIEST: f64 = -0.1;

@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use rapid_core::text;
 use serde_json::json;
 
 use super::{Format, progress};
@@ -15,7 +16,6 @@ use crate::record::inspect::{self, Inspection, ReadError};
 use crate::registry::ablation::AblationPlan;
 use crate::registry::{DeviceSpec, Mount, NodeSpec, Registry, RegistryErrors, did_you_mean};
 use crate::status::Grade;
-use crate::text;
 
 /// Why no list is printed.
 #[derive(Debug, thiserror::Error)]

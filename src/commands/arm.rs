@@ -2,7 +2,8 @@
 
 use std::io::{self, Write};
 
-use crate::action::Order;
+use rapid_core::action::Order;
+
 use crate::orders::give::{GiveError, give};
 
 /// Why an order was not carried out.

@@ -11,6 +11,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout, timeout_at};
@@ -22,12 +24,11 @@ use crate::calibration::{self, Estimate, Flip, Seen, brightness};
 use crate::cli::LatencyArgs;
 use crate::device::{Attachment, DeviceNode};
 use crate::driver::Driver;
+use crate::flash;
 use crate::registry::units::show_duration;
 use crate::registry::{Assigner, Assignment, DeviceSpec, NodeSpec, Registry};
 use crate::simulation::SimDevice;
-use crate::time::Stamp;
 use crate::tui::flashlight::{self, Flashlight};
-use crate::{flash, text};
 
 /// A camera that has sent nothing for this long is considered silent.
 const SILENCE: Duration = Duration::from_secs(5);

@@ -3,17 +3,17 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use rapid_core::interlock::StopKind;
+use rapid_core::text;
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line};
-use crate::interlock::StopKind;
 #[cfg(feature = "motors")]
 use crate::kinematics::Arm;
 use crate::registry::{
     ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
     ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, RegistryErrors, StopSpec, UsbSpec,
 };
-use crate::text;
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
 ///

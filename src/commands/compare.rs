@@ -3,6 +3,8 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use rapid_core::text;
+
 use super::Format;
 use super::progress::Bar;
 use crate::cli::ReplayArgs;
@@ -10,7 +12,6 @@ use crate::compare::{self, Again, Beside, CompareError, Compared, Comparison, Di
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::{Environment, LibraryError};
 use crate::registry::InferenceSpec;
-use crate::text;
 
 /// Differences up to this come from the order of floating-point additions, which depends on the machine.
 const USUAL_TOLERANCE: f64 = 1e-4;

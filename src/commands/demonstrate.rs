@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use std::sync::Arc;
 use std::time::Instant;
 
+use rapid_core::text;
 use serde_json::json;
 
 use super::Format;
@@ -16,7 +17,6 @@ use crate::record::EpisodeRequest;
 use crate::registry::Registry;
 use crate::simulation::task::Texture;
 use crate::status::{Board, Grade};
-use crate::text;
 
 /// Why not all demonstrations were recorded.
 #[derive(Debug, thiserror::Error)]

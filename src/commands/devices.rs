@@ -3,13 +3,13 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
+use rapid_core::text;
 use serde::Serialize;
 
 use super::{Format, json_line};
 use crate::device::{Attachment, DeviceNode, Unit};
 use crate::driver::camera::{CameraInfo, cameras, is_on_usb, name, query};
 use crate::registry::{Assigner, Assignment, DeviceSpec, IdentitySpec, Registry, UsbSpec};
-use crate::text;
 
 /// A node that is plugged in.
 #[derive(Debug, Clone, Serialize)]

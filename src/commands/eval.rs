@@ -4,6 +4,7 @@
 use std::io::{self, Write};
 use std::time::Instant;
 
+use rapid_core::text;
 use serde_json::json;
 
 use super::Format;
@@ -18,7 +19,6 @@ use crate::policy::model::Model;
 use crate::policy::sampler::PolicyError;
 use crate::registry::Registry;
 use crate::simulation::task::Outcome;
-use crate::text;
 
 /// Why there is no result.
 #[derive(Debug, thiserror::Error)]

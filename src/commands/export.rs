@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
+use rapid_core::text;
 use serde::Serialize;
 
 use super::progress::Work;
@@ -24,7 +25,6 @@ use crate::export::{
 use crate::record::inspect::{self, ReadError};
 use crate::registry::ExportSpec;
 use crate::status::Grade;
-use crate::text;
 
 /// Why the export ended.
 #[derive(Debug, thiserror::Error)]

@@ -4,11 +4,12 @@ use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use rapid_core::text;
+
 use super::{CommandStatus, Format, json_line, progress};
 use crate::episode::sha256;
 use crate::palette::Palette;
 use crate::record::inspect::{self, Judgement, ReadError};
-use crate::text;
 
 /// Why there is no report.
 #[derive(Debug, thiserror::Error)]

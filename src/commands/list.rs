@@ -10,6 +10,8 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::{Zone, rfc3339};
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line, progress};
@@ -19,8 +21,6 @@ use crate::record::inspect::{self, Judgement, Listed, ReadError};
 use crate::session::journal::{self, JournalError};
 use crate::status::Grade;
 use crate::status::session::{EpisodeEntry, Label};
-use crate::text;
-use crate::time::{Zone, rfc3339};
 
 /// Why there is no list.
 #[derive(Debug, thiserror::Error)]

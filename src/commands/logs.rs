@@ -2,12 +2,13 @@
 
 use std::io::{self, Write};
 
+use rapid_core::text;
+use rapid_core::time::{Zone, rfc3339};
+
 use super::Format;
 use super::monitor::{Connection, MonitorError, Wanted};
 use crate::palette::Palette;
 use crate::status::{Level, LogLine, PrintedOn, Snapshot};
-use crate::text;
-use crate::time::{Zone, rfc3339};
 
 /// Why the log is not shown.
 #[derive(Debug, thiserror::Error)]

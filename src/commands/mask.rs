@@ -6,13 +6,13 @@
 use std::io::{self, Write};
 use std::time::Duration;
 
+use rapid_core::mask::{MaskRecord, PhysicalMask};
+use rapid_core::text;
 use serde::{Deserialize, Serialize};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use crate::mask::{MaskRecord, PhysicalMask};
 use crate::palette::Palette;
-use crate::text;
 
 /// A record older than this is stale: a running publisher publishes every 2 ms.
 pub const STALE_AFTER: Duration = Duration::from_secs(1);
@@ -146,7 +146,7 @@ pub fn render_json(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64) ->
         device_count: record.device_count,
         online_count: record.mask.online_count(),
         sequence: record.sequence,
-        time: crate::time::rfc3339(record.realtime_ns),
+        time: rapid_core::time::rfc3339(record.realtime_ns),
         age_ms: (age(record, now_ns).as_secs_f64() * 1e6).round() / 1e3,
         stale: age(record, now_ns) > STALE_AFTER,
         devices: layout.map(|layout| {
@@ -257,7 +257,8 @@ impl Change {
                 Ok(render_json(record, names().as_deref(), now_ns)? + "\n")
             }
             Self::Gone(reason) if options.json => {
-                let gone = serde_json::json!({ "event": "gone", "gone": reason, "time": crate::time::rfc3339(now_ns) });
+                let gone =
+                    serde_json::json!({ "event": "gone", "gone": reason, "time": rapid_core::time::rfc3339(now_ns) });
                 Ok(text::json(&gone)? + "\n")
             }
             Self::Mask { record, before } => {
@@ -274,7 +275,7 @@ impl Change {
             Self::Back(record) => Ok(watched(record, &palette.good("the publisher is back"), palette)),
             Self::Gone(reason) => Ok(format!(
                 "{}  {}\n",
-                palette.faint(&crate::time::time_of_day(now_ns)),
+                palette.faint(&rapid_core::time::time_of_day(now_ns)),
                 palette.bad(&text::plain(reason))
             )),
         }
@@ -283,7 +284,7 @@ impl Change {
 
 fn watched(record: &MaskRecord, remark: &str, palette: Palette) -> String {
     let count = usize::from(record.device_count);
-    let time = palette.faint(&crate::time::time_of_day(record.realtime_ns));
+    let time = palette.faint(&rapid_core::time::time_of_day(record.realtime_ns));
     format!("{time}  {}  {}  {remark}\n", record.mask.hex(count), record.mask.binary(count))
 }
 

@@ -41,7 +41,7 @@ struct Tagged<'a, T> {
 /// `value`, an object, as one line of JSON with the key `event`: the kind of an object, by which docs/schema.json
 /// distinguishes all that are printed. Without a line end.
 fn json_line(event: &'static str, value: &impl serde::Serialize) -> std::io::Result<String> {
-    Ok(crate::text::json(&Tagged { event, value })?)
+    Ok(rapid_core::text::json(&Tagged { event, value })?)
 }
 
 /// How a listing is written.

@@ -3,10 +3,11 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use rapid_core::text;
+
 use super::Format;
 use crate::registry::catalogue::{self, CatalogueError, Descriptor};
 use crate::registry::{Registry, RegistryErrors, read_file};
-use crate::text;
 
 /// Why there is no descriptor.
 #[derive(Debug, thiserror::Error)]

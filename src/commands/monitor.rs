@@ -9,17 +9,17 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread;
 use std::time::Duration;
 
+use rapid_core::action::Order;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::time::Stamp;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::action::Order;
 use crate::app::signals::Signals;
-use crate::mask::PhysicalMask;
 use crate::orders::give::{self, GiveError};
 use crate::peer::ProcessState;
 use crate::status::attach::{Decoder, LinkError};
 use crate::status::{Command, SlotState, Snapshot};
-use crate::time::Stamp;
 use crate::tui::model::{Effect, Msg};
 use crate::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
 

@@ -7,13 +7,13 @@ use std::ffi::OsString;
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
+use rapid_core::text;
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line, list};
 use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::plot::{self, Plot};
 use crate::record::inspect::{self, Judgement, ReadError};
-use crate::text;
 
 /// Anyone may read a picture whose episode may be read.
 const MODE: u32 = 0o644;

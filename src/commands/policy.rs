@@ -6,6 +6,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::text;
 use serde_json::{Value, json};
 
 use super::Format;
@@ -20,7 +21,6 @@ use crate::policy::model::Model;
 use crate::policy::pace::{Pace, PaceVerdict};
 use crate::policy::sampler::{Computing, PolicyError};
 use crate::registry::{InferenceSpec, Registry};
-use crate::text;
 
 /// Why a policy cannot be shown.
 #[derive(Debug, thiserror::Error)]

@@ -12,8 +12,7 @@ use std::thread;
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
-
-use crate::text;
+use rapid_core::text;
 
 const UNITS: &str = "{prefix} {bar:20} {pos}/{len}{rate}{left}";
 const BYTES: &str = "{prefix} {bar:20} {done}{left}";

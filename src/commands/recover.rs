@@ -5,13 +5,13 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use rapid_core::text;
 use serde::Serialize;
 use serde_json::json;
 
 use super::progress::Bar;
 use super::{Format, json_line};
 use crate::episode::recover::{ProgressFn, RecoverError, Recovered, finished, is_damaged, left_behind, recover};
-use crate::text;
 
 /// The outcome of all files together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

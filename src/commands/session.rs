@@ -2,11 +2,12 @@
 
 use std::io::{self, Write};
 
+use rapid_core::text;
+
 use super::Format;
 use crate::orders::give::{GiveError, request};
 use crate::status::RegistryRequest;
 use crate::status::session::{Phase, SessionRequest, SessionStatus};
-use crate::text;
 
 /// Why a request was not carried out.
 #[derive(Debug, thiserror::Error)]

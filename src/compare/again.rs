@@ -8,6 +8,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 
+use rapid_core::sample::SampleHeader;
 use serde::Serialize;
 
 use super::difference::{Difference, distance};
@@ -20,7 +21,6 @@ use crate::policy::compose::Composer;
 use crate::policy::model::Model;
 use crate::policy::request::Request;
 use crate::registry::Registry;
-use crate::sample::SampleHeader;
 
 /// The result.
 #[derive(Debug, Clone, Default, Serialize)]

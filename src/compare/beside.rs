@@ -11,21 +11,21 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use rapid_core::modality::MAX_MODALITIES;
+use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_core::sync::Grid;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
 use super::difference::Difference;
 use super::survey::{Ordered, Received, Survey};
 use super::{CompareError, Ended};
-use crate::modality::MAX_MODALITIES;
 use crate::policy::bundle::Bundle;
 use crate::policy::horizon::{Counts, WithoutMask};
 use crate::policy::model::Model;
 use crate::policy::pilot::Pilot;
 use crate::policy::request::Request;
 use crate::registry::Registry;
-use crate::sample::{Epoch, SampleHeader};
-use crate::sync::Grid;
-use crate::time::Stamp;
 
 /// Seed of the policy's noise.
 const SEED: u64 = 0;

@@ -4,19 +4,19 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Encoding, Epoch, SampleHeader};
 use serde::Deserialize;
 
-use crate::action::ACTION_TOPIC;
 use crate::episode::ReadError;
 use crate::episode::decode::{Content, Sample, Scratch};
 use crate::episode::encode::EventText;
 use crate::episode::reader::{Entry, Item, Message, Reader};
 use crate::episode::reference;
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
 use crate::policy::bundle::ObservationSpec;
 use crate::registry::Registry;
-use crate::sample::{Encoding, Epoch, SampleHeader};
 
 /// The bits of a sample's number that a recorded message holds.
 pub(super) const SEQUENCE_BITS: u64 = 0xffff_ffff;

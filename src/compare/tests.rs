@@ -8,17 +8,17 @@ use std::io::Cursor;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::time::{Stamp, WallClock};
 use serde_json::Value;
 
 use super::*;
-use crate::action::ACTION_TOPIC;
 use crate::episode::decode::{self, Content, Kind, Scratch};
 use crate::episode::{ABOUT, EVENT_TOPIC};
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Recording, Trial};
 use crate::record::EpisodeRequest;
 use crate::record::stepped::Stepped;
 use crate::status::Board;
-use crate::time::{Stamp, WallClock};
 
 /// Trial with the same noise as a policy that watches.
 const SEED: u64 = 0;
@@ -495,7 +495,7 @@ fn actions_without_chunks_are_compared_with_those_of_a_watching_policy() {
     assert!((found.largest - 0.5).abs() < 1e-6 && found.at_tick == tick, "{found:?}");
 
     // Without the mask no modality is present.
-    let keep = |message: &mut Message| !message.is_chunk() && message.topic != crate::mask::MASK_TOPIC;
+    let keep = |message: &mut Message| !message.is_chunk() && message.topic != rapid_core::mask::MASK_TOPIC;
     let Comparison::Beside(beside) = recorded.compared(&recorded.edited(keep, |_| {})).unwrap().comparison else {
         panic!("of a policy")
     };

@@ -9,7 +9,7 @@
 
 use std::time::Duration;
 
-use crate::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// Action periods that may pass without an action.
 const PERIODS: u32 = 2;

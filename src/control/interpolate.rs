@@ -8,7 +8,7 @@
 
 use std::time::Duration;
 
-use crate::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// The target period before there were two targets.
 pub const FIRST_PERIOD: Duration = Duration::from_millis(100);

@@ -60,6 +60,9 @@ use notices::{Notices, Seldom};
 pub use returning::RETURN_SPEED;
 pub use words::Words;
 
+use rapid_core::action::Trip;
+use rapid_core::time::Stamp;
+
 use super::can::CanFrame;
 use super::damiao::codec::{self, StateCommand};
 use super::damiao::parameter::Reply;
@@ -67,9 +70,7 @@ use super::deadman::Deadman;
 use super::interpolate::Interpolator;
 use super::limits::Limits;
 use super::ramp::Ramp;
-use crate::action::Trip;
 use crate::registry::DamiaoSpec;
-use crate::time::Stamp;
 
 /// Values per motor in a sample: position rad, velocity rad/s and torque Nm of its joint, temperature of the transistors °C,
 /// of the winding °C, and the code of its status.

@@ -7,7 +7,7 @@
 
 use std::time::Duration;
 
-use crate::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// See the module's comment.
 #[derive(Debug, Clone)]

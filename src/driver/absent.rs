@@ -5,12 +5,13 @@ use std::future::Pending;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use rapid_core::action::{ActionSource, ActuatorNotice, Order};
+use rapid_core::permission::Attended;
+
 use super::{Agreed, DriverError, Reading};
 use tokio::sync::mpsc;
 
-use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::device::DeviceNode;
-use crate::permission::Attended;
 
 /// Never opened.
 #[derive(Debug)]

@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use crate::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// Transfer time of a byte at full speed of USB, 12 Mbit/s (USB 2.0, section 7.1.11). The baud rate of a CDC-ACM device
 /// is not that of any line.

@@ -37,6 +37,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use nokhwa::utils::{ApiBackend, CameraIndex, FrameFormat, RequestedFormat, RequestedFormatType};
+use rapid_core::sample::FLAG_DEVICE_TIME;
+use rapid_core::time::Stamp;
 use rustix::io::{FdFlags, fcntl_setfd};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -48,8 +50,6 @@ use self::format::{Frame, Layout, Numbering, fourcc_text};
 use self::node::{Node, Ring, open_error, setup_error};
 use super::{Agreed, DriverError, Reading, unblock};
 use crate::registry::CameraSpec;
-use crate::sample::FLAG_DEVICE_TIME;
-use crate::time::Stamp;
 
 pub use self::format::{CameraInfo, ControlInfo, Mode, Rate, Rates, Size};
 

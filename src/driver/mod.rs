@@ -23,17 +23,17 @@ pub mod sim;
 
 use std::sync::Arc;
 
+use rapid_core::action::{ActionSource, ActuatorNotice, Order};
+use rapid_core::permission::Attended;
+use rapid_core::provenance::Negotiated;
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 
-use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::device::DeviceNode;
-use crate::permission::Attended;
-use crate::provenance::Negotiated;
 use crate::registry::{CanProtocol, DeviceSpec, NodeSpec};
-use crate::sample::Encoding;
 use crate::simulation::{SimDevice, SimSource};
 use crate::status::Episode;
-use crate::time::Stamp;
 #[cfg(not(feature = "lan"))]
 use absent::Absent as Lan;
 #[cfg(not(feature = "motors"))]

@@ -15,6 +15,11 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::provenance::{KernelDriver, Negotiated};
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
+use rapid_core::time::{Stamp, nanoseconds};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
@@ -25,14 +30,9 @@ use crate::episode::decode::{Content, Kind, Sample, Scratch};
 use crate::episode::reader::{Channel, Item, Reader};
 use crate::episode::record_iter::{FileEnd, MAGIC};
 use crate::episode::{self, ReadAt, ReadError};
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
-use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
 use crate::registry::{DeviceSpec, Registry};
-use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::simulation::{SimDevice, SimFaults, SimSource};
-use crate::time::{Stamp, nanoseconds};
 
 /// Messages per read: at 1 kHz this covers the reading of a chunk.
 const BATCH: usize = 32;

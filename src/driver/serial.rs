@@ -15,15 +15,15 @@ use std::fmt;
 use std::os::fd::{AsFd as _, AsRawFd as _, BorrowedFd, FromRawFd as _, IntoRawFd as _, OwnedFd};
 use std::path::Path;
 
+use rapid_core::provenance::{Format, Negotiated};
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use serde::de::{DeserializeSeed, Deserializer, Error as _, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use tokio::io::AsyncReadExt as _;
 use tokio_serial::{ClearBuffer, SerialPort as _, SerialPortBuilder, SerialStream};
 
 use super::{Agreed, DriverError, Reading, arrival, unblock};
-use crate::provenance::{Format, Negotiated};
 use crate::registry::{Framing, Parse, SerialSpec};
-use crate::sample::Encoding;
-use crate::time::Stamp;
 use crate::tty;
 
 /// Bytes read from the kernel at once.

@@ -15,6 +15,11 @@ use std::sync::atomic::Ordering;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
+use rapid_core::modality::ModalityKind;
+use rapid_core::provenance::{Format, Negotiated};
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
+use rapid_core::sync::Grid;
+use rapid_core::time::{Stamp, nanoseconds};
 use tokio::time::Instant;
 
 use self::joints::Joints;
@@ -27,14 +32,9 @@ use crate::driver::can::{
     link::{Arrival, Received},
     raw,
 };
-use crate::modality::ModalityKind;
-use crate::provenance::{Format, Negotiated};
 use crate::registry::{CAN_RECORD, DeviceSpec, NodeSpec};
-use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::simulation::task::{self, PictureError, SharedTrial};
 use crate::simulation::{self, SimDevice, SimSource, TaskPart};
-use crate::sync::Grid;
-use crate::time::{Stamp, nanoseconds};
 
 /// Pictures a camera keeps for a late reader, as many as the real driver has buffers.
 const CAMERA_BACKLOG: u64 = 4;

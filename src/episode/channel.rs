@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::modality::ModalityKind;
+
 use super::form::Derived;
 use super::text_map;
-use crate::modality::ModalityKind;
 use crate::registry::{ActionSpec, DeviceSpec, NodeSpec};
 
 /// Of the topic of a device.

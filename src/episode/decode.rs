@@ -6,12 +6,13 @@
 //! Invariant: any bytes are accepted; a message that is not whole, or not of its schema, is `None`, never a panic.
 //! Invariant: memory does not grow with what a message claims.
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::sample::Encoding;
+
 use super::encode::EventText;
 use super::schema::SampleSchema;
 use super::wire::{Proto, whole_protobuf};
-use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::sample::Encoding;
 
 /// What the messages of a channel hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

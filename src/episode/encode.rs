@@ -7,12 +7,13 @@
 
 use std::ops::Range;
 
+use rapid_core::mask::Bits;
+use rapid_core::observation::Observation;
+use rapid_core::points;
+use rapid_core::sample::{Encoding, SampleHeader};
+
 use super::schema::SampleSchema;
-use crate::mask::Bits;
-use crate::observation::Observation;
-use crate::points;
 use crate::registry::{CalibrationSpec, PointsSpec};
-use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Event, Level, What};
 
 const VARINT: u8 = 0;
@@ -377,15 +378,14 @@ mod tests {
     use std::time::Duration;
 
     use prost_reflect::{DescriptorPool, DynamicMessage, Value};
+    use rapid_core::mask::PhysicalMask;
+    use rapid_core::modality::ModalityId;
+    use rapid_core::sample::Epoch;
+    use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
+    use rapid_core::time::Stamp;
 
     use super::*;
     use crate::episode::schema::{EVENT, FRAME, LOG, MASK, Schema};
-    use crate::mask::PhysicalMask;
-    use crate::modality::ModalityId;
-    use crate::registry::WhenStale;
-    use crate::sample::Epoch;
-    use crate::sync::{SyncModality, SyncSample, Synchronizer};
-    use crate::time::Stamp;
 
     const WALL: u64 = 1_700_000_000_123_456_789;
 

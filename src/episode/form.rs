@@ -5,10 +5,11 @@
 //! Invariant: nothing here is read again by `rapid`: the samples are what was measured.
 //! Invariant: numbers that do not form a pose (not finite, or without a rotation) give no message.
 
+use rapid_core::rotation::{self, Quaternion};
+
 use super::encode::{self, Joint, Pose};
 use super::schema::{self, SampleSchema, Schema};
 use crate::registry::{DeviceSpec, Form, JointsSpec, POSE_ENDING, PoseLayout, PoseSpec, Quantity, TipForm};
-use crate::rotation::{self, Quaternion};
 
 /// The topic of all transforms.
 pub const TRANSFORM_TOPIC: &str = "/tf";

@@ -5,10 +5,10 @@
 use std::io;
 use std::path::Path;
 
+use rapid_core::text;
 use sha2::{Digest, Sha256};
 
 use super::{ReadAt, ReadError, open};
-use crate::text;
 
 /// Bytes read at once.
 const PIECE: usize = 256 << 10;

@@ -1,8 +1,9 @@
 //! How intact a file is, as found while reading it.
 
+use rapid_core::text;
+
 use super::own::EpisodeId;
 use super::wire::Fields;
-use crate::text;
 
 /// How a file ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]

@@ -6,7 +6,7 @@
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use crate::modality::MAX_MODALITIES;
+use rapid_core::modality::MAX_MODALITIES;
 
 /// A message about a modality takes at most this many bytes in a `rapid.Frame`: tag, length, and its fields.
 const OF_A_SLOT: usize = 36;
@@ -69,12 +69,13 @@ impl Shown {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::PhysicalMask;
+    use rapid_core::modality::ModalityId;
+    use rapid_core::observation::{Observation, ObservationSlot};
+    use rapid_core::time::Stamp;
+
     use super::super::encode;
     use super::*;
-    use crate::mask::PhysicalMask;
-    use crate::modality::ModalityId;
-    use crate::observation::{Observation, ObservationSlot};
-    use crate::time::Stamp;
 
     #[test]
     fn the_largest_frame_has_room() {

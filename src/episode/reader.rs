@@ -12,6 +12,8 @@ use std::path::{Path, PathBuf};
 
 pub(crate) use mcap::Attachment;
 use mcap::records::MessageHeader;
+use rapid_core::mask::MASK_TOPIC;
+use rapid_core::modality::ModalityId;
 
 use super::chunk::is_sound;
 use super::decode::{self, Content, Kind, Scratch};
@@ -22,8 +24,6 @@ use super::source::ReadAt;
 use super::wire::Fields;
 use super::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, ReadError, op};
 use super::{boot_id, open};
-use crate::mask::MASK_TOPIC;
-use crate::modality::ModalityId;
 
 /// See the module's comment.
 pub(crate) struct Reader<R> {

@@ -3,11 +3,11 @@
 //! names its schema.
 
 use mcap::Attachment;
+use rapid_core::sample::SampleHeader;
 
 use super::decode::{self, Content, Kind, Scratch};
 use super::encode;
 use super::schema::SampleSchema;
-use crate::sample::SampleHeader;
 
 const PREFIX: &str = "reference/";
 const MEDIA: &str = "application/protobuf; messageType=";
@@ -55,8 +55,9 @@ pub(crate) fn sample(attachment: &Attachment<'_>) -> Option<(SampleHeader, Vec<u
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::sample::Encoding;
+
     use super::*;
-    use crate::sample::Encoding;
 
     #[test]
     fn what_is_attached_is_read_again_and_nothing_else() {

@@ -1,9 +1,10 @@
 //! Schemas of what is recorded, written into every file. They are compiled from the `.proto` files beside them; the test
 //! `schemas_match_their_proto_files` shows how.
 
-use crate::modality::ModalityKind;
+use rapid_core::modality::ModalityKind;
+use rapid_core::sample::{Encoding, SampleHeader};
+
 use crate::registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PixelFormat, RemoteSamples};
-use crate::sample::{Encoding, SampleHeader};
 
 /// Message encoding and schema encoding of every channel.
 pub const PROTOBUF: &str = "protobuf";

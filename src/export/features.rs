@@ -6,13 +6,13 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::action::ACTION_TOPIC;
 use serde_json::{Map, Value, json};
 
 use super::picture::{Codec, Pictures, Shape};
 use super::rows::Refusal;
 use super::statistics::Column;
 use super::survey::{Content, LONGEST, Survey};
-use crate::action::ACTION_TOPIC;
 use crate::registry::ExportSpec;
 use crate::registry::columns::{self, ColumnError, Vector};
 

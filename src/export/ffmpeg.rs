@@ -17,12 +17,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
+use rapid_core::text;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::{Errno, ioctl_fionbio, read};
 use rustix::process::{Pid, PidfdFlags, Signal, kill_process_group, pidfd_open};
 
 use super::picture::{Codec, Shape};
-use crate::text;
 
 /// How long ffmpeg may take nothing, give nothing and not end: an encoder takes seconds for a large picture.
 const PATIENCE: Duration = Duration::from_mins(5);

@@ -6,11 +6,12 @@
 use std::borrow::Cow;
 use std::fmt;
 
+use rapid_core::sample::Encoding;
+
 use super::rows::Payload;
 use crate::episode::decode::jpeg_frame;
 use crate::pixels::{LARGEST, Picture, PixelError, Pixels};
 use crate::record::is_whole_jpeg;
-use crate::sample::Encoding;
 
 /// How a dataset has its pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -11,13 +11,14 @@ use std::path::Path;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::action::ACTION_TOPIC;
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::modality::{ModalityId, ModalityKind};
+use rapid_core::sample::Encoding;
+
 use crate::episode::decode::{Content, FrameSlot, Kind, Sample, Scratch};
 use crate::episode::reader::{Item, Message, Reader};
 use crate::episode::{ABOUT, FRAME_TOPIC, ReadError};
-use crate::modality::{ModalityId, ModalityKind};
 use crate::registry::columns::ColumnError;
-use crate::sample::Encoding;
 
 /// Bytes of samples that may wait for their frame: a minute of four cameras, where a second is usual.
 const MOST_WAITING: usize = 1 << 30;

@@ -4,16 +4,17 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use rapid_core::modality::ModalityKind;
+use rapid_core::text;
+
 use super::picture::{self, Shape};
 use super::rows::{Index, Listed, Payload, Refusal, Row};
 use super::statistics::Column;
 use crate::episode::record_iter::FileEnd;
-use crate::modality::ModalityKind;
 use crate::pixels::{CHANNELS, Picture, Pixels};
 use crate::record::inspect::{self, Inspection, Judgement};
 use crate::registry::{ExportSpec, Form, Registry};
 use crate::status::{Grade, Verdict};
-use crate::text;
 
 /// Numbers that a registry may declare of a sample; what a file claims may be anything.
 pub(super) const LONGEST: usize = 1 << 16;

@@ -4,6 +4,12 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::observation::Observation;
+use rapid_core::sample::{Encoding, SampleHeader};
+
 use super::cells::CellMaker;
 use super::features::{Axis, Features, MASK, Origin, PLUGGED, STATE, VALID};
 use super::picture::{Codec, Pictures, Shape};
@@ -14,16 +20,11 @@ use super::survey::{Content, Stream, Survey};
 use super::table::{Position, Rows, Table};
 use super::verify::verify;
 use super::video::{Encoded, FrameMaker, Shown};
-use crate::action::ACTION_TOPIC;
 use crate::episode::encode;
 use crate::episode::schema::{FRAME, SampleSchema};
 use crate::episode::{FRAME_TOPIC, sha256, text_map};
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
-use crate::observation::Observation;
 use crate::pixels::{Picture, Pixels};
 use crate::registry::ExportSpec;
-use crate::sample::{Encoding, SampleHeader};
 use crate::status::Grade;
 
 const BEGIN: u64 = 1_700_000_000_000_000_000;

@@ -1,13 +1,13 @@
 //! Formats events: as a line for people, or as a JSON object.
 
+use rapid_core::modality::ModalityId;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
-use crate::modality::ModalityId;
 use crate::palette::Palette;
 use crate::qr;
 use crate::status::{DeviceStatus, Event, Snapshot, What};
-use crate::text;
-use crate::time::Stamp;
 
 /// An event with its time on the wall clock.
 #[derive(Serialize)]
@@ -19,7 +19,7 @@ struct Timed<'a> {
 
 /// An event as one JSON object, with `time` as RFC 3339 in UTC; without a line end.
 pub(super) fn json(event: &Event, wall_ns: u64) -> serde_json::Result<String> {
-    text::json(&Timed { event, time: crate::time::rfc3339(wall_ns) })
+    text::json(&Timed { event, time: rapid_core::time::rfc3339(wall_ns) })
 }
 
 /// The beginning of a run, as JSON: `{"event":"begin",...}`.
@@ -52,7 +52,7 @@ pub(super) fn begin_json(snapshot: &Snapshot, wall_ns: u64) -> serde_json::Resul
         rig: &snapshot.rig,
         devices: snapshot.devices.iter().map(device).collect(),
         links: &snapshot.links,
-        time: crate::time::rfc3339(wall_ns),
+        time: rapid_core::time::rfc3339(wall_ns),
     })
 }
 
@@ -73,7 +73,7 @@ const REST: usize = 1000;
 impl Columns {
     /// The rig and its modalities as a line; without a line end.
     pub(super) fn begin(self, snapshot: &Snapshot, wall_ns: u64) -> String {
-        let time = self.palette.faint(&crate::time::time_of_day(wall_ns));
+        let time = self.palette.faint(&rapid_core::time::time_of_day(wall_ns));
         let names: Vec<_> = snapshot.devices.iter().map(|device| text::plain(&device.name)).collect();
         let rig = self.palette.bold(&text::plain(&snapshot.rig));
         format!("{time}  rig {rig} looks for {}; ctrl-c ends the run", names.join(", "))
@@ -98,7 +98,7 @@ impl Columns {
             What::Unregistered { .. } | What::Discarded { .. } | What::Policy { .. } => palette.warn(&word),
             _ => palette.level(described.level, &word),
         };
-        let time = palette.faint(&crate::time::time_of_day(wall_ns));
+        let time = palette.faint(&rapid_core::time::time_of_day(wall_ns));
         let subject = text::left(&text::plain(&described.subject), self.name, "…");
         let rest = text::plain(described.detail());
         let rest = text::cut(&rest, REST, "…");

@@ -11,6 +11,8 @@ use std::io::{self, Write};
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::{Stamp, WallClock};
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::MissedTickBehavior;
@@ -20,8 +22,6 @@ use crate::outlet::Outlet;
 use crate::palette::Palette;
 use crate::status::rates::Rates;
 use crate::status::{Board, Event, Snapshot, What};
-use crate::text;
-use crate::time::{Stamp, WallClock};
 use totals::RunTotals;
 
 /// Maximum backlog of output; beyond it events wait, and are eventually missed.
@@ -183,10 +183,10 @@ impl Printer {
         self.totals.miss(missed);
         self.totals.agree(now);
         let line = if self.options.json {
-            let time = crate::time::rfc3339(self.wall.wall_ns(now.taken));
+            let time = rapid_core::time::rfc3339(self.wall.wall_ns(now.taken));
             serde_json::json!({ "event": "missed", "count": missed, "time": time }).to_string()
         } else {
-            let time = crate::time::time_of_day(self.wall.wall_ns(now.taken));
+            let time = rapid_core::time::time_of_day(self.wall.wall_ns(now.taken));
             let palette = self.columns.palette;
             format!(
                 "{}  {}",

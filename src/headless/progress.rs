@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
+use rapid_core::text;
 use serde::Serialize;
 
 use crate::status::rates::Rates;
 use crate::status::{PolicyStatus, SlotState, Snapshot};
-use crate::text;
 
 /// Progress as one line, without a line end: time, mask, policy, the episode, rates of streaming devices.
 pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, duration: Option<Duration>) -> String {
@@ -81,7 +81,7 @@ pub(super) fn json(
     wall_ns: u64,
 ) -> serde_json::Result<String> {
     text::json(&Progress {
-        time: crate::time::rfc3339(wall_ns),
+        time: rapid_core::time::rfc3339(wall_ns),
         elapsed: elapsed.as_secs_f64(),
         duration: duration.map(|duration| duration.as_secs_f64()),
         mask: snapshot.mask.hex(snapshot.devices.len()),

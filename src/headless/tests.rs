@@ -1,13 +1,13 @@
 use std::sync::Mutex;
 
+use rapid_core::interlock::{InputState, StopKind};
+use rapid_core::mask::{PhysicalMask, SizedMask};
+use rapid_core::provenance::{KernelDriver, Negotiated, UnplugSource};
+use rapid_core::sample::Epoch;
 use serde_json::Value;
 
 use super::*;
 use crate::device::UsbIdentity;
-use crate::interlock::{InputState, StopKind};
-use crate::mask::{PhysicalMask, SizedMask};
-use crate::provenance::{KernelDriver, Negotiated, UnplugSource};
-use crate::sample::Epoch;
 use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use crate::status::{
     Chunk, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, StopStatus,

@@ -5,13 +5,13 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::modality::MAX_MODALITIES;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
-use crate::modality::MAX_MODALITIES;
 use crate::palette::Palette;
 use crate::status::{DeviceStatus, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
-use crate::text;
-use crate::time::Stamp;
 
 /// How long each device was present, and which episodes were closed.
 #[derive(Debug)]

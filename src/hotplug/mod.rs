@@ -15,10 +15,10 @@ use std::path::PathBuf;
 use std::pin::Pin;
 
 use futures::Stream;
+use rapid_core::provenance::UnplugSource;
+use rapid_core::time::Stamp;
 
 use crate::device::Attachment;
-use crate::provenance::UnplugSource;
-use crate::time::Stamp;
 
 /// A device was plugged in or unplugged.
 #[derive(Debug, Clone, PartialEq)]

@@ -9,6 +9,7 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use futures::Stream;
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, Sleep, sleep_until};
 
@@ -16,7 +17,6 @@ use super::{HotplugError, HotplugEvent, UnplugSource};
 use crate::device::{Attachment, DeviceNode, Unit};
 use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
 use crate::simulation::{self, SimDevice};
-use crate::time::Stamp;
 
 /// Plays a [`Scenario`] on tokio's clock, from the moment it is created.
 #[derive(Debug)]

@@ -17,15 +17,15 @@ use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
 use futures::Stream;
+use rapid_core::provenance::KernelDriver;
+use rapid_core::time::Stamp;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use udev::{Device, Enumerator, EventType, MonitorBuilder, MonitorSocket};
 
 use super::{HotplugError, HotplugEvent, UnplugSource};
 use crate::device::{Attachment, DeviceNode, UsbIdentity};
-use crate::provenance::KernelDriver;
 use crate::registry::Registry;
-use crate::time::Stamp;
 
 /// Subsystems whose nodes are opened, in addition to USB devices themselves.
 const NODE_SUBSYSTEMS: [&str; 3] = ["video4linux", "tty", "net"];

@@ -5,9 +5,9 @@ use std::os::fd::{AsFd as _, BorrowedFd};
 use std::time::Duration;
 
 use evdev::{Device, EventSummary, InputEvent, KeyCode};
+use rapid_core::text::not_opened;
 
 use crate::registry::KeyInput;
-use crate::text::not_opened;
 
 /// The keys are queried at least this often.
 pub(super) const LOOK: Duration = Duration::from_millis(50);

@@ -10,13 +10,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use rustix::event::{EventfdFlags, eventfd};
 
 use super::watch::{Woken, wait};
 use super::{Report, lost_at_a_panic};
 use crate::registry::{Bound, FieldInput};
-use crate::sample::Encoding;
-use crate::time::Stamp;
 
 /// See the module's comment.
 #[derive(Debug, Clone)]

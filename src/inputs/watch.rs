@@ -6,11 +6,11 @@
 use std::os::fd::{AsFd, OwnedFd};
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::source::Source;
 use super::{Place, Report, lost_at_a_panic};
-use crate::time::Stamp;
 
 /// Time between a loss of a place and its reopening.
 const AGAIN: Duration = Duration::from_millis(500);

@@ -10,13 +10,14 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use rapid_core::interlock::{InputState, Interlocks};
+use rapid_core::permission::Permission;
+use rapid_core::time::Stamp;
+
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
-use crate::interlock::{InputState, Interlocks};
-use crate::permission::Permission;
 use crate::registry::Registry;
 use crate::status::Board;
-use crate::time::Stamp;
 
 /// The stops of a registry, none of which runs.
 pub fn of(registry: &Registry) -> Interlocks {

@@ -3,15 +3,15 @@
 use std::os::fd::OwnedFd;
 use std::time::{Duration, Instant};
 
+use rapid_core::action::{Order, Trip};
+use rapid_core::permission::Attended;
+use rapid_core::sample::Encoding;
 use rustix::fs::OFlags;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
 use super::*;
-use crate::action::{Order, Trip};
 use crate::inputs::{lost_at_a_panic, tap};
 use crate::patience::PATIENCE;
-use crate::permission::Attended;
-use crate::sample::Encoding;
 use crate::status::{Event, StopStatus, What};
 
 const DEVICES: &str = r#"

@@ -5,6 +5,8 @@
 //!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused where that is asked for.
 
+#![forbid(unsafe_code)]
+
 use jpeg_encoder::{ColorType, Encoder, EncodingError};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::errors::DecodeErrors;

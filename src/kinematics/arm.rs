@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use k::SerialChain;
 use k::nalgebra::{DMatrix, DVector, Isometry3, Quaternion, UnitQuaternion};
+use rapid_core::action::NoAction;
 
 use super::chain::{Chain, ChainError, isometry};
-use crate::action::NoAction;
 use crate::registry::{EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, MotorSpec, TipRotation};
 
 /// How near the tip must come to its target: a tenth of what the motors resolve.

@@ -1,14 +1,14 @@
 //! Poses against another computation of them, and targets against poses.
 
 use proptest::prelude::*;
+use rapid_core::action::NoAction::{Length, OutOfReach};
+use rapid_core::rotation;
 
 use super::arm::{NEAR_M, NEAR_RAD};
 use super::*;
-use crate::action::NoAction::{Length, OutOfReach};
 use crate::registry::{
     CanProtocol, CanSpec, DamiaoSpec, EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, NodeSpec, Registry, TipRotation,
 };
-use crate::rotation;
 
 const URDF: &str = include_str!("../../tests/arm/arm.urdf");
 const JOINTS: [&str; 5] = ["waist", "lift", "elbow", "pitch", "roll"];

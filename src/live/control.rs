@@ -11,11 +11,11 @@ use foxglove::websocket::service::{Service, ServiceSchema};
 use foxglove::websocket::{
     AnyClient, GetParametersResponder, Parameter, ParameterHandler, ParameterValue, SetParametersResponder,
 };
+use rapid_core::permission::Permission;
+use rapid_core::time::Stamp;
 use tokio::sync::oneshot;
 
-use crate::permission::Permission;
 use crate::status::session::{Asker, SessionRequest};
-use crate::time::Stamp;
 
 /// What clients may request.
 #[derive(Clone)]

@@ -34,6 +34,7 @@ use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 pub use control::Controls;
+use rapid_core::time::{Stamp, WallClock};
 use topics::Topics;
 
 use crate::bus::{BusError, Queues, Subscription};
@@ -41,7 +42,6 @@ use crate::episode::made::Made;
 use crate::fault;
 use crate::registry::{DeviceSpec, Registry};
 use crate::status::{Board, Event, Level, What};
-use crate::time::{Stamp, WallClock};
 
 /// Port of a Foxglove server, if none is named.
 const PORT: u16 = 8765;

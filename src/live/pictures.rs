@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use crate::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// Pictures of one topic that are sent each second, at most.
 const MOST_HZ: u64 = 30;

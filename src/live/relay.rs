@@ -17,6 +17,8 @@ use std::net::SocketAddr;
 use std::pin::pin;
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use rustix::net::sockopt::{
     set_socket_keepalive, set_socket_send_buffer_size, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl,
 };
@@ -27,8 +29,6 @@ use tokio::time::{Instant, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::{IDLE_TURN, REPORT_EVERY};
-use crate::text;
-use crate::time::Stamp;
 
 /// What waits of one topic for one client: three seconds of the mask, the newest picture of most cameras.
 const TOPIC_BYTES: usize = 64 << 10;

@@ -9,23 +9,23 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use foxglove::{Context, PartialMetadata, RawChannel, Schema as ChannelSchema};
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::mask::{Bits, MASK_TOPIC};
+use rapid_core::modality::MAX_MODALITIES;
+use rapid_core::observation::{OBSERVATION_TOPIC, Observation};
+use rapid_core::sample::SampleHeader;
+use rapid_core::text;
+use rapid_core::time::{Stamp, WallClock};
 
 use super::pictures::Pace;
-use crate::action::ACTION_TOPIC;
 use crate::bus::TopicId;
 use crate::episode::encode::{self, Announced, logged};
 use crate::episode::form::{Derived, TRANSFORM_TOPIC};
 use crate::episode::made::{Made, MadeKind};
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, channel};
-use crate::mask::{Bits, MASK_TOPIC};
-use crate::modality::MAX_MODALITIES;
-use crate::observation::{OBSERVATION_TOPIC, Observation};
 use crate::registry::{DeviceSpec, Form, Registry};
-use crate::sample::SampleHeader;
 use crate::status::Event;
-use crate::text;
-use crate::time::{Stamp, WallClock};
 
 /// Time between two messages about where a sensor sits.
 const PLACES_EVERY: Duration = Duration::from_secs(1);

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use rapid_core::time::{Stamp, WallClock};
+
 use super::{Lockstep, TrialError};
 use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
@@ -9,7 +11,6 @@ use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
 use crate::simulation::task::{Expert, Outcome, Size, Texture, Touch, UNSEEN_PERIOD, World};
 use crate::status::Board;
-use crate::time::{Stamp, WallClock};
 
 /// How far the gripper misses during a demonstration, so that demonstrations show corrections.
 const SHAKE: f64 = 0.006;

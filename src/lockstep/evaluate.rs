@@ -5,13 +5,15 @@
 
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
 use super::timing::Timing;
 use super::{Lockstep, STEP, Taker, TrialError};
 use crate::bus::TopicId;
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
 use crate::policy::bundle::Bundle;
 use crate::policy::horizon::{Counts, WithoutMask};
 use crate::policy::model::{AnswerError, Model};
@@ -22,10 +24,8 @@ use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::scenario::{Scenario, ScenarioAction};
 use crate::registry::{Registry, task};
-use crate::sample::SampleHeader;
 use crate::simulation::task::{AXES, Outcome, Size, Texture, Touch, UNSEEN_PERIOD};
 use crate::status::Event;
-use crate::time::Stamp;
 
 /// The random stream of a trial's seed that determines when cables are unplugged.
 const WINDOWS: u64 = 0x7769_6e64_6f77;
@@ -486,8 +486,9 @@ pub fn robot_time(steps: u64) -> Duration {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::Bits;
+
     use super::*;
-    use crate::mask::Bits;
     use crate::policy::bundle::example;
 
     #[test]

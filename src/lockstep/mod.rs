@@ -13,23 +13,24 @@ pub mod timing;
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use rapid_core::mask::{PhysicalMask, SizedMask};
+use rapid_core::modality::ModalityId;
+use rapid_core::provenance::Negotiated;
+use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
+use rapid_core::time::{Stamp, nanoseconds};
+
 use crate::bus::TopicId;
 use crate::device::{Attachment, DeviceNode};
 use crate::driver::DriverError;
 use crate::hotplug::script::Timeline;
-use crate::mask::{PhysicalMask, SizedMask};
-use crate::modality::ModalityId;
-use crate::provenance::Negotiated;
 use crate::record::RecordError;
 use crate::record::stepped::Taker;
 use crate::registry::scenario::{Scenario, ScenarioAction};
 use crate::registry::{DeviceSpec, Registry};
 use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
-use crate::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
 use crate::simulation::task::{self, AXES, AXIS_COUNT, STEP_HZ, SharedTrial};
 use crate::simulation::{SimSource, TaskPart};
 use crate::status::{Event, Provenance, SlotState, What};
-use crate::time::{Stamp, nanoseconds};
 use timing::Timing;
 
 /// Publication period of the mask (paper, appendix "Physical Mask Data Format": 500 Hz).

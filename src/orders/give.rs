@@ -6,15 +6,15 @@ use std::os::unix::fs::MetadataExt as _;
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
+use rapid_core::action::Order;
+use rapid_core::text::{plain, unanswered};
+use rapid_core::time::Stamp;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket_with};
 use serde::Serialize;
 
 use super::{Answer, DONE, LONGEST, LONGEST_ANSWER, instance_part, line, this_user};
-use crate::action::Order;
 use crate::peer::{Peer, ProcessState};
 use crate::status::attach::ATTACH;
-use crate::text::{plain, unanswered};
-use crate::time::Stamp;
 
 /// A run answers within milliseconds; a stopped process does not.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);

@@ -18,7 +18,7 @@
 //! (`--group-control`), and of no one else. They are given to a run of this user, or else to one whose group the sender
 //! is a member of, or by root to anyone's.
 //! Invariant: an arm counts only while its sender waits for the answer, and within a second: see
-//! [`Permission`](crate::permission::Permission). A disarm counts however late it arrives.
+//! [`Permission`](rapid_core::permission::Permission). A disarm counts however late it arrives.
 
 pub mod give;
 pub mod receive;
@@ -27,10 +27,9 @@ use std::io;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::SocketAddr;
 
+use rapid_core::action::Order;
+use rapid_core::time::Stamp;
 use serde::{Deserialize, Serialize};
-
-use crate::action::Order;
-use crate::time::Stamp;
 
 /// Longest line: a text of 2000 bytes, each of them escaped.
 const LONGEST: usize = 16_384;

@@ -12,18 +12,18 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_core::action::Order;
+use rapid_core::permission::Permission;
+use rapid_core::time::Stamp;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use tokio::sync::mpsc::Sender;
 use tokio::sync::mpsc::error::TrySendError;
 
 use super::{Answer, DONE, LONGEST, address, name, order, this_user};
-use crate::action::Order;
 use crate::peer::Peer;
-use crate::permission::Permission;
 use crate::status::RegistryRequest;
 use crate::status::attach::ATTACH;
 use crate::status::session::SessionRequest;
-use crate::time::Stamp;
 
 /// Connections at a time; beyond that the oldest is closed.
 const CONNECTIONS: usize = 16;

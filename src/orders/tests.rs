@@ -4,13 +4,13 @@ use std::io::{Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 
+use rapid_core::permission::{Attended, Permission};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, listen, socket_with};
 use tokio::sync::mpsc::{Receiver, channel};
 
 use super::give::{GiveError, attach, give, request};
 use super::receive::{Arrival, Asked, Orders, Wanted};
 use super::*;
-use crate::permission::{Attended, Permission};
 use crate::status::RegistryRequest;
 use crate::status::session::SessionRequest;
 use Order::{Arm, Disarm};

@@ -5,11 +5,12 @@ mod rows;
 
 use std::fmt::Write;
 
+use rapid_core::text;
+
 use super::gather::Timeline;
 use super::svg::{Anchor, Px, Svg};
 use crate::record::inspect::Inspection;
 use crate::status::session::EpisodeEntry;
-use crate::text;
 
 /// Width of the picture, and the margin around what it shows.
 const WIDTH: f64 = 1180.0;

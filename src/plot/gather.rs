@@ -5,12 +5,13 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+
 use super::thumbnail::{Thumbnail, Thumbnails};
-use crate::action::ACTION_TOPIC;
 use crate::episode::decode::{Content, FrameSlot, Kind, Scratch};
 use crate::episode::reader::{Channel, Item, Message};
 use crate::episode::schema::SampleSchema;
-use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::pixels::Picture;
 use crate::record::inspect::{Inspection, Numbers};
 

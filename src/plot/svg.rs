@@ -4,7 +4,7 @@
 
 use std::fmt::{self, Display, Write};
 
-use crate::text;
+use rapid_core::text;
 
 /// A document that grows.
 #[derive(Debug, Default)]

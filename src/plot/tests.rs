@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use proptest::prelude::*;
+use rapid_core::modality::ModalityId;
 use roxmltree::Document;
 
 use super::gather::{BINS, Mark, PICTURES, Row, Subject};
 use super::thumbnail::Thumbnail;
 use super::*;
 use crate::episode::testing;
-use crate::modality::ModalityId;
 use crate::record::inspect::{MaskEdge, ModalityReport, TopicReport};
 use crate::status::session::Label;
 use crate::status::{Grade, Verdict};

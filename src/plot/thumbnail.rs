@@ -86,8 +86,9 @@ fn mean(pixels: &[u8], from: [usize; 2], to: [usize; 2]) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::sample::Encoding;
+
     use super::*;
-    use crate::sample::Encoding;
 
     #[test]
     fn a_thumbnail_has_the_shape_and_the_shades_of_its_picture() {

@@ -18,11 +18,12 @@
 
 use std::ops::Range;
 
+use rapid_core::rotation::{self, Quaternion};
+use rapid_core::sample::Encoding;
+
 use super::bundle::{ActionRotation, BasePose, Bundle, POSITION, QUATERNION, Representation};
 use super::horizon::ChunkError;
 use super::request::{Cell, Request};
-use crate::rotation::{self, Quaternion};
-use crate::sample::Encoding;
 
 /// See the module's comment.
 #[derive(Debug)]

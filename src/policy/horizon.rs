@@ -29,11 +29,11 @@
 
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
 use serde::Serialize;
 
 use super::bundle::{Bundle, ObservationInput, ObservationSpec};
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
 use crate::registry::Registry;
 
 /// What a policy that was not trained with absent modalities does when an optional one disappears.

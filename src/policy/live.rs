@@ -18,6 +18,8 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::Stamp;
 use tokio_util::sync::CancellationToken;
 
 use super::bundle::Bundle;
@@ -28,9 +30,7 @@ use super::request::{Cell, Request};
 use crate::bus::{Inbox, Writer};
 use crate::fault;
 use crate::registry::Registry;
-use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Board, Hold, Level, PolicyEnd, PolicyStatus, What};
-use crate::time::Stamp;
 
 /// Nice value of the computing thread; all others have 0.
 const NICE: i32 = 5;

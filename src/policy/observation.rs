@@ -4,9 +4,10 @@
 //! Invariant: an absent modality is zeros after normalisation, and its element of the mask is 0.
 //! Invariant: a step of a history without a sample is zeros after normalisation, and its element of `valid` is 0.
 
+use rapid_core::rotation;
+
 use super::bundle::{Bundle, ObservationInput, ObservationSpec, VectorRotation, VectorSpec};
 use super::normalize::Normalizer;
-use crate::rotation;
 
 /// Why the numbers of a sample cannot be an observation.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -14,14 +14,15 @@
 
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Epoch, FLAG_ERROR, SampleHeader};
+use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
+use rapid_core::time::Stamp;
+
 use super::bundle::{Bundle, WhenAbsent};
 use super::request::Request;
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
-use crate::registry::{Registry, WhenStale};
-use crate::sample::{Epoch, FLAG_ERROR, SampleHeader};
-use crate::sync::{SyncModality, SyncSample, Synchronizer};
-use crate::time::Stamp;
+use crate::registry::Registry;
 
 /// See the module's comment.
 #[derive(Debug)]

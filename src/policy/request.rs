@@ -4,12 +4,13 @@
 //!
 //! Invariant: nothing here allocates once its cells have grown to the largest samples.
 
+use rapid_core::mask::{PhysicalMask, SizedMask};
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::Stamp;
+
 use super::bundle::{Bundle, ObservationSpec};
 use super::horizon::ChunkError;
-use crate::mask::{PhysicalMask, SizedMask};
-use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Chunk, ObservedSamples, ReferenceSample, What};
-use crate::time::Stamp;
 
 /// The samples of the steps of each observation, and what was present at the last of them.
 #[derive(Debug, Clone, Default)]

@@ -4,6 +4,8 @@
 //! The generator is PCG XSL 128/64 (O'Neill 2014), whose output its crate guarantees to keep. Streams of
 //! one seed do not overlap: drawing more numbers from one does not affect another.
 
+#![forbid(unsafe_code)]
+
 use rand_distr::{Distribution, StandardNormal, StandardUniform};
 use rand_pcg::Pcg64;
 

@@ -4,11 +4,12 @@
 
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::{Stamp, nanoseconds};
+
 use super::quality::{Measures, Meter};
 use crate::registry::{DeviceSpec, Limits, Registry};
 use crate::status::{Board, Level, What};
-use crate::text;
-use crate::time::{Stamp, nanoseconds};
 
 /// Shortest time between announcements of a modality.
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::{text, time};
 use rustix::fs::{Mode, OFlags};
 use serde::Serialize;
 
@@ -18,7 +19,6 @@ use crate::episode::Failed;
 use crate::episode::partial::{self, Lock, PARTIAL, TRASH, rename};
 use crate::folder::{Folder, FolderError, Links, Missing};
 use crate::status::{Board, Level, Verdict, What};
-use crate::{text, time};
 
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
 /// bytes a file name may have.

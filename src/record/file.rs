@@ -14,9 +14,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use mcap::Attachment;
 use mcap::records::MessageHeader;
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::mask::{Bits, MASK_TOPIC};
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::observation::Observation;
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::{Stamp, WallClock};
 
 use super::guard::Guard;
-use crate::action::ACTION_TOPIC;
 use crate::episode::channel;
 use crate::episode::chunk_writer::{self, ChunkWriter, Sink, io_error};
 use crate::episode::encode::{self, EventText};
@@ -26,13 +31,8 @@ use crate::episode::own::EpisodeId;
 use crate::episode::reference;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
-use crate::mask::{Bits, MASK_TOPIC};
-use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::observation::Observation;
 use crate::registry::{Form, ModuleSpec, Registry, TransformSpec};
-use crate::sample::SampleHeader;
 use crate::status::{Level, ReferenceSample};
-use crate::time::{Stamp, WallClock};
 
 /// See the module's comment.
 pub(super) struct EpisodeFile {

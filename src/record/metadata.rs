@@ -3,6 +3,8 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::time::{Stamp, WallClock, nanoseconds};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
@@ -11,10 +13,8 @@ use super::publishers;
 use super::quality::{Quality, Spread};
 use super::verdict::Facts;
 use crate::episode::{self, BOOT_ID, text_map};
-use crate::mask::PhysicalMask;
-use crate::registry::{ModuleSpec, Registry, WhenStale};
+use crate::registry::{ModuleSpec, Registry};
 use crate::status::Verdict;
-use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// Key of the record at the end: why the episode is not whole.
 pub(super) const CUT_SHORT: &str = "cut_short";
@@ -46,13 +46,9 @@ pub(super) fn beginning(
         .iter()
         .map(|device| {
             let modality = device.modality();
-            let when_stale = match device.when_stale {
-                WhenStale::Hold => "hold",
-                WhenStale::Zero => "zero",
-            };
             json!({
                 "name": device.name, "bit": device.id.bit(), "topic": device.topic,
-                "kind": modality.kind, "shape": modality.shape, "when_stale": when_stale,
+                "kind": modality.kind, "shape": modality.shape, "when_stale": device.when_stale.word(),
                 "latency_ns": nanoseconds(device.latency),
             })
         })

@@ -38,7 +38,7 @@ pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderAddition, RecorderConfig, Source};
 pub use space::Asker;
 
-use crate::text;
+use rapid_core::text;
 
 /// Why an episode cannot be recorded.
 #[derive(Debug, thiserror::Error)]

@@ -22,6 +22,12 @@ use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::mask::{Bits, PhysicalMask};
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
+use rapid_core::sync::{Grid, SyncSample, Synchronizer};
+use rapid_core::time::{Stamp, WallClock};
+
 use super::announce::{Announced, look};
 use super::episode_path::{self, EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::EpisodeFile;
@@ -36,13 +42,8 @@ use super::writeback::Writeback;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::encode::{Announced as Report, logged};
 use crate::episode::made::Shown;
-use crate::mask::{Bits, PhysicalMask};
-use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::{DeviceSpec, ModuleSpec, Registry};
-use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Event, Level, Outlook, RecordingStatus, What};
-use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
-use crate::time::{Stamp, WallClock};
 
 /// Samples of a modality that may arrive while a full queue is being written.
 const RING_SLACK: usize = 1024;
@@ -152,7 +153,7 @@ impl OpenEpisode {
         // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
         let kept = |device: &DeviceSpec| device.depth.saturating_add(RING_SLACK);
-        let modalities: Vec<_> = registry.devices.iter().map(|device| SyncModality::of(device, kept(device))).collect();
+        let modalities: Vec<_> = registry.devices.iter().map(|device| device.synchronised(kept(device))).collect();
         let writeback = Writeback::start(Arc::clone(&path.file), &path.folder);
         Ok(Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),

@@ -7,11 +7,11 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::time::Stamp;
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::status::{Event, Provenance, SlotState, What};
-use crate::time::Stamp;
 
 /// Serial of every device attached, by its modality's name.
 type Serials = BTreeMap<String, Option<String>>;
@@ -135,12 +135,13 @@ const fn has_ended(state: SlotState) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::SizedMask;
+    use rapid_core::modality::ModalityId;
+    use rapid_core::provenance::Negotiated;
+    use rapid_core::sample::Epoch;
+
     use super::*;
     use crate::device::UsbIdentity;
-    use crate::mask::SizedMask;
-    use crate::modality::ModalityId;
-    use crate::provenance::Negotiated;
-    use crate::sample::Epoch;
     use crate::status::PolicyEnd;
 
     const BEGIN: Stamp = Stamp(10_000_000_000);

@@ -7,11 +7,11 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::text;
 use serde::{Deserialize, Serialize};
 
 use crate::bus::Foreign;
 use crate::status::What;
-use crate::text;
 
 /// Key of the metadata record at the end: JSON, a list of [`Publisher`].
 pub(super) const KEY: &str = "publishers";

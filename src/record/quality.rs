@@ -15,14 +15,14 @@ use std::hash::{DefaultHasher, Hasher};
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::sync::Grid;
+use rapid_core::time::{Stamp, nanoseconds};
 use serde::Serialize;
 
 use self::presence::{Plugged, PresenceHistory};
-use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::{DeviceSpec, Registry, VerdictSpec};
-use crate::sync::Grid;
-use crate::time::{Stamp, nanoseconds};
 
 /// Room for intervals without a sample, or between equal ones, until the mask of their time is known. A reader that is
 /// further behind waits for a stalled disk, and may allocate.

@@ -21,6 +21,8 @@ use std::sync::mpsc::{self, Receiver, Sender, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::{ClockWatch, Stamp, WallClock};
 use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
 use tokio::sync::{oneshot, watch};
 use tokio_util::sync::CancellationToken;
@@ -39,9 +41,7 @@ use crate::episode::made::Shown;
 use crate::episode::partial::PARTIAL;
 use crate::fault;
 use crate::registry::Registry;
-use crate::sample::SampleHeader;
 use crate::status::{Board, Episode, EpisodeWatch, Event, Level, RecordingStatus, What};
-use crate::time::{ClockWatch, Stamp, WallClock};
 
 /// Longest wait for samples, which delays a command, an event or a due frame.
 const TURN: Duration = Duration::from_millis(20);

@@ -18,13 +18,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use rustix::fs::{FallocateFlags, fallocate, fstat, ftruncate};
 use rustix::io::Errno;
 
 use super::RecordError;
 use crate::disk::Disk;
-use crate::text;
-use crate::time::Stamp;
 
 /// Time left below which it is reported.
 const WARN_LEFT: Duration = Duration::from_mins(5);

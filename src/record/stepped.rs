@@ -5,6 +5,9 @@
 
 use std::sync::Arc;
 
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::{Stamp, WallClock};
+
 use super::RecordError;
 use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::open_episode::{Beginning, OpenEpisode};
@@ -13,9 +16,7 @@ use super::streams::Streams;
 use crate::bus::TopicId;
 use crate::episode::chunk_writer::Sink;
 use crate::registry::Registry;
-use crate::sample::SampleHeader;
 use crate::status::{Board, Event};
-use crate::time::{Stamp, WallClock};
 
 /// Who sees what a rig sends, in the order of time.
 pub trait Taker {

@@ -2,12 +2,13 @@
 
 use std::collections::VecDeque;
 
+use rapid_core::mask::Bits;
+use rapid_core::modality::MAX_MODALITIES;
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::Stamp;
+
 use super::open_episode::OpenEpisode;
 use crate::bus::TopicId;
-use crate::mask::Bits;
-use crate::modality::MAX_MODALITIES;
-use crate::sample::SampleHeader;
-use crate::time::Stamp;
 
 /// What is kept of all samples, recording or not.
 pub(super) struct Streams {

@@ -15,16 +15,16 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage, Value};
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
+use rapid_core::time::Stamp;
 
 use super::*;
 use crate::bus::TopicId;
 use crate::device::UsbIdentity;
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
 use crate::registry::Registry;
-use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Grade, Level, What};
-use crate::time::Stamp;
 
 const MS: u64 = 1_000_000;
 const CAM: u8 = 0;

@@ -10,13 +10,14 @@ pub mod settings;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use rapid_core::text;
+
 use crate::device::{Attachment, DeviceNode};
 use crate::driver::camera::query;
 use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::registry::candidate::{Candidate, unregistered};
 use crate::registry::edit::{self, EditError, NewEntry, Setting};
 use crate::registry::{Loaded, Registry, RegistryErrors, name_problem, read_file};
-use crate::text;
 
 /// Why the file was not written.
 #[derive(Debug, thiserror::Error)]
@@ -207,11 +208,12 @@ pub fn free_bit(registry: Option<&Registry>, besides: &[u8]) -> Option<u8> {
 mod tests {
     use std::sync::Arc;
 
+    use rapid_core::time::Stamp;
+
     use super::*;
     use crate::device::{Unit, UsbIdentity};
     use crate::registry::BUILTIN;
     use crate::simulation::{SimDevice, SimSource};
-    use crate::time::Stamp;
 
     #[test]
     fn a_registry_that_was_made_read_only_is_not_replaced() {

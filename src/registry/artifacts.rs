@@ -14,8 +14,9 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
+use rapid_core::modality::ModalityKind;
+
 use super::spec::{CanAdapter, CanProtocol, CanSpec, DeviceSpec, IdentitySpec, InputSpec, NodeSpec, Opens, Registry};
-use crate::modality::ModalityKind;
 
 /// First line of every generated file but the layout, which is JSON: a file that begins otherwise must not be removed.
 pub const HEADER: &str = "# Written by `rapid artifacts` from devices.toml: change that file and run it again.";

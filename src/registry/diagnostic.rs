@@ -5,9 +5,8 @@
 
 use std::fmt;
 
+use rapid_core::text::escaped;
 use serde::Serialize;
-
-use crate::text::escaped;
 
 /// One problem of a configuration or scenario file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]

@@ -22,9 +22,10 @@
 use std::collections::VecDeque;
 use std::path::Path;
 
+use rapid_core::modality::ModalityId;
+
 use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, PixelFormat, Registry};
 use crate::device::{Attachment, DeviceNode, Unit, UsbIdentity};
-use crate::modality::ModalityId;
 use crate::simulation::{SimSource, TaskPart};
 
 /// The result of matching an attached node.

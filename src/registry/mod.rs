@@ -38,5 +38,5 @@ pub use spec::{
     Mount, Mounting, NodeSpec, Opens, POOL_SPARE, POSE_ENDING, PREVIEW_DECODER, Parse, PhoneStream, PixelFormat,
     PointsSpec, PoseLayout, PoseSpec, Probe, ProcessSpec, Provider, Quantity, Registry, RemoteSamples, RigSpec,
     SLCAN_BITRATES, SerialSpec, Stop, StopSpec, TipForm, TipRotation, TransformSpec, UsbSpec, VerdictSpec, WatchSpec,
-    WhenStale, mounted, own_side,
+    mounted, own_side,
 };

@@ -24,6 +24,8 @@ mod verdict;
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
 use super::section::{Section, file_label, read, read_file};
 use super::spec::{
@@ -32,7 +34,6 @@ use super::spec::{
 };
 use super::trust::distrust;
 use super::units::{show_duration, show_size};
-use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
 use program::Programs;
 use verdict::Whose;

@@ -12,13 +12,14 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_core::modality::ModalityKind;
+
 use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::is_port;
 use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
 use super::section::{Section, file_label, read, read_file};
 use super::spec::{DeviceSpec, LanPicture, NodeSpec, Registry};
 use crate::device::{LanIdentity, UsbIdentity};
-use crate::modality::ModalityKind;
 use crate::simulation::{SimFaults, SimSource};
 
 const DEVICE_KEYS: [&str; 14] = [

@@ -18,11 +18,10 @@ use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use rapid_core::modality::{Modality, ModalityId, ModalityKind};
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::sync::{SyncModality, WhenStale};
 use serde::Serialize;
-
-use crate::modality::{Modality, ModalityId, ModalityKind};
-use crate::points::PacketFormat;
-use crate::sample::{Encoding, SampleHeader};
 
 pub use export::ExportSpec;
 pub use form::{CalibrationSpec, Form, JointsSpec, POSE_ENDING, PointsSpec, PoseLayout, PoseSpec, Quantity, TipForm};
@@ -331,20 +330,15 @@ pub enum Mount {
     Bottom,
 }
 
-/// What an observation holds for an attached modality without a sample in the window.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum WhenStale {
-    /// The newest sample with its age.
-    #[default]
-    Hold,
-    /// Nothing.
-    Zero,
-}
-
 impl DeviceSpec {
     /// The modality that this device provides.
     pub fn modality(&self) -> Modality {
         Modality { name: self.name.clone(), kind: self.node.modality_kind(), shape: self.node.shape() }
+    }
+
+    /// The same as the synchroniser needs to know it; `capacity` samples of it are kept.
+    pub const fn synchronised(&self, capacity: usize) -> SyncModality {
+        SyncModality { id: self.id, when_stale: self.when_stale, latency: self.latency, capacity }
     }
 }
 
@@ -520,31 +514,7 @@ impl CanSpec {
     }
 }
 
-/// Gives a type the words for its values: a table for the parser, the word of a value, and `Display` with that word.
-macro_rules! words {
-    ($($(#[$doc:meta])* $type:ident, $count:literal: $($word:literal = $value:ident),+ $(; $more:literal = $other:ident)?;)+) => {$(
-        impl $type {
-            $(#[$doc])*
-            pub const WORDS: [(&str, Self); $count] = [$(($word, Self::$value)),+];
-
-            /// The word for it.
-            pub const fn word(self) -> &'static str {
-                match self {
-                    $(Self::$value => $word,)+
-                    $(Self::$other => $more,)?
-                }
-            }
-        }
-
-        impl fmt::Display for $type {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str(self.word())
-            }
-        }
-    )+};
-}
-
-words! {
+rapid_core::words! {
     /// Every format and its V4L2 name.
     PixelFormat, 4: "MJPG" = Mjpg, "YUYV" = Yuyv, "GREY" = Grey, "Z16" = Z16;
     /// Every kind of content and its name.
@@ -561,10 +531,6 @@ words! {
     PoseLayout, 3: "columns" = Columns, "rows" = Rows, "quaternion" = Quaternion;
     /// Everything that a joint's number may be, and its name.
     Quantity, 4: "position" = Position, "velocity" = Velocity, "effort" = Effort, "other" = Other;
-    /// Every format of a LiDAR's packets and its name.
-    PacketFormat, 2: "velodyne" = Velodyne, "livox" = Livox;
-    /// Every policy and its name.
-    WhenStale, 2: "hold" = Hold, "zero" = Zero;
 }
 
 /// What the samples of a program may hold.
@@ -641,7 +607,6 @@ mod tests {
         assert_eq!(parses, ["csv", "json", "f32le", "raw"]);
         let mounts = [Mount::Front, Mount::Tip, Mount::Top, Mount::Bottom].map(|mount| mount.to_string());
         assert_eq!(mounts, ["front", "tip", "top", "bottom"]);
-        assert_eq!([WhenStale::Hold, WhenStale::Zero].map(|stale| stale.to_string()), ["hold", "zero"]);
         assert_eq!(Framing::Fixed(12).to_string(), "fixed 12");
     }
 }

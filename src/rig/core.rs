@@ -13,16 +13,17 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::mask::{Bits, PhysicalMask};
+use rapid_core::modality::ModalityId;
+use rapid_core::provenance::UnplugSource;
+use rapid_core::sample::Epoch;
+use rapid_core::time::Stamp;
+
 use super::slot::{self, End, Slot};
 use crate::device::{Attachment, Unit};
 use crate::hotplug::HotplugEvent;
-use crate::mask::{Bits, PhysicalMask};
-use crate::modality::ModalityId;
-use crate::provenance::UnplugSource;
 use crate::registry::{Assigner, Assignment, DeviceSpec, Registry};
-use crate::sample::Epoch;
 use crate::status::SlotState;
-use crate::time::Stamp;
 
 /// What happens to a rig.
 #[derive(Debug, Clone, PartialEq)]

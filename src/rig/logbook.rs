@@ -17,13 +17,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time;
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
 use crate::folder::state_directory;
 use crate::status::{Board, Level, What};
-use crate::text;
-use crate::time;
 
 /// Size in bytes at which a new file is started.
 const LARGEST: u64 = 1 << 20;

@@ -22,12 +22,12 @@ pub use owner::Rig;
 
 use std::sync::Arc;
 
+use rapid_core::modality::ModalityId;
 use tokio::sync::oneshot;
 
 use crate::bus::Writer;
 use crate::device::Attachment;
 use crate::hotplug::HotplugError;
-use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, Registry};
 use presence::PresenceError;
 

@@ -7,14 +7,14 @@ use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use tokio::net::unix::pipe::Receiver;
 use tokio::time::sleep;
 
 use super::logbook::Logbook;
 use super::programs::Programs;
 use crate::status::{Board, Level, PrintedOn, What};
-use crate::text;
-use crate::time::Stamp;
 
 /// Maximum bytes of a line; longer ones are cut.
 const LONGEST: usize = 1000;

@@ -8,6 +8,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
+use rapid_core::action::{ActuatorNotice, Arming};
+use rapid_core::mask::SizedMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::permission::Permission;
+use rapid_core::sample::Epoch;
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
@@ -21,20 +27,14 @@ use super::slot::End;
 use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
 use super::worker::Seat;
 use super::{Addition, RigCommand, RigError};
-use crate::action::{ActuatorNotice, Arming};
 use crate::bus::{Bus, TopicId, Writer};
 use crate::device::Attachment;
 use crate::driver::{ClockOffset, DriverError};
 use crate::hotplug::HotplugStream;
 use crate::inputs::tap::Tap;
-use crate::mask::SizedMask;
-use crate::modality::ModalityId;
-use crate::permission::Permission;
 use crate::registry::candidate::{Candidate, unregistered};
 use crate::registry::{DeviceSpec, Registry};
-use crate::sample::Epoch;
 use crate::status::{Board, EpisodeWatch, Level, SlotState, UnregisteredDevice, What};
-use crate::time::Stamp;
 
 /// The JSON file is written this often, and at every change.
 const JSON_PERIOD: Duration = Duration::from_secs(1);

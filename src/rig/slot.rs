@@ -19,9 +19,10 @@
 
 use std::time::Duration;
 
-use crate::sample::Epoch;
+use rapid_core::sample::Epoch;
+use rapid_core::time::Stamp;
+
 use crate::status::SlotState;
-use crate::time::Stamp;
 
 /// A stream that ends while its device is attached is restarted this many times...
 const MAX_RESTARTS: usize = 5;

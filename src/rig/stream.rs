@@ -11,6 +11,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use rapid_core::action::ActuatorNotice;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_core::time::{Stamp, nanoseconds};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
@@ -18,17 +22,13 @@ use tokio_util::sync::CancellationToken;
 use super::core::StreamEvent;
 use super::slot::End;
 use super::worker::Seat;
-use crate::action::ActuatorNotice;
 use crate::bus::Writer;
 use crate::device::Attachment;
 use crate::driver::{ClockOffset, Driver, DriverError, Reading};
 use crate::fault;
 use crate::inputs::tap::{Tap, lost_at_the_end};
-use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, NodeSpec};
-use crate::sample::{Epoch, SampleHeader};
 use crate::status::{Board, EpisodeWatch, Provenance};
-use crate::time::{Stamp, nanoseconds};
 
 /// A device that does not open within this time is retried.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);

@@ -13,6 +13,8 @@ mod keeper;
 
 use std::sync::Arc;
 
+use rapid_core::sample::Epoch;
+use rapid_core::time::Stamp;
 use tokio::sync::{Mutex, oneshot};
 use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
@@ -23,9 +25,7 @@ use crate::device::Attachment;
 use crate::driver::process::Launch;
 use crate::driver::{DriverError, Reading};
 use crate::registry::{DeviceSpec, ProcessSpec};
-use crate::sample::Epoch;
 use crate::status::{Board, Level, What};
-use crate::time::Stamp;
 use intake::{Intake, Judged};
 use keeper::Keeper;
 pub(super) use keeper::{TERM_LIMIT, describe};

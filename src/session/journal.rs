@@ -12,12 +12,12 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::time::{realtime_ns, rfc3339};
 use serde::{Deserialize, Serialize};
 
 use super::trash;
 use crate::folder::{self, Folder, Links, Missing, Sync};
 use crate::status::session::EpisodeEntry;
-use crate::time::{realtime_ns, rfc3339};
 
 /// The name of the file of a session in progress.
 const CURRENT: &str = "session.toml";

@@ -15,10 +15,11 @@ pub mod trash;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::Stamp;
+
 use crate::status::session::{EpisodeEntry, Label, Mark, Phase, SessionRequest, SessionStatus};
 use crate::status::{Grade, Verdict};
-use crate::text;
-use crate::time::Stamp;
 use journal::{Plan, SessionFile};
 
 /// Episodes that a screen lists.

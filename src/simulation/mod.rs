@@ -12,9 +12,10 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use rapid_core::provenance::KernelDriver;
+use rapid_core::time::Stamp;
+
 use self::task::SharedTrial;
-use crate::provenance::KernelDriver;
-use crate::time::Stamp;
 
 /// Faults of a simulated device while it is plugged in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -12,11 +12,11 @@ use std::collections::VecDeque;
 use std::io::{self, BufRead, Read};
 use std::sync::Arc;
 
+use rapid_core::text::unanswered;
 use serde::{Deserialize, Serialize};
 
 use super::preview::Preview;
 use super::{LogLine, Snapshot};
-use crate::text::unanswered;
 
 /// Changes when the messages do.
 pub const PROTOCOL: u32 = 1;
@@ -54,7 +54,7 @@ pub struct Encoder {
     /// Number of the next line of the log that was not sent.
     next_line: u64,
     /// Of each preview sent, its device and sequence number.
-    previews: Vec<(crate::modality::ModalityId, u64)>,
+    previews: Vec<(rapid_core::modality::ModalityId, u64)>,
 }
 
 impl Encoder {
@@ -169,10 +169,11 @@ impl Decoder {
 mod tests {
     use std::io::Cursor;
 
+    use rapid_core::sample::Encoding;
+
     use super::super::literal::{device, every_state, line, policy, recording, snapshot};
     use super::super::{Level, SlotState};
     use super::*;
-    use crate::sample::Encoding;
 
     fn preview(bit: u8, seq: u64) -> Arc<Preview> {
         let device = super::super::literal::id(bit);

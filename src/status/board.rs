@@ -11,6 +11,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use rapid_core::interlock::InputState;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
+use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_core::text;
+use rapid_core::time::{Stamp, realtime_ns};
 use tokio::sync::broadcast;
 
 use super::detail::{DeviceDetail, Intervals, StaticDetail};
@@ -20,13 +26,7 @@ use super::{
     DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance, RecordingStatus, SlotState,
     Snapshot, StopStatus, UnregisteredDevice, Verdict, What,
 };
-use crate::interlock::InputState;
-use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use crate::registry::{DeviceSpec, InterlockSpec, Registry};
-use crate::sample::{Epoch, SampleHeader};
-use crate::text;
-use crate::time::{Stamp, realtime_ns};
 
 /// Log lines kept for the screen.
 const LOG_LINES: usize = 2000;

@@ -5,9 +5,9 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use rapid_core::modality::ModalityId;
 use serde::{Deserialize, Serialize};
 
-use crate::modality::ModalityId;
 use crate::registry::{CanProtocol, DeviceSpec, MOTOR_CHANNELS, NodeSpec};
 use crate::status::Provenance;
 

@@ -4,17 +4,17 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use rapid_core::action::Arming;
+use rapid_core::mask::SizedMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::provenance::{KernelDriver, Negotiated, UnplugSource};
+use rapid_core::sample::Epoch;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
 use super::{Chunk, Grade, Hold, Level, PolicyEnd, PrintedOn, SlotState, StopStatus, Verdict};
-use crate::action::Arming;
 use crate::device::Unit;
-use crate::mask::SizedMask;
-use crate::modality::ModalityId;
-use crate::provenance::{KernelDriver, Negotiated, UnplugSource};
-use crate::sample::Epoch;
-use crate::text;
-use crate::time::Stamp;
 
 /// A state change with its time. As JSON, one object: `{"event":"state","device":...}`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -483,9 +483,10 @@ fn describe_chunk(chunk: &Chunk) -> Description {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::{PhysicalMask, SizedMask};
+    use rapid_core::provenance::UnplugSource;
+
     use super::*;
-    use crate::mask::{PhysicalMask, SizedMask};
-    use crate::provenance::UnplugSource;
     use crate::status::SlotState;
 
     #[test]

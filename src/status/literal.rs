@@ -4,14 +4,14 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::Epoch;
+use rapid_core::sync::WhenStale;
+use rapid_core::time::Stamp;
+
 use super::{Board, DeviceStatus, Level, LogLine, Outlook, PolicyStatus, RecordingStatus, SlotState, Snapshot};
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
-use crate::registry::{
-    CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
-};
-use crate::sample::Epoch;
-use crate::time::Stamp;
+use crate::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
 
 /// Moment of the snapshots: 754 s after the boot.
 pub(crate) const TAKEN: Stamp = Stamp(754_000_000_000);
@@ -167,7 +167,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         action: None,
         hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(
-            crate::modality::ModalityKind::Image,
+            rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),
         ),

@@ -18,15 +18,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::interlock::{InputState, StopKind};
+use rapid_core::mask::{PhysicalMask, SizedMask};
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::Epoch;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tokio::sync::{SetOnce, watch};
-
-use crate::interlock::{InputState, StopKind};
-use crate::mask::{PhysicalMask, SizedMask};
-use crate::modality::ModalityId;
-use crate::sample::Epoch;
-use crate::text;
-use crate::time::Stamp;
 
 use detail::DeviceDetail;
 use preview::Preview;

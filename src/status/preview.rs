@@ -8,11 +8,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::Stamp;
 use serde::{Deserialize, Serialize};
-
-use crate::modality::ModalityId;
-use crate::sample::{Encoding, SampleHeader};
-use crate::time::Stamp;
 
 /// How long a screen receives previews after it has asked for them.
 pub const LOOKED_AT: Duration = Duration::from_secs(2);

@@ -5,9 +5,10 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::time::Stamp;
+
 use super::{DeviceStatus, Snapshot};
-use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::time::Stamp;
 
 /// Rates are means over this time.
 const WINDOW: Duration = Duration::from_secs(2);
@@ -127,9 +128,10 @@ fn per_second(count: u64, over: Duration) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::PhysicalMask;
+    use rapid_core::sample::Epoch;
+
     use super::*;
-    use crate::mask::PhysicalMask;
-    use crate::sample::Epoch;
     use crate::status::{RecordingStatus, SlotState};
 
     const MS: u64 = 1_000_000;

@@ -7,11 +7,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
 use serde::{Deserialize, Serialize};
 use tokio::sync::oneshot;
 
 use super::{Grade, Sensors, Verdict};
-use crate::time::Stamp;
 
 /// What a screen, a pedal or another program may request of the session.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -247,7 +247,7 @@ pub struct Answered {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SessionStatus {
     /// Where its episodes are written.
-    #[serde(serialize_with = "crate::text::lossy")]
+    #[serde(serialize_with = "rapid_core::text::lossy")]
     pub folder: PathBuf,
     /// The task of the next episode.
     pub task: String,

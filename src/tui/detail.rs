@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use rapid_core::text;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Style};
@@ -18,7 +19,6 @@ use super::{log, view};
 use crate::palette::Palette;
 use crate::status::detail::{Channel, DeviceDetail, Intervals};
 use crate::status::{DeviceStatus, SlotState};
-use crate::text;
 
 /// Channels in one plot; of more, the first ones.
 const PLOTTED: usize = 6;
@@ -192,7 +192,7 @@ fn draw_plot(
     let now = model.shown().taken;
     let points: Vec<Vec<(f64, f64)>> = (0..PLOTTED)
         .map(|channel| {
-            let of = |(captured, numbers): &(crate::time::Stamp, Vec<f64>)| {
+            let of = |(captured, numbers): &(rapid_core::time::Stamp, Vec<f64>)| {
                 let value = numbers.get(channel).copied().filter(|value| value.is_finite())?;
                 Some((-now.since(*captured).as_secs_f64(), value))
             };

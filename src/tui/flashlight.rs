@@ -11,9 +11,9 @@ use crossterm::style::{Color, Print, ResetColor, SetBackgroundColor, SetForegrou
 use crossterm::terminal::{
     BeginSynchronizedUpdate, DisableLineWrap, EndSynchronizedUpdate, EnterAlternateScreen, size,
 };
+use rapid_core::text;
 
 use super::terminal::{enter_raw_mode, restore, writer};
-use crate::text;
 
 /// The terminal used as a light.
 pub struct Flashlight {

@@ -1,5 +1,6 @@
 //! The last line: the keys, or a question or message of the program.
 
+use rapid_core::text;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -7,7 +8,6 @@ use ratatui::text::{Line, Span};
 use super::keys;
 use super::model::{Model, Quit};
 use super::theme::Theme;
-use crate::text;
 
 /// Columns that a question leaves for its answer.
 const ROOM: usize = 20;

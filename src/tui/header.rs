@@ -1,6 +1,9 @@
 //! The first line: rig, uptime, the mask as a number, emergency stops and enabling switches, and whether an episode
 //! is being recorded.
 
+use rapid_core::interlock::{InputState, StopKind};
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::{Style, Stylize};
@@ -10,10 +13,7 @@ use super::link::LinkState;
 use super::model::Model;
 use super::recording;
 use super::theme::Theme;
-use crate::interlock::{InputState, StopKind};
 use crate::status::{Grade, SlotState, StopStatus};
-use crate::text;
-use crate::time::Stamp;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let width = usize::from(area.width);

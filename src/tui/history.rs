@@ -4,9 +4,10 @@
 
 use std::time::Duration;
 
-use crate::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::time::Stamp;
+
 use crate::status::{DeviceStatus, SlotState, Snapshot};
-use crate::time::Stamp;
 
 /// Seconds that are kept.
 pub(super) const SECONDS: usize = 60;
@@ -206,8 +207,9 @@ impl Lane {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::PhysicalMask;
+
     use super::*;
-    use crate::mask::PhysicalMask;
     use crate::status::literal::{device, id, snapshot};
 
     /// A device of 30 Hz: its state and samples at each tenth of a second.

@@ -1,8 +1,8 @@
-//! A scan of a LiDAR from above, from the packets that [`crate::points`] reads.
+//! A scan of a LiDAR from above, from the packets that [`rapid_core::points`] reads.
 
 use std::collections::VecDeque;
 
-use crate::points::{self, PacketFormat};
+use rapid_core::points::{self, PacketFormat};
 
 /// Points that are kept: some two turns, as often as packets are looked at.
 const POINTS: usize = 8192;

@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
+use rapid_core::action::Order;
+use rapid_core::permission::Permission;
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
 
 use super::model::{Effect, Msg};
-use crate::action::Order;
-use crate::permission::Permission;
 use crate::status::{Board, Command, Snapshot};
-use crate::time::Stamp;
 
 /// The link was closed: the screen ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,5 +1,7 @@
 //! The log: a panel with the newest lines, or a page of its own.
 
+use rapid_core::text;
+use rapid_core::time::realtime_ns;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Modifier;
@@ -10,8 +12,6 @@ use super::model::Model;
 use super::theme::Theme;
 use super::view;
 use crate::status::{Level, PrintedOn};
-use crate::text;
-use crate::time::realtime_ns;
 
 /// Columns of the level and of the output that a program printed on.
 const LEVEL: usize = 6;

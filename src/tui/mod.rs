@@ -38,6 +38,8 @@ use std::time::Duration;
 
 use crossterm::event::{Event, EventStream, MouseButton, MouseEvent, MouseEventKind};
 use futures::{FutureExt, Stream, StreamExt};
+use rapid_core::permission::Permission;
+use rapid_core::time::Zone;
 use ratatui::layout::Position;
 use rustix::process::Signal;
 use tokio::signal::unix::{SignalKind, signal};
@@ -46,9 +48,7 @@ use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
 use crate::palette::Palette;
-use crate::permission::Permission;
 use crate::status::{Board, Command};
-use crate::time::Zone;
 pub use link::{Closed, Link, LinkState, Own};
 use model::{Model, Msg};
 use terminal::Screen;

@@ -12,6 +12,9 @@ mod seen;
 use std::time::Duration;
 
 use crossterm::event::{KeyEvent, KeyEventKind, KeyModifiers};
+use rapid_core::action::Order;
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_core::time::{Stamp, Zone};
 
 use super::history::{Bit, Cell, History};
 use super::keys::{self, Act};
@@ -23,13 +26,10 @@ use super::theme::Edge;
 use super::tour::Tour;
 use super::view::Target;
 use super::{help, view};
-use crate::action::Order;
-use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::status::preview::Preview;
 use crate::status::rates::Rates;
 use crate::status::session::{Label, PRESS_AGAIN, SessionRequest};
 use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
-use crate::time::{Stamp, Zone};
 use prompt::{Naming, Prompt, Question};
 use seen::Seen;
 

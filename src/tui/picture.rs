@@ -6,6 +6,7 @@
 
 use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage};
+use rapid_core::modality::ModalityId;
 use ratatui::Frame;
 use ratatui::layout::{Rect, Size};
 use ratatui::text::Line;
@@ -14,7 +15,6 @@ use ratatui_image::protocol::Protocol;
 use ratatui_image::{FontSize, Image, Resize};
 
 use super::theme::Theme;
-use crate::modality::ModalityId;
 use crate::palette::Palette;
 use crate::pixels::{self, Pixels};
 use crate::status::preview::Preview;
@@ -210,8 +210,9 @@ fn as_text(frame: &mut Frame<'_>, area: Rect, picture: &Picture) {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::sample::Encoding;
+
     use super::*;
-    use crate::sample::Encoding;
 
     fn grey(width: u32, height: u32, shade: impl Fn(u32, u32) -> u8) -> Preview {
         let payload: Vec<u8> =

@@ -2,6 +2,8 @@
 //!
 //! Invariant: values that change while the policy acts keep their columns.
 
+use rapid_core::modality::ModalityId;
+use rapid_core::text;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -10,9 +12,7 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::{Edge, Theme};
 use super::view;
-use crate::modality::ModalityId;
 use crate::status::PolicyStatus;
-use crate::text;
 
 /// Longest name of an axis and longest unit, columns.
 const NAME: usize = 12;

@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -12,8 +14,6 @@ use super::theme::Theme;
 use super::view;
 use crate::status::session::Phase;
 use crate::status::{RecordingStatus, Verdict};
-use crate::text;
-use crate::time::Stamp;
 
 /// Columns below which the name of a file is left out.
 const FILE_LEAST: usize = 12;

@@ -5,13 +5,14 @@ use std::time::Duration;
 
 use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 use insta::assert_snapshot;
+use rapid_core::interlock::{InputState, StopKind};
+use rapid_core::time::Stamp;
 use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier, Style};
 
 use super::*;
-use crate::interlock::{InputState, StopKind};
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
@@ -19,7 +20,6 @@ use crate::status::session::{EpisodeEntry, Label, Phase, SessionRequest, Session
 use crate::status::{
     Finding, Grade, Level, Outlook, RecordingStatus, Sensors, SlotState, Snapshot, StopStatus, Verdict,
 };
-use crate::time::Stamp;
 use picture::Canvas;
 use theme::Charset;
 

@@ -3,12 +3,12 @@
 //! The styles are those of [`crate::palette`]; what only the monitor shows is added here. Every meaning that has a colour
 //! also has a symbol or a word.
 
+use rapid_core::text;
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::symbols::border;
 
 use crate::palette::{self, Palette};
 use crate::status::{Grade, Level, SlotState};
-use crate::text;
 
 /// Can the terminal show characters outside ASCII?
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,5 +1,6 @@
 //! The last five minutes of each bit of the mask, a row each.
 
+use rapid_core::text;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -9,7 +10,6 @@ use super::model::Model;
 use super::theme::Theme;
 use super::view;
 use crate::status::SlotState;
-use crate::text;
 
 /// Columns of the longest name.
 const NAME: usize = 16;

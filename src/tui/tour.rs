@@ -87,8 +87,9 @@ const MAY_GO: &str = "tactile_tip";
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::mask::PhysicalMask;
+
     use super::*;
-    use crate::mask::PhysicalMask;
     use crate::status::literal::{device, policy, recording, snapshot, three_streaming};
     use crate::status::{Hold, PolicyStatus, Verdict};
 

@@ -6,9 +6,9 @@
 //! Invariant: a picture is encoded once, however many pages show it. A damaged one is none.
 
 use hyper::body::Bytes;
+use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_jpeg::Values;
 
-use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::pixels::{self, Pixels};
 use crate::status::preview::Preview;
 
@@ -56,8 +56,9 @@ impl Pictures {
 
 #[cfg(test)]
 mod tests {
+    use rapid_core::sample::Encoding;
+
     use super::*;
-    use crate::sample::Encoding;
 
     fn preview(encoding: Encoding, [width, height]: [u32; 2], payload: &[u8]) -> Preview {
         Preview { encoding, width, height, bytes: payload.len(), payload: payload.into(), ..Preview::default() }

@@ -28,6 +28,9 @@ use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::TokioIo;
+use rapid_core::modality::ModalityId;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_local;
@@ -37,12 +40,9 @@ use super::door::{Asked, Door, NO_TOKEN, Refusal};
 use super::pictures::Pictures;
 use super::view::View;
 use crate::fault;
-use crate::modality::ModalityId;
 use crate::status::Board;
 use crate::status::rates::Rates;
 use crate::status::session::{Asker, SessionRequest};
-use crate::text;
-use crate::time::Stamp;
 
 /// Connections at a time: a page has two to six.
 const CONNECTIONS: usize = 32;

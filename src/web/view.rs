@@ -2,14 +2,14 @@
 //!
 //! Invariant: pure. Equal views are equal texts: what changes without news, such as the age of a sample, is not in it.
 
+use rapid_core::modality::ModalityId;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
-use crate::modality::ModalityId;
 use crate::status::rates::Rates;
 use crate::status::session::{EpisodeEntry, Phase, SessionStatus};
 use crate::status::{DeviceStatus, Finding, Level, RecordingStatus, Snapshot, StopStatus};
-use crate::text;
-use crate::time::Stamp;
 
 /// Warnings and errors of the log, at most.
 const WARNINGS: usize = 4;

@@ -4,13 +4,14 @@
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use crate::support::allocations::allocations;
 use crate::support::motors::motor_spec;
 use rapid::control::can::CanFrame;
 use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
 use rapid::control::damiao::parameter::{Parameter, Reply, Value};
 use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
-use rapid::time::Stamp;
 
 const MOTORS: u16 = 7;
 

@@ -13,14 +13,15 @@ use std::time::Duration;
 
 use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::{Driver, DriverError, sim};
-use rapid::modality::ModalityId;
 use rapid::registry::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, PixelFormat, Probe,
-    SerialSpec, UsbSpec, WhenStale,
+    SerialSpec, UsbSpec,
 };
-use rapid::sample::Encoding;
 use rapid::simulation::{SimDevice, SimSource};
-use rapid::time::Stamp;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::Encoding;
+use rapid_core::sync::WhenStale;
+use rapid_core::time::Stamp;
 use tokio::io::AsyncWriteExt as _;
 use tokio_serial::{SerialPort as _, SerialStream};
 
@@ -47,7 +48,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         action: None,
         hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
-            rapid::modality::ModalityKind::Image,
+            rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),
         ),
@@ -279,7 +280,7 @@ async fn a_packet_allocates_nothing_and_has_the_kernels_time() {
         let (count, reading) = allocations(driver.read()).await;
         let reading = reading.unwrap();
         assert_eq!((reading.bytes, reading.encoding), (&round.to_le_bytes()[..], Encoding::Bytes));
-        assert_eq!(reading.flags, rapid::sample::FLAG_DEVICE_TIME);
+        assert_eq!(reading.flags, rapid_core::sample::FLAG_DEVICE_TIME);
         // The wall clock is read a moment apart from ours, and may be slewed.
         assert!(reading.captured.after(Duration::from_millis(1)) >= sent && reading.captured <= Stamp::now());
         // As of a serial line.

@@ -5,8 +5,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::action::{ActionSource, ActuatorNotice, Arming, Order as Asked};
+
 use crate::support::motors::{Adapter, Hand, PATIENCE, spec};
-use rapid::action::{ActionSource, ActuatorNotice, Arming, Order as Asked};
 use rapid::driver::DriverError;
 use rapid::driver::can::link::Link;
 use rapid::driver::can::motors::Motors;

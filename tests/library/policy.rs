@@ -5,6 +5,8 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
+use rapid_core::sample::{Encoding, SampleHeader};
+
 use crate::support::allocations::allocations;
 use crate::support::onnx::{
     self, ACTION, CONDITION_SHARE, Change, HISTORY, HISTORY_STEPS, HORIZON, Message, SAMPLE_SHARE, SIDE, STEPS,
@@ -19,7 +21,6 @@ use rapid::policy::picture::{Picture, Preprocessor};
 use rapid::policy::request::Request;
 use rapid::policy::sampler::{Computing, PolicyError, Sampler};
 use rapid::registry::InferenceSpec;
-use rapid::sample::{Encoding, SampleHeader};
 
 fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
     let folder = tempfile::tempdir().unwrap();

@@ -8,11 +8,14 @@
 
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
+use rapid_core::time::Stamp;
+
 use crate::support::allocations::allocations;
 use crate::support::onnx::{
     ACTION, Change, HISTORY, HISTORY_STEPS, HORIZON, STEPS, encoder_of_history, write_bundle, write_graphs,
 };
-use rapid::mask::PhysicalMask;
 use rapid::policy::bundle::Bundle;
 use rapid::policy::compose::Composer;
 use rapid::policy::horizon::{ActionQueue, Situation, WithoutMask};
@@ -24,9 +27,7 @@ use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;
 use rapid::registry::Registry;
 use rapid::registry::task::PARTS;
-use rapid::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid::simulation::task::layout;
-use rapid::time::Stamp;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 

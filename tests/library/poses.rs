@@ -6,8 +6,11 @@
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::Stamp;
+
 use crate::support::onnx::{Change, write_bundle};
-use rapid::mask::PhysicalMask;
 use rapid::policy::bundle::Bundle;
 use rapid::policy::horizon::{ChunkError, HoldReason, WithoutMask};
 use rapid::policy::library::Environment;
@@ -16,8 +19,6 @@ use rapid::policy::pilot::Pilot;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;
 use rapid::registry::Registry;
-use rapid::sample::{Encoding, SampleHeader};
-use rapid::time::Stamp;
 
 const PERIOD: Duration = Duration::from_millis(100);
 const ALL: PhysicalMask = PhysicalMask(0b111);

@@ -12,16 +12,14 @@ use std::time::Duration;
 
 use rapid::bus::TopicId;
 use rapid::episode::{encode, schema::SampleSchema};
-use rapid::mask::PhysicalMask;
-use rapid::modality::ModalityId;
 use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
-use rapid::registry::{
-    CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
-};
-use rapid::sample::{Encoding, Epoch, SampleHeader};
+use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
 use rapid::status::Board;
-use rapid::sync::{SyncModality, SyncSample, Synchronizer};
-use rapid::time::Stamp;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Encoding, Epoch, SampleHeader};
+use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
+use rapid_core::time::Stamp;
 
 use crate::support::allocations::allocations;
 
@@ -119,7 +117,7 @@ async fn only_chunks_allocate() {
         action: None,
         hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
-            rapid::modality::ModalityKind::Image,
+            rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),
         ),

@@ -7,11 +7,12 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::interlock::StopKind;
+use rapid_core::modality::ModalityKind;
+use rapid_core::points::PacketFormat;
+
 use crate::support::mistakes;
 use proptest::prelude::*;
-use rapid::interlock::StopKind;
-use rapid::modality::ModalityKind;
-use rapid::points::PacketFormat;
 use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{

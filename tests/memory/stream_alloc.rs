@@ -24,15 +24,15 @@ use rapid::bus::{Bus, Inbox, TopicId};
 use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
-use rapid::mask::{Bits, PhysicalMask};
 use rapid::registry::Registry;
 use rapid::registry::scenario::Scenario;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
-use rapid::sample::SampleHeader;
 use rapid::simulation::SimDevice;
 use rapid::status::Board;
-use rapid::time::Stamp;
+use rapid_core::mask::{Bits, PhysicalMask};
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 

@@ -6,9 +6,9 @@ use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use rapid::remote::{Head, Kind, requested};
-use rapid::sample::Encoding;
-use rapid::time::Stamp;
+use rapid_core::remote::{Head, Kind, requested};
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 
 use crate::support::lan::{HEIGHT, RIG, RUN, Server, WIDTH, free_ports, life, life_of, picture, stop, wait_for};
 use crate::support::{self, Episode, EventMessage, Place, until};

@@ -6,8 +6,9 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use rapid_core::sample::Encoding;
+
 use crate::support::{self, Episode, Place, events, logged, until};
-use rapid::sample::Encoding;
 use rustix::process::Signal;
 use serde_json::Value;
 

@@ -3,18 +3,20 @@
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
+use rapid::bus::Header;
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::Stamp;
+
 use crate::support::{Episode, MaskMessage, Place, until};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::*;
-use rapid::sample::{Encoding, SampleHeader};
-use rapid::time::Stamp;
 use rustix::process::Signal;
 
 /// No mask of the simulated rig, which has three devices.
 const FORGED_MASK: u64 = 0xf0;
 const FORGED_PICTURE: &[u8] = b"no picture of ours";
 
-type Port = Publisher<ipc::Service, [u8], SampleHeader>;
+type Port = Publisher<ipc::Service, [u8], Header>;
 
 fn publisher(place: &Place, topic: &str) -> Port {
     let mut config = Config::global_config().clone();
@@ -26,15 +28,20 @@ fn publisher(place: &Place, topic: &str) -> Port {
         .expect("node");
     let name = ServiceName::new(topic).expect("name");
     let service =
-        node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<SampleHeader>().open().expect("topic");
+        node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<Header>().open().expect("topic");
     service.publisher_builder().initial_max_slice_len(64).create().expect("publisher")
 }
 
 fn give(port: &Port, seq: u64, encoding: Encoding, payload: &[u8]) {
     let now = Stamp::now().0;
     let mut sample = port.loan_slice_uninit(payload.len()).expect("loan");
-    *sample.user_header_mut() =
-        SampleHeader { seq, capture_ns: now, recv_ns: now, encoding: encoding as u32, ..SampleHeader::default() };
+    *sample.user_header_mut() = Header(SampleHeader {
+        seq,
+        capture_ns: now,
+        recv_ns: now,
+        encoding: encoding as u32,
+        ..SampleHeader::default()
+    });
     sample.write_from_slice(payload).send().expect("send");
 }
 

@@ -14,11 +14,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_core::mask::{MaskRecord, PhysicalMask};
+use rapid_core::sample::{Encoding, SampleHeader};
+
 use crate::support::{self, Place, python, sweep_bus, until};
 use rapid::bus::{Bus, TopicId};
-use rapid::mask::{MaskRecord, PhysicalMask};
 use rapid::registry::Registry;
-use rapid::sample::{Encoding, SampleHeader};
 
 /// What the simulated wrist camera would send.
 const PAYLOAD: &[u8] = b"\xff\xd8\xff\xe0 a picture";
@@ -195,7 +196,7 @@ fn the_mask_reader_of_the_examples_reads_again_after_a_torn_read() {
         device_count: 3,
         generation: 4,
         mask: PhysicalMask(0b101),
-        realtime_ns: rapid::time::realtime_ns() + 3_600_000_000_000,
+        realtime_ns: rapid_core::time::realtime_ns() + 3_600_000_000_000,
         sequence: 42,
     };
     // A write is in progress when it begins to read, and ends while it looks.

@@ -36,14 +36,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::sync::Grid;
+use rapid_core::time::Stamp;
+
 use crate::support::{self, Episode, EventMessage, Message, Place, events};
 use rapid::driver::sim;
 use rapid::record::inspect::{Inspection, inspect};
 use rapid::registry::scenario::{Scenario, ScenarioDevice};
 use rapid::registry::{DeviceSpec, Registry};
 use rapid::simulation::{SimFaults, SimSource};
-use rapid::sync::Grid;
-use rapid::time::Stamp;
 use serde::Deserialize;
 use serde_json::Value;
 

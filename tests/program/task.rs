@@ -4,6 +4,8 @@
 
 use std::sync::Arc;
 
+use rapid_core::time::{Stamp, WallClock};
+
 use crate::support::{self, Episode, Place, events};
 use rapid::lockstep::timing::Timing;
 use rapid::lockstep::{Lockstep, STEP};
@@ -12,7 +14,6 @@ use rapid::record::stepped::Stepped;
 use rapid::registry::Registry;
 use rapid::registry::scenario::Scenario;
 use rapid::status::Board;
-use rapid::time::{Stamp, WallClock};
 use serde_json::Value;
 
 /// The folder of the policy of the repository.

@@ -32,7 +32,7 @@ use rapid::control::damiao::parameter::Reply;
 use rapid::control::motors::{Brakes, BusState, Fault, MotorBus, Notice, Reason};
 use rapid::driver::can::guard::KEEP_FOR;
 use rapid::registry::{BrakeSpec, DamiaoSpec, MotorMode, Stop};
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 use vbench::emu::can::Frame;
 use vbench::emu::can::motion::{Mit, from_unsigned, to_unsigned};
 use vbench::emu::can::motor::Motor;

@@ -10,8 +10,9 @@ use std::time::{Duration, Instant};
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
-use rapid::mask::{Bits, MASK_TOPIC, PhysicalMask};
-use rapid::sample::SampleHeader;
+use rapid::bus::Header;
+use rapid_core::mask::{Bits, MASK_TOPIC, PhysicalMask};
+use rapid_core::sample::SampleHeader;
 
 use crate::Fault;
 
@@ -46,7 +47,7 @@ impl Running {
     }
 }
 
-type Samples = Subscriber<ipc::Service, [u8], SampleHeader>;
+type Samples = Subscriber<ipc::Service, [u8], Header>;
 
 /// A topic that is open.
 struct Topic {
@@ -75,7 +76,7 @@ impl Topic {
         let service = node
             .service_builder(&name)
             .publish_subscribe::<[u8]>()
-            .user_header::<SampleHeader>()
+            .user_header::<Header>()
             .open()
             .map_err(|error| fault(&error))?;
         let samples = service.subscriber_builder().buffer_size(depth).create().map_err(|error| fault(&error))?;

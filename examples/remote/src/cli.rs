@@ -81,7 +81,7 @@ pub struct Join {
     #[arg(long, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
     /// Port of this computer at which rapid reads, on 127.0.0.1 only; `port` in its entries
-    #[arg(long, default_value_t = rapid::remote::PORT)]
+    #[arg(long, default_value_t = rapid_core::remote::PORT)]
     pub port: u16,
     /// A computer from which nothing came for this long is absent, milliseconds
     #[arg(long, value_name = "MS", default_value_t = 700, value_parser = clap::value_parser!(u64).range(200..=60_000))]

@@ -7,7 +7,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 
 use crate::clock::{Clock, Estimate};
 

@@ -1,4 +1,4 @@
-//! `join`: the sensors of other computers for the `rapid` on this one, on a port of 127.0.0.1 ([`rapid::remote`]).
+//! `join`: the sensors of other computers for the `rapid` on this one, on a port of 127.0.0.1 ([`rapid_core::remote`]).
 //!
 //! Invariant: a connection exists while its sensor is present; samples and the frames between them have the clock of the
 //! moment they are sent at.
@@ -9,9 +9,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use rapid::remote::{HEAD, Head, Kind, LONGEST_REQUEST, requested};
-use rapid::sample::Encoding;
-use rapid::time::Stamp;
+use rapid_core::remote::{HEAD, Head, Kind, LONGEST_REQUEST, requested};
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::tcp::OwnedWriteHalf;
 use tokio::net::{TcpListener, TcpStream};

@@ -3,7 +3,7 @@
 //! | module  | owns                                                                                      |
 //! |---------|-------------------------------------------------------------------------------------------|
 //! | `clock` | how far the clock of another computer is from this one, and within what                   |
-//! | `wire`  | keys and messages on the network; samples are frames of `rapid::remote`                   |
+//! | `wire`  | keys and messages on the network; samples are frames of `rapid_core::remote`                   |
 //! | `link`  | the configuration of zenoh                                                                |
 //! | `bus`   | samples and mask of the `rapid` on this computer                                          |
 //! | `serve` | puts them on the network                                                                  |

@@ -10,11 +10,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use rapid::modality::ModalityKind;
+use rapid_core::modality::ModalityKind;
 use rapid::registry::{DeviceSpec, Registry};
-use rapid::remote::{HEAD, Head, Kind, is_name};
-use rapid::sample::Encoding;
-use rapid::time::Stamp;
+use rapid_core::remote::{HEAD, Head, Kind, is_name};
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait as _};
 

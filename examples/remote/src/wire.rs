@@ -1,4 +1,4 @@
-//! Keys and messages on the network; samples are frames of [`rapid::remote`].
+//! Keys and messages on the network; samples are frames of [`rapid_core::remote`].
 //!
 //! | key                         |                                                                     |
 //! |-----------------------------|---------------------------------------------------------------------|
@@ -12,8 +12,8 @@
 
 use std::collections::BTreeSet;
 
-use rapid::modality::MAX_MODALITIES;
-use rapid::remote::is_name;
+use rapid_core::modality::MAX_MODALITIES;
+use rapid_core::remote::is_name;
 
 /// Keys that `join` subscribes to, of every host.
 pub const ALL_ALIVE: &str = "rapid/*/alive";

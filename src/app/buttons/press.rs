@@ -9,8 +9,9 @@
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use crate::status::session::PRESS_AGAIN;
-use crate::time::Stamp;
 
 /// What is released for less than this was not released. A foot needs twice as long between two presses.
 const CHATTER: Duration = Duration::from_millis(30);

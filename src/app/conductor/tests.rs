@@ -1,6 +1,7 @@
 use std::fs::File;
 use std::io;
 
+use rapid_core::sample::{Epoch, SampleHeader};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -13,7 +14,6 @@ use crate::interlocks::Watched;
 use crate::patience::PATIENCE;
 use crate::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use crate::registry::Registry;
-use crate::sample::{Epoch, SampleHeader};
 use crate::session::journal::Plan;
 use crate::status::session::{Label, SessionRequest};
 use crate::status::{Grade, Level, Snapshot, Verdict};

@@ -128,7 +128,7 @@ fn without_a_registry_plugged_devices_are_still_listed() {
 #[test]
 fn json_distinguishes_plugged_and_missing() {
     let source = SimSource::Serial { channels: 1, hz: 100, seed: 1 };
-    let sim = DeviceNode::Sim(Arc::new(SimDevice::new("tof", source, crate::time::Stamp(0))));
+    let sim = DeviceNode::Sim(Arc::new(SimDevice::new("tof", source, rapid_core::time::Stamp(0))));
     let attached = [attachment(sim, usb((0x2e8a, 0x000a), None, "1-4", None)), video(0, WRIST, None, "1-2")];
     let text = printed(Entries::Of(&registry()), &attached, Format::Json);
     let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();

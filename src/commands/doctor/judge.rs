@@ -9,6 +9,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use rapid_core::text;
 use serde::Serialize;
 
 use super::facts::{Facts, Node, UsbDevice};
@@ -16,7 +17,6 @@ use super::load::{CameraLoad, budget, fitting, taken};
 use super::preview;
 use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::registry::{Assigner, DeviceSpec, InputSpec, NodeSpec, Opens, PixelFormat, Registry};
-use crate::text;
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
 const SLOWEST: f64 = 480.0;

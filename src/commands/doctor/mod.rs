@@ -11,6 +11,7 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use rapid_core::text;
 use serde::Serialize;
 
 use self::facts::UsbDevice;
@@ -20,7 +21,6 @@ use super::Format;
 use crate::folder::{Folder, Links, Missing};
 use crate::registry::Registry;
 use crate::registry::artifacts::{ArtifactKind, artifacts};
-use crate::text;
 
 /// Diagnoses the machine and writes the findings; true if none is bad.
 ///

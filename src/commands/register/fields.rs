@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 
+use rapid_core::text;
 use serde::Serialize;
 
 use super::{Dialogue, Format, RegisterError, listen};
@@ -12,7 +13,6 @@ use crate::registration::settings::suggested;
 use crate::registry::candidate::Candidate;
 use crate::registry::edit::Setting;
 use crate::registry::{Mount, Registry, name_problem};
-use crate::text;
 
 /// A unit that could be registered, as JSON.
 #[derive(Serialize)]

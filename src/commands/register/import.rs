@@ -5,6 +5,8 @@
 
 use std::path::Path;
 
+use rapid_core::text;
+
 use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::driver::camera::query;
 use crate::registration::settings::suggested;
@@ -13,7 +15,6 @@ use crate::registry::candidate::kind;
 use crate::registry::edit::{NewEntry, Setting};
 use crate::registry::import::{Foreign, devices, layout};
 use crate::registry::{RegistryErrors, like_a_name, name_problem, read_file};
-use crate::text;
 
 /// Service types and their protocols (`aod321/iPhoneVIO`; OpenGoPro, "mDNS").
 const PROTOCOLS: [(&str, &str); 2] = [("_iphonevio._tcp", "iphone"), ("_gopro-web._tcp", "gopro")];

@@ -12,6 +12,8 @@ use std::io::{self, BufRead, Write};
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_core::sample::Encoding;
+use rapid_core::text;
 use serde::Serialize;
 use tokio::time::{Instant, timeout_at};
 
@@ -28,8 +30,6 @@ use crate::registration::{Target, WriteError, comments, free_bit};
 use crate::registry::candidate::unregistered;
 use crate::registry::edit::{self, EditError, NewEntry, Setting};
 use crate::registry::{DeviceSpec, Framing, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec};
-use crate::sample::Encoding;
-use crate::text;
 
 pub use import::ImportError;
 

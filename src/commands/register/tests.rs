@@ -4,13 +4,13 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use clap::Parser;
+use rapid_core::time::Stamp;
 
 use super::*;
 use crate::cli::{Cli, Command};
 use crate::device::{DeviceNode, Unit, UsbIdentity};
 use crate::registry::{BUILTIN, Registry};
 use crate::simulation::{SimDevice, SimSource};
-use crate::time::Stamp;
 
 fn serial_line(serial: Option<&str>, port: &str) -> Attachment {
     let source = SimSource::Serial { channels: 2, hz: 1000, seed: 1 };

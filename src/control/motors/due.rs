@@ -2,16 +2,17 @@
 
 use std::time::Duration;
 
+use rapid_core::action::Trip;
+use rapid_core::time::Stamp;
+
 use super::MotorBus;
 use super::fault::Fault;
 use super::motor::{Motor, Phase};
 use super::notice::{BusState, Notice, Reason};
 use super::watch::Commanded;
-use crate::action::Trip;
 use crate::control::deadman::Verdict;
 use crate::control::ramp::Ramp;
 use crate::registry::{MotorMode, Stop};
-use crate::time::Stamp;
 
 /// An arm that took longer has failed...
 const ARM_WITHIN: Duration = Duration::from_secs(1);

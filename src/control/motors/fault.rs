@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
+use rapid_core::action::Trip;
+
 use super::words::Words;
-use crate::action::Trip;
 use crate::control::damiao::codec::MotorStatus;
 use crate::control::damiao::parameter::{Parameter, Value};
 

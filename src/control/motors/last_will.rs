@@ -2,10 +2,11 @@
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use super::{BusState, Fault, MotorBus};
 use crate::control::can::CanFrame;
 use crate::registry::DamiaoSpec;
-use crate::time::Stamp;
 
 /// A program that misses this many cycles has not stalled yet.
 const SLOW_CYCLES: u32 = 3;

@@ -23,6 +23,8 @@ mod stopping;
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use super::fault::{Fault, Part};
 use super::notice::Notice;
 use super::notices::Notices;
@@ -33,7 +35,6 @@ use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US,
 use crate::control::limits::{Limits, stiffness, within_torque};
 use crate::control::ramp::Ramp;
 use crate::registry::{MotorMode, MotorSpec, Stop};
-use crate::time::Stamp;
 use brake::Brake;
 pub(super) use brake::BrakeIs;
 use frames::within;

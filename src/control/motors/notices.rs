@@ -3,8 +3,9 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use super::notice::Notice;
-use crate::time::Stamp;
 
 /// Shortest time between notices of a frequent condition.
 const SELDOM: Duration = Duration::from_secs(1);

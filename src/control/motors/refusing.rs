@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use super::MotorBus;
 use super::notice::Refusal;
-use crate::time::Stamp;
 
 /// Actions may be this far in the future: the clock is the same, but ticks are rounded.
 const EARLY: Duration = Duration::from_millis(100);

@@ -2,13 +2,14 @@
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use super::MotorBus;
 use super::motor::Motor;
 use super::notice::Notice;
 use super::watch::beyond;
 use crate::control::limits::Limits;
 use crate::registry::MotorMode;
-use crate::time::Stamp;
 
 /// How fast a joint is driven back, rad/s: slow enough to step aside and to disarm.
 pub const RETURN_SPEED: f64 = 0.1;

@@ -8,14 +8,14 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::provenance::{Format, Negotiated};
+use rapid_core::sample::{Encoding, FLAG_ERROR};
+use rapid_core::time::Stamp;
 use serde::Serialize;
 
 use super::super::DriverError;
 use super::node::Card;
-use crate::provenance::{Format, Negotiated};
 use crate::registry::{CameraSpec, PixelFormat};
-use crate::sample::{Encoding, FLAG_ERROR};
-use crate::time::Stamp;
 
 /// Tolerance of a rate: many cameras call 30000/1001 30.
 const RATE_TOLERANCE: f64 = 0.005;

@@ -14,6 +14,8 @@ use std::path::Path;
 use std::ptr::NonNull;
 use std::{io, mem};
 
+use rapid_core::provenance::KernelDriver;
+use rapid_core::time::Stamp;
 use rustix::fs::{Mode as FileMode, OFlags};
 use v4l::v4l_sys::{
     V4L2_BUF_FLAG_ERROR, V4L2_BUF_FLAG_TIMESTAMP_MASK, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, V4L2_CAP_DEVICE_CAPS,
@@ -27,9 +29,7 @@ use v4l::v4l2::{self, vidioc};
 
 use super::super::DriverError;
 use super::format::{Agreed, ControlInfo, Frame, Rate, fourcc};
-use crate::provenance::KernelDriver;
 use crate::registry::CameraSpec;
-use crate::time::Stamp;
 
 /// `V4L2_BUF_TYPE_VIDEO_CAPTURE`.
 pub(super) const CAPTURE: u32 = v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE;

@@ -16,6 +16,7 @@ use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 
 use super::guard::{Guard, hand_over};
@@ -23,7 +24,6 @@ use crate::control::motors::Brakes as State;
 use crate::gpio::Output;
 use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::registry::{BrakeSpec, DamiaoSpec};
-use crate::time::Stamp;
 
 /// Every line is set again after this, so that an unplugged chip is noticed and a replugged one opened.
 const AGAIN: Duration = Duration::from_millis(500);

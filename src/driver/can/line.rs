@@ -7,6 +7,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
@@ -14,7 +15,6 @@ use super::link::{Arrival, LinkError};
 use super::{damiao_serial, slcan};
 use crate::control::can::CanFrame;
 use crate::driver::{arrival, serial};
-use crate::time::Stamp;
 
 /// Bytes taken from the kernel at once.
 const INBOX: usize = 4096;

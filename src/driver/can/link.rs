@@ -11,6 +11,7 @@ use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -21,7 +22,6 @@ use crate::control::can::CanFrame;
 use crate::device::DeviceNode;
 use crate::driver::DriverError;
 use crate::registry::{CanAdapter, CanSpec};
-use crate::time::Stamp;
 
 /// What else can wake a thread that waits for the bus: orders from two places, and actions.
 pub const BELLS: usize = 3;

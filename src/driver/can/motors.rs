@@ -15,21 +15,21 @@ use std::io;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
+use rapid_core::action::{ActionSource, ActuatorNotice, MAX_ACTION, Order};
+use rapid_core::permission::Attended;
+use rapid_core::provenance::{Format, Negotiated};
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use tokio::sync::mpsc;
 
 use super::claim::Claim;
 use super::guard::Guard;
 use super::link::{Link, LinkError};
-use crate::action::{ActionSource, ActuatorNotice, MAX_ACTION, Order};
 use crate::control::motors::SAMPLE_VALUES;
 use crate::device::DeviceNode;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
 use crate::kinematics::Arm;
 use crate::panics::CONTROL_THREAD;
-use crate::permission::Attended;
-use crate::provenance::{Format, Negotiated};
 use crate::registry::{CanSpec, DamiaoSpec};
-use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use control_loop::{ControlLoop, Sample, Shared};
 use effector::Effector;
 use powered::Powered;

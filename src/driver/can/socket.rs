@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::RcvBufForce;
+use rapid_core::time::{Stamp, WallClock};
 use rustix::net::{AddressFamily, Protocol, SendFlags, SocketFlags, SocketType};
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 
@@ -17,7 +18,6 @@ use super::link::{Arrival, LinkError, is_overflow};
 use super::netlink::{self, Ready};
 use crate::control::can::CanFrame;
 use crate::driver::datagram::{self, Datagram};
-use crate::time::{Stamp, WallClock};
 
 /// Bytes of a classical frame (`struct can_frame`, linux/can.h): identifier, length, three that mean nothing, data.
 const FRAME: usize = 16;

@@ -27,6 +27,8 @@ use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{mpsc, watch};
 use tokio::time::sleep;
@@ -41,8 +43,6 @@ use super::place::{Place, Server};
 use crate::driver::{DriverError, Reading};
 use crate::folder::{Folder, Links, Missing, Sync, read_text, state_directory};
 use crate::registry::LanPicture;
-use crate::sample::Encoding;
-use crate::time::Stamp;
 
 /// The camera answers within a tenth of a second, even while encoding.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);

@@ -21,6 +21,8 @@ pub(super) mod packet;
 use std::io::{self, Write as _};
 use std::time::Duration;
 
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
+use rapid_core::time::Stamp;
 use tokio::io::AsyncReadExt as _;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Instant;
@@ -31,8 +33,6 @@ use super::place::Place;
 use super::{PATIENCE, jpeg};
 use crate::driver::{DriverError, Reading};
 use crate::registry::{LanPicture, PhoneStream};
-use crate::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
-use crate::time::Stamp;
 
 /// Bytes read from the kernel at once.
 const INBOX: usize = 64 << 10;
@@ -150,7 +150,7 @@ impl Phone {
                     let text = String::from_utf8_lossy(text.get(..LONGEST_SESSION).unwrap_or(text));
                     tracing::info!(
                         device = self.name,
-                        session = crate::text::plain(&text).as_ref(),
+                        session = rapid_core::text::plain(&text).as_ref(),
                         "a phone connected"
                     );
                 }

@@ -7,6 +7,8 @@ use std::time::Duration;
 use hyper::StatusCode;
 use hyper::body::{Buf, Bytes};
 use hyper::header::CONTENT_TYPE;
+use rapid_core::sample::{Encoding, FLAG_ERROR};
+use rapid_core::time::Stamp;
 use tokio::time::{Instant, timeout_at};
 
 use super::http::{self, Reply};
@@ -15,8 +17,6 @@ use super::place::Server;
 use super::{PATIENCE, jpeg};
 use crate::driver::{DriverError, Reading};
 use crate::registry::LanPicture;
-use crate::sample::{Encoding, FLAG_ERROR};
-use crate::time::Stamp;
 
 const HEAD_LIMIT: Duration = Duration::from_secs(5);
 

@@ -22,10 +22,11 @@ mod udp;
 
 use std::time::Duration;
 
+use rapid_core::provenance::{Format, Negotiated};
+
 use super::{Agreed, ClockOffset, DriverError, Reading};
 use crate::device::DeviceNode;
 use crate::link::{Link, LinkState, LinkWatch};
-use crate::provenance::{Format, Negotiated};
 use crate::registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec, RemoteSamples};
 use place::Place;
 

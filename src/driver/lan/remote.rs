@@ -1,5 +1,5 @@
 //! Sensors of another computer: `rapid-remote` on this one sends their samples, with capture times on this clock
-//! ([`crate::remote`]).
+//! ([`rapid_core::remote`]).
 //!
 //! Invariant: a sample has the format that the entry states, and a capture time that can be one: the sender is another
 //! program.
@@ -8,6 +8,9 @@
 
 use std::time::Duration;
 
+use rapid_core::remote::{FrameError, Frames, Head, Kind, request};
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout, timeout_at};
@@ -15,9 +18,6 @@ use tokio::time::{Instant, timeout, timeout_at};
 use super::place::Server;
 use crate::driver::{ClockOffset, DriverError, Reading};
 use crate::registry::{PixelFormat, RemoteSamples};
-use crate::remote::{FrameError, Frames, Head, Kind, request};
-use crate::sample::Encoding;
-use crate::time::Stamp;
 
 /// More samples at once are not missing: their numbers began again.
 const MOST_MISSING: u64 = 1 << 20;

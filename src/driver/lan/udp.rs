@@ -15,6 +15,8 @@ use std::time::Duration;
 
 use nix::sys::socket::sockopt::BindToDevice;
 use nix::sys::socket::{SockaddrStorage, setsockopt};
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
+use rapid_core::time::{Stamp, realtime_ns};
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -25,8 +27,6 @@ use super::place::{Place, port_error};
 use crate::driver::datagram::{self, Datagram};
 use crate::driver::{DriverError, Reading};
 use crate::registry::own_side;
-use crate::sample::{Encoding, FLAG_DEVICE_TIME};
-use crate::time::{Stamp, realtime_ns};
 
 /// The interface is checked after this long without a packet.
 const ASK_AFTER: Duration = Duration::from_millis(500);

@@ -1,11 +1,11 @@
 use std::io::Write as _;
 
 use proptest::prelude::*;
+use rapid_core::mask::PhysicalMask;
 
 use super::*;
 use crate::effort::{cases, every};
 use crate::episode::testing::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
-use crate::mask::PhysicalMask;
 use crate::registry::scenario::ScenarioAction;
 
 fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
@@ -32,7 +32,7 @@ async fn samples_are_replayed_in_order_at_their_recorded_intervals_then_silence(
         for i in 0..100_u32 {
             let reading = replay.read().await.unwrap();
             assert_eq!(value(&reading).to_bits(), f64::from(i).to_bits());
-            assert_eq!((reading.encoding, reading.width), (crate::sample::Encoding::F64, 1));
+            assert_eq!((reading.encoding, reading.width), (rapid_core::sample::Encoding::F64, 1));
             assert_eq!(reading.captured.since(device.begun), Duration::from_millis(u64::from(i) * 10));
             assert!(stamp_of(Instant::now()) >= reading.captured, "a sample is not given before its time");
         }

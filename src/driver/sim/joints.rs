@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
+use rapid_core::action::{ActuatorNotice, Arming, Order};
+#[cfg(feature = "motors")]
+use rapid_core::action::{MAX_ACTION, NoAction};
 use tokio::sync::mpsc;
 
-use crate::action::{ActuatorNotice, Arming, Order};
-#[cfg(feature = "motors")]
-use crate::action::{MAX_ACTION, NoAction};
 use crate::driver::DriverError;
 #[cfg(feature = "motors")]
 use crate::kinematics::{Arm, Solver};
@@ -170,7 +170,7 @@ mod tests {
         let mut joints = Joints::new(1);
         let mut notices = joints.notices();
         joints.name_stops(&["pendant".into()].into());
-        let trip = Order::Emergency(crate::action::Trip { stop: 0, is_lost: true });
+        let trip = Order::Emergency(rapid_core::action::Trip { stop: 0, is_lost: true });
         joints.order(trip);
         assert!(notices.try_recv().is_err());
         joints.order(Order::Arm);

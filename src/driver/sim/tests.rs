@@ -130,7 +130,7 @@ async fn simulated_motors_reach_the_commanded_position() {
     check(arm, &twelve).unwrap();
     let mut sim = Sim::open(twelve).await.unwrap().with_node(&arm.node).unwrap();
     assert!(sim.command(&[0.5]).is_err(), "a target is missing");
-    sim.joints.order(crate::action::Order::Arm);
+    sim.joints.order(rapid_core::action::Order::Arm);
     sim.command(&[0.5, -0.25]).unwrap();
     let bytes = sim.read().await.unwrap().bytes.to_vec();
     let values: Vec<f64> = bytes.chunks(8).map(|value| f64::from_le_bytes(value.try_into().unwrap())).collect();

@@ -9,6 +9,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use mcap::McapError;
+use rapid_core::time;
 
 use super::super::chunk_writer::{Channel, ChunkWriter, Sink, io_error};
 use super::super::reader::Entry;
@@ -16,7 +17,6 @@ use super::super::record_iter::{Record, RecordIter, op};
 use super::report;
 use super::{ProgressFn, Repaired, summary::Summary};
 use crate::episode::{Failed, RECOVERED, ReadAt, SUMMARY, hash, own};
-use crate::time;
 
 /// Bytes read between two calls of a [`ProgressFn`], including those searched in vain for a chunk.
 const WATCH_EVERY: u64 = 1 << 20;

@@ -13,13 +13,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant, SystemTime};
 
+use rapid_core::text;
 use rustix::process::setpriority_process;
 
 use super::{Names, ProgressFn, RecoverError, Recovered, RepairOutcome, Source, recover};
 use crate::disk::Disk;
 use crate::episode::{self, Failed};
 use crate::status::{Board, Level, What};
-use crate::text;
 
 /// How soon a repair in the background notices that it is to end.
 const NOTICE: Duration = Duration::from_millis(20);

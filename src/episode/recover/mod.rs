@@ -39,12 +39,12 @@ use std::io::{self, Read, Seek};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
+use rapid_core::{text, time};
 use serde::Serialize;
 
 use super::partial::{self, Lock};
 use crate::episode::record_iter::MAGIC;
 use crate::episode::{self, Failed, ReadError};
-use crate::{text, time};
 
 use self::copy::Copied;
 pub use self::copy::recover_bytes;

@@ -340,8 +340,8 @@ async fn unread_bytes_are_reported_and_the_original_is_kept() {
                             || made.unread_bytes >= behind.len() as u64 / 2;
                         assert!(is_second || is_counted, "{what}: {report:?}");
                         let counts = [
-                            crate::text::counted(made.unread_bytes, "byte"),
-                            crate::text::counted(made.damaged_chunks, "damaged chunk"),
+                            rapid_core::text::counted(made.unread_bytes, "byte"),
+                            rapid_core::text::counted(made.damaged_chunks, "damaged chunk"),
                             "another episode's".to_owned(),
                         ];
                         let sentence = report.sentence().1;

@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::text;
+use rapid_core::time;
 use serde_json::{Map, Value, json};
 
 use super::copy::{About, Copied};
@@ -9,8 +11,6 @@ use super::summary::{LOSSLESS, SHA256, Summary};
 use super::{FileEnd, LeftOut, Recovered, RepairOutcome, Repaired};
 use crate::episode::{FAILED, text_map};
 use crate::status::{Grade, Level};
-use crate::text;
-use crate::time;
 
 /// The metadata record `rapid/summary` of an episode whose recorder wrote none, as far as it is
 /// known. Same keys as the recorder's, without those that only the recorder could count.

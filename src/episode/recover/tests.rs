@@ -67,9 +67,9 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_its_content() {
         "20261121_t_003.mcap.partial: repaired, {:.1} s, {} messages; the last second may be missing: {} bytes at the end were torn; \
          {} messages of a torn chunk taken without a check value, written since this machine was started",
         repaired.seconds,
-        crate::text::count(repaired.messages),
-        crate::text::count(repaired.unread_bytes),
-        crate::text::count(repaired.ordered_messages)
+        rapid_core::text::count(repaired.messages),
+        rapid_core::text::count(repaired.unread_bytes),
+        rapid_core::text::count(repaired.ordered_messages)
     );
     assert!(level == Level::Info && sentence.ends_with(&expected), "{sentence}");
 
@@ -105,7 +105,7 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_its_content() {
     assert_eq!(inspected.verdict.grade().unwrap(), Grade::Bad, "a modality of the test never delivers");
     let reason = format!(
         "the file is not whole: it was repaired; what came last may be missing; {} messages at its end are taken without a check value",
-        crate::text::count(repaired.ordered_messages)
+        rapid_core::text::count(repaired.ordered_messages)
     );
     assert!(inspected.verdict.reasons().contains(&reason.as_str()), "{:?}", inspected.verdict);
 }

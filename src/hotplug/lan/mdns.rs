@@ -18,13 +18,13 @@ use std::net::{IpAddr, SocketAddr, SocketAddrV6};
 use std::time::Duration;
 
 use mdns_sd::{Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo};
+use rapid_core::time::Stamp;
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::super::UnplugSource;
 use super::watch::Watch;
 use crate::link::{LOOK_EVERY, Link, LinkState};
 use crate::registry::LanSpec;
-use crate::time::Stamp;
 
 /// More devices of one service than a rig has.
 const MOST_INSTANCES: usize = 64;

@@ -9,6 +9,8 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::remote::{HEAD, Head, Kind};
+use rapid_core::time::Stamp;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpStream, UdpSocket};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
@@ -18,8 +20,6 @@ use super::watch::Watch;
 use crate::device::LastReceived;
 use crate::link::LOOK_EVERY;
 use crate::registry::{Probe, own_side};
-use crate::remote::{HEAD, Head, Kind};
-use crate::time::Stamp;
 
 /// Interval between queries; also the time limit of an answer.
 const EVERY: Duration = Duration::from_secs(1);

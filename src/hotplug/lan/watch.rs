@@ -9,12 +9,12 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 
 use super::super::{HotplugEvent, UnplugSource};
 use crate::device::{Attachment, DeviceNode, LanIdentity, LastReceived, Unit};
 use crate::link::{Link, LinkState};
-use crate::time::Stamp;
 
 /// See the module's comment.
 #[derive(Debug)]

@@ -1,11 +1,12 @@
 //! The head: file, verdict and reasons, and what is known about the episode.
 
+use rapid_core::text;
+use rapid_core::time::rfc3339;
+
 use super::{MARGIN, WIDTH};
 use crate::plot::svg::{Anchor, Px, Svg};
 use crate::record::inspect::{FileEnd, Inspection};
 use crate::status::session::{EpisodeEntry, Label};
-use crate::text;
-use crate::time::rfc3339;
 
 /// Lines of reasons; the report has all of them.
 const REASONS: usize = 8;

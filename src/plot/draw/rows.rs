@@ -3,12 +3,13 @@
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
+use rapid_core::modality::ModalityId;
+use rapid_core::text;
+
 use super::{FIGURES, LEFT, MARGIN, PLOT, x};
-use crate::modality::ModalityId;
 use crate::plot::gather::{BINS, PICTURES, Row, Subject, Timeline};
 use crate::plot::svg::{Anchor, Px, Svg};
 use crate::record::inspect::{Inspection, ModalityReport};
-use crate::text;
 
 /// Height of a row, and of that of the mask.
 const BAND: f64 = 34.0;

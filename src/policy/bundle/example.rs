@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
+use rapid_core::text::hexadecimal;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use super::{Bundle, POLICY_FILE};
-use crate::text::hexadecimal;
 
 /// The text of a valid `policy.json`: two cameras of 96x96, of which one is tactile, and an arm of
 /// four numbers; 10 DDIM steps.

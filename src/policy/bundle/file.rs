@@ -4,12 +4,12 @@
 use std::ops::Range;
 use std::time::Duration;
 
+use rapid_core::text;
 use serde::Deserialize;
 use serde::de::{Deserializer, Error, IgnoredAny, IntoDeserializer};
 use serde_json::{Map, Value};
 
 use super::spec::{ActionRotation, ColorOrder, Operation, VectorOperation, VectorRotation, WhenAbsent};
-use crate::text;
 
 /// Maximum number of actions in a chunk, and of values in an action.
 const MAX_ACTION: i64 = 1024;

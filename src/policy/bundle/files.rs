@@ -8,13 +8,13 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+use rapid_core::text;
 use sha2::{Digest, Sha256};
 
 use super::external::{self, GraphError};
 use super::read::Problems;
 use super::spec::{Bundle, BundleErrors, GraphFile};
 use super::validate::parse;
-use crate::text;
 
 /// The file that makes a folder a bundle.
 pub const POLICY_FILE: &str = "policy.json";

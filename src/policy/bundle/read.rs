@@ -7,6 +7,7 @@
 
 use std::fmt;
 
+use rapid_core::text;
 use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
@@ -14,7 +15,6 @@ use serde_path_to_error::Segment;
 
 use super::spec::BundleErrors;
 use crate::registry::{Diagnostic, did_you_mean};
-use crate::text;
 
 /// Maximum number of reported problems; a file with more was not written by a policy exporter.
 const MOST_PROBLEMS: usize = 100;

@@ -2,10 +2,11 @@
 
 use std::fmt;
 
+use rapid_core::modality::ModalityKind;
+
 use super::files::Graph;
 use super::read::Problems;
 use super::spec::{BasePose, Bundle, BundleErrors, ImageSpec, ObservationInput, VectorSpec};
-use crate::modality::ModalityKind;
 use crate::registry::{Registry, did_you_mean};
 
 /// Channels of a picture.

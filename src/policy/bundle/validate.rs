@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use rapid_core::text::counted;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
@@ -15,7 +16,6 @@ use super::spec::{
     QUATERNION, SchedulerSpec, TimestepSpacing, VectorSpec, WhenAbsent,
 };
 use crate::registry::did_you_mean;
-use crate::text::counted;
 
 /// What `format` must be.
 const FORMAT: &str = "rapid-policy/1";

@@ -2,12 +2,12 @@
 //! and against random poses from which an output is made.
 
 use proptest::prelude::*;
+use rapid_core::sample::SampleHeader;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::*;
 use crate::policy::bundle::example;
-use crate::sample::SampleHeader;
 
 const HORIZON: usize = 16;
 const START: usize = 1;

@@ -1,8 +1,8 @@
 use proptest::prelude::*;
+use rapid_core::sample::Encoding;
 use rapid_jpeg::Values;
 
 use super::*;
-use crate::sample::Encoding;
 
 const PLAIN: ImageSpec =
     ImageSpec { height: 2, width: 2, color: ColorOrder::Rgb, resize: None, crop: None, operation: None };

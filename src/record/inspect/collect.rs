@@ -6,6 +6,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::mask::{MASK_TOPIC, PhysicalMask};
+use rapid_core::modality::ModalityId;
+
 use super::super::metadata::{CONFIGURATION, POLICY};
 use super::super::quality::DurationHistogram;
 use super::super::verdict::Missing;
@@ -14,14 +18,11 @@ use super::policy::Gathered;
 use super::state::{self, Counted};
 use super::units;
 use super::{EventReport, Inspection, Judgement, Lateness, MaskEdge, ModalityReport, TopicReport};
-use crate::action::ACTION_TOPIC;
 use crate::episode::decode::{Content, FrameSlot, Kind, Scratch};
 use crate::episode::encode::EventText;
 use crate::episode::reader::{Attachment, Channel, Entry, Item, Message};
 use crate::episode::record_iter::Integrity;
 use crate::episode::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, Failed, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
-use crate::mask::{MASK_TOPIC, PhysicalMask};
-use crate::modality::ModalityId;
 
 /// Events and changes of the mask kept: a rig that flaps all day must not fill the memory.
 const MAX_EVENTS: usize = 10_000;

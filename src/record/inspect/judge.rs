@@ -10,6 +10,9 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
+use rapid_core::sample::Encoding;
 use serde_json::{Map, Value};
 
 use super::super::open_episode::SETTLE;
@@ -22,10 +25,7 @@ use crate::episode::decode::{FrameSlot, Sample};
 use crate::episode::reader::Message;
 use crate::episode::record_iter::Integrity;
 use crate::episode::{ABOUT, SUMMARY};
-use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use crate::registry::{Registry, VerdictSpec};
-use crate::sample::Encoding;
 use crate::status::{Grade, Verdict};
 
 /// No registry is longer; the text of a hostile file may be.

@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
+use rapid_core::text;
 use serde::Serialize;
 
 use super::render::clean;
 use super::{FileEnd, Inspection, Judgement, ReadError, inspect};
 use crate::episode::partial::PARTIAL;
 use crate::palette::Palette;
-use crate::text;
 
 /// An episode of a list. As JSON, one object a line.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -19,6 +19,7 @@ mod units;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use rapid_core::text;
 use serde::{Serialize, Serializer};
 
 use super::quality::{Quality, Spread};
@@ -27,7 +28,6 @@ use crate::episode::record_iter::Integrity;
 use crate::episode::{self, Failed, ReadAt};
 use crate::palette::Palette;
 use crate::status::{Grade, Sensors, Verdict};
-use crate::text;
 use collect::Collected;
 pub(crate) use judge::Numbers;
 

@@ -5,12 +5,12 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::text;
 use serde::Serialize;
 use serde_json::Value;
 
 use super::super::quality::DurationHistogram;
 use super::Lateness;
-use crate::text;
 
 /// Reasons kept apart; a file may hold any number of them.
 const MAX_REASONS: usize = 32;

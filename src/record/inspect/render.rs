@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
+use rapid_core::text;
+
 use super::{FileEnd, Inspection, Judgement, Lateness, ModalityReport, PolicyReport, TopicReport};
 use super::{policy, units};
 use crate::palette::Palette;
 use crate::record::Spread;
 use crate::status::Grade;
-use crate::text;
 
 /// Events shown; the JSON form has all of them.
 const EVENTS: usize = 40;

@@ -3,6 +3,9 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::sync::Grid;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use serde_json::Value;
 
 use super::super::metadata::CUT_SHORT;
@@ -14,9 +17,6 @@ use crate::episode::record_iter::{FileEnd, Integrity, LeftOut};
 use crate::episode::{ABOUT, SUMMARY};
 use crate::record::Quality;
 use crate::status::{Grade, Verdict};
-use crate::sync::Grid;
-use crate::text;
-use crate::time::Stamp;
 
 /// Ticks are at whole nanoseconds of another clock.
 const ROUNDING: u64 = 1_000;

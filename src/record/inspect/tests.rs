@@ -1,11 +1,11 @@
 //! Inspecting what the recorder wrote: whole, cut, flipped, and a literal report on the screen.
 
 use proptest::prelude::*;
+use rapid_core::mask::{PhysicalMask, SizedMask};
 
 use super::*;
 use crate::effort::{cases, every};
 use crate::episode::testing;
-use crate::mask::{PhysicalMask, SizedMask};
 use crate::palette::Palette;
 use crate::record::tests::Bench;
 use crate::status::{Chunk, Grade, Hold, Sensors, What};

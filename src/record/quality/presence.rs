@@ -3,8 +3,8 @@
 //! Invariant: pure; a span of presence counts from the publication of the mask that sets the bit to the one that clears
 //! it.
 
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
 
 /// When each modality was present, by the mask from `begin_ns` on. Memory grows with the changes of the mask, not with
 /// its publications.

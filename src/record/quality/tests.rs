@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use proptest::prelude::*;
+use rapid_core::modality::ModalityKind;
 
 use super::*;
-use crate::modality::ModalityKind;
 
 const MS: u64 = 1_000_000;
 const BEGIN: u64 = 5_000 * MS;

@@ -1,10 +1,11 @@
 //! Turns of the writer without its thread, at moments that the test chooses.
 
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::Encoding;
+
 use super::*;
-use crate::modality::ModalityId;
 use crate::record::inspect;
 use crate::record::tests::registry;
-use crate::sample::Encoding;
 
 /// A device of two numbers, in the registry of the bench.
 const TOF: u8 = 1;

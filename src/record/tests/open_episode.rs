@@ -1,14 +1,15 @@
 //! An open episode on a clock of its own: deadlines, losses, edges.
 
+use rapid_core::provenance::UnplugSource;
+use rapid_core::text::counted;
+use rapid_core::time::WallClock;
+
 use super::super::episode_path::EpisodePath;
 use super::super::open_episode::{Beginning, OpenEpisode};
 use super::super::provenance::Attached;
 use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
-use crate::provenance::UnplugSource;
 use crate::status::ReferenceSample;
-use crate::text::counted;
-use crate::time::WallClock;
 
 /// An open episode of its own clock, one second after the monotonic clock's zero.
 fn open(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {
@@ -61,7 +62,7 @@ fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
     let report = open.finish(Stamp(1200 * MS), &masks, None, &[]);
     assert_eq!(report.error, None);
     let read = read(&report.file);
-    assert_eq!(read.on(crate::mask::MASK_TOPIC).map(|message| message.1).collect::<Vec<_>>(), [5, 6, 7, 8]);
+    assert_eq!(read.on(rapid_core::mask::MASK_TOPIC).map(|message| message.1).collect::<Vec<_>>(), [5, 6, 7, 8]);
 }
 
 /// Those that the policy has when the episode begins, and those that it takes later.
@@ -331,7 +332,7 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
         let folder = tempfile::tempdir().unwrap();
         let report = acted(folder.path(), actions);
         let within = actions.iter().filter(|(_, at)| (1000..2000).contains(at)).count();
-        assert_eq!(read(&report.file).on(crate::action::ACTION_TOPIC).count(), within, "{what}");
+        assert_eq!(read(&report.file).on(rapid_core::action::ACTION_TOPIC).count(), within, "{what}");
         let reasons: Vec<_> = lost
             .map(|lost| {
                 format!("{lost} {} not in the file (limit 0)", if lost == 1 { "action is" } else { "actions are" })

@@ -2,10 +2,11 @@
 
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
+use rapid_core::time::WallClock;
+
 use super::*;
 use crate::disk::Disk;
 use crate::status::Event;
-use crate::time::WallClock;
 
 const GIB: u64 = 1 << 30;
 

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use proptest::prelude::*;
+use rapid_core::modality::ModalityKind;
 
 use super::*;
-use crate::modality::ModalityKind;
 
 /// Ten seconds of a camera of 30 Hz, away for three of them, without a fault.
 fn good() -> Quality {

@@ -33,7 +33,7 @@ fn a_camera_is_configured_with_a_format_it_offers() {
     let range = Rates::Range { slowest: Rate { frames: 5, seconds: 1 }, fastest: Rate { frames: 15, seconds: 1 } };
     assert_eq!(fps(&range), 15);
     let sim = SimSource::Serial { channels: 4, hz: 10, seed: 1 };
-    let sim = DeviceNode::Sim(Arc::new(SimDevice::new("x", sim, crate::time::Stamp(0))));
+    let sim = DeviceNode::Sim(Arc::new(SimDevice::new("x", sim, rapid_core::time::Stamp(0))));
     assert_eq!(suggested(&sim, None), serial_settings("csv", 4));
 }
 

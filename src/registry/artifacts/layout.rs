@@ -12,12 +12,12 @@
 
 use std::path::Path;
 
+use rapid_core::action::ACTION_TOPIC;
+use rapid_core::mask::MASK_TOPIC;
+use rapid_core::modality::ModalityKind;
+use rapid_core::observation::OBSERVATION_TOPIC;
 use serde_json::{Map, Value, json};
 
-use crate::action::ACTION_TOPIC;
-use crate::mask::MASK_TOPIC;
-use crate::modality::ModalityKind;
-use crate::observation::OBSERVATION_TOPIC;
 use crate::registry::{CanProtocol, CanSpec, DeviceSpec, Form, NodeSpec, Quantity, Registry};
 
 /// Topics that only files have, and their readers know.

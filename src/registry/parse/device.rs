@@ -6,19 +6,21 @@
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_core::action::MAX_ACTION;
+use rapid_core::modality::{ModalityId, ModalityKind};
+use rapid_core::sync::WhenStale;
+
 use super::effector::{self, EFFECTOR};
 use super::identity::name_problem;
 use super::program::{self, For, Programs};
 use super::verdict::{VerdictTable, Whose};
 use super::{form, identity, lan, motors, node, verdict};
-use crate::action::MAX_ACTION;
-use crate::modality::{ModalityId, ModalityKind};
 use crate::registry::columns::Vector;
 use crate::registry::section::Section;
 use crate::registry::spec::VerdictSpec;
 use crate::registry::spec::{
     ActionSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens,
-    PixelFormat, WhenStale,
+    PixelFormat,
 };
 
 /// Kinds of node this version has a driver for.

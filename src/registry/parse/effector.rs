@@ -2,8 +2,9 @@
 //!
 //! The description of the arm is not read here: a registry is also read where its files are not, from an episode.
 
+use rapid_core::action::MAX_ACTION;
+
 use super::program::Programs;
-use crate::action::MAX_ACTION;
 use crate::registry::section::Section;
 use crate::registry::spec::{
     ActionSpec, DamiaoSpec, EffectorSpec, GripperSpec, MOTOR_CHANNELS, MotorMode, TipRotation,

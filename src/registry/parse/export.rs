@@ -1,7 +1,8 @@
 //! `[export]`: the numbers of the state and of the action, by name.
 
+use rapid_core::action::ACTION_TOPIC;
+
 use super::device::Draft;
-use crate::action::ACTION_TOPIC;
 use crate::registry::columns::{ColumnError, Vector, choose};
 use crate::registry::section::Section;
 use crate::registry::spec::ExportSpec;

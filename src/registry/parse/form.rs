@@ -1,8 +1,9 @@
 //! `[device.NAME.pose]`, `[device.NAME.joints]`, `[device.NAME.calibration]` and `[device.NAME.points]`, and the forms that
 //! follow from the device itself.
 
-use crate::modality::ModalityKind;
-use crate::points::PacketFormat;
+use rapid_core::modality::ModalityKind;
+use rapid_core::points::PacketFormat;
+
 use crate::registry::section::Section;
 use crate::registry::spec::{
     CalibrationSpec, CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PointsSpec,

@@ -2,10 +2,11 @@
 
 use std::time::Duration;
 
+use rapid_core::interlock::{MAX_STOPS, StopKind};
+
 use super::device::{Draft, Kind};
 use super::identity::name_problem;
 use super::input::{self, INPUTS, LEVELS, are_one};
-use crate::interlock::{MAX_STOPS, StopKind};
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::Section;
 use crate::registry::spec::{FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff};

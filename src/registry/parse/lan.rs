@@ -3,13 +3,14 @@
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
+use rapid_core::modality::ModalityKind;
+use rapid_core::remote;
+
 use super::device::{Draft, IDENTITY_KEYS};
-use crate::modality::ModalityKind;
 use crate::registry::section::Section;
 use crate::registry::spec::{
     KINDS, LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, PixelFormat, Probe, RemoteSamples,
 };
-use crate::remote;
 
 const KEYS: [&str; 8] = ["protocol", "mdns", "instance", "host", "port", "probe", "probe_port", "lease"];
 /// Keys of the table that only some protocols have.

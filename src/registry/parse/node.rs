@@ -3,11 +3,11 @@
 
 use std::time::Duration;
 
+use rapid_core::modality::ModalityKind;
 use toml::de::DeValue;
 
 use super::device::Draft;
 use super::motors;
-use crate::modality::ModalityKind;
 use crate::registry::diagnostic::nearest;
 use crate::registry::section::Section;
 use crate::registry::spec::KINDS;

@@ -3,7 +3,7 @@
 //!
 //! Samples are recorded as they are; messages of these forms are derived from them (`episode::form`).
 
-use crate::points::PacketFormat;
+use rapid_core::points::PacketFormat;
 
 /// The end of the topic of poses.
 pub const POSE_ENDING: &str = "/pose";

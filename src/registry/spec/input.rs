@@ -4,10 +4,10 @@ use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use rapid_core::interlock::StopKind;
 use serde::Serialize;
 
 use super::Registry;
-use crate::interlock::StopKind;
 
 /// Buttons of a rig, at most.
 pub const MAX_BUTTONS: usize = 32;

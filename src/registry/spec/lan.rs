@@ -3,9 +3,10 @@
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
 
+use rapid_core::modality::ModalityKind;
+use rapid_core::remote;
+
 use super::PixelFormat;
-use crate::modality::ModalityKind;
-use crate::remote;
 
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]

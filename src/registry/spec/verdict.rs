@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use crate::modality::ModalityKind;
+use rapid_core::modality::ModalityKind;
 
 /// How many defects an episode may have before it gets a grade: the limits of one grade. A figure beyond its limit
 /// leads to the grade; `None` is a check that is off.

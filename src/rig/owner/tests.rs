@@ -7,17 +7,18 @@ use std::task::{Context, Wake, Waker};
 
 use futures::channel::mpsc::{UnboundedSender, unbounded};
 use futures::future::BoxFuture;
+use rapid_core::action::Order;
+use rapid_core::provenance::UnplugSource;
+use rapid_core::sync::WhenStale;
 use tokio::sync::{broadcast, watch};
 
 use super::*;
-use crate::action::Order;
 use crate::device::{DeviceNode, UsbIdentity};
 use crate::hotplug::{HotplugError, HotplugEvent};
 use crate::patience::PATIENCE;
-use crate::provenance::UnplugSource;
 use crate::registry::{
     ExportSpec, Framing, IdentitySpec, InferenceSpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec,
-    SerialSpec, UsbSpec, WhenStale,
+    SerialSpec, UsbSpec,
 };
 use crate::rig::presence::{Claim, read_mask};
 use crate::simulation::{SimDevice, SimSource};
@@ -45,7 +46,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         action: None,
         hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(
-            crate::modality::ModalityKind::Image,
+            rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),
         ),
@@ -612,7 +613,7 @@ async fn the_mask_is_published_before_the_announcement_and_its_file_agrees_with_
             let document: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
             report.extend(document["sequence"].as_u64().zip(document["mask"].as_str().map(str::to_owned)));
         }
-        let mut take = |topic: TopicId, header: &crate::sample::SampleHeader, payload: &[u8]| {
+        let mut take = |topic: TopicId, header: &rapid_core::sample::SampleHeader, payload: &[u8]| {
             if topic == TopicId::Mask {
                 published.insert(header.seq, payload[0]);
             }

@@ -7,13 +7,13 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{Ordering, fence};
 use std::time::Duration;
 
+use rapid_core::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
+use rapid_core::time::{Stamp, realtime_ns};
 use rustix::fs::{FlockOperation, Mode, OFlags};
 use rustix::io::Errno;
 
 use super::json::{self, json_path};
 use crate::folder::FolderError;
-use crate::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
-use crate::time::{Stamp, realtime_ns};
 
 /// If a publisher dies between creating and locking a file, the next one tries again.
 const TRIES: usize = 10;

@@ -3,14 +3,14 @@
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::time::{realtime_ns, rfc3339};
 use serde::Serialize;
 
 use super::PresenceError;
 use crate::folder::{Folder, Links, Missing, Sync};
-use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
 use crate::status::SlotState;
-use crate::time::{realtime_ns, rfc3339};
 
 /// One device of the JSON file.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -16,15 +16,15 @@ use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_core::mask::{Bits, PhysicalMask};
+use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::time::{Stamp, realtime_ns};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::bus::Writer;
 use crate::fault;
-use crate::mask::{Bits, PhysicalMask};
 use crate::realtime::{MASK_PRIORITY, use_fifo};
-use crate::sample::{Encoding, SampleHeader};
 use crate::status::Board;
-use crate::time::{Stamp, realtime_ns};
 
 pub use file::{PresenceError, instances, read_mask};
 pub use json::{JsonDevice, json_path};

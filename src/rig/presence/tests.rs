@@ -185,7 +185,7 @@ fn a_reader_never_sees_a_torn_record() {
 #[test]
 fn the_json_document_has_the_papers_fields() {
     let path = json_path(&path());
-    let bit = crate::modality::ModalityId::new(0).expect("below 64");
+    let bit = rapid_core::modality::ModalityId::new(0).expect("below 64");
     let device = JsonDevice {
         name: "cam".into(),
         bit,
@@ -210,7 +210,7 @@ fn the_json_document_has_the_papers_fields() {
 fn an_incomplete_mask_is_named_with_its_cause() {
     let folder = tempfile::tempdir().expect("folder");
     let path = folder.path().join("mask");
-    for bytes in [0, 1, crate::mask::RECORD_LEN / 2, crate::mask::RECORD_LEN - 1] {
+    for bytes in [0, 1, rapid_core::mask::RECORD_LEN / 2, rapid_core::mask::RECORD_LEN - 1] {
         std::fs::write(&path, vec![0; bytes]).expect("write");
         let report = read_mask(&path).expect_err("a part of a mask").to_string();
         let name = path.display().to_string();

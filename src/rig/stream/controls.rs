@@ -10,14 +10,14 @@ use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::action::{ActionSource, MAX_ACTION};
+use rapid_core::permission::{Attended, Permission};
 use tokio::io::unix::AsyncFd;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use super::source::Source;
-use crate::action::{ActionSource, MAX_ACTION};
 use crate::bus::{Actions, watch};
 use crate::driver::DriverError;
-use crate::permission::{Attended, Permission};
 
 /// See the module's comment.
 #[derive(Debug, Clone)]

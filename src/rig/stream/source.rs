@@ -3,14 +3,14 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::action::{ActionSource, ActuatorNotice, Order};
+use rapid_core::permission::Attended;
+use rapid_core::provenance::Negotiated;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::{CLOSE_LIMIT, Stream};
-use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::driver::{ClockOffset, Driver, DriverError, Reading};
-use crate::permission::Attended;
-use crate::provenance::Negotiated;
 use crate::registry::NodeSpec;
 use crate::rig::worker::{MOST_SILENT_BEATS, Worker};
 use crate::status::Episode;

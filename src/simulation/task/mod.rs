@@ -14,8 +14,9 @@ pub use rapid_world::{
     UNSEEN_PERIOD, World,
 };
 
+use rapid_core::sample::Encoding;
+
 use super::TaskPart;
-use crate::sample::Encoding;
 
 /// Nearly lossless, colours at full resolution: the texture is fine and coloured.
 const JPEG_QUALITY: u8 = 95;

@@ -4,6 +4,8 @@
 //!
 //! Invariant: everything follows from the seed and the actions.
 
+#![forbid(unsafe_code)]
+
 mod expert;
 mod looks;
 mod touch;

@@ -4,10 +4,11 @@
 
 use std::collections::VecDeque;
 
-use crate::modality::ModalityId;
-use crate::sample::Encoding;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
+
 use crate::status::preview::Preview;
-use crate::time::Stamp;
 use crate::tui::lidar::Sweep;
 use crate::tui::picture::Picture;
 

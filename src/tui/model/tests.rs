@@ -1,7 +1,7 @@
 use crossterm::event::KeyCode;
+use rapid_core::mask::PhysicalMask;
 
 use super::*;
-use crate::mask::PhysicalMask;
 use crate::status::literal::{TAKEN, every_state, id, line, recording, three_streaming};
 use crate::status::session::{Answered, EpisodeEntry, Label, SessionRequest, SessionStatus};
 use crate::status::{Grade, Level, UnregisteredDevice};
@@ -645,7 +645,7 @@ fn what_other_screens_look_at_takes_nothing_from_the_plot_of_this_one() {
             let payload: Vec<u8> = f64::from(step).to_le_bytes().to_vec();
             let (seq, bytes) = (u64::from(step), payload.len());
             let captured = Stamp(TAKEN.0 + u64::from(step));
-            let encoding = crate::sample::Encoding::F64;
+            let encoding = rapid_core::sample::Encoding::F64;
             std::sync::Arc::new(Preview {
                 device: id(bit),
                 seq,
@@ -670,7 +670,7 @@ fn a_line_that_is_too_slow_for_pictures_shows_none() {
     let payload: Vec<u8> = vec![7; 16];
     now.previews = vec![std::sync::Arc::new(Preview {
         device: id(0),
-        encoding: crate::sample::Encoding::Grey,
+        encoding: rapid_core::sample::Encoding::Grey,
         width: 4,
         height: 4,
         bytes: payload.len(),

@@ -1,7 +1,8 @@
 //! The pages, and the column beside the rig.
 
+use rapid_core::sample::Encoding;
+
 use super::*;
-use crate::sample::Encoding;
 use crate::status::detail::{Channel, DeviceDetail, Intervals};
 use crate::status::literal::id;
 use crate::status::preview::Preview;

@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rapid::rig::presence::PERIOD;
-use rapid::time::{Stamp, realtime_ns};
+use rapid_core::time::{Stamp, realtime_ns};
 use rustix::thread::{ClockId, Timespec, clock_nanosleep_absolute};
 use thread_priority::unix::{
     RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,

@@ -16,7 +16,7 @@ use rapid::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid::driver::can::raw::Raw;
 use rapid::hotplug::HotplugEvent;
 use rapid::registry::{CAN_RECORD, Registry};
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use vbench::emu::can::Frame;
 use vbench::emu::can::damiao;

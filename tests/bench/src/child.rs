@@ -15,7 +15,7 @@ use mcap::write::NoSeek;
 use rapid::device::DeviceNode;
 use rapid::driver::Driver;
 use rapid::simulation::SimDevice;
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 

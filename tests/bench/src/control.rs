@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rapid::time::{Stamp, realtime_ns};
+use rapid_core::time::{Stamp, realtime_ns};
 use serde_json::Value;
 
 use crate::beat::{sleep, sleep_until};

@@ -11,12 +11,12 @@ use rapid::bus::{Bus, TopicId};
 use rapid::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid::hotplug::{HotplugEvent, HotplugStream};
 use rapid::orders::receive::Orders;
-use rapid::permission::Permission;
 use rapid::registry::Registry;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
 use rapid::status::Board;
-use rapid::time::Stamp;
+use rapid_core::permission::Permission;
+use rapid_core::time::Stamp;
 use tokio_util::sync::CancellationToken;
 
 use crate::figure::Figure;

@@ -6,11 +6,11 @@ use rapid::bus::TopicId;
 use rapid::driver::sim;
 use rapid::episode::encode;
 use rapid::episode::schema::{self, SampleSchema};
-use rapid::modality::ModalityId;
 use rapid::registry::Registry;
 use rapid::registry::scenario::Scenario;
-use rapid::sample::{Encoding, SampleHeader};
 use rapid::simulation::SimSource;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Encoding, SampleHeader};
 
 use crate::Failure;
 
@@ -79,7 +79,7 @@ impl Feed {
         }
         let mask = SampleHeader { encoding: Encoding::Mask as u32, ..SampleHeader::default() };
         let mut message = Vec::new();
-        encode::mask(&mut message, u64::MAX / 2, rapid::mask::PhysicalMask(0x1f), 1 << 20);
+        encode::mask(&mut message, u64::MAX / 2, rapid_core::mask::PhysicalMask(0x1f), 1 << 20);
         lanes.push(Lane {
             topic: TopicId::Mask,
             name: "/rapid/mask".to_owned(),

@@ -12,9 +12,9 @@ use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
 use rapid::registry::Registry;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
-use rapid::sample::SampleHeader;
 use rapid::status::Board;
-use rapid::time::Stamp;
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::Stamp;
 use tokio_util::sync::CancellationToken;
 
 use crate::beat::sleep_until;

@@ -7,9 +7,9 @@ use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid::policy::picture::{Picture, Preprocessor};
 use rapid::random::Random;
-use rapid::sample::Encoding;
 use rapid::simulation::TaskPart;
 use rapid::simulation::task::{Expert, SIDE, Trial};
+use rapid_core::sample::Encoding;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 

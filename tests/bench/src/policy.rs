@@ -15,8 +15,8 @@ use rapid::policy::sampler::{Computing, Sampler};
 use rapid::random::Random;
 use rapid::registry::InferenceSpec;
 use rapid::registry::task::PARTS;
-use rapid::sample::SampleHeader;
 use rapid::simulation::task::{Expert, Trial, layout};
+use rapid_core::sample::SampleHeader;
 
 use crate::child::thread_cpu_s;
 use crate::figure::Figure;

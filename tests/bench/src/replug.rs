@@ -14,9 +14,9 @@ use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
 use rapid::hotplug::{HotplugError, HotplugEvent};
 use rapid::registry::scenario::{ScenarioAction, ScenarioEvent};
-use rapid::sample::Epoch;
 use rapid::simulation::SimDevice;
-use rapid::time::Stamp;
+use rapid_core::sample::Epoch;
+use rapid_core::time::Stamp;
 
 use crate::feed;
 use crate::figure::Figure;

@@ -14,7 +14,7 @@ use rapid::control::can::CanFrame;
 use rapid::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Ranges, StateCommand};
 use rapid::control::damiao::parameter::Reply;
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 
 use self::motor_world::motor_spec::{brake, bus, motor};
 use self::motor_world::{CYCLE, Input, Program, World};

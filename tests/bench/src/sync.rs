@@ -3,12 +3,11 @@
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-use rapid::mask::PhysicalMask;
-use rapid::modality::ModalityId;
-use rapid::registry::WhenStale;
-use rapid::sample::{Epoch, SampleHeader};
-use rapid::sync::{SyncModality, SyncSample, Synchronizer};
-use rapid::time::Stamp;
+use rapid_core::mask::PhysicalMask;
+use rapid_core::modality::ModalityId;
+use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
+use rapid_core::time::Stamp;
 
 use crate::figure::Figure;
 use crate::stats::{Sorted, median, range};

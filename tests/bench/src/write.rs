@@ -11,9 +11,9 @@ use std::time::{Duration, Instant};
 use mcap::{Compression, WriteOptions};
 use rapid::bus::TopicId;
 use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Sink, Source};
-use rapid::sample::SampleHeader;
 use rapid::status::Board;
-use rapid::time::Stamp;
+use rapid_core::sample::SampleHeader;
+use rapid_core::time::Stamp;
 
 use crate::child::{self, Plain, process_cpu_s, thread_cpu_s};
 use crate::feed::{self, Feed, Lane};

@@ -2,9 +2,9 @@
 
 use rapid::driver::lan::fuzzing;
 use rapid::hotplug::lan::fuzz_label;
-use rapid::points::{self, PacketFormat};
-use rapid::remote::{Frames, Head, Kind, request, requested};
-use rapid::sample::Encoding;
+use rapid_core::points::{self, PacketFormat};
+use rapid_core::remote::{Frames, Head, Kind, request, requested};
+use rapid_core::sample::Encoding;
 
 /// Of the smallest entry.
 const LARGEST: usize = 1024;

@@ -10,7 +10,7 @@ use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand}
 use rapid::control::damiao::parameter::{Parameter, Reply, Value};
 use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 use rapid::registry::{DamiaoSpec, MotorMode, MotorSpec};
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// Bytes of one thing that happens: what, a number, and eight more.
 const RECORD: usize = 10;

@@ -2,7 +2,7 @@
 
 use rapid::policy::bundle::{Bundle, ColorOrder, ImageSpec, Normalization, Operation};
 use rapid::policy::picture::{Picture, Preprocessor};
-use rapid::sample::Encoding;
+use rapid_core::sample::Encoding;
 
 use crate::seeds;
 

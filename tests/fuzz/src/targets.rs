@@ -10,13 +10,13 @@ use rapid::commands;
 use rapid::device::{Attachment, DeviceNode, Unit, UsbIdentity};
 use rapid::driver;
 use rapid::episode::recover::recover_bytes;
-use rapid::mask::{MaskRecord, RECORD_LEN};
 use rapid::palette::Palette;
 use rapid::record::inspect as inspection;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
 use rapid::registry::{Assigner, Assignment, Framing, Parse, Registry, RegistryErrors, SerialSpec};
-use rapid::text as shown;
+use rapid_core::mask::{MaskRecord, RECORD_LEN};
+use rapid_core::text as shown;
 
 use crate::artifacts;
 
@@ -177,7 +177,7 @@ pub fn layout(bytes: &[u8]) {
     let record = MaskRecord {
         device_count: 3,
         generation: 2,
-        mask: rapid::mask::PhysicalMask(u64::MAX),
+        mask: rapid_core::mask::PhysicalMask(u64::MAX),
         realtime_ns: 1,
         sequence: 1,
     };

@@ -12,7 +12,7 @@ use std::time::Duration;
 use rapid::control::motors::Notice;
 use rapid::random::Random;
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
-use rapid::time::Stamp;
+use rapid_core::time::Stamp;
 
 use crate::support::motor_world::motor_spec::{brake, bus, motor};
 use crate::support::motor_world::{CYCLE, World};

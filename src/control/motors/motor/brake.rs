@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use super::{Motor, Phase};
 use crate::registry::Stop;
-use crate::time::Stamp;
 
 /// What is known of a brake.
 #[derive(Debug, Clone, Copy, Default)]

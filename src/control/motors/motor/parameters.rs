@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use super::frames::within;
 use super::{Motor, Phase};
 use crate::control::can::CanFrame;
@@ -12,7 +14,6 @@ use crate::control::motors::fault::Fault;
 use crate::control::motors::notice::Notice;
 use crate::control::motors::notices::Notices;
 use crate::registry::MotorMode;
-use crate::time::Stamp;
 
 /// What is read, in this order.
 pub(super) const PROBE: [Parameter; 5] =

@@ -1,7 +1,8 @@
 //! Joints with a brake.
 
+use rapid_core::action::Trip;
+
 use super::*;
-use crate::action::Trip;
 use crate::registry::{Stop, StopSpec};
 use world::brake;
 

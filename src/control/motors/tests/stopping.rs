@@ -1,7 +1,8 @@
 //! How joints stop at a fault: each in its way, and none until the next arm in another.
 
+use rapid_core::action::Trip;
+
 use super::*;
-use crate::action::Trip;
 use crate::registry::{Stop, StopSpec};
 
 /// Two motors that are armed, the second of which stops in this way.

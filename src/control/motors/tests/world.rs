@@ -2,8 +2,9 @@
 
 use std::collections::VecDeque;
 
+use rapid_core::action::Trip;
+
 use super::*;
-use crate::action::Trip;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
 use crate::registry::{BrakeSpec, MotionSpec, MotorKind, MotorSpec, Mounting, Stop, StopSpec, WatchSpec};

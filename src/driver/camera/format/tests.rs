@@ -1,8 +1,8 @@
 use proptest::prelude::*;
+use rapid_core::sample::FLAG_ERROR;
+use rapid_core::time::Stamp;
 
 use super::*;
-use crate::sample::FLAG_ERROR;
-use crate::time::Stamp;
 
 fn spec(format: PixelFormat) -> CameraSpec {
     CameraSpec { width: 640, height: 480, fps: 30, format, depth_unit_um: 1000, controls: Vec::new() }

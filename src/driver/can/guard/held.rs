@@ -6,8 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
+
 use crate::gpio::Output;
-use crate::time::Stamp;
 
 /// A line that cannot be set is retried for this long...
 const RETRIED_FOR: Duration = Duration::from_secs(2);

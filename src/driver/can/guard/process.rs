@@ -6,6 +6,7 @@ use std::mem::MaybeUninit;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use rapid_core::time::Stamp;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fd::{AsFd, BorrowedFd, OwnedFd};
 use rustix::io::Errno;
@@ -19,7 +20,6 @@ use crate::driver::can::claim::Claim;
 use crate::driver::can::{damiao_serial, slcan, socket};
 use crate::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
 use crate::registry::{BrakeSpec, CanAdapter, MAX_MOTORS};
-use crate::time::Stamp;
 
 /// From one round of frames to the next.
 const ROUND: Duration = Duration::from_millis(5);

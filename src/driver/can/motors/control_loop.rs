@@ -18,21 +18,21 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use rapid_core::action::{ActionSource, ActuatorNotice, Arming, MAX_ACTION, Order, OrderSlot};
+use rapid_core::permission::Attended;
+use rapid_core::time::Stamp;
 use tokio::sync::mpsc;
 
 use super::powered::Powered;
 use super::statistics::{LoopStatistics, Punctuality};
-use crate::action::{ActionSource, ActuatorNotice, Arming, MAX_ACTION, Order, OrderSlot};
 use crate::control::can::CanFrame;
 use crate::control::motors::{BusState, SAMPLE_VALUES};
 use crate::control::pace::Pace;
 use crate::driver::DriverError;
 use crate::driver::can::link::LinkError;
 use crate::fault;
-use crate::permission::Attended;
 use crate::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
 use crate::registry::{DamiaoSpec, MAX_MOTORS};
-use crate::time::Stamp;
 
 /// Frames taken after the deadline of a cycle: a flooded bus must not keep the motors from their commands.
 const LATE_FRAMES: usize = 64;

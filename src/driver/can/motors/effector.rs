@@ -14,14 +14,14 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_core::action::{ActionSource, MAX_ACTION, NoAction};
+use rapid_core::bell::Bell;
+use rapid_core::text;
+use rapid_core::time::Stamp;
 use rustix::event::{PollFd, PollFlags, Timespec};
 
-use crate::action::{ActionSource, MAX_ACTION, NoAction};
-use crate::bell::Bell;
 use crate::kinematics::{Arm, Solver};
 use crate::registry::{MAX_MOTORS, MOTOR_CHANNELS};
-use crate::text;
-use crate::time::Stamp;
 
 /// The longest time that an action without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);

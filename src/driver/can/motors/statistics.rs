@@ -4,10 +4,10 @@ use std::fmt;
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
+use rapid_core::text;
+use rapid_core::time::nanoseconds;
 
 use crate::control::motors::Counts;
-use crate::text;
-use crate::time::nanoseconds;
 
 /// Longest time the statistics distinguish, ns.
 const LONGEST: u64 = 10_000_000_000;

@@ -7,22 +7,22 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use rapid_core::action::{Arming, NoAction};
+use rapid_core::interlock::{InputState, Interlocks, StopKind};
+use rapid_core::permission::Permission;
+use rapid_core::time::Stamp;
 use tokio::time::{Instant, interval, timeout};
 
 use super::*;
-use crate::action::{Arming, NoAction};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Reply, Value};
 use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
-use crate::interlock::{InputState, Interlocks, StopKind};
 use crate::patience::PATIENCE;
-use crate::permission::Permission;
 use crate::registry::{
     EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, TipRotation, WatchSpec,
 };
-use crate::time::Stamp;
 
 fn spec(count: u16, hz: u32) -> DamiaoSpec {
     let motor = |slave: u16| MotorSpec {

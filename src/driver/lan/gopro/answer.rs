@@ -2,7 +2,7 @@
 //!
 //! Invariant: strings from the camera become part of a path only if they are plain names.
 
-use crate::time::Stamp;
+use rapid_core::time::Stamp;
 
 /// The name of a clip on the card: plain names.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]

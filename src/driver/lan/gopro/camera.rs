@@ -14,6 +14,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use hyper::StatusCode;
+use rapid_core::time::Stamp;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep};
 use tokio_util::task::AbortOnDropHandle;
@@ -25,7 +26,6 @@ use super::clip::{self, Clip, Failure};
 use super::{ANSWER_LIMIT, Clips, LARGEST_ANSWER, TRIES, ask};
 use super::{Before, Books, Shutter};
 use crate::driver::DriverError;
-use crate::time::Stamp;
 
 /// The episode in progress, if there is one; `None` until the camera was notified.
 pub(super) type ReportedEpisode = Option<Option<PathBuf>>;

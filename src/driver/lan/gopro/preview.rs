@@ -17,6 +17,8 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
+use rapid_core::sample::Encoding;
+use rapid_core::time::Stamp;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::UdpSocket;
 use tokio::net::unix::pipe;
@@ -30,8 +32,6 @@ use super::super::place::Server;
 use super::ask;
 use crate::driver::{DriverError, Reading};
 use crate::registry::{LanPicture, PREVIEW_DECODER as DECODER, own_side};
-use crate::sample::Encoding;
-use crate::time::Stamp;
 
 /// Without a packet for this long the stream is requested again.
 const SILENT: Duration = Duration::from_secs(3);

@@ -153,12 +153,13 @@ fn actions_are_counted_by_what_became_of_them() {
 #[test]
 #[expect(clippy::cast_possible_truncation, reason = "a network has 32 bits")]
 fn relative_poses_of_a_policy_become_targets_that_lead_to_them() {
+    use rapid_core::rotation;
+    use rapid_core::sample::{Encoding, SampleHeader};
+
     use crate::kinematics::tests::{COMMANDED, SIX, apart, arm_of};
     use crate::policy::bundle::Bundle;
     use crate::policy::compose::Composer;
     use crate::policy::request::Request;
-    use crate::rotation;
-    use crate::sample::{Encoding, SampleHeader};
 
     const POLICY: &str = include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/bundle/valid/relative.json"));
     const MOTORS: usize = 7;

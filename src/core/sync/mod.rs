@@ -18,11 +18,25 @@ use std::time::Duration;
 use crate::mask::Bits;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::observation::{Observation, ObservationSlot};
-use crate::registry::{DeviceSpec, WhenStale};
 use crate::sample::Epoch;
 use crate::time::{Stamp, nanoseconds};
 
 pub use grid::Grid;
+
+/// What an observation holds for an attached modality without a sample in the window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum WhenStale {
+    /// The newest sample with its age.
+    #[default]
+    Hold,
+    /// Nothing.
+    Zero,
+}
+
+crate::words! {
+    /// Every policy and its name.
+    WhenStale, 2: "hold" = Hold, "zero" = Zero;
+}
 
 /// A modality as the synchroniser needs to know it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,13 +50,6 @@ pub struct SyncModality {
     /// Samples kept, at least 1: those of the longest time between a sample's capture and the
     /// evaluation of the last tick that may want it.
     pub capacity: usize,
-}
-
-impl SyncModality {
-    /// The modality of a device, of which `capacity` samples are kept.
-    pub const fn of(device: &DeviceSpec, capacity: usize) -> Self {
-        Self { id: device.id, when_stale: device.when_stale, latency: device.latency, capacity }
-    }
 }
 
 /// See the module's comment.

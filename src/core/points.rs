@@ -23,6 +23,11 @@ pub enum PacketFormat {
     Livox,
 }
 
+crate::words! {
+    /// Every format and its name.
+    PacketFormat, 2: "velodyne" = Velodyne, "livox" = Livox;
+}
+
 /// A point: x ahead of the sensor, y to its left, z up, in m (ROS REP 103).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {

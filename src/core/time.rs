@@ -85,9 +85,8 @@ impl WallClock {
         Self { offset_ns: best.1 }
     }
 
-    /// A relation chosen by the caller: wall ns minus monotonic ns.
-    #[cfg(test)]
-    pub(crate) const fn with_offset(offset_ns: i128) -> Self {
+    /// A relation chosen by the caller, for tests: wall ns minus monotonic ns.
+    pub const fn with_offset(offset_ns: i128) -> Self {
         Self { offset_ns }
     }
 

@@ -162,7 +162,7 @@ impl Interlocks {
     }
 
     /// Stores the state of an input. Returns whether it has changed.
-    pub(crate) fn set(&self, index: usize, state: InputState, now: Stamp) -> bool {
+    pub fn set(&self, index: usize, state: InputState, now: Stamp) -> bool {
         let code = match state {
             InputState::Runs => RUNS,
             InputState::Stopped => STOPPED,
@@ -179,14 +179,14 @@ impl Interlocks {
 
     /// An input that has stopped, or was lost, after this time, whatever it reports now; an emergency stop before an enabling
     /// switch.
-    pub(crate) fn stopped_after(&self, last: u64) -> Option<usize> {
+    pub fn stopped_after(&self, last: u64) -> Option<usize> {
         let is_after = |one: &Interlock| one.stopped.load(Ordering::SeqCst) > last;
         let stopped = |kind| self.all.iter().position(|one| one.kind == kind && is_after(one));
         stopped(StopKind::Emergency).or_else(|| stopped(StopKind::Enabling))
     }
 
     /// The order that results from an input that does not run.
-    pub(crate) fn order(&self, index: usize) -> Option<Order> {
+    pub fn order(&self, index: usize) -> Option<Order> {
         let trip =
             || Trip { stop: u8::try_from(index).unwrap_or(u8::MAX), is_lost: self.state(index) == InputState::Lost };
         Some(match self.all.get(index)?.kind {

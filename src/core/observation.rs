@@ -78,7 +78,8 @@ impl ObservationSlot {
         })
     }
 
-    pub(crate) fn empty(id: ModalityId) -> Self {
+    /// Nothing of a modality.
+    pub fn empty(id: ModalityId) -> Self {
         Self { id, plugged: false, present: false, valid: false, stale: false, age_ns: 0, seq: None, handle: None }
     }
 }
@@ -95,7 +96,8 @@ pub struct Observation {
 }
 
 impl Observation {
-    pub(crate) fn new(ids: &[ModalityId]) -> Self {
+    /// Of these modalities, with nothing seen.
+    pub fn new(ids: &[ModalityId]) -> Self {
         Self {
             tick: Stamp::default(),
             mask: PhysicalMask::EMPTY,

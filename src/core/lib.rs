@@ -1,0 +1,24 @@
+//! What every part of `rapid` speaks of: modalities, the mask, samples, time, observations and how they are
+//! synchronised, actions and who permits them, and text that is safe for a terminal.
+//!
+//! Invariant: nothing here opens a device, a file or a socket, starts a thread or waits; the clocks are read, and a
+//! bell of the kernel is rung.
+
+#![forbid(unsafe_code)]
+
+pub mod action;
+pub mod bell;
+pub mod interlock;
+pub mod mask;
+pub mod modality;
+pub mod observation;
+pub mod permission;
+pub mod points;
+pub mod provenance;
+pub mod remote;
+pub mod rotation;
+pub mod sample;
+pub mod sync;
+pub mod text;
+pub mod time;
+mod words;
