@@ -85,9 +85,11 @@ pub struct InferenceArgs {
     #[arg(long, value_name = "COUNT")]
     pub denoising_steps: Option<usize>,
     /// Threads to compute on [default: 1, or that of [inference] in devices.toml]
+    #[allow(rustdoc::broken_intra_doc_links, reason = "a table of devices.toml, as it is written there")]
     #[arg(long, value_name = "COUNT", value_parser = threads)]
     pub threads: Option<usize>,
     /// cpu, cuda or tensorrt [default: cpu, or that of [inference] in devices.toml]
+    #[allow(rustdoc::broken_intra_doc_links, reason = "a table of devices.toml, as it is written there")]
     #[arg(long, value_name = "NAME", value_parser = provider)]
     pub provider: Option<Provider>,
     /// onnxruntime library to use instead of the built-in one

@@ -7,7 +7,7 @@
 //! The protocol is `foxglove.sdk.v1` (<https://github.com/foxglove/ws-protocol>), by the crate `foxglove`.
 //!
 //! Invariant: nothing else waits for this thread: a client that reads slowly, or not at all, gets the newest of each topic
-//! when it reads ([`relay`]).
+//! when it reads (`relay`).
 //! Invariant: a turn is short, whatever waits on the bus: on a busy machine the connections would wait for its end, and of all that it
 //! sends a client gets the last topics alone.
 //! Invariant: nothing is encoded for a topic to which no client subscribes.

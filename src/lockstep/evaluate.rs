@@ -172,7 +172,7 @@ pub enum Configuration {
     /// Those that are present, by the mask.
     Dynamic,
     /// Every sensor that was present at the start is read at every tick by a loop that fails when a read does
-    /// ([`StaticLoop`]). The policy keeps the mask of the start.
+    /// (`StaticLoop`). The policy keeps the mask of the start.
     Static,
 }
 

@@ -6,7 +6,7 @@
 //! server answers websockets and nothing else.
 //!
 //! Invariant: nothing else waits for this thread: a client that reads slowly gets fewer views, and one that does not read
-//! is left ([`serve`]).
+//! is left (`serve`).
 //! Invariant: motors are neither armed nor disarmed by it: what stops motion must not depend on a radio.
 //! Invariant: whatever ends the thread, the run continues.
 

@@ -42,7 +42,7 @@ pub fn recorded_with(scenario: Scenario, is_expected: impl Fn(&str) -> bool) -> 
 }
 
 /// The guest's script and `rapid` ended without an error, and no episode has a reason against it that is not
-/// [of the machine](of_the_machine). The exit code reports a BAD one.
+/// of the machine (`of_the_machine`). The exit code reports a BAD one.
 pub fn ended(outcome: &Outcome) {
     ended_with(outcome, |_| false);
 }

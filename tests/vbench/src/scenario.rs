@@ -194,7 +194,7 @@ impl Scenario {
         self
     }
 
-    /// The least time that the guest's script has, for one that runs for longer than [`WATCHDOG`].
+    /// The least time that the guest's script has, for one that runs for longer than `WATCHDOG`.
     #[must_use]
     pub fn limit(mut self, limit: Duration) -> Self {
         self.limit = self.limit.max(limit);
