@@ -276,7 +276,7 @@ fn is_task(global: &Global) -> bool {
 fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let path = mask_path(global.instance.as_deref());
     let json = json_path(&path);
-    let names = || commands::mask::layout(&crate::folder::read_text(&json, LARGEST_JSON).ok()?);
+    let names = || commands::mask::layout(&rapid_system::folder::read_text(&json, LARGEST_JSON).ok()?);
     let read = || read_mask(&path).map_err(|error| no_mask(&error));
     let options = MaskOptions { watch, json: global.json, palette: Palette::of(&io::stdout()) };
     let stop = CancellationToken::new();
@@ -627,8 +627,9 @@ mod tests {
 
 #[cfg(test)]
 mod failure_tests {
+    use rapid_system::folder::FolderError;
+
     use super::*;
-    use crate::folder::FolderError;
 
     #[test]
     fn at_the_limit_of_open_files_the_error_names_the_limit_and_not_the_file() {

@@ -16,7 +16,6 @@ pub mod compare;
 #[cfg(feature = "motors")]
 pub mod control;
 pub mod device;
-pub mod disk;
 pub mod dispatch;
 pub mod driver;
 #[cfg(test)]
@@ -30,8 +29,6 @@ mod executable;
 pub mod export;
 pub mod fault;
 pub mod flash;
-pub mod folder;
-pub mod gpio;
 pub mod headless;
 pub mod hotplug;
 pub mod inputs;
@@ -52,13 +49,14 @@ pub mod panics;
 #[cfg(test)]
 #[path = "../tests/support/patience.rs"]
 mod patience;
-pub mod peer;
 pub mod pixels;
 pub mod plot;
 #[cfg(feature = "policy")]
 pub mod policy;
+#[cfg(test)]
+#[path = "../tests/support/ports.rs"]
+mod ports;
 pub mod qr;
-pub mod realtime;
 pub mod record;
 pub mod registration;
 pub mod registry;
@@ -69,7 +67,6 @@ pub mod simulation;
 #[path = "../tests/support/skip.rs"]
 mod skip;
 pub mod status;
-pub mod tty;
 pub mod tui;
 #[cfg(feature = "web")]
 pub mod web;

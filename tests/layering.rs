@@ -33,16 +33,10 @@ const LAYERS: &[&[&str]] = &[
         "palette",
         "qr",
         "outlet",
-        "folder",
-        "disk",
         "fault",
         "panics",
-        "peer",
-        "realtime",
         "control",
         "kinematics",
-        "gpio",
-        "tty",
         "pixels",
     ],
     &["hotplug", "episode", "driver", "bus", "orders", "inputs", "interlocks", "calibration"],
@@ -53,13 +47,12 @@ const LAYERS: &[&[&str]] = &[
 
 /// Imports within a layer.
 const SIDEWAYS: &[(&str, &[&str])] = &[
-    ("registry", &["folder", "device", "simulation"]),
+    ("registry", &["device", "simulation"]),
     ("device", &["simulation"]),
     ("status", &["registry", "device"]),
     ("palette", &["status"]),
     ("control", &["registry"]),
     ("kinematics", &["registry"]),
-    ("gpio", &["realtime"]),
     ("driver", &["episode"]),
     ("interlocks", &["inputs"]),
     ("app", &["tui", "headless", "logging"]),
@@ -96,8 +89,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("evdev", &["registry/parse", "inputs"]),
     ("foxglove", &["live"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
-    ("gpiocdev", &["gpio"]),
-    ("gpiocdev_uapi", &["gpio"]),
     ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan", "web"]),
     ("humantime", &["registry/units"]),
@@ -109,7 +100,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("if_addrs", &["driver/lan", "web"]),
     ("image", &["tui/picture"]),
     ("indicatif", &["commands/progress"]),
-    ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "inputs"]),
+    ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "policy/library", "inputs"]),
     ("k", &["kinematics"]),
     ("lz4", &["episode"]),
     ("mcap", &["episode", "record/file"]),
@@ -128,6 +119,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ),
     ("rapid_core", &[ANYWHERE]),
     ("rapid_random", &[ANYWHERE]),
+    ("rapid_system", &[ABOVE_NOUNS]),
     ("rapid_world", &["simulation/task"]),
     ("ratatui", &["tui"]),
     ("ratatui_core", &["tui"]),
@@ -144,7 +136,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("tokio", &[ABOVE_NOUNS]),
     ("tokio_serial", &["driver/serial"]),
     ("tokio_util", &[ABOVE_NOUNS]),
-    ("thread_priority", &["realtime"]),
     ("toml", &["registry", "session"]),
     ("toml_edit", &["registry"]),
     ("tracing", &[ABOVE_NOUNS]),
@@ -159,7 +150,7 @@ const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
 
 /// Where `unsafe` may stand: at the borders to the kernel and to shared memory.
-const UNSAFE_HOMES: &[&str] = &["driver", "bus", "peer", "policy/library/loader"];
+const UNSAFE_HOMES: &[&str] = &["driver", "bus", "policy/library/loader", "system/peer"];
 
 /// What makes one thread wait for another.
 const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaphore", "Barrier"];
@@ -570,31 +561,31 @@ fn is_after_generics(tokens: &[TokenTree], at: usize) -> bool {
 
 /// What the manifest of a crate and its lints cannot say.
 fn check_crate(source: &Source) -> Vec<Violation> {
-    source.violations(locks(source))
+    source.violations(edges(source))
 }
 
-fn locks(source: &Source) -> Vec<(usize, String)> {
+/// `unsafe` and locks outside their homes.
+fn edges(source: &Source) -> Vec<(usize, String)> {
     let place = source.module.join("/");
-    if LOCK_HOMES.iter().any(|(allowed, _)| is_within(&place, allowed)) {
-        return Vec::new();
+    let mut rules = Vec::new();
+    if !UNSAFE_HOMES.iter().any(|allowed| is_within(&place, allowed)) {
+        let rule = format!("`unsafe` outside {}", UNSAFE_HOMES.join("/ and ") + "/");
+        rules.extend(source.unsafe_lines.iter().map(|line| (*line, rule.clone())));
     }
-    let lock = |path: &[String]| path.iter().find(|name| LOCKS.contains(&name.as_str())).cloned();
-    let found = source.paths.iter().filter_map(|(line, path)| Some((*line, lock(path)?)));
-    found
-        .map(|(line, lock)| (line, format!("`{lock}`: nothing between a device and the file waits for another thread")))
-        .collect()
+    if !LOCK_HOMES.iter().any(|(allowed, _)| is_within(&place, allowed)) {
+        let lock = |path: &[String]| path.iter().find(|name| LOCKS.contains(&name.as_str())).cloned();
+        let found = source.paths.iter().filter_map(|(line, path)| Some((*line, lock(path)?)));
+        let waits = |lock| format!("`{lock}`: nothing between a device and the file waits for another thread");
+        rules.extend(found.map(|(line, lock)| (line, waits(lock))));
+    }
+    rules
 }
 
 fn check(source: &Source) -> Vec<Violation> {
-    let mut rules = locks(source);
+    let mut rules = edges(source);
     let place = source.module.join("/");
     let home = source.module.first().map(String::as_str);
 
-    for line in &source.unsafe_lines {
-        if !UNSAFE_HOMES.iter().any(|allowed| is_within(&place, allowed)) {
-            rules.push((*line, format!("`unsafe` outside {}", UNSAFE_HOMES.join("/ and ") + "/")));
-        }
-    }
     for (line, word) in &source.prints {
         rules.push((*line, format!("`{word}!`: write to a given `impl io::Write`")));
     }
@@ -743,7 +734,7 @@ mod the_check_itself {
         finds("driver/camerax.rs", "use v4l::Device;", &["1: crate `v4l`"]);
         finds("rig/mod.rs", "use {iceoryx2::prelude::*, std::io};", &["1: crate `iceoryx2`"]);
         finds("flash.rs", "use tokio::sync::watch;", &["1: crate `tokio`"]);
-        finds("disk.rs", "use rustix::time::ClockId;", &[]);
+        finds("registry/units.rs", "use rustix::time::ClockId;", &[]);
         finds("flash.rs", "use rustix::time::ClockId;", &["1: crate `rustix`"]);
     }
 
@@ -780,6 +771,8 @@ mod the_check_itself {
         finds("rig/stream.rs", "use std::sync::{Arc, Mutex};", &["1: `Mutex`"]);
         finds("episode/grid.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
         let files = BTreeMap::from([(PathBuf::from("core/mask.rs"), "use std::sync::Mutex;".to_owned())]);
+        assert_eq!(check_tree(&files, check_crate).len(), 1);
+        let files = BTreeMap::from([(PathBuf::from("core/mask.rs"), "fn f() { unsafe { g() } }".to_owned())]);
         assert_eq!(check_tree(&files, check_crate).len(), 1);
         finds("utils.rs", "", &["1: module `utils` has no layer"]);
     }

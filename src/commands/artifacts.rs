@@ -8,7 +8,8 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::folder::{Folder, FolderError, Links, Missing, Sync};
+use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
+
 use crate::registry::Registry;
 use crate::registry::artifacts::{Artifact, ArtifactKind, DESCRIPTORS, HEADER, SYSTEM_REGISTRY, artifacts};
 

@@ -8,10 +8,10 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line, list};
-use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::plot::{self, Plot};
 use crate::record::inspect::{self, Judgement, ReadError};
 

@@ -11,7 +11,7 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use crate::folder::{Folder, Links, Missing};
+use rapid_system::folder::{Folder, Links, Missing};
 
 /// Extension of a file that is not finished.
 pub(crate) const PARTIAL: &str = "partial";

@@ -12,11 +12,11 @@ use arrow_schema::ArrowError;
 use parquet::arrow::ArrowWriter;
 use parquet::errors::ParquetError;
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
+use rapid_system::folder::{Folder, Links, Missing, Sync};
 
 use super::features::IMAGES;
 use super::set::SetError;
 use super::table::CREATED_BY;
-use crate::folder::{Folder, Links, Missing, Sync};
 
 /// Files of a folder; also `chunks_size` in `info.json`.
 pub(super) const CHUNK: u64 = 1000;

@@ -26,6 +26,7 @@ use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, RecordBatch, String
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::errors::ParquetError;
+use rapid_system::folder::{Folder, FolderError, Links, Missing};
 use rustix::fs::FlockOperation;
 use serde_json::{Map, Value, json};
 
@@ -40,7 +41,6 @@ use super::survey::Survey;
 use super::table::{Position, Table, one_row, timestamp};
 use super::video::{Damaged, Encoded};
 use crate::episode::sha256;
-use crate::folder::{Folder, FolderError, Links, Missing};
 
 /// Bytes of a file in JSON, at most.
 const LARGEST_JSON: u64 = 64 << 20;
@@ -155,7 +155,7 @@ impl DataSet {
             return Ok(set);
         }
         let foreign = |problem: &str| SetError::Foreign { path: info.clone(), problem: problem.to_owned() };
-        let text = crate::folder::read_text(&info, LARGEST_JSON)
+        let text = rapid_system::folder::read_text(&info, LARGEST_JSON)
             .map_err(|source| SetError::Io { path: info.clone(), source })?;
         let value: Value = serde_json::from_str(&text).map_err(|error| foreign(&error.to_string()))?;
         let features = Features::of_set(&value);

@@ -5,7 +5,8 @@
 
 use std::os::fd::BorrowedFd;
 
-use crate::gpio::Input;
+use rapid_system::gpio::Input;
+
 use crate::registry::GpioInput;
 
 /// A line that this process holds.

@@ -22,9 +22,9 @@ use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
+use rapid_system::realtime::{CONTROL_PRIORITY, use_fifo};
 use rustix::event::{EventfdFlags, eventfd};
 
-use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::registry::{FieldInput, GpioInput, InputSpec, KeyInput, LineInput};
 use tap::Tap;
 

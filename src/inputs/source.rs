@@ -3,11 +3,12 @@
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
 
+use rapid_system::gpio::Input;
+
 use super::Place;
 use super::gpio::Gpio;
 use super::key::{self, Keys};
 use super::line::Lines;
-use crate::gpio::Input;
 
 /// See the module's comment.
 #[derive(Debug)]

@@ -9,11 +9,11 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::text::{plain, unanswered};
 use rapid_core::time::Stamp;
+use rapid_system::peer::{Peer, ProcessState};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket_with};
 use serde::Serialize;
 
 use super::{Answer, DONE, LONGEST, LONGEST_ANSWER, instance_part, line, this_user};
-use crate::peer::{Peer, ProcessState};
 use crate::status::attach::ATTACH;
 
 /// A run answers within milliseconds; a stopped process does not.

@@ -15,12 +15,12 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_system::peer::Peer;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use tokio::sync::mpsc::Sender;
 use tokio::sync::mpsc::error::TrySendError;
 
 use super::{Answer, DONE, LONGEST, address, name, order, this_user};
-use crate::peer::Peer;
 use crate::status::RegistryRequest;
 use crate::status::attach::ATTACH;
 use crate::status::session::SessionRequest;

@@ -59,7 +59,7 @@ pub enum RecordError {
     },
     /// The folder lies behind another user's link, or cannot be entered.
     #[error("{0}, or choose another with --out")]
-    Folder(crate::folder::FolderError),
+    Folder(rapid_system::folder::FolderError),
     /// There is not enough disk space for an episode.
     #[error(
         "{}: the disk is full: {} free, and an episode needs more than {}, which are kept free (disk_reserve under \

@@ -23,6 +23,7 @@ use std::time::Duration;
 
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{ClockWatch, Stamp, WallClock};
+use rapid_system::disk::Disk;
 use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
 use tokio::sync::{oneshot, watch};
 use tokio_util::sync::CancellationToken;
@@ -35,7 +36,6 @@ use super::publishers::Publishers;
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
 use crate::bus::{Foreign, Inbox, Queues, Subscription, TopicId};
-use crate::disk::Disk;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::made::Shown;
 use crate::episode::partial::PARTIAL;

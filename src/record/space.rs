@@ -20,11 +20,11 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_system::disk::Disk;
 use rustix::fs::{FallocateFlags, fallocate, fstat, ftruncate};
 use rustix::io::Errno;
 
 use super::RecordError;
-use crate::disk::Disk;
 
 /// Time left below which it is reported.
 const WARN_LEFT: Duration = Duration::from_mins(5);

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{self, SyncSender, TrySendError};
 use std::thread::JoinHandle;
 
-use crate::folder::Folder;
+use rapid_system::folder::Folder;
 
 /// See the module's comment.
 pub(super) struct Writeback {

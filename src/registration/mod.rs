@@ -11,10 +11,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
 
 use crate::device::{Attachment, DeviceNode};
 use crate::driver::camera::query;
-use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::registry::candidate::{Candidate, unregistered};
 use crate::registry::edit::{self, EditError, NewEntry, Setting};
 use crate::registry::{Loaded, Registry, RegistryErrors, name_problem, read_file};

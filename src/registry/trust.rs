@@ -15,9 +15,8 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use rapid_system::folder::{FolderError, Missing, PathWalk};
 use rustix::fs::{FileType, Stat};
-
-use crate::folder::{FolderError, Missing, PathWalk};
 
 /// Why the target of a path cannot be trusted. As text, the reason without the file's own name.
 #[derive(Debug, Clone, PartialEq, Eq)]

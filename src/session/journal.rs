@@ -13,10 +13,10 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rapid_core::time::{realtime_ns, rfc3339};
+use rapid_system::folder::{self, Folder, Links, Missing, Sync};
 use serde::{Deserialize, Serialize};
 
 use super::trash;
-use crate::folder::{self, Folder, Links, Missing, Sync};
 use crate::status::session::EpisodeEntry;
 
 /// The name of the file of a session in progress.

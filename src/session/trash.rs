@@ -6,11 +6,11 @@ use std::io;
 use std::os::fd::AsFd as _;
 use std::path::Path;
 
+use rapid_system::folder::{Folder, Links, Missing};
 use rustix::fs::RenameFlags;
 use rustix::io::Errno;
 
 use crate::episode::partial::TRASH;
-use crate::folder::{Folder, Links, Missing};
 
 /// Whether this is the name of an episode's file, and not a path.
 pub fn is_name(name: &str) -> bool {

@@ -12,13 +12,13 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use rapid_core::text;
+use rapid_system::folder::{Folder, Links, Missing};
 use serde::Serialize;
 
 use self::facts::UsbDevice;
 use self::facts::{Disk, Facts};
 use self::judge::{Finding, Level};
 use super::Format;
-use crate::folder::{Folder, Links, Missing};
 use crate::registry::Registry;
 use crate::registry::artifacts::{ArtifactKind, artifacts};
 

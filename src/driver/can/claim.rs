@@ -8,8 +8,9 @@ use std::io::ErrorKind;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
 
+use rapid_system::peer::Peer;
+
 use super::link::LinkError;
-use crate::peer::Peer;
 
 /// The motors behind an interface are ours until this is dropped.
 #[derive(Debug)]

@@ -14,10 +14,10 @@ use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant, SystemTime};
 
 use rapid_core::text;
+use rapid_system::disk::Disk;
 use rustix::process::setpriority_process;
 
 use super::{Names, ProgressFn, RecoverError, Recovered, RepairOutcome, Source, recover};
-use crate::disk::Disk;
 use crate::episode::{self, Failed};
 use crate::status::{Board, Level, What};
 

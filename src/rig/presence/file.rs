@@ -9,11 +9,11 @@ use std::time::Duration;
 
 use rapid_core::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
 use rapid_core::time::{Stamp, realtime_ns};
+use rapid_system::folder::FolderError;
 use rustix::fs::{FlockOperation, Mode, OFlags};
 use rustix::io::Errno;
 
 use super::json::{self, json_path};
-use crate::folder::FolderError;
 
 /// If a publisher dies between creating and locking a file, the next one tries again.
 const TRIES: usize = 10;

@@ -19,11 +19,11 @@ use std::time::Duration;
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::{Stamp, realtime_ns};
+use rapid_system::realtime::{MASK_PRIORITY, use_fifo};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::bus::Writer;
 use crate::fault;
-use crate::realtime::{MASK_PRIORITY, use_fifo};
 use crate::status::Board;
 
 pub use file::{PresenceError, instances, read_mask};

@@ -7,8 +7,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
-
-use crate::gpio::Output;
+use rapid_system::gpio::Output;
 
 /// A line that cannot be set is retried for this long...
 const RETRIED_FOR: Duration = Duration::from_secs(2);

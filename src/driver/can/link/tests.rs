@@ -5,12 +5,12 @@ use std::io::{Read as _, Write as _};
 use std::path::PathBuf;
 use std::thread::{self, JoinHandle};
 
+use crate::ports::may_be_opened;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
 use super::*;
 use crate::driver::can::slcan;
 use crate::patience::PATIENCE;
-use crate::tty;
 
 /// The adapter's end of a line, and the path of the host's.
 fn terminal() -> (File, PathBuf) {
@@ -149,7 +149,7 @@ fn a_line_is_opened_exclusively_and_hangs_up_once() {
     let second = Link::open_damiao(&path).unwrap_err();
     assert!(matches!(&second, LinkError::Retry(text) if text.contains("another program")), "{second}");
     drop(first);
-    assert!(tty::may_be_opened(&path));
+    assert!(may_be_opened(&path));
 }
 
 #[test]

@@ -16,6 +16,7 @@ use std::time::Duration;
 
 use hyper::StatusCode;
 use hyper::header::{CONTENT_LENGTH, CONTENT_RANGE};
+use rapid_system::disk::Disk;
 use rustix::fs::FlockOperation;
 use rustix::io::Errno;
 use tokio::time::timeout;
@@ -23,7 +24,6 @@ use tokio::time::timeout;
 use super::super::http::{self, Reply};
 use super::super::place::Server;
 use super::answer::{Name, is_plain};
-use crate::disk::Disk;
 
 const HEAD_LIMIT: Duration = Duration::from_secs(5);
 /// A camera that sends nothing for this long has stopped.
@@ -62,7 +62,7 @@ impl Clip {
 
     /// The clip described by the note at this path; `None` if it is not one of our notes.
     pub(super) fn of_note(path: &Path) -> Option<Self> {
-        let text = crate::folder::read_text(path, LARGEST_NOTE).ok()?;
+        let text = rapid_system::folder::read_text(path, LARGEST_NOTE).ok()?;
         Self::read(path, &text)
     }
 

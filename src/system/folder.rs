@@ -275,7 +275,7 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
 
 /// A walk along a path, one part at a time: each is opened in the one before, so that nothing on the way can be
 /// exchanged between a check and a step. Links are followed.
-pub(crate) struct PathWalk<'a> {
+pub struct PathWalk<'a> {
     missing: Missing,
     /// Called for each folder, link and file on the way before it is entered or followed.
     check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>,
@@ -286,7 +286,7 @@ pub(crate) struct PathWalk<'a> {
 
 impl<'a> PathWalk<'a> {
     /// Creates what is `missing`, and walks as far as `check` allows.
-    pub(crate) fn new(missing: Missing, check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>) -> Self {
+    pub fn new(missing: Missing, check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>) -> Self {
         Self { missing, check, shown: PathBuf::new(), followed: 0 }
     }
 
@@ -294,7 +294,7 @@ impl<'a> PathWalk<'a> {
     ///
     /// # Errors
     /// When it does not exist, or is not allowed.
-    pub(crate) fn to(&mut self, path: &Path) -> Result<OwnedFd, FolderError> {
+    pub fn to(&mut self, path: &Path) -> Result<OwnedFd, FolderError> {
         let start = Path::new(if path.is_absolute() { "/" } else { "." });
         let (mut at, _) = self.enter(CWD, start)?;
         // Remaining parts, the next part last.

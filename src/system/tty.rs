@@ -34,16 +34,6 @@ fn is_pseudo(port: impl AsFd) -> Result<bool> {
     Ok(PSEUDO.contains(&major(fstat(port)?.st_rdev)))
 }
 
-/// Whether a program without the capability to ignore `TIOCEXCL` may open the port.
-#[cfg(test)]
-pub(crate) fn may_be_opened(path: &std::path::Path) -> bool {
-    let mut shell = std::process::Command::new("setpriv");
-    if rustix::process::geteuid().is_root() {
-        shell.arg("--bounding-set=-sys_admin");
-    }
-    shell.args(["sh", "-c", ": <\"$0\""]).arg(path).status().is_ok_and(|status| status.success())
-}
-
 #[cfg(test)]
 mod tests {
     use std::path::Path;
@@ -53,6 +43,7 @@ mod tests {
     use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
     use super::*;
+    use crate::ports::may_be_opened;
 
     #[test]
     fn a_pseudo_terminal_can_be_opened_again_once_its_holder_has_closed_it() {
