@@ -7,11 +7,11 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rapid::device::DeviceNode;
 use rapid::driver::{Driver, DriverError, camera};
-use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec};
 use rapid_core::sync::WhenStale;
 use rapid_core::time::Stamp;
+use rapid_registry::device::DeviceNode;
+use rapid_registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec};
 
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -89,8 +89,8 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         latency: Duration::ZERO,
         form: None,
         action: None,
-        hooks: rapid::registry::Hooks::default(),
-        verdict: rapid::registry::VerdictSpec::of(
+        hooks: rapid_registry::Hooks::default(),
+        verdict: rapid_registry::VerdictSpec::of(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             None,

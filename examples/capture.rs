@@ -14,10 +14,10 @@ use std::time::{Duration, Instant};
 use nokhwa::utils::{
     ApiBackend, CameraFormat, CameraIndex, FrameFormat, RequestedFormat, RequestedFormatType, Resolution,
 };
-use rapid::device::DeviceNode;
 use rapid::driver::{Driver, DriverError};
-use rapid::registry::Registry;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::device::DeviceNode;
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::json;
 use tokio::runtime::{Builder, Runtime};

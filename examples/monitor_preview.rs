@@ -9,17 +9,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid::headless::{self, HeadlessOptions};
-use rapid::registry::{
-    CameraSpec, DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec,
-};
-use rapid::status::session::SessionRequest;
-use rapid::status::{Board, Command, Level, Outlook, RecordingStatus, SlotState, What};
 use rapid::tui::{self, ScreenOptions};
 use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::Epoch;
 use rapid_core::sync::WhenStale;
 use rapid_core::time::Stamp;
+use rapid_registry::{
+    CameraSpec, DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec,
+};
+use rapid_status::session::SessionRequest;
+use rapid_status::{Board, Command, Level, Outlook, RecordingStatus, SlotState, What};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -80,7 +80,7 @@ fn registry(count: u8) -> Registry {
             max_bytes: 1 << 20,
             depth: 8,
             when_stale: WhenStale::Hold,
-            verdict: rapid::registry::VerdictSpec::of(
+            verdict: rapid_registry::VerdictSpec::of(
                 rapid_core::modality::ModalityKind::Image,
                 std::time::Duration::from_millis(500),
                 None,
@@ -88,7 +88,7 @@ fn registry(count: u8) -> Registry {
             latency: Duration::ZERO,
             form: None,
             action: None,
-            hooks: rapid::registry::Hooks::default(),
+            hooks: rapid_registry::Hooks::default(),
         })
     };
     Registry {
@@ -210,6 +210,6 @@ fn report(board: &Board, level: Level, text: &str) {
 }
 
 /// The verdict on an episode that was never recorded.
-fn pretended() -> rapid::status::Verdict {
-    rapid::status::Verdict { grade: rapid::status::Grade::Good, reasons: Vec::new(), sensors: None }
+fn pretended() -> rapid_status::Verdict {
+    rapid_status::Verdict { grade: rapid_status::Grade::Good, reasons: Vec::new(), sensors: None }
 }

@@ -15,11 +15,11 @@ use std::time::Duration;
 
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
-use rapid::bus::Header;
-use rapid::pixels::{CHANNELS, Picture, Pixels};
+use rapid_bus::Header;
 use rapid_core::observation::{OBSERVATION_TOPIC, Observation, ObservationSlot};
 use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_millis(2);

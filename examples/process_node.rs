@@ -24,7 +24,7 @@ use std::str::FromStr;
 use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::*;
-use rapid::bus::Header;
+use rapid_bus::Header;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
 

@@ -16,7 +16,7 @@ use std::f64::consts::TAU;
 use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::*;
-use rapid::bus::Header;
+use rapid_bus::Header;
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;

@@ -20,8 +20,8 @@ use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;
-use rapid::random::Random;
 use rapid_core::mask::PhysicalMask;
+use rapid_core::random::Random;
 use rapid_core::sample::{Encoding, SampleHeader};
 use serde::Deserialize;
 

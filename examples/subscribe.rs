@@ -10,7 +10,7 @@ use std::error::Error;
 use std::time::Duration;
 
 use iceoryx2::prelude::*;
-use rapid::bus::Header;
+use rapid_bus::Header;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
 

@@ -13,15 +13,15 @@ use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use futures::Stream;
-use rapid::bus::{Bus, TopicId};
 use rapid::hotplug::script::Script;
 use rapid::hotplug::{HotplugError, HotplugEvent};
-use rapid::registry::Registry;
-use rapid::registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence, read_mask};
-use rapid::status::Board;
+use rapid_bus::{Bus, TopicId};
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
+use rapid_status::Board;
 use tokio_util::sync::CancellationToken;
 
 /// From one unplug to the next; the device comes back in between.

@@ -11,19 +11,18 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_bus::{BusError, Queues, Subscription, TopicId, Writer};
 use rapid_core::mask::Bits;
 use rapid_core::modality::ModalityId;
 use rapid_core::observation::{HEAD_BYTES, SLOT_BYTES};
 use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use rapid_core::sync::{Grid, SyncModality, SyncSample, Synchronizer};
 use rapid_core::time::Stamp;
+use rapid_registry::{DeviceSpec, Registry};
+use rapid_status::Board;
 use tokio::sync::mpsc;
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
-
-use crate::bus::{BusError, Queues, Subscription, TopicId, Writer};
-use crate::registry::{DeviceSpec, Registry};
-use crate::status::Board;
 
 /// Changes of the mask that are remembered between two ticks.
 const MASKS: usize = 64;

@@ -42,32 +42,32 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::FutureExt;
+use rapid_bus::{self, Bus, TopicId};
 use rapid_core::interlock::Interlocks;
 use rapid_core::mask::MASK_PATH;
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::scenario::Scenario;
+use rapid_registry::simulation::SimSource;
+use rapid_status::Board;
+use rapid_system::fault;
+use rapid_system::panics;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use crate::alignment::Alignment;
-use crate::bus::{self, Bus, TopicId};
 use crate::episode::made::Shown;
 use crate::episode::recover::Repairs;
-use crate::fault;
 use crate::interlocks::{self, Watched};
 use crate::logging::{self, Stderr};
 use crate::orders::receive::{Arrival, Orders};
-use crate::panics;
 use crate::record::{EpisodeRequest, RecorderConfig};
-use crate::registry::Registry;
-use crate::registry::scenario::Scenario;
 use crate::rig::Rig;
 use crate::rig::presence::{Claim, Presence};
 use crate::session::journal::Plan;
-use crate::simulation::SimSource;
-use crate::status::Board;
 use crate::tui::ScreenOptions;
 use attached::Attached;
 use buttons::Buttons;
@@ -173,7 +173,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let (permission, _orders, arrivals) = receive_orders(&options, interlocks::of(&registry))?;
     let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
 
-    bus::check_memory()?;
+    rapid_bus::check_memory()?;
     // A registry has at most 64 devices.
     let count = u8::try_from(registry.devices.len()).unwrap_or(u8::MAX);
     // Before the bus is touched: another run of this instance is an error.

@@ -19,8 +19,7 @@ use std::time::Duration;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum, ValueHint};
-
-use crate::registry::units::parse_duration;
+use rapid_registry::units::parse_duration;
 
 #[cfg(feature = "export")]
 pub use export::{ExportArgs, Layout, PictureForm};

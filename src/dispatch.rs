@@ -21,6 +21,12 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::text;
 use rapid_core::time::Zone;
+use rapid_registry::scenario::Scenario;
+use rapid_registry::{ModuleError, Registry, RegistryErrors};
+use rapid_status::Level;
+use rapid_status::palette::Palette;
+use rapid_status::session::SessionRequest;
+use rapid_system::outlet;
 use tokio_util::sync::CancellationToken;
 
 use self::registry::{
@@ -36,16 +42,10 @@ use crate::commands::mask::MaskOptions;
 use crate::commands::{self, CommandStatus, Format};
 use crate::driver::replay;
 use crate::hotplug::HotplugError;
-use crate::outlet;
-use crate::palette::Palette;
 use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError};
-use crate::registry::scenario::Scenario;
-use crate::registry::{ModuleError, Registry, RegistryErrors};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::session::journal::Plan;
-use crate::status::Level;
-use crate::status::session::SessionRequest;
 use crate::tui::ScreenOptions;
 
 #[cfg(feature = "policy")]
@@ -387,7 +387,7 @@ fn run(
 
 /// The episodes to record, if the registry knows the modules that were named.
 fn request(args: &RunArgs, registry: &Registry) -> Result<EpisodeRequest, Failure> {
-    let mounted = crate::registry::mounted(&registry.modules, &args.module)?;
+    let mounted = rapid_registry::mounted(&registry.modules, &args.module)?;
     Ok(EpisodeRequest {
         out: args.out.clone(),
         task: args.task.clone(),

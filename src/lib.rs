@@ -7,7 +7,6 @@
 
 pub mod alignment;
 pub mod app;
-pub mod bus;
 pub mod calibration;
 pub mod cli;
 pub mod commands;
@@ -15,7 +14,6 @@ pub mod commands;
 pub mod compare;
 #[cfg(feature = "motors")]
 pub mod control;
-pub mod device;
 pub mod dispatch;
 pub mod driver;
 #[cfg(test)]
@@ -27,7 +25,6 @@ pub mod episode;
 mod executable;
 #[cfg(feature = "export")]
 pub mod export;
-pub mod fault;
 pub mod flash;
 pub mod headless;
 pub mod hotplug;
@@ -37,38 +34,33 @@ pub mod interlocks;
 pub mod kinematics;
 #[cfg(feature = "lan")]
 pub mod link;
+#[cfg(test)]
+#[path = "../tests/support/literal.rs"]
+mod literal;
 #[cfg(feature = "foxglove")]
 pub mod live;
 #[cfg(feature = "policy")]
 pub mod lockstep;
 pub mod logging;
 pub mod orders;
-pub mod outlet;
-pub mod palette;
-pub mod panics;
 #[cfg(test)]
 #[path = "../tests/support/patience.rs"]
 mod patience;
-pub mod pixels;
 pub mod plot;
 #[cfg(feature = "policy")]
 pub mod policy;
 #[cfg(test)]
 #[path = "../tests/support/ports.rs"]
 mod ports;
-pub mod qr;
 pub mod record;
 pub mod registration;
-pub mod registry;
 pub mod rig;
 pub mod session;
-pub mod simulation;
 #[cfg(test)]
 #[path = "../tests/support/skip.rs"]
 mod skip;
-pub mod status;
 pub mod tui;
 #[cfg(feature = "web")]
 pub mod web;
 
-pub use rapid_random as random;
+pub use rapid_core::random;

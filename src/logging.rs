@@ -19,6 +19,10 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::realtime_ns;
+use rapid_status::palette::Palette;
+use rapid_status::{Board, Level};
+use rapid_system::outlet::Outlet;
+use rapid_system::panics;
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Subscriber};
@@ -29,10 +33,6 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, Registry};
 
 use crate::headless::ERASE_LINE;
-use crate::outlet::Outlet;
-use crate::palette::Palette;
-use crate::panics;
-use crate::status::{Board, Level};
 
 /// What is logged without `RAPID_LOG`. iceoryx2 warns of errors that it then handles; of the Foxglove server only what it
 /// drops is of interest, every half minute, and no client that has gone.

@@ -15,12 +15,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use motors::{Adapter, Hand, PATIENCE, spec};
-use rapid::device::DeviceNode;
 use rapid::driver::can::guard;
 use rapid::driver::can::motors::Motors;
-use rapid::registry::{CanAdapter, CanProtocol, CanSpec, DamiaoSpec, Stop};
 use rapid_core::action::{ActionSource, Order};
 use rapid_core::time::Stamp;
+use rapid_registry::device::DeviceNode;
+use rapid_registry::{CanAdapter, CanProtocol, CanSpec, DamiaoSpec, Stop};
 use rustix::process::{Pid, Signal, kill_process};
 
 const BOTH: [u16; 2] = [1, 2];

@@ -10,6 +10,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
+use rapid_status::attach::Encoder;
+use rapid_status::{Board, Command};
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
@@ -17,8 +19,6 @@ use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::orders::receive::Viewer;
-use crate::status::attach::Encoder;
-use crate::status::{Board, Command};
 
 /// Screens at a time.
 const SCREENS: usize = 8;

@@ -3,9 +3,8 @@
 
 use std::time::Duration;
 
+use rapid_bus::Watchman;
 use tokio::time::{MissedTickBehavior, interval};
-
-use crate::bus::Watchman;
 
 /// A check takes a system call for each of some dozens of files.
 const LOOK: Duration = Duration::from_secs(1);

@@ -13,15 +13,15 @@ use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_registry::{ButtonAction, ButtonSpec, Registry};
+use rapid_status::session::{Label, Phase, SessionRequest};
+use rapid_status::{Board, Level, What};
 use tokio::sync::{mpsc, oneshot};
 
 use super::conductor::reached;
 use super::requests::Request;
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
-use crate::registry::{ButtonAction, ButtonSpec, Registry};
-use crate::status::session::{Label, Phase, SessionRequest};
-use crate::status::{Board, Level, What};
 use press::{Gesture, Presses, Rules};
 
 /// Reads the buttons until it is dropped.

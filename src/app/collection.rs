@@ -8,6 +8,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use rapid_core::time::{Stamp, realtime_ns, rfc3339};
+use rapid_registry::{ModuleError, ModuleSpec};
+use rapid_status::session::{Answered, Phase, SessionRequest, SessionStatus};
+use rapid_status::{Board, EpisodeEnd, Level, Verdict, What};
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender};
 use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
@@ -18,12 +21,9 @@ use super::requests::Reply;
 use super::stage::join;
 use crate::record::inspect::{self, Judgement, Listed};
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
-use crate::registry::{self, ModuleError, ModuleSpec};
 use crate::session::journal::{self, Journal, Plan, SessionFile};
 use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
 use crate::session::{Answer, Effect, Session};
-use crate::status::session::{Answered, Phase, SessionRequest, SessionStatus};
-use crate::status::{Board, EpisodeEnd, Level, Verdict, What};
 
 /// Answers that wait for an episode to begin, or to end.
 type Waiting = Vec<oneshot::Sender<Result<String, String>>>;
@@ -67,7 +67,7 @@ const NO_MODULE: &str = "none";
 /// What is mounted once these are: each in place of the one in its slot.
 fn mounted(now: &[String], requested: &[String], known: &[ModuleSpec]) -> Result<Vec<String>, ModuleError> {
     let names: Vec<String> = requested.iter().filter(|name| *name != NO_MODULE).cloned().collect();
-    let new = registry::mounted(known, &names)?;
+    let new = rapid_registry::mounted(known, &names)?;
     let is_dismounted = requested.len() > names.len();
     let slot_of = |name: &String| known.iter().find(|module| module.name == *name).map(|module| module.mount);
     let stays = |name: &&String| !is_dismounted && new.iter().all(|module| slot_of(name) != Some(module.mount));
@@ -481,8 +481,9 @@ impl Collection {
 
 #[cfg(test)]
 mod tests {
+    use rapid_registry::Registry;
+
     use super::*;
-    use crate::registry::Registry;
 
     #[test]
     fn a_module_is_mounted_in_place_of_the_one_in_its_slot() {

@@ -9,6 +9,8 @@ use std::time::Duration;
 
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
+use rapid_system::fault;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
@@ -18,10 +20,7 @@ use super::collection::{Collection, Found};
 use super::settling::has_settled;
 use super::stage::{Stage, join};
 use super::{AppError, Request, Running, Screen};
-use crate::bus;
-use crate::fault;
 use crate::record::{RecordError, Recorder, RecorderConfig, Source};
-use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 
 /// Interval at which devices that are still opening are looked for.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);
@@ -64,7 +63,7 @@ impl Conductor {
         let mut has_looked = false;
         // How the output ended, once it has no reader.
         let mut output = Ok(());
-        let mut bus_lost = pin!(bus::lost());
+        let mut bus_lost = pin!(rapid_bus::lost());
         loop {
             let due = self.collection.due();
             let end = length.map(|length| begun + length);

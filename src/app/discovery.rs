@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
+use rapid_registry::{DeviceSpec, Registry};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -19,7 +20,6 @@ use crate::hotplug::HotplugStream;
 use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
 use crate::hotplug::udev::{Ask, UdevMonitor};
-use crate::registry::{DeviceSpec, Registry};
 
 /// Created by udev's daemon when it starts.
 const UDEV: &str = "/run/udev/control";

@@ -3,8 +3,9 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use rapid_bus::BusError;
+
 use super::LAST_CHUNK;
-use crate::bus::BusError;
 use crate::hotplug::HotplugError;
 #[cfg(feature = "foxglove")]
 use crate::live::LiveError;

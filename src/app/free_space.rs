@@ -4,11 +4,10 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_status::Board;
 use rapid_system::disk::Disk;
 use tokio::task::spawn_blocking;
 use tokio::time::sleep;
-
-use crate::status::Board;
 
 /// Interval of the reports; the recorder itself watches more closely.
 const LOOK_EVERY: Duration = Duration::from_secs(5);

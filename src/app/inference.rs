@@ -7,22 +7,22 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_bus::{Bus, Inbox, TopicId, Writer};
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
+use rapid_registry::Registry;
+use rapid_status::{Board, Level, What};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
 use super::settling;
 use super::stage::Stage;
-use crate::bus::{Bus, Inbox, TopicId, Writer};
 use crate::policy::library::Environment;
 use crate::policy::live::{Live, LiveOptions};
 use crate::policy::model::Model;
 use crate::policy::pace::{Pace, PaceVerdict};
 use crate::policy::sampler::Computing;
-use crate::registry::Registry;
-use crate::status::{Board, Level, What};
 
 /// Interval at which the mask is checked for that.
 const LOOK: Duration = Duration::from_millis(5);

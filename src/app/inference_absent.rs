@@ -2,13 +2,13 @@
 
 use std::sync::Arc;
 
+use rapid_bus::Bus;
+use rapid_registry::Registry;
+use rapid_status::Board;
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
 use super::stage::Stage;
-use crate::bus::Bus;
-use crate::registry::Registry;
-use crate::status::Board;
 
 /// No policy can be given.
 #[derive(Debug)]

@@ -10,17 +10,17 @@ use tokio::sync::watch;
 pub(super) use crate::live::LiveAddition;
 pub use crate::live::LiveOptions;
 
+use rapid_bus::Bus;
 use rapid_core::permission::Permission;
 use rapid_core::time::WallClock;
+use rapid_registry::Registry;
+use rapid_status::Board;
 
 use super::AppError;
 use super::requests::{Request, asker};
 use super::stage::Stage;
-use crate::bus::Bus;
 use crate::episode::made::Made;
 use crate::live::{Controls, Feed, Live};
-use crate::registry::Registry;
-use crate::status::Board;
 
 /// Listens, before anything of the run is started: a port in use is an error of the start.
 pub(super) async fn listen(

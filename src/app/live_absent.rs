@@ -2,18 +2,18 @@
 
 use std::sync::{Arc, mpsc};
 
+use rapid_bus::{Bus, Subscription};
 use rapid_core::permission::Permission;
 use rapid_core::time::WallClock;
+use rapid_registry::{DeviceSpec, Registry};
+use rapid_status::Board;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::watch;
 
 use super::AppError;
 use super::requests::Request;
 use super::stage::Stage;
-use crate::bus::{Bus, Subscription};
 use crate::episode::made::Made;
-use crate::registry::{DeviceSpec, Registry};
-use crate::status::Board;
 
 /// No server can be requested.
 #[derive(Debug, Clone, Copy)]

@@ -13,20 +13,20 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use rapid_bus::{BusError, Extension, Membership, Subscription};
 use rapid_core::time::Stamp;
+use rapid_registry::{DeviceSpec, Difference, ModuleSpec, Registry};
+use rapid_status::session::Answered;
+use rapid_status::{Board, Level, RegistryRequest, What};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_blocking;
 
 use super::live::LiveAddition;
 use super::requests::Reply;
 use super::stage::Stage;
-use crate::bus::{BusError, Extension, Membership, Subscription};
 use crate::record::RecorderAddition;
 use crate::registration;
-use crate::registry::{DeviceSpec, Difference, ModuleSpec, Registry};
 use crate::rig::{Addition, RigCommand};
-use crate::status::session::Answered;
-use crate::status::{Board, Level, RegistryRequest, What};
 
 /// The answer when the rest of the run is gone.
 const ENDING: &str = "the run is ending";

@@ -6,6 +6,8 @@
 use std::sync::Arc;
 
 use rapid_core::time::Stamp;
+use rapid_status::session::{Asker, SessionRequest};
+use rapid_status::{Command, RegistryRequest};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::spawn_blocking;
 
@@ -13,8 +15,6 @@ use super::attached::Attached;
 use super::controls;
 use crate::orders::receive::{Arrival, Wanted};
 use crate::rig::RigCommand;
-use crate::status::session::{Asker, SessionRequest};
-use crate::status::{Command, RegistryRequest};
 
 /// Receives the answer to a request: what was done, or why it was refused.
 pub(super) type Reply = Option<oneshot::Sender<Result<String, String>>>;
@@ -96,10 +96,10 @@ pub(super) fn sorted(
 
 #[cfg(test)]
 mod tests {
+    use crate::literal::board;
     use rapid_core::modality::ModalityId;
 
     use super::*;
-    use crate::status::literal::board;
 
     #[tokio::test]
     async fn the_rig_is_reached_while_the_conductor_is_busy() {

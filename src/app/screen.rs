@@ -5,14 +5,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::permission::Permission;
+use rapid_status::palette::Palette;
+use rapid_status::{Board, Command, Event};
+use rapid_system::fault;
 use tokio::sync::{broadcast, mpsc};
 
 use super::stage::Stage;
 use super::{AppError, Screen};
-use crate::fault;
 use crate::headless::{self, HeadlessOptions};
-use crate::palette::Palette;
-use crate::status::{Board, Command, Event};
 use crate::tui::{self, ScreenOptions, TuiError};
 
 /// Starts the requested screen, which shows these events of the board.

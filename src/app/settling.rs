@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::status::{Board, DeviceStatus, SlotState, Snapshot};
+use rapid_status::{Board, DeviceStatus, SlotState, Snapshot};
 
 /// Every attached device delivers by then, or is not waited for.
 pub(super) const LIMIT: Duration = Duration::from_secs(3);
@@ -24,10 +24,10 @@ fn is_everything_published(snapshot: &Snapshot) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use crate::literal::{device, id, snapshot};
     use rapid_core::mask::PhysicalMask;
 
     use super::*;
-    use crate::status::literal::{device, id, snapshot};
 
     #[test]
     fn a_device_is_waited_for_until_the_published_mask_agrees_with_its_state() {

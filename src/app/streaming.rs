@@ -1,11 +1,11 @@
 //! Stage streaming: the rig, from the first device to the end of the last device program.
 
+use rapid_system::fault;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
 use super::stage::Stage;
-use crate::fault;
 use crate::hotplug::HotplugStream;
 use crate::rig::{Rig, RigCommand};
 

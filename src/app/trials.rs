@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_registry::simulation::task::{Ended, Outcome, SharedTrial};
+use rapid_status::{Board, Level, What};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::stage::Stage;
-use crate::simulation::task::{Ended, Outcome, SharedTrial};
-use crate::status::{Board, Level, What};
 
 /// How often it looks: a trial takes ten seconds and more.
 const LOOK: Duration = Duration::from_millis(100);

@@ -8,10 +8,11 @@ use tokio::sync::mpsc::UnboundedSender;
 
 pub use crate::web::WebOptions;
 
+use rapid_status::Board;
+
 use super::AppError;
 use super::requests::{Request, asker};
 use super::stage::Stage;
-use crate::status::Board;
 use crate::web::Web;
 
 /// Starts the stage, before anything of the run is started: a port in use is an error of the start.

@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
+use rapid_status::Board;
 use tokio::sync::mpsc::UnboundedSender;
 
 use super::AppError;
 use super::requests::Request;
 use super::stage::Stage;
-use crate::status::Board;
 
 /// No page can be requested.
 #[derive(Debug, Clone)]

@@ -7,11 +7,11 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 
 use rapid_core::text;
+use rapid_registry::MAX_SUBSCRIBERS;
 use rustix::process::{Resource, getrlimit};
 
 use super::leftovers::Files;
 use super::room;
-use crate::registry::MAX_SUBSCRIBERS;
 
 /// With fewer free descriptors than this, the failure is attributed to their limit: iceoryx2 closes the descriptors of
 /// the failed step before it returns.

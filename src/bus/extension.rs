@@ -4,12 +4,13 @@
 
 use std::sync::Arc;
 
+use rapid_registry::DeviceSpec;
+
 use super::guard::{Guarded, contained};
 use super::home::Home;
 use super::inbox::Subscription;
 use super::topic::TopicSpec;
 use super::{BusError, TopicFactory, WAKE_NOTIFIERS, WAKE_SERVICE, Writer, error, open_topic, open_wake, room, sigbus};
-use crate::registry::DeviceSpec;
 
 /// See the module's comment. It must live as long as the run: samples that a reader has not fetched are lost with it.
 pub struct Extension {

@@ -16,13 +16,13 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use rapid_core::sample::SampleHeader;
+use rapid_registry::DeviceSpec;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
 use super::{BusError, Header, MAX_NODES, Service, service_name};
-use crate::registry::DeviceSpec;
 
 /// Prefix of an ingress topic's name; the modality's topic follows.
 const PREFIX: &str = "/rapid/ingress";

@@ -2,12 +2,12 @@ use rapid_core::action::{ActionSource, MAX_ACTION, NoAction};
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::Encoding;
 use rapid_core::sync::WhenStale;
+use rapid_registry::{
+    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec,
+};
 
 use super::*;
 use crate::patience::PATIENCE;
-use crate::registry::{
-    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec,
-};
 use std::time::{Duration, Instant};
 
 pub(super) fn registry(depth: usize) -> Registry {
@@ -30,7 +30,7 @@ pub(super) fn registry(depth: usize) -> Registry {
             identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: 2, serial: None, port: None }),
             node: NodeSpec::Serial(SerialSpec {
                 baud: 115_200,
-                framing: crate::registry::Framing::Line,
+                framing: rapid_registry::Framing::Line,
                 parse: Parse::Csv,
                 channels: 3,
             }),
@@ -43,8 +43,8 @@ pub(super) fn registry(depth: usize) -> Registry {
             latency: Duration::ZERO,
             form: None,
             action: None,
-            hooks: crate::registry::Hooks::default(),
-            verdict: crate::registry::VerdictSpec::of(
+            hooks: rapid_registry::Hooks::default(),
+            verdict: rapid_registry::VerdictSpec::of(
                 rapid_core::modality::ModalityKind::Image,
                 Duration::from_millis(500),
                 Some(30.0),
@@ -313,7 +313,7 @@ fn samples_of_a_foreign_publisher_are_counted_by_process_and_not_delivered() {
 #[test]
 fn actions_of_another_program_are_accepted_until_our_policy_publishes() {
     let mut registry = registry(16);
-    registry.devices[0].action = Some(crate::registry::ActionSpec {
+    registry.devices[0].action = Some(rapid_registry::ActionSpec {
         names: vec!["x".into()],
         units: vec!["1".into()],
         min: vec![0.0],

@@ -4,9 +4,9 @@ use rapid_core::action::{ACTION_TOPIC, MAX_ACTION};
 use rapid_core::mask::{MASK_TOPIC, PAYLOAD_LEN};
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::observation::{HEAD_BYTES, OBSERVATION_TOPIC, SLOT_BYTES};
+use rapid_registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
 use super::room::BOOKS;
-use crate::registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
 /// 4 s of mask at 500 Hz: how long a consumer may be held up without losing a sample.
 const MASK_DEPTH: usize = 2048;

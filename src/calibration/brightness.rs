@@ -1,7 +1,7 @@
 //! The mean brightness of a picture.
 
 use rapid_core::sample::Encoding;
-use rapid_jpeg::{DecodeError, Decoder};
+use rapid_pictures::jpeg::{DecodeError, Decoder};
 
 /// Why a picture has no brightness.
 #[derive(Debug, thiserror::Error)]
@@ -46,7 +46,7 @@ fn mean<'a>(luminance: impl Iterator<Item = &'a u8>) -> Result<f64, BrightnessEr
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use rapid_jpeg::{Values, encode};
+    use rapid_pictures::jpeg::{Values, encode};
 
     use super::*;
 

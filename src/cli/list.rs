@@ -4,8 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum, ValueHint};
 use rapid_core::time::Zone;
-
-use crate::status::Grade;
+use rapid_status::Grade;
 
 pub(super) const LIST: &str = "\
 Every file is read completely and judged again, and the labels and notes of its session are shown beside it. \

@@ -6,6 +6,7 @@ use std::time::Duration;
 #[cfg(feature = "policy")]
 use clap::Subcommand;
 use clap::{Args, ValueHint};
+use rapid_registry::{InferenceSpec, Provider};
 
 use super::run::{RUN, RunArgs};
 use super::time;
@@ -13,7 +14,6 @@ use super::time;
 use crate::lockstep::evaluate::Condition;
 #[cfg(feature = "policy")]
 use crate::policy::sampler::Computing;
-use crate::registry::{InferenceSpec, Provider};
 
 const POLICY: &str = "Policy options";
 

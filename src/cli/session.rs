@@ -1,8 +1,7 @@
 //! The grammar of `rapid episode` and `rapid session`.
 
 use clap::{Subcommand, ValueEnum};
-
-use crate::status::session::{Label, SessionRequest};
+use rapid_status::session::{Label, SessionRequest};
 
 pub(super) const EPISODE: &str = "\
 The running rapid answers when it is done and on the disk: `stop` when the file is closed,

@@ -8,14 +8,14 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_registry::ablation::AblationPlan;
+use rapid_registry::{DeviceSpec, Mount, NodeSpec, Registry, RegistryErrors, did_you_mean};
+use rapid_status::Grade;
 use serde_json::json;
 
 use super::{Format, progress};
 use crate::cli::{AblationArgs, Count};
 use crate::record::inspect::{self, Inspection, ReadError};
-use crate::registry::ablation::AblationPlan;
-use crate::registry::{DeviceSpec, Mount, NodeSpec, Registry, RegistryErrors, did_you_mean};
-use crate::status::Grade;
 
 /// Why no list is printed.
 #[derive(Debug, thiserror::Error)]
@@ -368,7 +368,7 @@ fn next_command(
     config: Option<&Path>,
     folder: &Path,
 ) -> String {
-    let has_tag = |module: &&crate::registry::ModuleSpec| {
+    let has_tag = |module: &&rapid_registry::ModuleSpec| {
         module.tags.iter().any(|(key, value)| *key == plan.tag && *value == wanted.finger)
     };
     let mut words = vec!["rapid".to_owned()];
@@ -399,8 +399,9 @@ fn quoted(word: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use rapid_registry::BUILTIN;
+
     use super::*;
-    use crate::registry::BUILTIN;
 
     fn registry() -> Registry {
         let modules = "\n[module.get]\nslot = \"tip\"\ntags = [\"finger=tactile\"]\ndevices = [\"tactile_tip\"]\n\

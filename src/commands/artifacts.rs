@@ -8,10 +8,9 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use rapid_registry::Registry;
+use rapid_registry::artifacts::{Artifact, ArtifactKind, DESCRIPTORS, HEADER, SYSTEM_REGISTRY, artifacts};
 use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
-
-use crate::registry::Registry;
-use crate::registry::artifacts::{Artifact, ArtifactKind, DESCRIPTORS, HEADER, SYSTEM_REGISTRY, artifacts};
 
 /// Why the artifacts could not be written or installed.
 #[derive(Debug, thiserror::Error)]

@@ -13,6 +13,10 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_registry::device::{Attachment, DeviceNode};
+use rapid_registry::simulation::SimDevice;
+use rapid_registry::units::show_duration;
+use rapid_registry::{Assigner, Assignment, DeviceSpec, NodeSpec, Registry};
 use serde::Serialize;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout, timeout_at};
@@ -22,12 +26,8 @@ use super::{Format, json_line};
 use crate::app::signals::Signals;
 use crate::calibration::{self, Estimate, Flip, Seen, brightness};
 use crate::cli::LatencyArgs;
-use crate::device::{Attachment, DeviceNode};
 use crate::driver::Driver;
 use crate::flash;
-use crate::registry::units::show_duration;
-use crate::registry::{Assigner, Assignment, DeviceSpec, NodeSpec, Registry};
-use crate::simulation::SimDevice;
 use crate::tui::flashlight::{self, Flashlight};
 
 /// A camera that has sent nothing for this long is considered silent.

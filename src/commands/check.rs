@@ -5,15 +5,15 @@ use std::path::Path;
 
 use rapid_core::interlock::StopKind;
 use rapid_core::text;
+use rapid_registry::{
+    ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
+    ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, RegistryErrors, StopSpec, UsbSpec,
+};
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line};
 #[cfg(feature = "motors")]
 use crate::kinematics::Arm;
-use crate::registry::{
-    ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
-    ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, RegistryErrors, StopSpec, UsbSpec,
-};
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
 ///
@@ -293,7 +293,7 @@ mod tests {
 
     #[test]
     fn a_good_registry_is_listed() {
-        let (outcome, text) = checked(crate::registry::BUILTIN, Format::Text);
+        let (outcome, text) = checked(rapid_registry::BUILTIN, Format::Text);
         assert_eq!(outcome, CommandStatus::Done);
         assert_eq!(
             text,
@@ -354,7 +354,7 @@ mod tests {
                      field = { device = \"motor_state\", index = 2, runs_above = 0.5 }\n[stop.door]\n\
                      kind = \"emergency\"\ngpio = { chip = \"/dev/gpiochip0\", line = 17, runs_while = \"low\" }\n\
                      [stop.key]\nkind = \"emergency\"\nkey = { device = \"a pad\", code = \"KEY_B\" }\n";
-        let text = format!("{}{stops}", crate::registry::BUILTIN);
+        let text = format!("{}{stops}", rapid_registry::BUILTIN);
         let (_, text_out) = checked(&text, Format::Text);
         for line in [
             "emergency stop pendant: /dev/ttyUSB7 at 115200 baud, runs with \"RUN\", lost after 200ms without it; stops nothing",
@@ -381,7 +381,7 @@ mod tests {
                        gpio = { chip = \"/dev/gpiochip0\", line = 17, pressed_while = \"low\" }\n\
                        press = \"disarm\"\n[button.grip]\nfield = { device = \"motor_state\", index = 2, \
                        pressed_above = 0.5, released_below = 0.25 }\npress = \"mark\"\n";
-        let text = format!("{}{buttons}", crate::registry::BUILTIN);
+        let text = format!("{}{buttons}", rapid_registry::BUILTIN);
         let (_, text_out) = checked(&text, Format::Text);
         for line in [
             "button pedal: KEY_B of a pad, which no other program gets; press: toggle; held for 1s: discard; two presses: redo",
@@ -401,7 +401,7 @@ mod tests {
 
     #[test]
     fn json_is_one_object_per_line() {
-        let (_, text) = checked(crate::registry::BUILTIN, Format::Json);
+        let (_, text) = checked(rapid_registry::BUILTIN, Format::Json);
         let rows: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         assert_eq!(rows.len(), 3);
         assert_eq!((&rows[0]["event"], &rows[0]["kind"]), (&"entry".into(), &"device".into()));

@@ -4,6 +4,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use rapid_core::text;
+use rapid_registry::InferenceSpec;
 
 use super::Format;
 use super::progress::Bar;
@@ -11,7 +12,6 @@ use crate::cli::ReplayArgs;
 use crate::compare::{self, Again, Beside, CompareError, Compared, Comparison, Difference, Spread, Watcher};
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::{Environment, LibraryError};
-use crate::registry::InferenceSpec;
 
 /// Differences up to this come from the order of floating-point additions, which depends on the machine.
 const USUAL_TOLERANCE: f64 = 1e-4;

@@ -6,6 +6,9 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use rapid_core::text;
+use rapid_registry::Registry;
+use rapid_registry::simulation::task::Texture;
+use rapid_status::{Board, Grade};
 use serde_json::json;
 
 use super::Format;
@@ -14,9 +17,6 @@ use crate::lockstep::STEP;
 use crate::lockstep::TrialError;
 use crate::lockstep::collect;
 use crate::record::EpisodeRequest;
-use crate::registry::Registry;
-use crate::simulation::task::Texture;
-use crate::status::{Board, Grade};
 
 /// Why not all demonstrations were recorded.
 #[derive(Debug, thiserror::Error)]

@@ -4,12 +4,12 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use rapid_core::text;
+use rapid_registry::device::{Attachment, DeviceNode, Unit};
+use rapid_registry::{Assigner, Assignment, DeviceSpec, IdentitySpec, Registry, UsbSpec};
 use serde::Serialize;
 
 use super::{Format, json_line};
-use crate::device::{Attachment, DeviceNode, Unit};
 use crate::driver::camera::{CameraInfo, cameras, is_on_usb, name, query};
-use crate::registry::{Assigner, Assignment, DeviceSpec, IdentitySpec, Registry, UsbSpec};
 
 /// A node that is plugged in.
 #[derive(Debug, Clone, Serialize)]

@@ -5,6 +5,9 @@ use std::io::{self, Write};
 use std::time::Instant;
 
 use rapid_core::text;
+use rapid_registry::Registry;
+use rapid_registry::simulation::task::Outcome;
+use rapid_status::palette::Palette;
 use serde_json::json;
 
 use super::Format;
@@ -12,13 +15,10 @@ use super::progress::Bar;
 use crate::cli::EvalArgs;
 use crate::lockstep::TrialError;
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, robot_time, wilson};
-use crate::palette::Palette;
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
 use crate::policy::sampler::PolicyError;
-use crate::registry::Registry;
-use crate::simulation::task::Outcome;
 
 /// Why there is no result.
 #[derive(Debug, thiserror::Error)]

@@ -12,6 +12,8 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
 use rapid_core::text;
+use rapid_registry::ExportSpec;
+use rapid_status::Grade;
 use serde::Serialize;
 
 use super::progress::Work;
@@ -23,8 +25,6 @@ use crate::export::{
     Survey, Verified,
 };
 use crate::record::inspect::{self, ReadError};
-use crate::registry::ExportSpec;
-use crate::status::Grade;
 
 /// Why the export ended.
 #[derive(Debug, thiserror::Error)]

@@ -5,10 +5,10 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_status::palette::Palette;
 
 use super::{CommandStatus, Format, json_line, progress};
 use crate::episode::sha256;
-use crate::palette::Palette;
 use crate::record::inspect::{self, Judgement, ReadError};
 
 /// Why there is no report.

@@ -12,15 +12,15 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::{Zone, rfc3339};
+use rapid_status::Grade;
+use rapid_status::palette::Palette;
+use rapid_status::session::{EpisodeEntry, Label};
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line, progress};
 use crate::cli::{LabelFilter, ListArgs, SortArg};
-use crate::palette::Palette;
 use crate::record::inspect::{self, Judgement, Listed, ReadError};
 use crate::session::journal::{self, JournalError};
-use crate::status::Grade;
-use crate::status::session::{EpisodeEntry, Label};
 
 /// Why there is no list.
 #[derive(Debug, thiserror::Error)]

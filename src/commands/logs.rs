@@ -4,11 +4,11 @@ use std::io::{self, Write};
 
 use rapid_core::text;
 use rapid_core::time::{Zone, rfc3339};
+use rapid_status::palette::Palette;
+use rapid_status::{Level, LogLine, PrintedOn, Snapshot};
 
 use super::Format;
 use super::monitor::{Connection, MonitorError, Wanted};
-use crate::palette::Palette;
-use crate::status::{Level, LogLine, PrintedOn, Snapshot};
 
 /// Why the log is not shown.
 #[derive(Debug, thiserror::Error)]

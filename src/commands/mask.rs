@@ -8,11 +8,10 @@ use std::time::Duration;
 
 use rapid_core::mask::{MaskRecord, PhysicalMask};
 use rapid_core::text;
+use rapid_status::palette::Palette;
 use serde::{Deserialize, Serialize};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
-
-use crate::palette::Palette;
 
 /// A record older than this is stale: a running publisher publishes every 2 ms.
 pub const STALE_AFTER: Duration = Duration::from_secs(1);

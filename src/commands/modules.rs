@@ -4,10 +4,10 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use rapid_core::text;
+use rapid_registry::catalogue::{self, CatalogueError, Descriptor};
+use rapid_registry::{Registry, RegistryErrors, read_file};
 
 use super::Format;
-use crate::registry::catalogue::{self, CatalogueError, Descriptor};
-use crate::registry::{Registry, RegistryErrors, read_file};
 
 /// Why there is no descriptor.
 #[derive(Debug, thiserror::Error)]

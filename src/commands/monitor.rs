@@ -12,14 +12,14 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::time::Stamp;
+use rapid_status::attach::{Decoder, LinkError};
+use rapid_status::{Command, SlotState, Snapshot};
 use rapid_system::peer::ProcessState;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::app::signals::Signals;
 use crate::orders::give::{self, GiveError};
-use crate::status::attach::{Decoder, LinkError};
-use crate::status::{Command, SlotState, Snapshot};
 use crate::tui::model::{Effect, Msg};
 use crate::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
 

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rapid_core::text;
+use rapid_registry::{InferenceSpec, Registry};
 use serde_json::{Value, json};
 
 use super::Format;
@@ -20,7 +21,6 @@ use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
 use crate::policy::pace::{Pace, PaceVerdict};
 use crate::policy::sampler::{Computing, PolicyError};
-use crate::registry::{InferenceSpec, Registry};
 
 /// Why a policy cannot be shown.
 #[derive(Debug, thiserror::Error)]

@@ -3,11 +3,11 @@
 use std::io::{self, Write};
 
 use rapid_core::text;
+use rapid_status::RegistryRequest;
+use rapid_status::session::{Phase, SessionRequest, SessionStatus};
 
 use super::Format;
 use crate::orders::give::{GiveError, request};
-use crate::status::RegistryRequest;
-use crate::status::session::{Phase, SessionRequest, SessionStatus};
 
 /// Why a request was not carried out.
 #[derive(Debug, thiserror::Error)]
@@ -78,9 +78,9 @@ fn show(session: &SessionStatus, out: &mut dyn Write) -> io::Result<()> {
         text::plain(&folder)
     )?;
     for entry in &session.episodes {
-        let verdict = entry.verdict.map_or("", crate::status::Grade::word);
+        let verdict = entry.verdict.map_or("", rapid_status::Grade::word);
         let seconds = entry.seconds.map(|seconds| format!("{seconds:.1} s")).unwrap_or_default();
-        let label = entry.label.map(crate::status::session::Label::word).unwrap_or_default();
+        let label = entry.label.map(rapid_status::session::Label::word).unwrap_or_default();
         let discarded = if entry.discarded { "discarded" } else { "" };
         let remarks = [discarded, label, &entry.label_reason, &entry.note, &entry.reasons.join("; ")];
         let remarks: Vec<_> = remarks.into_iter().filter(|text| !text.is_empty()).collect();

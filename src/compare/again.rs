@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 
 use rapid_core::sample::SampleHeader;
+use rapid_registry::Registry;
 use serde::Serialize;
 
 use super::difference::{Difference, distance};
@@ -20,7 +21,6 @@ use crate::policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation
 use crate::policy::compose::Composer;
 use crate::policy::model::Model;
 use crate::policy::request::Request;
-use crate::registry::Registry;
 
 /// The result.
 #[derive(Debug, Clone, Default, Serialize)]

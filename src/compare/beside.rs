@@ -15,6 +15,7 @@ use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_core::sync::Grid;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
 use serde::Serialize;
 
 use super::difference::Difference;
@@ -25,7 +26,6 @@ use crate::policy::horizon::{Counts, WithoutMask};
 use crate::policy::model::Model;
 use crate::policy::pilot::Pilot;
 use crate::policy::request::Request;
-use crate::registry::Registry;
 
 /// Seed of the policy's noise.
 const SEED: u64 = 0;

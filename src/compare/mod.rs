@@ -22,13 +22,14 @@ use self::again::Wanted;
 pub use self::again::{Again, ChunkInputs};
 pub use self::beside::Beside;
 pub use self::difference::{AxisDifference, Difference, Spread};
+use rapid_registry::Registry;
+
 use self::survey::Survey;
 use crate::episode::ReadError;
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::Environment;
 use crate::policy::model::Model;
 use crate::policy::sampler::{Computing, PolicyError};
-use crate::registry::Registry;
 
 /// Why there is no comparison.
 #[derive(Debug, thiserror::Error)]

@@ -8,6 +8,7 @@ use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, Epoch, SampleHeader};
+use rapid_registry::Registry;
 use serde::Deserialize;
 
 use crate::episode::ReadError;
@@ -16,7 +17,6 @@ use crate::episode::encode::EventText;
 use crate::episode::reader::{Entry, Item, Message, Reader};
 use crate::episode::reference;
 use crate::policy::bundle::ObservationSpec;
-use crate::registry::Registry;
 
 /// The bits of a sample's number that a recorded message holds.
 pub(super) const SEQUENCE_BITS: u64 = 0xffff_ffff;

@@ -20,7 +20,7 @@
 //!
 //! Invariant: no command is sent before an arm is requested, nor after a disarm or a stop until the next request; after
 //! a fault only commands that damp a joint or hold its position.
-//! Invariant: one motor that is silent, faulty or hot stops all, each as configured ([`Stop`](crate::registry::Stop)):
+//! Invariant: one motor that is silent, faulty or hot stops all, each as configured ([`Stop`](rapid_registry::Stop)):
 //! a robot arm must not continue without its elbow, nor fall because of it. No motor follows an action before the next
 //! arm. An emergency stop is a fault without a motor, with its own configured way to stop.
 //! Invariant: the first command is where the joint is. From there a commanded position changes by the
@@ -62,6 +62,7 @@ pub use words::Words;
 
 use rapid_core::action::Trip;
 use rapid_core::time::Stamp;
+use rapid_registry::DamiaoSpec;
 
 use super::can::CanFrame;
 use super::damiao::codec::{self, StateCommand};
@@ -70,7 +71,6 @@ use super::deadman::Deadman;
 use super::interpolate::Interpolator;
 use super::limits::Limits;
 use super::ramp::Ramp;
-use crate::registry::DamiaoSpec;
 
 /// Values per motor in a sample: position rad, velocity rad/s and torque Nm of its joint, temperature of the transistors °C,
 /// of the winding °C, and the code of its status.

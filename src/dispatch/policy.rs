@@ -4,6 +4,9 @@ use std::io::{self, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use rapid_registry::Registry;
+use rapid_registry::task::HANDHELD_MODULE;
+
 use super::Failure;
 use super::registry::{find_registry, load};
 use super::{block_on, check_writable, is_task, request, rig};
@@ -13,8 +16,6 @@ use crate::commands::{self, Format};
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::horizon::WithoutMask;
 use crate::policy::live::LiveOptions;
-use crate::registry::Registry;
-use crate::registry::task::HANDHELD_MODULE;
 
 /// The policy of a run, if one was requested.
 pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Result<Option<PolicyOptions>, Failure> {

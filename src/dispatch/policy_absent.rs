@@ -1,10 +1,11 @@
 //! Policies of a program that was built without cargo feature `policy`: each request is rejected with the fix.
 
+use rapid_registry::Registry;
+
 use super::Failure;
 use crate::app::PolicyOptions;
 use crate::cli::{Global, PolicyArgs, ReplayArgs, RunArgs, TaskArgs};
 use crate::commands::Format;
-use crate::registry::Registry;
 
 const NOT_BUILT: &str = "this rapid was built without `policy`: build it with `cargo build --release --features policy`, or leave --infer \
      and --expert out";

@@ -3,18 +3,19 @@
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
+use rapid_registry::Registry;
+use rapid_registry::device::Attachment;
+use rapid_status::palette::Palette;
+
 use super::{Failure, block_on, rig};
 use crate::app::Devices;
 use crate::cli::{Global, RegisterArgs, UnregisterArgs};
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::register::{self, Dialogue};
 use crate::commands::{self, Format};
-use crate::device::Attachment;
 use crate::driver::camera;
 use crate::hotplug::udev::{Ask, enumerate};
-use crate::palette::Palette;
 use crate::registration::Target;
-use crate::registry::Registry;
 
 pub(super) fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
     find_registry(global).map_or_else(|| Ok(Registry::builtin()), |path| load(&path))

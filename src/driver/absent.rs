@@ -7,11 +7,10 @@ use std::sync::Arc;
 
 use rapid_core::action::{ActionSource, ActuatorNotice, Order};
 use rapid_core::permission::Attended;
+use rapid_registry::device::DeviceNode;
 
 use super::{Agreed, DriverError, Reading};
 use tokio::sync::mpsc;
-
-use crate::device::DeviceNode;
 
 /// Never opened.
 #[derive(Debug)]

@@ -39,6 +39,7 @@ use std::time::{Duration, Instant};
 use nokhwa::utils::{ApiBackend, CameraIndex, FrameFormat, RequestedFormat, RequestedFormatType};
 use rapid_core::sample::FLAG_DEVICE_TIME;
 use rapid_core::time::Stamp;
+use rapid_registry::CameraSpec;
 use rustix::io::{FdFlags, fcntl_setfd};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -49,7 +50,6 @@ use v4l::video::Capture as _;
 use self::format::{Frame, Layout, Numbering, fourcc_text};
 use self::node::{Node, Ring, open_error, setup_error};
 use super::{Agreed, DriverError, Reading, unblock};
-use crate::registry::CameraSpec;
 
 pub use self::format::{CameraInfo, ControlInfo, Mode, Rate, Rates, Size};
 

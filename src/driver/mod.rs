@@ -28,12 +28,11 @@ use rapid_core::permission::Attended;
 use rapid_core::provenance::Negotiated;
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
+use rapid_registry::device::DeviceNode;
+use rapid_registry::simulation::{SimDevice, SimSource};
+use rapid_registry::{CanProtocol, DeviceSpec, NodeSpec};
 use tokio::sync::mpsc;
 
-use crate::device::DeviceNode;
-use crate::registry::{CanProtocol, DeviceSpec, NodeSpec};
-use crate::simulation::{SimDevice, SimSource};
-use crate::status::Episode;
 #[cfg(not(feature = "lan"))]
 use absent::Absent as Lan;
 #[cfg(not(feature = "motors"))]
@@ -42,6 +41,7 @@ use absent::{Absent as Motors, Absent as RawCan};
 use can::{motors::Motors, raw::Raw as RawCan};
 #[cfg(feature = "lan")]
 use lan::Lan;
+use rapid_status::Episode;
 
 /// One sample as received from the device, borrowed until the next read.
 #[derive(Debug)]

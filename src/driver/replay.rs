@@ -20,19 +20,19 @@ use rapid_core::modality::ModalityId;
 use rapid_core::provenance::{KernelDriver, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_registry::device::{LanIdentity, UsbIdentity};
+use rapid_registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
+use rapid_registry::simulation::{SimDevice, SimFaults, SimSource};
+use rapid_registry::{DeviceSpec, Registry};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::sim::stamp_of;
 use super::{Agreed, DriverError, Reading, unblock};
-use crate::device::{LanIdentity, UsbIdentity};
 use crate::episode::decode::{Content, Kind, Sample, Scratch};
 use crate::episode::reader::{Channel, Item, Reader};
 use crate::episode::record_iter::{FileEnd, MAGIC};
 use crate::episode::{self, ReadAt, ReadError};
-use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
-use crate::registry::{DeviceSpec, Registry};
-use crate::simulation::{SimDevice, SimFaults, SimSource};
 
 /// Messages per read: at 1 kHz this covers the reading of a chunk.
 const BATCH: usize = 32;

@@ -18,13 +18,13 @@ use std::path::Path;
 use rapid_core::provenance::{Format, Negotiated};
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
+use rapid_registry::{Framing, Parse, SerialSpec};
 use rapid_system::tty;
 use serde::de::{DeserializeSeed, Deserializer, Error as _, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use tokio::io::AsyncReadExt as _;
 use tokio_serial::{ClearBuffer, SerialPort as _, SerialPortBuilder, SerialStream};
 
 use super::{Agreed, DriverError, Reading, arrival, unblock};
-use crate::registry::{Framing, Parse, SerialSpec};
 
 /// Bytes read from the kernel at once.
 const INBOX: usize = 4096;

@@ -20,6 +20,9 @@ use rapid_core::provenance::{Format, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::sync::Grid;
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_registry::simulation::task::{self, PictureError, SharedTrial};
+use rapid_registry::simulation::{self, SimDevice, SimSource, TaskPart};
+use rapid_registry::{CAN_RECORD, DeviceSpec, NodeSpec};
 use tokio::time::Instant;
 
 use self::joints::Joints;
@@ -32,9 +35,6 @@ use crate::driver::can::{
     link::{Arrival, Received},
     raw,
 };
-use crate::registry::{CAN_RECORD, DeviceSpec, NodeSpec};
-use crate::simulation::task::{self, PictureError, SharedTrial};
-use crate::simulation::{self, SimDevice, SimSource, TaskPart};
 
 /// Pictures a camera keeps for a late reader, as many as the real driver has buffers.
 const CAMERA_BACKLOG: u64 = 4;

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use rapid_core::modality::ModalityKind;
+use rapid_registry::{ActionSpec, DeviceSpec, NodeSpec};
 
 use super::form::Derived;
 use super::text_map;
-use crate::registry::{ActionSpec, DeviceSpec, NodeSpec};
 
 /// Of the topic of a device.
 pub(crate) fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {

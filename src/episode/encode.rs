@@ -11,10 +11,10 @@ use rapid_core::mask::Bits;
 use rapid_core::observation::Observation;
 use rapid_core::points;
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_registry::{CalibrationSpec, PointsSpec};
+use rapid_status::{Event, Level, What};
 
 use super::schema::SampleSchema;
-use crate::registry::{CalibrationSpec, PointsSpec};
-use crate::status::{Event, Level, What};
 
 const VARINT: u8 = 0;
 const FIXED64: u8 = 1;

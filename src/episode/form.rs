@@ -6,10 +6,10 @@
 //! Invariant: numbers that do not form a pose (not finite, or without a rotation) give no message.
 
 use rapid_core::rotation::{self, Quaternion};
+use rapid_registry::{DeviceSpec, Form, JointsSpec, POSE_ENDING, PoseLayout, PoseSpec, Quantity, TipForm};
 
 use super::encode::{self, Joint, Pose};
 use super::schema::{self, SampleSchema, Schema};
-use crate::registry::{DeviceSpec, Form, JointsSpec, POSE_ENDING, PoseLayout, PoseSpec, Quantity, TipForm};
 
 /// The topic of all transforms.
 pub const TRANSFORM_TOPIC: &str = "/tf";

@@ -47,13 +47,6 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
 
-/// Topic of the frame index.
-pub(crate) const FRAME_TOPIC: &str = "/rapid/frame";
-/// Topic of events.
-pub(crate) const EVENT_TOPIC: &str = "/rapid/event";
-/// Topic of the log.
-pub(crate) const LOG_TOPIC: &str = "/rapid/log";
-
 /// Metadata record at an episode's beginning.
 pub(crate) const ABOUT: &str = "rapid";
 /// Metadata record at an episode's end.

@@ -14,6 +14,7 @@ pub(crate) use mcap::Attachment;
 use mcap::records::MessageHeader;
 use rapid_core::mask::MASK_TOPIC;
 use rapid_core::modality::ModalityId;
+use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC};
 
 use super::chunk::is_sound;
 use super::decode::{self, Content, Kind, Scratch};
@@ -22,7 +23,7 @@ use super::record_iter::RecordIter;
 use super::schema::{PROTOBUF, SampleSchema};
 use super::source::ReadAt;
 use super::wire::Fields;
-use super::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, ReadError, op};
+use super::{ABOUT, ReadError, op};
 use super::{boot_id, open};
 
 /// See the module's comment.

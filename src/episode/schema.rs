@@ -3,8 +3,7 @@
 
 use rapid_core::modality::ModalityKind;
 use rapid_core::sample::{Encoding, SampleHeader};
-
-use crate::registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PixelFormat, RemoteSamples};
+use rapid_registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PixelFormat, RemoteSamples};
 
 /// Message encoding and schema encoding of every channel.
 pub const PROTOBUF: &str = "protobuf";

@@ -7,13 +7,13 @@ use std::borrow::Cow;
 use std::rc::Rc;
 
 use rapid_core::modality::ModalityKind;
+use rapid_pictures::pixels::Pixels;
 
 use super::features::{Axis, Features, Origin};
 use super::picture::{self, Pictures};
 use super::rows::{Payload, Refusal, Row};
 use super::survey::{is_usable, narrow};
 use super::video::Damaged;
-use crate::pixels::Pixels;
 
 /// The values of a row.
 #[derive(Debug, Default)]

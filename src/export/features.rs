@@ -7,14 +7,14 @@
 use std::collections::BTreeMap;
 
 use rapid_core::action::ACTION_TOPIC;
+use rapid_registry::ExportSpec;
+use rapid_registry::columns::{self, ColumnError, Vector};
 use serde_json::{Map, Value, json};
 
 use super::picture::{Codec, Pictures, Shape};
 use super::rows::Refusal;
 use super::statistics::Column;
 use super::survey::{Content, LONGEST, Survey};
-use crate::registry::ExportSpec;
-use crate::registry::columns::{self, ColumnError, Vector};
 
 /// Feature of the vectors.
 pub(super) const STATE: &str = "observation.state";
@@ -438,9 +438,10 @@ impl Known {
 
 #[cfg(test)]
 mod tests {
+    use rapid_status::Grade;
+
     use super::super::survey::Stream;
     use super::*;
-    use crate::status::Grade;
 
     fn features() -> Features {
         Features {

@@ -7,10 +7,10 @@ use std::borrow::Cow;
 use std::fmt;
 
 use rapid_core::sample::Encoding;
+use rapid_pictures::pixels::{LARGEST, Picture, PixelError, Pixels};
 
 use super::rows::Payload;
 use crate::episode::decode::jpeg_frame;
-use crate::pixels::{LARGEST, Picture, PixelError, Pixels};
 use crate::record::is_whole_jpeg;
 
 /// How a dataset has its pictures.
@@ -181,7 +181,7 @@ mod tests {
         let picture =
             |bytes: &[u8]| Payload::Picture { encoding: Encoding::Mjpeg, width: 8, height: 4, bytes: bytes.to_vec() };
         let mut jpeg = Vec::new();
-        rapid_jpeg::encode(&[9; 32], [4, 8], rapid_jpeg::Values::Grey, 90, &mut jpeg).unwrap();
+        rapid_pictures::jpeg::encode(&[9; 32], [4, 8], rapid_pictures::jpeg::Values::Grey, 90, &mut jpeg).unwrap();
         let whole = picture(&jpeg);
         assert_eq!(shape(&whole), Some(Shape { height: 4, width: 8, channels: 1 }));
         assert_eq!(file(&whole, &mut Pixels::default()).unwrap(), jpeg);

@@ -6,15 +6,15 @@ use std::sync::atomic::AtomicBool;
 
 use rapid_core::modality::ModalityKind;
 use rapid_core::text;
+use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
+use rapid_registry::{ExportSpec, Form, Registry};
+use rapid_status::{Grade, Verdict};
 
 use super::picture::{self, Shape};
 use super::rows::{Index, Listed, Payload, Refusal, Row};
 use super::statistics::Column;
 use crate::episode::record_iter::FileEnd;
-use crate::pixels::{CHANNELS, Picture, Pixels};
 use crate::record::inspect::{self, Inspection, Judgement};
-use crate::registry::{ExportSpec, Form, Registry};
-use crate::status::{Grade, Verdict};
 
 /// Numbers that a registry may declare of a sample; what a file claims may be anything.
 pub(super) const LONGEST: usize = 1 << 16;
@@ -368,7 +368,7 @@ mod tests {
 
     #[test]
     fn why_a_registry_in_an_episode_cannot_be_read_is_reported() {
-        let (registry, reason) = registry_of(crate::registry::BUILTIN);
+        let (registry, reason) = registry_of(rapid_registry::BUILTIN);
         assert_eq!((registry.is_some(), reason), (true, None));
         let (registry, reason) = registry_of("[rig]\nobservation_hertz = 30\n");
         assert!(registry.is_none() && reason.is_some_and(|reason| reason.contains("observation_hertz")));

@@ -9,6 +9,10 @@ use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::observation::Observation;
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::topic::FRAME_TOPIC;
+use rapid_pictures::pixels::{Picture, Pixels};
+use rapid_registry::ExportSpec;
+use rapid_status::Grade;
 
 use super::cells::CellMaker;
 use super::features::{Axis, Features, MASK, Origin, PLUGGED, STATE, VALID};
@@ -22,10 +26,7 @@ use super::verify::verify;
 use super::video::{Encoded, FrameMaker, Shown};
 use crate::episode::encode;
 use crate::episode::schema::{FRAME, SampleSchema};
-use crate::episode::{FRAME_TOPIC, sha256, text_map};
-use crate::pixels::{Picture, Pixels};
-use crate::registry::ExportSpec;
-use crate::status::Grade;
+use crate::episode::{sha256, text_map};
 
 const BEGIN: u64 = 1_700_000_000_000_000_000;
 const GREY: [u8; 8] = [0, 30, 60, 90, 120, 150, 180, 255];
@@ -103,7 +104,7 @@ fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
         recording.frame(number, [(number < 2).then_some(number.into()), None]);
     }
     let mut jpeg = Vec::new();
-    rapid_jpeg::encode(&[200; 8], [2, 4], rapid_jpeg::Values::Grey, 90, &mut jpeg).unwrap();
+    rapid_pictures::jpeg::encode(&[200; 8], [2, 4], rapid_pictures::jpeg::Values::Grey, 90, &mut jpeg).unwrap();
     recording.sample(Some(0), 0, Encoding::Mjpeg, &jpeg);
     // With its beginning, its size and its end, but without the pixels.
     let scan = jpeg.windows(2).position(|mark| mark == [0xff, 0xda]).unwrap();

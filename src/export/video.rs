@@ -7,6 +7,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
+use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
+
 use super::features::Features;
 use super::ffmpeg::{Ffmpeg, FfmpegError, Running, Stop};
 use super::files::{NewFile, VIDEOS};
@@ -14,7 +16,6 @@ use super::picture::{self, Shape};
 use super::rows::{Index, Payload, Refusal, Row};
 use super::set::SetError;
 use super::survey::Survey;
-use crate::pixels::{CHANNELS, Picture, Pixels};
 
 /// Rows of which a camera's picture cannot be decoded: the place of the camera among the modalities, and the row.
 pub(super) type Damaged = BTreeSet<(usize, usize)>;
@@ -130,7 +131,7 @@ pub fn encode(
 
 /// How near a frame is to the picture that it was made of: the ratio of signal to noise, dB; 100 if they are equal.
 pub(super) fn psnr(found: &[u8], expected: &[u8]) -> f64 {
-    let squares = rapid_jpeg::squares(found, expected);
+    let squares = rapid_pictures::jpeg::squares(found, expected);
     (10.0 * (255.0_f64.powi(2) * expected.len() as f64 / squares as f64).log10()).min(100.0)
 }
 

@@ -3,11 +3,10 @@
 use rapid_core::modality::ModalityId;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_pictures::qr;
+use rapid_status::palette::Palette;
+use rapid_status::{DeviceStatus, Event, Snapshot, What};
 use serde::Serialize;
-
-use crate::palette::Palette;
-use crate::qr;
-use crate::status::{DeviceStatus, Event, Snapshot, What};
 
 /// An event with its time on the wall clock.
 #[derive(Serialize)]

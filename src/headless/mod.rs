@@ -13,15 +13,15 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::{Stamp, WallClock};
+use rapid_system::outlet::Outlet;
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use crate::outlet::Outlet;
-use crate::palette::Palette;
-use crate::status::rates::Rates;
-use crate::status::{Board, Event, Snapshot, What};
+use rapid_status::palette::Palette;
+use rapid_status::rates::Rates;
+use rapid_status::{Board, Event, Snapshot, What};
 use totals::RunTotals;
 
 /// Maximum backlog of output; beyond it events wait, and are eventually missed.

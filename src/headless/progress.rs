@@ -3,10 +3,9 @@
 use std::time::Duration;
 
 use rapid_core::text;
+use rapid_status::rates::Rates;
+use rapid_status::{PolicyStatus, SlotState, Snapshot};
 use serde::Serialize;
-
-use crate::status::rates::Rates;
-use crate::status::{PolicyStatus, SlotState, Snapshot};
 
 /// Progress as one line, without a line end: time, mask, policy, the episode, rates of streaming devices.
 pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, duration: Option<Duration>) -> String {

@@ -1,18 +1,18 @@
 use std::sync::Mutex;
 
+use crate::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use rapid_core::interlock::{InputState, StopKind};
 use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_core::provenance::{KernelDriver, Negotiated, UnplugSource};
 use rapid_core::sample::Epoch;
-use serde_json::Value;
-
-use super::*;
-use crate::device::UsbIdentity;
-use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
-use crate::status::{
+use rapid_registry::device::UsbIdentity;
+use rapid_status::{
     Chunk, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, StopStatus,
     Verdict, What,
 };
+use serde_json::Value;
+
+use super::*;
 
 /// An output that stores the bytes written to it.
 #[derive(Clone, Default)]

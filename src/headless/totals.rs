@@ -8,10 +8,9 @@ use std::time::Duration;
 use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_status::palette::Palette;
+use rapid_status::{DeviceStatus, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
 use serde::Serialize;
-
-use crate::palette::Palette;
-use crate::status::{DeviceStatus, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
 
 /// How long each device was present, and which episodes were closed.
 #[derive(Debug)]

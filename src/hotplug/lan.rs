@@ -24,6 +24,7 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use futures::Stream;
+use rapid_registry::{DeviceSpec, LanFind, NodeSpec, Probe};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
@@ -31,7 +32,6 @@ use self::mdns::Browser;
 use self::probe::Question;
 use self::watch::Watch;
 use super::{HotplugError, HotplugEvent};
-use crate::registry::{DeviceSpec, LanFind, NodeSpec, Probe};
 
 /// Queue length for events; the rig reads them at once.
 const DEPTH: usize = 64;

@@ -17,8 +17,7 @@ use std::pin::Pin;
 use futures::Stream;
 use rapid_core::provenance::UnplugSource;
 use rapid_core::time::Stamp;
-
-use crate::device::Attachment;
+use rapid_registry::device::Attachment;
 
 /// A device was plugged in or unplugged.
 #[derive(Debug, Clone, PartialEq)]

@@ -10,13 +10,13 @@ use std::time::Duration;
 
 use futures::Stream;
 use rapid_core::time::Stamp;
+use rapid_registry::device::{Attachment, DeviceNode, Unit};
+use rapid_registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
+use rapid_registry::simulation::{self, SimDevice};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::{HotplugError, HotplugEvent, UnplugSource};
-use crate::device::{Attachment, DeviceNode, Unit};
-use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
-use crate::simulation::{self, SimDevice};
 
 /// Plays a [`Scenario`] on tokio's clock, from the moment it is created.
 #[derive(Debug)]
@@ -210,9 +210,10 @@ impl Stream for Script {
 
 #[cfg(test)]
 mod tests {
+    use rapid_registry::device::UsbIdentity;
+    use rapid_registry::simulation::{SimFaults, SimSource};
+
     use super::*;
-    use crate::device::UsbIdentity;
-    use crate::simulation::{SimFaults, SimSource};
     use futures::StreamExt;
 
     fn device(name: &str, port: &str, plugged: bool) -> ScenarioDevice {

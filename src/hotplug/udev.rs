@@ -19,13 +19,13 @@ use std::task::{Context, Poll, ready};
 use futures::Stream;
 use rapid_core::provenance::KernelDriver;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use udev::{Device, Enumerator, EventType, MonitorBuilder, MonitorSocket};
 
 use super::{HotplugError, HotplugEvent, UnplugSource};
-use crate::device::{Attachment, DeviceNode, UsbIdentity};
-use crate::registry::Registry;
 
 /// Subsystems whose nodes are opened, in addition to USB devices themselves.
 const NODE_SUBSYSTEMS: [&str; 3] = ["video4linux", "tty", "net"];
@@ -376,8 +376,9 @@ mod tests {
 
 #[cfg(test)]
 mod known_tests {
+    use rapid_registry::device::{DeviceNode, UsbIdentity};
+
     use super::*;
-    use crate::device::{DeviceNode, UsbIdentity};
 
     /// A node `port/name` of the device with this number.
     fn node(path: &str, number: u32) -> Present {

@@ -5,9 +5,8 @@
 
 use std::os::fd::BorrowedFd;
 
+use rapid_registry::GpioInput;
 use rapid_system::gpio::Input;
-
-use crate::registry::GpioInput;
 
 /// A line that this process holds.
 #[derive(Debug)]

@@ -6,8 +6,7 @@ use std::time::Duration;
 
 use evdev::{Device, EventSummary, InputEvent, KeyCode};
 use rapid_core::text::not_opened;
-
-use crate::registry::KeyInput;
+use rapid_registry::KeyInput;
 
 /// The keys are queried at least this often.
 pub(super) const LOOK: Duration = Duration::from_millis(50);

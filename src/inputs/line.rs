@@ -9,12 +9,11 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::Duration;
 
 use rapid_core::text::not_opened;
+use rapid_registry::{LineInput, LineOff};
 use rapid_system::tty;
 use rustix::fs::{Mode, OFlags, open};
 use rustix::io::Errno;
 use rustix::termios::{ControlModes, OptionalActions, QueueSelector, tcflush, tcgetattr, tcsetattr};
-
-use crate::registry::{LineInput, LineOff};
 
 /// Longest line that is evaluated; a longer one cannot be one of the meaningful lines.
 const LONGEST: usize = 128;

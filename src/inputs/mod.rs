@@ -25,7 +25,7 @@ use std::thread::JoinHandle;
 use rapid_system::realtime::{CONTROL_PRIORITY, use_fifo};
 use rustix::event::{EventfdFlags, eventfd};
 
-use crate::registry::{FieldInput, GpioInput, InputSpec, KeyInput, LineInput};
+use rapid_registry::{FieldInput, GpioInput, InputSpec, KeyInput, LineInput};
 use tap::Tap;
 
 /// Receives what the inputs of a place report, from any thread. For a number it is called with every sample: it must not
@@ -177,7 +177,7 @@ mod tests {
             InputSpec::Key(KeyInput { device, code, number, on_while_pressed: true, grab: false })
         };
         let line = |path: &str, on: &str| {
-            let (path, on, off) = (path.into(), on.to_owned(), crate::registry::LineOff::AtOnce);
+            let (path, on, off) = (path.into(), on.to_owned(), rapid_registry::LineOff::AtOnce);
             InputSpec::Serial(LineInput { path, baud: 9600, on, off, silence: None })
         };
         let gpio = |line| InputSpec::Gpio(GpioInput { chip: "/dev/gpiochip0".into(), line, on_while_high: false });

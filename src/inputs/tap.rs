@@ -12,11 +12,11 @@ use std::time::Duration;
 
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
+use rapid_registry::{Bound, FieldInput};
 use rustix::event::{EventfdFlags, eventfd};
 
 use super::watch::{Woken, wait};
 use super::{Report, lost_at_a_panic};
-use crate::registry::{Bound, FieldInput};
 
 /// See the module's comment.
 #[derive(Debug, Clone)]

@@ -13,11 +13,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rapid_core::interlock::{InputState, Interlocks};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_status::Board;
 
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
-use crate::registry::Registry;
-use crate::status::Board;
 
 /// The stops of a registry, none of which runs.
 pub fn of(registry: &Registry) -> Interlocks {

@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 use rapid_core::action::{Order, Trip};
 use rapid_core::permission::Attended;
 use rapid_core::sample::Encoding;
+use rapid_status::{Event, StopStatus, What};
 use rustix::fs::OFlags;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
 use super::*;
 use crate::inputs::{lost_at_a_panic, tap};
 use crate::patience::PATIENCE;
-use crate::status::{Event, StopStatus, What};
 
 const DEVICES: &str = r#"
 [device.arm]

@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use k::SerialChain;
 use k::nalgebra::{DMatrix, DVector, Isometry3, Quaternion, UnitQuaternion};
 use rapid_core::action::NoAction;
+use rapid_registry::{EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, MotorSpec, TipRotation};
 
 use super::chain::{Chain, ChainError, isometry};
-use crate::registry::{EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, MotorSpec, TipRotation};
 
 /// How near the tip must come to its target: a tenth of what the motors resolve.
 pub(super) const NEAR_M: f64 = 1e-4;

@@ -3,12 +3,12 @@
 use proptest::prelude::*;
 use rapid_core::action::NoAction::{Length, OutOfReach};
 use rapid_core::rotation;
+use rapid_registry::{
+    CanProtocol, CanSpec, DamiaoSpec, EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, NodeSpec, Registry, TipRotation,
+};
 
 use super::arm::{NEAR_M, NEAR_RAD};
 use super::*;
-use crate::registry::{
-    CanProtocol, CanSpec, DamiaoSpec, EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, NodeSpec, Registry, TipRotation,
-};
 
 const URDF: &str = include_str!("../../tests/arm/arm.urdf");
 const JOINTS: [&str; 5] = ["waist", "lift", "elbow", "pitch", "roll"];

@@ -13,9 +13,8 @@ use foxglove::websocket::{
 };
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_status::session::{Asker, SessionRequest};
 use tokio::sync::oneshot;
-
-use crate::status::session::{Asker, SessionRequest};
 
 /// What clients may request.
 #[derive(Clone)]

@@ -34,14 +34,14 @@ use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 pub use control::Controls;
+use rapid_bus::{BusError, Queues, Subscription};
 use rapid_core::time::{Stamp, WallClock};
+use rapid_registry::{DeviceSpec, Registry};
+use rapid_status::{Board, Event, Level, What};
+use rapid_system::fault;
 use topics::Topics;
 
-use crate::bus::{BusError, Queues, Subscription};
 use crate::episode::made::Made;
-use crate::fault;
-use crate::registry::{DeviceSpec, Registry};
-use crate::status::{Board, Event, Level, What};
 
 /// Port of a Foxglove server, if none is named.
 const PORT: u16 = 8765;

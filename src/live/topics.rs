@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use foxglove::{Context, PartialMetadata, RawChannel, Schema as ChannelSchema};
+use rapid_bus::TopicId;
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::{Bits, MASK_TOPIC};
 use rapid_core::modality::MAX_MODALITIES;
@@ -16,16 +17,16 @@ use rapid_core::observation::{OBSERVATION_TOPIC, Observation};
 use rapid_core::sample::SampleHeader;
 use rapid_core::text;
 use rapid_core::time::{Stamp, WallClock};
+use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
+use rapid_registry::{DeviceSpec, Form, Registry};
+use rapid_status::Event;
 
 use super::pictures::Pace;
-use crate::bus::TopicId;
+use crate::episode::channel;
 use crate::episode::encode::{self, Announced, logged};
 use crate::episode::form::{Derived, TRANSFORM_TOPIC};
 use crate::episode::made::{Made, MadeKind};
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
-use crate::episode::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, channel};
-use crate::registry::{DeviceSpec, Form, Registry};
-use crate::status::Event;
 
 /// Time between two messages about where a sensor sits.
 const PLACES_EVERY: Duration = Duration::from_secs(1);

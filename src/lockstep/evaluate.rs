@@ -5,27 +5,27 @@
 
 use std::time::Duration;
 
+use rapid_bus::TopicId;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
+use rapid_core::random::Random;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_registry::scenario::{Scenario, ScenarioAction};
+use rapid_registry::simulation::task::{AXES, Outcome, Size, Texture, Touch, UNSEEN_PERIOD};
+use rapid_registry::{Registry, task};
+use rapid_status::Event;
 use serde::Serialize;
 
 use super::timing::Timing;
 use super::{Lockstep, STEP, Taker, TrialError};
-use crate::bus::TopicId;
 use crate::policy::bundle::Bundle;
 use crate::policy::horizon::{Counts, WithoutMask};
 use crate::policy::model::{AnswerError, Model};
 use crate::policy::pilot::Pilot;
 use crate::policy::request::Request;
-use crate::random::Random;
 use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
-use crate::registry::scenario::{Scenario, ScenarioAction};
-use crate::registry::{Registry, task};
-use crate::simulation::task::{AXES, Outcome, Size, Texture, Touch, UNSEEN_PERIOD};
-use crate::status::Event;
 
 /// The random stream of a trial's seed that determines when cables are unplugged.
 const WINDOWS: u64 = 0x7769_6e64_6f77;

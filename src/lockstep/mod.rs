@@ -13,24 +13,24 @@ pub mod timing;
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use rapid_bus::TopicId;
 use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_core::modality::ModalityId;
 use rapid_core::provenance::Negotiated;
 use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_registry::device::{Attachment, DeviceNode};
+use rapid_registry::scenario::{Scenario, ScenarioAction};
+use rapid_registry::simulation::task::{self, AXES, AXIS_COUNT, STEP_HZ, SharedTrial};
+use rapid_registry::simulation::{SimSource, TaskPart};
+use rapid_registry::{DeviceSpec, Registry};
+use rapid_status::{Event, Provenance, SlotState, What};
 
-use crate::bus::TopicId;
-use crate::device::{Attachment, DeviceNode};
 use crate::driver::DriverError;
 use crate::hotplug::script::Timeline;
 use crate::record::RecordError;
 use crate::record::stepped::Taker;
-use crate::registry::scenario::{Scenario, ScenarioAction};
-use crate::registry::{DeviceSpec, Registry};
 use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
-use crate::simulation::task::{self, AXES, AXIS_COUNT, STEP_HZ, SharedTrial};
-use crate::simulation::{SimSource, TaskPart};
-use crate::status::{Event, Provenance, SlotState, What};
 use timing::Timing;
 
 /// Publication period of the mask (paper, appendix "Physical Mask Data Format": 500 Hz).

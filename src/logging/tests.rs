@@ -70,7 +70,7 @@ fn text_lines_replace_a_progress_line_on_the_same_terminal() {
 }
 
 fn sink_to(form: Stderr, before: &'static str, out: impl Write + Send + 'static) -> StderrSink {
-    let palette = crate::palette::Palette::Plain;
+    let palette = rapid_status::palette::Palette::Plain;
     StderrSink { form, palette, before, outlet: outlet(out).unwrap(), lost: AtomicU64::new(0) }
 }
 
@@ -142,7 +142,7 @@ fn a_line_without_room_is_not_the_end_of_the_log() {
 
 #[test]
 fn a_wrong_filter_is_named() {
-    let board = Arc::new(crate::status::literal::board(&["cam"]));
+    let board = Arc::new(crate::literal::board(&["cam"]));
     let error = init(board, Some("rapid=loud"), Stderr::Nothing).unwrap_err();
     assert!(error.to_string().starts_with("RAPID_LOG: "), "{error}");
 }

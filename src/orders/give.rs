@@ -9,12 +9,12 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::text::{plain, unanswered};
 use rapid_core::time::Stamp;
+use rapid_status::attach::ATTACH;
 use rapid_system::peer::{Peer, ProcessState};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket_with};
 use serde::Serialize;
 
 use super::{Answer, DONE, LONGEST, LONGEST_ANSWER, instance_part, line, this_user};
-use crate::status::attach::ATTACH;
 
 /// A run answers within milliseconds; a stopped process does not.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);
@@ -156,8 +156,8 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     unreached.map_or(Ok(()), Err)
 }
 
-/// Makes a request to the run of `instance`, a [`SessionRequest`](crate::status::session::SessionRequest) or a
-/// [`RegistryRequest`](crate::status::RegistryRequest); the answer, once it is carried out.
+/// Makes a request to the run of `instance`, a [`SessionRequest`](rapid_status::session::SessionRequest) or a
+/// [`RegistryRequest`](rapid_status::RegistryRequest); the answer, once it is carried out.
 ///
 /// # Errors
 /// When no run has carried it out.

@@ -9,10 +9,10 @@
 //! (unix(7)). Any user can create a socket of that name: the peer is identified by the kernel (`SO_PEERCRED`). An order
 //! is one line, `arm NS` or `disarm NS` with the time at which it was given (`CLOCK_MONOTONIC`, ns); the answer is one
 //! line, `done` or the reason of the refusal, and the connection is closed. A request is one line of JSON, a
-//! [`SessionRequest`](crate::status::session::SessionRequest) or a
-//! [`RegistryRequest`](crate::status::RegistryRequest); so is its [`Answer`], which comes when what was requested is done:
+//! [`SessionRequest`](rapid_status::session::SessionRequest) or a
+//! [`RegistryRequest`](rapid_status::RegistryRequest); so is its [`Answer`], which comes when what was requested is done:
 //! when the file of an episode is closed, or when one has begun. A screen sends `attach`, and the connection becomes its
-//! link ([`crate::status::attach`]).
+//! link ([`rapid_status::attach`]).
 //!
 //! Invariant: orders of this user and of root are accepted, those of members of a group if the run was started so
 //! (`--group-control`), and of no one else. They are given to a run of this user, or else to one whose group the sender

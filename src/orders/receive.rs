@@ -15,15 +15,15 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_status::RegistryRequest;
+use rapid_status::attach::ATTACH;
+use rapid_status::session::SessionRequest;
 use rapid_system::peer::Peer;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use tokio::sync::mpsc::Sender;
 use tokio::sync::mpsc::error::TrySendError;
 
 use super::{Answer, DONE, LONGEST, address, name, order, this_user};
-use crate::status::RegistryRequest;
-use crate::status::attach::ATTACH;
-use crate::status::session::SessionRequest;
 
 /// Connections at a time; beyond that the oldest is closed.
 const CONNECTIONS: usize = 16;

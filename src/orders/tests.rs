@@ -5,14 +5,14 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 
 use rapid_core::permission::{Attended, Permission};
+use rapid_status::RegistryRequest;
+use rapid_status::session::SessionRequest;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, listen, socket_with};
 use tokio::sync::mpsc::{Receiver, channel};
 
 use super::give::{GiveError, attach, give, request};
 use super::receive::{Arrival, Asked, Orders, Wanted};
 use super::*;
-use crate::status::RegistryRequest;
-use crate::status::session::SessionRequest;
 use Order::{Arm, Disarm};
 
 /// A run's side, under a separate instance.

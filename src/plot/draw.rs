@@ -6,11 +6,11 @@ mod rows;
 use std::fmt::Write;
 
 use rapid_core::text;
+use rapid_status::session::EpisodeEntry;
 
 use super::gather::Timeline;
 use super::svg::{Anchor, Px, Svg};
 use crate::record::inspect::Inspection;
-use crate::status::session::EpisodeEntry;
 
 /// Width of the picture, and the margin around what it shows.
 const WIDTH: f64 = 1180.0;

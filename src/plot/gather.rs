@@ -7,12 +7,12 @@ use std::collections::BTreeMap;
 
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
+use rapid_pictures::pixels::Picture;
 
 use super::thumbnail::{Thumbnail, Thumbnails};
 use crate::episode::decode::{Content, FrameSlot, Kind, Scratch};
 use crate::episode::reader::{Channel, Item, Message};
 use crate::episode::schema::SampleSchema;
-use crate::pixels::Picture;
 use crate::record::inspect::{Inspection, Numbers};
 
 /// Bins of the time of an episode.

@@ -15,9 +15,10 @@ mod thumbnail;
 
 use std::path::Path;
 
+use rapid_status::session::EpisodeEntry;
+
 use crate::episode::reader::Reader;
 use crate::record::inspect::{self, Inspection, Judgement, ReadError};
-use crate::status::session::EpisodeEntry;
 use gather::{Span, Timeline};
 
 /// How every picture begins, by which it is recognised as made here.

@@ -4,6 +4,8 @@ use std::path::Path;
 
 use proptest::prelude::*;
 use rapid_core::modality::ModalityId;
+use rapid_status::session::Label;
+use rapid_status::{Grade, Verdict};
 use roxmltree::Document;
 
 use super::gather::{BINS, Mark, PICTURES, Row, Subject};
@@ -11,8 +13,6 @@ use super::thumbnail::Thumbnail;
 use super::*;
 use crate::episode::testing;
 use crate::record::inspect::{MaskEdge, ModalityReport, TopicReport};
-use crate::status::session::Label;
-use crate::status::{Grade, Verdict};
 
 const HOSTILE: &str = "</text><script>alert(1)</script> \"'&\u{0}\u{1b}[2J\u{202e}\u{ffff}";
 

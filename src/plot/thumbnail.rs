@@ -2,9 +2,8 @@
 
 use std::fmt;
 
-use rapid_jpeg::Values;
-
-use crate::pixels::{CHANNELS, Picture, Pixels};
+use rapid_pictures::jpeg::Values;
+use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
 
 /// Longest side of one, pixels: twice as many as are shown, for screens with small pixels.
 const LONGEST: usize = 176;
@@ -46,7 +45,7 @@ impl Thumbnails {
         let small = mean(self.pixels.values(), size, [height, width]);
         let mut jpeg = Vec::new();
         let (columns, rows) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
-        rapid_jpeg::encode(&small, [rows, columns], Values::Rgb, QUALITY, &mut jpeg).ok()?;
+        rapid_pictures::jpeg::encode(&small, [rows, columns], Values::Rgb, QUALITY, &mut jpeg).ok()?;
         Some(Thumbnail { share, aspect: width as f64 / height as f64, jpeg })
     }
 }

@@ -11,10 +11,10 @@ use ort::memory::Allocator;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::session::{HasSelectedOutputs, OutputSelector, RunOptions, Session, SessionInputValue};
 use ort::value::{DynValue, Outlet, PrimitiveTensorElementType, Tensor, TensorElementType, ValueType};
+use rapid_registry::{InferenceSpec, Provider};
 
 use super::bundle::{Element, GraphShape, TensorShape};
 use super::library::Environment;
-use crate::registry::{InferenceSpec, Provider};
 
 /// Why a graph cannot be loaded or run.
 #[derive(Debug, thiserror::Error)]

@@ -31,10 +31,10 @@ use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
+use rapid_registry::Registry;
 use serde::Serialize;
 
 use super::bundle::{Bundle, ObservationInput, ObservationSpec};
-use crate::registry::Registry;
 
 /// What a policy that was not trained with absent modalities does when an optional one disappears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -18,8 +18,12 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
+use rapid_bus::{Inbox, Writer};
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_status::{Board, Hold, Level, PolicyEnd, PolicyStatus, What};
+use rapid_system::fault;
 use tokio_util::sync::CancellationToken;
 
 use super::bundle::Bundle;
@@ -27,10 +31,6 @@ use super::horizon::{Counts, WithoutMask};
 use super::model::Model;
 use super::pilot::{FIRST_TICK_AFTER, Pilot};
 use super::request::{Cell, Request};
-use crate::bus::{Inbox, Writer};
-use crate::fault;
-use crate::registry::Registry;
-use crate::status::{Board, Hold, Level, PolicyEnd, PolicyStatus, What};
 
 /// Nice value of the computing thread; all others have 0.
 const NICE: i32 = 5;

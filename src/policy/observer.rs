@@ -19,10 +19,10 @@ use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Epoch, FLAG_ERROR, SampleHeader};
 use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
 
 use super::bundle::{Bundle, WhenAbsent};
 use super::request::Request;
-use crate::registry::Registry;
 
 /// See the module's comment.
 #[derive(Debug)]

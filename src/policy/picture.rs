@@ -6,11 +6,12 @@
 //!
 //! Invariant: a refused picture changes neither the observation nor the reference.
 
+use rapid_pictures::pixels::{CHANNELS, PixelError, Pixels};
+
 use super::bundle::{ColorOrder, ImageSpec, Normalization, Operation};
 use super::normalize::Normalizer;
-use crate::pixels::{CHANNELS, PixelError, Pixels};
 
-pub use crate::pixels::Picture;
+pub use rapid_pictures::pixels::Picture;
 
 /// Why a picture cannot be an observation.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

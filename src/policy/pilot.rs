@@ -7,17 +7,17 @@
 
 use std::time::Duration;
 
+use rapid_bus::TopicId;
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
 
 use super::bundle::Bundle;
 use super::compose::Composer;
 use super::horizon::{ActionQueue, ChunkError, Situation, Step, WithoutMask};
 use super::observer::Observer;
 use super::request::Request;
-use crate::bus::TopicId;
-use crate::registry::Registry;
 
 /// The first tick is this much later than the capture of the newest sample that it waited for: what a device and
 /// the bus take.

@@ -8,14 +8,15 @@
 //! Invariant: non-finite values are passed on unchanged: the action queue refuses them.
 //! Invariant: a chunk is computed without an allocation on this side of onnxruntime.
 
+use rapid_core::random::Random;
+use rapid_registry::InferenceSpec;
+
 use super::bundle::{Bundle, BundleErrors, Graph};
 use super::graphs::{BoundGraph, GraphError, LoadedGraph};
 use super::library::Environment;
 use super::normalize::Normalizer;
 use super::observation::ObservationTensors;
 use super::scheduler::{Scheduler, SchedulerError};
-use crate::random::Random;
-use crate::registry::InferenceSpec;
 
 /// The stream of a seed that the noise is drawn from.
 const NOISE: u64 = 0x706f_6c69_6379;

@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_registry::{DeviceSpec, Limits, Registry};
+use rapid_status::{Board, Level, What};
 
 use super::quality::{Measures, Meter};
-use crate::registry::{DeviceSpec, Limits, Registry};
-use crate::status::{Board, Level, What};
 
 /// Shortest time between announcements of a modality.
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::{text, time};
+use rapid_status::{Board, Level, Verdict, What};
 use rapid_system::folder::{Folder, FolderError, Links, Missing};
 use rustix::fs::{Mode, OFlags};
 use serde::Serialize;
@@ -18,7 +19,6 @@ use serde::Serialize;
 use super::RecordError;
 use crate::episode::Failed;
 use crate::episode::partial::{self, Lock, PARTIAL, TRASH, rename};
-use crate::status::{Board, Level, Verdict, What};
 
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
 /// bytes a file name may have.

@@ -20,6 +20,9 @@ use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::observation::Observation;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{Stamp, WallClock};
+use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
+use rapid_registry::{Form, ModuleSpec, Registry, TransformSpec};
+use rapid_status::{Level, ReferenceSample};
 
 use super::guard::Guard;
 use crate::episode::channel;
@@ -30,9 +33,7 @@ use crate::episode::made::{MadeKind, Shown};
 use crate::episode::own::EpisodeId;
 use crate::episode::reference;
 use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
-use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
-use crate::registry::{Form, ModuleSpec, Registry, TransformSpec};
-use crate::status::{Level, ReferenceSample};
+use crate::episode::{ABOUT, SUMMARY};
 
 /// See the module's comment.
 pub(super) struct EpisodeFile {

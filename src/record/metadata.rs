@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 
 use rapid_core::mask::PhysicalMask;
 use rapid_core::time::{Stamp, WallClock, nanoseconds};
+use rapid_registry::{ModuleSpec, Registry};
+use rapid_status::Verdict;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
@@ -13,8 +15,6 @@ use super::publishers;
 use super::quality::{Quality, Spread};
 use super::verdict::Facts;
 use crate::episode::{self, BOOT_ID, text_map};
-use crate::registry::{ModuleSpec, Registry};
-use crate::status::Verdict;
 
 /// Key of the record at the end: why the episode is not whole.
 pub(super) const CUT_SHORT: &str = "cut_short";
@@ -213,7 +213,7 @@ mod tests {
     fn modules_are_declared_or_detected_and_bring_their_tags() {
         let modules = "\n[module.tactile]\nslot = \"tip\"\ntags = [\"finger=tactile\"]\ndevices = [\"tactile_tip\"]\n\
             [module.soft]\nslot = \"tip\"\ntags = [\"finger=soft\", \"colour=red\"]\n[module.never]\nslot = \"front\"\n";
-        let registry = Registry::parse(&format!("{}{modules}", crate::registry::BUILTIN), None).unwrap().registry;
+        let registry = Registry::parse(&format!("{}{modules}", rapid_registry::BUILTIN), None).unwrap().registry;
         let of = |report: &[&str], tags: &[(&str, &str)], mask| {
             let report: Vec<String> = report.iter().map(|name| (*name).to_owned()).collect();
             let tags: Vec<_> = tags.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
@@ -233,7 +233,7 @@ mod tests {
         // Two mounts for one camera: which of them carries it is declared.
         let mounts = "[module.straight]\nslot = \"top\"\ntags = [\"wrist=straight\"]\ndevices = [\"cam_wrist\"]\n\
             [module.angled]\nslot = \"top\"\ntags = [\"wrist=angled\"]\ndevices = [\"cam_wrist\"]\n";
-        let registry = Registry::parse(&format!("{}{mounts}", crate::registry::BUILTIN), None).unwrap().registry;
+        let registry = Registry::parse(&format!("{}{mounts}", rapid_registry::BUILTIN), None).unwrap().registry;
         let of = |report: &[String]| Configuration::of(&registry, report, &[], PhysicalMask(0b001)).modules;
         assert_eq!(of(&[]), Vec::<String>::new());
         assert_eq!(of(&["angled".to_owned()]), ["angled"]);

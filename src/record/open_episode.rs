@@ -27,6 +27,8 @@ use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use rapid_core::sync::{Grid, SyncSample, Synchronizer};
 use rapid_core::time::{Stamp, WallClock};
+use rapid_registry::{DeviceSpec, ModuleSpec, Registry};
+use rapid_status::{Board, Event, Level, Outlook, RecordingStatus, What};
 
 use super::announce::{Announced, look};
 use super::episode_path::{self, EpisodePath, EpisodeReport, EpisodeRequest};
@@ -42,8 +44,6 @@ use super::writeback::Writeback;
 use crate::episode::chunk_writer::Sink;
 use crate::episode::encode::{Announced as Report, logged};
 use crate::episode::made::Shown;
-use crate::registry::{DeviceSpec, ModuleSpec, Registry};
-use crate::status::{Board, Event, Level, Outlook, RecordingStatus, What};
 
 /// Samples of a modality that may arrive while a full queue is being written.
 const RING_SLACK: usize = 1024;

@@ -8,10 +8,9 @@
 use std::collections::BTreeMap;
 
 use rapid_core::time::Stamp;
+use rapid_status::{Event, Provenance, SlotState, What};
 use serde::Serialize;
 use serde_json::{Value, json};
-
-use crate::status::{Event, Provenance, SlotState, What};
 
 /// Serial of every device attached, by its modality's name.
 type Serials = BTreeMap<String, Option<String>>;
@@ -139,10 +138,10 @@ mod tests {
     use rapid_core::modality::ModalityId;
     use rapid_core::provenance::Negotiated;
     use rapid_core::sample::Epoch;
+    use rapid_registry::device::UsbIdentity;
+    use rapid_status::PolicyEnd;
 
     use super::*;
-    use crate::device::UsbIdentity;
-    use crate::status::PolicyEnd;
 
     const BEGIN: Stamp = Stamp(10_000_000_000);
 

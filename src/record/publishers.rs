@@ -1,17 +1,16 @@
 //! Other programs that published on our topics: which, and how many samples.
 //!
 //! A rig has one publisher per topic. On the topic of a modality or of the mask, samples of another publisher are kept
-//! out of the episode ([`crate::bus::Inbox`]); on `/action`, while a policy runs, they are recorded, because the
+//! out of the episode ([`rapid_bus::Inbox`]); on `/action`, while a policy runs, they are recorded, because the
 //! actuator executes them. Either way the episode is SUSPECT and the program is the reason. A reader of the file knows
 //! it from the event `publisher` and from the summary, which counts the samples.
 
 use std::collections::BTreeMap;
 
+use rapid_bus::Foreign;
 use rapid_core::text;
+use rapid_status::What;
 use serde::{Deserialize, Serialize};
-
-use crate::bus::Foreign;
-use crate::status::What;
 
 /// Key of the metadata record at the end: JSON, a list of [`Publisher`].
 pub(super) const KEY: &str = "publishers";

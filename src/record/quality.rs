@@ -19,10 +19,10 @@ use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::sync::Grid;
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_registry::{DeviceSpec, Registry, VerdictSpec};
 use serde::Serialize;
 
 use self::presence::{Plugged, PresenceHistory};
-use crate::registry::{DeviceSpec, Registry, VerdictSpec};
 
 /// Room for intervals without a sample, or between equal ones, until the mask of their time is known. A reader that is
 /// further behind waits for a stalled disk, and may allocate.

@@ -21,9 +21,13 @@ use std::sync::mpsc::{self, Receiver, Sender, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_bus::{Foreign, Inbox, Queues, Subscription, TopicId};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{ClockWatch, Stamp, WallClock};
+use rapid_registry::Registry;
+use rapid_status::{Board, Episode, EpisodeWatch, Event, Level, RecordingStatus, What};
 use rapid_system::disk::Disk;
+use rapid_system::fault;
 use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
 use tokio::sync::{oneshot, watch};
 use tokio_util::sync::CancellationToken;
@@ -35,13 +39,9 @@ use super::provenance::Attached;
 use super::publishers::Publishers;
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
-use crate::bus::{Foreign, Inbox, Queues, Subscription, TopicId};
 use crate::episode::chunk_writer::Sink;
 use crate::episode::made::Shown;
 use crate::episode::partial::PARTIAL;
-use crate::fault;
-use crate::registry::Registry;
-use crate::status::{Board, Episode, EpisodeWatch, Event, Level, RecordingStatus, What};
 
 /// Longest wait for samples, which delays a command, an event or a due frame.
 const TURN: Duration = Duration::from_millis(20);

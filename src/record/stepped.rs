@@ -5,18 +5,18 @@
 
 use std::sync::Arc;
 
+use rapid_bus::TopicId;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{Stamp, WallClock};
+use rapid_registry::Registry;
+use rapid_status::{Board, Event};
 
 use super::RecordError;
 use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::open_episode::{Beginning, OpenEpisode};
 use super::provenance::Attached;
 use super::streams::Streams;
-use crate::bus::TopicId;
 use crate::episode::chunk_writer::Sink;
-use crate::registry::Registry;
-use crate::status::{Board, Event};
 
 /// Who sees what a rig sends, in the order of time.
 pub trait Taker {

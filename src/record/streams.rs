@@ -2,13 +2,13 @@
 
 use std::collections::VecDeque;
 
+use rapid_bus::TopicId;
 use rapid_core::mask::Bits;
 use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
 
 use super::open_episode::OpenEpisode;
-use crate::bus::TopicId;
 
 /// What is kept of all samples, recording or not.
 pub(super) struct Streams {

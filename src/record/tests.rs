@@ -15,16 +15,16 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage, Value};
+use rapid_bus::TopicId;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::device::UsbIdentity;
+use rapid_status::{Board, Grade, Level, What};
 
 use super::*;
-use crate::bus::TopicId;
-use crate::device::UsbIdentity;
-use crate::registry::Registry;
-use crate::status::{Board, Grade, Level, What};
 
 const MS: u64 = 1_000_000;
 const CAM: u8 = 0;
@@ -281,7 +281,7 @@ impl Bench {
         }
     }
 
-    async fn until_closed(&self, events: &mut tokio::sync::broadcast::Receiver<crate::status::Event>) -> What {
+    async fn until_closed(&self, events: &mut tokio::sync::broadcast::Receiver<rapid_status::Event>) -> What {
         loop {
             let event = events.recv().await.unwrap();
             if matches!(event.what, What::Episode { .. }) {

@@ -20,10 +20,11 @@ mod tests;
 
 use std::time::Duration;
 
+use rapid_registry::{Limits, VerdictSpec};
+use rapid_status::{Finding, Grade, Sensors, Verdict};
+
 use super::publishers::Publisher;
 use super::quality::Quality;
-use crate::registry::{Limits, VerdictSpec};
-use crate::status::{Finding, Grade, Sensors, Verdict};
 
 /// A modality with its limits.
 #[derive(Debug, Clone)]

@@ -11,13 +11,13 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_registry::candidate::{Candidate, unregistered};
+use rapid_registry::device::{Attachment, DeviceNode};
+use rapid_registry::edit::{self, EditError, NewEntry, Setting};
+use rapid_registry::{Loaded, Registry, RegistryErrors, name_problem, read_file};
 use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
 
-use crate::device::{Attachment, DeviceNode};
 use crate::driver::camera::query;
-use crate::registry::candidate::{Candidate, unregistered};
-use crate::registry::edit::{self, EditError, NewEntry, Setting};
-use crate::registry::{Loaded, Registry, RegistryErrors, name_problem, read_file};
 
 /// Why the file was not written.
 #[derive(Debug, thiserror::Error)]
@@ -209,11 +209,11 @@ mod tests {
     use std::sync::Arc;
 
     use rapid_core::time::Stamp;
+    use rapid_registry::BUILTIN;
+    use rapid_registry::device::{Unit, UsbIdentity};
+    use rapid_registry::simulation::{SimDevice, SimSource};
 
     use super::*;
-    use crate::device::{Unit, UsbIdentity};
-    use crate::registry::BUILTIN;
-    use crate::simulation::{SimDevice, SimSource};
 
     #[test]
     fn a_registry_that_was_made_read_only_is_not_replaced() {

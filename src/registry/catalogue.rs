@@ -212,7 +212,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::registry::Registry;
+    use crate::Registry;
 
     #[test]
     fn the_catalogue_is_that_of_the_paper() {

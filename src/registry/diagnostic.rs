@@ -80,7 +80,7 @@ pub(super) fn nearest<'k>(given: &str, known: impl IntoIterator<Item = &'k str>)
 }
 
 /// The fix for an unknown name: the nearest known one, or a list of all.
-pub(crate) fn did_you_mean<S: AsRef<str>>(given: &str, known: impl IntoIterator<Item = S>, what: &str) -> String {
+pub fn did_you_mean<S: AsRef<str>>(given: &str, known: impl IntoIterator<Item = S>, what: &str) -> String {
     let known: Vec<S> = known.into_iter().collect();
     let known: Vec<&str> = known.iter().map(AsRef::as_ref).collect();
     match nearest(given, known.iter().copied()) {

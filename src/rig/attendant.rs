@@ -13,6 +13,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_registry::device::Attachment;
+use rapid_registry::{DeviceSpec, Hook};
+use rapid_status::{Episode, EpisodeWatch, Level};
 use tokio::sync::Mutex;
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
@@ -20,10 +23,7 @@ use tokio_util::sync::CancellationToken;
 use super::output::Output;
 use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
 use super::worker::{TERM_LIMIT, describe};
-use crate::device::Attachment;
 use crate::driver::process::Launch;
-use crate::registry::{DeviceSpec, Hook};
-use crate::status::{Episode, EpisodeWatch, Level};
 
 /// A hook that has not ended by then is killed.
 pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);

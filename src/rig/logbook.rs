@@ -19,11 +19,10 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time;
+use rapid_status::{Board, Level, What};
 use rapid_system::folder::state_directory;
 use tokio::sync::oneshot;
 use tokio::time::timeout;
-
-use crate::status::{Board, Level, What};
 
 /// Size in bytes at which a new file is started.
 const LARGEST: u64 = 1 << 20;

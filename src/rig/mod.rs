@@ -22,13 +22,13 @@ pub use owner::Rig;
 
 use std::sync::Arc;
 
+use rapid_bus::Writer;
 use rapid_core::modality::ModalityId;
+use rapid_registry::device::Attachment;
+use rapid_registry::{DeviceSpec, Registry};
 use tokio::sync::oneshot;
 
-use crate::bus::Writer;
-use crate::device::Attachment;
 use crate::hotplug::HotplugError;
-use crate::registry::{DeviceSpec, Registry};
 use presence::PresenceError;
 
 /// Why the rig cannot continue.

@@ -9,12 +9,12 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_status::{Board, Level, PrintedOn, What};
 use tokio::net::unix::pipe::Receiver;
 use tokio::time::sleep;
 
 use super::logbook::Logbook;
 use super::programs::Programs;
-use crate::status::{Board, Level, PrintedOn, What};
 
 /// Maximum bytes of a line; longer ones are cut.
 const LONGEST: usize = 1000;
@@ -219,7 +219,7 @@ mod tests {
     #[tokio::test]
     async fn what_a_child_prints_last_is_logged_however_soon_it_ends() {
         use std::io::Write as _;
-        let board = Arc::new(Board::new(&crate::registry::Registry::builtin()));
+        let board = Arc::new(Board::new(&rapid_registry::Registry::builtin()));
         let mut events = board.events();
         let now = Stamp::now();
         let mut output = Output {

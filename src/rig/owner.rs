@@ -8,12 +8,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
+use rapid_bus::{Bus, TopicId, Writer};
 use rapid_core::action::{ActuatorNotice, Arming};
 use rapid_core::mask::SizedMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::permission::Permission;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_registry::candidate::{Candidate, unregistered};
+use rapid_registry::device::Attachment;
+use rapid_registry::{DeviceSpec, Registry};
+use rapid_status::{Board, EpisodeWatch, Level, SlotState, UnregisteredDevice, What};
 use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
@@ -27,14 +32,9 @@ use super::slot::End;
 use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
 use super::worker::Seat;
 use super::{Addition, RigCommand, RigError};
-use crate::bus::{Bus, TopicId, Writer};
-use crate::device::Attachment;
 use crate::driver::{ClockOffset, DriverError};
 use crate::hotplug::HotplugStream;
 use crate::inputs::tap::Tap;
-use crate::registry::candidate::{Candidate, unregistered};
-use crate::registry::{DeviceSpec, Registry};
-use crate::status::{Board, EpisodeWatch, Level, SlotState, UnregisteredDevice, What};
 
 /// The JSON file is written this often, and at every change.
 const JSON_PERIOD: Duration = Duration::from_secs(1);

@@ -4,6 +4,10 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_bus::{Bus, Membership};
+use rapid_registry::device::Attachment;
+use rapid_registry::{DeviceSpec, NodeSpec, Registry};
+use rapid_status::Board;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -11,11 +15,7 @@ use tokio_util::task::TaskTracker;
 use super::attendant::HOOK_LIMIT;
 use super::logbook::Logbook;
 use super::worker::TERM_LIMIT;
-use crate::bus::{Bus, Membership};
-use crate::device::Attachment;
 use crate::driver::process::Spawner;
-use crate::registry::{DeviceSpec, NodeSpec, Registry};
-use crate::status::Board;
 
 /// Allowance for the kernel and a busy machine, beyond the time a program has to end.
 pub(super) const MARGIN: Duration = Duration::from_secs(2);

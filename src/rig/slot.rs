@@ -21,8 +21,7 @@ use std::time::Duration;
 
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
-
-use crate::status::SlotState;
+use rapid_status::SlotState;
 
 /// A stream that ends while its device is attached is restarted this many times...
 const MAX_RESTARTS: usize = 5;

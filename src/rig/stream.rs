@@ -11,10 +11,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use rapid_bus::Writer;
 use rapid_core::action::ActuatorNotice;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_registry::device::Attachment;
+use rapid_registry::{DeviceSpec, NodeSpec};
+use rapid_status::{Board, EpisodeWatch, Provenance};
+use rapid_system::fault;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
@@ -22,13 +27,8 @@ use tokio_util::sync::CancellationToken;
 use super::core::StreamEvent;
 use super::slot::End;
 use super::worker::Seat;
-use crate::bus::Writer;
-use crate::device::Attachment;
 use crate::driver::{ClockOffset, Driver, DriverError, Reading};
-use crate::fault;
 use crate::inputs::tap::{Tap, lost_at_the_end};
-use crate::registry::{DeviceSpec, NodeSpec};
-use crate::status::{Board, EpisodeWatch, Provenance};
 
 /// A device that does not open within this time is retried.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);

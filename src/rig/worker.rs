@@ -13,19 +13,19 @@ mod keeper;
 
 use std::sync::Arc;
 
+use rapid_bus::{Arrivals, Bus, Given, Ingress, Membership};
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_registry::device::Attachment;
+use rapid_registry::{DeviceSpec, ProcessSpec};
+use rapid_status::{Board, Level, What};
 use tokio::sync::{Mutex, oneshot};
 use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
-use crate::bus::{Arrivals, Bus, Given, Ingress, Membership};
-use crate::device::Attachment;
 use crate::driver::process::Launch;
 use crate::driver::{DriverError, Reading};
-use crate::registry::{DeviceSpec, ProcessSpec};
-use crate::status::{Board, Level, What};
 use intake::{Intake, Judged};
 use keeper::Keeper;
 pub(super) use keeper::{TERM_LIMIT, describe};

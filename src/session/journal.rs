@@ -13,11 +13,11 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rapid_core::time::{realtime_ns, rfc3339};
+use rapid_status::session::EpisodeEntry;
 use rapid_system::folder::{self, Folder, Links, Missing, Sync};
 use serde::{Deserialize, Serialize};
 
 use super::trash;
-use crate::status::session::EpisodeEntry;
 
 /// The name of the file of a session in progress.
 const CURRENT: &str = "session.toml";
@@ -294,9 +294,8 @@ fn identity(path: &Path) -> Option<(u64, u64)> {
 mod span {
     use std::time::Duration;
 
+    use rapid_registry::units::{parse_duration, show_duration};
     use serde::{Deserialize, Deserializer, Serializer, de};
-
-    use crate::registry::units::{parse_duration, show_duration};
 
     #[expect(clippy::ref_option, reason = "serde gives it so")]
     pub(super) fn serialize<S: Serializer>(span: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
@@ -319,9 +318,10 @@ mod span {
 
 #[cfg(test)]
 mod tests {
+    use rapid_status::session::{Label, Mark};
+    use rapid_status::{Grade, Sensors};
+
     use super::*;
-    use crate::status::session::{Label, Mark};
-    use crate::status::{Grade, Sensors};
 
     fn entry(file: &str) -> EpisodeEntry {
         EpisodeEntry {

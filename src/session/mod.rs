@@ -18,9 +18,9 @@ use std::time::Duration;
 use rapid_core::text;
 use rapid_core::time::Stamp;
 
-use crate::status::session::{EpisodeEntry, Label, Mark, Phase, SessionRequest, SessionStatus};
-use crate::status::{Grade, Verdict};
 use journal::{Plan, SessionFile};
+use rapid_status::session::{EpisodeEntry, Label, Mark, Phase, SessionRequest, SessionStatus};
+use rapid_status::{Grade, Verdict};
 
 /// Episodes that a screen lists.
 const LISTED: usize = 200;

@@ -171,14 +171,21 @@ mod tests {
 
     use rapid_core::sample::Encoding;
 
-    use super::super::literal::{device, every_state, line, policy, recording, snapshot};
     use super::super::{Level, SlotState};
     use super::*;
+    use crate::literal::{device, every_state, line, policy, recording, snapshot};
 
     fn preview(bit: u8, seq: u64) -> Arc<Preview> {
-        let device = super::super::literal::id(bit);
+        let device = crate::literal::id(bit);
         let payload: Arc<[u8]> = b"line\n{\"message\"\n".as_slice().into();
-        Arc::new(Preview { device, seq, encoding: Encoding::F64, bytes: payload.len(), payload, ..Preview::default() })
+        Arc::new(Preview {
+            device,
+            seq,
+            encoding: Encoding::F64,
+            bytes: payload.len(),
+            payload,
+            ..crate::literal::preview()
+        })
     }
 
     #[test]

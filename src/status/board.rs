@@ -17,6 +17,7 @@ use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_core::text;
 use rapid_core::time::{Stamp, realtime_ns};
+use rapid_registry::{DeviceSpec, InterlockSpec, Registry};
 use tokio::sync::broadcast;
 
 use super::detail::{DeviceDetail, Intervals, StaticDetail};
@@ -26,7 +27,6 @@ use super::{
     DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance, RecordingStatus, SlotState,
     Snapshot, StopStatus, UnregisteredDevice, Verdict, What,
 };
-use crate::registry::{DeviceSpec, InterlockSpec, Registry};
 
 /// Log lines kept for the screen.
 const LOG_LINES: usize = 2000;

@@ -6,10 +6,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use rapid_core::modality::ModalityId;
+use rapid_registry::{CanProtocol, DeviceSpec, MOTOR_CHANNELS, NodeSpec};
 use serde::{Deserialize, Serialize};
 
-use crate::registry::{CanProtocol, DeviceSpec, MOTOR_CHANNELS, NodeSpec};
-use crate::status::Provenance;
+use crate::Provenance;
 
 /// A number in the samples of a device.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

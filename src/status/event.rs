@@ -11,10 +11,10 @@ use rapid_core::provenance::{KernelDriver, Negotiated, UnplugSource};
 use rapid_core::sample::Epoch;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_registry::device::Unit;
 use serde::Serialize;
 
 use super::{Chunk, Grade, Hold, Level, PolicyEnd, PrintedOn, SlotState, StopStatus, Verdict};
-use crate::device::Unit;
 
 /// A state change with its time. As JSON, one object: `{"event":"state","device":...}`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -487,7 +487,7 @@ mod tests {
     use rapid_core::provenance::UnplugSource;
 
     use super::*;
-    use crate::status::SlotState;
+    use crate::SlotState;
 
     #[test]
     fn a_state_is_a_sentence_in_the_log() {

@@ -83,15 +83,6 @@ impl Preview {
 }
 
 #[cfg(test)]
-impl Default for Preview {
-    fn default() -> Self {
-        let device = ModalityId::new(0).unwrap_or_else(|| unreachable!());
-        let (captured, encoding, payload) = (Stamp(0), Encoding::Bytes, nothing());
-        Self { device, seq: 0, captured, encoding, width: 0, height: 0, bytes: 0, payload }
-    }
-}
-
-#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -107,7 +98,7 @@ mod tests {
 
     #[test]
     fn pictures_are_shown_less_often_than_numbers() {
-        let last = Preview { captured: Stamp(1_000_000_000), ..Preview::default() };
+        let last = Preview { captured: Stamp(1_000_000_000), ..crate::literal::preview() };
         let after = |ms| last.captured.after(Duration::from_millis(ms));
         assert!(last.is_outdated(after(50), 100) && !last.is_outdated(after(49), 100));
         assert!(last.is_outdated(after(200), 100_000) && !last.is_outdated(after(199), 100_000));

@@ -132,7 +132,7 @@ mod tests {
     use rapid_core::sample::Epoch;
 
     use super::*;
-    use crate::status::{RecordingStatus, SlotState};
+    use crate::{RecordingStatus, SlotState};
 
     const MS: u64 = 1_000_000;
 
@@ -170,7 +170,7 @@ mod tests {
                 bytes,
                 dropped: 0,
                 room: None,
-                outlook: crate::status::Outlook::default(),
+                outlook: crate::Outlook::default(),
             }),
             last_episode: None,
             last_verdict: None,

@@ -4,6 +4,9 @@
 use std::time::Duration;
 
 use rapid_core::text;
+use rapid_status::detail::{Channel, DeviceDetail, Intervals};
+use rapid_status::palette::Palette;
+use rapid_status::{DeviceStatus, SlotState};
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Style};
@@ -16,9 +19,6 @@ use super::model::Model;
 use super::picture::Canvas;
 use super::theme::Theme;
 use super::{log, view};
-use crate::palette::Palette;
-use crate::status::detail::{Channel, DeviceDetail, Intervals};
-use crate::status::{DeviceStatus, SlotState};
 
 /// Channels in one plot; of more, the first ones.
 const PLOTTED: usize = 6;

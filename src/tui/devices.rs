@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use rapid_core::text;
+use rapid_status::{DeviceStatus, Finding, Level, SlotState, Snapshot};
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::{Modifier, Style, Stylize};
@@ -12,7 +13,6 @@ use super::history::{self, Cell};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::{DeviceStatus, Finding, Level, SlotState, Snapshot};
 
 /// Columns of state, rate, age, gaps and total, each with the space before it.
 const STATE: usize = 12;

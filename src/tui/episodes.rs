@@ -1,6 +1,7 @@
 //! The episodes panel: those of the session, the newest first.
 
 use rapid_core::text;
+use rapid_status::session::{EpisodeEntry, Label, SessionStatus};
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::text::{Line, Span};
@@ -8,7 +9,6 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::session::{EpisodeEntry, Label, SessionStatus};
 
 /// Columns of the name of a file.
 const NAME: usize = 34;

@@ -4,6 +4,7 @@
 use rapid_core::interlock::{InputState, StopKind};
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_status::{Grade, SlotState, StopStatus};
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::{Style, Stylize};
@@ -13,7 +14,6 @@ use super::link::LinkState;
 use super::model::Model;
 use super::recording;
 use super::theme::Theme;
-use crate::status::{Grade, SlotState, StopStatus};
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let width = usize::from(area.width);

@@ -1,5 +1,6 @@
 //! The help: all keys on two pages, and the meaning of the states.
 
+use rapid_status::SlotState;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
 use ratatui::style::Modifier;
@@ -10,7 +11,6 @@ use super::keys;
 use super::link::LinkState;
 use super::model::Model;
 use super::theme::Theme;
-use crate::status::SlotState;
 
 /// Pages of the help.
 pub(super) const PAGES: usize = 2;
@@ -63,8 +63,9 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, page: usize, model: &Model
 
 #[cfg(test)]
 mod tests {
+    use rapid_status::palette::Palette;
+
     use super::*;
-    use crate::palette::Palette;
     use crate::tui::theme::Charset;
 
     const THEME: Theme = Theme { palette: Palette::Plain, charset: Charset::Unicode };

@@ -6,8 +6,7 @@ use std::time::Duration;
 
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::time::Stamp;
-
-use crate::status::{DeviceStatus, SlotState, Snapshot};
+use rapid_status::{DeviceStatus, SlotState, Snapshot};
 
 /// Seconds that are kept.
 pub(super) const SECONDS: usize = 60;
@@ -207,10 +206,10 @@ impl Lane {
 
 #[cfg(test)]
 mod tests {
+    use crate::literal::{device, id, snapshot};
     use rapid_core::mask::PhysicalMask;
 
     use super::*;
-    use crate::status::literal::{device, id, snapshot};
 
     /// A device of 30 Hz: its state and samples at each tenth of a second.
     fn played(history: &mut History, tenths: impl Iterator<Item = (SlotState, u64)>) {

@@ -3,10 +3,10 @@
 //! Invariant: a key has one meaning, apart from the text of a prompt.
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+use rapid_status::SlotState;
+use rapid_status::session::Phase;
 
 use super::model::{Model, Page};
-use crate::status::SlotState;
-use crate::status::session::Phase;
 
 /// What a key does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

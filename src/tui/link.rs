@@ -5,11 +5,11 @@ use std::sync::Arc;
 use rapid_core::action::Order;
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_status::{Board, Command, Snapshot};
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
 
 use super::model::{Effect, Msg};
-use crate::status::{Board, Command, Snapshot};
 
 /// The link was closed: the screen ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -2,6 +2,7 @@
 
 use rapid_core::text;
 use rapid_core::time::realtime_ns;
+use rapid_status::{Level, PrintedOn};
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Modifier;
@@ -11,7 +12,6 @@ use super::log_view::{Entry, LogView};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::{Level, PrintedOn};
 
 /// Columns of the level and of the output that a program printed on.
 const LEVEL: usize = 6;

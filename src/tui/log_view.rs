@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use crate::status::{Level, LogLine};
+use rapid_status::{Level, LogLine};
 
 /// A repeat is grouped with a line at most so many entries before it: two devices in trouble alternate.
 const GROUP_WITHIN: usize = 8;
@@ -144,9 +144,10 @@ fn is_repeat(a: &LogLine, b: &LogLine) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use crate::literal::line;
+    use rapid_status::PrintedOn;
+
     use super::*;
-    use crate::status::PrintedOn;
-    use crate::status::literal::line;
 
     fn log() -> Vec<Arc<LogLine>> {
         vec![

@@ -1,6 +1,7 @@
 //! The mask panel: one cell per modality, filled while its bit is set.
 
 use rapid_core::text;
+use rapid_status::DeviceStatus;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -8,7 +9,6 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::{Edge, Theme};
 use super::view;
-use crate::status::DeviceStatus;
 
 /// Longest name in a cell, columns.
 const NAME: usize = 16;

@@ -38,21 +38,20 @@ use std::time::Duration;
 
 use crossterm::event::{Event, EventStream, MouseButton, MouseEvent, MouseEventKind};
 use futures::{FutureExt, Stream, StreamExt};
+pub use link::{Closed, Link, LinkState, Own};
+use model::{Model, Msg};
 use rapid_core::permission::Permission;
 use rapid_core::time::Zone;
+use rapid_status::palette::Palette;
+use rapid_status::{Board, Command};
 use ratatui::layout::Position;
 use rustix::process::Signal;
+use terminal::Screen;
+use theme::Theme;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{Notify, mpsc};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
-
-use crate::palette::Palette;
-use crate::status::{Board, Command};
-pub use link::{Closed, Link, LinkState, Own};
-use model::{Model, Msg};
-use terminal::Screen;
-use theme::Theme;
 
 /// Time between two frames when no key is pressed.
 const FRAME: Duration = Duration::from_millis(67);

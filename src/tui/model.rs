@@ -15,6 +15,10 @@ use crossterm::event::{KeyEvent, KeyEventKind, KeyModifiers};
 use rapid_core::action::Order;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::time::{Stamp, Zone};
+use rapid_status::preview::Preview;
+use rapid_status::rates::Rates;
+use rapid_status::session::{Label, PRESS_AGAIN, SessionRequest};
+use rapid_status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
 
 use super::history::{Bit, Cell, History};
 use super::keys::{self, Act};
@@ -26,10 +30,6 @@ use super::theme::Edge;
 use super::tour::Tour;
 use super::view::Target;
 use super::{help, view};
-use crate::status::preview::Preview;
-use crate::status::rates::Rates;
-use crate::status::session::{Label, PRESS_AGAIN, SessionRequest};
-use crate::status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
 use prompt::{Naming, Prompt, Question};
 use seen::Seen;
 

@@ -1,5 +1,6 @@
 //! The links to the page for a phone, the first as a QR code.
 
+use rapid_pictures::qr;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
 use ratatui::text::{Line, Span};
@@ -7,7 +8,6 @@ use ratatui::widgets::{Block, Clear, Paragraph};
 
 use super::model::Model;
 use super::theme::{Charset, Theme};
-use crate::qr;
 
 /// Rows of other links, at most.
 const OTHERS: usize = 3;

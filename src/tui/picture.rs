@@ -7,6 +7,9 @@
 use image::imageops::FilterType;
 use image::{DynamicImage, RgbImage};
 use rapid_core::modality::ModalityId;
+use rapid_pictures::pixels::{self, Pixels};
+use rapid_status::palette::Palette;
+use rapid_status::preview::Preview;
 use ratatui::Frame;
 use ratatui::layout::{Rect, Size};
 use ratatui::text::Line;
@@ -15,9 +18,6 @@ use ratatui_image::protocol::Protocol;
 use ratatui_image::{FontSize, Image, Resize};
 
 use super::theme::Theme;
-use crate::palette::Palette;
-use crate::pixels::{self, Pixels};
-use crate::status::preview::Preview;
 
 /// Longest side of a picture that is kept, in pixels: more than a terminal shows, and quick to scale.
 const LARGEST: usize = 640;
@@ -218,7 +218,7 @@ mod tests {
         let payload: Vec<u8> =
             (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| shade(x, y)).collect();
         let bytes = payload.len();
-        Preview { encoding: Encoding::Grey, width, height, bytes, payload: payload.into(), ..Preview::default() }
+        Preview { encoding: Encoding::Grey, width, height, bytes, payload: payload.into(), ..crate::literal::preview() }
     }
 
     #[test]
@@ -229,8 +229,8 @@ mod tests {
         let mut short = grey(8, 8, |_, _| 0);
         short.payload = short.payload[1..].into();
         assert!(Picture::decode(&short).unwrap().is_err());
-        assert!(Picture::decode(&Preview::default()).is_none());
-        let numbers = Preview { encoding: Encoding::F64, width: 3, ..Preview::default() };
+        assert!(Picture::decode(&crate::literal::preview()).is_none());
+        let numbers = Preview { encoding: Encoding::F64, width: 3, ..crate::literal::preview() };
         assert!(Picture::decode(&numbers).is_none(), "the width of numbers is their count");
     }
 

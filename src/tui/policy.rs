@@ -4,6 +4,7 @@
 
 use rapid_core::modality::ModalityId;
 use rapid_core::text;
+use rapid_status::PolicyStatus;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -12,7 +13,6 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::{Edge, Theme};
 use super::view;
-use crate::status::PolicyStatus;
 
 /// Longest name of an axis and longest unit, columns.
 const NAME: usize = 12;

@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_status::session::Phase;
+use rapid_status::{RecordingStatus, Verdict};
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -12,8 +14,6 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::session::Phase;
-use crate::status::{RecordingStatus, Verdict};
 
 /// Columns below which the name of a file is left out.
 const FILE_LEAST: usize = 12;

@@ -21,6 +21,8 @@ use crossterm::terminal::{
     enable_raw_mode,
 };
 use futures::{Stream, StreamExt as _};
+use rapid_system::outlet::Outlet;
+use rapid_system::panics;
 use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
 use rustix::event::{PollFd, PollFlags, Timespec};
@@ -31,8 +33,6 @@ use super::model::Model;
 use super::picture::Canvas;
 use super::theme::Theme;
 use super::view;
-use crate::outlet::Outlet;
-use crate::panics;
 
 /// How long a blocked terminal may take for the last frame before it is abandoned.
 const LAST_FRAME: Duration = Duration::from_millis(500);

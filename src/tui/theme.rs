@@ -1,14 +1,13 @@
 //! Colours and symbols, according to what the terminal can show.
 //!
-//! The styles are those of [`crate::palette`]; what only the monitor shows is added here. Every meaning that has a colour
+//! The styles are those of [`rapid_status::palette`]; what only the monitor shows is added here. Every meaning that has a colour
 //! also has a symbol or a word.
 
 use rapid_core::text;
+use rapid_status::palette::{self, Palette};
+use rapid_status::{Grade, Level, SlotState};
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::symbols::border;
-
-use crate::palette::{self, Palette};
-use crate::status::{Grade, Level, SlotState};
 
 /// Can the terminal show characters outside ASCII?
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,6 +1,7 @@
 //! The last five minutes of each bit of the mask, a row each.
 
 use rapid_core::text;
+use rapid_status::SlotState;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -9,7 +10,6 @@ use super::history::{Bit, MASK_SECONDS};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::SlotState;
 
 /// Columns of the longest name.
 const NAME: usize = 16;

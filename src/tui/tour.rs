@@ -2,7 +2,7 @@
 //!
 //! Invariant: a step is over once the rig shows it, whatever was pressed.
 
-use crate::status::{SlotState, Snapshot};
+use rapid_status::{SlotState, Snapshot};
 
 /// Snapshots, ten a second: a policy that loses what it requires acts until its next tick.
 const SURE: u8 = 10;
@@ -87,11 +87,11 @@ const MAY_GO: &str = "tactile_tip";
 
 #[cfg(test)]
 mod tests {
+    use crate::literal::{device, policy, recording, snapshot, three_streaming};
     use rapid_core::mask::PhysicalMask;
+    use rapid_status::{Hold, PolicyStatus, Verdict};
 
     use super::*;
-    use crate::status::literal::{device, policy, recording, snapshot, three_streaming};
-    use crate::status::{Hold, PolicyStatus, Verdict};
 
     #[test]
     fn each_step_is_over_when_the_rig_shows_it() {
@@ -112,7 +112,7 @@ mod tests {
         step(&opening, Tour::Plug);
         step(&now, Tour::End);
         now.recording = None;
-        now.last_verdict = Some(Verdict { grade: crate::status::Grade::Good, reasons: Vec::new(), sensors: None });
+        now.last_verdict = Some(Verdict { grade: rapid_status::Grade::Good, reasons: Vec::new(), sensors: None });
         step(&now, Tour::Over);
         // With a policy.
         let mut tour = Tour::default();

@@ -28,9 +28,9 @@ use rustix::net::sockopt::set_socket_send_buffer_size;
 use tokio::task::LocalSet;
 use tokio_util::sync::CancellationToken;
 
-use crate::status::session::Asker;
-use crate::status::{Board, Level, What};
 use door::Door;
+use rapid_status::session::Asker;
+use rapid_status::{Board, Level, What};
 use serve::Server;
 use token::Token;
 pub use token::TokenError;

@@ -7,10 +7,9 @@
 
 use hyper::body::Bytes;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
-use rapid_jpeg::Values;
-
-use crate::pixels::{self, Pixels};
-use crate::status::preview::Preview;
+use rapid_pictures::jpeg::Values;
+use rapid_pictures::pixels::{self, Pixels};
+use rapid_status::preview::Preview;
 
 /// Longest side, in pixels: as wide as the screen of a phone, in its own pixels.
 const LARGEST: usize = 640;
@@ -48,7 +47,7 @@ impl Pictures {
         let (width, height, rgb) = pixels::every(step, [height, width], self.pixels.values());
         let side = |side: usize| u16::try_from(side).unwrap_or(u16::MAX);
         let mut jpeg = Vec::new();
-        rapid_jpeg::encode(&rgb, [side(height), side(width)], Values::Rgb, QUALITY, &mut jpeg)
+        rapid_pictures::jpeg::encode(&rgb, [side(height), side(width)], Values::Rgb, QUALITY, &mut jpeg)
             .map_err(|error| error.to_string())?;
         Ok(jpeg.into())
     }
@@ -61,7 +60,7 @@ mod tests {
     use super::*;
 
     fn preview(encoding: Encoding, [width, height]: [u32; 2], payload: &[u8]) -> Preview {
-        Preview { encoding, width, height, bytes: payload.len(), payload: payload.into(), ..Preview::default() }
+        Preview { encoding, width, height, bytes: payload.len(), payload: payload.into(), ..crate::literal::preview() }
     }
 
     #[test]

@@ -31,6 +31,10 @@ use hyper_util::rt::TokioIo;
 use rapid_core::modality::ModalityId;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_status::Board;
+use rapid_status::rates::Rates;
+use rapid_status::session::{Asker, SessionRequest};
+use rapid_system::fault;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_local;
@@ -39,10 +43,6 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep, sleep_until};
 use super::door::{Asked, Door, NO_TOKEN, Refusal};
 use super::pictures::Pictures;
 use super::view::View;
-use crate::fault;
-use crate::status::Board;
-use crate::status::rates::Rates;
-use crate::status::session::{Asker, SessionRequest};
 
 /// Connections at a time: a page has two to six.
 const CONNECTIONS: usize = 32;

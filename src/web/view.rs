@@ -5,11 +5,10 @@
 use rapid_core::modality::ModalityId;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_status::rates::Rates;
+use rapid_status::session::{EpisodeEntry, Phase, SessionStatus};
+use rapid_status::{DeviceStatus, Finding, Level, RecordingStatus, Snapshot, StopStatus};
 use serde::Serialize;
-
-use crate::status::rates::Rates;
-use crate::status::session::{EpisodeEntry, Phase, SessionStatus};
-use crate::status::{DeviceStatus, Finding, Level, RecordingStatus, Snapshot, StopStatus};
 
 /// Warnings and errors of the log, at most.
 const WARNINGS: usize = 4;
@@ -165,9 +164,10 @@ const fn until(phase: Phase) -> Option<Stamp> {
 
 #[cfg(test)]
 mod tests {
+    use crate::literal::{TAKEN, every_state, id, recording, three_streaming};
+    use rapid_status::{Grade, Outlook};
+
     use super::*;
-    use crate::status::literal::{TAKEN, every_state, id, recording, three_streaming};
-    use crate::status::{Grade, Outlook};
     use std::time::Duration;
 
     fn shown(snapshot: &Snapshot) -> serde_json::Value {

@@ -11,17 +11,17 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::{Driver, DriverError, sim};
-use rapid::registry::{
-    CameraSpec, DeviceSpec, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, PixelFormat, Probe,
-    SerialSpec, UsbSpec,
-};
-use rapid::simulation::{SimDevice, SimSource};
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::Encoding;
 use rapid_core::sync::WhenStale;
 use rapid_core::time::Stamp;
+use rapid_registry::device::{DeviceNode, LastReceived};
+use rapid_registry::simulation::{SimDevice, SimSource};
+use rapid_registry::{
+    CameraSpec, DeviceSpec, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, PixelFormat, Probe,
+    SerialSpec, UsbSpec,
+};
 use tokio::io::AsyncWriteExt as _;
 use tokio_serial::{SerialPort as _, SerialStream};
 
@@ -46,8 +46,8 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         latency: Duration::ZERO,
         form: None,
         action: None,
-        hooks: rapid::registry::Hooks::default(),
-        verdict: rapid::registry::VerdictSpec::of(
+        hooks: rapid_registry::Hooks::default(),
+        verdict: rapid_registry::VerdictSpec::of(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),

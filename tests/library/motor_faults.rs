@@ -12,9 +12,10 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
+use rapid_registry::{DamiaoSpec, MotorMode, Stop};
+
 use crate::support::motor_world::World;
 use crate::support::motor_world::motor_spec::{brake, bus, motor};
-use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use serde::Deserialize;
 
 /// A file of `tests/faults`.

@@ -6,12 +6,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::action::{ActionSource, ActuatorNotice, Arming, Order as Asked};
+use rapid_registry::{DamiaoSpec, Mounting};
 
 use crate::support::motors::{Adapter, Hand, PATIENCE, spec};
 use rapid::driver::DriverError;
 use rapid::driver::can::link::Link;
 use rapid::driver::can::motors::Motors;
-use rapid::registry::{DamiaoSpec, Mounting};
 use tokio::sync::mpsc::Receiver;
 use tokio::time::{Instant, interval, timeout};
 use vbench::emu::order::Order;
@@ -243,7 +243,7 @@ fn a_panic_of_thread_control_turns_motors_off() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "run by a_panic_of_thread_control_turns_motors_off"]
 async fn in_a_process_that_panics() {
-    rapid::panics::to_log();
+    rapid_system::panics::to_log();
     let order = std::env::var_os("MOTORS_PANIC_AT").expect("the file at which thread `control` panics");
     let adapter = Adapter::plug(AXES);
     let mut driven = open(&adapter);

@@ -6,6 +6,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_registry::InferenceSpec;
 
 use crate::support::allocations::allocations;
 use crate::support::onnx::{
@@ -20,7 +21,6 @@ use rapid::policy::observation::ObservationTensors;
 use rapid::policy::picture::{Picture, Preprocessor};
 use rapid::policy::request::Request;
 use rapid::policy::sampler::{Computing, PolicyError, Sampler};
-use rapid::registry::InferenceSpec;
 
 fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
     let folder = tempfile::tempdir().unwrap();
@@ -106,7 +106,7 @@ fn a_chunk_matches_its_definition() {
     assert_eq!((sampler.chunk_len(), sampler.steps()), (HORIZON * ACTION, 10));
     let noise = |seed| {
         let mut noise = vec![0.0; HORIZON * ACTION];
-        rapid::random::Random::new(seed, 0x706f_6c69_6379).fill_normal(&mut noise);
+        rapid_core::random::Random::new(seed, 0x706f_6c69_6379).fill_normal(&mut noise);
         noise.into_iter().map(f64::from).collect::<Vec<_>>()
     };
     // Means of the inputs: wrist 0.5, tactile -0.75, state (0.5..2 of 0..2, so -0.5..1) 0.25.
@@ -245,7 +245,7 @@ fn the_encoder_gets_the_steps_of_a_history_and_which_of_them_there_are() {
         let mut found = vec![0.0; HORIZON * ACTION];
         sampler.answer(&request, &mut found).unwrap();
         let mut noise = vec![0.0; HORIZON * ACTION];
-        rapid::random::Random::new(0, 0x706f_6c69_6379).fill_normal(&mut noise);
+        rapid_core::random::Random::new(0, 0x706f_6c69_6379).fill_normal(&mut noise);
         let noise: Vec<f64> = noise.into_iter().map(f64::from).collect();
         close(&found, &in_units(&by_hand((sum + count) / 4.0 / 3.0, &noise, 10)));
     }
@@ -289,7 +289,14 @@ fn a_jpeg_allocates_only_the_buffers_of_the_decoder() {
     };
     let mut preprocessor = Preprocessor::new(spec, &rapid::policy::bundle::Normalization::Identity);
     let mut jpeg = Vec::new();
-    rapid_jpeg::encode(&vec![90; 3 * 320 * 240], [240, 320], rapid_jpeg::Values::Rgb, 85, &mut jpeg).unwrap();
+    rapid_pictures::jpeg::encode(
+        &vec![90; 3 * 320 * 240],
+        [240, 320],
+        rapid_pictures::jpeg::Values::Rgb,
+        85,
+        &mut jpeg,
+    )
+    .unwrap();
     let picture = Picture { encoding: Encoding::Mjpeg, width: 320, height: 240, bytes: &jpeg };
     let mut out = vec![0.0; preprocessor.output_len()];
     let mut write = || preprocessor.write(&picture, &mut out).unwrap();

@@ -11,6 +11,9 @@ use std::time::Duration;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::simulation::task::layout;
+use rapid_registry::task::PARTS;
 
 use crate::support::allocations::allocations;
 use crate::support::onnx::{
@@ -25,9 +28,6 @@ use rapid::policy::observer::Observer;
 use rapid::policy::pilot::Pilot;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;
-use rapid::registry::Registry;
-use rapid::registry::task::PARTS;
-use rapid::simulation::task::layout;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 
@@ -287,7 +287,7 @@ fn a_step_of_the_horizon_never_allocates() {
 fn jpeg(side: u16, color: u8) -> Vec<u8> {
     let mut jpeg = Vec::new();
     let pixels = vec![color; 3 * usize::from(side) * usize::from(side)];
-    rapid_jpeg::encode(&pixels, [side; 2], rapid_jpeg::Values::Rgb, 90, &mut jpeg).unwrap();
+    rapid_pictures::jpeg::encode(&pixels, [side; 2], rapid_pictures::jpeg::Values::Rgb, 90, &mut jpeg).unwrap();
     jpeg
 }
 

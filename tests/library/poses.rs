@@ -9,6 +9,7 @@ use std::time::Duration;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
 
 use crate::support::onnx::{Change, write_bundle};
 use rapid::policy::bundle::Bundle;
@@ -18,7 +19,6 @@ use rapid::policy::model::Model;
 use rapid::policy::pilot::Pilot;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;
-use rapid::registry::Registry;
 
 const PERIOD: Duration = Duration::from_millis(100);
 const ALL: PhysicalMask = PhysicalMask(0b111);
@@ -45,7 +45,14 @@ fn push(pilot: &mut Pilot, registry: &Registry, tick: u64) {
             (Encoding::F64, 0)
         } else {
             let color = u8::try_from(40 + 20 * tick).unwrap();
-            rapid_jpeg::encode(&vec![color; 3 * 96 * 96], [96; 2], rapid_jpeg::Values::Rgb, 90, &mut bytes).unwrap();
+            rapid_pictures::jpeg::encode(
+                &vec![color; 3 * 96 * 96],
+                [96; 2],
+                rapid_pictures::jpeg::Values::Rgb,
+                90,
+                &mut bytes,
+            )
+            .unwrap();
             (Encoding::Mjpeg, 96)
         };
         let header = SampleHeader {

@@ -10,16 +10,16 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
-use rapid::bus::TopicId;
 use rapid::episode::{encode, schema::SampleSchema};
 use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
-use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
-use rapid::status::Board;
+use rapid_bus::TopicId;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, Epoch, SampleHeader};
 use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
 use rapid_core::time::Stamp;
+use rapid_registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
+use rapid_status::Board;
 
 use crate::support::allocations::allocations;
 
@@ -115,8 +115,8 @@ async fn only_chunks_allocate() {
         latency: Duration::ZERO,
         form: None,
         action: None,
-        hooks: rapid::registry::Hooks::default(),
-        verdict: rapid::registry::VerdictSpec::of(
+        hooks: rapid_registry::Hooks::default(),
+        verdict: rapid_registry::VerdictSpec::of(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),
@@ -132,8 +132,8 @@ async fn only_chunks_allocate() {
         expect: Vec::new(),
     };
     let registry = Arc::new(Registry {
-        inference: rapid::registry::InferenceSpec::default(),
-        export: rapid::registry::ExportSpec::default(),
+        inference: rapid_registry::InferenceSpec::default(),
+        export: rapid_registry::ExportSpec::default(),
         rig,
         devices: vec![device],
         modules: Vec::new(),

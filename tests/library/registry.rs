@@ -10,17 +10,17 @@ use std::time::Duration;
 use rapid_core::interlock::StopKind;
 use rapid_core::modality::ModalityKind;
 use rapid_core::points::PacketFormat;
-
-use crate::support::mistakes;
-use proptest::prelude::*;
-use rapid::registry::artifacts::{ArtifactKind, artifacts};
-use rapid::registry::scenario::Scenario;
-use rapid::registry::{
+use rapid_registry::artifacts::{ArtifactKind, artifacts};
+use rapid_registry::scenario::Scenario;
+use rapid_registry::{
     BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Form, Framing, Hook, InputSpec, JointsSpec,
     LanFind, LanPicture, LanProtocol, LineOff, Loaded, ModuleSpec, MotionSpec, MotorKind, MotorMode, Mounting,
     NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, PointsSpec, PoseLayout, PoseSpec, Probe, Quantity, Registry, Stop,
     StopSpec, VerdictSpec, WatchSpec,
 };
+
+use crate::support::mistakes;
+use proptest::prelude::*;
 
 fn files(folder: &str) -> Vec<PathBuf> {
     mistakes::files(&format!("registry/{folder}"), "toml")
@@ -64,7 +64,7 @@ fn motors_that_keep_moving_long_after_a_kill_cause_a_warning() {
     for (timeout, is_warned) in [("200ms", false), ("500ms", false), ("501ms", true), ("10s", true)] {
         let text = text.replace("timeout = \"200ms\"", &format!("timeout = \"{timeout}\""));
         let warnings = Registry::parse(&text, None).unwrap().warnings;
-        let is_of_it = |warning: &rapid::registry::Diagnostic| {
+        let is_of_it = |warning: &rapid_registry::Diagnostic| {
             warning.message.starts_with(&format!("timeout = {timeout}: ")) && warning.to_string().contains("500ms")
         };
         assert_eq!(warnings.iter().any(is_of_it), is_warned, "{timeout}: {warnings:?}");
@@ -151,7 +151,7 @@ fn modules_are_parsed_and_mounted_by_name() {
     assert!((length - 1.0).abs() < 1e-12, "of calibrations, which are rounded");
     let mounted = |names: &[&str]| {
         let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
-        rapid::registry::mounted(&modules, &names).map(|found| found.len()).map_err(|error| error.to_string())
+        rapid_registry::mounted(&modules, &names).map(|found| found.len()).map_err(|error| error.to_string())
     };
     assert_eq!(mounted(&["soft_tip", "pinch", "pinch"]), Ok(2));
     assert!(mounted(&["soft_tpi"]).unwrap_err().contains("did you mean \"soft_tip\"?"));

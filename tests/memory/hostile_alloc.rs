@@ -3,7 +3,7 @@
 
 use rapid::episode::recover::recover_bytes;
 use rapid::record::inspect::{Inspection, inspect_bytes};
-use rapid::status::Grade;
+use rapid_status::Grade;
 
 use crate::{alone, measured};
 

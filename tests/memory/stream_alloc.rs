@@ -20,19 +20,19 @@ use std::time::Duration;
 
 use futures::poll;
 use rapid::alignment::Alignment;
-use rapid::bus::{Bus, Inbox, TopicId};
-use rapid::device::{DeviceNode, LastReceived};
 use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
-use rapid::registry::Registry;
-use rapid::registry::scenario::Scenario;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
-use rapid::simulation::SimDevice;
-use rapid::status::Board;
+use rapid_bus::{Bus, Inbox, TopicId};
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::device::{DeviceNode, LastReceived};
+use rapid_registry::scenario::Scenario;
+use rapid_registry::simulation::SimDevice;
+use rapid_status::Board;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 

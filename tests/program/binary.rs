@@ -153,11 +153,11 @@ fn bad_arguments_and_configurations_exit_with_2_and_a_fix() {
 #[test]
 fn check_prints_every_entry_or_every_problem() {
     let place = Place::new();
-    let builtin = place.write("devices.toml", rapid::registry::BUILTIN);
+    let builtin = place.write("devices.toml", rapid_registry::BUILTIN);
     let good = place.run(&["check"]);
     assert_eq!(good.status.code(), Some(0), "{}", text(&good.stderr));
     assert!(text(&good.stdout).ends_with("devices.toml: 3 devices, ok\n"), "{}", text(&good.stdout));
-    let broken = rapid::registry::BUILTIN.replace("vid =", "vdi =");
+    let broken = rapid_registry::BUILTIN.replace("vid =", "vdi =");
     std::fs::write(builtin, broken).expect("write");
     let bad = place.run(&["check"]);
     assert_eq!(bad.status.code(), Some(2));

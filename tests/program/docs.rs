@@ -19,8 +19,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use rapid::cli::Cli;
-use rapid::registry::Registry;
-use rapid::registry::scenario::Scenario;
+use rapid_registry::Registry;
+use rapid_registry::scenario::Scenario;
 
 use crate::support::{Place, executable, python};
 

@@ -65,7 +65,7 @@ fn a_panic_anywhere_ends_the_run_with_a_whole_file_and_names_its_place() {
         let error = printed.lines().rfind(|line| line.starts_with("error: ")).unwrap_or_default();
         assert!(error.contains(named), "{at}: {printed}");
         assert!(
-            printed.contains(&format!("fault ordered for {at}")) && printed.contains("src/fault.rs:"),
+            printed.contains(&format!("fault ordered for {at}")) && printed.contains("src/system/fault.rs:"),
             "{at}: {printed}"
         );
         assert!(!place.mask_file().exists(), "{at}");

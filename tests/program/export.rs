@@ -12,7 +12,7 @@ use arrow_array::{ArrayRef, RecordBatch};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use rapid::cli::{ExportArgs, Layout};
 use rapid::commands::{self, Format};
-use rapid::registry::BUILTIN;
+use rapid_registry::BUILTIN;
 use serde_json::Value;
 
 use crate::support::{Episode, Place};

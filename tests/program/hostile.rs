@@ -175,10 +175,10 @@ fn give(path: &Path, uid: u32, mode: u32) {
 fn a_registry_that_others_may_change_is_refused_as_root_and_warned_of_otherwise() {
     let Some(shared) = Shared::new() else { return };
     let place = &shared.place;
-    let registry = place.write("devices.toml", rapid::registry::BUILTIN);
+    let registry = place.write("devices.toml", rapid_registry::BUILTIN);
     fs::create_dir(place.path("open")).expect("folder");
     let through = place.path("open/devices.toml");
-    fs::write(&through, rapid::registry::BUILTIN).expect("write");
+    fs::write(&through, rapid_registry::BUILTIN).expect("write");
     symlink(&registry, place.path("link.toml")).expect("link");
     give(&registry, 0, 0o644);
     let check = |path: &str| place.run(&["check", "--config", path]);
@@ -223,7 +223,7 @@ fn a_registry_that_others_may_change_is_refused_as_root_and_warned_of_otherwise(
 fn two_users_on_one_machine_do_not_write_through_each_other() {
     let Some(shared) = Shared::new() else { return };
     let place = &shared.place;
-    let registry = place.write("devices.toml", rapid::registry::BUILTIN);
+    let registry = place.write("devices.toml", rapid_registry::BUILTIN);
     give(&registry, 0, 0o644);
     let out = place.path("out");
     fs::create_dir(&out).expect("folder");

@@ -334,7 +334,7 @@ fn the_embedded_policy_is_available_in_any_folder_and_names_the_rig_it_fits() {
     let folder = rapid::policy::bundle::Bundle::load(Path::new(BUNDLE)).expect("the same as a folder");
     assert_eq!(policy["hash"], folder.hash);
 
-    let builtin = place.write("builtin.toml", rapid::registry::BUILTIN).display().to_string();
+    let builtin = place.write("builtin.toml", rapid_registry::BUILTIN).display().to_string();
     let output = place.run(&["--infer", "--config", &builtin, "--sim", "--duration", "2s"]);
     let printed = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{printed}");

@@ -10,8 +10,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use rapid_registry::Registry;
+
 use crate::support::{self, Episode, Place, Running, events, wait_for};
-use rapid::registry::Registry;
 use rustix::process::Signal;
 use serde_json::Value;
 

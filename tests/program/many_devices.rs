@@ -5,12 +5,13 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use rapid_bus::Bus;
+use rapid_registry::scenario::Scenario;
+use rapid_registry::{NodeSpec, Registry};
+
 use crate::shared_memory::after;
 use crate::support::{self, Episode, Place, events};
-use rapid::bus::Bus;
 use rapid::driver::sim;
-use rapid::registry::scenario::Scenario;
-use rapid::registry::{NodeSpec, Registry};
 
 const CAMERAS: usize = 16;
 const SECONDS: usize = 4;

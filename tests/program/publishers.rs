@@ -3,7 +3,7 @@
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
-use rapid::bus::Header;
+use rapid_bus::Header;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
 

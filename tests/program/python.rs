@@ -14,12 +14,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_bus::{Bus, TopicId};
 use rapid_core::mask::{MaskRecord, PhysicalMask};
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_registry::Registry;
 
 use crate::support::{self, Place, python, sweep_bus, until};
-use rapid::bus::{Bus, TopicId};
-use rapid::registry::Registry;
 
 /// What the simulated wrist camera would send.
 const PAYLOAD: &[u8] = b"\xff\xd8\xff\xe0 a picture";

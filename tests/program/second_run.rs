@@ -5,8 +5,9 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use rapid_registry::Registry;
+
 use crate::support::{self, Episode, PATIENCE, Place, events, until};
-use rapid::registry::Registry;
 use rustix::process::Signal;
 
 /// The fingertip is away for a second.

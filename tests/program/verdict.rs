@@ -7,8 +7,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::process::Command;
 
+use rapid_core::random::Random;
+
 use crate::support::{Place, events};
-use rapid::random::Random;
 use rapid::record::inspect;
 use serde_json::Value;
 

@@ -10,7 +10,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rapid::driver::sim;
-use rapid::simulation::SimSource;
+use rapid_registry::simulation::SimSource;
 use rustix::process::Signal;
 use serde_json::Value;
 

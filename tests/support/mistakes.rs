@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use rapid::registry::Diagnostic;
+use rapid_registry::Diagnostic;
 
 /// The files of a folder of `tests/` with this extension, by name.
 pub(crate) fn files(folder: &str, extension: &str) -> Vec<PathBuf> {

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rapid::registry::{
+use rapid_registry::{
     BrakeSpec, DamiaoSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, WatchSpec,
 };
 

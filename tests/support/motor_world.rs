@@ -31,8 +31,8 @@ use rapid::control::damiao::codec;
 use rapid::control::damiao::parameter::Reply;
 use rapid::control::motors::{Brakes, BusState, Fault, MotorBus, Notice, Reason};
 use rapid::driver::can::guard::KEEP_FOR;
-use rapid::registry::{BrakeSpec, DamiaoSpec, MotorMode, Stop};
 use rapid_core::time::Stamp;
+use rapid_registry::{BrakeSpec, DamiaoSpec, MotorMode, Stop};
 use vbench::emu::can::Frame;
 use vbench::emu::can::motion::{Mit, from_unsigned, to_unsigned};
 use vbench::emu::can::motor::Motor;
@@ -625,7 +625,7 @@ impl Judge {
 
 impl Axis {
     /// The violation of a command.
-    fn judge_command(&mut self, value: f64, kp: f64, motor: &rapid::registry::MotorSpec, now: Stamp) -> Option<String> {
+    fn judge_command(&mut self, value: f64, kp: f64, motor: &rapid_registry::MotorSpec, now: Stamp) -> Option<String> {
         const ROUNDING: f64 = 2.0 * 25.0 / 65_535.0;
         if motor.mode == MotorMode::Velocity {
             return (value.abs() > motor.velocity + 1e-6).then(|| format!("is commanded {value} rad/s"));

@@ -19,10 +19,10 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 pub(crate) use patience::PATIENCE;
-use rapid::registry::{CanAdapter, DamiaoSpec, MotorMode, MotorSpec};
 use rapid_core::action::{ActionSource, MAX_ACTION, NoAction};
 use rapid_core::bell::Bell;
 use rapid_core::time::Stamp;
+use rapid_registry::{CanAdapter, DamiaoSpec, MotorMode, MotorSpec};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use vbench::emu::can::bus::{self, Bus};
 use vbench::emu::can::damiao::{self, Damiao};

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
-use rapid::bus::Header;
+use rapid_bus::Header;
 use rapid_core::mask::{Bits, MASK_TOPIC, PhysicalMask};
 use rapid_core::sample::SampleHeader;
 

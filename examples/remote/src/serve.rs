@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use rapid_core::modality::ModalityKind;
-use rapid::registry::{DeviceSpec, Registry};
+use rapid_registry::{DeviceSpec, Registry};
 use rapid_core::remote::{HEAD, Head, Kind, is_name};
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;

@@ -10,8 +10,7 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
-
-use crate::status::session::PRESS_AGAIN;
+use rapid_status::session::PRESS_AGAIN;
 
 /// What is released for less than this was not released. A foot needs twice as long between two presses.
 const CHATTER: Duration = Duration::from_millis(30);
@@ -39,7 +38,7 @@ pub(super) struct Rules {
     /// Two presses within [`PRESS_AGAIN`] are one gesture.
     pub(super) has_double: bool,
     /// Presses within [`PRESS_AGAIN`] of the one before do not count: see
-    /// [`counts_once`](crate::status::session::SessionRequest::counts_once).
+    /// [`counts_once`](rapid_status::session::SessionRequest::counts_once).
     pub(super) counts_once: bool,
 }
 

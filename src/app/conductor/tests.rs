@@ -1,7 +1,11 @@
 use std::fs::File;
 use std::io;
 
+use rapid_bus::TopicId;
 use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_registry::Registry;
+use rapid_status::session::{Label, SessionRequest};
+use rapid_status::{Grade, Level, Snapshot, Verdict};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -9,14 +13,10 @@ use super::super::Signals;
 use super::super::buttons::Buttons;
 use super::super::streaming::Streaming;
 use super::*;
-use crate::bus::TopicId;
 use crate::interlocks::Watched;
 use crate::patience::PATIENCE;
 use crate::record::{EpisodeRequest, RecorderConfig, Sink, Source};
-use crate::registry::Registry;
 use crate::session::journal::Plan;
-use crate::status::session::{Label, SessionRequest};
-use crate::status::{Grade, Level, Snapshot, Verdict};
 
 /// A bus on which nothing is published.
 struct Quiet;

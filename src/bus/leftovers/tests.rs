@@ -9,10 +9,10 @@ use std::sync::mpsc;
 use rustix::fs::{CWD, mknodat};
 
 use super::*;
-use crate::bus::Bus;
-use crate::bus::home::Home;
-use crate::bus::tests::registry;
+use crate::Bus;
+use crate::home::Home;
 use crate::patience::PATIENCE;
+use crate::tests::registry;
 
 const HASH: &str = "0354a209029e7d094a819e2d4030ea331e6caaf0";
 /// A port of process 25769.

@@ -1,10 +1,10 @@
 use std::sync::Arc;
 
 use insta::assert_snapshot;
+use rapid_registry::device::UsbIdentity;
+use rapid_registry::simulation::{SimDevice, SimSource};
 
 use super::*;
-use crate::device::UsbIdentity;
-use crate::simulation::{SimDevice, SimSource};
 
 /// A wrist camera by its serial number, two interchangeable cameras, a serial line by its port.
 const REGISTRY: &str = r#"

@@ -10,13 +10,13 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use rapid_core::text;
+use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
+use rapid_registry::{Assigner, DeviceSpec, InputSpec, NodeSpec, Opens, PixelFormat, Registry};
 use serde::Serialize;
 
 use super::facts::{Facts, Node, UsbDevice};
 use super::load::{CameraLoad, budget, fitting, taken};
 use super::preview;
-use crate::device::{Attachment, DeviceNode, UsbIdentity};
-use crate::registry::{Assigner, DeviceSpec, InputSpec, NodeSpec, Opens, PixelFormat, Registry};
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
 const SLOWEST: f64 = 480.0;

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::registry::{CameraSpec, PixelFormat};
+use rapid_registry::{CameraSpec, PixelFormat};
 
 /// Most payload of the isochronous transfers of one high-speed bus, bytes per second: 80 % of 480 Mbit/s
 /// (USB 2.0, 5.6.4), with 38 bytes of overhead per transaction of 1024 (5.6.3).

@@ -12,6 +12,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use rapid_core::text;
+use rapid_registry::Registry;
+use rapid_registry::artifacts::{ArtifactKind, artifacts};
 use rapid_system::folder::{Folder, Links, Missing};
 use serde::Serialize;
 
@@ -19,8 +21,6 @@ use self::facts::UsbDevice;
 use self::facts::{Disk, Facts};
 use self::judge::{Finding, Level};
 use super::Format;
-use crate::registry::Registry;
-use crate::registry::artifacts::{ArtifactKind, artifacts};
 
 /// Diagnoses the machine and writes the findings; true if none is bad.
 ///

@@ -2,8 +2,9 @@
 
 use std::ffi::OsStr;
 
+use rapid_registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PREVIEW_DECODER as DECODER};
+
 use super::judge::Finding;
-use crate::registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PREVIEW_DECODER as DECODER};
 
 /// Whether there is such a program in the folders of `path`.
 pub(super) fn is_on(path: Option<&OsStr>) -> bool {

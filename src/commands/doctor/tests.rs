@@ -5,10 +5,10 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
 use insta::assert_snapshot;
+use rapid_registry::BUILTIN;
 
 use super::facts::{Interface, Node, User, collect};
 use super::*;
-use crate::registry::BUILTIN;
 
 /// A machine's /sys, /proc, /etc and /dev below a folder.
 struct Tree(tempfile::TempDir);

@@ -3,16 +3,16 @@
 use std::io::{self, Write};
 
 use rapid_core::text;
+use rapid_registry::candidate::Candidate;
+use rapid_registry::device::{DeviceNode, UsbIdentity};
+use rapid_registry::edit::Setting;
+use rapid_registry::{Mount, Registry, name_problem};
 use serde::Serialize;
 
 use super::{Dialogue, Format, RegisterError, listen};
 use crate::cli::RegisterArgs;
-use crate::device::{DeviceNode, UsbIdentity};
 use crate::driver::camera::query;
 use crate::registration::settings::suggested;
-use crate::registry::candidate::Candidate;
-use crate::registry::edit::Setting;
-use crate::registry::{Mount, Registry, name_problem};
 
 /// A unit that could be registered, as JSON.
 #[derive(Serialize)]

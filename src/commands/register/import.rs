@@ -6,15 +6,15 @@
 use std::path::Path;
 
 use rapid_core::text;
+use rapid_registry::candidate::kind;
+use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
+use rapid_registry::edit::{NewEntry, Setting};
+use rapid_registry::import::{Foreign, devices, layout};
+use rapid_registry::{RegistryErrors, like_a_name, name_problem, read_file};
 
-use crate::device::{Attachment, DeviceNode, UsbIdentity};
 use crate::driver::camera::query;
 use crate::registration::settings::suggested;
 use crate::registration::{Target, free_bit};
-use crate::registry::candidate::kind;
-use crate::registry::edit::{NewEntry, Setting};
-use crate::registry::import::{Foreign, devices, layout};
-use crate::registry::{RegistryErrors, like_a_name, name_problem, read_file};
 
 /// Service types and their protocols (`aod321/iPhoneVIO`; OpenGoPro, "mDNS").
 const PROTOCOLS: [(&str, &str); 2] = [("_iphonevio._tcp", "iphone"), ("_gopro-web._tcp", "gopro")];

@@ -14,6 +14,10 @@ use std::time::Duration;
 
 use rapid_core::sample::Encoding;
 use rapid_core::text;
+use rapid_registry::candidate::unregistered;
+use rapid_registry::device::{Attachment, DeviceNode};
+use rapid_registry::edit::{self, EditError, NewEntry, Setting};
+use rapid_registry::{DeviceSpec, Framing, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec};
 use serde::Serialize;
 use tokio::time::{Instant, timeout_at};
 
@@ -22,14 +26,10 @@ use super::artifacts::ArtifactsError;
 use super::modules::{self, ModulesError};
 use super::{Format, artifacts};
 use crate::cli::{RegisterArgs, UnregisterArgs};
-use crate::device::{Attachment, DeviceNode};
 use crate::driver::serial::Serial;
 use crate::driver::{Driver, DriverError};
 use crate::registration::settings::lines_look_like;
 use crate::registration::{Target, WriteError, comments, free_bit};
-use crate::registry::candidate::unregistered;
-use crate::registry::edit::{self, EditError, NewEntry, Setting};
-use crate::registry::{DeviceSpec, Framing, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec};
 
 pub use import::ImportError;
 

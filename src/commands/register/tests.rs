@@ -5,12 +5,12 @@ use std::sync::Arc;
 
 use clap::Parser;
 use rapid_core::time::Stamp;
+use rapid_registry::device::{DeviceNode, Unit, UsbIdentity};
+use rapid_registry::simulation::{SimDevice, SimSource};
+use rapid_registry::{BUILTIN, Registry};
 
 use super::*;
 use crate::cli::{Cli, Command};
-use crate::device::{DeviceNode, Unit, UsbIdentity};
-use crate::registry::{BUILTIN, Registry};
-use crate::simulation::{SimDevice, SimSource};
 
 fn serial_line(serial: Option<&str>, port: &str) -> Attachment {
     let source = SimSource::Serial { channels: 2, hz: 1000, seed: 1 };

@@ -4,8 +4,9 @@
 //! difference from these is reported: the `type` is wrong, or the motor was configured otherwise.
 //! Source: the tables of the public drivers `DM_CAN.py` and of `LeRobot`.
 
+use rapid_registry::MotorKind;
+
 use super::codec::Ranges;
-use crate::registry::MotorKind;
 
 /// PMAX in rad, VMAX in rad/s and TMAX in Nm as they leave the factory.
 pub const fn shipped(kind: MotorKind) -> [f64; 3] {

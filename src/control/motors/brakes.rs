@@ -7,10 +7,10 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::{DamiaoSpec, Stop};
 
 use super::motor::BrakeIs;
 use super::{BusState, Fault, Motor, MotorBus, Notice};
-use crate::registry::{DamiaoSpec, Stop};
 
 /// States of brakes, a bit for each motor, the first one the lowest; without any bit set a brake is engaged. Bits of
 /// motors without a brake mean nothing.

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use rapid_core::action::Trip;
 use rapid_core::time::Stamp;
+use rapid_registry::{MotorMode, Stop};
 
 use super::MotorBus;
 use super::fault::Fault;
@@ -12,7 +13,6 @@ use super::notice::{BusState, Notice, Reason};
 use super::watch::Commanded;
 use crate::control::deadman::Verdict;
 use crate::control::ramp::Ramp;
-use crate::registry::{MotorMode, Stop};
 
 /// An arm that took longer has failed...
 const ARM_WITHIN: Duration = Duration::from_secs(1);

@@ -3,10 +3,10 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::DamiaoSpec;
 
 use super::{BusState, Fault, MotorBus};
 use crate::control::can::CanFrame;
-use crate::registry::DamiaoSpec;
 
 /// A program that misses this many cycles has not stalled yet.
 const SLOW_CYCLES: u32 = 3;

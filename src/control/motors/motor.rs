@@ -24,6 +24,7 @@ mod stopping;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::{MotorMode, MotorSpec, Stop};
 
 use super::fault::{Fault, Part};
 use super::notice::Notice;
@@ -34,7 +35,6 @@ use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand}
 use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
 use crate::control::limits::{Limits, stiffness, within_torque};
 use crate::control::ramp::Ramp;
-use crate::registry::{MotorMode, MotorSpec, Stop};
 use brake::Brake;
 pub(super) use brake::BrakeIs;
 use frames::within;

@@ -3,13 +3,13 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::MotorMode;
 
 use super::MotorBus;
 use super::motor::Motor;
 use super::notice::Notice;
 use super::watch::beyond;
 use crate::control::limits::Limits;
-use crate::registry::MotorMode;
 
 /// How fast a joint is driven back, rad/s: slow enough to step aside and to disarm.
 pub const RETURN_SPEED: f64 = 0.1;

@@ -14,10 +14,11 @@ mod world;
 
 use std::time::Duration;
 
+use rapid_registry::MotorMode;
+
 use super::*;
 use crate::control::damiao::codec::MotorStatus;
 use crate::control::damiao::parameter::{Parameter, Value};
-use crate::registry::MotorMode;
 use world::{MIT, Sim, World, motor, spec};
 
 #[test]

@@ -7,12 +7,12 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::{MotorMode, MotorSpec};
 
 use super::fault::Strange;
 use super::notice::Notice;
 use super::notices::Notices;
 use crate::control::damiao::codec::{Feedback, Ranges};
-use crate::registry::{MotorMode, MotorSpec};
 
 /// Consecutive frames with an impossible position that make a fault: a single one may be damaged.
 const JUMPS: u32 = 3;

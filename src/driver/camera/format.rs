@@ -11,11 +11,11 @@ use std::time::Duration;
 use rapid_core::provenance::{Format, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_ERROR};
 use rapid_core::time::Stamp;
+use rapid_registry::{CameraSpec, PixelFormat};
 use serde::Serialize;
 
 use super::super::DriverError;
 use super::node::Card;
-use crate::registry::{CameraSpec, PixelFormat};
 
 /// Tolerance of a rate: many cameras call 30000/1001 30.
 const RATE_TOLERANCE: f64 = 0.005;

@@ -16,6 +16,7 @@ use std::{io, mem};
 
 use rapid_core::provenance::KernelDriver;
 use rapid_core::time::Stamp;
+use rapid_registry::CameraSpec;
 use rustix::fs::{Mode as FileMode, OFlags};
 use v4l::v4l_sys::{
     V4L2_BUF_FLAG_ERROR, V4L2_BUF_FLAG_TIMESTAMP_MASK, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, V4L2_CAP_DEVICE_CAPS,
@@ -29,7 +30,6 @@ use v4l::v4l2::{self, vidioc};
 
 use super::super::DriverError;
 use super::format::{Agreed, ControlInfo, Frame, Rate, fourcc};
-use crate::registry::CameraSpec;
 
 /// `V4L2_BUF_TYPE_VIDEO_CAPTURE`.
 pub(super) const CAPTURE: u32 = v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE;

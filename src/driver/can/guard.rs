@@ -29,6 +29,8 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
+use rapid_registry::device::DeviceNode;
+use rapid_registry::{CanSpec, DamiaoSpec, MAX_MOTORS};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::net::{
@@ -40,9 +42,7 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open, setsid};
 use super::link::Link;
 use crate::control::can::CanFrame;
 use crate::control::motors::{MotorBus, stalled_after};
-use crate::device::DeviceNode;
 use crate::driver::process::leak_nothing;
-use crate::registry::{CanSpec, DamiaoSpec, MAX_MOTORS};
 
 pub use process::run;
 

@@ -12,6 +12,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::device::DeviceNode;
+use rapid_registry::{CanAdapter, CanSpec};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -19,9 +21,7 @@ use tokio::io::unix::AsyncFd;
 use super::line::Line;
 use super::socket::Socket;
 use crate::control::can::CanFrame;
-use crate::device::DeviceNode;
 use crate::driver::DriverError;
-use crate::registry::{CanAdapter, CanSpec};
 
 /// What else can wake a thread that waits for the bus: orders from two places, and actions.
 pub const BELLS: usize = 3;

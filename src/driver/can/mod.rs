@@ -17,7 +17,7 @@ pub mod raw;
 pub mod slcan;
 mod socket;
 
-use crate::registry::{CanAdapter, NodeSpec, Registry};
+use rapid_registry::{CanAdapter, NodeSpec, Registry};
 
 /// Makes the kernel load its CAN modules if an entry needs them, so that the first plug does not wait for that. Returns
 /// at once; errors are reported when an adapter is opened.

@@ -8,12 +8,12 @@
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use rapid_registry::CAN_RESTART_MS;
 use serde::Serialize;
 use socketcan::CanInterface;
 use socketcan::nl::{CanState, InterfaceDetails, NlError};
 
 use super::link::LinkError;
-use crate::registry::CAN_RESTART_MS;
 
 /// The state of a CAN interface.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]

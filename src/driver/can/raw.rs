@@ -25,12 +25,12 @@ use std::time::Duration;
 use rapid_core::provenance::{Format, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::time::Stamp;
+use rapid_registry::device::DeviceNode;
+use rapid_registry::{CAN_BATCH, CAN_RECORD, CanSpec};
 
 use super::link::{AsyncLink, Link, LinkError, Received, is_bus_off};
 use super::socket::can_id;
-use crate::device::DeviceNode;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
-use crate::registry::{CAN_BATCH, CAN_RECORD, CanSpec};
 
 /// Time between batches: at 8,000 frames a second a batch has 16.
 const PACE: Duration = Duration::from_millis(2);

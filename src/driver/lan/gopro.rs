@@ -29,6 +29,7 @@ use std::time::Duration;
 
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
+use rapid_registry::LanPicture;
 use rapid_system::folder::{Folder, Links, Missing, Sync, read_text, state_directory};
 use serde::{Deserialize, Serialize};
 use tokio::sync::{mpsc, watch};
@@ -42,7 +43,6 @@ use self::preview::Preview;
 use super::http;
 use super::place::{Place, Server};
 use crate::driver::{DriverError, Reading};
-use crate::registry::LanPicture;
 
 /// The camera answers within a tenth of a second, even while encoding.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);

@@ -23,6 +23,7 @@ use std::time::Duration;
 
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
 use rapid_core::time::Stamp;
+use rapid_registry::{LanPicture, PhoneStream};
 use tokio::io::AsyncReadExt as _;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Instant;
@@ -32,7 +33,6 @@ use super::mjpeg::check_size;
 use super::place::Place;
 use super::{PATIENCE, jpeg};
 use crate::driver::{DriverError, Reading};
-use crate::registry::{LanPicture, PhoneStream};
 
 /// Bytes read from the kernel at once.
 const INBOX: usize = 64 << 10;

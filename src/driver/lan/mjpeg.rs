@@ -9,6 +9,7 @@ use hyper::body::{Buf, Bytes};
 use hyper::header::CONTENT_TYPE;
 use rapid_core::sample::{Encoding, FLAG_ERROR};
 use rapid_core::time::Stamp;
+use rapid_registry::LanPicture;
 use tokio::time::{Instant, timeout_at};
 
 use super::http::{self, Reply};
@@ -16,7 +17,6 @@ use super::multipart::{Cut, Multipart, boundary};
 use super::place::Server;
 use super::{PATIENCE, jpeg};
 use crate::driver::{DriverError, Reading};
-use crate::registry::LanPicture;
 
 const HEAD_LIMIT: Duration = Duration::from_secs(5);
 

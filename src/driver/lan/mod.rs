@@ -23,11 +23,11 @@ mod udp;
 use std::time::Duration;
 
 use rapid_core::provenance::{Format, Negotiated};
+use rapid_registry::device::DeviceNode;
+use rapid_registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec, RemoteSamples};
 
 use super::{Agreed, ClockOffset, DriverError, Reading};
-use crate::device::DeviceNode;
 use crate::link::{Link, LinkState, LinkWatch};
-use crate::registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec, RemoteSamples};
 use place::Place;
 
 /// A camera or a phone that sends no complete sample for this long is reconnected. Six of these and the delays between

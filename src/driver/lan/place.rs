@@ -4,13 +4,13 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 use std::{fmt, io};
 
+use rapid_registry::device::{DeviceNode, LastReceived};
+use rapid_registry::own_side;
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::timeout;
 
-use crate::device::{DeviceNode, LastReceived};
 use crate::driver::DriverError;
 use crate::link::{Link, LinkState};
-use crate::registry::own_side;
 
 /// A device on the same network answers within milliseconds.
 const CONNECT_LIMIT: Duration = Duration::from_secs(2);

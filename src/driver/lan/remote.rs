@@ -11,13 +11,13 @@ use std::time::Duration;
 use rapid_core::remote::{FrameError, Frames, Head, Kind, request};
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
+use rapid_registry::{PixelFormat, RemoteSamples};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout, timeout_at};
 
 use super::place::Server;
 use crate::driver::{ClockOffset, DriverError, Reading};
-use crate::registry::{PixelFormat, RemoteSamples};
 
 /// More samples at once are not missing: their numbers began again.
 const MOST_MISSING: u64 = 1 << 20;

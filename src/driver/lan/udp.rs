@@ -17,6 +17,7 @@ use nix::sys::socket::sockopt::BindToDevice;
 use nix::sys::socket::{SockaddrStorage, setsockopt};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::time::{Stamp, realtime_ns};
+use rapid_registry::own_side;
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -26,7 +27,6 @@ use tokio::time::timeout;
 use super::place::{Place, port_error};
 use crate::driver::datagram::{self, Datagram};
 use crate::driver::{DriverError, Reading};
-use crate::registry::own_side;
 
 /// The interface is checked after this long without a packet.
 const ASK_AFTER: Duration = Duration::from_millis(500);
@@ -149,8 +149,9 @@ fn address(from: &SockaddrStorage) -> Option<IpAddr> {
 mod tests {
     use std::net::UdpSocket;
 
+    use rapid_registry::device::{DeviceNode, LastReceived};
+
     use super::*;
-    use crate::device::{DeviceNode, LastReceived};
 
     /// For UDP and TCP.
     #[tokio::test]

@@ -2,11 +2,11 @@ use std::io::Write as _;
 
 use proptest::prelude::*;
 use rapid_core::mask::PhysicalMask;
+use rapid_registry::scenario::ScenarioAction;
 
 use super::*;
 use crate::effort::{cases, every};
 use crate::episode::testing::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
-use crate::registry::scenario::ScenarioAction;
 
 fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
     let mut file = tempfile::NamedTempFile::new().unwrap();
@@ -74,7 +74,7 @@ fn a_scenario_follows_the_recorded_mask() {
     let file = file(&episode(options()));
     let Replayed { registry, scenario, length } = scenario(file.path()).unwrap();
     assert_eq!(length.as_millis(), 990);
-    assert_eq!(registry, crate::registry::Registry::parse(REGISTRY, None).unwrap().registry);
+    assert_eq!(registry, rapid_registry::Registry::parse(REGISTRY, None).unwrap().registry);
     let plugged: Vec<_> = scenario.devices.iter().map(|device| (device.name.as_str(), device.plugged)).collect();
     assert_eq!(plugged, [("tof", true), ("cam", false)]);
     let [tof, cam] = &scenario.devices[..] else { panic!("two devices") };

@@ -1,6 +1,6 @@
 //! The pictures of a simulated camera: encoded once, and numbered when they are sent.
 
-use rapid_jpeg::Values;
+use rapid_pictures::jpeg::Values;
 
 use super::super::DriverError;
 
@@ -156,7 +156,7 @@ fn sides(width: u32, height: u32) -> Result<[u16; 2], DriverError> {
 
 fn jpeg(pixels: &[u8], size: [u16; 2]) -> Result<Vec<u8>, DriverError> {
     let mut encoded = Vec::new();
-    rapid_jpeg::encode(pixels, size, Values::Rgb, JPEG_QUALITY, &mut encoded)
+    rapid_pictures::jpeg::encode(pixels, size, Values::Rgb, JPEG_QUALITY, &mut encoded)
         .map_err(|error| DriverError::Fatal(format!("a simulated picture: {error}")))?;
     Ok(encoded)
 }

@@ -122,7 +122,7 @@ async fn simulated_motors_reach_the_commanded_position() {
     let text = "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\n[device.arm.can]\nprotocol = \"damiao\"\n\
                 motors = [{ name = \"a\", slave = 1, type = \"DM4310\", kp = 1, kd = 0.1, position = [-1, 1] },\n\
                           { name = \"b\", slave = 2, type = \"DM4310\", kp = 1, kd = 0.1, position = [-1, 1] }]\n";
-    let registry = crate::registry::Registry::parse(text, None).unwrap().registry;
+    let registry = rapid_registry::Registry::parse(text, None).unwrap().registry;
     let arm = &registry.devices[0];
     let sends = |channels| device(SimSource::Serial { channels, hz: 1000, seed: 1 });
     assert!(check(arm, &sends(11)).is_err());
@@ -141,7 +141,7 @@ async fn simulated_motors_reach_the_commanded_position() {
 async fn simulated_byte_streams_match_the_real_device() {
     let text = "[device.bus]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\n[device.bus.can]\nprotocol = \"raw\"\n\
                 [device.lidar]\nnode = \"lan\"\n[device.lidar.lan]\nprotocol = \"udp\"\nport = 2368\nhost = \"10.0.0.9\"\n";
-    let registry = crate::registry::Registry::parse(text, None).unwrap().registry;
+    let registry = rapid_registry::Registry::parse(text, None).unwrap().registry;
     for (name, length) in [("bus", CAN_RECORD), ("lidar", 8)] {
         let spec = registry.named(name).unwrap();
         let source = device(SimSource::Serial { channels: 1, hz: 1000, seed: 0x0102_0304 });

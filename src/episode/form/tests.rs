@@ -3,9 +3,9 @@
 use proptest::prelude::*;
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage as _};
 use rapid_core::points::PacketFormat;
+use rapid_registry::{CalibrationSpec, PointsSpec};
 
 use super::*;
-use crate::registry::{CalibrationSpec, PointsSpec};
 
 const WALL: u64 = 1_700_000_000_123_456_789;
 

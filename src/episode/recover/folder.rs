@@ -14,12 +14,12 @@ use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant, SystemTime};
 
 use rapid_core::text;
+use rapid_status::{Board, Level, What};
 use rapid_system::disk::Disk;
 use rustix::process::setpriority_process;
 
 use super::{Names, ProgressFn, RecoverError, Recovered, RepairOutcome, Source, recover};
 use crate::episode::{self, Failed};
-use crate::status::{Board, Level, What};
 
 /// How soon a repair in the background notices that it is to end.
 const NOTICE: Duration = Duration::from_millis(20);

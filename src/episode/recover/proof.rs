@@ -151,7 +151,7 @@ async fn every_byte_of_a_torn_chunk_is_counted_and_its_messages_are_reported_as_
             for shown in [&shown, &seen] {
                 let is_stated = shown.verdict.reasons().iter().any(|reason| reason.contains("without a check value"));
                 assert!(taken == 0 || is_stated, "{what}: {:?}", shown.verdict);
-                assert_ne!(shown.verdict.grade(), Some(crate::status::Grade::Good));
+                assert_ne!(shown.verdict.grade(), Some(rapid_status::Grade::Good));
             }
             fs::remove_file(&made.to).unwrap();
         }
@@ -326,7 +326,7 @@ async fn unread_bytes_are_reported_and_the_original_is_kept() {
             let what = format!("{name}, cut at {cut} of {}, {} bytes behind", first.len(), behind.len());
             let file = put(&folder, name, &bytes);
             let seen = inspect(&file).unwrap();
-            assert_ne!(seen.verdict.grade(), Some(crate::status::Grade::Good), "{what}");
+            assert_ne!(seen.verdict.grade(), Some(rapid_status::Grade::Good), "{what}");
             let reasons = seen.verdict.reasons().join("; ");
             assert!(reasons.contains("not readable") || reasons.contains("left out"), "{what}: {reasons}");
             let original = match recover(&file, &mut keep_going) {

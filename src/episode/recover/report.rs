@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 
 use rapid_core::text;
 use rapid_core::time;
+use rapid_status::{Grade, Level};
 use serde_json::{Map, Value, json};
 
 use super::copy::{About, Copied};
 use super::summary::{LOSSLESS, SHA256, Summary};
 use super::{FileEnd, LeftOut, Recovered, RepairOutcome, Repaired};
 use crate::episode::{FAILED, text_map};
-use crate::status::{Grade, Level};
 
 /// The metadata record `rapid/summary` of an episode whose recorder wrote none, as far as it is
 /// known. Same keys as the recorder's, without those that only the recorder could count.

@@ -5,6 +5,7 @@ use std::io::Write;
 use std::time::Duration;
 
 use proptest::prelude::*;
+use rapid_status::{Grade, Level};
 
 use super::copy::{About, Error};
 use super::*;
@@ -12,7 +13,6 @@ use crate::effort::every;
 use crate::episode::testing::{self, Message, metadata, mutated, mutations, strictly};
 use crate::record::Sink;
 use crate::record::tests::{Bench, registry};
-use crate::status::{Grade, Level};
 
 pub(super) fn keep_going(_: u64, _: u64) -> ControlFlow<()> {
     ControlFlow::Continue(())

@@ -19,12 +19,12 @@ use std::time::Duration;
 
 use mdns_sd::{Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo};
 use rapid_core::time::Stamp;
+use rapid_registry::LanSpec;
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::super::UnplugSource;
 use super::watch::Watch;
 use crate::link::{LOOK_EVERY, Link, LinkState};
-use crate::registry::LanSpec;
 
 /// More devices of one service than a rig has.
 const MOST_INSTANCES: usize = 64;

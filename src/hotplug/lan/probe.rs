@@ -11,15 +11,15 @@ use std::time::Duration;
 
 use rapid_core::remote::{HEAD, Head, Kind};
 use rapid_core::time::Stamp;
+use rapid_registry::device::LastReceived;
+use rapid_registry::{Probe, own_side};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpStream, UdpSocket};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use super::super::UnplugSource;
 use super::watch::Watch;
-use crate::device::LastReceived;
 use crate::link::LOOK_EVERY;
-use crate::registry::{Probe, own_side};
 
 /// Interval between queries; also the time limit of an answer.
 const EVERY: Duration = Duration::from_secs(1);

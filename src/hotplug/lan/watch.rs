@@ -10,10 +10,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::device::{Attachment, DeviceNode, LanIdentity, LastReceived, Unit};
 use tokio::sync::mpsc;
 
 use super::super::{HotplugEvent, UnplugSource};
-use crate::device::{Attachment, DeviceNode, LanIdentity, LastReceived, Unit};
 use crate::link::{Link, LinkState};
 
 /// See the module's comment.

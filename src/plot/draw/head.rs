@@ -2,11 +2,11 @@
 
 use rapid_core::text;
 use rapid_core::time::rfc3339;
+use rapid_status::session::{EpisodeEntry, Label};
 
 use super::{MARGIN, WIDTH};
 use crate::plot::svg::{Anchor, Px, Svg};
 use crate::record::inspect::{FileEnd, Inspection};
-use crate::status::session::{EpisodeEntry, Label};
 
 /// Lines of reasons; the report has all of them.
 const REASONS: usize = 8;
@@ -20,8 +20,8 @@ const NAME: usize = 84;
 pub(super) fn draw(page: &mut Svg, report: &Inspection, noted: Option<&EpisodeEntry>) -> f64 {
     let name = report.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     page.text("title", MARGIN, 44.0, Anchor::Start, &text::cut(&text::plain(&name), NAME, "…"));
-    let word = report.verdict.grade().map_or("no verdict", crate::status::Grade::word);
-    let class = report.verdict.grade().map_or("none", crate::status::Grade::word);
+    let word = report.verdict.grade().map_or("no verdict", rapid_status::Grade::word);
+    let class = report.verdict.grade().map_or("none", rapid_status::Grade::word);
     let width = 24.0 + 9.6 * text::width(word) as f64;
     let left = Px(WIDTH - MARGIN - width);
     page.raw(format_args!(
@@ -68,7 +68,7 @@ fn facts(report: &Inspection) -> String {
         FileEnd::Unfinished | FileEnd::Torn => Some("not finished"),
         FileEnd::Damaged => Some("damaged"),
     };
-    let sensors = report.verdict.verdict().map(crate::status::Verdict::sensors).filter(|words| !words.is_empty());
+    let sensors = report.verdict.verdict().map(rapid_status::Verdict::sensors).filter(|words| !words.is_empty());
     let begun = (report.begin_ns > 0).then(|| rfc3339(report.begin_ns).replace('T', " "));
     let begun = begun.map(|begun| format!("{} UTC", begun.split('.').next().unwrap_or_default()));
     let messages = text::counted(report.messages, "message");

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use rapid_registry::did_you_mean;
 use serde_json::Value;
 
 use super::file::{ActionFile, BaseFile, Limits, RepresentationWord, Sliced};
@@ -11,7 +12,6 @@ use super::spec::{
     SliceNormalization,
 };
 use super::validate::{check_length, normalization};
-use crate::registry::did_you_mean;
 
 /// The fix for a shape that is none of a pose.
 const NO_POSE: &str =

@@ -8,13 +8,13 @@
 use std::fmt;
 
 use rapid_core::text;
+use rapid_registry::{Diagnostic, did_you_mean};
 use serde::Deserialize;
 use serde::de::{DeserializeOwned, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use serde_path_to_error::Segment;
 
 use super::spec::BundleErrors;
-use crate::registry::{Diagnostic, did_you_mean};
 
 /// Maximum number of reported problems; a file with more was not written by a policy exporter.
 const MOST_PROBLEMS: usize = 100;

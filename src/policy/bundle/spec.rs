@@ -7,11 +7,11 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use rapid_registry::Diagnostic;
+use rapid_status::What;
 use serde::{Deserialize, Serialize};
 
 use super::file;
-use crate::registry::Diagnostic;
-use crate::status::What;
 
 /// A checked bundle.
 #[derive(Debug, Clone, PartialEq)]

@@ -3,11 +3,11 @@
 use std::fmt;
 
 use rapid_core::modality::ModalityKind;
+use rapid_registry::{Registry, did_you_mean};
 
 use super::files::Graph;
 use super::read::Problems;
 use super::spec::{BasePose, Bundle, BundleErrors, ImageSpec, ObservationInput, VectorSpec};
-use crate::registry::{Registry, did_you_mean};
 
 /// Channels of a picture.
 const CHANNELS: usize = 3;

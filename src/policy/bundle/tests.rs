@@ -1,9 +1,10 @@
 //! Compares a bundle with its files, its rig and its graphs. The contents of the file are tested in
 //! `tests/library/bundle.rs`.
 
+use rapid_registry::Registry;
+
 use super::example::{POLICY, write, write_changed};
 use super::*;
-use crate::registry::Registry;
 
 /// The smallest possible models: `ModelProto` with only a version.
 const ONE: &[u8] = &[8, 1];

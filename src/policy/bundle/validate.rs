@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid_core::text::counted;
+use rapid_registry::did_you_mean;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
@@ -15,7 +16,6 @@ use super::spec::{
     Bundle, BundleErrors, HistorySpec, ImageSpec, MAX_SPAN, MaskSpec, Normalization, ObservationInput, ObservationSpec,
     QUATERNION, SchedulerSpec, TimestepSpacing, VectorSpec, WhenAbsent,
 };
-use crate::registry::did_you_mean;
 
 /// What `format` must be.
 const FORMAT: &str = "rapid-policy/1";

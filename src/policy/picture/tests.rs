@@ -1,6 +1,6 @@
 use proptest::prelude::*;
 use rapid_core::sample::Encoding;
-use rapid_jpeg::Values;
+use rapid_pictures::jpeg::Values;
 
 use super::*;
 
@@ -19,7 +19,7 @@ fn picture(encoding: Encoding, [height, width]: [usize; 2], bytes: &[u8]) -> Pic
 fn jpeg(pixels: &[u8], [height, width]: [usize; 2]) -> Vec<u8> {
     let mut jpeg = Vec::new();
     let side = |side: usize| u16::try_from(side).unwrap();
-    rapid_jpeg::encode(pixels, [side(height), side(width)], Values::Rgb, 100, &mut jpeg).unwrap();
+    rapid_pictures::jpeg::encode(pixels, [side(height), side(width)], Values::Rgb, 100, &mut jpeg).unwrap();
     jpeg
 }
 

@@ -9,6 +9,7 @@ use std::path::Path;
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::{MASK_TOPIC, PhysicalMask};
 use rapid_core::modality::ModalityId;
+use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
 
 use super::super::metadata::{CONFIGURATION, POLICY};
 use super::super::quality::DurationHistogram;
@@ -22,7 +23,7 @@ use crate::episode::decode::{Content, FrameSlot, Kind, Scratch};
 use crate::episode::encode::EventText;
 use crate::episode::reader::{Attachment, Channel, Entry, Item, Message};
 use crate::episode::record_iter::Integrity;
-use crate::episode::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, Failed, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
+use crate::episode::{ABOUT, FAILED, Failed, RECOVERED, SUMMARY, Writer};
 
 /// Events and changes of the mask kept: a rig that flaps all day must not fill the memory.
 const MAX_EVENTS: usize = 10_000;

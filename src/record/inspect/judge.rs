@@ -13,6 +13,8 @@ use std::time::Duration;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use rapid_core::sample::Encoding;
+use rapid_registry::{Registry, VerdictSpec};
+use rapid_status::{Grade, Verdict};
 use serde_json::{Map, Value};
 
 use super::super::open_episode::SETTLE;
@@ -25,8 +27,6 @@ use crate::episode::decode::{FrameSlot, Sample};
 use crate::episode::reader::Message;
 use crate::episode::record_iter::Integrity;
 use crate::episode::{ABOUT, SUMMARY};
-use crate::registry::{Registry, VerdictSpec};
-use crate::status::{Grade, Verdict};
 
 /// No registry is longer; the text of a hostile file may be.
 const LONGEST_REGISTRY: usize = 1 << 20;

@@ -5,12 +5,12 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_status::palette::Palette;
 use serde::Serialize;
 
 use super::render::clean;
 use super::{FileEnd, Inspection, Judgement, ReadError, inspect};
 use crate::episode::partial::PARTIAL;
-use crate::palette::Palette;
 
 /// An episode of a list. As JSON, one object a line.
 #[derive(Debug, Clone, PartialEq, Serialize)]

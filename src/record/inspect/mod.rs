@@ -20,14 +20,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_status::palette::Palette;
+use rapid_status::{Grade, Sensors, Verdict};
 use serde::{Serialize, Serializer};
 
 use super::quality::{Quality, Spread};
 use crate::episode::reader::Reader;
 use crate::episode::record_iter::Integrity;
 use crate::episode::{self, Failed, ReadAt};
-use crate::palette::Palette;
-use crate::status::{Grade, Sensors, Verdict};
 use collect::Collected;
 pub(crate) use judge::Numbers;
 

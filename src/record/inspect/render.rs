@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use rapid_core::text;
+use rapid_status::Grade;
+use rapid_status::palette::Palette;
 
 use super::{FileEnd, Inspection, Judgement, Lateness, ModalityReport, PolicyReport, TopicReport};
 use super::{policy, units};
-use crate::palette::Palette;
 use crate::record::Spread;
-use crate::status::Grade;
 
 /// Events shown; the JSON form has all of them.
 const EVENTS: usize = 40;

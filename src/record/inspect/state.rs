@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use rapid_core::sync::Grid;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_status::{Grade, Verdict};
 use serde_json::Value;
 
 use super::super::metadata::CUT_SHORT;
@@ -16,7 +17,6 @@ use crate::episode::own::EpisodeId;
 use crate::episode::record_iter::{FileEnd, Integrity, LeftOut};
 use crate::episode::{ABOUT, SUMMARY};
 use crate::record::Quality;
-use crate::status::{Grade, Verdict};
 
 /// Ticks are at whole nanoseconds of another clock.
 const ROUNDING: u64 = 1_000;

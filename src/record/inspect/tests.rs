@@ -2,13 +2,13 @@
 
 use proptest::prelude::*;
 use rapid_core::mask::{PhysicalMask, SizedMask};
+use rapid_status::palette::Palette;
+use rapid_status::{Chunk, Grade, Hold, Sensors, What};
 
 use super::*;
 use crate::effort::{cases, every};
 use crate::episode::testing;
-use crate::palette::Palette;
 use crate::record::tests::Bench;
-use crate::status::{Chunk, Grade, Hold, Sensors, What};
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
     match inspect_from(bytes, bytes.len() as u64, Path::new("x.mcap"), episode::boot_id()) {

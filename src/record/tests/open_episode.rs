@@ -3,13 +3,13 @@
 use rapid_core::provenance::UnplugSource;
 use rapid_core::text::counted;
 use rapid_core::time::WallClock;
+use rapid_status::ReferenceSample;
 
 use super::super::episode_path::EpisodePath;
 use super::super::open_episode::{Beginning, OpenEpisode};
 use super::super::provenance::Attached;
 use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
-use crate::status::ReferenceSample;
 
 /// An open episode of its own clock, one second after the monotonic clock's zero.
 fn open(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {

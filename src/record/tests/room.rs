@@ -3,10 +3,10 @@
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
 use rapid_core::time::WallClock;
+use rapid_status::Event;
 use rapid_system::disk::Disk;
 
 use super::*;
-use crate::status::Event;
 
 const GIB: u64 = 1 << 30;
 

@@ -32,9 +32,7 @@ fn overwrite(file: &Path) -> File {
     file
 }
 
-async fn recorded(
-    deed: Deed,
-) -> (Bench, PathBuf, Option<File>, tokio::sync::broadcast::Receiver<crate::status::Event>) {
+async fn recorded(deed: Deed) -> (Bench, PathBuf, Option<File>, tokio::sync::broadcast::Receiver<rapid_status::Event>) {
     let bench = Bench::new();
     let events = bench.board.events();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use rapid_registry::simulation::SimDevice;
+
 use super::*;
 use crate::driver::camera::Mode;
-use crate::simulation::SimDevice;
 
 #[test]
 fn a_camera_is_configured_with_a_format_it_offers() {

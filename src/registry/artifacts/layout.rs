@@ -16,13 +16,10 @@ use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::MASK_TOPIC;
 use rapid_core::modality::ModalityKind;
 use rapid_core::observation::OBSERVATION_TOPIC;
+use rapid_core::topic::{FRAME_TOPIC, LOG_TOPIC};
 use serde_json::{Map, Value, json};
 
-use crate::registry::{CanProtocol, CanSpec, DeviceSpec, Form, NodeSpec, Quantity, Registry};
-
-/// Topics that only files have, and their readers know.
-pub(super) const FRAME_TOPIC: &str = "/rapid/frame";
-pub(super) const LOG_TOPIC: &str = "/rapid/log";
+use crate::{CanProtocol, CanSpec, DeviceSpec, Form, NodeSpec, Quantity, Registry};
 
 /// Numbers of a device that are plotted.
 const MOST_PLOTTED: u32 = 16;

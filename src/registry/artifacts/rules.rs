@@ -15,7 +15,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use super::HEADER;
-use crate::registry::spec::{
+use crate::spec::{
     CAN_RESTART_MS, CanProtocol, CanSpec, DeviceSpec, GpioInput, InputSpec, NodeSpec, Opens, Registry, UsbSpec,
 };
 

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use yaml_rust2::{Yaml, YamlLoader};
 
 use super::*;
-use crate::registry::{Form, IdentitySpec};
+use crate::{Form, IdentitySpec};
 
 fn text_of(all: &[Artifact], path: &str) -> String {
     all.iter().find(|artifact| artifact.path == Path::new(path)).unwrap().contents.clone()
@@ -158,7 +158,6 @@ fn the_layout_shows_every_device_and_places_every_panel_once() {
         }
         assert_eq!(panels.contains_key("Plot!action"), registry.actuator().is_some());
     }
-    assert_eq!((layout::FRAME_TOPIC, layout::LOG_TOPIC), (crate::episode::FRAME_TOPIC, crate::episode::LOG_TOPIC));
 }
 
 #[test]
@@ -226,7 +225,7 @@ fn a_can_interface_is_brought_up_with_the_bit_rate_of_its_entry() {
 fn the_service_may_open_usb_devices_only_where_a_program_does() {
     let program = "[device.a]\nvid = \"1\"\npid = \"1\"\nnode = \"p\"\n";
     let tty = format!("{program}[device.a.process]\nopens = \"tty\"\n");
-    for (text, usb) in [(program, true), (tty.as_str(), false), (crate::registry::BUILTIN, false)] {
+    for (text, usb) in [(program, true), (tty.as_str(), false), (crate::BUILTIN, false)] {
         let all = artifacts(&Registry::parse(text, None).unwrap().registry);
         let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
         let lines: Vec<_> = unit.lines().collect();
@@ -256,7 +255,7 @@ fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_or_button_needs_th
         (pedal, true, false),
         (panel, false, true),
     ] {
-        let text = format!("{}{stops}", crate::registry::BUILTIN);
+        let text = format!("{}{stops}", crate::BUILTIN);
         let all = artifacts(&Registry::parse(&text, None).unwrap().registry);
         let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
         assert_eq!(rules.contains("SUBSYSTEM==\"gpio\", KERNEL==\"gpiochip3\", GROUP=\"gpio\""), chips, "{rules}");

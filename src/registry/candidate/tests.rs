@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use super::*;
+use crate::BUILTIN;
 use crate::device::Unit;
-use crate::registry::BUILTIN;
 
 fn usb(ids: (u16, u16), serial: Option<&str>, port: &str) -> UsbIdentity {
     UsbIdentity {

@@ -1,7 +1,7 @@
 //! The difference, as data: a text, what is changed in it, and what a run makes of that.
 
 use super::*;
-use crate::registry::spec::LanFind;
+use crate::spec::LanFind;
 
 const RIG: &str = r#"
 [rig]

@@ -5,8 +5,8 @@ use std::time::Duration;
 use super::device::Draft;
 use super::identity::name_problem;
 use super::input::{self, INPUTS, LEVELS, are_one};
-use crate::registry::section::Section;
-use crate::registry::spec::{
+use crate::section::Section;
+use crate::spec::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
 };

@@ -15,10 +15,10 @@ use super::identity::name_problem;
 use super::program::{self, For, Programs};
 use super::verdict::{VerdictTable, Whose};
 use super::{form, identity, lan, motors, node, verdict};
-use crate::registry::columns::Vector;
-use crate::registry::section::Section;
-use crate::registry::spec::VerdictSpec;
-use crate::registry::spec::{
+use crate::columns::Vector;
+use crate::section::Section;
+use crate::spec::VerdictSpec;
+use crate::spec::{
     ActionSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens,
     PixelFormat,
 };

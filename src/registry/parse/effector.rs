@@ -5,10 +5,8 @@
 use rapid_core::action::MAX_ACTION;
 
 use super::program::Programs;
-use crate::registry::section::Section;
-use crate::registry::spec::{
-    ActionSpec, DamiaoSpec, EffectorSpec, GripperSpec, MOTOR_CHANNELS, MotorMode, TipRotation,
-};
+use crate::section::Section;
+use crate::spec::{ActionSpec, DamiaoSpec, EffectorSpec, GripperSpec, MOTOR_CHANNELS, MotorMode, TipRotation};
 
 /// The table.
 pub(super) const EFFECTOR: &str = "effector";

@@ -3,9 +3,9 @@
 use rapid_core::action::ACTION_TOPIC;
 
 use super::device::Draft;
-use crate::registry::columns::{ColumnError, Vector, choose};
-use crate::registry::section::Section;
-use crate::registry::spec::ExportSpec;
+use crate::columns::{ColumnError, Vector, choose};
+use crate::section::Section;
+use crate::spec::ExportSpec;
 
 const FIX: &str = "write NAME, NAME.0, NAME.0-5, or the names that its numbers have by its joints or pose";
 

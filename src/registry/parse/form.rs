@@ -4,8 +4,8 @@
 use rapid_core::modality::ModalityKind;
 use rapid_core::points::PacketFormat;
 
-use crate::registry::section::Section;
-use crate::registry::spec::{
+use crate::section::Section;
+use crate::spec::{
     CalibrationSpec, CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PointsSpec,
     PoseLayout, PoseSpec, Quantity, TipForm,
 };

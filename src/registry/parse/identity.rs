@@ -2,8 +2,8 @@
 //! `port`.
 
 use super::device::{IDENTITY_KEYS, Kind};
-use crate::registry::section::Section;
-use crate::registry::spec::{IdentitySpec, UsbSpec};
+use crate::section::Section;
+use crate::spec::{IdentitySpec, UsbSpec};
 
 /// In bytes.
 const LONGEST_NAME: usize = 64;

@@ -5,9 +5,9 @@ use std::str::FromStr as _;
 
 use super::device::Draft;
 use super::names;
-use crate::registry::diagnostic::did_you_mean;
-use crate::registry::section::Section;
-use crate::registry::spec::{Bound, InputSpec};
+use crate::diagnostic::did_you_mean;
+use crate::section::Section;
+use crate::spec::{Bound, InputSpec};
 
 /// The keys of which each stop and button has one.
 pub(super) const INPUTS: [&str; 4] = ["key", "gpio", "serial", "field"];

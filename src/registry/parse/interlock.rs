@@ -7,9 +7,9 @@ use rapid_core::interlock::{MAX_STOPS, StopKind};
 use super::device::{Draft, Kind};
 use super::identity::name_problem;
 use super::input::{self, INPUTS, LEVELS, are_one};
-use crate::registry::diagnostic::did_you_mean;
-use crate::registry::section::Section;
-use crate::registry::spec::{FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff};
+use crate::diagnostic::did_you_mean;
+use crate::section::Section;
+use crate::spec::{FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff};
 
 const KINDS: [(&str, StopKind); 2] = [("emergency", StopKind::Emergency), ("enabling", StopKind::Enabling)];
 /// A stop that is silent for this long is lost, unless its entry states otherwise.

@@ -7,10 +7,8 @@ use rapid_core::modality::ModalityKind;
 use rapid_core::remote;
 
 use super::device::{Draft, IDENTITY_KEYS};
-use crate::registry::section::Section;
-use crate::registry::spec::{
-    KINDS, LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, PixelFormat, Probe, RemoteSamples,
-};
+use crate::section::Section;
+use crate::spec::{KINDS, LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, PixelFormat, Probe, RemoteSamples};
 
 const KEYS: [&str; 8] = ["protocol", "mdns", "instance", "host", "port", "probe", "probe_port", "lease"];
 /// Keys of the table that only some protocols have.

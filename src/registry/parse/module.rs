@@ -3,9 +3,9 @@
 use super::device::Draft;
 use super::identity::name_problem;
 use super::names;
-use crate::registry::diagnostic::did_you_mean;
-use crate::registry::section::Section;
-use crate::registry::spec::{ModuleSpec, Mount, TransformSpec};
+use crate::diagnostic::did_you_mean;
+use crate::section::Section;
+use crate::spec::{ModuleSpec, Mount, TransformSpec};
 
 const TRANSFORM: &str = "transform";
 const POSITION: &str = "position";

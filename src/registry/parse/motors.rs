@@ -4,13 +4,13 @@ use std::time::Duration;
 
 use super::effector;
 use super::input::{LEVELS, gpio_line};
-use crate::registry::diagnostic::did_you_mean;
-use crate::registry::section::Section;
-use crate::registry::spec::{
+use crate::diagnostic::did_you_mean;
+use crate::section::Section;
+use crate::spec::{
     ActionSpec, BrakeSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotionSpec, MotorKind, MotorMode, MotorSpec,
     Mounting, NodeSpec, Stop, StopSpec, WatchSpec,
 };
-use crate::registry::units::show_duration;
+use crate::units::show_duration;
 
 const KEYS: [&str; 11] =
     ["name", "slave", "master", "type", "mode", "kp", "kd", "position", "velocity", "torque", "slew"];

@@ -8,10 +8,10 @@ use toml::de::DeValue;
 
 use super::device::Draft;
 use super::motors;
-use crate::registry::diagnostic::nearest;
-use crate::registry::section::Section;
-use crate::registry::spec::KINDS;
-use crate::registry::spec::{
+use crate::diagnostic::nearest;
+use crate::section::Section;
+use crate::spec::KINDS;
+use crate::spec::{
     CAN_BATCH, CAN_RECORD, CameraSpec, CanAdapter, CanProtocol, CanSpec, Framing, Hook, LanProtocol, LanSpec, NodeSpec,
     Opens, Parse, PixelFormat, ProcessSpec, SLCAN_BITRATES, SerialSpec,
 };

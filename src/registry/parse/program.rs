@@ -11,10 +11,10 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use super::device::Draft;
-use crate::registry::diagnostic::nearest;
-use crate::registry::section::{Section, printable};
-use crate::registry::spec::{Hook, Hooks};
-use crate::registry::trust::distrust;
+use crate::diagnostic::nearest;
+use crate::section::{Section, printable};
+use crate::spec::{Hook, Hooks};
+use crate::trust::distrust;
 
 /// Number of files beside the registry that are compared with a name that is not found.
 const MOST_COMPARED: usize = 1000;
@@ -232,7 +232,7 @@ mod tests {
 
     #[test]
     fn a_program_that_others_could_change_is_rejected_as_root_and_causes_a_warning_otherwise() {
-        use crate::registry::Registry;
+        use crate::Registry;
         let dir = tempfile::tempdir().unwrap();
         allow(dir.path(), 0o755);
         let (file, program) = (dir.path().join("devices.toml"), dir.path().join("p"));

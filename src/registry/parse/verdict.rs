@@ -10,8 +10,8 @@
 use std::iter::zip;
 use std::time::Duration;
 
-use crate::registry::section::Section;
-use crate::registry::spec::{Limits, VerdictSpec};
+use crate::section::Section;
+use crate::spec::{Limits, VerdictSpec};
 
 type Share = fn(&mut Limits) -> &mut Option<f64>;
 type Time = fn(&mut Limits) -> &mut Option<Duration>;

@@ -1,6 +1,6 @@
 //! `[export]`: which numbers the datasets made of a rig's episodes have.
 
-/// Which numbers a dataset has, in the grammar of [`columns`](crate::registry::columns): `[export]`, or `--state` and
+/// Which numbers a dataset has, in the grammar of [`columns`](crate::columns): `[export]`, or `--state` and
 /// `--action` of `rapid export`, whose defaults it has.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ExportSpec {

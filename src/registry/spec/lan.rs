@@ -154,7 +154,7 @@ impl LanFind {
     }
 
     /// The service that announces it, and the instance if only one is to match; both without regard to case.
-    pub(in crate::registry) fn announced(&self) -> Option<(&str, Option<&str>)> {
+    pub(crate) fn announced(&self) -> Option<(&str, Option<&str>)> {
         match self {
             Self::Mdns { service, instance } => Some((service.as_str(), instance.as_deref())),
             Self::Adapter { .. } | Self::Host { .. } => None,
@@ -185,14 +185,14 @@ pub fn own_side(peer: Option<IpAddr>) -> IpAddr {
 
 impl LanPicture {
     /// Pictures of a phone unless the entry states otherwise.
-    pub(in crate::registry) const OF_A_PHONE: Self = Self { width: 1920, height: 1440, fps: 30 };
+    pub(crate) const OF_A_PHONE: Self = Self { width: 1920, height: 1440, fps: 30 };
     /// Pictures of a camera unless the entry states otherwise.
-    pub(in crate::registry) const OF_A_CAMERA: Self = Self { width: 640, height: 480, fps: 30 };
+    pub(crate) const OF_A_CAMERA: Self = Self { width: 640, height: 480, fps: 30 };
 }
 
 impl LanSpec {
     /// Applies the rig's settings for the disk.
-    pub(in crate::registry) fn keep_free(&mut self, disk_reserve: Option<u64>) {
+    pub(crate) fn keep_free(&mut self, disk_reserve: Option<u64>) {
         if let LanProtocol::Gopro { reserve, .. } = &mut self.protocol {
             *reserve = disk_reserve;
         }
@@ -278,7 +278,7 @@ impl LanSpec {
     }
 
     /// Largest payload in bytes, and the least that may be written instead.
-    pub(in crate::registry) fn max_bytes(&self) -> (u64, u64) {
+    pub(crate) fn max_bytes(&self) -> (u64, u64) {
         /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
         const SMALLEST_JPEG: u64 = 64 << 10;
         match (self.modality_kind(), self.picture()) {

@@ -68,7 +68,7 @@ pub fn mounted<'a>(modules: &'a [ModuleSpec], names: &[String]) -> Result<Vec<&'
             let fix = if modules.is_empty() {
                 "it names no modules: write one, or use --tag".to_owned()
             } else {
-                crate::registry::did_you_mean(name, modules.iter().map(|module| &module.name), "modules are")
+                crate::did_you_mean(name, modules.iter().map(|module| &module.name), "modules are")
             };
             return Err(ModuleError::Unknown { name: name.clone(), fix });
         };

@@ -4,8 +4,9 @@ mod simulator;
 
 use std::path::PathBuf;
 
+use rapid_registry::device::{DeviceNode, UsbIdentity};
+
 use super::*;
-use crate::device::{DeviceNode, UsbIdentity};
 
 fn registry(entries: &[(&str, u8)]) -> Registry {
     let entry = |(serial, bit): &(&str, u8)| {

@@ -10,19 +10,19 @@ use futures::future::BoxFuture;
 use rapid_core::action::Order;
 use rapid_core::provenance::UnplugSource;
 use rapid_core::sync::WhenStale;
-use tokio::sync::{broadcast, watch};
-
-use super::*;
-use crate::device::{DeviceNode, UsbIdentity};
-use crate::hotplug::{HotplugError, HotplugEvent};
-use crate::patience::PATIENCE;
-use crate::registry::{
+use rapid_registry::device::{DeviceNode, UsbIdentity};
+use rapid_registry::simulation::{SimDevice, SimSource};
+use rapid_registry::{
     ExportSpec, Framing, IdentitySpec, InferenceSpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec,
     SerialSpec, UsbSpec,
 };
+use rapid_status::Event;
+use tokio::sync::{broadcast, watch};
+
+use super::*;
+use crate::hotplug::{HotplugError, HotplugEvent};
+use crate::patience::PATIENCE;
 use crate::rig::presence::{Claim, read_mask};
-use crate::simulation::{SimDevice, SimSource};
-use crate::status::Event;
 
 mod actuator;
 
@@ -44,8 +44,8 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         latency: Duration::ZERO,
         form: None,
         action: None,
-        hooks: crate::registry::Hooks::default(),
-        verdict: crate::registry::VerdictSpec::of(
+        hooks: rapid_registry::Hooks::default(),
+        verdict: rapid_registry::VerdictSpec::of(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),
@@ -161,7 +161,7 @@ impl Bench {
                 let begun = Instant::now();
                 loop {
                     let units = self.board.snapshot().unregistered;
-                    let is_at = |(unit, port): (&crate::status::UnregisteredDevice, &&str)| {
+                    let is_at = |(unit, port): (&rapid_status::UnregisteredDevice, &&str)| {
                         unit.device == format!("0001:0002  port {port}  no serial  (no product name)")
                             && (unit.node.as_str(), unit.name.is_none()) == ("serial", true)
                     };
@@ -420,7 +420,7 @@ async fn devices_are_notified_of_the_episode_in_progress() {
     };
     let begin = |number: u8| {
         let file = PathBuf::from(format!("/episodes/{number}.mcap"));
-        notify.send_replace(Some(Arc::new(crate::status::Episode::new(&file))));
+        notify.send_replace(Some(Arc::new(rapid_status::Episode::new(&file))));
     };
 
     for step in [Plug("1", CHANNELS), Until("a streaming")] {
@@ -492,7 +492,7 @@ async fn a_stream_that_panics_is_started_again_and_its_bit_stays_clear() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_end_is_announced_before_a_slow_device_has_closed() {
-    use crate::simulation::SimFaults;
+    use rapid_registry::simulation::SimFaults;
     let registry = registry(Duration::ZERO, Duration::from_secs(1));
     let name = format!("ending{}", std::process::id());
     let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::time::{realtime_ns, rfc3339};
+use rapid_status::SlotState;
 use rapid_system::folder::{Folder, Links, Missing, Sync};
 use serde::Serialize;
 
 use super::PresenceError;
-use crate::status::SlotState;
 
 /// One device of the JSON file.
 #[derive(Debug, Clone, PartialEq, Serialize)]

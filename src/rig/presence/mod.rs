@@ -16,15 +16,14 @@ use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use rapid_bus::Writer;
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::{Stamp, realtime_ns};
+use rapid_status::Board;
+use rapid_system::fault;
 use rapid_system::realtime::{MASK_PRIORITY, use_fifo};
 use tokio_util::sync::{CancellationToken, DropGuard};
-
-use crate::bus::Writer;
-use crate::fault;
-use crate::status::Board;
 
 pub use file::{PresenceError, instances, read_mask};
 pub use json::{JsonDevice, json_path};

@@ -10,13 +10,13 @@ use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_bus::{Actions, watch};
 use rapid_core::action::{ActionSource, MAX_ACTION};
 use rapid_core::permission::{Attended, Permission};
 use tokio::io::unix::AsyncFd;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use super::source::Source;
-use crate::bus::{Actions, watch};
 use crate::driver::DriverError;
 
 /// See the module's comment.

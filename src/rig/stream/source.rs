@@ -6,14 +6,14 @@ use std::time::Duration;
 use rapid_core::action::{ActionSource, ActuatorNotice, Order};
 use rapid_core::permission::Attended;
 use rapid_core::provenance::Negotiated;
+use rapid_registry::NodeSpec;
+use rapid_status::Episode;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::{CLOSE_LIMIT, Stream};
 use crate::driver::{ClockOffset, Driver, DriverError, Reading};
-use crate::registry::NodeSpec;
 use crate::rig::worker::{MOST_SILENT_BEATS, Worker};
-use crate::status::Episode;
 
 /// The source of a stream's samples.
 #[derive(Debug)]

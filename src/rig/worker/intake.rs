@@ -13,8 +13,7 @@ use std::time::Duration;
 use rapid_core::modality::{ModalityId, ModalityKind};
 use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, SampleHeader};
 use rapid_core::time::Stamp;
-
-use crate::registry::ProcessSpec;
+use rapid_registry::ProcessSpec;
 
 /// A sample that claims to be older than this is not believed.
 const OLDEST: Duration = Duration::from_secs(10);

@@ -7,16 +7,16 @@ use std::os::unix::process::ExitStatusExt;
 use std::process::ExitStatus;
 use std::time::Duration;
 
+use rapid_bus::Membership;
+use rapid_status::Level;
 use tokio::sync::{OwnedMutexGuard, oneshot};
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::super::output::Output;
 use super::super::programs::Programs;
-use crate::bus::Membership;
 use crate::driver::DriverError;
 use crate::driver::process::{Child, Launch};
-use crate::status::Level;
 
 /// How long a child has to end after SIGTERM.
 pub(in crate::rig) const TERM_LIMIT: Duration = Duration::from_secs(5);

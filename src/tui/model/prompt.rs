@@ -3,10 +3,10 @@
 //! Invariant: while a text is typed, letters are text: none of them begins, ends or discards anything.
 
 use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+use rapid_status::session::{EpisodeEntry, Label, SessionRequest, SessionStatus};
+use rapid_status::{Command, UnregisteredDevice};
 
 use super::{Effect, Model, Quit};
-use crate::status::session::{EpisodeEntry, Label, SessionRequest, SessionStatus};
-use crate::status::{Command, UnregisteredDevice};
 
 /// Devices without an entry, and their names.
 #[derive(Debug, Default)]

@@ -7,8 +7,8 @@ use std::collections::VecDeque;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
+use rapid_status::preview::Preview;
 
-use crate::status::preview::Preview;
 use crate::tui::lidar::Sweep;
 use crate::tui::picture::Picture;
 

@@ -1,10 +1,10 @@
+use crate::literal::{TAKEN, every_state, id, line, recording, three_streaming};
 use crossterm::event::KeyCode;
 use rapid_core::mask::PhysicalMask;
+use rapid_status::session::{Answered, EpisodeEntry, Label, SessionRequest, SessionStatus};
+use rapid_status::{Grade, Level, UnregisteredDevice};
 
 use super::*;
-use crate::status::literal::{TAKEN, every_state, id, line, recording, three_streaming};
-use crate::status::session::{Answered, EpisodeEntry, Label, SessionRequest, SessionStatus};
-use crate::status::{Grade, Level, UnregisteredDevice};
 
 fn press(code: KeyCode) -> Msg {
     Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))
@@ -251,7 +251,7 @@ fn a_held_space_bar_begins_one_episode_and_a_second_press_ends_it() {
     let mut model = Model::new(three_streaming());
     let mut presses = |times: &[u64], recording: bool| {
         let mut snapshot = three_streaming();
-        snapshot.recording = recording.then(|| crate::status::literal::recording(0));
+        snapshot.recording = recording.then(|| crate::literal::recording(0));
         let effect = |ms: &u64| {
             model.update(after(&snapshot, *ms));
             model.update(space())
@@ -269,7 +269,7 @@ fn a_held_space_bar_begins_one_episode_and_a_second_press_ends_it() {
 #[test]
 fn an_announcement_ends_with_what_it_announces() {
     let mut recording = three_streaming();
-    recording.recording = Some(crate::status::literal::recording(0));
+    recording.recording = Some(crate::literal::recording(0));
     let mut failed = three_streaming();
     failed.not_started = Some("the disk is full".to_owned());
     for (before, then) in
@@ -289,7 +289,7 @@ fn an_announcement_ends_with_what_it_announces() {
 fn the_bell_rings_at_begin_end_and_each_loss_unless_it_is_off() {
     let quiet = three_streaming();
     let mut recording = quiet.clone();
-    recording.recording = Some(crate::status::literal::recording(0));
+    recording.recording = Some(crate::literal::recording(0));
     for lost in [SlotState::Absent, SlotState::Stalled, SlotState::Backoff, SlotState::Failed, SlotState::Opening] {
         let mut without = recording.clone();
         without.devices[1].state = lost;
@@ -675,7 +675,7 @@ fn a_line_that_is_too_slow_for_pictures_shows_none() {
         height: 4,
         bytes: payload.len(),
         payload: payload.into(),
-        ..Preview::default()
+        ..crate::literal::preview()
     })];
     let mut model = Model::new(now.clone());
     // The rig alone is small: whatever the line does, there is nothing to leave out.

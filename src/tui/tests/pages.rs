@@ -1,12 +1,12 @@
 //! The pages, and the column beside the rig.
 
+use crate::literal::id;
 use rapid_core::sample::Encoding;
+use rapid_status::detail::{Channel, DeviceDetail, Intervals};
+use rapid_status::preview::Preview;
+use rapid_status::session::Mark;
 
 use super::*;
-use crate::status::detail::{Channel, DeviceDetail, Intervals};
-use crate::status::literal::id;
-use crate::status::preview::Preview;
-use crate::status::session::Mark;
 
 /// What is known of a device, with so many intervals around `hz`.
 fn detail(bit: u8, channels: Vec<Channel>) -> DeviceDetail {
@@ -136,10 +136,10 @@ fn bytes_are_shown_as_bytes_and_a_device_without_samples_says_so() {
 #[test]
 fn the_log_has_a_page_with_its_filters() {
     let mut snapshot = with(three_streaming(), detail(0, Vec::new()), picture());
-    snapshot.log.push(Arc::new(crate::status::LogLine {
-        printed: Some(crate::status::PrintedOn::Stderr),
+    snapshot.log.push(Arc::new(rapid_status::LogLine {
+        printed: Some(rapid_status::PrintedOn::Stderr),
         text: "tof: Traceback (most recent call last), a line that is so long that it does not fit into the width of the screen".to_owned(),
-        ..crate::status::LogLine::clone(&line(4, Level::Info, "tof: x"))
+        ..rapid_status::LogLine::clone(&line(4, Level::Info, "tof: x"))
     }));
     let mut model = measured(&snapshot);
     for key in ['l', 'w'] {

@@ -1,8 +1,9 @@
 //! The policy panel: acting, holding, dry, and with more content than fits.
 
+use crate::literal::policy;
+use rapid_status::{Hold, PolicyStatus};
+
 use super::*;
-use crate::status::literal::policy;
-use crate::status::{Hold, PolicyStatus};
 
 const SMALL: (u16, u16) = (60, 12);
 const USUAL: (u16, u16) = (80, 24);

@@ -11,12 +11,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use futures::StreamExt;
-use rapid::bus::TopicId;
-use rapid::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid::driver::can::raw::Raw;
 use rapid::hotplug::HotplugEvent;
-use rapid::registry::{CAN_RECORD, Registry};
+use rapid_bus::TopicId;
 use rapid_core::time::Stamp;
+use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
+use rapid_registry::{CAN_RECORD, Registry};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use vbench::emu::can::Frame;
 use vbench::emu::can::damiao;

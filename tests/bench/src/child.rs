@@ -12,10 +12,10 @@ use clap::Subcommand;
 use mcap::WriteOptions;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
-use rapid::device::DeviceNode;
 use rapid::driver::Driver;
-use rapid::simulation::SimDevice;
 use rapid_core::time::Stamp;
+use rapid_registry::device::DeviceNode;
+use rapid_registry::simulation::SimDevice;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 

@@ -7,16 +7,16 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use rapid::bus::{Bus, TopicId};
-use rapid::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid::hotplug::{HotplugEvent, HotplugStream};
 use rapid::orders::receive::Orders;
-use rapid::registry::Registry;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
-use rapid::status::Board;
+use rapid_bus::{Bus, TopicId};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
+use rapid_status::Board;
 use tokio_util::sync::CancellationToken;
 
 use crate::figure::Figure;

@@ -3,7 +3,7 @@
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use rapid::simulation::task::STEP_HZ;
+use rapid_registry::simulation::task::STEP_HZ;
 use serde_json::Value;
 
 use crate::figure::Figure;

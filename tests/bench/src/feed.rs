@@ -2,15 +2,15 @@
 
 use std::sync::Arc;
 
-use rapid::bus::TopicId;
 use rapid::driver::sim;
 use rapid::episode::encode;
 use rapid::episode::schema::{self, SampleSchema};
-use rapid::registry::Registry;
-use rapid::registry::scenario::Scenario;
-use rapid::simulation::SimSource;
+use rapid_bus::TopicId;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_registry::Registry;
+use rapid_registry::scenario::Scenario;
+use rapid_registry::simulation::SimSource;
 
 use crate::Failure;
 

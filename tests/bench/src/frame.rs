@@ -5,16 +5,16 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use rapid::bus::{Bus, Inbox, TopicId};
 use rapid::hotplug::HotplugStream;
 use rapid::hotplug::script::Script;
 use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
-use rapid::registry::Registry;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
-use rapid::status::Board;
+use rapid_bus::{Bus, Inbox, TopicId};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_registry::Registry;
+use rapid_status::Board;
 use tokio_util::sync::CancellationToken;
 
 use crate::beat::sleep_until;

@@ -11,13 +11,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use rapid::bus::{Bus, TopicId, Writer};
 use rapid::control::can::CanFrame;
 use rapid::control::motors::MotorBus;
 use rapid::driver::can::link::Link;
 use rapid::driver::can::motors::{Motors, Punctuality};
-use rapid::random::Random;
+use rapid_bus::{Bus, TopicId, Writer};
 use rapid_core::action::Order;
+use rapid_core::random::Random;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
 

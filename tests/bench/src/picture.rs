@@ -6,10 +6,10 @@ use std::time::Instant;
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid::policy::picture::{Picture, Preprocessor};
-use rapid::random::Random;
-use rapid::simulation::TaskPart;
-use rapid::simulation::task::{Expert, SIDE, Trial};
+use rapid_core::random::Random;
 use rapid_core::sample::Encoding;
+use rapid_registry::simulation::TaskPart;
+use rapid_registry::simulation::task::{Expert, SIDE, Trial};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 

@@ -12,11 +12,11 @@ use rapid::policy::model::Model;
 use rapid::policy::observation::ObservationTensors;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::{Computing, Sampler};
-use rapid::random::Random;
-use rapid::registry::InferenceSpec;
-use rapid::registry::task::PARTS;
-use rapid::simulation::task::{Expert, Trial, layout};
+use rapid_core::random::Random;
 use rapid_core::sample::SampleHeader;
+use rapid_registry::InferenceSpec;
+use rapid_registry::simulation::task::{Expert, Trial, layout};
+use rapid_registry::task::PARTS;
 
 use crate::child::thread_cpu_s;
 use crate::figure::Figure;

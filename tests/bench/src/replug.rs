@@ -8,15 +8,15 @@ use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use futures::Stream;
-use rapid::bus::TopicId;
-use rapid::device::DeviceNode;
 use rapid::driver::Driver;
 use rapid::hotplug::script::Script;
 use rapid::hotplug::{HotplugError, HotplugEvent};
-use rapid::registry::scenario::{ScenarioAction, ScenarioEvent};
-use rapid::simulation::SimDevice;
+use rapid_bus::TopicId;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_registry::device::DeviceNode;
+use rapid_registry::scenario::{ScenarioAction, ScenarioEvent};
+use rapid_registry::simulation::SimDevice;
 
 use crate::feed;
 use crate::figure::Figure;

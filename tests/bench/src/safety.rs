@@ -13,8 +13,8 @@ use std::time::Duration;
 use rapid::control::can::CanFrame;
 use rapid::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Ranges, StateCommand};
 use rapid::control::damiao::parameter::Reply;
-use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use rapid_core::time::Stamp;
+use rapid_registry::{DamiaoSpec, MotorMode, Stop};
 
 use self::motor_world::motor_spec::{brake, bus, motor};
 use self::motor_world::{CYCLE, Input, Program, World};
@@ -223,7 +223,7 @@ fn plain(spec: DamiaoSpec, holds: Rc<Cell<bool>>) -> Program {
 
 impl Axis {
     /// The frame of a cycle: towards the target, as far from the motor's reported position as the torque limit allows.
-    fn follow(&mut self, motor: &rapid::registry::MotorSpec, ranges: &Ranges) -> Option<CanFrame> {
+    fn follow(&mut self, motor: &rapid_registry::MotorSpec, ranges: &Ranges) -> Option<CanFrame> {
         let [kp, kd] = GAINS;
         // The first frame queries the position: without gains nothing moves, and a joint held by hand stays.
         let Some(feedback) = self.feedback else {

@@ -9,11 +9,11 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
 use mcap::{Compression, WriteOptions};
-use rapid::bus::TopicId;
 use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Sink, Source};
-use rapid::status::Board;
+use rapid_bus::TopicId;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_status::Board;
 
 use crate::child::{self, Plain, process_cpu_s, thread_cpu_s};
 use crate::feed::{self, Feed, Lane};

@@ -6,12 +6,12 @@ use std::net::{Ipv4Addr, Ipv6Addr};
 use std::path::Path;
 use std::time::Duration;
 
-use rapid::registry::artifacts::{ArtifactKind, artifacts};
-use rapid::registry::{
+use rapid_core::modality::ModalityKind;
+use rapid_registry::artifacts::{ArtifactKind, artifacts};
+use rapid_registry::{
     ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Hook, InputSpec, InterlockSpec, LanFind, LanProtocol, LanSpec,
     NodeSpec, ProcessSpec, Registry,
 };
-use rapid_core::modality::ModalityKind;
 use yaml_rust2::{Yaml, YamlLoader};
 
 use crate::rules::{self, Token};

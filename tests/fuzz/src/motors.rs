@@ -9,8 +9,8 @@ use rapid::control::can::CanFrame;
 use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
 use rapid::control::damiao::parameter::{Parameter, Reply, Value};
 use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
-use rapid::registry::{DamiaoSpec, MotorMode, MotorSpec};
 use rapid_core::time::Stamp;
+use rapid_registry::{DamiaoSpec, MotorMode, MotorSpec};
 
 /// Bytes of one thing that happens: what, a number, and eight more.
 const RECORD: usize = 10;

@@ -8,12 +8,12 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions};
 use rapid::episode::encode;
 use rapid::episode::schema::{self, SampleSchema};
-use rapid::registry::{BUILTIN, Registry};
-use rapid::status::Level;
 use rapid_core::mask::{MaskRecord, PhysicalMask};
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_registry::{BUILTIN, Registry};
+use rapid_status::Level;
 
 /// The registries the tests know, good and bad.
 #[must_use]

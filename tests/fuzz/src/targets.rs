@@ -7,16 +7,16 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid::commands;
-use rapid::device::{Attachment, DeviceNode, Unit, UsbIdentity};
 use rapid::driver;
 use rapid::episode::recover::recover_bytes;
-use rapid::palette::Palette;
 use rapid::record::inspect as inspection;
-use rapid::registry::scenario::Scenario;
-use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
-use rapid::registry::{Assigner, Assignment, Framing, Parse, Registry, RegistryErrors, SerialSpec};
 use rapid_core::mask::{MaskRecord, RECORD_LEN};
 use rapid_core::text as shown;
+use rapid_registry::device::{Attachment, DeviceNode, Unit, UsbIdentity};
+use rapid_registry::scenario::Scenario;
+use rapid_registry::units::{parse_duration, parse_size, show_duration, show_size};
+use rapid_registry::{Assigner, Assignment, Framing, Parse, Registry, RegistryErrors, SerialSpec};
+use rapid_status::palette::Palette;
 
 use crate::artifacts;
 

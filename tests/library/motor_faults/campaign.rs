@@ -10,9 +10,9 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use rapid::control::motors::Notice;
-use rapid::random::Random;
-use rapid::registry::{DamiaoSpec, MotorMode, Stop};
+use rapid_core::random::Random;
 use rapid_core::time::Stamp;
+use rapid_registry::{DamiaoSpec, MotorMode, Stop};
 
 use crate::support::motor_world::motor_spec::{brake, bus, motor};
 use crate::support::motor_world::{CYCLE, World};

@@ -1,8 +1,8 @@
 use proptest::prelude::*;
+use rapid_registry::MotorKind;
 
 use super::*;
 use crate::control::damiao::model::{is_shipped, shipped};
-use crate::registry::MotorKind;
 
 #[test]
 fn replies_are_read_by_the_type_of_their_parameter() {

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::Stop;
 
 use super::{Motor, Phase};
-use crate::registry::Stop;
 
 /// What is known of a brake.
 #[derive(Debug, Clone, Copy, Default)]

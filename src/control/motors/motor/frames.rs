@@ -1,12 +1,13 @@
 //! The frames of a motor that carry numbers, as those of its joint: only here does a number of a joint become one of a motor,
-//! or the other way round, by [`Mounting`](crate::registry::Mounting).
+//! or the other way round, by [`Mounting`](rapid_registry::Mounting).
 //!
 //! Invariant: every position, velocity and torque in [`Motor`], and of whatever uses it, is of the joint.
+
+use rapid_registry::MotorSpec;
 
 use super::Motor;
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, Mit, NotFinite, Ranges};
-use crate::registry::MotorSpec;
 
 /// The positions of a joint, rad, that are within its limits and that its motor can encode, which is from `-range` to
 /// `range`: those beyond can be neither sent nor reported. The lower end is above the upper one if there are none.

@@ -1,6 +1,7 @@
 //! What a motor reports, judged by its [`Supervision`](crate::control::motors::watch::Supervision).
 
 use rapid_core::time::Stamp;
+use rapid_registry::{MotorMode, Stop};
 
 use super::{Motor, Phase};
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
@@ -9,7 +10,6 @@ use crate::control::motors::fault::Fault;
 use crate::control::motors::notice::Notice;
 use crate::control::motors::notices::Notices;
 use crate::control::motors::watch::{Commanded, beyond, fast};
-use crate::registry::{MotorMode, Stop};
 
 /// So many frames in a row make sure that a motor has turned itself off.
 const SURE: u8 = 2;

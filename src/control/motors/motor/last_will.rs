@@ -1,9 +1,10 @@
 //! What a motor is sent when this program can send nothing any more.
 
+use rapid_registry::{MotorMode, Stop};
+
 use super::{Motor, Phase};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{Feedback, StateCommand};
-use crate::registry::{MotorMode, Stop};
 
 impl Motor {
     /// The frame that keeps the motor from falling, or from falling fast, while no program reads what it reports; one that

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::MotorMode;
 
 use super::frames::within;
 use super::{Motor, Phase};
@@ -13,7 +14,6 @@ use crate::control::damiao::parameter::{self, ControlMode, Parameter, Reply, Val
 use crate::control::motors::fault::Fault;
 use crate::control::motors::notice::Notice;
 use crate::control::motors::notices::Notices;
-use crate::registry::MotorMode;
 
 /// What is read, in this order.
 pub(super) const PROBE: [Parameter; 5] =

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::{MotorMode, Stop, StopSpec};
 
 use super::{Motor, Phase};
-use crate::registry::{MotorMode, Stop, StopSpec};
 
 impl Motor {
     /// Stops it at a fault; `is_own`: its own. One that is not on is turned off; one that is kept already stays so, but for

@@ -1,10 +1,10 @@
 //! Whatever happens, in whatever order: the judge of [`World`] sees every frame.
 
 use proptest::prelude::*;
+use rapid_registry::{Mounting, Stop};
 
 use super::*;
 use crate::control::damiao::codec::StateCommand;
-use crate::registry::{Mounting, Stop};
 
 /// What happens next.
 #[derive(Debug, Clone)]

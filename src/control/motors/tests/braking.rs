@@ -1,9 +1,9 @@
 //! Joints with a brake.
 
 use rapid_core::action::Trip;
+use rapid_registry::{Stop, StopSpec};
 
 use super::*;
-use crate::registry::{Stop, StopSpec};
 use world::brake;
 
 /// Two motors, the second of which has a brake and stops in these ways.

@@ -2,10 +2,10 @@
 //! everything else is of the joint.
 
 use proptest::prelude::*;
+use rapid_registry::{Mounting, Stop};
 
 use super::*;
 use crate::control::damiao::codec::{Feedback, Ranges};
-use crate::registry::{Mounting, Stop};
 
 const MOUNTINGS: [Mounting; 3] = [
     Mounting { zero: 1.25, reversed: false },

@@ -1,8 +1,9 @@
 //! How motors start: near to where they are, softly, and after every fault that they have latched was reported.
 
+use rapid_registry::MotionSpec;
+
 use super::world::CYCLE;
 use super::*;
-use crate::registry::MotionSpec;
 
 /// A motor in MIT mode that starts as one does by default, and has answered.
 fn ready(slew: f64) -> World {

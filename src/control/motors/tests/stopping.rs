@@ -1,9 +1,9 @@
 //! How joints stop at a fault: each in its way, and none until the next arm in another.
 
 use rapid_core::action::Trip;
+use rapid_registry::{Stop, StopSpec};
 
 use super::*;
-use crate::registry::{Stop, StopSpec};
 
 /// Two motors that are armed, the second of which stops in this way.
 fn armed(mode: MotorMode, stop: StopSpec) -> World {

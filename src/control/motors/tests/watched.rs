@@ -2,10 +2,11 @@
 
 use std::f64::consts::TAU;
 
+use rapid_registry::MotorSpec;
+
 use super::world::CYCLE;
 use super::*;
 use crate::control::damiao::parameter::{Parameter, Value};
-use crate::registry::MotorSpec;
 
 /// One motor that is armed, changed by `change` before.
 fn armed(change: impl Fn(&mut MotorSpec)) -> World {

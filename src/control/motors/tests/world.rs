@@ -3,11 +3,11 @@
 use std::collections::VecDeque;
 
 use rapid_core::action::Trip;
+use rapid_registry::{BrakeSpec, MotionSpec, MotorKind, MotorSpec, Mounting, Stop, StopSpec, WatchSpec};
 
 use super::*;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
-use crate::registry::{BrakeSpec, MotionSpec, MotorKind, MotorSpec, Mounting, Stop, StopSpec, WatchSpec};
 
 pub(super) const CYCLE: Duration = Duration::from_millis(5);
 

@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::{BrakeSpec, CanAdapter, MAX_MOTORS};
 use rapid_system::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -19,7 +20,6 @@ use crate::control::can::CanFrame;
 use crate::control::damiao::codec::StateCommand;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::{damiao_serial, slcan, socket};
-use crate::registry::{BrakeSpec, CanAdapter, MAX_MOTORS};
 
 /// From one round of frames to the next.
 const ROUND: Duration = Duration::from_millis(5);

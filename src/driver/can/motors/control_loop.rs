@@ -21,6 +21,8 @@ use std::time::Duration;
 use rapid_core::action::{ActionSource, ActuatorNotice, Arming, MAX_ACTION, Order, OrderSlot};
 use rapid_core::permission::Attended;
 use rapid_core::time::Stamp;
+use rapid_registry::{DamiaoSpec, MAX_MOTORS};
+use rapid_system::fault;
 use rapid_system::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
 use tokio::sync::mpsc;
 
@@ -31,8 +33,6 @@ use crate::control::motors::{BusState, SAMPLE_VALUES};
 use crate::control::pace::Pace;
 use crate::driver::DriverError;
 use crate::driver::can::link::LinkError;
-use crate::fault;
-use crate::registry::{DamiaoSpec, MAX_MOTORS};
 
 /// Frames taken after the deadline of a cycle: a flooded bus must not keep the motors from their commands.
 const LATE_FRAMES: usize = 64;

@@ -18,10 +18,10 @@ use rapid_core::action::{ActionSource, MAX_ACTION, NoAction};
 use rapid_core::bell::Bell;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_registry::{MAX_MOTORS, MOTOR_CHANNELS};
 use rustix::event::{PollFd, PollFlags, Timespec};
 
 use crate::kinematics::{Arm, Solver};
-use crate::registry::{MAX_MOTORS, MOTOR_CHANNELS};
 
 /// The longest time that an action without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);

@@ -4,6 +4,7 @@ use std::io;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_registry::DamiaoSpec;
 
 use crate::control::can::CanFrame;
 use crate::control::motors::MotorBus;
@@ -11,7 +12,6 @@ use crate::driver::can::brakes::Brakes;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::guard::Guard;
 use crate::driver::can::link::{Link, LinkError};
-use crate::registry::DamiaoSpec;
 
 /// The least number of times that motors are ordered to turn off, [`AGAIN`] apart: a frame may be lost.
 const TURN_OFF: usize = 3;

@@ -11,6 +11,9 @@ use rapid_core::action::{Arming, NoAction};
 use rapid_core::interlock::{InputState, Interlocks, StopKind};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_registry::{
+    EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, TipRotation, WatchSpec,
+};
 use tokio::time::{Instant, interval, timeout};
 
 use super::*;
@@ -20,9 +23,6 @@ use crate::control::damiao::parameter::{Parameter, Reply, Value};
 use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
 use crate::patience::PATIENCE;
-use crate::registry::{
-    EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, TipRotation, WatchSpec,
-};
 
 fn spec(count: u16, hz: u32) -> DamiaoSpec {
     let motor = |slave: u16| MotorSpec {

@@ -19,6 +19,7 @@ use std::time::Duration;
 
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
+use rapid_registry::{LanPicture, PREVIEW_DECODER as DECODER, own_side};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::UdpSocket;
 use tokio::net::unix::pipe;
@@ -31,7 +32,6 @@ use super::super::multipart::{Cut, Multipart};
 use super::super::place::Server;
 use super::ask;
 use crate::driver::{DriverError, Reading};
-use crate::registry::{LanPicture, PREVIEW_DECODER as DECODER, own_side};
 
 /// Without a packet for this long the stream is requested again.
 const SILENT: Duration = Duration::from_secs(3);

@@ -4,13 +4,13 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use rapid_registry::device::{DeviceNode, LastReceived};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 
 use super::answer::Name;
 use super::clip::Failure;
 use super::*;
-use crate::device::{DeviceNode, LastReceived};
 use crate::patience::PATIENCE;
 
 /// A camera that has a clip and interrupts it this many times; with counts of requests.

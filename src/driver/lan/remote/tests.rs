@@ -1,12 +1,12 @@
 use std::net::{Ipv4Addr, SocketAddr};
 
 use rapid_core::remote::{LONGEST_REASON, requested};
+use rapid_registry::LanPicture;
+use rapid_registry::device::{DeviceNode, LastReceived};
 use tokio::net::TcpListener;
 
 use super::super::place::Place;
 use super::*;
-use crate::device::{DeviceNode, LastReceived};
-use crate::registry::LanPicture;
 
 const PICTURES: RemoteSamples = RemoteSamples::Pictures(LanPicture { width: 4, height: 2, fps: 30 }, PixelFormat::Grey);
 const LEASE: Duration = Duration::from_secs(30);

@@ -1,8 +1,8 @@
+use rapid_registry::device::{Attachment, DeviceNode, Unit};
 use tokio::sync::mpsc;
 
 use super::super::super::HotplugEvent;
 use super::*;
-use crate::device::{Attachment, DeviceNode, Unit};
 
 const LEASE: Duration = Duration::from_secs(3);
 

@@ -1,11 +1,11 @@
 use std::net::IpAddr;
 
+use rapid_registry::device::DeviceNode;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
 use super::super::super::HotplugEvent;
 use super::*;
-use crate::device::DeviceNode;
 
 const LOCAL: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
 

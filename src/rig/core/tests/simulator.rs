@@ -5,9 +5,10 @@
 
 use std::path::PathBuf;
 
+use rapid_core::random::Random;
+use rapid_registry::device::{DeviceNode, UsbIdentity};
+
 use super::super::*;
-use crate::device::{DeviceNode, UsbIdentity};
-use crate::random::Random;
 
 const SEEDS: u64 = 1000;
 const STEPS: u64 = 1000;

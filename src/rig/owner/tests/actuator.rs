@@ -1,10 +1,11 @@
 //! An actuator: simulated motors, which only an order arms.
 
-use super::*;
-use crate::registry::{
+use rapid_registry::{
     ActionSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, MOTOR_CHANNELS, MotionSpec, MotorKind, MotorMode,
     MotorSpec, Mounting, StopSpec, WatchSpec,
 };
+
+use super::*;
 
 const NUMBERS: usize = MOTOR_CHANNELS;
 

@@ -1,7 +1,7 @@
 use proptest::prelude::*;
+use rapid_registry::Opens;
 
 use super::*;
-use crate::registry::Opens;
 
 const NOW: Stamp = Stamp(100_000_000_000);
 

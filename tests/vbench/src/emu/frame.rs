@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use rapid_jpeg::{EncodeError, Values};
+use rapid_pictures::jpeg::{EncodeError, Values};
 
 use super::spec::CAMERAS;
 
@@ -62,7 +62,7 @@ pub fn jpegs(width: u16, height: u16) -> Result<Vec<Vec<u8>>, EncodeError> {
     (0..PICTURES)
         .map(|picture| {
             let mut jpeg = Vec::new();
-            rapid_jpeg::encode(&gray(width, height, picture), [height, width], Values::Grey, 80, &mut jpeg)?;
+            rapid_pictures::jpeg::encode(&gray(width, height, picture), [height, width], Values::Grey, 80, &mut jpeg)?;
             Ok(jpeg)
         })
         .collect()

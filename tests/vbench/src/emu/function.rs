@@ -40,7 +40,7 @@ pub enum ContentError {
         /// Pixels down.
         height: u16,
         /// Why.
-        source: rapid_jpeg::EncodeError,
+        source: rapid_pictures::jpeg::EncodeError,
     },
     /// The feed cannot be read.
     #[error(transparent)]

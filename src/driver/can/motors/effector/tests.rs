@@ -2,9 +2,10 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
+use rapid_registry::{CanProtocol, CanSpec, NodeSpec, Registry};
+
 use super::*;
 use crate::patience::PATIENCE;
-use crate::registry::{CanProtocol, CanSpec, NodeSpec, Registry};
 
 /// The arm of the tests, as `tests/arm/devices.toml` declares it.
 fn effector() -> Effector {

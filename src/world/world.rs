@@ -9,7 +9,7 @@
 //!
 //! Invariant: random numbers for the appearance do not affect the dynamics, and the reverse: each has its own stream.
 
-use rapid_random::Random;
+use rapid_core::random::Random;
 
 /// Steps per second, which is also the rate of all its devices, Hz.
 pub const STEP_HZ: u32 = 10;

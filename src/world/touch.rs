@@ -16,7 +16,7 @@
 use std::f64::consts::{PI, TAU};
 use std::sync::LazyLock;
 
-use rapid_random::Random;
+use rapid_core::random::Random;
 
 use super::looks::{PIXELS, SIDE, narrow, offset};
 use super::world::{Texture, stream};

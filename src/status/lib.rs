@@ -9,9 +9,16 @@ pub mod attach;
 pub mod board;
 pub mod detail;
 mod event;
+#[cfg(test)]
+#[path = "../../tests/support/literal.rs"]
+mod literal;
+pub mod palette;
 pub mod preview;
 pub mod rates;
 pub mod session;
+
+#[cfg(test)]
+extern crate self as rapid_status;
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -34,9 +41,6 @@ use session::{Answered, SessionRequest, SessionStatus};
 pub use board::{Board, EpisodeCounts, EpisodeEnd, ReferenceSample};
 pub use event::Description;
 pub use event::{Event, Provenance, What};
-
-#[cfg(test)]
-pub(crate) mod literal;
 
 /// Creates an enum whose values have words: `word` returns it, and JSON uses it.
 macro_rules! words {

@@ -5,7 +5,7 @@
 
 use std::f64::consts::TAU;
 
-use rapid_random::Random;
+use rapid_core::random::Random;
 
 use super::touch::{Touch, pixels};
 use super::world::{Texture, World, stream};

@@ -1,11 +1,6 @@
 //! JPEG pictures (ITU-T T.81) as pixels, and pixels as JPEG pictures: 8 bits a value, row by row from the top.
 //!
-//! A crate of its own, because both libraries are generic: their code is compiled with the crate that calls it. This one is
-//! optimised in tests, too, which decode and encode tens of thousands of pictures; so what goes through every pixel is here.
-//!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused where that is asked for.
-
-#![forbid(unsafe_code)]
 
 use jpeg_encoder::{ColorType, Encoder, EncodingError};
 use zune_jpeg::JpegDecoder;

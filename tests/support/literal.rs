@@ -1,4 +1,5 @@
 //! Literal snapshots and boards, for tests of screens.
+#![allow(dead_code, reason = "each crate of screens uses a part of it")]
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -6,12 +7,12 @@ use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
-use rapid_core::sample::Epoch;
+use rapid_core::sample::{Encoding, Epoch};
 use rapid_core::sync::WhenStale;
 use rapid_core::time::Stamp;
+use rapid_registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
 
-use super::{Board, DeviceStatus, Level, LogLine, Outlook, PolicyStatus, RecordingStatus, SlotState, Snapshot};
-use crate::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
+use rapid_status::{Board, DeviceStatus, Level, LogLine, Outlook, PolicyStatus, RecordingStatus, SlotState, Snapshot};
 
 /// Moment of the snapshots: 754 s after the boot.
 pub(crate) const TAKEN: Stamp = Stamp(754_000_000_000);
@@ -165,16 +166,16 @@ pub(crate) fn board(names: &[&str]) -> Board {
         latency: Duration::ZERO,
         form: None,
         action: None,
-        hooks: crate::registry::Hooks::default(),
-        verdict: crate::registry::VerdictSpec::of(
+        hooks: rapid_registry::Hooks::default(),
+        verdict: rapid_registry::VerdictSpec::of(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),
         ),
     };
     Board::new(&Registry {
-        inference: crate::registry::InferenceSpec::default(),
-        export: crate::registry::ExportSpec::default(),
+        inference: rapid_registry::InferenceSpec::default(),
+        export: rapid_registry::ExportSpec::default(),
         rig: RigSpec {
             name: "bench-1".to_owned(),
             observation_hz: 30.0,
@@ -191,4 +192,11 @@ pub(crate) fn board(names: &[&str]) -> Board {
         path: None,
         text: String::new(),
     })
+}
+
+/// A sample without content.
+pub(crate) fn preview() -> rapid_status::preview::Preview {
+    let device = ModalityId::new(0).unwrap_or_else(|| unreachable!());
+    let (captured, encoding, payload) = (Stamp(0), Encoding::Bytes, Arc::from([]));
+    rapid_status::preview::Preview { device, seq: 0, captured, encoding, width: 0, height: 0, bytes: 0, payload }
 }

@@ -7,7 +7,7 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use rapid_jpeg::{EncodeError, Values};
+use rapid_pictures::jpeg::{EncodeError, Values};
 
 pub use rapid_world::{
     AXES, AXIS_COUNT, Expert, Looks, MAX_STEPS, Outcome, SIDE, SIDE_PIXELS, STEP_HZ, Size, Texture, Touch,
@@ -160,7 +160,7 @@ impl Trial {
         if part.numbers().is_some() {
             return Ok(());
         }
-        Ok(rapid_jpeg::encode(&self.picture, [SIDE_U16; 2], Values::Rgb, JPEG_QUALITY, payload)?)
+        Ok(rapid_pictures::jpeg::encode(&self.picture, [SIDE_U16; 2], Values::Rgb, JPEG_QUALITY, payload)?)
     }
 }
 

@@ -7,7 +7,7 @@ use std::io::IsTerminal;
 
 use anstyle::{AnsiColor, Color, Style};
 
-use crate::status::{Grade, Level, SlotState};
+use crate::{Grade, Level, SlotState};
 
 /// Something good.
 pub const GOOD: Style = AnsiColor::Green.on_default();

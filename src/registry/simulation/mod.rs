@@ -234,8 +234,7 @@ impl SimDevice {
     }
 
     /// How many recording commands it received, and how many to end one.
-    #[cfg(test)]
-    pub(crate) fn recordings(&self) -> (u32, u32) {
+    pub fn recordings(&self) -> (u32, u32) {
         let (begun, over) = &self.episodes;
         (begun.load(Ordering::Acquire), over.load(Ordering::Acquire))
     }

@@ -25,11 +25,17 @@ mod home;
 mod inbox;
 mod ingress;
 mod leftovers;
+#[cfg(test)]
+#[path = "../../tests/support/patience.rs"]
+mod patience;
 mod place;
 mod room;
 mod service;
 mod shared;
 mod sigbus;
+#[cfg(test)]
+#[path = "../../tests/support/skip.rs"]
+mod skip;
 mod topic;
 mod writer;
 
@@ -41,8 +47,7 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::SampleHeader;
-
-use crate::registry::{DeviceSpec, MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
+use rapid_registry::{DeviceSpec, MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 
 use error::topic_error;
 use guard::{Guarded, contained};

@@ -80,7 +80,7 @@ fn pictures_differ_from_those_of_training_by_no_more_than_documented() {
         ("cut_422", Apart { inside: 4, at_edge: 10, share: 0.17 }),
         ("cut_420", Apart { inside: 4, at_edge: 10, share: 0.30 }),
     ];
-    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/jpeg");
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/jpeg");
     for (name, bound) in cases {
         let read = |kind: &str| std::fs::read(folder.join(format!("{name}.{kind}"))).unwrap();
         let (jpeg, file) = (read("jpg"), read("ppm"));

@@ -4,8 +4,6 @@
 //! The generator is PCG XSL 128/64 (O'Neill 2014), whose output its crate guarantees to keep. Streams of
 //! one seed do not overlap: drawing more numbers from one does not affect another.
 
-#![forbid(unsafe_code)]
-
 use rand_distr::{Distribution, StandardNormal, StandardUniform};
 use rand_pcg::Pcg64;
 
@@ -15,16 +13,19 @@ pub struct Random(Pcg64);
 
 impl Random {
     /// The stream from its beginning.
+    #[inline]
     pub fn new(seed: u64, stream: u64) -> Self {
         Self(Pcg64::new(seed.into(), stream.into()))
     }
 
     /// A sample of the normal distribution with mean 0 and deviation 1.
+    #[inline]
     pub fn normal(&mut self) -> f32 {
         StandardNormal.sample(&mut self.0)
     }
 
     /// All of them normal.
+    #[inline]
     pub fn fill_normal(&mut self, values: &mut [f32]) {
         for value in values {
             *value = self.normal();
@@ -32,12 +33,14 @@ impl Random {
     }
 
     /// Uniform from `low` to below `high`.
+    #[inline]
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         let share: f64 = StandardUniform.sample(&mut self.0);
         low + share * (high - low)
     }
 
     /// A whole number below `end`; 0 if that is 0.
+    #[inline]
     pub fn below(&mut self, end: u64) -> u64 {
         let number: u64 = StandardUniform.sample(&mut self.0);
         // The high half of the product (Lemire 2019): off by less than end / 2^64.

@@ -4,13 +4,13 @@
 //!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
 
+use crate::jpeg::{DecodeError, Decoder};
 use rapid_core::sample::Encoding;
-use rapid_jpeg::{DecodeError, Decoder};
 
 /// Values of a pixel.
 pub const CHANNELS: usize = 3;
 /// Pixels a picture may have along a side, as in the registry.
-pub(crate) const LARGEST: usize = rapid_jpeg::LARGEST;
+pub const LARGEST: usize = crate::jpeg::LARGEST;
 
 /// Why a payload has no pixels.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -1,6 +1,6 @@
 //! The expert: a script that knows the block's position and texture, and demonstrates the task.
 
-use rapid_random::Random;
+use rapid_core::random::Random;
 
 use super::world::{AXES, World, stream};
 

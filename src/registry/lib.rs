@@ -9,6 +9,7 @@ pub mod artifacts;
 pub mod candidate;
 pub mod catalogue;
 pub mod columns;
+pub mod device;
 mod diagnostic;
 mod difference;
 pub mod edit;
@@ -18,12 +19,16 @@ mod parse;
 pub mod scenario;
 mod scenario_file;
 mod section;
+pub mod simulation;
+#[cfg(test)]
+#[path = "../../tests/support/skip.rs"]
+mod skip;
 mod spec;
 pub mod task;
 pub mod trust;
 pub mod units;
 
-pub(crate) use diagnostic::did_you_mean;
+pub use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use difference::Difference;
 pub use identity::{Assigner, Assignment, Detached, Explanation};
