@@ -300,7 +300,7 @@ mod tests {
             (format!("{}/rapid_test_sigbus_{number}", std::env::temp_dir().display()), Some(libc::SIGBUS)),
         ] {
             let ended = std::process::Command::new(std::env::current_exe().unwrap())
-                .args(["--exact", "bus::sigbus::tests::helper", "--ignored"])
+                .args(["--exact", "sigbus::tests::helper", "--ignored"])
                 .env("RAPID_TEST_TOUCH", &path)
                 .output()
                 .unwrap();

@@ -220,7 +220,7 @@ fn a_killed_subscriber_that_held_samples_loses_none_and_frees_its_place() {
     let reported = std::env::temp_dir().join(&name);
     for _ in 0..3 {
         let mut process = std::process::Command::new(std::env::current_exe().expect("this test"))
-            .args(["--exact", "bus::tests::held_samples_helper", "--ignored", "--nocapture"])
+            .args(["--exact", "tests::held_samples_helper", "--ignored", "--nocapture"])
             .env("RAPID_TEST_HOLD", &name)
             .stdout(std::process::Stdio::null())
             .spawn()

@@ -208,7 +208,7 @@ mod tests {
     fn a_sample_whose_memory_is_overwritten_ends_the_use_of_the_bus_and_not_the_process() {
         for name in ["before_it_is_filled", "before_it_is_sent"] {
             let ended = std::process::Command::new(std::env::current_exe().unwrap())
-                .args(["--exact", &format!("bus::writer::tests::{name}"), "--ignored", "--nocapture"])
+                .args(["--exact", &format!("writer::tests::{name}"), "--ignored", "--nocapture"])
                 .output()
                 .unwrap();
             // Of a name that fits no test nothing runs, and nothing fails.

@@ -64,7 +64,7 @@ fn helper() {
 
 fn member(name: &str, stays: bool) -> (Child, String) {
     let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["--exact", "bus::leftovers::tests::helper", "--ignored", "--nocapture"]).env("RAPID_TEST_BUS", name);
+    command.args(["--exact", "leftovers::tests::helper", "--ignored", "--nocapture"]).env("RAPID_TEST_BUS", name);
     if stays {
         command.env("RAPID_TEST_STAY", "");
     }

@@ -25,7 +25,7 @@ fn with_serial(serial: &str) -> Registry {
 
 #[test]
 fn the_repository_contains_the_artifacts_of_devices_toml() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("udev");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../udev");
     let all = artifacts(&Registry::builtin());
     for artifact in &all {
         let path = folder.join(&artifact.path);
