@@ -8,8 +8,6 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use rapid::headless::{self, HeadlessOptions};
-use rapid::tui::{self, ScreenOptions};
 use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::Epoch;
@@ -18,6 +16,8 @@ use rapid_core::time::Stamp;
 use rapid_registry::{
     CameraSpec, DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec,
 };
+use rapid_screens::headless::{self, HeadlessOptions};
+use rapid_screens::tui::{self, ScreenOptions};
 use rapid_status::session::SessionRequest;
 use rapid_status::{Board, Command, Level, Outlook, RecordingStatus, SlotState, What};
 use tokio::sync::mpsc;

@@ -23,6 +23,7 @@ use rapid_core::text;
 use rapid_core::time::Zone;
 use rapid_registry::scenario::Scenario;
 use rapid_registry::{ModuleError, Registry, RegistryErrors};
+use rapid_screens::tui::ScreenOptions;
 use rapid_status::Level;
 use rapid_status::palette::Palette;
 use rapid_status::session::SessionRequest;
@@ -46,7 +47,6 @@ use crate::record::inspect::ReadError;
 use crate::record::{self, EpisodeRequest, RecordError};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::session::journal::Plan;
-use crate::tui::ScreenOptions;
 
 #[cfg(feature = "policy")]
 use crate::commands::compare::CompareFailure;
@@ -180,7 +180,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             reported(commands::plot::plot(&paths, to.as_deref(), format, out, &mut io::stderr())?)
         }
         Command::Inspect { paths, plot: None } => {
-            let columns = crate::tui::columns().unwrap_or(100);
+            let columns = rapid_screens::tui::columns().unwrap_or(100);
             let palette = Palette::of(&io::stdout());
             reported(commands::inspect::inspect(&paths, format, columns, palette, out)?)
         }

@@ -26,7 +26,6 @@ mod executable;
 #[cfg(feature = "export")]
 pub mod export;
 pub mod flash;
-pub mod headless;
 pub mod hotplug;
 pub mod inputs;
 pub mod interlocks;
@@ -41,7 +40,6 @@ mod literal;
 pub mod live;
 #[cfg(feature = "policy")]
 pub mod lockstep;
-pub mod logging;
 pub mod orders;
 #[cfg(test)]
 #[path = "../tests/support/patience.rs"]
@@ -59,8 +57,3 @@ pub mod session;
 #[cfg(test)]
 #[path = "../tests/support/skip.rs"]
 mod skip;
-pub mod tui;
-#[cfg(feature = "web")]
-pub mod web;
-
-pub use rapid_core::random;

@@ -26,8 +26,8 @@ const LAYERS: &[&[&str]] = &[
     &["flash"],
     &["link", "control", "kinematics"],
     &["hotplug", "episode", "driver", "orders", "inputs", "interlocks", "calibration"],
-    &["rig", "alignment", "record", "session", "policy", "registration", "live", "web"],
-    &["app", "lockstep", "compare", "export", "plot", "tui", "headless", "logging"],
+    &["rig", "alignment", "record", "session", "policy", "registration", "live"],
+    &["app", "lockstep", "compare", "export", "plot"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
@@ -35,24 +35,13 @@ const LAYERS: &[&[&str]] = &[
 const SIDEWAYS: &[(&str, &[&str])] = &[
     ("driver", &["episode"]),
     ("interlocks", &["inputs"]),
-    ("app", &["tui", "headless", "logging"]),
-    // Without a screen the log is lines among the lines of the run.
-    ("logging", &["headless"]),
     ("main", &["dispatch", "cli", "commands"]),
     ("dispatch", &["cli", "commands"]),
     ("commands", &["cli"]),
 ];
 
-/// Modules that see less than their layer would let them: besides layer 0 only these.
-const NARROW: &[(&str, &[&str], &str)] = &[
-    ("tui", &[], "a screen knows snapshots and commands, no stage"),
-    ("headless", &[], "a screen knows snapshots and commands, no stage"),
-    ("logging", &[], "the log goes to the board and knows no stage"),
-];
-
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).
 const HOMES: &[(&str, &[&str])] = &[
-    ("anstyle", &["tui/theme"]),
     ("arrow_array", &["export"]),
     ("arrow_schema", &["export"]),
     ("clap", &["cli", "dispatch", "main", "commands"]),
@@ -60,16 +49,14 @@ const HOMES: &[(&str, &[&str])] = &[
     ("clap_mangen", &["commands"]),
     ("cobs", &["driver/serial"]),
     ("crc32fast", &["episode"]),
-    ("crossterm", &["tui"]),
     ("evdev", &["inputs"]),
     ("foxglove", &["live"]),
-    ("futures", &["hotplug", "driver", "rig", "record", "app", "tui", "headless", "commands"]),
+    ("futures", &["hotplug", "driver", "rig", "record", "app", "commands"]),
     ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
-    ("http_body_util", &["driver/lan", "web"]),
-    ("hyper", &["driver/lan", "web"]),
-    ("hyper_util", &["driver/lan", "web"]),
-    ("if_addrs", &["driver/lan", "web"]),
-    ("image", &["tui/picture"]),
+    ("http_body_util", &["driver/lan"]),
+    ("hyper", &["driver/lan"]),
+    ("hyper_util", &["driver/lan"]),
+    ("if_addrs", &["driver/lan"]),
     ("indicatif", &["commands/progress"]),
     ("libc", &["hotplug", "driver", "rig", "app", "policy/library", "inputs"]),
     ("k", &["kinematics"]),
@@ -82,9 +69,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("ort", &["policy/library", "policy/graphs"]),
     ("parquet", &["export"]),
     ("png", &["export"]),
-    ("ratatui", &["tui"]),
-    ("ratatui_core", &["tui"]),
-    ("ratatui_image", &["tui/picture"]),
     ("rustix", &[ABOVE_NOUNS]),
     ("sd_notify", &["app/watchdog"]),
     ("serde", &[ANYWHERE]),
@@ -98,7 +82,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("tokio_util", &[ABOVE_NOUNS]),
     ("toml", &["session"]),
     ("tracing", &[ABOVE_NOUNS]),
-    ("tracing_subscriber", &["logging"]),
     ("urdf_rs", &["kinematics"]),
     ("udev", &["hotplug/udev"]),
     ("v4l", &["driver/camera"]),
@@ -127,7 +110,7 @@ const LOCK_HOMES: &[(&str, &str)] = &[
     ("policy/library", "onnxruntime is loaded once, before the first chunk"),
     ("system/fault", "tests"),
     ("system/panics", "messages of panics"),
-    ("tui", "the monitor's terminal"),
+    ("screens/tui", "the monitor's terminal"),
 ];
 
 /// Macros that write where a screen may be.
@@ -589,8 +572,7 @@ fn import(home: &str, path: &[String]) -> Option<String> {
         let sideways = SIDEWAYS.iter().any(|(module, seen)| *module == home && seen.contains(&target));
         return (from > 0 && !sideways).then(|| format!("{edge}: modules of this layer do not import one another"));
     }
-    let (_, seen, why) = NARROW.iter().find(|(module, ..)| *module == home)?;
-    (to > 0 && !seen.contains(&target)).then(|| format!("{edge}: {why}"))
+    None
 }
 
 /// What is wrong with the file at `place` naming the crate `path` begins with.
@@ -643,9 +625,7 @@ mod the_check_itself {
         finds("rig/stream.rs", "\n\nuse crate::record::Writer;", &["3: `rig` (layer 3) imports `record`"]);
         finds("interlocks/mod.rs", "use crate::inputs::Input;", &[]);
         finds("kinematics/mod.rs", "use crate::control::Command;", &["1: `kinematics` (layer 1) imports `control`"]);
-        finds("app.rs", "use crate::{tui, rig, record, headless};", &[]);
-        finds("tui/view.rs", "use rapid_status::Snapshot;", &[]);
-        finds("tui/view.rs", "use crate::rig::Rig;", &["1: `tui` (layer 4) imports `rig` (layer 3): a screen"]);
+        finds("app.rs", "use crate::{rig, record};", &[]);
     }
 
     #[test]

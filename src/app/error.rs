@@ -4,20 +4,20 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rapid_bus::BusError;
+use rapid_screens::logging::LoggingError;
+use rapid_screens::tui::TuiError;
+#[cfg(feature = "web")]
+use rapid_web::WebError;
 
 use super::LAST_CHUNK;
 use crate::hotplug::HotplugError;
 #[cfg(feature = "foxglove")]
 use crate::live::LiveError;
-use crate::logging::LoggingError;
 #[cfg(feature = "policy")]
 use crate::policy::{library::LibraryError, sampler::PolicyError};
 use crate::record::RecordError;
 use crate::rig::RigError;
 use crate::rig::presence::PresenceError;
-use crate::tui::TuiError;
-#[cfg(feature = "web")]
-use crate::web::WebError;
 
 /// Why a run could not begin or continue.
 #[derive(Debug, thiserror::Error)]

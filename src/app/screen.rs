@@ -5,6 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::permission::Permission;
+use rapid_screens::headless::{self, HeadlessOptions};
+use rapid_screens::tui::{self, ScreenOptions, TuiError};
 use rapid_status::palette::Palette;
 use rapid_status::{Board, Command, Event};
 use rapid_system::fault;
@@ -12,8 +14,6 @@ use tokio::sync::{broadcast, mpsc};
 
 use super::stage::Stage;
 use super::{AppError, Screen};
-use crate::headless::{self, HeadlessOptions};
-use crate::tui::{self, ScreenOptions, TuiError};
 
 /// Starts the requested screen, which shows these events of the board.
 pub(super) fn start(

@@ -1,4 +1,4 @@
-//! Stage page: thread `web`, which serves the page for a phone ([`crate::web`]).
+//! Stage page: thread `web`, which serves the page for a phone ([`rapid_web`]).
 //!
 //! Invariant: no recording ends because of it: its failure is an error of the log.
 
@@ -6,14 +6,14 @@ use std::sync::Arc;
 
 use tokio::sync::mpsc::UnboundedSender;
 
-pub use crate::web::WebOptions;
+pub use rapid_web::WebOptions;
 
 use rapid_status::Board;
+use rapid_web::Web;
 
 use super::AppError;
 use super::requests::{Request, asker};
 use super::stage::Stage;
-use crate::web::Web;
 
 /// Starts the stage, before anything of the run is started: a port in use is an error of the start.
 pub(super) fn start(

@@ -17,6 +17,7 @@ use rapid_registry::device::{Attachment, DeviceNode};
 use rapid_registry::simulation::SimDevice;
 use rapid_registry::units::show_duration;
 use rapid_registry::{Assigner, Assignment, DeviceSpec, NodeSpec, Registry};
+use rapid_screens::tui::flashlight::{self, Flashlight};
 use serde::Serialize;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout, timeout_at};
@@ -28,7 +29,6 @@ use crate::calibration::{self, Estimate, Flip, Seen, brightness};
 use crate::cli::LatencyArgs;
 use crate::driver::Driver;
 use crate::flash;
-use crate::tui::flashlight::{self, Flashlight};
 
 /// A camera that has sent nothing for this long is considered silent.
 const SILENCE: Duration = Duration::from_secs(5);

@@ -12,6 +12,8 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::time::Stamp;
+use rapid_screens::tui::model::{Effect, Msg};
+use rapid_screens::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
 use rapid_status::attach::{Decoder, LinkError};
 use rapid_status::{Command, SlotState, Snapshot};
 use rapid_system::peer::ProcessState;
@@ -20,8 +22,6 @@ use tokio_util::sync::CancellationToken;
 
 use crate::app::signals::Signals;
 use crate::orders::give::{self, GiveError};
-use crate::tui::model::{Effect, Msg};
-use crate::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
 
 /// Time between two attempts to reach the next run.
 const AGAIN: Duration = Duration::from_secs(1);

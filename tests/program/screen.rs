@@ -1,6 +1,6 @@
 //! A day of collection in a real terminal: what a user sees and types, in tmux.
 //!
-//! Words are looked for where a user would look for them; the layout is a matter of the snapshots in `src/tui`.
+//! Words are looked for where a user would look for them; the layout is a matter of the snapshots in `src/screens/tui`.
 
 use std::time::Duration;
 

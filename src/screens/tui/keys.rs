@@ -307,7 +307,7 @@ mod tests {
 
     #[test]
     fn the_page_about_the_monitor_lists_exactly_these_keys() {
-        let page = include_str!("../../docs/monitor.md");
+        let page = include_str!("../../../docs/monitor.md");
         let rows: Vec<_> = page.lines().filter(|line| line.starts_with("| `")).collect();
         let expected: Vec<_> = help(true)
             .chain(help(false))

@@ -12,6 +12,9 @@
 
 mod door;
 mod links;
+#[cfg(test)]
+#[path = "../../tests/support/literal.rs"]
+mod literal;
 mod pictures;
 mod serve;
 mod token;
