@@ -19,7 +19,6 @@ pub mod driver;
 #[cfg(test)]
 #[path = "../tests/support/effort.rs"]
 mod effort;
-pub mod episode;
 #[cfg(all(test, feature = "export"))]
 #[path = "../tests/support/executable.rs"]
 mod executable;
@@ -44,13 +43,14 @@ pub mod orders;
 #[cfg(test)]
 #[path = "../tests/support/patience.rs"]
 mod patience;
-pub mod plot;
 #[cfg(feature = "policy")]
 pub mod policy;
 #[cfg(test)]
 #[path = "../tests/support/ports.rs"]
 mod ports;
-pub mod record;
+#[cfg(test)]
+#[path = "../tests/support/recorded.rs"]
+mod recorded;
 pub mod registration;
 pub mod rig;
 pub mod session;

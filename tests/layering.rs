@@ -25,15 +25,14 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 const LAYERS: &[&[&str]] = &[
     &["flash"],
     &["link", "control", "kinematics"],
-    &["hotplug", "episode", "driver", "orders", "inputs", "interlocks", "calibration"],
-    &["rig", "alignment", "record", "session", "policy", "registration", "live"],
-    &["app", "lockstep", "compare", "export", "plot"],
+    &["hotplug", "driver", "orders", "inputs", "interlocks", "calibration"],
+    &["rig", "alignment", "session", "policy", "registration", "live"],
+    &["app", "lockstep", "compare", "export"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
 /// Imports within a layer.
 const SIDEWAYS: &[(&str, &[&str])] = &[
-    ("driver", &["episode"]),
     ("interlocks", &["inputs"]),
     ("main", &["dispatch", "cli", "commands"]),
     ("dispatch", &["cli", "commands"]),
@@ -48,11 +47,10 @@ const HOMES: &[(&str, &[&str])] = &[
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("clap_mangen", &["commands"]),
     ("cobs", &["driver/serial"]),
-    ("crc32fast", &["episode"]),
     ("evdev", &["inputs"]),
     ("foxglove", &["live"]),
-    ("futures", &["hotplug", "driver", "rig", "record", "app", "commands"]),
-    ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
+    ("futures", &["hotplug", "driver", "rig", "app", "commands"]),
+    ("hdrhistogram", &["policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan"]),
     ("hyper", &["driver/lan"]),
     ("hyper_util", &["driver/lan"]),
@@ -60,8 +58,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("indicatif", &["commands/progress"]),
     ("libc", &["hotplug", "driver", "rig", "app", "policy/library", "inputs"]),
     ("k", &["kinematics"]),
-    ("lz4", &["episode"]),
-    ("mcap", &["episode", "record/file"]),
     ("mdns_sd", &["hotplug/lan"]),
     ("memchr", &["driver/lan"]),
     ("nix", &["driver/datagram", "driver/lan/udp", "driver/can/socket"]),
@@ -74,7 +70,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
     ("serde_path_to_error", &["policy/bundle"]),
-    ("sha2", &["policy/bundle", "episode/hash"]),
+    ("sha2", &["policy/bundle"]),
     ("socketcan", &["driver/can"]),
     ("thiserror", &[ANYWHERE]),
     ("tokio", &[ABOVE_NOUNS]),
@@ -86,7 +82,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("udev", &["hotplug/udev"]),
     ("v4l", &["driver/camera"]),
     ("zip", &["commands/policy"]),
-    ("zstd", &["episode", "policy/library"]),
+    ("zstd", &["policy/library"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
@@ -622,10 +618,10 @@ mod the_check_itself {
             "use crate::driver::Reading;",
             &["1: `inputs` (layer 2) imports `driver` (layer 2): mod"],
         );
-        finds("rig/stream.rs", "\n\nuse crate::record::Writer;", &["3: `rig` (layer 3) imports `record`"]);
+        finds("rig/stream.rs", "\n\nuse crate::session::Journal;", &["3: `rig` (layer 3) imports `session`"]);
         finds("interlocks/mod.rs", "use crate::inputs::Input;", &[]);
         finds("kinematics/mod.rs", "use crate::control::Command;", &["1: `kinematics` (layer 1) imports `control`"]);
-        finds("app.rs", "use crate::{rig, record};", &[]);
+        finds("app.rs", "use crate::{rig, session};", &[]);
     }
 
     #[test]
@@ -658,8 +654,8 @@ mod the_check_itself {
         finds("flash.rs", "#[cfg(test)]\nmod tests {\n use crate::rig::Rig;\n fn f() { println!() }\n}", &[]);
         finds("flash.rs", "#[cfg(not(test))]\nmod x { use crate::rig::Rig; }", &["2: `flash`"]);
         let files = BTreeMap::from([
-            (PathBuf::from("episode/grid.rs"), "#[cfg(test)]\nmod tests;".to_owned()),
-            (PathBuf::from("episode/grid/tests.rs"), "use crate::rig::Rig;".to_owned()),
+            (PathBuf::from("driver/grid.rs"), "#[cfg(test)]\nmod tests;".to_owned()),
+            (PathBuf::from("driver/grid/tests.rs"), "use crate::rig::Rig;".to_owned()),
         ]);
         assert_eq!(check_tree(&files, check), []);
     }
@@ -714,7 +710,7 @@ mod the_check_itself {
         finds("rig/mod.rs", "fn f() { if a { println!(\"x\") } }", &["1: `println!`"]);
         finds("rig/worker.rs", "use std::sync::{Arc, Mutex};", &[]);
         finds("rig/stream.rs", "use std::sync::{Arc, Mutex};", &["1: `Mutex`"]);
-        finds("episode/grid.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
+        finds("driver/grid.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
         let files = BTreeMap::from([(PathBuf::from("core/mask.rs"), "use std::sync::Mutex;".to_owned())]);
         assert_eq!(check_tree(&files, check_crate).len(), 1);
         let files = BTreeMap::from([(PathBuf::from("core/mask.rs"), "fn f() { unsafe { g() } }".to_owned())]);

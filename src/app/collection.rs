@@ -8,6 +8,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use rapid_core::time::{Stamp, realtime_ns, rfc3339};
+use rapid_episode::record::inspect::{self, Judgement, Listed};
+use rapid_episode::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
 use rapid_registry::{ModuleError, ModuleSpec};
 use rapid_status::session::{Answered, Phase, SessionRequest, SessionStatus};
 use rapid_status::{Board, EpisodeEnd, Level, Verdict, What};
@@ -19,8 +21,6 @@ use super::AppError;
 use super::conductor::LAST_SAMPLES;
 use super::requests::Reply;
 use super::stage::join;
-use crate::record::inspect::{self, Judgement, Listed};
-use crate::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
 use crate::session::journal::{self, Journal, Plan, SessionFile};
 use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
 use crate::session::{Answer, Effect, Session};

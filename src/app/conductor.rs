@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_episode::record::{RecordError, Recorder, RecorderConfig, Source};
 use rapid_status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 use rapid_system::fault;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
@@ -20,7 +21,6 @@ use super::collection::{Collection, Found};
 use super::settling::has_settled;
 use super::stage::{Stage, join};
 use super::{AppError, Request, Running, Screen};
-use crate::record::{RecordError, Recorder, RecorderConfig, Source};
 
 /// Interval at which devices that are still opening are looked for.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);

@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rapid_bus::BusError;
+use rapid_episode::record::RecordError;
 use rapid_screens::logging::LoggingError;
 use rapid_screens::tui::TuiError;
 #[cfg(feature = "web")]
@@ -15,7 +16,6 @@ use crate::hotplug::HotplugError;
 use crate::live::LiveError;
 #[cfg(feature = "policy")]
 use crate::policy::{library::LibraryError, sampler::PolicyError};
-use crate::record::RecordError;
 use crate::rig::RigError;
 use crate::rig::presence::PresenceError;
 

@@ -13,13 +13,13 @@ pub use crate::live::LiveOptions;
 use rapid_bus::Bus;
 use rapid_core::permission::Permission;
 use rapid_core::time::WallClock;
+use rapid_episode::made::Made;
 use rapid_registry::Registry;
 use rapid_status::Board;
 
 use super::AppError;
 use super::requests::{Request, asker};
 use super::stage::Stage;
-use crate::episode::made::Made;
 use crate::live::{Controls, Feed, Live};
 
 /// Listens, before anything of the run is started: a port in use is an error of the start.

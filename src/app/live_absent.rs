@@ -5,6 +5,7 @@ use std::sync::{Arc, mpsc};
 use rapid_bus::{Bus, Subscription};
 use rapid_core::permission::Permission;
 use rapid_core::time::WallClock;
+use rapid_episode::made::Made;
 use rapid_registry::{DeviceSpec, Registry};
 use rapid_status::Board;
 use tokio::sync::mpsc::UnboundedSender;
@@ -13,7 +14,6 @@ use tokio::sync::watch;
 use super::AppError;
 use super::requests::Request;
 use super::stage::Stage;
-use crate::episode::made::Made;
 
 /// No server can be requested.
 #[derive(Debug, Clone, Copy)]

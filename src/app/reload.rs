@@ -15,6 +15,7 @@ use std::sync::Arc;
 
 use rapid_bus::{BusError, Extension, Membership, Subscription};
 use rapid_core::time::Stamp;
+use rapid_episode::record::RecorderAddition;
 use rapid_registry::{DeviceSpec, Difference, ModuleSpec, Registry};
 use rapid_status::session::Answered;
 use rapid_status::{Board, Level, RegistryRequest, What};
@@ -24,7 +25,6 @@ use tokio::task::spawn_blocking;
 use super::live::LiveAddition;
 use super::requests::Reply;
 use super::stage::Stage;
-use crate::record::RecorderAddition;
 use crate::registration;
 use crate::rig::{Addition, RigCommand};
 

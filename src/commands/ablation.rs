@@ -8,6 +8,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_episode::record::inspect::{self, Inspection, ReadError};
 use rapid_registry::ablation::AblationPlan;
 use rapid_registry::{DeviceSpec, Mount, NodeSpec, Registry, RegistryErrors, did_you_mean};
 use rapid_status::Grade;
@@ -15,7 +16,6 @@ use serde_json::json;
 
 use super::{Format, progress};
 use crate::cli::{AblationArgs, Count};
-use crate::record::inspect::{self, Inspection, ReadError};
 
 /// Why no list is printed.
 #[derive(Debug, thiserror::Error)]

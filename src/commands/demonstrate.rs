@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use rapid_core::text;
+use rapid_episode::record::EpisodeRequest;
 use rapid_registry::Registry;
 use rapid_registry::simulation::task::Texture;
 use rapid_status::{Board, Grade};
@@ -16,7 +17,6 @@ use super::progress::Bar;
 use crate::lockstep::STEP;
 use crate::lockstep::TrialError;
 use crate::lockstep::collect;
-use crate::record::EpisodeRequest;
 
 /// Why not all demonstrations were recorded.
 #[derive(Debug, thiserror::Error)]

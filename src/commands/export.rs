@@ -12,6 +12,8 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
 use rapid_core::text;
+use rapid_episode::record::inspect::{self, ReadError};
+use rapid_episode::sha256;
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
 use serde::Serialize;
@@ -19,12 +21,10 @@ use serde::Serialize;
 use super::progress::Work;
 use super::{Format, json_line};
 use crate::cli::{ExportArgs, PictureForm};
-use crate::episode::sha256;
 use crate::export::{
     self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal, SetError,
     Survey, Verified,
 };
-use crate::record::inspect::{self, ReadError};
 
 /// Why the export ended.
 #[derive(Debug, thiserror::Error)]

@@ -5,11 +5,11 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_episode::record::inspect::{self, Judgement, ReadError};
+use rapid_episode::sha256;
 use rapid_status::palette::Palette;
 
 use super::{CommandStatus, Format, json_line, progress};
-use crate::episode::sha256;
-use crate::record::inspect::{self, Judgement, ReadError};
 
 /// Why there is no report.
 #[derive(Debug, thiserror::Error)]

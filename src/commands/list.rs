@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::{Zone, rfc3339};
+use rapid_episode::record::inspect::{self, Judgement, Listed, ReadError};
 use rapid_status::Grade;
 use rapid_status::palette::Palette;
 use rapid_status::session::{EpisodeEntry, Label};
@@ -19,7 +20,6 @@ use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line, progress};
 use crate::cli::{LabelFilter, ListArgs, SortArg};
-use crate::record::inspect::{self, Judgement, Listed, ReadError};
 use crate::session::journal::{self, JournalError};
 
 /// Why there is no list.

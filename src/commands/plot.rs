@@ -8,12 +8,12 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_episode::plot::{self, Plot};
+use rapid_episode::record::inspect::{self, Judgement, ReadError};
 use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line, list};
-use crate::plot::{self, Plot};
-use crate::record::inspect::{self, Judgement, ReadError};
 
 /// Anyone may read a picture whose episode may be read.
 const MODE: u32 = 0o644;

@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use rapid_core::text;
+use rapid_episode::recover::{ProgressFn, RecoverError, Recovered, finished, is_damaged, left_behind, recover};
 use serde::Serialize;
 use serde_json::json;
 
 use super::progress::Bar;
 use super::{Format, json_line};
-use crate::episode::recover::{ProgressFn, RecoverError, Recovered, finished, is_damaged, left_behind, recover};
 
 /// The outcome of all files together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -186,8 +186,8 @@ mod tests {
 
     #[test]
     fn a_damaged_finished_file_is_reported_with_the_fix() {
-        let bytes = crate::episode::testing::episode(crate::episode::testing::options());
-        let whole = crate::episode::recover::recover_bytes(&bytes).expect("an episode");
+        let bytes = crate::recorded::episode(crate::recorded::options());
+        let whole = rapid_episode::recover::recover_bytes(&bytes).expect("an episode");
         // The check value of the summary, before the magic number: every message is still readable.
         let mut flipped = whole.clone();
         flipped[whole.len() - 10] ^= 1;

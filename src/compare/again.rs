@@ -9,14 +9,14 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 
 use rapid_core::sample::SampleHeader;
+use rapid_episode::decode::{Content, Scratch};
+use rapid_episode::reader::{Item, Reader};
 use rapid_registry::Registry;
 use serde::Serialize;
 
 use super::difference::{Difference, distance};
 use super::survey::{RecordedAction, RecordedChunk, RecordedSamples, SEQUENCE_BITS, Survey, header};
 use super::{CompareError, Ended};
-use crate::episode::decode::{Content, Scratch};
-use crate::episode::reader::{Item, Reader};
 use crate::policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation, VectorOperation};
 use crate::policy::compose::Composer;
 use crate::policy::model::Model;

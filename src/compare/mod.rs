@@ -22,10 +22,10 @@ use self::again::Wanted;
 pub use self::again::{Again, ChunkInputs};
 pub use self::beside::Beside;
 pub use self::difference::{AxisDifference, Difference, Spread};
+use rapid_episode::ReadError;
 use rapid_registry::Registry;
 
 use self::survey::Survey;
-use crate::episode::ReadError;
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::Environment;
 use crate::policy::model::Model;

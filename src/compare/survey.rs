@@ -8,14 +8,14 @@ use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, Epoch, SampleHeader};
+use rapid_episode::ReadError;
+use rapid_episode::decode::{Content, Sample, Scratch};
+use rapid_episode::encode::EventText;
+use rapid_episode::reader::{Entry, Item, Message, Reader};
+use rapid_episode::reference;
 use rapid_registry::Registry;
 use serde::Deserialize;
 
-use crate::episode::ReadError;
-use crate::episode::decode::{Content, Sample, Scratch};
-use crate::episode::encode::EventText;
-use crate::episode::reader::{Entry, Item, Message, Reader};
-use crate::episode::reference;
 use crate::policy::bundle::ObservationSpec;
 
 /// The bits of a sample's number that a recorded message holds.

@@ -11,15 +11,15 @@ use std::sync::Arc;
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::time::{Stamp, WallClock};
 use rapid_core::topic::EVENT_TOPIC;
+use rapid_episode::ABOUT;
+use rapid_episode::decode::{self, Content, Kind, Scratch};
+use rapid_episode::record::EpisodeRequest;
+use rapid_episode::record::stepped::Stepped;
 use rapid_status::Board;
 use serde_json::Value;
 
 use super::*;
-use crate::episode::ABOUT;
-use crate::episode::decode::{self, Content, Kind, Scratch};
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Recording, Trial};
-use crate::record::EpisodeRequest;
-use crate::record::stepped::Stepped;
 
 /// Trial with the same noise as a policy that watches.
 const SEED: u64 = 0;

@@ -20,6 +20,10 @@ use rapid_core::modality::ModalityId;
 use rapid_core::provenance::{KernelDriver, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_episode::decode::{Content, Kind, Sample, Scratch};
+use rapid_episode::reader::{Channel, Item, Reader};
+use rapid_episode::record_iter::{FileEnd, MAGIC};
+use rapid_episode::{ReadAt, ReadError};
 use rapid_registry::device::{LanIdentity, UsbIdentity};
 use rapid_registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
 use rapid_registry::simulation::{SimDevice, SimFaults, SimSource};
@@ -29,10 +33,6 @@ use tokio::time::Instant;
 
 use super::sim::stamp_of;
 use super::{Agreed, DriverError, Reading, unblock};
-use crate::episode::decode::{Content, Kind, Sample, Scratch};
-use crate::episode::reader::{Channel, Item, Reader};
-use crate::episode::record_iter::{FileEnd, MAGIC};
-use crate::episode::{self, ReadAt, ReadError};
 
 /// Messages per read: at 1 kHz this covers the reading of a chunk.
 const BATCH: usize = 32;
@@ -243,7 +243,7 @@ pub fn describe(file: &Path) -> Result<EpisodeDescription, DriverError> {
 
 /// Opens a file that was properly closed.
 fn open(path: &Path) -> Result<Reader<File>, DriverError> {
-    let (file, size) = episode::open(path)?;
+    let (file, size) = rapid_episode::open(path)?;
     let not_mcap = || ReadError::NotMcap(path.to_owned());
     let magic_at = |at| {
         let mut read = [0; MAGIC.len()];

@@ -9,7 +9,7 @@ use super::form::Derived;
 use super::text_map;
 
 /// Of the topic of a device.
-pub(crate) fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {
+pub fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {
     let kind = serde_json::to_value(device.modality().kind).ok();
     let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
     let mut metadata = text_map([("modality", device.name.clone()), ("bit", device.id.to_string()), ("kind", kind)]);
@@ -20,7 +20,7 @@ pub(crate) fn of_device(device: &DeviceSpec) -> BTreeMap<String, String> {
 }
 
 /// Of a topic derived from that of a device; that of transforms is derived from several.
-pub(crate) fn of_derived(device: &DeviceSpec, derived: Derived) -> BTreeMap<String, String> {
+pub fn of_derived(device: &DeviceSpec, derived: Derived) -> BTreeMap<String, String> {
     match derived {
         Derived::Transform => BTreeMap::new(),
         Derived::Pose | Derived::Joints | Derived::Calibration | Derived::Points => {
@@ -30,7 +30,7 @@ pub(crate) fn of_derived(device: &DeviceSpec, derived: Derived) -> BTreeMap<Stri
 }
 
 /// Of the topic of actions, which move `device`.
-pub(crate) fn of_action(device: &DeviceSpec, action: &ActionSpec) -> BTreeMap<String, String> {
+pub fn of_action(device: &DeviceSpec, action: &ActionSpec) -> BTreeMap<String, String> {
     let (names, units) = (serde_json::json!(action.names), serde_json::json!(action.units));
     text_map([("actuator", device.name.clone()), ("names", names.to_string()), ("units", units.to_string())])
 }

@@ -16,7 +16,8 @@ use super::wire::{Proto, whole_protobuf};
 
 /// What the messages of a channel hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub enum Kind {
+    /// A message with a sample.
     Sample(SampleSchema),
     /// `rapid.Mask`.
     Mask,
@@ -30,12 +31,14 @@ pub(crate) enum Kind {
 
 /// The content of a message.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Content<'a> {
+pub enum Content<'a> {
+    /// A sample.
     Sample(Sample<'a>),
     /// A publication of the mask.
     Mask(PhysicalMask),
     /// A tick of the frame index: one entry for each modality.
     Frame(&'a [FrameSlot]),
+    /// Something that happened.
     Event(EventText<'a>),
     /// A whole message of a channel of [`Kind::Other`].
     Other,
@@ -43,44 +46,47 @@ pub(crate) enum Content<'a> {
 
 /// A sample, as sent by its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Sample<'a> {
+pub struct Sample<'a> {
     /// How `payload` is encoded.
-    pub(crate) encoding: Encoding,
+    pub encoding: Encoding,
     /// Pixels of a picture, or the count of numbers; 0 if unknown.
-    pub(crate) width: u32,
+    pub width: u32,
     /// Pixels of a picture, else 0.
-    pub(crate) height: u32,
-    pub(crate) payload: &'a [u8],
+    pub height: u32,
+    /// As the device sent it.
+    pub payload: &'a [u8],
 }
 
 /// One modality in a tick of the frame index.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[expect(clippy::struct_excessive_bools, reason = "they are the message's")]
-pub(crate) struct FrameSlot {
-    pub(crate) id: ModalityId,
-    pub(crate) present: bool,
+pub struct FrameSlot {
+    /// Which modality.
+    pub id: ModalityId,
+    /// Its bit in the mask.
+    pub present: bool,
     /// Its device is plugged in, whether it runs or not: set wherever `present` is, also in files of versions that did not
     /// record it.
-    pub(crate) plugged: bool,
+    pub plugged: bool,
     /// A sample lies within the window.
-    pub(crate) valid: bool,
+    pub valid: bool,
     /// Present without such a sample.
-    pub(crate) stale: bool,
+    pub stale: bool,
     /// Age of the sample at the tick, ns; negative if it was captured after it.
-    pub(crate) age_ns: i64,
+    pub age_ns: i64,
     /// Number of the sample that belongs to the tick, if one does; its message has the lower 32 bits.
-    pub(crate) seq: Option<u64>,
+    pub seq: Option<u64>,
 }
 
 /// Memory for content that must be converted; reused for every message.
 #[derive(Debug, Default)]
-pub(crate) struct Scratch {
+pub struct Scratch {
     payload: Vec<u8>,
     slots: Vec<FrameSlot>,
 }
 
 /// Reads a message of a channel of `kind`.
-pub(crate) fn content<'a>(kind: Kind, message: &'a [u8], scratch: &'a mut Scratch) -> Option<Content<'a>> {
+pub fn content<'a>(kind: Kind, message: &'a [u8], scratch: &'a mut Scratch) -> Option<Content<'a>> {
     Some(match kind {
         Kind::Sample(schema) => Content::Sample(sample(schema, message, &mut scratch.payload)?),
         Kind::Mask => Content::Mask(mask(message)?),
@@ -249,7 +255,7 @@ fn last_bytes(message: &[u8], requested: u64) -> Option<&[u8]> {
 
 /// Width, height and the number of components in a JPEG's frame header (ITU-T T.81, B.2.2): any SOF marker except DHT,
 /// JPG, DAC.
-pub(crate) fn jpeg_frame(bytes: &[u8]) -> Option<(u32, u32, u8)> {
+pub fn jpeg_frame(bytes: &[u8]) -> Option<(u32, u32, u8)> {
     let mut rest = bytes.strip_prefix(&[0xff, 0xd8])?;
     loop {
         let (&[0xff, marker], after) = rest.split_first_chunk()? else { return None };

@@ -385,7 +385,7 @@ mod tests {
     use rapid_core::time::Stamp;
 
     use super::*;
-    use crate::episode::schema::{EVENT, FRAME, LOG, MASK, Schema};
+    use crate::schema::{EVENT, FRAME, LOG, MASK, Schema};
 
     const WALL: u64 = 1_700_000_000_123_456_789;
 

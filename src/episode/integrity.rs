@@ -86,28 +86,28 @@ fn is(count: u64, what: &str) -> String {
 
 /// How intact a file is, as far as it has been read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct Integrity {
+pub struct Integrity {
     /// How the file ends.
-    pub(crate) end: FileEnd,
+    pub end: FileEnd,
     /// Bytes understood.
-    pub(crate) bytes: u64,
+    pub bytes: u64,
     /// Chunks with a wrong check value; nothing of them is shown.
-    pub(crate) damaged_chunks: u64,
+    pub damaged_chunks: u64,
     /// Other parts left out.
-    pub(crate) left_out: LeftOut,
+    pub left_out: LeftOut,
     /// Whole messages of a chunk cut by the end of the file, shown without a check value: the kernel that was running
     /// when they were written still runs, and has kept their order.
-    pub(crate) ordered_messages: u64,
+    pub ordered_messages: u64,
     /// The file is whole: finished, nothing after its end, every check value right, nothing left out.
-    pub(crate) sound: bool,
+    pub sound: bool,
     /// It is whole, and no check value is zero, the format's value for "not computed".
-    pub(crate) proven: bool,
+    pub proven: bool,
     /// Which program wrote it.
-    pub(crate) writer: Writer,
+    pub writer: Writer,
     /// Its end gives the place of its index.
-    pub(crate) indexed: bool,
+    pub indexed: bool,
     /// The episode that its chunks name.
-    pub(crate) episode: Option<EpisodeId>,
+    pub episode: Option<EpisodeId>,
 }
 
 impl Integrity {
@@ -118,8 +118,7 @@ impl Integrity {
     }
 
     /// The unreadable parts of the file, for people; `None` if there are none.
-    #[cfg(feature = "policy")]
-    pub(crate) fn damage(&self) -> Option<String> {
+    pub fn damage(&self) -> Option<String> {
         let end = match self.end {
             FileEnd::Finished => None,
             FileEnd::Unfinished => Some("the file was not finished".to_owned()),
@@ -150,7 +149,7 @@ pub(super) const LARGEST_HEADER: u64 = 4 << 10;
 
 /// Which program wrote a file, by its header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) enum Writer {
+pub enum Writer {
     /// This one.
     Rapid,
     /// Another, which has put a profile or its name there.

@@ -29,7 +29,7 @@ const LARGEST: usize = 256 << 10;
 
 /// Identifies an episode among several in one file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct EpisodeId([u8; 16]);
+pub struct EpisodeId([u8; 16]);
 
 impl EpisodeId {
     /// Of an episode that begins now: ns since 1970, and ns of the monotonic clock, whose combination is unique.

@@ -16,7 +16,7 @@ use rapid_system::folder::{Folder, Links, Missing};
 /// Extension of a file that is not finished.
 pub(crate) const PARTIAL: &str = "partial";
 /// Folder beside the episodes for those that were discarded.
-pub(crate) const TRASH: &str = ".trash";
+pub const TRASH: &str = ".trash";
 
 /// The owner of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

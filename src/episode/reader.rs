@@ -27,7 +27,7 @@ use super::{ABOUT, ReadError, op};
 use super::{boot_id, open};
 
 /// See the module's comment.
-pub(crate) struct Reader<R> {
+pub struct Reader<R> {
     path: PathBuf,
     records: RecordIter<R>,
     schemas: BTreeMap<u16, String>,
@@ -37,23 +37,29 @@ pub(crate) struct Reader<R> {
 
 /// A channel, as it was first defined.
 #[derive(Debug)]
-pub(crate) struct Channel {
-    pub(crate) id: u16,
-    pub(crate) topic: String,
+pub struct Channel {
+    /// Its number in the file.
+    pub id: u16,
+    /// Its topic.
+    pub topic: String,
     /// Name of the schema; empty if the file does not define it.
-    pub(crate) schema: String,
+    pub schema: String,
     /// The modality it belongs to: its bit and its name.
-    pub(crate) bit: Option<ModalityId>,
-    pub(crate) modality: Option<String>,
+    pub bit: Option<ModalityId>,
+    /// The modality that sends on it, if one does.
+    pub modality: Option<String>,
     /// Of the topic of actions: the names of the axes, a list in JSON.
-    pub(crate) names: Option<String>,
-    pub(crate) kind: Kind,
+    pub names: Option<String>,
+    /// What its messages hold.
+    pub kind: Kind,
 }
 
 /// A record of the file.
 #[derive(Debug)]
-pub(crate) enum Item<'a> {
+pub enum Item<'a> {
+    /// A channel begins.
     Channel(&'a Channel),
+    /// A message.
     Message(Message<'a>),
     /// Any record except a channel and a message.
     Other(Entry<'a>),
@@ -63,20 +69,22 @@ pub(crate) enum Item<'a> {
 
 /// A message, its content not yet read.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Message<'a> {
-    pub(crate) channel: &'a Channel,
+pub struct Message<'a> {
+    /// Its channel.
+    pub channel: &'a Channel,
     /// The lower 32 bits of the number of a sample, a mask or an action.
-    pub(crate) sequence: u32,
+    pub sequence: u32,
     /// Capture, wall time in ns since 1970.
-    pub(crate) log_time: u64,
+    pub log_time: u64,
     /// Receipt, wall time in ns since 1970.
-    pub(crate) publish_time: u64,
-    pub(crate) data: &'a [u8],
+    pub publish_time: u64,
+    /// The whole message, encoded.
+    pub data: &'a [u8],
 }
 
 impl<'a> Message<'a> {
     /// Reads the content; `None` if it is incomplete or does not match the channel's schema.
-    pub(crate) fn content<'s>(&self, scratch: &'s mut Scratch) -> Option<Content<'s>>
+    pub fn content<'s>(&self, scratch: &'s mut Scratch) -> Option<Content<'s>>
     where
         'a: 's,
     {
@@ -92,7 +100,10 @@ impl<R> std::fmt::Debug for Reader<R> {
 
 impl Reader<File> {
     /// Opens an episode, finished or not.
-    pub(crate) fn open(path: &Path) -> Result<Self, ReadError> {
+    ///
+    /// # Errors
+    /// The file cannot be read, or is no MCAP file.
+    pub fn open(path: &Path) -> Result<Self, ReadError> {
         let (file, size) = open(path)?;
         Self::new(file, size, path, boot_id())
     }
@@ -100,7 +111,10 @@ impl Reader<File> {
 
 impl<R: ReadAt> Reader<R> {
     /// Starts reading `size` bytes, called `path` in errors. `boot`: see [`RecordIter::of_boot`].
-    pub(crate) fn new(file: R, size: u64, path: &Path, boot: Option<String>) -> Result<Self, ReadError> {
+    ///
+    /// # Errors
+    /// The file cannot be read, or is no MCAP file.
+    pub fn new(file: R, size: u64, path: &Path, boot: Option<String>) -> Result<Self, ReadError> {
         let records = RecordIter::new(file, size)
             .map_err(|source| ReadError::Io { path: path.to_owned(), source })?
             .ok_or_else(|| ReadError::NotMcap(path.to_owned()))?;
@@ -110,7 +124,10 @@ impl<R: ReadAt> Reader<R> {
     }
 
     /// Moves to the next record; `false` at the end.
-    pub(crate) fn advance(&mut self) -> Result<bool, ReadError> {
+    ///
+    /// # Errors
+    /// The file cannot be read. Bytes that are damaged are no error: they are left out.
+    pub fn advance(&mut self) -> Result<bool, ReadError> {
         let advanced = self.records.advance().map_err(|source| ReadError::Io { path: self.path.clone(), source })?;
         let record = self.records.record();
         if record.opcode == op::MESSAGE {
@@ -133,7 +150,7 @@ impl<R: ReadAt> Reader<R> {
     }
 
     /// The current record.
-    pub(crate) fn item(&self) -> Item<'_> {
+    pub fn item(&self) -> Item<'_> {
         let read = match Entry::read(self.records.record()) {
             Some(Entry::Message { header, data }) => self.channels.get(&header.channel_id).map(|channel| {
                 let (sequence, log_time, publish_time) = (header.sequence, header.log_time, header.publish_time);
@@ -147,17 +164,17 @@ impl<R: ReadAt> Reader<R> {
     }
 
     /// The channels defined so far.
-    pub(crate) fn channels(&self) -> impl Iterator<Item = &Channel> {
+    pub fn channels(&self) -> impl Iterator<Item = &Channel> {
         self.channels.values()
     }
 
     /// The metadata at the beginning of the episode, once they have been read.
-    pub(crate) fn about(&self, key: &str) -> Option<&str> {
+    pub fn about(&self, key: &str) -> Option<&str> {
         self.about.as_ref()?.get(key).map(String::as_str)
     }
 
     /// The integrity of the file so far; complete once the last record was read.
-    pub(crate) fn integrity(&self) -> Integrity {
+    pub fn integrity(&self) -> Integrity {
         self.records.integrity()
     }
 }
@@ -181,7 +198,8 @@ impl Channel {
 ///
 /// A record may contain any bytes; one that is shorter than its fields is `None`, never a panic.
 #[derive(Debug)]
-pub(crate) enum Entry<'a> {
+#[expect(missing_docs, reason = "records and fields have the names of the specification")]
+pub enum Entry<'a> {
     Schema {
         id: u16,
         name: &'a str,

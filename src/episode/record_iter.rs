@@ -30,7 +30,7 @@ pub(crate) use super::integrity::{Integrity, Record};
 pub(crate) use super::op;
 
 /// At the beginning of a file and at its end.
-pub(crate) const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
+pub const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
 /// Largest record that is read: a greater length counts as damaged. A 4K raw picture has 16 MiB.
 pub(crate) const MAX_RECORD: u64 = 256 << 20;
 /// An opcode, and the length of what follows as u64.

@@ -32,12 +32,12 @@ pub(crate) fn attachment<'a>(
 }
 
 /// The key of the observation; `None` if this is another attachment.
-pub(crate) fn observation<'a>(attachment: &'a Attachment<'_>) -> Option<&'a str> {
+pub fn observation<'a>(attachment: &'a Attachment<'_>) -> Option<&'a str> {
     attachment.name.strip_prefix(PREFIX)
 }
 
 /// The sample as far as its message contains it; `None` if it cannot be read.
-pub(crate) fn sample(attachment: &Attachment<'_>) -> Option<(SampleHeader, Vec<u8>)> {
+pub fn sample(attachment: &Attachment<'_>) -> Option<(SampleHeader, Vec<u8>)> {
     let schema = SampleSchema::named(attachment.media_type.strip_prefix(MEDIA)?)?;
     let mut scratch = Scratch::default();
     let Content::Sample(sample) = decode::content(Kind::Sample(schema), &attachment.data, &mut scratch)? else {

@@ -19,10 +19,7 @@ pub struct Schema {
 
 macro_rules! schema {
     ($name:literal) => {
-        Schema {
-            name: $name,
-            data: include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/src/episode/proto/", $name, ".bin")),
-        }
+        Schema { name: $name, data: include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/proto/", $name, ".bin")) }
     };
 }
 

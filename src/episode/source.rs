@@ -16,8 +16,11 @@ const WINDOW: usize = 64 << 10;
 const PIECE: u64 = 1 << 20;
 
 /// Random access reading, like `pread`.
-pub(crate) trait ReadAt {
+pub trait ReadAt {
     /// Reads up to `buffer.len()` bytes from `at`; 0 at the end.
+    ///
+    /// # Errors
+    /// As `pread(2)`.
     fn read_at(&self, buffer: &mut [u8], at: u64) -> io::Result<usize>;
 }
 

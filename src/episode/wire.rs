@@ -70,7 +70,7 @@ impl<'a> Fields<'a> {
 
 /// A field of a protobuf message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Proto<'a> {
+pub enum Proto<'a> {
     /// A varint.
     Varint(u64),
     /// The bits of a fixed 64-bit field.
@@ -82,7 +82,8 @@ pub(crate) enum Proto<'a> {
 }
 
 impl<'a> Proto<'a> {
-    pub(crate) fn number(self) -> u64 {
+    /// A number; of a field of bytes, 0.
+    pub fn number(self) -> u64 {
         match self {
             Self::Varint(number) | Self::Fixed64(number) => number,
             Self::Fixed32(number) => number.into(),
@@ -96,7 +97,8 @@ impl<'a> Proto<'a> {
         (number >> 1).cast_signed() ^ -(number & 1).cast_signed()
     }
 
-    pub(crate) fn bytes(self) -> &'a [u8] {
+    /// The bytes; of a number, none.
+    pub fn bytes(self) -> &'a [u8] {
         match self {
             Self::Bytes(bytes) => bytes,
             _ => &[],
@@ -105,12 +107,12 @@ impl<'a> Proto<'a> {
 }
 
 /// The fields of a protobuf message, until its end or the first invalid byte.
-pub(crate) fn protobuf(message: &[u8]) -> impl Iterator<Item = (u64, Proto<'_>)> {
+pub fn protobuf(message: &[u8]) -> impl Iterator<Item = (u64, Proto<'_>)> {
     whole_protobuf(message).map_while(|field| field)
 }
 
 /// The fields of a protobuf message; one `None` at the end if the bytes are not a whole message.
-pub(crate) fn whole_protobuf(message: &[u8]) -> impl Iterator<Item = Option<(u64, Proto<'_>)>> {
+pub fn whole_protobuf(message: &[u8]) -> impl Iterator<Item = Option<(u64, Proto<'_>)>> {
     let mut fields = Fields(message);
     std::iter::from_fn(move || {
         if fields.0.is_empty() {

@@ -7,11 +7,11 @@ use std::borrow::Cow;
 use std::fmt;
 
 use rapid_core::sample::Encoding;
+use rapid_episode::decode::jpeg_frame;
+use rapid_episode::record::is_whole_jpeg;
 use rapid_pictures::pixels::{LARGEST, Picture, PixelError, Pixels};
 
 use super::rows::Payload;
-use crate::episode::decode::jpeg_frame;
-use crate::record::is_whole_jpeg;
 
 /// How a dataset has its pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

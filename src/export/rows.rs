@@ -15,11 +15,10 @@ use rapid_core::action::ACTION_TOPIC;
 use rapid_core::modality::{ModalityId, ModalityKind};
 use rapid_core::sample::Encoding;
 use rapid_core::topic::FRAME_TOPIC;
+use rapid_episode::decode::{Content, FrameSlot, Kind, Sample, Scratch};
+use rapid_episode::reader::{Item, Message, Reader};
+use rapid_episode::{ABOUT, ReadError};
 use rapid_registry::columns::ColumnError;
-
-use crate::episode::decode::{Content, FrameSlot, Kind, Sample, Scratch};
-use crate::episode::reader::{Item, Message, Reader};
-use crate::episode::{ABOUT, ReadError};
 
 /// Bytes of samples that may wait for their frame: a minute of four cameras, where a second is usual.
 const MOST_WAITING: usize = 1 << 30;

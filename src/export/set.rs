@@ -26,6 +26,7 @@ use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, RecordBatch, String
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::errors::ParquetError;
+use rapid_episode::sha256;
 use rapid_system::folder::{Folder, FolderError, Links, Missing};
 use rustix::fs::FlockOperation;
 use serde_json::{Map, Value, json};
@@ -40,7 +41,6 @@ use super::statistics::Column;
 use super::survey::Survey;
 use super::table::{Position, Table, one_row, timestamp};
 use super::video::{Damaged, Encoded};
-use crate::episode::sha256;
 
 /// Bytes of a file in JSON, at most.
 const LARGEST_JSON: u64 = 64 << 20;

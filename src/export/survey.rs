@@ -6,6 +6,8 @@ use std::sync::atomic::AtomicBool;
 
 use rapid_core::modality::ModalityKind;
 use rapid_core::text;
+use rapid_episode::record::inspect::{self, Inspection, Judgement};
+use rapid_episode::record_iter::FileEnd;
 use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
 use rapid_registry::{ExportSpec, Form, Registry};
 use rapid_status::{Grade, Verdict};
@@ -13,8 +15,6 @@ use rapid_status::{Grade, Verdict};
 use super::picture::{self, Shape};
 use super::rows::{Index, Listed, Payload, Refusal, Row};
 use super::statistics::Column;
-use crate::episode::record_iter::FileEnd;
-use crate::record::inspect::{self, Inspection, Judgement};
 
 /// Numbers that a registry may declare of a sample; what a file claims may be anything.
 pub(super) const LONGEST: usize = 1 << 16;

@@ -1,7 +1,7 @@
 //! Foxglove: the topics of a running rig over a websocket, as they are recorded.
 //!
 //! Thread `foxglove` has everything: a subscriber of the bus of its own, the server with its connections, and the
-//! encoder, which is that of the recorder ([`crate::episode::encode`]). Messages and times are those of the episode in
+//! encoder, which is that of the recorder ([`rapid_episode::encode`]). Messages and times are those of the episode in
 //! progress, byte for byte: the clock comes from the recorder.
 //!
 //! The protocol is `foxglove.sdk.v1` (<https://github.com/foxglove/ws-protocol>), by the crate `foxglove`.
@@ -36,12 +36,11 @@ use tokio_util::sync::CancellationToken;
 pub use control::Controls;
 use rapid_bus::{BusError, Queues, Subscription};
 use rapid_core::time::{Stamp, WallClock};
+use rapid_episode::made::Made;
 use rapid_registry::{DeviceSpec, Registry};
 use rapid_status::{Board, Event, Level, What};
 use rapid_system::fault;
 use topics::Topics;
-
-use crate::episode::made::Made;
 
 /// Port of a Foxglove server, if none is named.
 const PORT: u16 = 8765;

@@ -18,15 +18,15 @@ use rapid_core::sample::SampleHeader;
 use rapid_core::text;
 use rapid_core::time::{Stamp, WallClock};
 use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
+use rapid_episode::channel;
+use rapid_episode::encode::{self, Announced, logged};
+use rapid_episode::form::{Derived, TRANSFORM_TOPIC};
+use rapid_episode::made::{Made, MadeKind};
+use rapid_episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use rapid_registry::{DeviceSpec, Form, Registry};
 use rapid_status::Event;
 
 use super::pictures::Pace;
-use crate::episode::channel;
-use crate::episode::encode::{self, Announced, logged};
-use crate::episode::form::{Derived, TRANSFORM_TOPIC};
-use crate::episode::made::{Made, MadeKind};
-use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 
 /// Time between two messages about where a sensor sits.
 const PLACES_EVERY: Duration = Duration::from_secs(1);

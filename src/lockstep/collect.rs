@@ -3,14 +3,14 @@
 use std::sync::Arc;
 
 use rapid_core::time::{Stamp, WallClock};
+use rapid_episode::record::stepped::Stepped;
+use rapid_episode::record::{EpisodeReport, EpisodeRequest, RecordError};
 use rapid_registry::Registry;
 use rapid_registry::scenario::Scenario;
 use rapid_registry::simulation::task::{Expert, Outcome, Size, Texture, Touch, UNSEEN_PERIOD, World};
 use rapid_status::Board;
 
 use super::{Lockstep, TrialError};
-use crate::record::stepped::Stepped;
-use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 
 /// How far the gripper misses during a demonstration, so that demonstrations show corrections.
 const SHAKE: f64 = 0.006;

@@ -11,6 +11,8 @@ use rapid_core::modality::ModalityId;
 use rapid_core::random::Random;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_episode::record::stepped::Stepped;
+use rapid_episode::record::{EpisodeReport, EpisodeRequest, RecordError};
 use rapid_registry::scenario::{Scenario, ScenarioAction};
 use rapid_registry::simulation::task::{AXES, Outcome, Size, Texture, Touch, UNSEEN_PERIOD};
 use rapid_registry::{Registry, task};
@@ -24,8 +26,6 @@ use crate::policy::horizon::{Counts, WithoutMask};
 use crate::policy::model::{AnswerError, Model};
 use crate::policy::pilot::Pilot;
 use crate::policy::request::Request;
-use crate::record::stepped::Stepped;
-use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 
 /// The random stream of a trial's seed that determines when cables are unplugged.
 const WINDOWS: u64 = 0x7769_6e64_6f77;

@@ -19,6 +19,8 @@ use rapid_core::modality::ModalityId;
 use rapid_core::provenance::Negotiated;
 use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_episode::record::RecordError;
+use rapid_episode::record::stepped::Taker;
 use rapid_registry::device::{Attachment, DeviceNode};
 use rapid_registry::scenario::{Scenario, ScenarioAction};
 use rapid_registry::simulation::task::{self, AXES, AXIS_COUNT, STEP_HZ, SharedTrial};
@@ -28,8 +30,6 @@ use rapid_status::{Event, Provenance, SlotState, What};
 
 use crate::driver::DriverError;
 use crate::hotplug::script::Timeline;
-use crate::record::RecordError;
-use crate::record::stepped::Taker;
 use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
 use timing::Timing;
 

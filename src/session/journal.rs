@@ -378,7 +378,7 @@ mod tests {
             let folder = tempfile::tempdir().unwrap();
             let noted_entry = EpisodeEntry { discarded: noted, ..entry(name) };
             Journal::open(folder.path()).0.save(&session(vec![noted_entry])).unwrap();
-            let trash = folder.path().join(crate::episode::partial::TRASH);
+            let trash = folder.path().join(rapid_episode::partial::TRASH);
             std::fs::create_dir(&trash).unwrap();
             let places = [(is_here, folder.path().join(name)), (is_in_trash, trash.join(name))];
             for (_, place) in places.into_iter().filter(|(is_there, _)| *is_there) {

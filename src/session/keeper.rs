@@ -9,12 +9,12 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::thread::{Builder, JoinHandle};
 
+use rapid_episode::partial::TRASH;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::sync::oneshot;
 
 use super::journal::{Journal, SessionFile};
 use super::trash;
-use crate::episode::partial::TRASH;
 
 /// A change of the disk.
 #[derive(Debug, Clone, PartialEq)]

@@ -6,11 +6,10 @@ use std::io;
 use std::os::fd::AsFd as _;
 use std::path::Path;
 
+use rapid_episode::partial::TRASH;
 use rapid_system::folder::{Folder, Links, Missing};
 use rustix::fs::RenameFlags;
 use rustix::io::Errno;
-
-use crate::episode::partial::TRASH;
 
 /// Whether this is the name of an episode's file, and not a path.
 pub fn is_name(name: &str) -> bool {

@@ -10,14 +10,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
-use rapid::episode::{encode, schema::SampleSchema};
-use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
 use rapid_bus::TopicId;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, Epoch, SampleHeader};
 use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
 use rapid_core::time::Stamp;
+use rapid_episode::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
+use rapid_episode::{encode, schema::SampleSchema};
 use rapid_registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
 use rapid_status::Board;
 

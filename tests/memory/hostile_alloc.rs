@@ -1,8 +1,8 @@
 //! Files of a few hundred kB that expand to very many small records: what is kept of them and what is done for them is
 //! bounded by the size of the file, and whatever is not judged is a reason.
 
-use rapid::episode::recover::recover_bytes;
-use rapid::record::inspect::{Inspection, inspect_bytes};
+use rapid_episode::record::inspect::{Inspection, inspect_bytes};
+use rapid_episode::recover::recover_bytes;
 use rapid_status::Grade;
 
 use crate::{alone, measured};

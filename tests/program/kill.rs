@@ -1,7 +1,7 @@
 //! Episodes survive `kill -9`: the next run repairs what is there.
 //!
 //! What is in the file when a run is killed depends on how much of the machine its threads got. That whatever is half a
-//! second old is written is a test on the recorder's own clock (`src/record/recorder/tests.rs`); here a run is killed when
+//! second old is written is a test on the recorder's own clock (`src/episode/record/recorder/tests.rs`); here a run is killed when
 //! its file has what was published at an earlier moment, and all of that is in the repaired one.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]

@@ -5,6 +5,8 @@
 use std::sync::Arc;
 
 use rapid_core::time::{Stamp, WallClock};
+use rapid_episode::record::EpisodeRequest;
+use rapid_episode::record::stepped::Stepped;
 use rapid_registry::Registry;
 use rapid_registry::scenario::Scenario;
 use rapid_status::Board;
@@ -12,8 +14,6 @@ use rapid_status::Board;
 use crate::support::{self, Episode, Place, events};
 use rapid::lockstep::timing::Timing;
 use rapid::lockstep::{Lockstep, STEP};
-use rapid::record::EpisodeRequest;
-use rapid::record::stepped::Stepped;
 use serde_json::Value;
 
 /// The folder of the policy of the repository.

@@ -8,9 +8,9 @@ use std::path::Path;
 use std::process::Command;
 
 use rapid_core::random::Random;
+use rapid_episode::record::inspect;
 
 use crate::support::{Place, events};
-use rapid::record::inspect;
 use serde_json::Value;
 
 /// A camera and a serial device, small enough for many copies of an episode.

@@ -3,6 +3,7 @@ use std::io;
 
 use rapid_bus::TopicId;
 use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_episode::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use rapid_registry::Registry;
 use rapid_status::session::{Label, SessionRequest};
 use rapid_status::{Grade, Level, Snapshot, Verdict};
@@ -15,7 +16,6 @@ use super::super::streaming::Streaming;
 use super::*;
 use crate::interlocks::Watched;
 use crate::patience::PATIENCE;
-use crate::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use crate::session::journal::Plan;
 
 /// A bus on which nothing is published.

@@ -1,12 +1,12 @@
 use std::io::Write as _;
 
+use crate::recorded::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
 use proptest::prelude::*;
 use rapid_core::mask::PhysicalMask;
 use rapid_registry::scenario::ScenarioAction;
 
 use super::*;
 use crate::effort::{cases, every};
-use crate::episode::testing::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
 
 fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
     let mut file = tempfile::NamedTempFile::new().unwrap();

@@ -16,7 +16,7 @@ use super::super::reader::Entry;
 use super::super::record_iter::{Record, RecordIter, op};
 use super::report;
 use super::{ProgressFn, Repaired, summary::Summary};
-use crate::episode::{Failed, RECOVERED, ReadAt, SUMMARY, hash, own};
+use crate::{Failed, RECOVERED, ReadAt, SUMMARY, hash, own};
 
 /// Bytes read between two calls of a [`ProgressFn`], including those searched in vain for a chunk.
 const WATCH_EVERY: u64 = 1 << 20;

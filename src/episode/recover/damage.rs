@@ -13,10 +13,10 @@ use super::copy::recover_bytes;
 use super::tests::{keep_going, names, put, recorded};
 use super::{FileEnd, RecoverError, RepairOutcome, left_behind, recover};
 use crate::effort::every;
-use crate::episode::op;
-use crate::episode::own::EpisodeId;
-use crate::episode::record_iter::MAGIC;
-use crate::episode::testing::{self, Message, metadata, strictly};
+use crate::op;
+use crate::own::EpisodeId;
+use crate::record_iter::MAGIC;
+use crate::testing::{self, Message, metadata, strictly};
 
 /// Mutations of each file.
 const CASES: usize = 120;
@@ -179,7 +179,7 @@ pub(super) fn unfinished(bytes: &[u8]) -> &[u8] {
 #[tokio::test]
 async fn nothing_is_taken_from_a_torn_chunk_after_a_reboot() {
     let (folder, mut bytes) = recorded().await;
-    let boot = crate::episode::boot_id().unwrap();
+    let boot = crate::boot_id().unwrap();
     let at = bytes.windows(boot.len()).position(|part| part == boot.as_bytes()).unwrap();
     bytes[at..at + boot.len()].copy_from_slice(boot.replace(|c: char| c.is_ascii_hexdigit(), "0").as_bytes());
     let original = strictly(&bytes);

@@ -19,7 +19,7 @@ use rapid_system::disk::Disk;
 use rustix::process::setpriority_process;
 
 use super::{Names, ProgressFn, RecoverError, Recovered, RepairOutcome, Source, recover};
-use crate::episode::{self, Failed};
+use crate::Failed;
 
 /// How soon a repair in the background notices that it is to end.
 const NOTICE: Duration = Duration::from_millis(20);
@@ -49,7 +49,7 @@ pub fn finished(folder: &Path) -> io::Result<Vec<PathBuf>> {
 /// # Errors
 /// When it cannot be read, or `watch` ends it.
 pub fn is_damaged(path: &Path, watch: &mut ProgressFn<'_>) -> Result<bool, RecoverError> {
-    let (file, size) = episode::open(path)?;
+    let (file, size) = crate::open(path)?;
     let failed = Failed::of(&file, size).map_err(|source| super::io_of(path, source))?;
     let source = Source { path, file, size, failed };
     let Some(known) = source.read(watch)? else { return Ok(false) };

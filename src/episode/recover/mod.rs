@@ -43,8 +43,8 @@ use rapid_core::{text, time};
 use serde::Serialize;
 
 use super::partial::{self, Lock};
-use crate::episode::record_iter::MAGIC;
-use crate::episode::{self, Failed, ReadError};
+use crate::record_iter::MAGIC;
+use crate::{Failed, ReadError};
 
 use self::copy::Copied;
 pub use self::copy::recover_bytes;
@@ -201,7 +201,7 @@ pub fn recover(path: &Path, watch: &mut ProgressFn<'_>) -> Result<Recovered, Rec
     if fs::symlink_metadata(path).map_err(io)?.is_symlink() {
         return Err(RecoverError::NotFile(path.to_owned()));
     }
-    let (file, _) = episode::open(path)?;
+    let (file, _) = crate::open(path)?;
     let names = Names::of(path);
     match partial::take(&file, path).map_err(io)? {
         Lock::Ours => {}
@@ -303,7 +303,7 @@ impl Source<'_> {
     /// After an error there is no such file.
     fn copy(&self, to: &Path, sha256: String, watch: &mut ProgressFn<'_>) -> Result<Option<Copied>, RecoverError> {
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
-        let (time_ns, boot, failed) = (time::realtime_ns(), episode::boot_id(), self.failed.as_ref());
+        let (time_ns, boot, failed) = (time::realtime_ns(), crate::boot_id(), self.failed.as_ref());
         let about = copy::About { name: &name, sha256, time_ns, boot, failed };
         let copied = names::create(to).map_err(copy::Error::Write).and_then(|file| {
             let copied = copy::copy(&self.file, self.size, &about, file, watch);
@@ -342,7 +342,7 @@ impl Source<'_> {
         watch: &mut ProgressFn<'_>,
     ) -> Result<Option<(PathBuf, bool)>, RecoverError> {
         for finished in names.candidates() {
-            let Ok((file, size)) = episode::open(&finished) else { continue };
+            let Ok((file, size)) = crate::open(&finished) else { continue };
             let summary = copy::summary(&file, size, watch).map_err(|error| self.error(error, self.path))?;
             let Some(summary) = summary else { continue };
             if let Some((_, is_all)) = summary.made_of(self.size).filter(|(of, _)| *of == sha256) {

@@ -9,10 +9,10 @@ use super::damage::{Chunk, chunks, largest, unfinished};
 use super::tests::{keep_going, names, put, recorded, repaired};
 use super::{FileEnd, RecoverError, RepairOutcome, recover};
 use crate::effort::every;
-use crate::episode::own::EpisodeId;
-use crate::episode::record_iter::MAGIC;
-use crate::episode::testing::{Message, metadata, strictly};
+use crate::own::EpisodeId;
 use crate::record::inspect::{Inspection, inspect};
+use crate::record_iter::MAGIC;
+use crate::testing::{Message, metadata, strictly};
 
 /// Makes something of this name.
 type Plant<'a> = &'a dyn Fn(&Path);
@@ -112,7 +112,7 @@ fn records(bytes: &[u8], chunk: &Chunk) -> Vec<(usize, bool)> {
     let (mut at, mut ends) = (chunk.content.start + 40, Vec::new());
     while at < chunk.content.end {
         let length = usize::try_from(u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap())).unwrap();
-        let is_message = bytes[at] == crate::episode::op::MESSAGE;
+        let is_message = bytes[at] == crate::op::MESSAGE;
         at += 9 + length;
         ends.push((at, is_message));
     }

@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use super::copy::{About, Copied};
 use super::summary::{LOSSLESS, SHA256, Summary};
 use super::{FileEnd, LeftOut, Recovered, RepairOutcome, Repaired};
-use crate::episode::{FAILED, text_map};
+use crate::{FAILED, text_map};
 
 /// The metadata record `rapid/summary` of an episode whose recorder wrote none, as far as it is
 /// known. Same keys as the recorder's, without those that only the recorder could count.

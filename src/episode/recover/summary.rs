@@ -7,7 +7,7 @@ use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
 
 use super::super::reader::Entry;
 use super::super::record_iter::Integrity;
-use crate::episode::{ABOUT, FAILED, RECOVERED, SUMMARY};
+use crate::{ABOUT, FAILED, RECOVERED, SUMMARY};
 
 /// Key of `rapid/recovered`: "true" if only a torn end of the original is left out.
 pub(super) const LOSSLESS: &str = "lossless";

@@ -10,9 +10,9 @@ use rapid_status::{Grade, Level};
 use super::copy::{About, Error};
 use super::*;
 use crate::effort::every;
-use crate::episode::testing::{self, Message, metadata, mutated, mutations, strictly};
 use crate::record::Sink;
 use crate::record::tests::{Bench, registry};
+use crate::testing::{self, Message, metadata, mutated, mutations, strictly};
 
 pub(super) fn keep_going(_: u64, _: u64) -> ControlFlow<()> {
     ControlFlow::Continue(())

@@ -7,7 +7,7 @@
 //! Invariant: a file that cannot be parsed to its end is refused: another parser might find more in it.
 //! Invariant: the work grows with the number of fields; no nesting makes it recurse.
 
-use crate::episode::wire::{Proto, protobuf, whole_protobuf};
+use rapid_episode::wire::{Proto, protobuf, whole_protobuf};
 
 /// Largest field number; a parser with 32-bit keys would misread a larger one.
 const LAST_FIELD: u64 = (1 << 29) - 1;

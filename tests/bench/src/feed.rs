@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use rapid::driver::sim;
-use rapid::episode::encode;
-use rapid::episode::schema::{self, SampleSchema};
 use rapid_bus::TopicId;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_episode::encode;
+use rapid_episode::schema::{self, SampleSchema};
 use rapid_registry::Registry;
 use rapid_registry::scenario::Scenario;
 use rapid_registry::simulation::SimSource;

@@ -7,12 +7,12 @@ use std::time::Duration;
 
 use rapid::hotplug::HotplugStream;
 use rapid::hotplug::script::Script;
-use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
 use rapid_bus::{Bus, Inbox, TopicId};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_episode::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
 use rapid_registry::Registry;
 use rapid_status::Board;
 use tokio_util::sync::CancellationToken;

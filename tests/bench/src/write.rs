@@ -9,10 +9,10 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
 use mcap::{Compression, WriteOptions};
-use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Sink, Source};
 use rapid_bus::TopicId;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_episode::record::{EpisodeRequest, Recorder, RecorderConfig, Sink, Source};
 use rapid_status::Board;
 
 use crate::child::{self, Plain, process_cpu_s, thread_cpu_s};
@@ -264,7 +264,7 @@ fn lane_of(messages: Vec<Vec<u8>>) -> Feed {
     let lane = Lane {
         topic: TopicId::Mask,
         name: "/set".to_owned(),
-        schema: rapid::episode::schema::SampleSchema::Bytes,
+        schema: rapid_episode::schema::SampleSchema::Bytes,
         header: SampleHeader::default(),
         payloads: messages.clone(),
         messages,

@@ -6,12 +6,12 @@ use std::path::Path;
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions};
-use rapid::episode::encode;
-use rapid::episode::schema::{self, SampleSchema};
 use rapid_core::mask::{MaskRecord, PhysicalMask};
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_episode::encode;
+use rapid_episode::schema::{self, SampleSchema};
 use rapid_registry::{BUILTIN, Registry};
 use rapid_status::Level;
 

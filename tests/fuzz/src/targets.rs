@@ -8,10 +8,10 @@ use std::time::Duration;
 
 use rapid::commands;
 use rapid::driver;
-use rapid::episode::recover::recover_bytes;
-use rapid::record::inspect as inspection;
 use rapid_core::mask::{MaskRecord, RECORD_LEN};
 use rapid_core::text as shown;
+use rapid_episode::record::inspect as inspection;
+use rapid_episode::recover::recover_bytes;
 use rapid_registry::device::{Attachment, DeviceNode, Unit, UsbIdentity};
 use rapid_registry::scenario::Scenario;
 use rapid_registry::units::{parse_duration, parse_size, show_duration, show_size};
@@ -99,7 +99,7 @@ pub fn serial(bytes: &[u8]) {
 /// One recorded message, of each schema.
 pub fn message(bytes: &[u8]) {
     for schema in ["foxglove.CompressedImage", "foxglove.RawImage", "rapid.Scalars", "rapid.Bytes"] {
-        if let Some((payload, width, _)) = rapid::episode::decode(schema, bytes) {
+        if let Some((payload, width, _)) = rapid_episode::decode(schema, bytes) {
             // Padding of rows is taken away; nothing is added.
             assert!(payload.len() <= bytes.len(), "{schema} grew");
             assert!(schema != "rapid.Scalars" || payload.len() == width as usize * 8);

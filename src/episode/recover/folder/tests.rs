@@ -2,8 +2,8 @@
 
 use super::super::tests::{names, put, recorded};
 use super::*;
-use crate::episode::testing::strictly;
 use crate::record::tests::registry;
+use crate::testing::strictly;
 
 #[tokio::test]
 async fn a_folder_is_repaired_and_reported_in_the_background() {

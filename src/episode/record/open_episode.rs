@@ -41,9 +41,9 @@ use super::quality::{Frames, Measured, Measures, Quality, SampleFacts};
 use super::streams::{Hole, MaskHistory};
 use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge};
 use super::writeback::Writeback;
-use crate::episode::chunk_writer::Sink;
-use crate::episode::encode::{Announced as Report, logged};
-use crate::episode::made::Shown;
+use crate::chunk_writer::Sink;
+use crate::encode::{Announced as Report, logged};
+use crate::made::Shown;
 
 /// Samples of a modality that may arrive while a full queue is being written.
 const RING_SLACK: usize = 1024;

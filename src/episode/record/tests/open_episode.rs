@@ -104,7 +104,7 @@ fn references_of_the_policy_are_attached() {
     let summary = mcap::Summary::read(&whole).unwrap().unwrap();
     assert_eq!(summary.attachment_indexes.len(), 5, "with the registry");
     let message = &read(&report.file).attachments["reference/known"];
-    assert_eq!(crate::episode::decode("rapid.Scalars", message).unwrap().0, 1.5_f64.to_le_bytes());
+    assert_eq!(crate::decode("rapid.Scalars", message).unwrap().0, 1.5_f64.to_le_bytes());
 }
 
 #[test]

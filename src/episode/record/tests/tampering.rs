@@ -5,8 +5,8 @@ use std::io::{Read as _, Seek, SeekFrom};
 use std::time::Instant;
 
 use super::*;
-use crate::episode::{recover, testing};
 use crate::patience::PATIENCE;
+use crate::{recover, testing};
 
 /// Bytes that are in the kernel's hands before the file is touched.
 const ENOUGH: u64 = 200_000;
@@ -152,7 +152,7 @@ fn has_chunk(bytes: &[u8]) -> bool {
     while let Some(length) = bytes.get(at + 1..at + 9) {
         let end = u64::from_le_bytes(length.try_into().unwrap()).saturating_add(at as u64 + 9);
         match usize::try_from(end) {
-            Ok(end) if end <= bytes.len() && bytes[at] == crate::episode::op::CHUNK => {
+            Ok(end) if end <= bytes.len() && bytes[at] == crate::op::CHUNK => {
                 // Two times, the size, the check value, no compression, and the size again.
                 let (head, records) = bytes[at + 9..end].split_at(40);
                 let check = u32::from_le_bytes(head[24..28].try_into().unwrap());
@@ -211,7 +211,7 @@ fn an_episode_with_nothing_left_but_its_reason_is_bad_for_that_reason() {
     let why = "another program cut it while it was recorded: all of it is gone";
     let file = folder.path().join("a_001.mcap.partial");
     for before in [&b""[..], &[0; 100]] {
-        std::fs::write(&file, [before, &crate::episode::Failed::mark(why)].concat()).unwrap();
+        std::fs::write(&file, [before, &crate::Failed::mark(why)].concat()).unwrap();
         found_again("nothing is left", why, &file);
     }
 }

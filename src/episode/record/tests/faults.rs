@@ -1,8 +1,8 @@
 //! Disks that fail, kills and panics.
 
 use super::*;
-use crate::episode::Failed;
-use crate::episode::recover;
+use crate::Failed;
+use crate::recover;
 
 /// A disk of few bytes.
 struct SmallDisk(File, usize);

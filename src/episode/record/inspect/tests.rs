@@ -7,11 +7,11 @@ use rapid_status::{Chunk, Grade, Hold, Sensors, What};
 
 use super::*;
 use crate::effort::{cases, every};
-use crate::episode::testing;
 use crate::record::tests::Bench;
+use crate::testing;
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
-    match inspect_from(bytes, bytes.len() as u64, Path::new("x.mcap"), episode::boot_id()) {
+    match inspect_from(bytes, bytes.len() as u64, Path::new("x.mcap"), crate::boot_id()) {
         Err(ReadError::NotMcap(_)) => None,
         read => Some(read.unwrap()),
     }

@@ -10,10 +10,10 @@ use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_pictures::pixels::Picture;
 
 use super::thumbnail::{Thumbnail, Thumbnails};
-use crate::episode::decode::{Content, FrameSlot, Kind, Scratch};
-use crate::episode::reader::{Channel, Item, Message};
-use crate::episode::schema::SampleSchema;
+use crate::decode::{Content, FrameSlot, Kind, Scratch};
+use crate::reader::{Channel, Item, Message};
 use crate::record::inspect::{Inspection, Numbers};
+use crate::schema::SampleSchema;
 
 /// Bins of the time of an episode.
 pub(super) const BINS: usize = 480;

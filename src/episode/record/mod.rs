@@ -30,10 +30,9 @@ mod writeback;
 
 use std::path::PathBuf;
 
-pub use crate::episode::chunk_writer::Sink;
+pub use crate::chunk_writer::Sink;
 pub use episode_path::{EpisodeReport, EpisodeRequest, open_folder};
-#[cfg(feature = "export")]
-pub(crate) use quality::is_whole_jpeg;
+pub use quality::is_whole_jpeg;
 pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderAddition, RecorderConfig, Source};
 pub use space::Asker;

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::render::clean;
 use super::{FileEnd, Inspection, Judgement, ReadError, inspect};
-use crate::episode::partial::PARTIAL;
+use crate::partial::PARTIAL;
 
 /// An episode of a list. As JSON, one object a line.
 #[derive(Debug, Clone, PartialEq, Serialize)]

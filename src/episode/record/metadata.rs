@@ -14,7 +14,7 @@ use super::provenance::Units;
 use super::publishers;
 use super::quality::{Quality, Spread};
 use super::verdict::Facts;
-use crate::episode::{self, BOOT_ID, text_map};
+use crate::{BOOT_ID, text_map};
 
 /// Key of the record at the end: why the episode is not whole.
 pub(super) const CUT_SHORT: &str = "cut_short";
@@ -78,7 +78,7 @@ pub(super) fn beginning(
     ]);
     report.extend(units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
     // A repair trusts what was written last only where the kernel that wrote it still runs.
-    report.extend(episode::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
+    report.extend(crate::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
     report
 }
 

@@ -22,7 +22,7 @@ use rustix::fs::inotify::{self, CreateFlags, ReadFlags, Reader, WatchFlags};
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl, fstat, stat};
 
 use super::episode_path::EpisodePath;
-use crate::episode::record_iter::RecordIter;
+use crate::record_iter::RecordIter;
 
 /// Room for the events of one read; more need another.
 const EVENT_BYTES: usize = 1024;

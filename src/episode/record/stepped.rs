@@ -16,7 +16,7 @@ use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::open_episode::{Beginning, OpenEpisode};
 use super::provenance::Attached;
 use super::streams::Streams;
-use crate::episode::chunk_writer::Sink;
+use crate::chunk_writer::Sink;
 
 /// Who sees what a rig sends, in the order of time.
 pub trait Taker {

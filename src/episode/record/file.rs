@@ -25,15 +25,15 @@ use rapid_registry::{Form, ModuleSpec, Registry, TransformSpec};
 use rapid_status::{Level, ReferenceSample};
 
 use super::guard::Guard;
-use crate::episode::channel;
-use crate::episode::chunk_writer::{self, ChunkWriter, Sink, io_error};
-use crate::episode::encode::{self, EventText};
-use crate::episode::form::{Derived, TRANSFORM_TOPIC};
-use crate::episode::made::{MadeKind, Shown};
-use crate::episode::own::EpisodeId;
-use crate::episode::reference;
-use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
-use crate::episode::{ABOUT, SUMMARY};
+use crate::channel;
+use crate::chunk_writer::{self, ChunkWriter, Sink, io_error};
+use crate::encode::{self, EventText};
+use crate::form::{Derived, TRANSFORM_TOPIC};
+use crate::made::{MadeKind, Shown};
+use crate::own::EpisodeId;
+use crate::reference;
+use crate::schema::{self, PROTOBUF, SampleSchema, Schema};
+use crate::{ABOUT, SUMMARY};
 
 /// See the module's comment.
 pub(super) struct EpisodeFile {

@@ -1,6 +1,7 @@
 //! A small episode, and what can happen to its bytes.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails a test")]
+#![allow(dead_code, reason = "each crate uses a part of it")]
 
 use std::collections::BTreeMap;
 use std::io::Cursor;

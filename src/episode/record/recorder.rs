@@ -39,9 +39,9 @@ use super::provenance::Attached;
 use super::publishers::Publishers;
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
-use crate::episode::chunk_writer::Sink;
-use crate::episode::made::Shown;
-use crate::episode::partial::PARTIAL;
+use crate::chunk_writer::Sink;
+use crate::made::Shown;
+use crate::partial::PARTIAL;
 
 /// Longest wait for samples, which delays a command, an event or a due frame.
 const TURN: Duration = Duration::from_millis(20);

@@ -19,11 +19,11 @@ use super::policy::Gathered;
 use super::state::{self, Counted};
 use super::units;
 use super::{EventReport, Inspection, Judgement, Lateness, MaskEdge, ModalityReport, TopicReport};
-use crate::episode::decode::{Content, FrameSlot, Kind, Scratch};
-use crate::episode::encode::EventText;
-use crate::episode::reader::{Attachment, Channel, Entry, Item, Message};
-use crate::episode::record_iter::Integrity;
-use crate::episode::{ABOUT, FAILED, Failed, RECOVERED, SUMMARY, Writer};
+use crate::decode::{Content, FrameSlot, Kind, Scratch};
+use crate::encode::EventText;
+use crate::reader::{Attachment, Channel, Entry, Item, Message};
+use crate::record_iter::Integrity;
+use crate::{ABOUT, FAILED, Failed, RECOVERED, SUMMARY, Writer};
 
 /// Events and changes of the mask kept: a rig that flaps all day must not fill the memory.
 const MAX_EVENTS: usize = 10_000;

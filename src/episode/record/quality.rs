@@ -492,7 +492,7 @@ const EOI: [u8; 2] = [0xff, 0xd9];
 
 /// Does a payload begin and end like a JPEG picture? Checks two bytes at each end; padding of zeros, as of some
 /// cameras, does not count.
-pub(crate) fn is_whole_jpeg(payload: &[u8]) -> bool {
+pub fn is_whole_jpeg(payload: &[u8]) -> bool {
     let end = payload.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
     let picture = payload.get(..end).unwrap_or_default();
     // Both markers, each with bytes of its own.

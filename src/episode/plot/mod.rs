@@ -17,7 +17,7 @@ use std::path::Path;
 
 use rapid_status::session::EpisodeEntry;
 
-use crate::episode::reader::Reader;
+use crate::reader::Reader;
 use crate::record::inspect::{self, Inspection, Judgement, ReadError};
 use gather::{Span, Timeline};
 

@@ -23,10 +23,10 @@ use super::super::quality::{Frames, Measured, Measures, Quality, SampleFacts, Sp
 use super::super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
 use super::ModalityReport;
 use super::state::{self, Counted, file_state};
-use crate::episode::decode::{FrameSlot, Sample};
-use crate::episode::reader::Message;
-use crate::episode::record_iter::Integrity;
-use crate::episode::{ABOUT, SUMMARY};
+use crate::decode::{FrameSlot, Sample};
+use crate::reader::Message;
+use crate::record_iter::Integrity;
+use crate::{ABOUT, SUMMARY};
 
 /// No registry is longer; the text of a hostile file may be.
 const LONGEST_REGISTRY: usize = 1 << 20;

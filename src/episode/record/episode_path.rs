@@ -17,8 +17,8 @@ use rustix::fs::{Mode, OFlags};
 use serde::Serialize;
 
 use super::RecordError;
-use crate::episode::Failed;
-use crate::episode::partial::{self, Lock, PARTIAL, TRASH, rename};
+use crate::Failed;
+use crate::partial::{self, Lock, PARTIAL, TRASH, rename};
 
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
 /// bytes a file name may have.

@@ -11,8 +11,8 @@ use roxmltree::Document;
 use super::gather::{BINS, Mark, PICTURES, Row, Subject};
 use super::thumbnail::Thumbnail;
 use super::*;
-use crate::episode::testing;
 use crate::record::inspect::{MaskEdge, ModalityReport, TopicReport};
+use crate::testing;
 
 const HOSTILE: &str = "</text><script>alert(1)</script> \"'&\u{0}\u{1b}[2J\u{202e}\u{ffff}";
 

@@ -25,14 +25,14 @@ use rapid_status::{Grade, Sensors, Verdict};
 use serde::{Serialize, Serializer};
 
 use super::quality::{Quality, Spread};
-use crate::episode::reader::Reader;
-use crate::episode::record_iter::Integrity;
-use crate::episode::{self, Failed, ReadAt};
+use crate::reader::Reader;
+use crate::record_iter::Integrity;
+use crate::{Failed, ReadAt};
 use collect::Collected;
 pub(crate) use judge::Numbers;
 
-pub use crate::episode::ReadError;
-pub use crate::episode::record_iter::{FileEnd, LeftOut};
+pub use crate::ReadError;
+pub use crate::record_iter::{FileEnd, LeftOut};
 pub use list::{Listed, episodes, list, render_list};
 pub use policy::{HoldReport, PolicyReport};
 pub use render::render;
@@ -254,8 +254,8 @@ impl Serialize for Judgement {
 /// # Errors
 /// When it cannot be read or is not an MCAP file. An unfinished or damaged one is not an error.
 pub fn inspect(path: &Path) -> Result<Inspection, ReadError> {
-    let (file, size) = episode::open(path)?;
-    inspect_from(file, size, path, episode::boot_id())
+    let (file, size) = crate::open(path)?;
+    inspect_from(file, size, path, crate::boot_id())
 }
 
 /// What a file of these bytes, which may be any, holds; `None` if they are no MCAP file.

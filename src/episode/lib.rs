@@ -5,39 +5,51 @@
 //!
 //! Invariant: no bytes cause a panic here, and memory holds one record of a file at a time.
 
-pub(crate) mod channel;
+pub mod channel;
 mod chunk;
 pub(crate) mod chunk_writer;
-pub(crate) mod decode;
+pub mod decode;
+#[cfg(test)]
+#[path = "../../tests/support/effort.rs"]
+mod effort;
 pub mod encode;
 mod failed;
 pub mod form;
 mod hash;
 mod index;
 mod integrity;
-pub(crate) mod made;
+pub mod made;
 mod names;
 pub(crate) mod op;
 pub(crate) mod own;
-pub(crate) mod partial;
-pub(crate) mod reader;
-pub(crate) mod record_iter;
+pub mod partial;
+#[cfg(test)]
+#[path = "../../tests/support/patience.rs"]
+mod patience;
+pub mod plot;
+pub mod reader;
+pub mod record;
+pub mod record_iter;
 pub mod recover;
-pub(crate) mod reference;
+pub mod reference;
 mod resync;
 pub mod schema;
+#[cfg(test)]
+#[path = "../../tests/support/skip.rs"]
+mod skip;
 mod source;
 #[cfg(test)]
+#[path = "../../tests/support/recorded.rs"]
 pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
-pub(crate) mod wire;
+pub mod wire;
 
 pub use decode::decode;
 pub(crate) use failed::Failed;
 pub use hash::sha256;
 pub(crate) use integrity::Writer;
-pub(crate) use source::ReadAt;
+pub use source::ReadAt;
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -48,7 +60,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::OFlags;
 
 /// Metadata record at an episode's beginning.
-pub(crate) const ABOUT: &str = "rapid";
+pub const ABOUT: &str = "rapid";
 /// Metadata record at an episode's end.
 pub(crate) const SUMMARY: &str = "rapid/summary";
 /// Metadata record of an episode that was repaired.
@@ -61,7 +73,7 @@ pub(crate) const FAILED: &str = "failed";
 pub(crate) const BOOT_ID: &str = "boot_id";
 
 /// Pairs of text as MCAP's metadata have them.
-pub(crate) fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
+pub fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
     pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
@@ -93,7 +105,10 @@ pub enum ReadError {
 
 /// Opens a file to be read, and its size in bytes. Pipes, devices and folders are refused without
 /// being opened: opening one may block forever or have side effects.
-pub(crate) fn open(path: &Path) -> Result<(File, u64), ReadError> {
+///
+/// # Errors
+/// There is no such file, or it is not a file.
+pub fn open(path: &Path) -> Result<(File, u64), ReadError> {
     let io = |source| ReadError::Io { path: path.to_owned(), source };
     let not_file = || ReadError::NotFile(path.to_owned());
     if !std::fs::metadata(path).map_err(io)?.is_file() {

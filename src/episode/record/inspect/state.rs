@@ -13,10 +13,10 @@ use super::super::metadata::CUT_SHORT;
 use super::super::verdict::{FileState, Missing};
 use super::ModalityReport;
 use super::judge::Ending;
-use crate::episode::own::EpisodeId;
-use crate::episode::record_iter::{FileEnd, Integrity, LeftOut};
-use crate::episode::{ABOUT, SUMMARY};
+use crate::own::EpisodeId;
 use crate::record::Quality;
+use crate::record_iter::{FileEnd, Integrity, LeftOut};
+use crate::{ABOUT, SUMMARY};
 
 /// Ticks are at whole nanoseconds of another clock.
 const ROUNDING: u64 = 1_000;
