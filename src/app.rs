@@ -193,10 +193,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
     // earlier one left unfinished.
     let _repairs = may_record.then(|| {
-        let (unfinished, found) = (conductor.collection.unfinished(), conductor.found());
-        let folder = out.clone();
-        let examine = move || unfinished.into_iter().for_each(|file| collection::examine(&folder, file, &found));
-        let repairs = Repairs::start(out.clone(), reserve, Arc::clone(&board), examine);
+        let repairs = Repairs::start(out.clone(), reserve, Arc::clone(&board), conductor.collection.examination());
         repairs.inspect_err(|error| tracing::warn!(%error, "unfinished episodes are not repaired")).ok()
     });
     // A panic here ends the run like any other error: the shutdown is carried out in order.
@@ -310,7 +307,6 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let taps = [watched.taps(), buttons.taps()].concat();
     let streaming = Streaming::start(rig.obeying(&permission).tapped(&taps), plugged, rig_commands);
     let conductor = Conductor {
-        events: board.events(),
         board,
         collection,
         record: options.record,
@@ -318,7 +314,6 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         duration: options.duration,
         begin_episode: options.record,
         loaded,
-        found: mpsc::unbounded_channel(),
     };
     let running = Running {
         permission,

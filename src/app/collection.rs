@@ -6,24 +6,27 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use rapid_core::time::{Stamp, realtime_ns, rfc3339};
 use rapid_episode::record::inspect::{self, Judgement, Listed};
-use rapid_episode::record::{EpisodeReport, EpisodeRequest, RecordError, Recorder};
+use rapid_episode::record::{EpisodeRequest, RecordError, Recorder};
 use rapid_registry::{ModuleError, ModuleSpec};
 use rapid_status::session::{Answered, Phase, SessionRequest, SessionStatus};
-use rapid_status::{Board, EpisodeEnd, Level, Verdict, What};
-use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender};
+use rapid_status::{Board, EpisodeReport, Level, Verdict, What};
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
 
 use super::AppError;
-use super::conductor::LAST_SAMPLES;
 use super::requests::Reply;
 use super::stage::join;
 use crate::session::journal::{self, Journal, Plan, SessionFile};
 use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
 use crate::session::{Answer, Effect, Session};
+
+/// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
+const LAST_SAMPLES: Duration = Duration::from_secs(2);
 
 /// Answers that wait for an episode to begin, or to end.
 type Waiting = Vec<oneshot::Sender<Result<String, String>>>;
@@ -38,14 +41,14 @@ fn reply_all(to: Waiting, answer: &Result<String, String>) {
 }
 
 /// What became of an episode of which no end was noted.
-pub(super) struct Found {
+struct Found {
     file: String,
     /// Its length in seconds and its verdict; `None` if nothing was recorded.
     end: Option<(f64, Verdict)>,
 }
 
 /// Reads an episode of which no end was noted: the run was killed then. Blocks. One that waits to be repaired stays as it is.
-pub(super) fn examine(folder: &Path, file: String, found: &UnboundedSender<Found>) {
+fn examine(folder: &Path, file: String, found: &UnboundedSender<Found>) {
     let is_there = |ending: &str| folder.join(format!("{file}{ending}")).symlink_metadata().is_ok();
     let end = if is_there("") {
         let Listed { verdict: Judgement::Episode(verdict), seconds, .. } = inspect::list(&folder.join(&file)) else {
@@ -78,7 +81,7 @@ fn mounted(now: &[String], requested: &[String], known: &[ModuleSpec]) -> Result
 /// See the module's comment.
 pub(super) struct Collection {
     board: Arc<Board>,
-    pub(super) recorder: Recorder,
+    recorder: Recorder,
     /// Folder, modules and duration of each episode; task and tags are the session's.
     episode: EpisodeRequest,
     /// The modules of the registry.
@@ -88,6 +91,8 @@ pub(super) struct Collection {
     /// What the keeper is to do for the request that is being carried out.
     operations: Vec<Operation>,
     outcomes: UnboundedReceiver<Outcome>,
+    /// What became of episodes of which no end was noted.
+    found: (UnboundedSender<Found>, UnboundedReceiver<Found>),
     at_begin: Beginning,
     at_end: Waiting,
     answer: Option<Answered>,
@@ -101,8 +106,6 @@ pub(super) struct Collection {
     taken: Vec<String>,
     /// The plan of this run has a goal.
     has_goal: bool,
-    /// The end that was handled last: a reader that missed events may see it again.
-    handled: Option<EpisodeEnd>,
 }
 
 impl Collection {
@@ -135,6 +138,7 @@ impl Collection {
             keeper,
             operations: Vec::new(),
             outcomes,
+            found: unbounded_channel(),
             at_begin: Vec::new(),
             at_end: Vec::new(),
             answer: None,
@@ -142,7 +146,6 @@ impl Collection {
             superseded: earlier.filter(|_| is_new),
             taken,
             has_goal,
-            handled: None,
         };
         collection.show();
         Ok(collection)
@@ -239,20 +242,30 @@ impl Collection {
         }
     }
 
-    /// An episode has ended. One that was handled already is ignored.
+    /// Waits for the end of the episode in progress, which is to be [noted](Self::note_end); meanwhile, it takes what the
+    /// keeper reports, and what became of episodes of which no end was noted. Cancel-safe.
+    pub(super) async fn ended(&mut self) -> EpisodeReport {
+        loop {
+            tokio::select! {
+                biased;
+                Some(end) = self.recorder.ended() => return end,
+                Some(outcome) = self.outcomes.recv() => self.take(outcome),
+                // This holds a sender: it does not end.
+                Some(found) = self.found.1.recv() => self.examined(&found),
+            }
+        }
+    }
+
+    /// An episode has ended.
     ///
     /// # Errors
     /// When the next one could not begin.
-    pub(super) async fn ended(&mut self, end: &EpisodeEnd) -> Result<(), RecordError> {
-        let (effects, answer) = self.note_end(end);
+    pub(super) async fn note_end(&mut self, end: &EpisodeReport) -> Result<(), RecordError> {
+        let (effects, answer) = self.end_noted(end);
         self.carry_out(effects, answer).await
     }
 
-    fn note_end(&mut self, end: &EpisodeEnd) -> (Vec<Effect>, Option<Pending>) {
-        if self.handled.as_ref() == Some(end) {
-            return (Vec::new(), None);
-        }
-        self.handled = Some(end.clone());
+    fn end_noted(&mut self, end: &EpisodeReport) -> (Vec<Effect>, Option<Pending>) {
         let file = end.file.display();
         let to = std::mem::take(&mut self.at_end);
         let answer = if let Some(error) = &end.error {
@@ -267,13 +280,14 @@ impl Collection {
         (self.session.ended(&end.file, end.seconds, &end.verdict, Stamp::now()), answer)
     }
 
-    /// The episodes of which no end was noted.
-    pub(super) fn unfinished(&self) -> Vec<String> {
-        self.session.unfinished()
+    /// Examines the episodes of which no end was noted: the run was killed then. It is to be called where blocking is allowed.
+    pub(super) fn examination(&self) -> impl FnOnce() + Send + 'static {
+        let (folder, unfinished, found) = (self.episode.out.clone(), self.session.unfinished(), self.found.0.clone());
+        move || unfinished.into_iter().for_each(|file| examine(&folder, file, &found))
     }
 
     /// What became of an episode of which no end was noted.
-    pub(super) fn examined(&mut self, Found { file, end }: &Found) {
+    fn examined(&mut self, Found { file, end }: &Found) {
         let end = end.as_ref().map(|(seconds, verdict)| (*seconds, verdict));
         for effect in self.session.examined(file, end) {
             self.change(effect);
@@ -282,17 +296,8 @@ impl Collection {
         self.show();
     }
 
-    /// The next outcome of the keeper. Cancel-safe.
-    pub(super) async fn outcome(&mut self) -> Outcome {
-        match self.outcomes.recv().await {
-            Some(outcome) => outcome,
-            // Its thread ends with this.
-            None => std::future::pending().await,
-        }
-    }
-
     /// Takes an outcome of the keeper.
-    pub(super) fn take(&mut self, outcome: Outcome) {
+    fn take(&mut self, outcome: Outcome) {
         match outcome {
             Outcome::Discarded(file) => self.board.announce(What::Discarded { file: self.episode.out.join(file) }),
             Outcome::Restored(file) => self.board.announce(What::Restored { file: self.episode.out.join(file) }),
@@ -444,20 +449,14 @@ impl Collection {
     }
 
     /// Ends the episode in progress, if there is one, waits until its file is closed, and notes it; no other begins.
-    pub(super) async fn finish_episode(&mut self) -> Option<EpisodeEnd> {
-        let EpisodeReport { file, seconds, error, verdict, .. } = self.recorder.stop().await.ok()?;
-        let end = EpisodeEnd { file, seconds, error, verdict };
-        self.note_last(&end);
-        Some(end)
-    }
-
-    /// An episode has ended, and no other begins.
-    pub(super) fn note_last(&mut self, end: &EpisodeEnd) {
-        let (effects, answer) = self.note_end(end);
+    pub(super) async fn finish_episode(&mut self) -> Option<EpisodeReport> {
+        let end = self.recorder.stop().await?;
+        let (effects, answer) = self.end_noted(&end);
         for effect in effects {
             self.change(effect);
         }
         self.submit(answer);
+        Some(end)
     }
 
     /// Writes the summary and waits until everything about the session is on the disk.

@@ -10,14 +10,12 @@ use std::time::Duration;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
 use rapid_episode::record::{RecordError, Recorder, RecorderConfig, Source};
-use rapid_status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
+use rapid_status::{Board, DeviceStatus, EpisodeReport, Level, SlotState, What};
 use rapid_system::fault;
-use tokio::sync::broadcast::error::{RecvError, TryRecvError};
-use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use super::collection::{Collection, Found};
+use super::collection::Collection;
 use super::settling::has_settled;
 use super::stage::{Stage, join};
 use super::{AppError, Request, Running, Screen};
@@ -27,20 +25,15 @@ const SETTLE_LOOK: Duration = Duration::from_millis(20);
 
 /// If no device is plugged in, this is reported after this time.
 const NONE_AFTER: Duration = Duration::from_secs(3);
-/// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
-pub(super) const LAST_SAMPLES: Duration = Duration::from_secs(2);
 
 /// Carries out requests, from the first sample to the request to end.
 pub(super) struct Conductor {
     pub(super) board: Arc<Board>,
-    pub(super) events: broadcast::Receiver<Event>,
     pub(super) collection: Collection,
     pub(super) record: bool,
     /// The run is for one episode, and not for a session of several.
     pub(super) is_single: bool,
     pub(super) duration: Option<Duration>,
-    /// What became of episodes of which no end was noted.
-    pub(super) found: (mpsc::UnboundedSender<Found>, mpsc::UnboundedReceiver<Found>),
     /// An episode is still to begin, as soon as every device delivers samples.
     pub(super) begin_episode: bool,
     /// The policy is loaded, if there is one: the run's time begins.
@@ -48,11 +41,6 @@ pub(super) struct Conductor {
 }
 
 impl Conductor {
-    /// Takes what became of an episode of which no end was noted.
-    pub(super) fn found(&self) -> mpsc::UnboundedSender<Found> {
-        self.found.0.clone()
-    }
-
     /// Returns when the run is to end, with the reason if it is an error.
     pub(super) async fn conduct(&mut self, running: &mut Running) -> Result<(), AppError> {
         let mut begun = Instant::now();
@@ -84,9 +72,7 @@ impl Conductor {
                     outcome => return outcome,
                 },
                 // Before requests: the end of the last episode is handled before the next one begins.
-                event = self.events.recv() => {
-                    if self.episode_ended(event, running.kind).await? { return output; }
-                }
+                end = self.collection.ended() => if self.episode_ended(end, running.kind).await? { return output },
                 Some(request) = running.requests.recv() => {
                     // A slow disk takes time to close a file: a signal does not wait for it. The recorder still carries
                     // out the request, and its end is taken during the shutdown.
@@ -102,7 +88,7 @@ impl Conductor {
                     let text = "the synchronisation panicked: no more observations are published".to_owned();
                     self.board.announce(What::Log { level: Level::Error, text });
                 }
-                // After the events: the end of its episode explains more.
+                // After the end of its episode, which explains more.
                 outcome = running.recording.outcome() => return outcome.and(Err(AppError::Panicked("the recorder"))),
                 never = fault::strike("main") => never,
                 () = self.loaded.cancelled(), if !is_loaded => (is_loaded, begun) = (true, Instant::now()),
@@ -114,9 +100,6 @@ impl Conductor {
                         }
                     }
                 }
-                outcome = self.collection.outcome() => self.collection.take(outcome),
-                // This holds a sender: it does not end.
-                Some(found) = self.found.1.recv() => self.collection.examined(&found),
                 () = reached(due) => {
                     let begun = self.collection.tick().await;
                     self.tolerate(begun, running.kind)?;
@@ -180,27 +163,12 @@ impl Conductor {
 
     /// Ends the episode in progress, if there is one; an error if its file is not whole.
     pub(super) async fn finish_episode(&mut self) -> Result<(), AppError> {
-        if let Some(end) = self.collection.finish_episode().await {
-            return whole(end);
-        }
-        // It may have ended during the run without a request: the event that reports it may not be read yet.
-        loop {
-            let event = match self.events.try_recv() {
-                Ok(event) => Ok(event),
-                Err(TryRecvError::Lagged(count)) => Err(RecvError::Lagged(count)),
-                Err(TryRecvError::Empty | TryRecvError::Closed) => return Ok(()),
-            };
-            if let Some(end) = self.end_in(event) {
-                self.collection.note_last(&end);
-                whole(end)?;
-            }
-        }
+        self.collection.finish_episode().await.map_or(Ok(()), whole)
     }
 
     /// True when what the run was for has been recorded.
-    async fn episode_ended(&mut self, event: Result<Event, RecvError>, screen: Screen) -> Result<bool, AppError> {
-        let Some(end) = self.end_in(event) else { return Ok(false) };
-        let begun = self.collection.ended(&end).await;
+    async fn episode_ended(&mut self, end: EpisodeReport, screen: Screen) -> Result<bool, AppError> {
+        let begun = self.collection.note_end(&end).await;
         if !self.record {
             self.tolerate(begun, screen)?;
             return Ok(false);
@@ -211,21 +179,10 @@ impl Conductor {
         let is_single = self.is_single && self.duration.is_some();
         Ok(is_single || (screen != Screen::Monitor && self.collection.is_complete()))
     }
-
-    /// The end of an episode in this event, or in events that were missed.
-    fn end_in(&self, event: Result<Event, RecvError>) -> Option<EpisodeEnd> {
-        match event {
-            Ok(Event { what: What::Episode { file, seconds, error, verdict, .. }, .. }) => {
-                Some(EpisodeEnd { file, seconds, error, verdict })
-            }
-            Err(RecvError::Lagged(_)) => self.board.last_end(),
-            Ok(_) | Err(RecvError::Closed) => None,
-        }
-    }
 }
 
 /// An error if the file of the episode is not whole.
-fn whole(EpisodeEnd { file, error, .. }: EpisodeEnd) -> Result<(), AppError> {
+fn whole(EpisodeReport { file, error, .. }: EpisodeReport) -> Result<(), AppError> {
     match error {
         Some(reason) => Err(AppError::Episode { file, reason }),
         None => Ok(()),
@@ -254,7 +211,7 @@ async fn policy_ended(inference: &mut Option<Stage>) -> Result<(), AppError> {
 /// When the system provides no thread.
 pub(super) fn record(source: impl Source + 'static, config: RecorderConfig) -> Result<(Stage, Recorder), AppError> {
     let mut recorder = Recorder::spawn(source, config)?;
-    let (ended, thread) = (recorder.ended(), recorder.hand_over());
+    let (ended, thread) = (recorder.thread_ended(), recorder.hand_over());
     let stage = Stage::start("the recorder", |_| async move {
         ended.cancelled().await;
         match thread {

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use rapid_core::time::{Stamp, WallClock};
 use rapid_episode::record::stepped::Stepped;
-use rapid_episode::record::{EpisodeReport, EpisodeRequest, RecordError};
+use rapid_episode::record::{EpisodeRequest, RecordError};
 use rapid_registry::Registry;
 use rapid_registry::scenario::Scenario;
 use rapid_registry::simulation::task::{Expert, Outcome, Size, Texture, Touch, UNSEEN_PERIOD, World};
-use rapid_status::Board;
+use rapid_status::{Board, EpisodeReport};
 
 use super::{Lockstep, TrialError};
 

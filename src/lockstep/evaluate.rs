@@ -12,11 +12,11 @@ use rapid_core::random::Random;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
 use rapid_episode::record::stepped::Stepped;
-use rapid_episode::record::{EpisodeReport, EpisodeRequest, RecordError};
+use rapid_episode::record::{EpisodeRequest, RecordError};
 use rapid_registry::scenario::{Scenario, ScenarioAction};
 use rapid_registry::simulation::task::{AXES, Outcome, Size, Texture, Touch, UNSEEN_PERIOD};
 use rapid_registry::{Registry, task};
-use rapid_status::Event;
+use rapid_status::{EpisodeReport, Event};
 use serde::Serialize;
 
 use super::timing::Timing;

@@ -64,19 +64,6 @@ impl StreamCounters {
     }
 }
 
-/// The end of an episode, as in `What::Episode`.
-#[derive(Debug, Clone, PartialEq)]
-pub struct EpisodeEnd {
-    /// Its file.
-    pub file: PathBuf,
-    /// Its length.
-    pub seconds: f64,
-    /// Why the file is not whole, if it is not.
-    pub error: Option<String>,
-    /// The verdict.
-    pub verdict: Verdict,
-}
-
 /// The sample that a policy compares all later ones of an observation with, or that stands for them.
 #[derive(Debug, Clone)]
 pub struct ReferenceSample {
@@ -102,7 +89,7 @@ pub struct EpisodeCounts {
 impl EpisodeCounts {
     fn note(&mut self, what: &What) {
         match what {
-            What::Episode { file, verdict, .. } => self.kept.push((file.clone(), verdict.grade)),
+            What::Episode(end) => self.kept.push((end.file.clone(), end.verdict.grade)),
             What::Discarded { file } => shift(&mut self.kept, &mut self.discarded, file),
             What::Restored { file } => shift(&mut self.discarded, &mut self.kept, file),
             _ => {}
@@ -178,7 +165,6 @@ pub struct Board {
     disk_free: Mutex<Option<u64>>,
     links: Mutex<Vec<String>>,
     simulated: AtomicBool,
-    last_end: Mutex<Option<EpisodeEnd>>,
     episodes: Mutex<EpisodeCounts>,
     log: Mutex<Log>,
     /// Until when a modality is looked at.
@@ -239,7 +225,6 @@ impl Board {
             disk_free: Mutex::new(None),
             links: Mutex::new(Vec::new()),
             simulated: AtomicBool::new(false),
-            last_end: Mutex::new(None),
             episodes: Mutex::new(EpisodeCounts::default()),
             log: Mutex::new(Log::default()),
             looks: (0..MAX_MODALITIES).map(|_| AtomicU64::new(0)).collect(),
@@ -394,10 +379,6 @@ impl Board {
             let named = if device.is_none() { self.device_in(&text) } else { None };
             self.write(level, &text, (device.or(named.as_deref()), printed));
         }
-        if let What::Episode { file, seconds, error, verdict, .. } = &what {
-            let (file, error, verdict) = (file.clone(), error.clone(), verdict.clone());
-            *lock(&self.last_end) = Some(EpisodeEnd { file, seconds: *seconds, error, verdict });
-        }
         if let What::Opened { bit, provenance, .. } = &what
             && let Some(opened) = lock(&self.opened).get_mut(bit.index())
         {
@@ -406,11 +387,6 @@ impl Board {
         lock(&self.episodes).note(&what);
         // An error only means that there is no subscriber.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
-    }
-
-    /// The last announced end of an episode: for readers that missed events.
-    pub fn last_end(&self) -> Option<EpisodeEnd> {
-        lock(&self.last_end).clone()
     }
 
     /// The episodes of this run.

@@ -91,24 +91,7 @@ pub enum What {
         file: PathBuf,
     },
     /// An episode ended and its file is closed.
-    Episode {
-        /// The file; it keeps the suffix `.partial` if it could not be finished.
-        #[serde(serialize_with = "text::lossy")]
-        file: PathBuf,
-        /// Length in seconds.
-        seconds: f64,
-        /// Messages.
-        messages: u64,
-        /// Bytes of the file.
-        bytes: u64,
-        /// Samples lost on the way to the file.
-        dropped: u64,
-        /// Why the file is not whole, if it is not.
-        error: Option<String>,
-        /// The verdict.
-        #[serde(flatten)]
-        verdict: Verdict,
-    },
+    Episode(EpisodeReport),
     /// An episode was moved to the trash.
     Discarded {
         /// The file, as it was.
@@ -240,6 +223,27 @@ pub enum What {
     },
 }
 
+/// How an episode ended.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EpisodeReport {
+    /// The file; its name still ends in `.partial` if it could not be finished.
+    #[serde(serialize_with = "text::lossy")]
+    pub file: PathBuf,
+    /// Length in seconds.
+    pub seconds: f64,
+    /// Messages handed to the file.
+    pub messages: u64,
+    /// Bytes of the file.
+    pub bytes: u64,
+    /// Samples lost on the way to the file.
+    pub dropped: u64,
+    /// Why the file, or the episode in it, is not whole, if it is not.
+    pub error: Option<String>,
+    /// The verdict.
+    #[serde(flatten)]
+    pub verdict: Verdict,
+}
+
 /// The origin of the samples of one epoch of a modality.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Provenance {
@@ -259,11 +263,33 @@ pub struct Provenance {
     pub latency_ns: u64,
 }
 
-impl What {
-    /// Whether an episode ended early, but with a whole file.
-    pub fn is_cut_short(&self) -> bool {
-        let Self::Episode { file, error: Some(_), .. } = self else { return false };
-        file.extension().is_some_and(|extension| extension == "mcap")
+impl EpisodeReport {
+    /// Whether it ended early, but with a whole file.
+    fn is_cut_short(&self) -> bool {
+        self.error.is_some() && self.file.extension().is_some_and(|extension| extension == "mcap")
+    }
+
+    fn describe(&self) -> Description {
+        let Self { file, seconds, messages, bytes, dropped, error, verdict } = self;
+        let level = match (error, verdict.grade) {
+            (None, Grade::Good) => Level::Info,
+            (None, Grade::Suspect) => Level::Warn,
+            (Some(_), _) | (None, Grade::Bad) => Level::Error,
+        };
+        let end = match error {
+            None => "finished",
+            Some(_) if self.is_cut_short() => "cut short",
+            Some(_) => "not whole",
+        };
+        let sensors = verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default();
+        // If an error caused a reason, the reason includes the error.
+        let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
+        let why = if why.is_empty() { why } else { format!(": {why}") };
+        let (word, file, size) = (verdict.grade.word(), file.display(), text::size(*bytes));
+        let sentence = format!(
+            "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{sensors}{why}"
+        );
+        Description::of(level, "episode", word, sentence).without(&format!("{word} "))
     }
 }
 
@@ -360,7 +386,7 @@ impl What {
                 D::of(Level::Info, "episode", "recording", format!("recording {}", file.display()))
                     .without("recording ")
             }
-            Self::Episode { .. } => self.describe_episode(),
+            Self::Episode(end) => end.describe(),
             Self::Discarded { file } => {
                 D::of(Level::Info, "episode", "discarded", format!("episode {} is in the trash", file.display()))
             }
@@ -439,31 +465,6 @@ impl What {
             Self::Printed { device, printed, .. } => (Some(device), Some(*printed)),
             _ => (None, None),
         }
-    }
-
-    fn describe_episode(&self) -> Description {
-        let Self::Episode { file, seconds, messages, bytes, dropped, error, verdict } = self else {
-            return Description::of(Level::Error, "episode", "", String::new());
-        };
-        let level = match (error, verdict.grade) {
-            (None, Grade::Good) => Level::Info,
-            (None, Grade::Suspect) => Level::Warn,
-            (Some(_), _) | (None, Grade::Bad) => Level::Error,
-        };
-        let end = match error {
-            None => "finished",
-            Some(_) if self.is_cut_short() => "cut short",
-            Some(_) => "not whole",
-        };
-        let sensors = verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default();
-        // If an error caused a reason, the reason includes the error.
-        let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
-        let why = if why.is_empty() { why } else { format!(": {why}") };
-        let (word, file, size) = (verdict.grade.word(), file.display(), text::size(*bytes));
-        let sentence = format!(
-            "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{sensors}{why}"
-        );
-        Description::of(level, "episode", word, sentence).without(&format!("{word} "))
     }
 }
 

@@ -38,9 +38,9 @@ use detail::DeviceDetail;
 use preview::Preview;
 use session::{Answered, SessionRequest, SessionStatus};
 
-pub use board::{Board, EpisodeCounts, EpisodeEnd, ReferenceSample};
+pub use board::{Board, EpisodeCounts, ReferenceSample};
 pub use event::Description;
-pub use event::{Event, Provenance, What};
+pub use event::{EpisodeReport, Event, Provenance, What};
 
 /// Creates an enum whose values have words: `word` returns it, and JSON uses it.
 macro_rules! words {

@@ -155,7 +155,7 @@ async fn only_chunks_allocate() {
         done: Arc::clone(&done),
     };
     let folder = tempfile::tempdir().unwrap();
-    let recorder = Recorder::spawn(source, RecorderConfig::new(registry, board)).unwrap();
+    let mut recorder = Recorder::spawn(source, RecorderConfig::new(registry, board)).unwrap();
     let request = EpisodeRequest { out: folder.path().to_owned(), task: "alloc".to_owned(), ..Default::default() };
     recorder.start(request).await.unwrap();
     starter.send(()).unwrap();

@@ -6,7 +6,7 @@ use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_episode::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use rapid_registry::Registry;
 use rapid_status::session::{Label, SessionRequest};
-use rapid_status::{Grade, Level, Snapshot, Verdict};
+use rapid_status::{Level, Snapshot};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -77,8 +77,6 @@ impl Bench {
         let collection =
             Collection::new(recorder, episode, plan, true, (&board, watch::channel(Vec::new()).1)).unwrap();
         let conductor = Conductor {
-            found: tokio::sync::mpsc::unbounded_channel(),
-            events: board.events(),
             board: Arc::clone(&board),
             collection,
             record,
@@ -226,26 +224,13 @@ async fn the_last_episode_whose_file_fails_is_an_error_of_the_run() {
     let collection = &mut bench.conductor.collection;
     collection.request(&SessionRequest::Start, Stamp::now(), None).await.unwrap();
     collection.end_episode().await;
-    assert!(collection.recorder.stop().await.is_err());
-    let end = bench.board.last_end().unwrap();
-    bench.conductor.collection.ended(&end).await.unwrap();
+    let end = collection.ended().await;
+    collection.note_end(&end).await.unwrap();
     bench.conductor.collection.request(&SessionRequest::Start, Stamp::now(), None).await.unwrap();
     let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
     assert!(error.contains("_002.mcap.partial") && error.contains("lost"), "{error}");
     assert!(error.contains("`rapid recover ") && error.matches("_002").count() == 2, "{error}");
     bench.end().await;
-}
-
-fn ended(error: Option<&str>) -> What {
-    What::Episode {
-        file: "a.mcap".into(),
-        seconds: 1.0,
-        messages: 1,
-        bytes: 1,
-        dropped: 0,
-        error: error.map(str::to_owned),
-        verdict: Verdict { grade: Grade::Good, reasons: Vec::new(), sensors: None },
-    }
 }
 
 /// More events than the channel buffers for a reader.
@@ -255,35 +240,55 @@ fn flood(board: &Board) {
     }
 }
 
+type Disk = fn(File) -> Box<dyn Sink>;
+
+/// A bench whose only episode has ended, on a disk that failed or not, before many other events.
+async fn ended(duration: Option<Duration>, disk: Disk) -> Bench {
+    let mut bench = Bench::new(true, duration, disk);
+    bench.conductor.begin_episode = false;
+    flood(&bench.board);
+    let collection = &mut bench.conductor.collection;
+    collection.request(&SessionRequest::Start, Stamp::now(), None).await.unwrap();
+    collection.end_episode().await;
+    until(&bench.board, "the end", |file| file.is_none()).await;
+    flood(&bench.board);
+    bench
+}
+
+const DISKS: [(Disk, bool); 2] = [(|file| Box::new(file), false), (|file| Box::new(Lost(file)), true)];
+
 #[tokio::test(start_paused = true)]
-async fn an_end_among_missed_events_still_ends_the_run() {
-    for error in [None, Some("torn")] {
-        let mut bench = Bench::new(true, Some(Duration::from_secs(1)), |file| Box::new(file));
-        bench.conductor.begin_episode = false;
-        bench.board.announce(ended(error));
-        flood(&bench.board);
+async fn an_end_among_many_events_still_ends_the_run() {
+    for (disk, is_lost) in DISKS {
+        let mut bench = ended(Some(Duration::from_secs(1)), disk).await;
         let conducted = tokio::time::timeout(PATIENCE, bench.conductor.conduct(&mut bench.running)).await;
-        let error_text = conducted.expect("an end").err().map(|error| error.to_string());
-        assert_eq!(error_text.as_deref(), error.map(|_| "a.mcap: torn"));
+        let error = conducted.expect("an end").err().map(|error| error.to_string());
+        assert_eq!(error.map(|error| error.contains("_001.mcap.partial: lost")), is_lost.then_some(true));
         bench.end().await;
     }
 }
 
 #[tokio::test]
-async fn an_end_during_shutdown_is_found_before_and_after_missed_events() {
-    for end_first in [true, false] {
-        let mut bench = Bench::new(true, None, |file| Box::new(file));
-        if end_first {
-            bench.board.announce(ended(Some("torn")));
-            flood(&bench.board);
-        } else {
-            flood(&bench.board);
-            bench.board.announce(ended(Some("torn")));
-        }
-        let error = bench.conductor.finish_episode().await.unwrap_err();
-        assert_eq!(error.to_string(), "a.mcap: torn");
-        bench.end().await;
-    }
+async fn an_end_during_shutdown_is_found_among_many_events() {
+    let mut bench = ended(None, |file| Box::new(Lost(file))).await;
+    let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
+    assert!(error.contains("_001.mcap.partial: lost"), "{error}");
+    // It is found once.
+    bench.conductor.finish_episode().await.unwrap();
+    bench.end().await;
+}
+
+/// A request that a signal interrupts is still carried out by the recorder.
+#[tokio::test]
+async fn the_end_of_an_episode_whose_beginning_was_not_waited_for_is_found() {
+    let mut bench = Bench::new(false, None, |file| Box::new(Lost(file)));
+    let collection = &mut bench.conductor.collection;
+    let begun = collection.request(&SessionRequest::Start, Stamp::now(), None);
+    assert!(futures::FutureExt::now_or_never(begun).is_none(), "the recorder's thread has answered already");
+    until(&bench.board, "an episode", |file| file.is_some()).await;
+    let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
+    assert!(error.contains("_001.mcap.partial: lost"), "{error}");
+    bench.end().await;
 }
 
 async fn when(board: &Board, what: &str, holds: impl Fn(&Snapshot) -> bool) {
@@ -320,10 +325,11 @@ async fn episodes_are_discarded_restored_labelled_and_the_session_ended_by_reque
         ask(SessionRequest::Start).await.unwrap();
         let discarded = ask(SessionRequest::Discard { episode: None }).await.unwrap();
         assert!(discarded.contains("_002.mcap"), "{discarded}");
-        let name = bench.board.last_end().unwrap().file.file_name().unwrap().to_str().unwrap().to_owned();
-        when(&bench.board, "it is in the trash", |_| trash(&name)).await;
+        let last = bench.board.snapshot().last_episode.unwrap();
+        let name = last.file_name().unwrap().to_str().unwrap();
+        when(&bench.board, "it is in the trash", |_| trash(name)).await;
         ask(SessionRequest::Undo).await.unwrap();
-        when(&bench.board, "it is back", |_| !trash(&name)).await;
+        when(&bench.board, "it is back", |_| !trash(name)).await;
         // Recorded again: the discarded one keeps its name, so the next has another.
         ask(SessionRequest::Redo).await.unwrap();
         let stopped = ask(SessionRequest::Stop).await.unwrap();

@@ -10,11 +10,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use rapid_core::{text, time};
-use rapid_status::{Board, Level, Verdict, What};
+use rapid_core::time;
+use rapid_status::{Board, Level, What};
 use rapid_system::folder::{Folder, FolderError, Links, Missing};
 use rustix::fs::{Mode, OFlags};
-use serde::Serialize;
 
 use super::RecordError;
 use crate::Failed;
@@ -43,27 +42,6 @@ pub struct EpisodeRequest {
     pub duration: Option<Duration>,
     /// Names that the session gave before: none is given twice, also when its file was moved away meanwhile.
     pub taken: Vec<String>,
-}
-
-/// How an episode ended.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct EpisodeReport {
-    /// The file; its name still ends in `.partial` if it could not be finished.
-    #[serde(serialize_with = "text::lossy")]
-    pub file: PathBuf,
-    /// Length in seconds.
-    pub seconds: f64,
-    /// Messages handed to the file.
-    pub messages: u64,
-    /// Bytes of the file.
-    pub bytes: u64,
-    /// Samples lost on the way to the file.
-    pub dropped: u64,
-    /// Why the file, or the episode in it, is not whole, if it is not.
-    pub error: Option<String>,
-    /// The verdict.
-    #[serde(flatten)]
-    pub verdict: Verdict,
 }
 
 /// The folder of an episode's file, held open, and its two names in it; the file is locked until the

@@ -31,7 +31,7 @@ mod writeback;
 use std::path::PathBuf;
 
 pub use crate::chunk_writer::Sink;
-pub use episode_path::{EpisodeReport, EpisodeRequest, open_folder};
+pub use episode_path::{EpisodeRequest, open_folder};
 pub use quality::is_whole_jpeg;
 pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderAddition, RecorderConfig, Source};

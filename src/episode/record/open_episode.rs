@@ -28,10 +28,10 @@ use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use rapid_core::sync::{Grid, SyncSample, Synchronizer};
 use rapid_core::time::{Stamp, WallClock};
 use rapid_registry::{DeviceSpec, ModuleSpec, Registry};
-use rapid_status::{Board, Event, Level, Outlook, RecordingStatus, What};
+use rapid_status::{Board, EpisodeReport, Event, Level, Outlook, RecordingStatus, What};
 
 use super::announce::{Announced, look};
-use super::episode_path::{self, EpisodePath, EpisodeReport, EpisodeRequest};
+use super::episode_path::{self, EpisodePath, EpisodeRequest};
 use super::file::EpisodeFile;
 use super::guard::Guard;
 use super::metadata::{self, Configuration, Ending};

@@ -11,6 +11,7 @@
 mod tests;
 
 use std::any::Any;
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io;
 use std::ops::ControlFlow;
@@ -25,7 +26,7 @@ use rapid_bus::{Foreign, Inbox, Queues, Subscription, TopicId};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{ClockWatch, Stamp, WallClock};
 use rapid_registry::Registry;
-use rapid_status::{Board, Episode, EpisodeWatch, Event, Level, RecordingStatus, What};
+use rapid_status::{Board, Episode, EpisodeReport, EpisodeWatch, Event, Level, RecordingStatus, What};
 use rapid_system::disk::Disk;
 use rapid_system::fault;
 use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
@@ -33,7 +34,7 @@ use tokio::sync::{oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::RecordError;
-use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::episode_path::{EpisodePath, EpisodeRequest};
 use super::open_episode::{Beginning, OpenEpisode};
 use super::provenance::Attached;
 use super::publishers::Publishers;
@@ -152,8 +153,10 @@ pub struct Recorder {
     orders: Option<Sender<RecorderOrder>>,
     thread: Option<JoinHandle<()>>,
     additions: Sender<RecorderAddition>,
-    ended: CancellationToken,
+    thread_ended: CancellationToken,
     episode: EpisodeWatch,
+    /// Each receives the end of an episode that was requested, until it is taken; nothing if it did not begin.
+    ends: VecDeque<oneshot::Receiver<EpisodeReport>>,
     clock: watch::Receiver<WallClock>,
 }
 
@@ -175,21 +178,22 @@ impl Recorder {
         let (orders, inbox) = mpsc::channel();
         let (additions, added) = mpsc::channel();
         let events = config.board.events();
-        let ended = CancellationToken::new();
+        let thread_ended = CancellationToken::new();
         let (notify, episode) = watch::channel(None);
         let (in_force, clock) = watch::channel((config.clock)());
-        let guard = ended.clone().drop_guard();
+        let guard = thread_ended.clone().drop_guard();
         let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
             Writer::new(config, inbox, added, events, notify, in_force).run(source);
         })?;
-        Ok(Self { orders: Some(orders), thread: Some(thread), additions, ended, episode, clock })
+        let (orders, thread, ends) = (Some(orders), Some(thread), VecDeque::new());
+        Ok(Self { orders, thread, additions, thread_ended, episode, ends, clock })
     }
 
     /// Cancelled when the thread has ended: before the handle is dropped, by a panic.
-    pub fn ended(&self) -> CancellationToken {
-        self.ended.clone()
+    pub fn thread_ended(&self) -> CancellationToken {
+        self.thread_ended.clone()
     }
 
     /// Hands over the thread: dropping the handle still ends it, and its new owner joins it.
@@ -208,12 +212,17 @@ impl Recorder {
         self.clock.clone()
     }
 
-    /// Begins an episode; returns the name its file will have.
+    /// Begins an episode; returns the name its file will have. [`Self::ended`] returns its end, also if this is
+    /// cancelled.
     ///
     /// # Errors
     /// When there is one in progress, or its file cannot be created.
-    pub async fn start(&self, request: EpisodeRequest) -> Result<PathBuf, RecordError> {
-        self.ask(|reply| RecorderOrder::Start(request, reply)).await
+    pub async fn start(&mut self, request: EpisodeRequest) -> Result<PathBuf, RecordError> {
+        let ((begun, beginning), (ended, end)) = (oneshot::channel(), oneshot::channel());
+        let orders = self.orders.as_ref().ok_or(RecordError::Ended)?;
+        orders.send(RecorderOrder::Start { request, begun, ended }).map_err(|_| RecordError::Ended)?;
+        self.ends.push_back(end);
+        beginning.await.unwrap_or(Err(RecordError::Ended))
     }
 
     /// Sets the end of the episode in progress, if any, to the moment `at`; an earlier end stays. Does not wait: its
@@ -225,34 +234,29 @@ impl Recorder {
         }
     }
 
-    /// Ends the episode in progress at this moment; see [`Self::stop_at`].
-    ///
-    /// # Errors
-    /// Those of [`Self::stop_at`].
-    pub async fn stop(&self) -> Result<EpisodeReport, RecordError> {
-        self.stop_at(Stamp::now()).await
+    /// Waits for the end of the oldest episode whose end was not taken: its file is closed then. `None` if there is none.
+    /// Cancel-safe.
+    pub async fn ended(&mut self) -> Option<EpisodeReport> {
+        while let Some(end) = self.ends.front_mut() {
+            let end = end.await;
+            self.ends.pop_front();
+            if let Ok(end) = end {
+                return Some(end);
+            }
+        }
+        None
     }
 
-    /// Ends the episode in progress at the moment `at`; returns once its file is closed. An episode whose end is
-    /// already fixed, by its duration or by [`Self::end`], is still waited for.
-    ///
-    /// # Errors
-    /// When there is none: an episode ended by its duration or the disk is reported by `What::Episode` alone.
-    pub async fn stop_at(&self, at: Stamp) -> Result<EpisodeReport, RecordError> {
-        self.end(at);
-        self.ask(RecorderOrder::Await).await
+    /// Ends the episode in progress at this moment, unless its end is fixed already, and waits for it as
+    /// [`Self::ended`] does.
+    pub async fn stop(&mut self) -> Option<EpisodeReport> {
+        self.end(Stamp::now());
+        self.ended().await
     }
 
     /// For modalities that are added during the run. It does not keep the thread.
     pub fn additions(&self) -> Sender<RecorderAddition> {
         self.additions.clone()
-    }
-
-    async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> RecorderOrder) -> Result<T, RecordError> {
-        let (reply, answer) = oneshot::channel();
-        let orders = self.orders.as_ref().ok_or(RecordError::Ended)?;
-        orders.send(order(reply)).map_err(|_| RecordError::Ended)?;
-        answer.await.unwrap_or(Err(RecordError::Ended))
     }
 }
 
@@ -266,17 +270,17 @@ impl Drop for Recorder {
     }
 }
 
-/// The sender of an answer.
-type Reply<T> = oneshot::Sender<Result<T, RecordError>>;
-
 /// Requests to the thread.
 enum RecorderOrder {
     /// Begin an episode now.
-    Start(EpisodeRequest, Reply<PathBuf>),
+    Start {
+        request: EpisodeRequest,
+        /// Receives the name its file will have.
+        begun: oneshot::Sender<Result<PathBuf, RecordError>>,
+        ended: oneshot::Sender<EpisodeReport>,
+    },
     /// Fix the end of the episode in progress to this moment, when it was requested.
     End(Stamp),
-    /// Answer when the file of the episode in progress is closed.
-    Await(Reply<EpisodeReport>),
 }
 
 /// The thread's own state.
@@ -290,6 +294,8 @@ struct Writer {
     /// Those of the episode in progress, or of the time since the last one began.
     publishers: Publishers,
     open: Option<OpenEpisode>,
+    /// Receives the end of the episode in progress.
+    ended: Option<oneshot::Sender<EpisodeReport>>,
     /// Receives the reports of the episode.
     episode: watch::Sender<Option<Arc<Episode>>>,
     /// Room for the episode's file.
@@ -298,7 +304,6 @@ struct Writer {
     /// Receives the clock of each episode.
     in_force: watch::Sender<WallClock>,
     clock_looked: Stamp,
-    waiting: Vec<Reply<EpisodeReport>>,
     flushed: Stamp,
     reported: Stamp,
     /// When the episode in progress was last judged.
@@ -325,12 +330,12 @@ impl Writer {
             attached: Attached::default(),
             publishers: Publishers::default(),
             open: None,
+            ended: None,
             episode,
             space: None,
             clock,
             in_force,
             clock_looked: Stamp::default(),
-            waiting: Vec::new(),
             flushed: Stamp::default(),
             reported: Stamp::default(),
             judged: Stamp::default(),
@@ -417,22 +422,19 @@ impl Writer {
     fn take_orders(&mut self) -> bool {
         loop {
             match self.inbox.try_recv() {
-                Ok(RecorderOrder::Start(request, reply)) => {
+                Ok(RecorderOrder::Start { request, begun, ended }) => {
                     let started = self.start(&request);
+                    if started.is_ok() {
+                        self.ended = Some(ended);
+                    }
                     // The requester may have ended.
-                    let _ = reply.send(started);
+                    let _ = begun.send(started);
                 }
                 Ok(RecorderOrder::End(at)) => {
                     if let Some(open) = &mut self.open {
                         open.end_at(at);
                     }
                 }
-                Ok(RecorderOrder::Await(reply)) => match &self.open {
-                    Some(_) => self.waiting.push(reply),
-                    None => {
-                        let _ = reply.send(Err(RecordError::Idle));
-                    }
-                },
                 Err(TryRecvError::Empty) => return true,
                 Err(TryRecvError::Disconnected) => {
                     if let Some(open) = &mut self.open {
@@ -559,11 +561,10 @@ impl Writer {
         if report.file.extension().is_none_or(|extension| extension != PARTIAL) {
             board.set_last_episode(report.file.clone(), report.verdict.clone());
         }
-        let board = &self.config.board;
-        let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = report.clone();
-        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error, verdict });
-        for reply in self.waiting.drain(..) {
-            let _ = reply.send(Ok(report.clone()));
+        board.announce(What::Episode(report.clone()));
+        if let Some(ended) = self.ended.take() {
+            // The handle may have been dropped.
+            let _ = ended.send(report);
         }
     }
 

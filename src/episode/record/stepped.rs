@@ -9,10 +9,10 @@ use rapid_bus::TopicId;
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{Stamp, WallClock};
 use rapid_registry::Registry;
-use rapid_status::{Board, Event};
+use rapid_status::{Board, EpisodeReport, Event};
 
 use super::RecordError;
-use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::episode_path::{EpisodePath, EpisodeRequest};
 use super::open_episode::{Beginning, OpenEpisode};
 use super::provenance::Attached;
 use super::streams::Streams;

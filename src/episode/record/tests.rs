@@ -22,7 +22,7 @@ use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_registry::Registry;
 use rapid_registry::device::UsbIdentity;
-use rapid_status::{Board, Grade, Level, What};
+use rapid_status::{Board, EpisodeReport, Grade, Level, What};
 
 use super::*;
 
@@ -230,7 +230,7 @@ impl Bench {
     }
 
     /// Half a second in which nothing is sent and these events are announced, `before` it begins and within.
-    pub(crate) async fn half_a_second(&self, before: Vec<What>, within: Vec<What>) -> PathBuf {
+    pub(crate) async fn half_a_second(&mut self, before: Vec<What>, within: Vec<What>) -> PathBuf {
         self.mask(0, 1, Stamp::now().0);
         self.script.taken().await;
         for what in before {
@@ -249,7 +249,7 @@ impl Bench {
     /// the mask at first.
     ///
     /// Returns the file's name and `t0`, which lies 1 ms after the beginning of the episode.
-    pub(crate) async fn one_second(&self) -> (PathBuf, Stamp) {
+    pub(crate) async fn one_second(&mut self) -> (PathBuf, Stamp) {
         self.mask(0b11, 1, Stamp::now().0);
         self.script.taken().await;
         let script = self.script.clone();
@@ -284,7 +284,7 @@ impl Bench {
     async fn until_closed(&self, events: &mut tokio::sync::broadcast::Receiver<rapid_status::Event>) -> What {
         loop {
             let event = events.recv().await.unwrap();
-            if matches!(event.what, What::Episode { .. }) {
+            if matches!(event.what, What::Episode(_)) {
                 return event.what;
             }
         }

@@ -34,7 +34,7 @@ pub(super) fn names(folder: &Path) -> Vec<String> {
 
 /// The bytes of an episode of the recorder, and a folder to play with.
 pub(super) async fn recorded() -> (tempfile::TempDir, Vec<u8>) {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let (file, _) = bench.one_second().await;
     bench.until_file(&file).await;
     (tempfile::tempdir().unwrap(), fs::read(&file).unwrap())
@@ -175,7 +175,7 @@ async fn a_file_being_written_is_left_alone() {
     repaired(&partial);
 
     // The recorder's own, from its first moment to its last.
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let (finished, _) = bench.one_second().await;
     let partial = finished.with_extension("mcap.partial");
     while !finished.exists() {

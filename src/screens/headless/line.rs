@@ -92,7 +92,7 @@ impl Columns {
         let word = format!("{:WORD$}", described.word);
         let word = match &event.what {
             What::State { state, .. } => palette.state(*state, &word),
-            What::Episode { verdict, .. } => palette.grade(verdict.grade, &word),
+            What::Episode(end) => palette.grade(end.verdict.grade, &word),
             What::Recording { .. } | What::Act { .. } | What::Policy { dry_run: false, .. } => palette.good(&word),
             What::Unregistered { .. } | What::Discarded { .. } | What::Policy { .. } => palette.warn(&word),
             _ => palette.level(described.level, &word),

@@ -7,8 +7,8 @@ use rapid_core::provenance::{KernelDriver, Negotiated, UnplugSource};
 use rapid_core::sample::Epoch;
 use rapid_registry::device::UsbIdentity;
 use rapid_status::{
-    Chunk, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, StopStatus,
-    Verdict, What,
+    Chunk, EpisodeReport, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState,
+    StopStatus, Verdict, What,
 };
 use serde_json::Value;
 
@@ -50,7 +50,7 @@ fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> What {
 }
 
 fn episode(dropped: u64, error: Option<&str>) -> What {
-    What::Episode {
+    What::Episode(EpisodeReport {
         file: if error == Some("disk full") { "out/a.mcap.partial".into() } else { "out/a.mcap".into() },
         seconds: 30.04,
         messages: 1234,
@@ -69,7 +69,7 @@ fn episode(dropped: u64, error: Option<&str>) -> What {
             let sensors = Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] });
             Verdict { grade, reasons, sensors }
         },
-    }
+    })
 }
 
 fn usb() -> UsbIdentity {

@@ -9,7 +9,7 @@ use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::text;
 use rapid_core::time::Stamp;
 use rapid_status::palette::Palette;
-use rapid_status::{DeviceStatus, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
+use rapid_status::{DeviceStatus, EpisodeReport, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
 use serde::Serialize;
 
 /// How long each device was present, and which episodes were closed.
@@ -160,16 +160,11 @@ impl RunTotals {
                     presence.set(*state, event.stamp);
                 }
             }
-            What::Episode { file, seconds, messages, bytes, dropped, error, verdict } => self.episodes.push(Episode {
-                file: file.clone(),
-                seconds: *seconds,
-                messages: *messages,
-                bytes: *bytes,
-                dropped: *dropped,
-                error: error.clone(),
-                verdict: verdict.clone(),
-                discarded: false,
-            }),
+            What::Episode(end) => {
+                let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = end.clone();
+                let discarded = false;
+                self.episodes.push(Episode { file, seconds, messages, bytes, dropped, error, verdict, discarded });
+            }
             What::Discarded { file } => self.discard(file, true),
             What::Restored { file } => self.discard(file, false),
             What::Policy { policy, dry_run, .. } => self.policy = Some((policy.clone(), *dry_run)),

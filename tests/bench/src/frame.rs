@@ -122,7 +122,7 @@ impl Recording {
         let board = Arc::new(Board::new(registry));
         let source = Noting { inbox: bus.inbox()?, log: Arc::clone(&log) };
         let config = RecorderConfig::new(Arc::new(registry.clone()), Arc::clone(&board));
-        let recorder = Recorder::spawn(source, config)?;
+        let mut recorder = Recorder::spawn(source, config)?;
         let out = tempfile::Builder::new().prefix("frame").tempdir_in(bench.scratch.path())?;
         let request =
             EpisodeRequest { out: out.path().to_owned(), task: "frame".to_owned(), ..EpisodeRequest::default() };
@@ -131,8 +131,8 @@ impl Recording {
     }
 
     /// Ends the episode; returns all samples that passed.
-    pub(crate) fn end(self, runtime: &tokio::runtime::Runtime) -> Result<Vec<Passed>, Failure> {
-        let report = runtime.block_on(self.recorder.stop())?;
+    pub(crate) fn end(mut self, runtime: &tokio::runtime::Runtime) -> Result<Vec<Passed>, Failure> {
+        let report = runtime.block_on(self.recorder.stop()).ok_or("no episode was recorded")?;
         if let Some(error) = report.error {
             return Err(error.into());
         }

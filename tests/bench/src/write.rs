@@ -148,14 +148,14 @@ fn recorder(bench: &Bench, feed: &Feed, seconds: u64) -> Result<Taken, Failure> 
     let source = Fed { feed: feed.clone(), left, numbers, start, begun: None, done };
     let config =
         RecorderConfig { sink: Box::new(|file| Box::new(Unsynced(file))), ..RecorderConfig::new(registry, board) };
-    let recorder = Recorder::spawn(source, config)?;
+    let mut recorder = Recorder::spawn(source, config)?;
     let out = tempfile::Builder::new().prefix("write").tempdir_in(bench.scratch.path())?;
     let runtime = tokio::runtime::Builder::new_current_thread().build()?;
     let request = EpisodeRequest { out: out.path().to_owned(), task: "write".to_owned(), ..EpisodeRequest::default() };
     runtime.block_on(recorder.start(request))?;
     go.send(())?;
     let taken = taken.recv_timeout(Duration::from_secs(600))?;
-    let report = runtime.block_on(recorder.stop())?;
+    let report = runtime.block_on(recorder.stop()).ok_or("no episode was recorded")?;
     let wanted = left as u64;
     if report.error.is_some() || report.dropped > 0 || report.messages < wanted {
         return Err(format!("{} of {wanted} messages written, {:?}", report.messages, report.error).into());

@@ -18,7 +18,7 @@ fn of(bytes: &[u8]) -> Option<Inspection> {
 }
 
 async fn episode() -> (Bench, PathBuf) {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let (file, _) = bench.one_second().await;
     bench.until_file(&file).await;
     (bench, file)
@@ -118,7 +118,7 @@ fn any_damaged_file_has_a_report() {
 
 #[tokio::test]
 async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let announced = What::Policy {
         policy: "tactile-id".to_owned(),
         folder: "models/tactile-id".into(),

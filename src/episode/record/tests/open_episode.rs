@@ -256,7 +256,7 @@ async fn a_plugged_device_that_never_sends_is_reported_by_recorder_and_inspect_a
     let silent = "never: plugged in for";
     // In before the episode, in it, and out again in it.
     for (before, missed) in [(true, true), (true, false), (false, false)] {
-        let bench = Bench::new();
+        let mut bench = Bench::new();
         let begin = Stamp::now().0;
         bench.mask(0b10, 1, begin);
         bench.script.taken().await;

@@ -30,7 +30,7 @@ async fn until(events: &mut tokio::sync::broadcast::Receiver<Event>, wanted: imp
 #[tokio::test]
 async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     let free = Arc::new(AtomicU64::new(50 * GIB));
-    let bench = on_disk(&free);
+    let mut bench = on_disk(&free);
     let mut events = bench.board.events();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     bench.sample(TOF, 1, 0, Stamp::now().0, 0);
@@ -46,14 +46,15 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     free.store(GIB - (128 << 20), Ordering::Relaxed);
     let closed = until(&mut events, |what| {
         assert!(!matches!(what, What::DiskLow { .. }), "reported twice");
-        matches!(what, What::Episode { .. })
+        matches!(what, What::Episode(_))
     });
-    let What::Episode { file, error, .. } = closed.await else { unreachable!() };
+    let What::Episode(EpisodeReport { file, error, .. }) = closed.await else { unreachable!() };
     assert_eq!(file, finished);
     let error = error.unwrap();
     assert!(error.contains("nearly full") && error.contains("disk_reserve") && error.contains("--out"), "{error}");
     let read = read(&finished);
     assert_eq!(read.metadata["rapid/summary"]["cut_short"], error);
+    let error_of_first = error.clone();
     let answer = inspect::inspect(&finished).unwrap();
     assert!(
         answer.verdict.verdict().unwrap().grade > Grade::Good
@@ -76,12 +77,15 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     // Room again.
     free.store(50 * GIB, Ordering::Relaxed);
     bench.recorder.start(bench.request(None)).await.unwrap();
+    // No end is lost, also if nobody waited for it when the next episode began.
+    assert_eq!(bench.recorder.stop().await.unwrap().error.as_ref(), Some(&error_of_first));
     assert_eq!(bench.recorder.stop().await.unwrap().error, None);
+    assert_eq!(bench.recorder.stop().await, None);
 }
 
 #[tokio::test]
 async fn a_disk_that_does_not_report_its_space_is_written_to() {
-    let bench = Bench::with(|config| config.disk = Box::new(|_| Err(io::ErrorKind::Unsupported.into())));
+    let mut bench = Bench::with(|config| config.disk = Box::new(|_| Err(io::ErrorKind::Unsupported.into())));
     bench.recorder.start(bench.request(None)).await.unwrap();
     assert_eq!(bench.recorder.stop().await.unwrap().error, None);
 }
@@ -89,7 +93,7 @@ async fn a_disk_that_does_not_report_its_space_is_written_to() {
 #[tokio::test]
 async fn reserved_space_is_released() {
     use std::os::unix::fs::MetadataExt;
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     assert_eq!(bench.recorder.stop().await.unwrap().error, None);
     let metadata = std::fs::metadata(&finished).unwrap();
@@ -98,7 +102,7 @@ async fn reserved_space_is_released() {
 
 #[tokio::test]
 async fn a_removed_folder_is_recreated_with_the_episode() {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     bench.sample(TOF, 1, 0, Stamp::now().0, 0);
     std::fs::remove_dir_all(finished.parent().unwrap()).unwrap();
@@ -114,7 +118,7 @@ async fn a_removed_folder_is_recreated_with_the_episode() {
 async fn a_file_removed_on_a_file_system_that_only_hides_it_is_written_again() {
     // As NFS and libfuse do it.
     for hidden in [".nfs000000000004a1c700000002", ".fuse_hidden0000000300000001"] {
-        let bench = Bench::new();
+        let mut bench = Bench::new();
         let finished = bench.recorder.start(bench.request(None)).await.unwrap();
         bench.sample(TOF, 1, 0, Stamp::now().0, 0);
         let hidden = finished.with_file_name(hidden);
@@ -131,7 +135,7 @@ async fn a_file_removed_on_a_file_system_that_only_hides_it_is_written_again() {
 #[tokio::test]
 async fn a_folder_with_a_non_utf8_name_holds_episodes_like_any_other() {
     use std::os::unix::ffi::OsStrExt;
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let mut request = bench.request(None);
     request.out = bench.folder.path().join(std::ffi::OsStr::from_bytes(b"caf\xe9"));
     let finished = bench.recorder.start(request).await.unwrap();
@@ -149,7 +153,7 @@ async fn a_folder_with_a_non_utf8_name_holds_episodes_like_any_other() {
 
 #[tokio::test]
 async fn a_removed_file_is_reported_while_recording_and_takes_no_other_name() {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let mut events = bench.board.events();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     std::fs::remove_file(finished.with_extension("mcap.partial")).unwrap();
@@ -166,7 +170,7 @@ async fn a_removed_file_is_reported_while_recording_and_takes_no_other_name() {
 
 #[tokio::test]
 async fn a_folder_that_is_moved_and_replaced_is_followed() {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     let (out, elsewhere) = (finished.parent().unwrap(), bench.folder.path().join("elsewhere"));
     std::fs::rename(out, &elsewhere).unwrap();
@@ -182,7 +186,7 @@ async fn a_folder_that_is_moved_and_replaced_is_followed() {
 #[tokio::test]
 async fn a_clock_step_is_an_event_and_times_never_decrease() {
     let set = Arc::new(AtomicI64::new(0));
-    let bench = Bench::with(|config| {
+    let mut bench = Bench::with(|config| {
         let set = Arc::clone(&set);
         let offset = i128::from(1_700_000_000 * 1000 * MS);
         config.clock = Box::new(move || WallClock::with_offset(offset + i128::from(set.load(Ordering::Relaxed))));

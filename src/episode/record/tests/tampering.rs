@@ -33,7 +33,7 @@ fn overwrite(file: &Path) -> File {
 }
 
 async fn recorded(deed: Deed) -> (Bench, PathBuf, Option<File>, tokio::sync::broadcast::Receiver<rapid_status::Event>) {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let events = bench.board.events();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     for seq in 0..400 {
@@ -91,7 +91,8 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
         let (bench, finished, _, mut events) = recorded(deed).await;
         // The end is not requested.
         let closed = tokio::time::timeout(PATIENCE, bench.until_closed(&mut events)).await;
-        let What::Episode { file, error, verdict, .. } = closed.unwrap_or_else(|_| panic!("{what}: does not end"))
+        let What::Episode(EpisodeReport { file, error, verdict, .. }) =
+            closed.unwrap_or_else(|_| panic!("{what}: does not end"))
         else {
             unreachable!()
         };
@@ -135,7 +136,7 @@ async fn a_file_modified_while_it_is_recorded_is_not_called_good() {
         }),
     ];
     for (what, deed) in deeds {
-        let (bench, finished, _kept, _) = recorded(deed).await;
+        let (mut bench, finished, _kept, _) = recorded(deed).await;
         let report = bench.recorder.stop().await.unwrap();
         let error = report.error.unwrap_or_else(|| panic!("{what}: no error"));
         assert!(error.contains("another program") && error.contains("while it was recorded"), "{what}: {error}");
@@ -219,7 +220,7 @@ fn an_episode_with_nothing_left_but_its_reason_is_bad_for_that_reason() {
 #[tokio::test]
 async fn an_episode_that_is_whole_when_the_disk_refuses_it_stays_bad() {
     // The last write of all: the summary is GOOD by then.
-    let bench = Bench::with_sink(|file| Box::new(super::faults::Unsure(file)));
+    let mut bench = Bench::with_sink(|file| Box::new(super::faults::Unsure(file)));
     bench.recorder.start(bench.request(None)).await.unwrap();
     bench.sample(TOF, 1, 0, Stamp::now().0, 0);
     let report = bench.recorder.stop().await.unwrap();
@@ -256,7 +257,7 @@ async fn an_episode_whose_name_was_taken_gets_the_next_one_and_keeps_its_verdict
         }),
     ];
     for (what, deed) in deeds {
-        let (bench, finished, _kept, mut events) = recorded(deed).await;
+        let (mut bench, finished, _kept, mut events) = recorded(deed).await;
         let planted = std::fs::symlink_metadata(&finished).unwrap();
         let report = bench.recorder.stop().await.unwrap();
         assert_eq!(report.error, None, "{what}");
@@ -298,7 +299,7 @@ async fn a_file_that_others_only_read_or_touch_is_recorded_as_usual() {
         ("open for writing", |file| Some(writable(file))),
     ];
     for (what, deed) in deeds {
-        let (bench, finished, _kept, _) = recorded(deed).await;
+        let (mut bench, finished, _kept, _) = recorded(deed).await;
         let report = bench.recorder.stop().await.unwrap();
         assert_eq!((report.error, report.file.as_path()), (None, finished.as_path()), "{what}");
         assert_eq!(read(&finished).on("/rapid/cam_wrist").count(), 400, "{what}");
