@@ -1,5 +1,9 @@
 //! What a run collects: its session, with the recorder and the keeper that carry out what the session decides.
 //!
+//! What is to be collected, what was collected and what can be undone is the [`Session`]'s, and nothing of it is kept here:
+//! this owns the recorder and the keeper, the requesters that wait for an answer, and what of the disk is the run's choice:
+//! the folder, the modules that are mounted, and whether the session gets a file.
+//!
 //! Invariant: the recorder alone knows whether an episode is in progress; the session follows what it reports.
 //! Invariant: a request is answered once, also when what it waits for does not happen; and when what it changed is on the
 //! disk, not before.
@@ -102,10 +106,6 @@ pub(super) struct Collection {
     /// When the session began whose file is there but which is not continued. It is archived before this session's is
     /// written: a run that records nothing changes nothing.
     superseded: Option<String>,
-    /// Names of the episodes of earlier sessions: none is given again.
-    taken: Vec<String>,
-    /// The plan of this run has a goal.
-    has_goal: bool,
 }
 
 impl Collection {
@@ -125,9 +125,8 @@ impl Collection {
             tracing::warn!(%error, "an earlier session is not continued");
         }
         let earlier = before.as_ref().map(|before| before.begun.clone());
-        let has_goal = plan.goal.is_some();
-        let taken = journal::sessions(&episode.out).0.into_iter().flat_map(SessionFile::into_names).collect();
-        let (session, is_new) = Session::new(&episode.out, plan, before, rfc3339(realtime_ns()));
+        let names = journal::sessions(&episode.out).0.into_iter().flat_map(SessionFile::into_names).collect();
+        let (session, is_new) = Session::new(&episode.out, plan, before, names, rfc3339(realtime_ns()));
         let (keeper, outcomes) = Keeper::start(&episode.out, journal)?;
         let collection = Self {
             board: Arc::clone(board),
@@ -144,8 +143,6 @@ impl Collection {
             answer: None,
             is_kept,
             superseded: earlier.filter(|_| is_new),
-            taken,
-            has_goal,
         };
         collection.show();
         Ok(collection)
@@ -153,7 +150,7 @@ impl Collection {
 
     /// What this run was to collect was collected before.
     pub(super) fn was_complete(&self) -> bool {
-        self.has_goal && self.is_complete()
+        self.session.is_done()
     }
 
     /// What is collected is complete.
@@ -310,9 +307,6 @@ impl Collection {
             }
             Outcome::Failed(why) => self.fail(why),
             Outcome::Closed(closed) => {
-                if closed.is_ok() {
-                    self.taken.extend(self.session.names().cloned());
-                }
                 self.session.closed(closed.is_ok(), rfc3339(realtime_ns()));
                 if let Err(why) = closed {
                     self.fail(why);
@@ -398,7 +392,7 @@ impl Collection {
         let request = EpisodeRequest {
             task: plan.task.clone(),
             tags: plan.tags.iter().map(|(key, value)| (key.clone(), value.clone())).collect(),
-            taken: self.taken.iter().chain(self.session.names()).cloned().collect(),
+            taken: self.session.taken(),
             ..self.episode.clone()
         };
         let started = self.recorder.start(request).await;

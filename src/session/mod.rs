@@ -1,7 +1,9 @@
-//! A session: what is collected, and what happens before, between and after its episodes.
+//! A session: what is to be collected, what was collected, and what of it can be undone; and what happens before, between
+//! and after its episodes.
 //!
-//! [`Session`] is a pure core: requests, begins and ends of episodes and the time go in, [`Effect`]s come out. Its owner
-//! carries them out and reports how they ended.
+//! [`Session`] alone has these three: the plan, the entries of the episodes with the names that are taken, and the order in
+//! which episodes were discarded. It is a pure core: requests, begins and ends of episodes and the time go in, [`Effect`]s
+//! come out. Its owner carries them out and reports how they ended.
 //!
 //! Invariant: pure: no clock, no file, no recorder. [`journal`] is its file, [`trash`] its folder, and [`keeper`] the
 //! thread that changes both.
@@ -118,6 +120,10 @@ struct Shown<'a> {
 pub struct Session {
     folder: PathBuf,
     file: SessionFile,
+    /// The plan with which it was made has a goal.
+    has_own_goal: bool,
+    /// Names of the episodes of earlier sessions.
+    earlier: Vec<String>,
     phase: Phase,
     after: After,
     /// The entry of the episode in progress, and when it began.
@@ -130,18 +136,27 @@ pub struct Session {
 
 impl Session {
     /// A session in `folder` by `plan`. It continues `before`, the session in progress there, if that has the same task;
-    /// otherwise the second value is true, and `before` is to be archived.
-    pub fn new(folder: &Path, plan: Plan, before: Option<SessionFile>, begun: String) -> (Self, bool) {
+    /// otherwise the second value is true, and `before` is to be archived. No episode gets a name of `earlier` ones.
+    pub fn new(
+        folder: &Path,
+        plan: Plan,
+        before: Option<SessionFile>,
+        earlier: Vec<String>,
+        begun: String,
+    ) -> (Self, bool) {
         let continued = before.filter(|before| before.plan.task == plan.task);
         let is_new = continued.is_none();
         let episodes = continued.as_ref().map(|before| before.episodes.clone()).unwrap_or_default();
         let begun = continued.as_ref().map_or(begun, |before| before.begun.clone());
+        let has_own_goal = plan.goal.is_some();
         let goal = plan.goal.or_else(|| continued?.plan.goal);
         let discarded = (0..episodes.len()).filter(|index| episodes.get(*index).is_some_and(|e| e.discarded)).collect();
         let file = SessionFile { begun, plan: Plan { goal, ..plan }, episodes, ..SessionFile::default() };
         let session = Self {
             folder: folder.to_owned(),
             file,
+            has_own_goal,
+            earlier,
             phase: Phase::Idle,
             after: After::default(),
             current: None,
@@ -156,9 +171,10 @@ impl Session {
         &self.file
     }
 
-    /// The names of all its episodes, discarded or not.
-    pub fn names(&self) -> impl Iterator<Item = &String> {
-        self.file.episodes.iter().map(|entry| &entry.file)
+    /// The names that no further episode gets: those of all its episodes, discarded or not, and of earlier sessions.
+    pub fn taken(&self) -> Vec<String> {
+        let own = self.file.episodes.iter().map(|entry| &entry.file);
+        self.earlier.iter().chain(own).cloned().collect()
     }
 
     /// The episode that a request without a name is about: the one in progress, or the last that is kept.
@@ -185,6 +201,11 @@ impl Session {
     /// Whether there is a goal and it is reached.
     pub fn is_complete(&self) -> bool {
         self.file.plan.goal.is_some_and(|goal| self.counted() >= usize::try_from(goal).unwrap_or(usize::MAX))
+    }
+
+    /// Whether the goal of the plan with which it was made is reached.
+    pub fn is_done(&self) -> bool {
+        self.has_own_goal && self.is_complete()
     }
 
     /// When [`Self::tick`] is to be called next, if at all.
@@ -310,6 +331,7 @@ impl Session {
     pub fn closed(&mut self, is_closed: bool, now: String) {
         self.closing = false;
         if is_closed {
+            self.earlier = self.taken();
             self.file = SessionFile { begun: now, plan: self.file.plan.clone(), ..SessionFile::default() };
             self.discarded.clear();
         }

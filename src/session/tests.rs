@@ -29,7 +29,7 @@ fn plan() -> Plan {
 
 impl Owner {
     fn new(plan: Plan) -> Self {
-        let (session, is_new) = Session::new(Path::new("episodes"), plan, None, "t0".to_owned());
+        let (session, is_new) = Session::new(Path::new("episodes"), plan, None, Vec::new(), "t0".to_owned());
         assert!(is_new);
         Self {
             saved: session.file().clone(),
@@ -254,13 +254,13 @@ fn a_session_is_continued_by_the_same_task_only() {
     owner.record();
     owner.request(SessionRequest::Discard { episode: None }).unwrap();
     let before = Some(owner.saved.clone());
-    let (mut again, is_new) = Session::new(Path::new("episodes"), plan(), before.clone(), "t2".to_owned());
+    let (mut again, is_new) = Session::new(Path::new("episodes"), plan(), before.clone(), Vec::new(), "t2".to_owned());
     assert!(!is_new);
     assert_eq!((again.counted(), again.plan().goal, again.file().begun.as_str()), (1, Some(5), "t0"));
     let undone = again.request(&SessionRequest::Undo, owner.now).unwrap();
     assert_eq!(undone.1.first(), Some(&Effect::Restore("002.mcap".to_owned())));
     let other = Plan { task: "pour".to_owned(), ..plan() };
-    let (other, is_new) = Session::new(Path::new("episodes"), other, before, "t2".to_owned());
+    let (other, is_new) = Session::new(Path::new("episodes"), other, before, Vec::new(), "t2".to_owned());
     assert!(is_new && other.file().episodes.is_empty());
 }
 
@@ -277,6 +277,7 @@ fn ending_a_session_deletes_what_was_discarded_and_nothing_else() {
     assert_eq!((owner.files.len(), owner.trash.len()), (1, 0));
     assert!(owner.session.file().episodes.is_empty());
     owner.request(SessionRequest::Start).unwrap();
+    assert_eq!(owner.session.taken(), ["001.mcap", "002.mcap", "003.mcap"], "no name is given again");
     assert_eq!(owner.request(SessionRequest::EndSession), Err(Refusal::Busy));
 }
 
@@ -307,7 +308,8 @@ fn an_episode_of_a_killed_run_counts_once_it_is_known_what_became_of_it() {
     owner.request(SessionRequest::Start).unwrap();
     assert_eq!((owner.session.counted(), owner.session.unfinished().len()), (1, 0), "it is being recorded");
     // Killed, and started again.
-    let (mut again, _) = Session::new(Path::new("episodes"), plan(), Some(owner.saved.clone()), "t2".to_owned());
+    let (mut again, _) =
+        Session::new(Path::new("episodes"), plan(), Some(owner.saved.clone()), Vec::new(), "t2".to_owned());
     assert_eq!((again.counted(), again.unfinished()), (1, vec!["002.mcap".to_owned()]));
     assert!(!again.is_complete());
     let nothing = again.examined("002.mcap", None);
