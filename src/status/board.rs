@@ -3,12 +3,14 @@
 //! One writer per item: the rig writes slots and the mask, streams write their own counters, the recorder writes the
 //! recording. A screen only takes [`Snapshot`]s.
 //!
-//! Invariant: per-sample data are atomics; the locks here guard data that changes at most a few times a second, and are
-//! never held while waiting.
+//! Invariant: per-sample data and the mask are atomics; everything else is guarded by one lock, so that a snapshot is of one
+//! moment. It changes at most a few times a second.
+//! Invariant: the lock is never held while waiting, nor while a sample or a line is copied or converted; nothing is logged
+//! under it, since a line of the log takes it.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rapid_core::interlock::InputState;
@@ -147,32 +149,92 @@ struct SlotStatus {
 pub struct Board {
     rig: String,
     started: Stamp,
-    /// Ascending by bit.
-    entries: Mutex<Vec<Entry>>,
-    unregistered: Mutex<Vec<UnregisteredDevice>>,
-    registry_answer: Mutex<Option<Answered>>,
     counters: Vec<StreamCounters>,
-    slots: Mutex<Vec<SlotStatus>>,
     mask: AtomicU64,
     mask_sequence: AtomicU64,
-    stops: Mutex<Vec<StopStatus>>,
-    recording: Mutex<Option<RecordingStatus>>,
-    not_started: Mutex<Option<String>>,
-    policy: Mutex<Option<PolicyStatus>>,
-    references: Mutex<Vec<Arc<ReferenceSample>>>,
-    last_episode: Mutex<Option<(PathBuf, Verdict)>>,
-    session: Mutex<Option<SessionStatus>>,
-    disk_free: Mutex<Option<u64>>,
-    links: Mutex<Vec<String>>,
-    simulated: AtomicBool,
-    episodes: Mutex<EpisodeCounts>,
-    log: Mutex<Log>,
     /// Until when a modality is looked at.
     looks: Vec<AtomicU64>,
-    /// The newest incarnation of each modality.
-    opened: Mutex<Vec<Option<Provenance>>>,
-    previews: Mutex<Vec<Arc<Preview>>>,
+    state: Mutex<State>,
     events: broadcast::Sender<Event>,
+}
+
+/// What a snapshot shows besides the counters and the mask.
+#[derive(Debug)]
+struct State {
+    /// Ascending by bit.
+    entries: Vec<Entry>,
+    unregistered: Vec<UnregisteredDevice>,
+    registry_answer: Option<Answered>,
+    slots: Vec<SlotStatus>,
+    stops: Vec<StopStatus>,
+    recording: Option<RecordingStatus>,
+    not_started: Option<String>,
+    policy: Option<PolicyStatus>,
+    references: Vec<Arc<ReferenceSample>>,
+    last_episode: Option<(PathBuf, Verdict)>,
+    session: Option<SessionStatus>,
+    disk_free: Option<u64>,
+    links: Vec<String>,
+    simulated: bool,
+    episodes: EpisodeCounts,
+    log: Log,
+    /// The newest incarnation of each modality.
+    opened: Vec<Option<Provenance>>,
+    previews: Vec<Arc<Preview>>,
+}
+
+impl State {
+    fn new(registry: &Registry) -> Self {
+        Self {
+            entries: registry.devices.iter().map(Entry::of).collect(),
+            unregistered: Vec::new(),
+            registry_answer: None,
+            slots: vec![SlotStatus::default(); MAX_MODALITIES],
+            stops: registry.stops.iter().map(unreported).collect(),
+            recording: None,
+            not_started: None,
+            policy: None,
+            references: Vec::new(),
+            last_episode: None,
+            session: None,
+            disk_free: None,
+            links: Vec::new(),
+            simulated: false,
+            episodes: EpisodeCounts::default(),
+            log: Log::default(),
+            opened: vec![None; MAX_MODALITIES],
+            previews: Vec::new(),
+        }
+    }
+
+    /// The device with whose name a line begins.
+    fn device_in(&self, text: &str) -> Option<String> {
+        let begins = |name: &str| text.strip_prefix(name).is_some_and(|rest| rest.starts_with([':', ' ', ',']));
+        self.entries.iter().map(|entry| &entry.name).find(|name| begins(name)).cloned()
+    }
+
+    /// Adds a line, now, which is about the device with whose name it begins if it names none.
+    fn write(&mut self, line: LogLine) {
+        let device = line.device.or_else(|| self.device_in(&line.text));
+        let line = LogLine { number: self.log.added, wall_ns: realtime_ns(), device, ..line };
+        self.log.added += 1;
+        if self.log.lines.len() == LOG_LINES {
+            self.log.lines.pop_front();
+        }
+        self.log.lines.push_back(Arc::new(line));
+    }
+
+    fn preview(&self, id: ModalityId) -> Option<&Arc<Preview>> {
+        self.previews.iter().find(|preview| preview.device == id)
+    }
+
+    fn note_opened(&mut self, what: &What) {
+        if let What::Opened { bit, provenance, .. } = what
+            && let Some(opened) = self.opened.get_mut(bit.index())
+        {
+            *opened = Some(Provenance::clone(provenance));
+        }
+    }
 }
 
 /// What an entry of the registry contributes to each snapshot.
@@ -208,30 +270,18 @@ impl Board {
         Self {
             rig: registry.rig.name.clone(),
             started: Stamp::now(),
-            entries: Mutex::new(registry.devices.iter().map(Entry::of).collect()),
-            unregistered: Mutex::new(Vec::new()),
-            registry_answer: Mutex::new(None),
             counters,
-            slots: Mutex::new(vec![SlotStatus::default(); MAX_MODALITIES]),
             mask: AtomicU64::new(0),
             mask_sequence: AtomicU64::new(0),
-            stops: Mutex::new(registry.stops.iter().map(unreported).collect()),
-            recording: Mutex::new(None),
-            not_started: Mutex::new(None),
-            policy: Mutex::new(None),
-            references: Mutex::new(Vec::new()),
-            last_episode: Mutex::new(None),
-            session: Mutex::new(None),
-            disk_free: Mutex::new(None),
-            links: Mutex::new(Vec::new()),
-            simulated: AtomicBool::new(false),
-            episodes: Mutex::new(EpisodeCounts::default()),
-            log: Mutex::new(Log::default()),
             looks: (0..MAX_MODALITIES).map(|_| AtomicU64::new(0)).collect(),
-            opened: Mutex::new(vec![None; MAX_MODALITIES]),
-            previews: Mutex::new(Vec::new()),
+            state: Mutex::new(State::new(registry)),
             events: broadcast::channel(EVENT_DEPTH).0,
         }
+    }
+
+    /// A poisoned lock guards plain values that are always complete: they remain usable.
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The counters of a stream.
@@ -241,9 +291,10 @@ impl Board {
 
     /// Adds an entry, whose bit no other has.
     pub fn add(&self, device: &DeviceSpec) {
-        let mut entries = lock(&self.entries);
+        let entry = Entry::of(device);
+        let entries = &mut self.state().entries;
         let at = entries.partition_point(|entry| entry.id < device.id);
-        entries.insert(at, Entry::of(device));
+        entries.insert(at, entry);
     }
 
     /// Reports connected units that no entry matches.
@@ -251,17 +302,17 @@ impl Board {
         for unit in &mut units {
             unit.device = text::plain(&unit.device).into_owned();
         }
-        *lock(&self.unregistered) = units;
+        self.state().unregistered = units;
     }
 
     /// Reports the answer to a request about the registry.
     pub fn set_registry_answer(&self, answer: Answered) {
-        *lock(&self.registry_answer) = Some(answer);
+        self.state().registry_answer = Some(answer);
     }
 
     /// Reports the state of a slot.
     pub fn set_slot(&self, id: ModalityId, state: SlotState, epoch: Epoch, detail: &str) {
-        let slot = &mut lock(&self.slots)[id.index()];
+        let slot = &mut self.state().slots[id.index()];
         slot.state = state;
         slot.epoch = epoch;
         detail.clone_into(&mut slot.detail);
@@ -269,7 +320,7 @@ impl Board {
 
     /// Reports the state of stop `index` of the registry, and announces it.
     pub fn set_stop(&self, index: usize, state: InputState, detail: &str) {
-        let changed = lock(&self.stops).get_mut(index).map(|stop| {
+        let changed = self.state().stops.get_mut(index).map(|stop| {
             stop.state = state;
             detail.clone_into(&mut stop.detail);
             stop.clone()
@@ -281,7 +332,7 @@ impl Board {
 
     /// Emergency stops and enabling switches, in the order of the registry.
     pub fn stops(&self) -> Vec<StopStatus> {
-        lock(&self.stops).clone()
+        self.state().stops.clone()
     }
 
     /// Reports a publication of the mask.
@@ -297,101 +348,87 @@ impl Board {
 
     /// Reports the recording in progress, or that there is none.
     pub fn set_recording(&self, recording: Option<RecordingStatus>) {
-        *lock(&self.recording) = recording;
+        self.state().recording = recording;
     }
 
     /// Reports why an episode was not begun, or that one has.
     pub fn set_not_started(&self, why: Option<String>) {
-        *lock(&self.not_started) = why.map(|why| text::plain(&why).into_owned());
+        let why = why.map(|why| text::plain(&why).into_owned());
+        self.state().not_started = why;
     }
 
     /// Whether an episode is in progress.
     pub fn is_recording(&self) -> bool {
-        lock(&self.recording).is_some()
+        self.state().recording.is_some()
     }
 
     /// Reports the policy's status, or that there is no policy.
     pub fn set_policy(&self, policy: Option<PolicyStatus>) {
-        *lock(&self.policy) = policy;
+        self.state().policy = policy;
     }
 
     /// Reports a sample that the policy compares all later ones with. A run has one policy.
     pub fn add_reference(&self, reference: ReferenceSample) {
-        lock(&self.references).push(Arc::new(reference));
+        self.state().references.push(Arc::new(reference));
     }
 
     /// Those of the policy from number `from` on, in the order in which it took them.
     pub fn references(&self, from: usize) -> Vec<Arc<ReferenceSample>> {
-        lock(&self.references).get(from..).unwrap_or_default().to_vec()
+        self.state().references.get(from..).unwrap_or_default().to_vec()
     }
 
     /// Reports the last finished file.
     pub fn set_last_episode(&self, file: PathBuf, verdict: Verdict) {
-        *lock(&self.last_episode) = Some((file, verdict));
+        self.state().last_episode = Some((file, verdict));
     }
 
     /// Reports the session.
     pub fn set_session(&self, session: SessionStatus) {
-        *lock(&self.session) = Some(session);
+        self.state().session = Some(session);
     }
 
     /// Reports that the devices are simulated.
     pub fn set_simulated(&self) {
-        self.simulated.store(true, Ordering::Relaxed);
+        self.state().simulated = true;
     }
 
     /// Reports the free space on the disk of the episodes, bytes.
     pub fn set_disk_free(&self, free: Option<u64>) {
-        *lock(&self.disk_free) = free;
+        self.state().disk_free = free;
     }
 
     /// Reports the links to the page of this run, the likeliest first.
     pub fn set_links(&self, links: Vec<String>) {
-        *lock(&self.links) = links;
+        self.state().links = links;
     }
 
     /// Adds a line to the log, now. The device that it is about is the one with which it begins.
     pub fn log(&self, level: Level, text: &str) {
-        self.write(level, text, (self.device_in(text).as_deref(), None));
-    }
-
-    fn device_in(&self, text: &str) -> Option<String> {
-        let begins = |name: &str| text.strip_prefix(name).is_some_and(|rest| rest.starts_with([':', ' ', ',']));
-        lock(&self.entries).iter().map(|entry| &entry.name).find(|name| begins(name)).cloned()
-    }
-
-    /// Without characters from a device that could move a terminal's cursor.
-    fn write(&self, level: Level, text: &str, (device, printed): (Option<&str>, Option<PrintedOn>)) {
-        let (text, device) = (text::plain(text).into_owned(), device.map(str::to_owned));
-        let mut log = lock(&self.log);
-        let line = LogLine { number: log.added, wall_ns: realtime_ns(), level, device, printed, text };
-        log.added += 1;
-        if log.lines.len() == LOG_LINES {
-            log.lines.pop_front();
-        }
-        log.lines.push_back(Arc::new(line));
+        let line = plain(level, text, None, None);
+        self.state().write(line);
     }
 
     /// Announces an event, now, to all subscribers, and adds it to the log.
     pub fn announce(&self, what: What) {
-        if let Some((level, text)) = what.log_line() {
+        let line = what.log_line().map(|(level, text)| {
             let (device, printed) = what.source();
-            let named = if device.is_none() { self.device_in(&text) } else { None };
-            self.write(level, &text, (device.or(named.as_deref()), printed));
-        }
-        if let What::Opened { bit, provenance, .. } = &what
-            && let Some(opened) = lock(&self.opened).get_mut(bit.index())
+            plain(level, &text, device, printed)
+        });
         {
-            *opened = Some(Provenance::clone(provenance));
+            let mut state = self.state();
+            if let Some(line) = line {
+                state.write(line);
+            }
+            state.note_opened(&what);
+            state.episodes.note(&what);
         }
-        lock(&self.episodes).note(&what);
         // An error only means that there is no subscriber.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
     }
 
     /// The episodes of this run.
     pub fn episodes(&self) -> EpisodeCounts {
-        lock(&self.episodes).clone()
+        self.state().episodes.clone()
     }
 
     /// All events from now on.
@@ -415,114 +452,110 @@ impl Board {
         if !self.is_looked_at(id, Stamp(header.recv_ns)) {
             return;
         }
-        let mut previews = lock(&self.previews);
-        let last = previews.iter().position(|preview| preview.device == id);
-        if last
-            .and_then(|last| previews.get(last))
-            .is_some_and(|last| !last.is_outdated(Stamp(header.capture_ns), payload.len()))
-        {
+        let is_due = |last: &Arc<Preview>| last.is_outdated(Stamp(header.capture_ns), payload.len());
+        if !self.state().preview(id).is_none_or(is_due) {
             return;
         }
-        if let Some(last) = last {
-            previews.remove(last);
-        }
-        previews.extend(Preview::of(id, header, payload).map(Arc::new));
+        let preview = Preview::of(id, header, payload).map(Arc::new);
+        let previews = &mut self.state().previews;
+        previews.retain(|last| last.device != id);
+        previews.extend(preview);
     }
 
     /// The newest sample of a device that is looked at, if there is one.
     pub fn newest_preview(&self, id: ModalityId) -> Option<Arc<Preview>> {
-        lock(&self.previews).iter().find(|preview| preview.device == id).cloned()
+        self.state().preview(id).cloned()
     }
 
     /// The modalities whose samples are pictures.
     pub fn cameras(&self) -> Vec<ModalityId> {
-        lock(&self.entries).iter().filter(|entry| entry.kind == ModalityKind::Image).map(|entry| entry.id).collect()
+        let state = self.state();
+        state.entries.iter().filter(|entry| entry.kind == ModalityKind::Image).map(|entry| entry.id).collect()
     }
 
     /// The node of a device that was opened.
     pub fn node(&self, id: ModalityId) -> Option<String> {
-        lock(&self.opened).get(id.index())?.as_ref().map(|opened| opened.node.clone())
+        self.state().opened.get(id.index())?.as_ref().map(|opened| opened.node.clone())
     }
 
     /// Reports that a control of a device was set.
     pub fn set_control(&self, id: ModalityId, name: &str, value: i64) {
-        if let Some(Some(opened)) = lock(&self.opened).get_mut(id.index()) {
+        if let Some(Some(opened)) = self.state().opened.get_mut(id.index()) {
             opened.negotiated.controls.insert(name.to_owned(), value);
         }
     }
 
     /// The name of the entry of a bit.
     pub fn name(&self, id: ModalityId) -> Option<String> {
-        lock(&self.entries).iter().find(|entry| entry.id == id).map(|entry| entry.name.clone())
-    }
-
-    /// Of the devices that are looked at.
-    fn details(&self, now: Stamp) -> Vec<DeviceDetail> {
-        let entries = lock(&self.entries);
-        let looked_at = entries.iter().filter(|entry| self.is_looked_at(entry.id, now));
-        let detail = |entry: &Entry| {
-            let opened = lock(&self.opened);
-            let opened = opened.get(entry.id.index()).and_then(Option::as_ref);
-            DeviceDetail::of(&entry.detail, opened, self.counters(entry.id).intervals.counts())
-        };
-        looked_at.map(detail).collect()
-    }
-
-    /// Those of devices that are looked at; the others are dropped.
-    fn previews(&self, now: Stamp) -> Vec<Arc<Preview>> {
-        let mut previews = lock(&self.previews);
-        previews.retain(|preview| self.is_looked_at(preview.device, now));
-        previews.clone()
+        self.state().entries.iter().find(|entry| entry.id == id).map(|entry| entry.name.clone())
     }
 
     /// The current state of everything.
     pub fn snapshot(&self) -> Snapshot {
+        let mut state = self.state();
         let taken = Stamp::now();
-        let slots = lock(&self.slots).clone();
-        let device = |Entry { id, name, topic, nominal_hz, .. }: &Entry| {
-            let counters = &self.counters[id.index()];
-            let slot = &slots[id.index()];
-            let newest = counters.newest.load(Ordering::Relaxed);
-            DeviceStatus {
-                name: name.clone(),
-                id: *id,
-                topic: topic.clone(),
-                state: slot.state,
-                epoch: slot.epoch,
-                detail: slot.detail.clone(),
-                nominal_hz: *nominal_hz,
-                samples: counters.samples.load(Ordering::Relaxed),
-                gaps: counters.gaps.load(Ordering::Relaxed),
-                bytes: counters.bytes.load(Ordering::Relaxed),
-                newest: (newest > 0).then_some(Stamp(newest)),
-            }
-        };
-        let devices = lock(&self.entries).iter().map(device).collect();
-        let (last_episode, last_verdict) = lock(&self.last_episode).clone().unzip();
+        // Those of devices that nobody looks at are dropped.
+        state.previews.retain(|preview| self.is_looked_at(preview.device, taken));
+        let (last_episode, last_verdict) = state.last_episode.clone().unzip();
         Snapshot {
             rig: self.rig.clone(),
             taken,
             uptime: taken.since(self.started),
             mask: self.mask(),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
-            devices,
-            unregistered: lock(&self.unregistered).clone(),
-            registry_answer: lock(&self.registry_answer).clone(),
-            stops: self.stops(),
-            recording: lock(&self.recording).clone(),
-            not_started: lock(&self.not_started).clone(),
-            policy: lock(&self.policy).clone(),
+            devices: state.entries.iter().map(|entry| self.device(entry, &state)).collect(),
+            unregistered: state.unregistered.clone(),
+            registry_answer: state.registry_answer.clone(),
+            stops: state.stops.clone(),
+            recording: state.recording.clone(),
+            not_started: state.not_started.clone(),
+            policy: state.policy.clone(),
             last_episode,
             last_verdict,
-            session: lock(&self.session).clone(),
-            disk_free: *lock(&self.disk_free),
-            links: lock(&self.links).clone(),
-            simulated: self.simulated.load(Ordering::Relaxed),
-            log: lock(&self.log).lines.iter().cloned().collect(),
-            details: self.details(taken),
-            previews: self.previews(taken),
+            session: state.session.clone(),
+            disk_free: state.disk_free,
+            links: state.links.clone(),
+            simulated: state.simulated,
+            log: state.log.lines.iter().cloned().collect(),
+            details: self.details(&state, taken),
+            previews: state.previews.clone(),
         }
     }
+
+    fn device(&self, entry: &Entry, state: &State) -> DeviceStatus {
+        let counters = &self.counters[entry.id.index()];
+        let slot = &state.slots[entry.id.index()];
+        let newest = counters.newest.load(Ordering::Relaxed);
+        DeviceStatus {
+            name: entry.name.clone(),
+            id: entry.id,
+            topic: entry.topic.clone(),
+            state: slot.state,
+            epoch: slot.epoch,
+            detail: slot.detail.clone(),
+            nominal_hz: entry.nominal_hz,
+            samples: counters.samples.load(Ordering::Relaxed),
+            gaps: counters.gaps.load(Ordering::Relaxed),
+            bytes: counters.bytes.load(Ordering::Relaxed),
+            newest: (newest > 0).then_some(Stamp(newest)),
+        }
+    }
+
+    /// Of the devices that are looked at.
+    fn details(&self, state: &State, now: Stamp) -> Vec<DeviceDetail> {
+        let looked_at = state.entries.iter().filter(|entry| self.is_looked_at(entry.id, now));
+        let detail = |entry: &Entry| {
+            let opened = state.opened.get(entry.id.index()).and_then(Option::as_ref);
+            DeviceDetail::of(&entry.detail, opened, self.counters(entry.id).intervals.counts())
+        };
+        looked_at.map(detail).collect()
+    }
+}
+
+/// A line of the log as of yet without its place. It has no characters from a device that could move a terminal's cursor.
+fn plain(level: Level, text: &str, device: Option<&str>, printed: Option<PrintedOn>) -> LogLine {
+    let (text, device) = (text::plain(text).into_owned(), device.map(str::to_owned));
+    LogLine { number: 0, wall_ns: 0, level, device, printed, text }
 }
 
 fn unreported(stop: &InterlockSpec) -> StopStatus {
@@ -530,7 +563,35 @@ fn unreported(stop: &InterlockSpec) -> StopStatus {
     StopStatus { stop: stop.name.clone(), kind: stop.kind, state: InputState::Lost, detail }
 }
 
-/// A poisoned lock here guards plain values that are always complete: they remain usable.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicBool;
+
+    use super::*;
+
+    #[test]
+    fn a_snapshot_is_of_one_moment() {
+        let text = "[device.tof]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\nbit = 0\n";
+        let registry = Registry::parse(text, None).unwrap().registry;
+        let (board, id) = (Board::new(&registry), registry.devices[0].id);
+        let is_over = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                for number in 1_u32.. {
+                    if is_over.load(Ordering::Relaxed) {
+                        return;
+                    }
+                    board.set_slot(id, SlotState::Absent, Epoch(number), "");
+                    board.set_links(vec![number.to_string()]);
+                }
+            });
+            let mixed = (0..20_000).find_map(|_| {
+                let Snapshot { devices, links, .. } = board.snapshot();
+                let (first, second) = (devices[0].epoch.0, links.first().map_or(0, |link| link.parse().unwrap()));
+                (first < second).then_some((first, second))
+            });
+            is_over.store(true, Ordering::Relaxed);
+            assert_eq!(mixed, None, "the first was set before the second");
+        });
+    }
 }
