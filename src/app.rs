@@ -147,6 +147,14 @@ pub struct Options {
     pub web: Option<WebOptions>,
 }
 
+impl Options {
+    /// Whether the run is for one episode, and not for a session of several.
+    const fn is_single(&self) -> bool {
+        let Plan { goal, episode_time, reset_time, .. } = &self.plan;
+        goal.is_none() && episode_time.is_none() && reset_time.is_none()
+    }
+}
+
 /// Where the mask of an instance is published.
 pub fn mask_path(instance: Option<&str>) -> PathBuf {
     match instance {
@@ -242,18 +250,18 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         Some(live) => Some(live::listen(live, &registry, &board, &permission, &to_conductor).await?),
         None => None,
     };
-    let web = options.web.map(|options| web::start(&options, &board, &to_conductor)).transpose()?;
+    let web = options.web.as_ref().map(|options| web::start(options, &board, &to_conductor)).transpose()?;
     let (shown, made) = Shown::channel();
     let mut config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
     config.shown = listening.is_some().then_some(shown);
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let (following, to_recorder, clock) = (recorder.episode(), recorder.additions(), recorder.clock());
+    let references = recorder.references();
+    let is_single = options.is_single();
     // Ending by itself after some time is the run's, unless it has several episodes.
-    let Plan { goal, episode_time, reset_time, .. } = options.plan;
-    let is_single = goal.is_none() && episode_time.is_none() && reset_time.is_none();
-    let duration = episode_time.or(options.duration.filter(|_| is_single));
-    let episode = EpisodeRequest { duration, ..options.episode };
+    let duration = options.plan.episode_time.or(options.duration.filter(|_| is_single));
     let is_kept = !(is_single && options.record && options.screen != Screen::Monitor);
+    let episode = EpisodeRequest { duration, ..options.episode };
     let (modules, mountable) = watch::channel(registry.modules.clone());
     let collection = Collection::new(recorder, episode, options.plan, is_kept, (&board, mountable))?;
     let kind = options.screen;
@@ -271,9 +279,10 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         let (commands, from_screen) = mpsc::channel(16);
         let attached = Attached::new(Arc::clone(&board), commands.clone());
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration, options.shown);
-        let start = |policy| inference::start(policy, &registry, bus, (&board, &loaded), options.record);
-        let inference = options.policy.map(start).transpose()?;
-        let live = listening.map(|listening| listening.start(bus, &board, (clock, made))).transpose()?;
+        let (registry, board, loaded, is_recorded) = (&registry, &board, &loaded, options.record);
+        let surroundings = inference::Surroundings { registry, bus, board, loaded, references, is_recorded };
+        let inference = options.policy.map(|policy| inference::start(policy, surroundings)).transpose()?;
+        let live = listening.map(|listening| listening.start(bus, board, (clock, made))).transpose()?;
         Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live))
     };
     let (discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live) = match others() {

@@ -5,6 +5,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::mpsc::Sender;
 use std::time::Duration;
 
 use rapid_bus::{Bus, Inbox, TopicId, Writer};
@@ -18,6 +19,7 @@ use tokio_util::sync::CancellationToken;
 use super::AppError;
 use super::settling;
 use super::stage::Stage;
+use crate::episode::ReferenceSample;
 use crate::policy::library::Environment;
 use crate::policy::live::{Live, LiveOptions};
 use crate::policy::model::Model;
@@ -40,19 +42,27 @@ pub struct PolicyOptions {
     pub library: Option<PathBuf>,
 }
 
+/// What the stage is given by others.
+pub(super) struct Surroundings<'a> {
+    pub(super) registry: &'a Arc<Registry>,
+    pub(super) bus: &'a Bus,
+    pub(super) board: &'a Arc<Board>,
+    /// Cancelled by it when the policy is loaded.
+    pub(super) loaded: &'a CancellationToken,
+    /// Receives the samples that all later ones of an observation are compared with.
+    pub(super) references: Sender<ReferenceSample>,
+    /// It is to be recorded.
+    pub(super) is_recorded: bool,
+}
+
 /// Starts the stage: it loads the policy and starts it when everything it requires is present; when it is to be
 /// recorded, after the episode has begun, so that the file holds everything it observed. `loaded` is cancelled when it is
 /// loaded.
 ///
 /// # Errors
 /// When it cannot read the bus.
-pub(super) fn start(
-    options: PolicyOptions,
-    registry: &Arc<Registry>,
-    bus: &Bus,
-    (board, loaded): (&Arc<Board>, &CancellationToken),
-    is_recorded: bool,
-) -> Result<Stage, AppError> {
+pub(super) fn start(options: PolicyOptions, surroundings: Surroundings<'_>) -> Result<Stage, AppError> {
+    let Surroundings { registry, bus, board, loaded, references, is_recorded } = surroundings;
     let flight = Flight {
         required: required(&options, registry),
         inbox: bus.inbox()?,
@@ -60,6 +70,7 @@ pub(super) fn start(
         registry: Arc::clone(registry),
         board: Arc::clone(board),
         loaded: loaded.clone(),
+        references,
         is_recorded,
         options,
     };
@@ -85,6 +96,7 @@ struct Flight {
     registry: Arc<Registry>,
     board: Arc<Board>,
     loaded: CancellationToken,
+    references: Sender<ReferenceSample>,
     is_recorded: bool,
 }
 
@@ -110,13 +122,13 @@ impl Flight {
         if !self.settled(&stop).await? {
             return Ok(());
         }
-        let Self { options: PolicyOptions { live, .. }, inbox, actions, registry, board, .. } = self;
+        let Self { options: PolicyOptions { live, .. }, inbox, actions, registry, board, references, .. } = self;
         board.announce(live.bundle.begins(library, live.dry_run));
         for (modality, time) in live.bundle.held() {
             let text = format!("policy: while {modality} is absent, its last samples stand in for it, for {time:?}");
             board.announce(What::Log { level: Level::Info, text });
         }
-        let live = Live::start(live, model, &registry, inbox, actions, Arc::clone(&board))?;
+        let live = Live::start(live, model, &registry, inbox, actions, Arc::clone(&board), references)?;
         let ended = live.ended();
         tokio::select! {
             () = stop.cancelled() => {}

@@ -1,6 +1,7 @@
 //! Stage inference of a program that was built without cargo feature `policy`: there is nothing to start.
 
 use std::sync::Arc;
+use std::sync::mpsc::Sender;
 
 use rapid_bus::Bus;
 use rapid_registry::Registry;
@@ -9,18 +10,24 @@ use tokio_util::sync::CancellationToken;
 
 use super::AppError;
 use super::stage::Stage;
+use crate::episode::ReferenceSample;
 
 /// No policy can be given.
 #[derive(Debug)]
 pub enum PolicyOptions {}
 
+/// What the stage would be given by others.
+#[expect(dead_code, reason = "there is no stage that reads it")]
+pub(super) struct Surroundings<'a> {
+    pub(super) registry: &'a Arc<Registry>,
+    pub(super) bus: &'a Bus,
+    pub(super) board: &'a Arc<Board>,
+    pub(super) loaded: &'a CancellationToken,
+    pub(super) references: Sender<ReferenceSample>,
+    pub(super) is_recorded: bool,
+}
+
 /// Starts nothing.
-pub(super) fn start(
-    options: PolicyOptions,
-    _: &Arc<Registry>,
-    _: &Bus,
-    _: (&Arc<Board>, &CancellationToken),
-    _: bool,
-) -> Result<Stage, AppError> {
+pub(super) fn start(options: PolicyOptions, _: Surroundings<'_>) -> Result<Stage, AppError> {
     match options {}
 }

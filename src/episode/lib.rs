@@ -49,6 +49,7 @@ pub use decode::decode;
 pub(crate) use failed::Failed;
 pub use hash::sha256;
 pub(crate) use integrity::Writer;
+pub use reference::ReferenceSample;
 pub use source::ReadAt;
 
 use std::collections::BTreeMap;

@@ -12,16 +12,24 @@ use super::schema::SampleSchema;
 const PREFIX: &str = "reference/";
 const MEDIA: &str = "application/protobuf; messageType=";
 
-/// The attachment of a sample of `device`, captured at `wall_ns`. `message` is memory for it.
-pub(crate) fn attachment<'a>(
-    message: &'a mut Vec<u8>,
-    observation: &str,
-    device: &str,
-    wall_ns: u64,
-    (header, payload): (&SampleHeader, &[u8]),
-) -> Attachment<'a> {
+/// The sample that a policy compares all later ones of an observation with, or that stands for them.
+#[derive(Debug, Clone)]
+pub struct ReferenceSample {
+    /// Key of the observation.
+    pub observation: String,
+    /// Name of the modality.
+    pub modality: String,
+    /// As received.
+    pub header: SampleHeader,
+    /// As the device sent it.
+    pub payload: Vec<u8>,
+}
+
+/// The attachment of a sample that was captured at `wall_ns`. `message` is memory for it.
+pub(crate) fn attachment<'a>(message: &'a mut Vec<u8>, wall_ns: u64, sample: &ReferenceSample) -> Attachment<'a> {
+    let ReferenceSample { observation, modality, header, payload } = sample;
     let schema = SampleSchema::of(header, payload);
-    encode::sample(message, schema, wall_ns, device, header, payload);
+    encode::sample(message, schema, wall_ns, modality, header, payload);
     Attachment {
         log_time: wall_ns,
         create_time: wall_ns,
@@ -68,7 +76,10 @@ mod tests {
         {
             let header = SampleHeader { encoding: encoding as u32, width, height, ..SampleHeader::default() };
             let mut message = Vec::new();
-            let mut attached = attachment(&mut message, "touch", "tip", 77, (&header, &payload));
+            let (observation_key, modality) = ("touch".to_owned(), "tip".to_owned());
+            let reference =
+                ReferenceSample { observation: observation_key, modality, header, payload: payload.clone() };
+            let mut attached = attachment(&mut message, 77, &reference);
             let (read_header, read_payload) = sample(&attached).unwrap();
             assert_eq!((observation(&attached), read_payload), (Some("touch"), payload));
             assert_eq!((read_header.encoding, read_header.capture_ns), (encoding as u32, 77));

@@ -8,12 +8,12 @@
 //! samples of devices that run at the rate of the grid are then fresh at each tick.
 //!
 //! Invariant: between two ticks nothing here allocates, locks or logs. An answer is taken at a tick: its chunk is announced as
-//! an event, and a new reference is reported to the board.
+//! an event, and a new reference goes to the recorder.
 //! Invariant: once the handle is stopped, nothing more is published.
 
 use std::io;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -31,6 +31,7 @@ use super::horizon::{Counts, WithoutMask};
 use super::model::Model;
 use super::pilot::{FIRST_TICK_AFTER, Pilot};
 use super::request::{Cell, Request};
+use crate::episode::ReferenceSample;
 
 /// Nice value of the computing thread; all others have 0.
 const NICE: i32 = 5;
@@ -65,7 +66,8 @@ pub struct Live {
 }
 
 impl Live {
-    /// Starts both threads. `actions` is where actions are published.
+    /// Starts both threads. `actions` is where actions are published, `references` where the samples go that all later ones
+    /// are compared with.
     ///
     /// # Errors
     /// When the system provides no thread.
@@ -76,6 +78,7 @@ impl Live {
         inbox: Inbox,
         actions: Option<Arc<Writer>>,
         board: Arc<Board>,
+        references: Sender<ReferenceSample>,
     ) -> io::Result<Self> {
         let (stop, ended) = (CancellationToken::new(), CancellationToken::new());
         let (requests, received) = sync_channel(1);
@@ -91,6 +94,7 @@ impl Live {
             inbox,
             actions: actions.filter(|_| !options.dry_run),
             board,
+            references,
             requests,
             answers,
             devices: registry.devices.len(),
@@ -170,6 +174,8 @@ struct Control {
     /// Where actions are published; `None` in a dry run.
     actions: Option<Arc<Writer>>,
     board: Arc<Board>,
+    /// Receives the samples that all later ones of an observation are compared with.
+    references: Sender<ReferenceSample>,
     requests: SyncSender<Exchange>,
     answers: Receiver<Exchange>,
     /// Number of registered modalities: digits of the mask.
@@ -267,7 +273,8 @@ impl Control {
         };
         for (at, cell) in exchange.firsts.drain(..) {
             let Some(observation) = self.options.bundle.observations.get(at) else { continue };
-            self.board.add_reference(cell.into_reference(observation));
+            // The recorder has ended only when the run ends.
+            let _ = self.references.send(cell.into_reference(observation));
         }
         let request = &exchange.request;
         let latency = exchange.done.since(request.stamp);

@@ -66,19 +66,6 @@ impl StreamCounters {
     }
 }
 
-/// The sample that a policy compares all later ones of an observation with, or that stands for them.
-#[derive(Debug, Clone)]
-pub struct ReferenceSample {
-    /// Key of the observation.
-    pub observation: String,
-    /// Name of the modality.
-    pub modality: String,
-    /// As received.
-    pub header: SampleHeader,
-    /// As the device sent it.
-    pub payload: Vec<u8>,
-}
-
 /// The episodes of a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct EpisodeCounts {
@@ -170,7 +157,6 @@ struct State {
     recording: Option<RecordingStatus>,
     not_started: Option<String>,
     policy: Option<PolicyStatus>,
-    references: Vec<Arc<ReferenceSample>>,
     last_episode: Option<(PathBuf, Verdict)>,
     session: Option<SessionStatus>,
     disk_free: Option<u64>,
@@ -194,7 +180,6 @@ impl State {
             recording: None,
             not_started: None,
             policy: None,
-            references: Vec::new(),
             last_episode: None,
             session: None,
             disk_free: None,
@@ -365,16 +350,6 @@ impl Board {
     /// Reports the policy's status, or that there is no policy.
     pub fn set_policy(&self, policy: Option<PolicyStatus>) {
         self.state().policy = policy;
-    }
-
-    /// Reports a sample that the policy compares all later ones with. A run has one policy.
-    pub fn add_reference(&self, reference: ReferenceSample) {
-        self.state().references.push(Arc::new(reference));
-    }
-
-    /// Those of the policy from number `from` on, in the order in which it took them.
-    pub fn references(&self, from: usize) -> Vec<Arc<ReferenceSample>> {
-        self.state().references.get(from..).unwrap_or_default().to_vec()
     }
 
     /// Reports the last finished file.

@@ -38,7 +38,7 @@ use detail::DeviceDetail;
 use preview::Preview;
 use session::{Answered, SessionRequest, SessionStatus};
 
-pub use board::{Board, EpisodeCounts, ReferenceSample};
+pub use board::{Board, EpisodeCounts};
 pub use event::Description;
 pub use event::{EpisodeReport, Event, Provenance, What};
 

@@ -22,18 +22,17 @@ use rapid_core::sample::SampleHeader;
 use rapid_core::time::{Stamp, WallClock};
 use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
 use rapid_registry::{Form, ModuleSpec, Registry, TransformSpec};
-use rapid_status::{Level, ReferenceSample};
+use rapid_status::Level;
 
 use super::guard::Guard;
-use crate::channel;
 use crate::chunk_writer::{self, ChunkWriter, Sink, io_error};
 use crate::encode::{self, EventText};
 use crate::form::{Derived, TRANSFORM_TOPIC};
 use crate::made::{MadeKind, Shown};
 use crate::own::EpisodeId;
-use crate::reference;
+use crate::reference::{self, ReferenceSample};
 use crate::schema::{self, PROTOBUF, SampleSchema, Schema};
-use crate::{ABOUT, SUMMARY};
+use crate::{ABOUT, SUMMARY, channel};
 
 /// See the module's comment.
 pub(super) struct EpisodeFile {
@@ -280,11 +279,9 @@ impl EpisodeFile {
     }
 
     /// Attaches a sample that the policy compares later ones with.
-    pub(super) fn reference(&mut self, reference: &ReferenceSample) -> io::Result<()> {
-        let ReferenceSample { observation, modality, header, payload } = reference;
-        let wall_ns = self.clock.wall_ns(Stamp(header.capture_ns));
-        let sample = (header, payload.as_slice());
-        let attachment = reference::attachment(&mut self.message, observation, modality, wall_ns, sample);
+    pub(super) fn reference(&mut self, sample: &ReferenceSample) -> io::Result<()> {
+        let wall_ns = self.clock.wall_ns(Stamp(sample.header.capture_ns));
+        let attachment = reference::attachment(&mut self.message, wall_ns, sample);
         self.writer.attach(&attachment).map_err(io_error)
     }
 

@@ -41,6 +41,7 @@ use super::quality::{Frames, Measured, Measures, Quality, SampleFacts};
 use super::streams::{Hole, MaskHistory};
 use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge};
 use super::writeback::Writeback;
+use crate::ReferenceSample;
 use crate::chunk_writer::Sink;
 use crate::encode::{Announced as Report, logged};
 use crate::made::Shown;
@@ -69,22 +70,14 @@ pub(super) struct Beginning<'a> {
     pub(super) begin: Stamp,
     /// Where what is written is shown.
     pub(super) shown: Option<Shown>,
+    /// References that the policy has taken so far.
+    pub(super) references: &'a [ReferenceSample],
 }
 
 /// The measured quality of each modality in an episode that ends at `end`.
 fn qualities<'a>(registry: &'a Registry, measures: &Measures, end: Stamp) -> Vec<(&'a DeviceSpec, Quality)> {
     let quality = |device: &'a DeviceSpec| Some((device, measures.quality(device.id, end.0)?));
     registry.devices.iter().filter_map(quality).collect()
-}
-
-/// Attaches the references that the policy has taken since the `attached` first ones, and counts them. Those captured in the
-/// episode are attached, too: its chunks do not always show which sample was the reference.
-fn attach_references(file: &mut EpisodeFile, board: &Board, attached: &mut usize) -> io::Result<()> {
-    for reference in board.references(*attached) {
-        file.reference(&reference)?;
-        *attached += 1;
-    }
-    Ok(())
 }
 
 fn judged<'a>(qualities: &'a [(&DeviceSpec, Quality)]) -> Vec<Judged<'a>> {
@@ -125,7 +118,7 @@ pub(super) struct OpenEpisode {
 impl OpenEpisode {
     /// Begins an episode and writes the file's initial records.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
-        let Beginning { registry, board, request, path, sink, attached, clock, begin, shown } = beginning;
+        let Beginning { registry, board, request, path, sink, attached, clock, begin, shown, references } = beginning;
         let units = Units::new(attached);
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, bits, _)| bits.mask);
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
@@ -148,8 +141,7 @@ impl OpenEpisode {
             file.mask(header, *bits, *sequence)?;
             measures.mask(header.capture_ns, bits.mask);
         }
-        let mut references = 0;
-        attach_references(&mut file, &board, &mut references)?;
+        references.iter().try_for_each(|reference| file.reference(reference))?;
         // If killed right now, it is still an episode, of a known task and rig.
         file.flush()?;
         let kept = |device: &DeviceSpec| device.depth.saturating_add(RING_SLACK);
@@ -172,7 +164,7 @@ impl OpenEpisode {
             logs: 0,
             events: 0,
             units,
-            references,
+            references: references.len(),
             settle,
             outlook: Outlook::default(),
             failed: None,
@@ -304,11 +296,22 @@ impl OpenEpisode {
         self.end.is_some_and(|end| now >= end)
     }
 
+    /// Attaches those of all `references` of the policy that are not attached yet. Those captured in the episode are attached,
+    /// too: its chunks do not always show which sample was the reference.
+    pub(super) fn attach(&mut self, references: &[ReferenceSample]) {
+        for reference in references.get(self.references..).unwrap_or_default() {
+            if self.failed.is_some() {
+                return;
+            }
+            self.failed = self.file.reference(reference).err();
+            self.references += 1;
+        }
+    }
+
     /// Passes the written data to the kernel and starts its writeback without waiting for it.
     pub(super) fn flush(&mut self) {
         if self.failed.is_none() {
-            let attached = attach_references(&mut self.file, &self.board, &mut self.references);
-            self.failed = attached.and_then(|()| self.file.flush()).err();
+            self.failed = self.file.flush().err();
         }
         if self.writeback.as_ref().is_some_and(|writeback| writeback.ask().is_none()) {
             self.end_writeback();
@@ -364,8 +367,7 @@ impl OpenEpisode {
         };
         let closed = match self.failed {
             None => {
-                let attached = attach_references(&mut self.file, &self.board, &mut self.references);
-                let finished = attached.and_then(|()| self.file.finish(metadata::end(&ending)));
+                let finished = self.file.finish(metadata::end(&ending));
                 finished.and_then(|()| episode_path::keep(&self.path))
             }
             Some(error) => Err(error),

@@ -40,6 +40,7 @@ use super::provenance::Attached;
 use super::publishers::Publishers;
 use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
+use crate::ReferenceSample;
 use crate::chunk_writer::Sink;
 use crate::made::Shown;
 use crate::partial::PARTIAL;
@@ -153,6 +154,7 @@ pub struct Recorder {
     orders: Option<Sender<RecorderOrder>>,
     thread: Option<JoinHandle<()>>,
     additions: Sender<RecorderAddition>,
+    references: Sender<ReferenceSample>,
     thread_ended: CancellationToken,
     episode: EpisodeWatch,
     /// Each receives the end of an episode that was requested, until it is taken; nothing if it did not begin.
@@ -177,6 +179,7 @@ impl Recorder {
     pub fn spawn(source: impl Source + 'static, mut config: RecorderConfig) -> io::Result<Self> {
         let (orders, inbox) = mpsc::channel();
         let (additions, added) = mpsc::channel();
+        let (references, taken) = mpsc::channel();
         let events = config.board.events();
         let thread_ended = CancellationToken::new();
         let (notify, episode) = watch::channel(None);
@@ -185,10 +188,10 @@ impl Recorder {
         let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
-            Writer::new(config, inbox, added, events, notify, in_force).run(source);
+            Writer::new(config, inbox, added, References::new(taken), events, notify, in_force).run(source);
         })?;
         let (orders, thread, ends) = (Some(orders), Some(thread), VecDeque::new());
-        Ok(Self { orders, thread, additions, thread_ended, episode, ends, clock })
+        Ok(Self { orders, thread, additions, references, thread_ended, episode, ends, clock })
     }
 
     /// Cancelled when the thread has ended: before the handle is dropped, by a panic.
@@ -258,6 +261,12 @@ impl Recorder {
     pub fn additions(&self) -> Sender<RecorderAddition> {
         self.additions.clone()
     }
+
+    /// For the samples that the policy compares all later ones with: each is attached to the episode in progress, and to all
+    /// later ones. A run has one policy. It does not keep the thread.
+    pub fn references(&self) -> Sender<ReferenceSample> {
+        self.references.clone()
+    }
 }
 
 impl Drop for Recorder {
@@ -283,11 +292,30 @@ enum RecorderOrder {
     End(Stamp),
 }
 
+/// The references of the policy, in the order in which it took them.
+struct References {
+    taken: Receiver<ReferenceSample>,
+    all: Vec<ReferenceSample>,
+}
+
+impl References {
+    const fn new(taken: Receiver<ReferenceSample>) -> Self {
+        Self { taken, all: Vec::new() }
+    }
+
+    /// All so far.
+    fn all(&mut self) -> &[ReferenceSample] {
+        self.all.extend(self.taken.try_iter());
+        &self.all
+    }
+}
+
 /// The thread's own state.
 struct Writer {
     config: RecorderConfig,
     inbox: Receiver<RecorderOrder>,
     added: Receiver<RecorderAddition>,
+    references: References,
     events: broadcast::Receiver<Event>,
     streams: Streams,
     attached: Attached,
@@ -316,6 +344,7 @@ impl Writer {
         config: RecorderConfig,
         inbox: Receiver<RecorderOrder>,
         added: Receiver<RecorderAddition>,
+        references: References,
         events: broadcast::Receiver<Event>,
         episode: watch::Sender<Option<Arc<Episode>>>,
         in_force: watch::Sender<WallClock>,
@@ -325,6 +354,7 @@ impl Writer {
             config,
             inbox,
             added,
+            references,
             events,
             streams: Streams::new(),
             attached: Attached::default(),
@@ -476,6 +506,7 @@ impl Writer {
             clock,
             begin,
             shown: self.config.shown.clone(),
+            references: self.references.all(),
         };
         let mut open = OpenEpisode::begin(beginning, &self.streams.masks).map_err(failed)?;
         // An episode records their state at its beginning, not only changes.
@@ -496,6 +527,7 @@ impl Writer {
         let Some(open) = &mut self.open else { return };
         open.advance(now, &self.streams.masks);
         if now.since(self.flushed) >= FLUSH_EVERY {
+            open.attach(self.references.all());
             open.flush();
             self.flushed = now;
         }
@@ -549,7 +581,8 @@ impl Writer {
     }
 
     fn finish(&mut self, now: Stamp, reason: Option<String>) {
-        let Some(open) = self.open.take() else { return };
+        let Some(mut open) = self.open.take() else { return };
+        open.attach(self.references.all());
         let ended = self.episode.send_replace(None);
         let report = open.finish(now, &self.streams.masks, reason, self.publishers.list());
         ended.inspect(|ended| ended.end(&report.file));

@@ -67,6 +67,7 @@ impl Stepped {
             clock: self.clock,
             begin,
             shown: None,
+            references: &[],
         };
         self.open = Some(OpenEpisode::begin(beginning, &self.streams.masks).map_err(failed)?);
         Ok(())

@@ -17,9 +17,9 @@ fn recording(folder: &Path, begin: Stamp) -> (Writer, PathBuf) {
     let events = board.events();
     let mut config = RecorderConfig::new(registry, board);
     config.begin = Box::new(move || begin);
-    let (inbox, added) = (mpsc::channel().1, mpsc::channel().1);
+    let (inbox, added, references) = (mpsc::channel().1, mpsc::channel().1, References::new(mpsc::channel().1));
     let (episode, in_force) = (watch::channel(None).0, watch::channel(WallClock::now()).0);
-    let mut writer = Writer::new(config, inbox, added, events, episode, in_force);
+    let mut writer = Writer::new(config, inbox, added, references, events, episode, in_force);
     let request = EpisodeRequest { out: folder.to_owned(), task: "t".to_owned(), ..EpisodeRequest::default() };
     let finished = writer.start(&request).unwrap();
     (writer, finished.with_extension("mcap.partial"))

@@ -3,20 +3,26 @@
 use rapid_core::provenance::UnplugSource;
 use rapid_core::text::counted;
 use rapid_core::time::WallClock;
-use rapid_status::ReferenceSample;
 
 use super::super::episode_path::EpisodePath;
 use super::super::open_episode::{Beginning, OpenEpisode};
 use super::super::provenance::Attached;
 use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
+use crate::episode::ReferenceSample;
 
 /// An open episode of its own clock, one second after the monotonic clock's zero.
 fn open(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {
-    open_of(registry(), folder, board, masks)
+    open_of(registry(), folder, board, masks, &[])
 }
 
-fn open_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {
+fn open_of(
+    registry: Registry,
+    folder: &Path,
+    board: &Arc<Board>,
+    masks: &MaskHistory,
+    references: &[ReferenceSample],
+) -> OpenEpisode {
     let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
     let path = EpisodePath::create(
         &EpisodeRequest { out: folder.to_owned(), task: "t".into(), ..EpisodeRequest::default() },
@@ -33,6 +39,7 @@ fn open_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHi
         clock,
         begin: Stamp(1000 * MS),
         shown: None,
+        references,
     };
     OpenEpisode::begin(beginning, masks).unwrap()
 }
@@ -70,20 +77,18 @@ fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
 fn references_of_the_policy_are_attached() {
     let folder = tempfile::tempdir().unwrap();
     let board = Arc::new(Board::new(&registry()));
-    let take = |observation: &str, capture_ms| {
-        board.add_reference(ReferenceSample {
-            observation: observation.to_owned(),
-            modality: "tof".to_owned(),
-            header: scalars(3, capture_ms, capture_ms),
-            payload: 1.5_f64.to_le_bytes().to_vec(),
-        });
+    let reference = |observation: &str, capture_ms| ReferenceSample {
+        observation: observation.to_owned(),
+        modality: "tof".to_owned(),
+        header: scalars(3, capture_ms, capture_ms),
+        payload: 1.5_f64.to_le_bytes().to_vec(),
     };
-    take("known", 500);
+    let mut taken = vec![reference("known", 500)];
     let masks = MaskHistory::new();
-    let mut open = open(folder.path(), &board, &masks);
+    let mut open = open_of(registry(), folder.path(), &board, &masks, &taken);
     let attached = |path: &Path| -> Vec<String> { read(path).attachments.into_keys().collect() };
-    take("taken_late", 999);
-    take("of_the_episode", 1001);
+    taken.extend([reference("taken_late", 999), reference("of_the_episode", 1001)]);
+    open.attach(&taken);
     open.flush();
     let partial: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
     let [partial] = &partial[..] else { panic!("{partial:?}") };
@@ -94,7 +99,8 @@ fn references_of_the_policy_are_attached() {
             "{name}: it would be lost in a kill"
         );
     }
-    take("at_the_end", 1050);
+    taken.push(reference("at_the_end", 1050));
+    open.attach(&taken);
     open.end_at(Stamp(1100 * MS));
     let report = open.finish(Stamp(1300 * MS), &masks, None, &[]);
     assert_eq!(report.error, None);
@@ -216,7 +222,7 @@ fn every_frame_waits_for_a_slow_sensor() {
     masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
     let mut late = registry();
     late.devices[usize::from(TOF)].latency = Duration::from_millis(300);
-    let mut open = open_of(late, folder.path(), &board, &masks);
+    let mut open = open_of(late, folder.path(), &board, &masks, &[]);
     let at = |ms: u64| Stamp(ms * MS);
     open.end_at(at(1010));
     // It stands for tick 0, at 1000 ms; and one, captured as late, for a moment after the end.
@@ -301,7 +307,7 @@ fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
     let board = Arc::new(Board::new(&registry));
     let mut streams = Streams::new();
     streams.masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
-    let mut open = open_of(registry, folder, &board, &streams.masks);
+    let mut open = open_of(registry, folder, &board, &streams.masks, &[]);
     open.end_at(Stamp(2000 * MS));
     for ms in 900..2200 {
         if ms % 10 == 0 {
