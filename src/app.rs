@@ -253,10 +253,11 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let web = options.web.as_ref().map(|options| web::start(options, &board, &to_conductor)).transpose()?;
     let (shown, made) = Shown::channel();
     let mut config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
-    config.shown = listening.is_some().then_some(shown);
+    let (stop_states, stops) = interlocks::states(&registry);
+    (config.shown, config.stops) = (listening.is_some().then_some(shown), stops);
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let (following, to_recorder, clock) = (recorder.episode(), recorder.additions(), recorder.clock());
-    let references = recorder.references();
+    let (references, mask) = (recorder.references(), presence.published());
     let is_single = options.is_single();
     // Ending by itself after some time is the run's, unless it has several episodes.
     let duration = options.plan.episode_time.or(options.duration.filter(|_| is_single));
@@ -275,12 +276,13 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         // The inputs report their first state at once.
         let events = board.events();
         // Until the very end: a device that is being closed may still move.
-        let watched = Watched::begin(&registry, &permission, &board).map_err(AppError::Interlocks)?;
+        let watched = Watched::begin(&registry, &permission, &stop_states, &board).map_err(AppError::Interlocks)?;
         let (commands, from_screen) = mpsc::channel(16);
         let attached = Attached::new(Arc::clone(&board), commands.clone());
         let screen = screen::start(kind, &board, events, commands, &permission, options.duration, options.shown);
-        let (registry, board, loaded, is_recorded) = (&registry, &board, &loaded, options.record);
-        let surroundings = inference::Surroundings { registry, bus, board, loaded, references, is_recorded };
+        let (registry, board, loaded) = (&registry, &board, &loaded);
+        let episode = options.record.then(|| following.clone());
+        let surroundings = inference::Surroundings { registry, bus, board, loaded, references, mask, episode };
         let inference = options.policy.map(|policy| inference::start(policy, surroundings)).transpose()?;
         let live = listening.map(|listening| listening.start(bus, board, (clock, made))).transpose()?;
         Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live))
@@ -305,6 +307,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
         rig: to_rig.clone(),
         discovery: to_discovery,
         recorder: to_recorder,
+        episode: following.clone(),
         alignment: to_alignment,
         live: to_live,
         modules,
@@ -441,7 +444,8 @@ async fn finish(
     mut outcome: Result<(), AppError>,
 ) -> Result<(), AppError> {
     // Scripts read lines and JSON, and check the exit code.
-    let judged = (conductor.record && running.kind != Screen::Monitor).then(|| Arc::clone(&conductor.board));
+    let is_judged = conductor.record && running.kind != Screen::Monitor;
+    let mut bad = None;
     // First, all motion ends, whichever program publishes actions. A chunk that is being computed is waited for with
     // the rest.
     running.permission.disarm(Stamp::now());
@@ -463,6 +467,7 @@ async fn finish(
         keep_first(&mut outcome, running.streaming.end().await);
         keep_first(&mut outcome, finished);
         keep_first(&mut outcome, conductor.collection.close().await);
+        bad = conductor.collection.bad();
         // The recorder's thread ends when its handle is dropped: it has nothing left to write.
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
@@ -492,7 +497,7 @@ async fn finish(
     if twice {
         keep_first(&mut outcome, Err(AppError::InterruptedTwice));
     }
-    if let Some((count, file)) = judged.and_then(|board| board.episodes().bad()) {
+    if let Some((count, file)) = bad.filter(|_| is_judged) {
         keep_first(&mut outcome, Err(AppError::Bad { count, file }));
     }
     outcome

@@ -8,7 +8,7 @@
 //! Invariant: a request is answered once, also when what it waits for does not happen; and when what it changed is on the
 //! disk, not before.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ use rapid_episode::record::inspect::{self, Judgement, Listed};
 use rapid_episode::record::{EpisodeRequest, RecordError, Recorder};
 use rapid_registry::{ModuleError, ModuleSpec};
 use rapid_status::session::{Answered, Phase, SessionRequest, SessionStatus};
-use rapid_status::{Board, EpisodeReport, Level, Verdict, What};
+use rapid_status::{Board, EpisodeCounts, EpisodeReport, Level, Verdict, What};
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
@@ -100,6 +100,8 @@ pub(super) struct Collection {
     at_begin: Beginning,
     at_end: Waiting,
     answer: Option<Answered>,
+    /// The episodes of this run.
+    episodes: EpisodeCounts,
     /// The session has a file. A run that records one episode by itself leaves that episode and nothing beside it, unless
     /// something is requested of it.
     is_kept: bool,
@@ -141,6 +143,7 @@ impl Collection {
             at_begin: Vec::new(),
             at_end: Vec::new(),
             answer: None,
+            episodes: EpisodeCounts::default(),
             is_kept,
             superseded: earlier.filter(|_| is_new),
         };
@@ -156,6 +159,11 @@ impl Collection {
     /// What is collected is complete.
     pub(super) fn is_complete(&self) -> bool {
         self.session.is_complete()
+    }
+
+    /// How many of this run's episodes are kept and BAD, and the file of the last; `None` if there is none.
+    pub(super) fn bad(&self) -> Option<(usize, PathBuf)> {
+        self.episodes.bad()
     }
 
     /// When [`Self::tick`] is to be called next, if at all.
@@ -263,6 +271,7 @@ impl Collection {
     }
 
     fn end_noted(&mut self, end: &EpisodeReport) -> (Vec<Effect>, Option<Pending>) {
+        self.episodes.note(&What::Episode(end.clone()));
         let file = end.file.display();
         let to = std::mem::take(&mut self.at_end);
         let answer = if let Some(error) = &end.error {
@@ -296,8 +305,8 @@ impl Collection {
     /// Takes an outcome of the keeper.
     fn take(&mut self, outcome: Outcome) {
         match outcome {
-            Outcome::Discarded(file) => self.board.announce(What::Discarded { file: self.episode.out.join(file) }),
-            Outcome::Restored(file) => self.board.announce(What::Restored { file: self.episode.out.join(file) }),
+            Outcome::Discarded(file) => self.moved(What::Discarded { file: self.episode.out.join(file) }),
+            Outcome::Restored(file) => self.moved(What::Restored { file: self.episode.out.join(file) }),
             Outcome::NotMoved(file, why) => {
                 for effect in self.session.not_moved(&file) {
                     self.change(effect);
@@ -315,6 +324,11 @@ impl Collection {
             Outcome::Answered(answer) => self.answer(answer, None),
         }
         self.show();
+    }
+
+    fn moved(&mut self, what: What) {
+        self.episodes.note(&what);
+        self.board.announce(what);
     }
 
     fn fail(&mut self, text: String) {

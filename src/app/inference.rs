@@ -12,7 +12,7 @@ use rapid_bus::{Bus, Inbox, TopicId, Writer};
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_registry::Registry;
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EpisodeWatch, Level, What};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
@@ -25,6 +25,7 @@ use crate::policy::live::{Live, LiveOptions};
 use crate::policy::model::Model;
 use crate::policy::pace::{Pace, PaceVerdict};
 use crate::policy::sampler::Computing;
+use crate::rig::presence::Published;
 
 /// Interval at which the mask is checked for that.
 const LOOK: Duration = Duration::from_millis(5);
@@ -51,8 +52,9 @@ pub(super) struct Surroundings<'a> {
     pub(super) loaded: &'a CancellationToken,
     /// Receives the samples that all later ones of an observation are compared with.
     pub(super) references: Sender<ReferenceSample>,
-    /// It is to be recorded.
-    pub(super) is_recorded: bool,
+    pub(super) mask: Published,
+    /// The episode that is to hold everything that it observes, if it is to be recorded.
+    pub(super) episode: Option<EpisodeWatch>,
 }
 
 /// Starts the stage: it loads the policy and starts it when everything it requires is present; when it is to be
@@ -62,7 +64,7 @@ pub(super) struct Surroundings<'a> {
 /// # Errors
 /// When it cannot read the bus.
 pub(super) fn start(options: PolicyOptions, surroundings: Surroundings<'_>) -> Result<Stage, AppError> {
-    let Surroundings { registry, bus, board, loaded, references, is_recorded } = surroundings;
+    let Surroundings { registry, bus, board, loaded, references, mask, episode } = surroundings;
     let flight = Flight {
         required: required(&options, registry),
         inbox: bus.inbox()?,
@@ -71,7 +73,8 @@ pub(super) fn start(options: PolicyOptions, surroundings: Surroundings<'_>) -> R
         board: Arc::clone(board),
         loaded: loaded.clone(),
         references,
-        is_recorded,
+        mask,
+        episode,
         options,
     };
     Ok(Stage::start("the policy", |stop| flight.run(stop)))
@@ -97,7 +100,8 @@ struct Flight {
     board: Arc<Board>,
     loaded: CancellationToken,
     references: Sender<ReferenceSample>,
-    is_recorded: bool,
+    mask: Published,
+    episode: Option<EpisodeWatch>,
 }
 
 impl Flight {
@@ -170,13 +174,13 @@ impl Flight {
                 () = stop.cancelled() => return Ok(false),
                 _ = look.tick() => {}
             }
-            let missing = missing(&self.required, self.board.mask());
+            let missing = missing(&self.required, self.mask.mask());
             if missing.is_empty() {
                 // It does not begin without a sensor that is plugged in and only not open yet.
                 if !settling::has_settled(&self.board, begun.elapsed()) {
                     continue;
                 }
-                if !self.is_recorded || self.board.is_recording() {
+                if self.episode.as_ref().is_none_or(|episode| episode.borrow().is_some()) {
                     return Ok(true);
                 }
                 continue;

@@ -5,12 +5,13 @@ use std::sync::mpsc::Sender;
 
 use rapid_bus::Bus;
 use rapid_registry::Registry;
-use rapid_status::Board;
+use rapid_status::{Board, EpisodeWatch};
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
 use super::stage::Stage;
 use crate::episode::ReferenceSample;
+use crate::rig::presence::Published;
 
 /// No policy can be given.
 #[derive(Debug)]
@@ -24,7 +25,8 @@ pub(super) struct Surroundings<'a> {
     pub(super) board: &'a Arc<Board>,
     pub(super) loaded: &'a CancellationToken,
     pub(super) references: Sender<ReferenceSample>,
-    pub(super) is_recorded: bool,
+    pub(super) mask: Published,
+    pub(super) episode: Option<EpisodeWatch>,
 }
 
 /// Starts nothing.

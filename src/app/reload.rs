@@ -18,7 +18,7 @@ use rapid_core::time::Stamp;
 use rapid_episode::record::RecorderAddition;
 use rapid_registry::{DeviceSpec, Difference, ModuleSpec, Registry};
 use rapid_status::session::Answered;
-use rapid_status::{Board, Level, RegistryRequest, What};
+use rapid_status::{Board, EpisodeWatch, Level, RegistryRequest, What};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_blocking;
 
@@ -43,6 +43,7 @@ pub(super) struct Reload {
     /// Searches for what is on the network.
     pub(super) discovery: mpsc::UnboundedSender<Vec<Arc<DeviceSpec>>>,
     pub(super) recorder: std::sync::mpsc::Sender<RecorderAddition>,
+    pub(super) episode: EpisodeWatch,
     pub(super) alignment: mpsc::UnboundedSender<(Arc<DeviceSpec>, Subscription)>,
     /// The Foxglove server, if there is one.
     pub(super) live: Option<std::sync::mpsc::Sender<LiveAddition>>,
@@ -130,7 +131,7 @@ impl Reload {
             opened.iter().map(|opened| format!("[device.{}] as bit {}", opened.device.name, opened.device.id));
         let names: Vec<_> = devices.chain(modules.iter().map(|name| format!("[module.{name}]"))).collect();
         let names = names.join(", ");
-        let episode = if self.board.is_recording() { "; recorded from the next episode on" } else { "" };
+        let episode = if self.episode.borrow().is_some() { "; recorded from the next episode on" } else { "" };
         self.board.announce(What::Log { level: Level::Info, text: format!("registry: added {names}{episode}") });
         // A stage that is gone has ended with the run, or ends it.
         let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(&registry), subscription: None });

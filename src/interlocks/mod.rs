@@ -1,7 +1,7 @@
 //! Emergency stops and enabling switches: what follows from their inputs.
 //!
 //! The inputs are read by the threads of [`crate::inputs`]. The state of an input goes to the run's [`Permission`], which
-//! gives the orders, and then to the board.
+//! gives the orders, then to [`States`], from which an episode takes those of its beginning, and to the board.
 //!
 //! Invariant: the order is given before anything is shown or logged.
 //! Invariant: an input that is lost does not run.
@@ -14,10 +14,19 @@ use rapid_core::interlock::{InputState, Interlocks};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
 use rapid_registry::Registry;
-use rapid_status::Board;
+use rapid_status::{Board, StopStatus};
+use tokio::sync::watch;
 
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
+
+/// The inputs of a rig in the order of the registry, each as it was reported last.
+pub type States = watch::Receiver<Vec<StopStatus>>;
+
+/// Where the states of the inputs of `registry` are put, and read.
+pub fn states(registry: &Registry) -> (watch::Sender<Vec<StopStatus>>, States) {
+    watch::channel(StopStatus::unreported(registry))
+}
 
 /// The stops of a registry, none of which runs.
 pub fn of(registry: &Registry) -> Interlocks {
@@ -32,16 +41,22 @@ pub struct Watched {
 }
 
 impl Watched {
-    /// Reads the inputs of `registry` from now on, for `permission`, which was created from the same registry.
+    /// Reads the inputs of `registry` from now on, for `permission` and `states`, which were created from the same registry.
     ///
     /// # Errors
     /// When the system provides no thread.
-    pub fn begin(registry: &Registry, permission: &Arc<Permission>, board: &Arc<Board>) -> io::Result<Self> {
+    pub fn begin(
+        registry: &Registry,
+        permission: &Arc<Permission>,
+        states: &watch::Sender<Vec<StopStatus>>,
+        board: &Arc<Board>,
+    ) -> io::Result<Self> {
         let mut watched = Self { readers: Readers::new(true)?, is_ending: Arc::default() };
         for (index, spec) in registry.stops.iter().enumerate() {
             let reporter = Reporter {
                 index,
                 permission: Arc::clone(permission),
+                states: states.clone(),
                 board: Arc::clone(board),
                 is_ending: Arc::clone(&watched.is_ending),
             };
@@ -72,6 +87,7 @@ impl Watched {
 struct Reporter {
     index: usize,
     permission: Arc<Permission>,
+    states: watch::Sender<Vec<StopStatus>>,
     board: Arc<Board>,
     /// See [`Watched::end`].
     is_ending: Arc<AtomicBool>,
@@ -81,8 +97,18 @@ impl Reporter {
     /// `why` it is lost, if it is.
     fn report(&self, state: InputState, why: &str) {
         let is_news = self.permission.report(self.index, state, Stamp::now());
-        if is_news && !self.is_ending.load(Ordering::Relaxed) {
-            self.board.set_stop(self.index, state, why);
+        if !is_news || self.is_ending.load(Ordering::Relaxed) {
+            return;
+        }
+        let mut reported = None;
+        self.states.send_modify(|states| {
+            reported = states.get_mut(self.index).map(|stop| {
+                (stop.state, stop.detail) = (state, why.to_owned());
+                stop.clone()
+            });
+        });
+        if let Some(stop) = reported {
+            self.board.set_stop(stop);
         }
     }
 }

@@ -38,6 +38,7 @@ struct Run {
     board: Arc<Board>,
     events: tokio::sync::broadcast::Receiver<Event>,
     watched: Watched,
+    reported: watch::Sender<Vec<StopStatus>>,
 }
 
 fn run(stops: &str) -> Run {
@@ -46,8 +47,9 @@ fn run(stops: &str) -> Run {
     let permission = Arc::new(Permission::new(false).with_interlocks(of(&registry)));
     let attended = permission.attend();
     let events = board.events();
-    let watched = Watched::begin(&registry, &permission, &board).unwrap();
-    Run { permission, attended, board, events, watched }
+    let reported = states(&registry).0;
+    let watched = Watched::begin(&registry, &permission, &reported, &board).unwrap();
+    Run { permission, attended, board, events, watched, reported }
 }
 
 impl Run {
@@ -236,6 +238,7 @@ fn an_input_whose_thread_panics_is_lost() {
     let reporter = Reporter {
         index: 0,
         permission: Arc::clone(&run.permission),
+        states: run.reported.clone(),
         board: Arc::clone(&run.board),
         is_ending: Arc::default(),
     };
@@ -257,6 +260,7 @@ fn an_input_whose_thread_panics_is_lost() {
     });
     assert!(panicked.join().is_err());
     assert_eq!((run.stop().state, run.orders()), (InputState::Lost, vec![Order::Disarm]));
+    assert_eq!(run.reported.borrow()[0], run.stop(), "an episode records what is shown");
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! The board: where stages report the data that a screen may show.
 //!
-//! One writer per item: the rig writes slots and the mask, streams write their own counters, the recorder writes the
+//! It is what screens see and nothing else: what one stage tells another goes over a channel or a handle of the stage that
+//! owns it. One writer per item: the rig writes slots and the mask, streams write their own counters, the recorder writes the
 //! recording. A screen only takes [`Snapshot`]s.
 //!
 //! Invariant: per-sample data and the mask are atomics; everything else is guarded by one lock, so that a snapshot is of one
@@ -13,13 +14,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use rapid_core::interlock::InputState;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_core::text;
 use rapid_core::time::{Stamp, realtime_ns};
-use rapid_registry::{DeviceSpec, InterlockSpec, Registry};
+use rapid_registry::{DeviceSpec, Registry};
 use tokio::sync::broadcast;
 
 use super::detail::{DeviceDetail, Intervals, StaticDetail};
@@ -76,7 +76,8 @@ pub struct EpisodeCounts {
 }
 
 impl EpisodeCounts {
-    fn note(&mut self, what: &What) {
+    /// Takes an event about an episode.
+    pub fn note(&mut self, what: &What) {
         match what {
             What::Episode(end) => self.kept.push((end.file.clone(), end.verdict.grade)),
             What::Discarded { file } => shift(&mut self.kept, &mut self.discarded, file),
@@ -176,7 +177,7 @@ impl State {
             unregistered: Vec::new(),
             registry_answer: None,
             slots: vec![SlotStatus::default(); MAX_MODALITIES],
-            stops: registry.stops.iter().map(unreported).collect(),
+            stops: StopStatus::unreported(registry),
             recording: None,
             not_started: None,
             policy: None,
@@ -303,32 +304,18 @@ impl Board {
         detail.clone_into(&mut slot.detail);
     }
 
-    /// Reports the state of stop `index` of the registry, and announces it.
-    pub fn set_stop(&self, index: usize, state: InputState, detail: &str) {
-        let changed = self.state().stops.get_mut(index).map(|stop| {
-            stop.state = state;
-            detail.clone_into(&mut stop.detail);
-            stop.clone()
-        });
-        if let Some(stop) = changed {
-            self.announce(What::Stop(stop));
+    /// Reports the state of an emergency stop or an enabling switch, and announces it.
+    pub fn set_stop(&self, stop: StopStatus) {
+        if let Some(shown) = self.state().stops.iter_mut().find(|shown| shown.stop == stop.stop) {
+            shown.clone_from(&stop);
         }
-    }
-
-    /// Emergency stops and enabling switches, in the order of the registry.
-    pub fn stops(&self) -> Vec<StopStatus> {
-        self.state().stops.clone()
+        self.announce(What::Stop(stop));
     }
 
     /// Reports a publication of the mask.
     pub fn set_mask(&self, mask: PhysicalMask, sequence: u64) {
         self.mask.store(mask.0, Ordering::Relaxed);
         self.mask_sequence.store(sequence, Ordering::Relaxed);
-    }
-
-    /// The mask as published.
-    pub fn mask(&self) -> PhysicalMask {
-        PhysicalMask(self.mask.load(Ordering::Relaxed))
     }
 
     /// Reports the recording in progress, or that there is none.
@@ -340,11 +327,6 @@ impl Board {
     pub fn set_not_started(&self, why: Option<String>) {
         let why = why.map(|why| text::plain(&why).into_owned());
         self.state().not_started = why;
-    }
-
-    /// Whether an episode is in progress.
-    pub fn is_recording(&self) -> bool {
-        self.state().recording.is_some()
     }
 
     /// Reports the policy's status, or that there is no policy.
@@ -476,7 +458,7 @@ impl Board {
             rig: self.rig.clone(),
             taken,
             uptime: taken.since(self.started),
-            mask: self.mask(),
+            mask: PhysicalMask(self.mask.load(Ordering::Relaxed)),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
             devices: state.entries.iter().map(|entry| self.device(entry, &state)).collect(),
             unregistered: state.unregistered.clone(),
@@ -531,11 +513,6 @@ impl Board {
 fn plain(level: Level, text: &str, device: Option<&str>, printed: Option<PrintedOn>) -> LogLine {
     let (text, device) = (text::plain(text).into_owned(), device.map(str::to_owned));
     LogLine { number: 0, wall_ns: 0, level, device, printed, text }
-}
-
-fn unreported(stop: &InterlockSpec) -> StopStatus {
-    let detail = "it has not reported yet".to_owned();
-    StopStatus { stop: stop.name.clone(), kind: stop.kind, state: InputState::Lost, detail }
 }
 
 #[cfg(test)]

@@ -31,6 +31,7 @@ use rapid_core::modality::ModalityId;
 use rapid_core::sample::Epoch;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_registry::{InterlockSpec, Registry};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tokio::sync::{SetOnce, watch};
 
@@ -352,6 +353,18 @@ pub struct StopStatus {
 }
 
 impl StopStatus {
+    /// Those of a registry, in its order, before any of them has reported.
+    pub fn unreported(registry: &Registry) -> Vec<Self> {
+        let detail = "it has not reported yet";
+        let of = |spec: &InterlockSpec| Self {
+            stop: spec.name.clone(),
+            kind: spec.kind,
+            state: InputState::Lost,
+            detail: detail.to_owned(),
+        };
+        registry.stops.iter().map(of).collect()
+    }
+
     /// Whether it needs attention; a released enabling switch does not.
     pub fn is_problem(&self) -> bool {
         match self.kind {

@@ -14,7 +14,7 @@ use super::super::Signals;
 use super::super::buttons::Buttons;
 use super::super::streaming::Streaming;
 use super::*;
-use crate::interlocks::Watched;
+use crate::interlocks::{self, Watched};
 use crate::patience::PATIENCE;
 use crate::session::journal::Plan;
 
@@ -103,7 +103,13 @@ impl Bench {
                 hurry: CancellationToken::new(),
             },
             permission: Arc::default(),
-            watched: Watched::begin(&Registry::builtin(), &Arc::default(), &board).unwrap(),
+            watched: Watched::begin(
+                &Registry::builtin(),
+                &Arc::default(),
+                &interlocks::states(&Registry::builtin()).0,
+                &board,
+            )
+            .unwrap(),
             buttons: Buttons::default(),
             mask_ended: CancellationToken::new(),
             kind: Screen::Monitor,

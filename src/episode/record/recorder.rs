@@ -42,6 +42,7 @@ use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
 use crate::ReferenceSample;
 use crate::chunk_writer::Sink;
+use crate::interlocks::{self, States};
 use crate::made::Shown;
 use crate::partial::PARTIAL;
 
@@ -128,14 +129,17 @@ pub struct RecorderConfig {
     /// Returns the start time of an episode requested now: now. Tests use it to send the samples of the beginning, so
     /// that they belong to it on machines of any speed.
     pub begin: Box<dyn FnMut() -> Stamp + Send>,
+    /// The emergency stops and enabling switches: an episode records their states at its beginning.
+    pub stops: States,
     /// Where what is written is shown, if anywhere.
     pub shown: Option<Shown>,
 }
 
 impl RecorderConfig {
-    /// Episodes of `registry`, reported on `board`, written to their files.
+    /// Episodes of `registry`, reported on `board`, written to their files; its stops have not reported.
     pub fn new(registry: Arc<Registry>, board: Arc<Board>) -> Self {
         Self {
+            stops: interlocks::states(&registry).1,
             registry,
             board,
             sink: Box::new(|file| Box::new(file)),
@@ -510,7 +514,8 @@ impl Writer {
         };
         let mut open = OpenEpisode::begin(beginning, &self.streams.masks).map_err(failed)?;
         // An episode records their state at its beginning, not only changes.
-        for stop in self.config.board.stops() {
+        let stops = self.config.stops.borrow().clone();
+        for stop in stops {
             open.event(&Event { stamp: begin, what: What::Stop(stop) });
         }
         self.config.board.set_recording(Some(open.status(begin)));

@@ -523,7 +523,7 @@ async fn the_end_is_announced_before_a_slow_device_has_closed() {
         (ended, Stamp::now())
     });
     let begun = Instant::now();
-    while !board.mask().contains(registry.devices[0].id) {
+    while !board.snapshot().mask.contains(registry.devices[0].id) {
         assert!(begun.elapsed() < PATIENCE, "no sample");
         sleep(Duration::from_millis(1)).await;
     }
@@ -604,7 +604,7 @@ async fn the_mask_is_published_before_the_announcement_and_its_file_agrees_with_
             };
             hotplug.unbounded_send(Ok(event)).expect("rig");
             let begun = Instant::now();
-            while board.mask().contains(registry.devices[0].id) != is_there {
+            while board.snapshot().mask.contains(registry.devices[0].id) != is_there {
                 assert!(begun.elapsed() < PATIENCE, "round {round}: the mask stays");
                 sleep(Duration::from_millis(1)).await;
             }

@@ -51,6 +51,8 @@ pub struct Presence {
 #[derive(Debug)]
 struct Shared {
     mask: AtomicU64,
+    /// The mask as it was published last.
+    published: AtomicU64,
     plugged: AtomicU64,
     /// Number of registered modalities.
     devices: AtomicU8,
@@ -63,6 +65,17 @@ impl Shared {
         let mask = self.mask.load(Ordering::Acquire);
         let plugged = self.plugged.load(Ordering::Acquire) | mask;
         Bits { mask: PhysicalMask(mask), plugged: PhysicalMask(plugged) }
+    }
+}
+
+/// See [`Presence::published`].
+#[derive(Debug, Clone)]
+pub struct Published(Arc<Shared>);
+
+impl Published {
+    /// The mask.
+    pub fn mask(&self) -> PhysicalMask {
+        PhysicalMask(self.0.published.load(Ordering::Acquire))
     }
 }
 
@@ -93,6 +106,7 @@ impl Presence {
         let devices = AtomicU8::new(file.device_count());
         let shared = Arc::new(Shared {
             mask: AtomicU64::new(0),
+            published: AtomicU64::new(0),
             plugged: AtomicU64::new(0),
             devices,
             stop: AtomicBool::new(false),
@@ -111,6 +125,11 @@ impl Presence {
     /// Cancelled when the thread has ended; a panic can end it before this is dropped.
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
+    }
+
+    /// Reads, at any moment, the mask that is published.
+    pub fn published(&self) -> Published {
+        Published(Arc::clone(&self.shared))
     }
 
     /// Reads, at any moment, the mask that should be published.
@@ -251,6 +270,7 @@ impl Heartbeat {
         let mask = bits.mask;
         self.file.set_device_count(self.shared.devices.load(Ordering::Acquire));
         let sequence = self.file.publish(mask, realtime_ns()).map_err(|error| error.to_string())?;
+        self.shared.published.store(mask.0, Ordering::Release);
         self.board.set_mask(mask, sequence);
         let header = SampleHeader {
             seq: sequence,
