@@ -15,6 +15,8 @@ mod difference;
 pub mod edit;
 mod identity;
 pub mod import;
+pub mod keys;
+mod kinds;
 mod parse;
 pub mod scenario;
 mod scenario_file;

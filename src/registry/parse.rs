@@ -27,10 +27,11 @@ use std::time::Duration;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
+use super::keys::{About, keys};
 use super::section::{Section, file_label, read, read_file};
 use super::spec::{
-    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, POOL_SPARE, Provider, RESERVED_BYTES, Registry,
-    RigSpec, SAMPLE_OVERHEAD,
+    DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, POOL_SPARE, RESERVED_BYTES, Registry, RigSpec,
+    SAMPLE_OVERHEAD,
 };
 use super::trust::distrust;
 use super::units::{show_duration, show_size};
@@ -43,6 +44,28 @@ pub use identity::{like_a_name, name_problem};
 
 /// The registry used when there is no file: the rig that `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
+
+keys! {
+    /// The tables of the file.
+    pub(super) const ROOT {} below {
+        /// The rig.
+        rig = About::Table(&[RigSpec::KEYS]);
+        /// What policies are computed on.
+        inference = About::Table(&[InferenceSpec::KEYS]);
+        /// Which numbers a dataset has.
+        export = About::Table(&[ExportSpec::KEYS]);
+        /// Limits of the verdict for all devices.
+        verdict = About::ANY_TABLE;
+        /// A device, and the modality that it provides.
+        device = About::Named(device::KEYS);
+        /// What is mounted in a slot of the gripper.
+        module = About::Named(&[module::ModuleKeys::KEYS]);
+        /// An emergency stop or an enabling switch.
+        stop = About::ANY_TABLE;
+        /// A pedal or button.
+        button = About::ANY_TABLE;
+    }
+}
 
 /// Topics `rapid` publishes itself.
 const OWN_TOPICS: [&str; 7] =
@@ -107,7 +130,7 @@ impl Registry {
         let (devices, modules, stops, buttons) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let (inference, export) = (InferenceSpec::default(), ExportSpec::default());
         Self {
-            rig: rig(None),
+            rig: RigSpec::default(),
             inference,
             export,
             devices,
@@ -122,10 +145,10 @@ impl Registry {
 
 /// The content of the tables of the text.
 fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Registry, RegistryErrors> {
-    root.allow(&["rig", "inference", "export", "verdict", "device", "module", "stop", "button"]);
-    let section = root.table("rig");
-    let mut rig = rig(section.as_ref());
-    let inference = root.table("inference").map(|section| inference(&section)).unwrap_or_default();
+    root.known(&[ROOT]);
+    let section = root.table_or_empty("rig");
+    let rig = RigSpec::read(&section);
+    let inference = InferenceSpec::read(&root.table_or_empty("inference"));
     let verdict = verdict::read(root, Whose::Rig);
     let mut drafts = drafts(root, programs);
     if drafts.is_empty() && root.is_faultless() {
@@ -135,7 +158,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     check_identities(&drafts);
     check_streams(&drafts);
     check_topics(&drafts);
-    rig.expect = section.map(|section| expected(&section, &drafts)).unwrap_or_default();
+    check_expected(&section, &rig.expect, &drafts);
     check_actuators(&drafts);
     lan::check_ports(&drafts);
     lan::check_gopros(&drafts);
@@ -162,51 +185,6 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
         }
     }
     Ok(Registry { rig, inference, export, devices, modules, stops, buttons, path: None, text: String::new() })
-}
-
-fn rig(section: Option<&Section<'_>>) -> RigSpec {
-    let mut rig = RigSpec {
-        name: "rig".to_owned(),
-        observation_hz: 30.0,
-        sync_window: Duration::from_millis(25),
-        cooldown: Duration::from_secs(2),
-        memory_budget: 512 << 20,
-        disk_reserve: None,
-        expect: Vec::new(),
-    };
-    let Some(section) = section else { return rig };
-    let known = ["name", "observation_hz", "sync_window", "cooldown", "memory_budget", "disk_reserve", "expect"];
-    section.allow(&known);
-    if let Some(name) = section.text("name") {
-        // The name becomes part of file names.
-        let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-        if (1..=64).contains(&name.len()) && name.chars().all(legal) && !name.starts_with('.') {
-            name.clone_into(&mut rig.name);
-        } else {
-            let fix = "use letters, digits, `-`, `_` and `.`, at most 64, not beginning with `.`";
-            section.report("name", format!("rig name {name:?} cannot be part of a file name"), fix);
-        }
-    }
-    if let Some(hz) = section.number("observation_hz", 0.1..=1000.0) {
-        rig.observation_hz = hz;
-    }
-    let window = Duration::from_millis(1)..=Duration::from_secs(10);
-    rig.sync_window = section.duration("sync_window", window).unwrap_or(rig.sync_window);
-    let cooldown = Duration::ZERO..=Duration::from_mins(1);
-    rig.cooldown = section.duration("cooldown", cooldown).unwrap_or(rig.cooldown);
-    let budget = 1 << 20..=64 << 30;
-    rig.memory_budget = section.size("memory_budget", budget).unwrap_or(rig.memory_budget);
-    rig.disk_reserve = section.size("disk_reserve", 0..=1 << 40);
-    rig
-}
-
-fn inference(section: &Section<'_>) -> InferenceSpec {
-    let mut inference = InferenceSpec::default();
-    section.allow(&["threads", "provider"]);
-    let most = i64::try_from(InferenceSpec::MOST_THREADS).unwrap_or(i64::MAX);
-    inference.threads = section.integer("threads", 1..=most).unwrap_or(inference.threads);
-    inference.provider = section.choice("provider", &Provider::WORDS).unwrap_or(inference.provider);
-    inference
 }
 
 /// One draft per entry, in the order of the file.
@@ -329,8 +307,7 @@ fn check_topics(drafts: &[Draft<'_>]) {
 }
 
 /// The entries of which every episode must contain samples.
-fn expected(rig: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<String> {
-    let expected = rig.texts("expect").unwrap_or_default();
+fn check_expected(rig: &Section<'_>, expected: &[String], drafts: &[Draft<'_>]) {
     for (index, name) in expected.iter().enumerate() {
         if !drafts.iter().any(|draft| draft.name == *name) {
             let fix = did_you_mean(name, names(drafts), "entries are");
@@ -339,7 +316,6 @@ fn expected(rig: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<String> {
             rig.report("expect", format!("expect: {name:?} is in the list twice"), "name it once");
         }
     }
-    expected
 }
 
 /// Names of the entries.

@@ -11,12 +11,14 @@ use std::io::{ErrorKind, Read};
 use std::ops::RangeInclusive;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use toml::Spanned;
 use toml::de::{DeInteger, DeTable, DeValue};
 
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
+use super::keys::Keys;
 use super::trust::distrust;
 use super::units::{parse_duration, parse_size, show_duration, show_size};
 
@@ -84,6 +86,14 @@ pub(super) fn read<T>(
     problems.check()?;
     Ok(read)
 }
+
+/// The result of `reader` for an empty table: what applies without any key.
+pub(super) fn of_nothing<T>(reader: impl FnOnce(&Section<'_>) -> T) -> T {
+    let problems = Problems::new(String::new(), "");
+    reader(&Section { table: &EMPTY, at: 0, entry: String::new(), problems: &problems })
+}
+
+static EMPTY: LazyLock<DeTable<'static>> = LazyLock::new(DeTable::new);
 
 /// How a file is named in messages.
 pub(super) fn file_label(path: Option<&Path>, otherwise: &str) -> String {
@@ -171,6 +181,12 @@ impl<'a> Section<'a> {
 
     pub(super) fn is_faultless(&self) -> bool {
         self.problems.found.borrow().is_empty()
+    }
+
+    /// Notes every key that is not among these.
+    pub(super) fn known(&self, keys: Keys) {
+        let names: Vec<&str> = keys.iter().copied().flatten().map(|key| key.name).collect();
+        self.allow(&names);
     }
 
     /// Notes every key that is not in `known`.
@@ -407,6 +423,11 @@ impl<'a> Section<'a> {
             return self.wrong_type(key, "a table", format!("write it as a table [{entry}]"));
         };
         Some(self.part(table, value.span().start, entry))
+    }
+
+    /// The table of `key`; without one, an empty table.
+    pub(super) fn table_or_empty(&self, key: &str) -> Section<'a> {
+        self.table(key).unwrap_or_else(|| self.part(&EMPTY, self.at, self.child(key)))
     }
 
     /// A table below this one.

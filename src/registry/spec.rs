@@ -12,6 +12,7 @@ mod lan;
 mod module;
 mod motors;
 mod mounting;
+mod rig;
 mod verdict;
 
 use std::fmt;
@@ -19,10 +20,11 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid_core::modality::{Modality, ModalityId, ModalityKind};
-use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_core::sample::SampleHeader;
 use rapid_core::sync::{SyncModality, WhenStale};
 use serde::Serialize;
 
+pub use super::kinds::camera::{CameraSpec, PixelFormat};
 pub use export::ExportSpec;
 pub use form::{CalibrationSpec, Form, JointsSpec, POSE_ENDING, PointsSpec, PoseLayout, PoseSpec, Quantity, TipForm};
 pub use inference::{InferenceSpec, Provider};
@@ -39,6 +41,7 @@ pub use motors::{
     StopSpec, TipRotation, WatchSpec,
 };
 pub use mounting::Mounting;
+pub use rig::RigSpec;
 pub use verdict::{Limits, VerdictSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: those that 8 subscribers hold, 4 each, the
@@ -76,27 +79,6 @@ pub struct Registry {
     pub path: Option<PathBuf>,
     /// The text itself, recorded with every episode.
     pub text: String,
-}
-
-/// The `[rig]` table.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RigSpec {
-    /// Name of the rig, default `rig`.
-    pub name: String,
-    /// Rate of the observation grid in Hz, `0.1..=1000`, default 30.
-    pub observation_hz: f64,
-    /// Half width of the window in which a sample counts as belonging to a tick, default 25 ms
-    /// (paper, section "Synchronized Subscriber").
-    pub sync_window: Duration,
-    /// How long a returned device waits after a removal before it is started, default 2 s.
-    pub cooldown: Duration,
-    /// Upper bound of the shared memory all topics may reserve, bytes, default 512 MiB.
-    pub memory_budget: u64,
-    /// Space that recording leaves free on its disk, bytes; `None` is the smaller of 1 GiB and a twentieth
-    /// of the disk.
-    pub disk_reserve: Option<u64>,
-    /// Names of the entries without whose samples an episode is SUSPECT; none by default.
-    pub expect: Vec<String>,
 }
 
 /// One `[device.NAME]` table.
@@ -203,49 +185,6 @@ pub enum NodeSpec {
     Can(CanSpec),
     /// A device on the network, or behind a network adapter.
     Lan(LanSpec),
-}
-
-/// `[device.NAME.camera]`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CameraSpec {
-    /// Pixels, `1..=8192`, default 640.
-    pub width: u32,
-    /// Pixels, `1..=8192`, default 480.
-    pub height: u32,
-    /// Frames per second, `1..=1000`, default 30.
-    pub fps: u32,
-    /// Pixel format, default MJPG.
-    pub format: PixelFormat,
-    /// Depth: the distance of one count, um, `1..=100_000`, default 1000.
-    pub depth_unit_um: u32,
-    /// Controls set at start: V4L2 control name as listed by `rapid devices`, value.
-    pub controls: Vec<(String, i64)>,
-}
-
-/// Pixel formats that can be requested of a camera, by their V4L2 names.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "UPPERCASE")]
-pub enum PixelFormat {
-    /// Motion JPEG.
-    Mjpg,
-    /// YUV 4:2:2 packed.
-    Yuyv,
-    /// 8-bit luminance.
-    Grey,
-    /// 16-bit distances.
-    Z16,
-}
-
-impl PixelFormat {
-    /// How its pictures are encoded.
-    pub const fn encoding(self) -> Encoding {
-        match self {
-            Self::Mjpg => Encoding::Mjpeg,
-            Self::Yuyv => Encoding::Yuyv,
-            Self::Grey => Encoding::Grey,
-            Self::Z16 => Encoding::Depth,
-        }
-    }
 }
 
 /// `[device.NAME.tty]`.
@@ -515,8 +454,6 @@ impl CanSpec {
 }
 
 rapid_core::words! {
-    /// Every format and its V4L2 name.
-    PixelFormat, 4: "MJPG" = Mjpg, "YUYV" = Yuyv, "GREY" = Grey, "Z16" = Z16;
     /// Every kind of content and its name.
     Parse, 4: "csv" = Csv, "json" = Json, "f32le" = F32le, "raw" = Raw;
     /// Every slot and its name.

@@ -16,11 +16,12 @@ use super::program::{self, For, Programs};
 use super::verdict::{VerdictTable, Whose};
 use super::{form, identity, lan, motors, node, verdict};
 use crate::columns::Vector;
+use crate::keys::{About, Keys, NUMBERS, Own, Size, TEXT, TEXTS, Time, Words, keys, own, text, whole};
 use crate::section::Section;
 use crate::spec::VerdictSpec;
 use crate::spec::{
-    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens,
-    PixelFormat,
+    ActionSpec, CameraSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hook, Hooks, IdentitySpec, LanSpec, Mount,
+    NodeSpec, Opens, PixelFormat,
 };
 
 /// Kinds of node this version has a driver for.
@@ -30,25 +31,125 @@ pub(super) const BUILT_IN: [(&str, Kind); 4] =
 const PROCESS: &str = "process";
 /// Keys that state which device an entry identifies.
 pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
-const KEYS: [&str; 9] = [NODE, "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
-const TABLES: [&str; 13] = [
-    "camera",
-    "tty",
-    "can",
-    "lan",
-    "process",
-    "verdict",
-    "action",
-    "pose",
-    "joints",
-    "calibration",
-    "points",
-    EFFECTOR,
-    STREAM,
-];
 /// The further streams of a camera.
 const STREAM: &str = "stream";
-const NODE: &str = "node";
+
+keys! {
+    /// Which device the entry identifies, and how it is read.
+    const OF_THE_DEVICE {
+        /// USB vendor id, as `lsusb` shows it.
+        vid = USB_ID, usually "a device on the network has none";
+        /// USB product id.
+        pid = USB_ID, usually "likewise";
+        /// Serial number. In files of the last release, the table of a serial line.
+        serial = SERIAL, usually "any unit of the model";
+        /// Serial number, in an entry whose table of a serial line is still called `serial`.
+        serial_number = TEXT;
+        /// USB port, instead of the serial number: `"1-2.3"`.
+        port = TEXT;
+        /// How it is read: `"camera"`, `"serial"`, `"can"`, `"lan"`, or the name of a program.
+        node = TEXT, need "";
+    }
+}
+
+keys! {
+    /// The keys that a stream of a device has too.
+    #[derive(Debug)]
+    pub(super) struct StreamKeys(least_bytes: u64) {
+        /// Topic on the bus and in the recording.
+        topic: Option<String> = TOPIC, usually "`/rapid/` with the node and the name";
+        /// Bit in the physical mask.
+        bit: Option<u8> = whole::<u8>(0, HIGHEST_BIT), usually "the lowest free one";
+        /// Where the module is mounted.
+        slot: Option<Mount> = Words(&Mount::WORDS), usually "none";
+        /// Attached, but silent for this long: shown as stalled.
+        stall_after: Option<Duration> = Time(Duration::from_millis(10), Duration::from_hours(1)), usually "`\"500ms\"`, or ten pictures";
+        /// Largest sample: shared memory is reserved for it.
+        max_bytes: Option<u64> = Size(1, 256 << 20), within Size(least_bytes, 256 << 20), usually "by kind";
+        /// Samples that a reader may fall behind before the oldest is lost.
+        depth: Option<u64> = whole::<u64>(2, 4096), usually "by kind";
+        /// At a tick without a sample in the window: the newest with its age, or zeros.
+        when_stale: WhenStale = Words(&WhenStale::WORDS), or WhenStale::default();
+        /// How long before its capture the content of a sample happened.
+        latency: Duration = Time(Duration::ZERO, LONGEST_LATENCY), or Duration::ZERO;
+    }
+}
+
+keys! {
+    /// Tables of a stream.
+    const TABLES_OF_A_STREAM {} below {
+        /// A camera.
+        camera = About::Table(&[CameraSpec::KEYS]);
+        /// Limits of the verdict for this device.
+        verdict = About::ANY_TABLE;
+        /// Intrinsics of its pictures.
+        calibration = About::Table(&[form::CalibrationKeys::KEYS]);
+    }
+}
+
+keys! {
+    /// Tables of a device.
+    const TABLES {} below {
+        /// A camera.
+        camera = About::Table(&[CameraSpec::KEYS]);
+        /// A serial line.
+        tty = About::ANY_TABLE;
+        /// A CAN adapter.
+        can = About::ANY_TABLE;
+        /// A device on the network.
+        lan = About::ANY_TABLE;
+        /// A program that reads the device.
+        process = About::ANY_TABLE;
+        /// Limits of the verdict for this device.
+        verdict = About::ANY_TABLE;
+        /// The actions of a program's actuator.
+        action = About::Table(&[ActionKeys::KEYS]);
+        /// Its numbers are a pose.
+        pose = About::Table(&form::POSE_KEYS);
+        /// Its numbers are the states of joints.
+        joints = About::Table(&[form::JointsKeys::KEYS]);
+        /// Intrinsics of its pictures.
+        calibration = About::Table(&[form::CalibrationKeys::KEYS]);
+        /// Its packets are those of a LiDAR.
+        points = About::Table(&[form::PointsKeys::KEYS]);
+        /// The tip of an arm, whose pose is commanded.
+        effector = About::ANY_TABLE;
+        /// Further streams of a camera.
+        stream = About::Named(OF_A_STREAM);
+    }
+}
+
+keys! {
+    /// Programs that are run at events of the device.
+    const HOOKS {
+        /// A program that is run when the device was attached, and its arguments.
+        on_attach = TEXTS;
+        /// Likewise, when it was removed.
+        on_detach = TEXTS;
+        /// Likewise, when an episode begins.
+        on_record_start = TEXTS;
+        /// Likewise, when it is over.
+        on_record_stop = TEXTS;
+    }
+}
+
+/// The keys of `[device.NAME.stream.NAME]`.
+const OF_A_STREAM: Keys = &[StreamKeys::KEYS, TABLES_OF_A_STREAM];
+
+/// The keys of `[device.NAME]`.
+pub(super) const KEYS: Keys = &[OF_THE_DEVICE, StreamKeys::KEYS, TABLES, HOOKS];
+
+const TOPIC: Own<String> = text(topic, "text that begins with `/`");
+const USB_ID: Own<u16> = own(
+    usb_id,
+    "four hexadecimal digits",
+    r#"{"anyOf": [{"type": "string", "pattern": "^(0[xX])?[0-9a-fA-F]{1,4}$"}, {"type": "integer"}]}"#,
+);
+const SERIAL: Own<()> = own(|_, _| None, "text", r#"{"type": ["string", "object"]}"#);
+
+fn usb_id(table: &Section<'_>, key: &str) -> Option<u16> {
+    table.usb_id(key)
+}
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -189,7 +290,7 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>)
     if let Some((message, fix)) = name_problem(name) {
         section.report_at(section.at, message, fix);
     }
-    section.allow(&[&IDENTITY_KEYS[..], &KEYS, &TABLES, &Hooks::KEYS].concat());
+    section.known(KEYS);
     let kind = kind(&section);
     let identity = identity::identity(kind, &section);
     if kind != Some(Kind::Camera) && section.has(STREAM) {
@@ -223,8 +324,7 @@ pub(super) fn streams<'a>(owner: &Draft<'a>, programs: Programs<'_>) -> Vec<Draf
         if let Some((message, fix)) = name_problem(&name) {
             section.report_at(section.at, message, fix);
         }
-        let keys = KEYS.iter().filter(|key| **key != NODE);
-        section.allow(&keys.copied().chain(["camera", "verdict", "calibration"]).collect::<Vec<_>>());
+        section.known(OF_A_STREAM);
         let mut draft = draft(&name, section, (owner.kind, owner.identity.clone()), programs);
         if !draft.section.has("topic") {
             draft.topic = format!("{}/{stream}", owner.topic);
@@ -244,7 +344,7 @@ fn draft<'a>(
 ) -> Draft<'a> {
     let mut heartbeat = None;
     let mut settings = match kind {
-        Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section))),
+        Some(Kind::Camera) => Some(NodeSpec::Camera(CameraSpec::of(&section, &node::TTY))),
         Some(Kind::Serial) => node::serial(&section).map(NodeSpec::Serial),
         Some(Kind::Can) => node::can(&section).map(NodeSpec::Can),
         Some(Kind::Lan) => lan::lan(&section).map(NodeSpec::Lan),
@@ -271,16 +371,9 @@ fn draft<'a>(
         }
         _ => {}
     }
-    let topic = topic(&section).unwrap_or_else(|| default_topic(kind, name));
-    let bit = section.integer("bit", 0..=HIGHEST_BIT);
-    let mount = section.choice("slot", &Mount::WORDS);
-    let when_stale = section.choice("when_stale", &WhenStale::WORDS).unwrap_or_default();
-    let stall = Duration::from_millis(10)..=Duration::from_hours(1);
-    let stall_after = heartbeat
-        .or_else(|| section.duration("stall_after", stall))
-        .unwrap_or_else(|| node::default_stall(settings.as_ref()));
-    let latency = section.duration("latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
-    let max_bytes = node::max_bytes(&section, settings.as_ref());
+    let (bytes, least_bytes) = node::sizes(settings.as_ref());
+    let keys = StreamKeys::values(&section, least_bytes);
+    let stall_after = heartbeat.or(keys.stall_after).unwrap_or_else(|| node::default_stall(settings.as_ref()));
     let action = match &settings {
         Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => {
             Some(motors::axes(damiao, &section))
@@ -290,22 +383,21 @@ fn draft<'a>(
             action(&section, moves || programs.are_nowhere())
         }
     };
-    let written = section.integer("depth", 2..=4096);
     Draft {
         name: name.to_owned(),
         identity,
         stream_of: None,
         kind,
-        topic,
-        bit,
+        topic: keys.topic.unwrap_or_else(|| default_topic(kind, name)),
+        bit: keys.bit,
         id: None,
-        mount,
+        mount: keys.slot,
         stall_after,
-        max_bytes,
-        depth: written.unwrap_or_else(|| node::default_depth(settings.as_ref())),
-        depth_written: written.is_some(),
-        when_stale,
-        latency,
+        max_bytes: keys.max_bytes.unwrap_or(bytes),
+        depth: keys.depth.unwrap_or_else(|| node::default_depth(settings.as_ref())),
+        depth_written: keys.depth.is_some(),
+        when_stale: keys.when_stale,
+        latency: keys.latency,
         verdict: verdict::read(&section, Whose::Device),
         form: form::form(name, &section, settings.as_ref(), settings.as_ref().and_then(numbers_of)),
         action,
@@ -351,10 +443,10 @@ pub(super) fn default_topic(kind: Option<Kind>, name: &str) -> String {
     format!("/rapid/{kind}/{name}")
 }
 
-fn topic(section: &Section<'_>) -> Option<String> {
+fn topic(section: &Section<'_>, key: &str) -> Option<String> {
     /// The longest name of an iceoryx2 service is 255 bytes.
     const LONGEST: usize = 200;
-    let topic = section.text("topic")?;
+    let topic = section.text(key)?;
     let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/');
     let (message, fix) = if !topic.starts_with('/') {
         (format!("topic {topic:?} does not begin with `/`"), format!("write {:?}", format!("/{topic}")))
@@ -367,10 +459,22 @@ fn topic(section: &Section<'_>) -> Option<String> {
     } else {
         return Some(topic.to_owned());
     };
-    section.refuse("topic", message, fix)
+    section.refuse(key, message, fix)
 }
 
-const ACTION_KEYS: [&str; 4] = ["names", "units", "min", "max"];
+keys! {
+    /// `[device.NAME.action]`: each list has one entry per axis.
+    struct ActionKeys {
+        /// Names of the axes.
+        names: Option<Vec<String>> = TEXTS, need "write names = a list with one entry per axis";
+        /// Their units.
+        units: Option<Vec<String>> = TEXTS, need "write units = a list with one entry per axis";
+        /// Their lowest targets.
+        min: Option<Vec<f64>> = NUMBERS, need "write min = a list with one entry per axis";
+        /// Their highest targets.
+        max: Option<Vec<f64>> = NUMBERS, need "write max = a list with one entry per axis";
+    }
+}
 
 /// Reads the table; `None` without one, or if a problem with it was reported. A table for a device that does not `move`
 /// is such a problem.
@@ -383,13 +487,7 @@ pub(super) fn action(section: &Section<'_>, moves: bool) -> Option<ActionSpec> {
                    other device is moved by a program (node = its name)";
         return section.refuse("action", message, fix);
     }
-    table.allow(&ACTION_KEYS);
-    for key in ACTION_KEYS {
-        table.need(key, &format!("write {key} = a list with one entry per axis"));
-    }
-    // All of them first: every mistake is reported.
-    let (names, units) = (table.texts("names"), table.texts("units"));
-    let (min, max) = (table.numbers("min"), table.numbers("max"));
+    let ActionKeys { names, units, min, max } = ActionKeys::read(&table);
     let (names, units, min, max) = (names?, units?, min?, max?);
     if names.is_empty() || names.len() > MAX_ACTION {
         let fix = format!("name 1 to {MAX_ACTION} axes");

@@ -4,6 +4,7 @@
 use rapid_core::modality::ModalityKind;
 use rapid_core::points::PacketFormat;
 
+use crate::keys::{Key, NUMBERS, Own, TEXT, TEXTS, Words, keys, texts};
 use crate::section::Section;
 use crate::spec::{
     CalibrationSpec, CanProtocol, CanSpec, Form, JointsSpec, LanProtocol, LanSpec, NodeSpec, PhoneStream, PointsSpec,
@@ -15,12 +16,64 @@ const JOINTS: &str = "joints";
 const CALIBRATION: &str = "calibration";
 const POINTS: &str = "points";
 const WORLD: &str = "world";
+/// The keys of the table of a pose.
+pub(super) const POSE_KEYS: [&[Key]; 2] = [PoseKeys::KEYS, FrameKeys::KEYS];
 /// Models of a lens that viewers know, each with its name and how many parameters it has.
 const MODELS: [(&str, (&str, usize)); 3] = [
     ("plumb_bob", ("plumb_bob", 5)),
     ("rational_polynomial", ("rational_polynomial", 8)),
     ("kannala_brandt", ("kannala_brandt", 4)),
 ];
+
+keys! {
+    /// `[device.NAME.pose]`: the pose of a frame that has the name of the entry.
+    pub(super) struct PoseKeys {
+        /// The order of its numbers.
+        layout: Option<PoseLayout> = Words(&PoseLayout::WORDS), need "write layout = \"quaternion\", \"columns\" or \"rows\"";
+    }
+}
+
+keys! {
+    /// The frame of a pose.
+    pub(super) struct FrameKeys {
+        /// The frame in which the pose is given.
+        parent: Option<String> = TEXT, usually "`\"world\"`";
+    }
+}
+
+keys! {
+    /// `[device.NAME.joints]`.
+    pub(super) struct JointsKeys {
+        /// Names of the joints, as in the robot's description.
+        names: Option<Vec<String>> = TEXTS, need "write names = [\"shoulder\", \"elbow\"], as in the robot's description";
+        /// What the numbers of each joint are, in order: `"position"`, `"velocity"`, `"effort"`, `"other"`.
+        quantities: Option<Vec<Quantity>> = QUANTITIES, usually "`[\"position\"]`";
+    }
+}
+
+keys! {
+    /// `[device.NAME.calibration]`.
+    pub(super) struct CalibrationKeys {
+        /// Model of the lens.
+        model: Option<(&'static str, usize)> = Words(&MODELS), usually "`\"plumb_bob\"`";
+        /// Its parameters: as many as the model has, or none.
+        distortion: Option<Vec<f64>> = NUMBERS, usually "none";
+        /// `[fx, 0, cx, 0, fy, cy, 0, 0, 1]`, row by row, in pixels of the pictures as they are recorded.
+        intrinsics: Option<Vec<f64>> = NUMBERS, need "write intrinsics = [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels";
+    }
+}
+
+keys! {
+    /// `[device.NAME.points]`.
+    pub(super) struct PointsKeys {
+        /// The format of its packets.
+        format: Option<PacketFormat> = Words(&PacketFormat::WORDS), need "write format = \"velodyne\" or \"livox\"";
+        /// The frame in which points are given.
+        frame: Option<String> = TEXT, usually "the name of the entry";
+    }
+}
+
+const QUANTITIES: Own<Vec<Quantity>> = texts(quantities, "a list of these words");
 /// Of a motor: `control::motors::SAMPLE_VALUES`.
 const OF_A_MOTOR: [Quantity; 6] =
     [Quantity::Position, Quantity::Velocity, Quantity::Effort, Quantity::Other, Quantity::Other, Quantity::Other];
@@ -33,7 +86,10 @@ pub(super) fn form(name: &str, section: &Section<'_>, node: Option<&NodeSpec>, c
     {
         refuse_tables(section, &own);
         return Some(match (own, section.table(POSE)) {
-            (Form::Pose(own), Some(table)) => Form::Pose(PoseSpec { parent: parent(&table, name, &["parent"]), ..own }),
+            (Form::Pose(own), Some(table)) => {
+                table.known(&[FrameKeys::KEYS]);
+                Form::Pose(PoseSpec { parent: parent(&table, name), ..own })
+            }
             (own, _) => own,
         });
     }
@@ -102,15 +158,14 @@ fn refuse_tables(section: &Section<'_>, own: &Form) {
 }
 
 fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> Option<CalibrationSpec> {
-    table.allow(&["model", "distortion", "intrinsics"]);
-    table.need("intrinsics", "write intrinsics = [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels");
+    let keys = CalibrationKeys::read(table);
     let size = node.shape();
     let (ModalityKind::Image | ModalityKind::Depth, [height, width]) = (node.modality_kind(), &size[..]) else {
         return section.refuse(CALIBRATION, "its samples are not pictures".to_owned(), "remove the table");
     };
     refuse_others(section, &[POSE, JOINTS, POINTS], "its samples are pictures");
-    let distortion = if table.has("distortion") { table.numbers("distortion")? } else { Vec::new() };
-    let intrinsics = table.numbers("intrinsics")?;
+    let distortion = if table.has("distortion") { keys.distortion? } else { Vec::new() };
+    let intrinsics = keys.intrinsics?;
     let Ok(intrinsics) = <[f64; 9]>::try_from(intrinsics.as_slice()) else {
         let message = format!("{} numbers, and the matrix has 9", intrinsics.len());
         return table.refuse("intrinsics", message, "write [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels");
@@ -120,7 +175,7 @@ fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> O
         let fix = "write [fx, 0, cx, 0, fy, cy, 0, 0, 1], row by row, in pixels of the pictures as they are recorded";
         return table.refuse("intrinsics", "not the matrix of a camera".to_owned(), fix);
     }
-    let (model, parameters) = if table.has("model") { table.choice("model", &MODELS)? } else { ("plumb_bob", 5) };
+    let (model, parameters) = if table.has("model") { keys.model? } else { ("plumb_bob", 5) };
     if !distortion.is_empty() && distortion.len() != parameters {
         let message = format!("{} numbers, and {model} has {parameters}", distortion.len());
         return table.refuse("distortion", message, "write those of the calibration, or name its `model`");
@@ -132,20 +187,19 @@ fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> O
 }
 
 fn points(name: &str, section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> Option<PointsSpec> {
-    table.allow(&["format", "frame"]);
-    table.need("format", "write format = \"velodyne\" or \"livox\"");
+    let keys = PointsKeys::read(table);
     if node.modality_kind() != ModalityKind::Bytes {
         return section.refuse(POINTS, "its samples are not packets".to_owned(), "remove the table");
     }
     refuse_others(section, &[POSE, JOINTS], "its samples are packets");
-    let frame = match table.text("frame") {
-        Some("") => {
+    let frame = match keys.frame {
+        Some(frame) if frame.is_empty() => {
             let fix = "write frame = \"base\", or remove the key: the frame has the name of the entry then";
             return table.refuse("frame", "the frame has no name".to_owned(), fix);
         }
-        frame => frame.unwrap_or(name).to_owned(),
+        frame => frame.unwrap_or_else(|| name.to_owned()),
     };
-    Some(PointsSpec { format: table.choice("format", &PacketFormat::WORDS)?, frame })
+    Some(PointsSpec { format: keys.format?, frame })
 }
 
 fn refuse_others(section: &Section<'_>, others: &[&str], why: &str) {
@@ -154,10 +208,9 @@ fn refuse_others(section: &Section<'_>, others: &[&str], why: &str) {
     }
 }
 
-fn parent(table: &Section<'_>, name: &str, keys: &[&str]) -> String {
-    table.allow(keys);
-    match table.text("parent") {
-        Some("") => {
+fn parent(table: &Section<'_>, name: &str) -> String {
+    match FrameKeys::values(table).parent {
+        Some(parent) if parent.is_empty() => {
             table.report("parent", "the frame has no name", "write parent = \"world\", or remove the key");
             String::new()
         }
@@ -165,21 +218,19 @@ fn parent(table: &Section<'_>, name: &str, keys: &[&str]) -> String {
             table.report("parent", "the frame of the entry itself", "name another frame, such as \"world\"");
             String::new()
         }
-        parent => parent.unwrap_or(WORLD).to_owned(),
+        parent => parent.unwrap_or_else(|| WORLD.to_owned()),
     }
 }
 
 fn pose(name: &str, table: &Section<'_>) -> Option<PoseSpec> {
-    let parent = parent(table, name, &["layout", "parent"]);
-    table.need("layout", "write layout = \"quaternion\", \"columns\" or \"rows\"");
-    Some(PoseSpec { layout: table.choice("layout", &PoseLayout::WORDS)?, parent })
+    table.known(&POSE_KEYS);
+    let (keys, parent) = (PoseKeys::values(table), parent(table, name));
+    Some(PoseSpec { layout: keys.layout?, parent })
 }
 
 fn joints(table: &Section<'_>) -> Option<JointsSpec> {
-    table.allow(&["names", "quantities"]);
-    table.need("names", "write names = [\"shoulder\", \"elbow\"], as in the robot's description");
-    let names = table.texts("names");
-    let quantities = if table.has("quantities") { quantities(table) } else { Some(vec![Quantity::Position]) };
+    let JointsKeys { names, quantities } = JointsKeys::read(table);
+    let quantities = if table.has("quantities") { quantities } else { Some(vec![Quantity::Position]) };
     let (names, quantities) = (names?, quantities?);
     let twice = names.iter().enumerate().find(|(at, name)| names.iter().take(*at).any(|earlier| earlier == *name));
     if names.is_empty() {
@@ -194,22 +245,21 @@ fn joints(table: &Section<'_>) -> Option<JointsSpec> {
     Some(JointsSpec { names, quantities, tip: None })
 }
 
-fn quantities(table: &Section<'_>) -> Option<Vec<Quantity>> {
-    const KEY: &str = "quantities";
+fn quantities(table: &Section<'_>, key: &str) -> Option<Vec<Quantity>> {
     const FIX: &str =
         "write each of \"position\", \"velocity\" and \"effort\" at most once, and \"other\" for the rest";
     let mut found = Vec::new();
-    for word in table.texts(KEY)? {
+    for word in table.texts(key)? {
         let Some((_, quantity)) = Quantity::WORDS.iter().find(|(known, _)| *known == word) else {
-            return table.refuse(KEY, format!("unknown quantity {word:?}"), FIX);
+            return table.refuse(key, format!("unknown quantity {word:?}"), FIX);
         };
         if *quantity != Quantity::Other && found.contains(quantity) {
-            return table.refuse(KEY, format!("{word:?} is in the list twice"), FIX);
+            return table.refuse(key, format!("{word:?} is in the list twice"), FIX);
         }
         found.push(*quantity);
     }
     if found.iter().all(|quantity| *quantity == Quantity::Other) {
-        return table.refuse(KEY, "none of them is a state of a joint".to_owned(), FIX);
+        return table.refuse(key, "none of them is a state of a joint".to_owned(), FIX);
     }
     Some(found)
 }

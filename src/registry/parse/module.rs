@@ -4,12 +4,38 @@ use super::device::Draft;
 use super::identity::name_problem;
 use super::names;
 use crate::diagnostic::did_you_mean;
+use crate::keys::{About, TEXT, TEXTS, Words, keys, numbers};
 use crate::section::Section;
 use crate::spec::{ModuleSpec, Mount, TransformSpec};
 
+keys! {
+    /// `[module.NAME]`.
+    pub(super) struct ModuleKeys {
+        /// Where on the gripper it is mounted.
+        slot: Option<Mount> = Words(&Mount::WORDS), need "write slot = \"front\", \"tip\", \"top\" or \"bottom\"";
+        /// Tags of episodes with it, each `"KEY=VALUE"`.
+        tags: Vec<String> = TEXTS, or Vec::new();
+        /// Entries of its sensors.
+        devices: Vec<String> = TEXTS, or Vec::new();
+    } below {
+        /// Where a sensor sits, by the name of its entry.
+        transform = About::Named(&[TransformKeys::KEYS]);
+    }
+}
+
+keys! {
+    /// `[module.NAME.transform.SENSOR]`.
+    pub(super) struct TransformKeys {
+        /// The frame in which the place is given.
+        parent: Option<String> = TEXT, usually "`\"gripper\"`";
+        /// `[x, y, z]`, m.
+        position: Option<[f64; 3]> = numbers(place, "3 numbers"), need "write position = [x, y, z], in m";
+        /// A quaternion `[x, y, z, w]` of length 1.
+        rotation: Option<[f64; 4]> = numbers(rotation, "4 numbers"), usually "`[0, 0, 0, 1]`";
+    }
+}
+
 const TRANSFORM: &str = "transform";
-const POSITION: &str = "position";
-const ROTATION: &str = "rotation";
 /// The frame in which a sensor's place is given, unless its table names another.
 const GRIPPER: &str = "gripper";
 /// Longest name of a frame, bytes.
@@ -37,17 +63,14 @@ pub(super) fn modules(root: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<ModuleSpe
 }
 
 fn module(name: &str, section: &Section<'_>, drafts: &[Draft<'_>], earlier: &[ModuleSpec]) -> Option<ModuleSpec> {
-    section.allow(&["slot", "tags", "devices", TRANSFORM]);
-    section.need("slot", "write slot = \"front\", \"tip\", \"top\" or \"bottom\"");
-    let mount = section.choice("slot", &Mount::WORDS);
+    let ModuleKeys { slot: mount, tags: written, devices } = ModuleKeys::read(section);
     let mut tags = Vec::new();
-    for tag in section.texts("tags").unwrap_or_default() {
+    for tag in written {
         match tag.split_once('=') {
             Some((key, value)) if !key.is_empty() => tags.push((key.to_owned(), value.to_owned())),
             _ => section.report("tags", format!("{tag:?} is not a tag"), "write KEY=VALUE, as \"finger=soft\""),
         }
     }
-    let devices = section.texts("devices").unwrap_or_default();
     for device in &devices {
         let Some(draft) = drafts.iter().find(|draft| draft.name == *device) else {
             let fix = did_you_mean(device, names(drafts), "entries are");
@@ -91,36 +114,36 @@ fn transforms(section: &Section<'_>, devices: &[String]) -> Vec<TransformSpec> {
 }
 
 fn transform(sensor: &str, table: &Section<'_>) -> Option<TransformSpec> {
-    table.allow(&["parent", POSITION, ROTATION]);
-    table.need(POSITION, "write position = [x, y, z], in m");
-    let (parent, position, rotation) =
-        (parent(sensor, table), numbers(table, POSITION, "write position = [x, y, z], in m"), rotation(table));
-    Some(TransformSpec { sensor: sensor.to_owned(), parent: parent?, position: position?, rotation: rotation? })
+    let keys = TransformKeys::read(table);
+    let parent = parent(sensor, keys.parent, table);
+    let rotation = if table.has("rotation") { keys.rotation } else { Some([0.0, 0.0, 0.0, 1.0]) };
+    Some(TransformSpec { sensor: sensor.to_owned(), parent: parent?, position: keys.position?, rotation: rotation? })
 }
 
-fn parent(sensor: &str, table: &Section<'_>) -> Option<String> {
-    let parent = table.text("parent").unwrap_or(GRIPPER);
+fn parent(sensor: &str, parent: Option<String>, table: &Section<'_>) -> Option<String> {
+    let parent = parent.unwrap_or_else(|| GRIPPER.to_owned());
     if parent.is_empty() || parent == sensor || parent.len() > LONGEST {
         let fix = format!("name another frame, of at most {LONGEST} bytes, or remove the key: it is {GRIPPER:?} then");
         return table.refuse("parent", format!("{parent:?} cannot be the frame in which {sensor} sits"), fix);
     }
-    Some(parent.to_owned())
+    Some(parent)
 }
 
-fn rotation(table: &Section<'_>) -> Option<[f64; 4]> {
-    if !table.has(ROTATION) {
-        return Some([0.0, 0.0, 0.0, 1.0]);
-    }
-    let rotation: [f64; 4] = numbers(table, ROTATION, "write rotation = [x, y, z, w]")?;
+fn place(table: &Section<'_>, key: &str) -> Option<[f64; 3]> {
+    exactly(table, key, "write position = [x, y, z], in m")
+}
+
+fn rotation(table: &Section<'_>, key: &str) -> Option<[f64; 4]> {
+    let rotation: [f64; 4] = exactly(table, key, "write rotation = [x, y, z, w]")?;
     let length = rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
     if (length - 1.0).abs() > TOLERANCE {
         let fix = "write a quaternion x y z w of length 1, or remove the key if the sensor is not turned";
-        return table.refuse(ROTATION, format!("not a rotation: its length is {length:.3}"), fix);
+        return table.refuse(key, format!("not a rotation: its length is {length:.3}"), fix);
     }
     Some(rotation.map(|part| part / length))
 }
 
-fn numbers<const COUNT: usize>(table: &Section<'_>, key: &str, fix: &str) -> Option<[f64; COUNT]> {
+fn exactly<const COUNT: usize>(table: &Section<'_>, key: &str, fix: &str) -> Option<[f64; COUNT]> {
     let numbers = table.numbers(key)?;
     match <[f64; COUNT]>::try_from(numbers.as_slice()) {
         Ok(numbers) if numbers.iter().all(|number| number.is_finite()) => Some(numbers),

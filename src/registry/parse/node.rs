@@ -12,66 +12,12 @@ use crate::diagnostic::nearest;
 use crate::section::Section;
 use crate::spec::KINDS;
 use crate::spec::{
-    CAN_BATCH, CAN_RECORD, CameraSpec, CanAdapter, CanProtocol, CanSpec, Framing, Hook, LanProtocol, LanSpec, NodeSpec,
-    Opens, Parse, PixelFormat, ProcessSpec, SLCAN_BITRATES, SerialSpec,
+    CAN_BATCH, CAN_RECORD, CanAdapter, CanProtocol, CanSpec, Framing, Hook, LanProtocol, LanSpec, NodeSpec, Opens,
+    Parse, ProcessSpec, SLCAN_BITRATES, SerialSpec,
 };
 
 /// Names of the table of a serial line: the present one, and the one before it.
 pub(super) const TTY: [&str; 2] = ["tty", "serial"];
-
-pub(super) fn camera(section: &Section<'_>) -> CameraSpec {
-    for key in TTY.into_iter().filter(|key| section.is_table(key)) {
-        let fix = "remove the table, or write node = \"serial\"";
-        section.report(key, format!("a camera has no table [{}]", section.child(key)), fix);
-    }
-    let mut camera = CameraSpec {
-        width: 640,
-        height: 480,
-        fps: 30,
-        format: PixelFormat::Mjpg,
-        depth_unit_um: MILLIMETRE,
-        controls: Vec::new(),
-    };
-    let Some(table) = section.table("camera") else { return camera };
-    table.allow(&["width", "height", "fps", "format", "depth_unit", "controls"]);
-    let integer = |key, most, default| table.integer(key, 1..=most).unwrap_or(default);
-    camera.width = integer("width", 8192, camera.width);
-    camera.height = integer("height", 8192, camera.height);
-    camera.fps = integer("fps", 1000, camera.fps);
-    camera.format = table.choice("format", &PixelFormat::WORDS).unwrap_or(camera.format);
-    if let Some(unit) = depth_unit(&table, camera.format) {
-        camera.depth_unit_um = unit;
-    }
-    if let Some(controls) = table.table("controls") {
-        for (_, name, _) in controls.fields() {
-            if let Some(value) = controls.integer(name, i64::MIN..=i64::MAX) {
-                camera.controls.push((name.to_owned(), value));
-            }
-        }
-    }
-    camera
-}
-
-/// In um.
-const MILLIMETRE: u32 = 1000;
-
-/// The distance of one count of a picture of distances, in um.
-fn depth_unit(table: &Section<'_>, format: PixelFormat) -> Option<u32> {
-    const KEY: &str = "depth_unit";
-    let text = table.text(KEY)?;
-    if format != PixelFormat::Z16 {
-        return table.refuse(KEY, format!("pictures in {format} have no distances"), "remove the key");
-    }
-    let number = |unit: &str| text.strip_suffix(unit)?.trim_end().parse::<u32>().ok();
-    let um = number("um").or_else(|| number("mm")?.checked_mul(MILLIMETRE));
-    um.filter(|um| (1..=100 * MILLIMETRE).contains(um)).or_else(|| {
-        table.refuse(
-            KEY,
-            format!("{text:?} is no distance"),
-            "write a whole number of mm or um, such as \"1mm\" or \"100um\"",
-        )
-    })
-}
 
 pub(super) fn serial(section: &Section<'_>) -> Option<SerialSpec> {
     if section.has("camera") {
@@ -167,10 +113,11 @@ pub(super) fn default_stall(node: Option<&NodeSpec>) -> Duration {
     }
 }
 
-pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>) -> u64 {
+/// Bytes of its largest sample unless the entry states otherwise, and the least that may be written.
+pub(super) fn sizes(node: Option<&NodeSpec>) -> (u64, u64) {
     /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
     const SMALLEST_JPEG: u64 = 64 << 10;
-    let (default, least) = match node {
+    match node {
         Some(NodeSpec::Camera(camera)) => {
             let pixels = u64::from(camera.width) * u64::from(camera.height);
             match camera.format.encoding().pixel_bytes() {
@@ -197,8 +144,7 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>) -> u64 {
             _ => (64 << 10, 1),
         },
         None => (1, 1),
-    };
-    section.size("max_bytes", least..=256 << 20).unwrap_or(default)
+    }
 }
 
 /// About two seconds of pictures, and a second of a LiDAR's packets; a serial line may send 1000 samples a second.

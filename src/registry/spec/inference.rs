@@ -1,12 +1,17 @@
 //! `[inference]`: what policies are computed on, on this machine.
 
-/// `[inference]`: the defaults of `--threads` and `--provider`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct InferenceSpec {
-    /// Threads that onnxruntime computes on, `1..=64`, default 1: the rig's other tasks need the processor too.
-    pub threads: usize,
-    /// Which of onnxruntime's execution providers computes, default `cpu`.
-    pub provider: Provider,
+use crate::keys::{Words, keys, whole};
+use crate::section::of_nothing;
+
+keys! {
+    /// `[inference]`: the defaults of `--threads` and `--provider`.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub struct InferenceSpec {
+        /// Threads that onnxruntime computes on; the rig's other tasks need the processor too.
+        threads: usize = whole::<usize>(1, 64), or 1;
+        /// Which of onnxruntime's execution providers computes.
+        provider: Provider = Words(&Provider::WORDS), or Provider::Cpu;
+    }
 }
 
 impl InferenceSpec {
@@ -16,7 +21,7 @@ impl InferenceSpec {
 
 impl Default for InferenceSpec {
     fn default() -> Self {
-        Self { threads: 1, provider: Provider::Cpu }
+        of_nothing(Self::values)
     }
 }
 
