@@ -14,9 +14,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use rapid_core::modality::ModalityKind;
-
-use super::spec::{CanAdapter, CanProtocol, CanSpec, DeviceSpec, IdentitySpec, InputSpec, NodeSpec, Opens, Registry};
+use super::spec::{DeviceSpec, IdentitySpec, InputSpec, NodeSpec, Registry};
 
 /// First line of every generated file but the layout, which is JSON: a file that begins otherwise must not be removed.
 pub const HEADER: &str = "# Written by `rapid artifacts` from devices.toml: change that file and run it again.";
@@ -111,37 +109,12 @@ fn identity(identity: &IdentitySpec) -> String {
 }
 
 fn sensor(node: &NodeSpec) -> String {
-    let kind = node.kind();
-    match node {
-        NodeSpec::Camera(camera) => format!(
-            "  - kind: \"{kind}\"\n    width: {}\n    height: {}\n    fps: {}\n    format: \"{}\"\n",
-            camera.width, camera.height, camera.fps, camera.format
-        ),
-        NodeSpec::Serial(serial) => format!(
-            "  - kind: \"{kind}\"\n    baud: {}\n    framing: \"{}\"\n    parse: \"{}\"\n    channels: {}\n",
-            serial.baud, serial.framing, serial.parse, serial.channels
-        ),
-        NodeSpec::Can(can) => {
-            format!("  - kind: \"{kind}\"\n    adapter: \"{}\"\n    bitrate: {}\n", can.adapter, can.bitrate)
-        }
-        NodeSpec::Lan(lan) => format!("  - kind: \"{kind}\"\n    format: {}\n", quoted(&lan.format())),
-        NodeSpec::Process(process) => {
-            let program = process.program.file_name().unwrap_or_default().to_string_lossy();
-            let shape = match (process.kind, process.shape.as_slice()) {
-                (ModalityKind::Image | ModalityKind::Depth, [height, width]) => {
-                    format!("    width: {width}\n    height: {height}\n")
-                }
-                (ModalityKind::Scalars, [channels]) => format!("    channels: {channels}\n"),
-                _ => String::new(),
-            };
-            format!("  - kind: \"{kind}\"\n    program: {}\n{shape}", quoted(&program))
-        }
-    }
+    format!("  - kind: \"{}\"\n{}", node.kind(), node.of_kind().descriptor())
 }
 
 /// A YAML double-quoted scalar (YAML 1.2.2 section 7.3.1), in ASCII: parsers differ in their treatment of
 /// line separators and non-characters.
-fn quoted(text: &str) -> String {
+pub(crate) fn quoted(text: &str) -> String {
     let mut quoted = String::with_capacity(text.len() + 2);
     quoted.push('"');
     for c in text.chars() {
@@ -162,29 +135,29 @@ pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
 
 /// Device nodes: the group that may open them, set by our rules or by udev's, and their name in /proc/devices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Nodes {
+pub(crate) struct Nodes {
     group: &'static str,
     kind: &'static str,
 }
 
 /// A program opens the USB device itself.
-const USB: Nodes = Nodes { group: "plugdev", kind: "char-usb_device" };
+pub(crate) const USB: Nodes = Nodes { group: "plugdev", kind: "char-usb_device" };
 /// A stop or a button is a key.
 const KEYS: Nodes = Nodes { group: "input", kind: "char-input" };
 /// A stop, a button, or the brake of a joint, is a line of a GPIO chip.
-const GPIO: Nodes = Nodes { group: "gpio", kind: "char-gpiochip" };
+pub(crate) const GPIO: Nodes = Nodes { group: "gpio", kind: "char-gpiochip" };
 
 /// What the entries of a registry require of the system.
 #[derive(Debug, Default)]
-struct Needs {
+pub(crate) struct Needs {
     /// Kinds of sockets, besides those of udev, the journal and programs. A CAN adapter on a serial line has none.
-    sockets: BTreeSet<&'static str>,
+    pub(crate) sockets: BTreeSet<&'static str>,
     /// Nodes that only some registries need.
-    nodes: BTreeSet<Nodes>,
+    pub(crate) nodes: BTreeSet<Nodes>,
     /// Other programs are run: nodes and hooks.
-    programs: bool,
+    pub(crate) programs: bool,
     /// Motors have a guard, which outlives the program.
-    guard: bool,
+    pub(crate) guard: bool,
     /// A stop or a button is on a serial port of the board.
     uarts: bool,
 }
@@ -193,28 +166,7 @@ impl Needs {
     fn of(registry: &Registry) -> Self {
         let mut needs = Self::default();
         for device in &registry.devices {
-            if let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node {
-                needs.guard = true;
-                if motors.motors.iter().any(|motor| motor.brake.is_some()) {
-                    needs.nodes.insert(GPIO);
-                }
-            }
-            match &device.node {
-                NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan => {
-                    needs.sockets.insert("AF_CAN");
-                }
-                NodeSpec::Lan(lan) => {
-                    let families = ["AF_INET", "AF_INET6"].into_iter().zip(lan.find.families());
-                    needs.sockets.extend(families.filter(|(_, is_needed)| *is_needed).map(|(family, _)| family));
-                }
-                NodeSpec::Process(process) => {
-                    needs.programs = true;
-                    if process.opens == Opens::Usb {
-                        needs.nodes.insert(USB);
-                    }
-                }
-                NodeSpec::Can(_) | NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
-            }
+            device.node.of_kind().need(&mut needs);
             needs.programs |= !device.hooks.is_empty();
         }
         for (_, input) in registry.inputs() {

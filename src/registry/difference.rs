@@ -178,12 +178,8 @@ fn obstacle(device: &DeviceSpec, running: &Registry, new: &Registry) -> Option<S
     if !device.hooks.is_empty() {
         return Some("its hooks need what a run sets up for programs at its start".to_owned());
     }
-    match device.node {
-        NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Lan(_) => {}
-        NodeSpec::Process(_) => {
-            return Some("its program needs what a run sets up for programs at its start".to_owned());
-        }
-        NodeSpec::Can(_) => return Some("its interface is brought up at the start".to_owned()),
+    if let Some(why) = device.node.of_kind().only_at_start() {
+        return Some(why.to_owned());
     }
     if let Some(other) = running.devices.iter().find(|other| compete(device, other)) {
         let why = format!("a device of its service may belong to [device.{}], which this run searches for", other.name);

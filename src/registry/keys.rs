@@ -5,7 +5,6 @@
 //!
 //! Invariant: what a key may be is not stated anywhere else.
 
-#![allow(dead_code, reason = "tables are converted one at a time")]
 #![expect(clippy::redundant_closure_for_method_calls, reason = "the methods are of a section of one lifetime")]
 
 mod documents;
@@ -34,6 +33,11 @@ pub(crate) struct Key {
     pub(crate) is_needed: bool,
 }
 
+/// The key of a table, whose keys are declared elsewhere, and which is read by itself.
+pub(crate) const fn table(name: &'static str, meaning: &'static str, about: fn() -> About) -> Key {
+    Key { name, meaning, about, default: || None, is_needed: false }
+}
+
 /// The keys of a table, in groups.
 pub(crate) type Keys = &'static [&'static [Key]];
 
@@ -51,9 +55,6 @@ pub(crate) enum About {
 }
 
 impl About {
-    /// A table whose keys are not declared.
-    pub(crate) const ANY_TABLE: Self = Self::Named(&[]);
-
     fn value(words: impl Into<String>, schema: Json) -> Self {
         Self::Value(words.into(), schema)
     }
@@ -348,13 +349,7 @@ macro_rules! keys {
         }
     };
     (@below $table:ident, ($($meaning:literal),+), $about:expr) => {
-        $crate::keys::Key {
-            name: stringify!($table),
-            meaning: concat!($($meaning),+),
-            about: || $about,
-            default: || None,
-            is_needed: false,
-        }
+        $crate::keys::table(stringify!($table), concat!($($meaning),+), || $about)
     };
     (@name $field:ident) => { stringify!($field) };
     (@name $field:ident $key:literal) => { $key };

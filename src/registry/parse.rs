@@ -7,18 +7,14 @@
 //! Invariant: all problems of a file are reported at once, each with its place and a fix.
 
 mod button;
-mod device;
-mod effector;
+pub(crate) mod device;
 mod export;
 mod form;
 mod identity;
-mod input;
+pub(crate) mod input;
 mod interlock;
-mod lan;
 mod module;
-mod motors;
-mod node;
-mod program;
+pub(crate) mod program;
 mod verdict;
 
 use std::path::Path;
@@ -28,6 +24,7 @@ use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
 use super::keys::{About, keys};
+use super::kinds::{self, Word};
 use super::section::{Section, file_label, read, read_file};
 use super::spec::{
     DeviceSpec, ExportSpec, IdentitySpec, InferenceSpec, NodeSpec, POOL_SPARE, RESERVED_BYTES, Registry, RigSpec,
@@ -55,15 +52,15 @@ keys! {
         /// Which numbers a dataset has.
         export = About::Table(&[ExportSpec::KEYS]);
         /// Limits of the verdict for all devices.
-        verdict = About::ANY_TABLE;
+        verdict = About::Table(verdict::OF_THE_RIG);
         /// A device, and the modality that it provides.
-        device = About::Named(device::KEYS);
+        device = About::Named(kinds::KEYS);
         /// What is mounted in a slot of the gripper.
         module = About::Named(&[module::ModuleKeys::KEYS]);
         /// An emergency stop or an enabling switch.
-        stop = About::ANY_TABLE;
+        stop = About::Named(interlock::KEYS);
         /// A pedal or button.
-        button = About::ANY_TABLE;
+        button = About::Named(button::KEYS);
     }
 }
 
@@ -160,11 +157,11 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     check_topics(&drafts);
     check_expected(&section, &rig.expect, &drafts);
     check_actuators(&drafts);
-    lan::check_ports(&drafts);
-    lan::check_gopros(&drafts);
-    lan::check_instances(&drafts);
+    kinds::lan::check_ports(&drafts);
+    kinds::lan::check_gopros(&drafts);
+    kinds::lan::check_instances(&drafts);
     assign_bits(&mut drafts);
-    node::warn_of_old_names(&drafts);
+    kinds::serial::warn_of_old_names(&drafts);
     warn_of_unused_ports(&drafts);
     program::warn_of_distrusted(&drafts);
     fit(&mut drafts, rig.memory_budget, root);
@@ -177,7 +174,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict, rig.sync_window)).collect();
     devices.sort_by_key(|(_, device)| device.id);
     warn_of_narrow_window(&devices, rig.sync_window);
-    motors::warn_of_slow_stop(&devices);
+    kinds::can::warn_of_slow_stop(&devices);
     let mut devices: Vec<_> = devices.into_iter().map(|(_, device)| device).collect();
     for device in &mut devices {
         if let NodeSpec::Lan(lan) = &mut device.node {
@@ -373,7 +370,7 @@ const LEAST_CAMERA_DEPTH: u64 = 8;
 /// file stay. If the total is still too large, a problem names the largest topics. Lowered depths cause a warning.
 fn fit(drafts: &mut [Draft<'_>], budget: u64, root: &Section<'_>) {
     let scaled = |draft: &Draft<'_>, permille: u64| {
-        if draft.depth_written || draft.kind != Some(device::Kind::Camera) {
+        if draft.depth_written || draft.kind != Some(Word::Camera) {
             return draft.depth;
         }
         // Depths are at most 4096: no overflow.
@@ -409,11 +406,8 @@ fn pool(draft: &Draft<'_>, depth: u64) -> u64 {
 
 fn report(drafts: &[Draft<'_>], total: u64, budget: u64, root: &Section<'_>) {
     let size = |draft: &Draft<'_>| {
-        let depth = if draft.depth_written || draft.kind != Some(device::Kind::Camera) {
-            draft.depth
-        } else {
-            LEAST_CAMERA_DEPTH
-        };
+        let depth =
+            if draft.depth_written || draft.kind != Some(Word::Camera) { draft.depth } else { LEAST_CAMERA_DEPTH };
         (pool(draft, depth), depth)
     };
     let mut largest: Vec<_> = drafts.iter().map(|draft| (size(draft), draft)).collect();

@@ -12,13 +12,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use rapid_core::modality::ModalityKind;
-
 use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::is_port;
 use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent};
 use super::section::{Section, file_label, read, read_file};
-use super::spec::{DeviceSpec, LanPicture, NodeSpec, Registry};
+use super::spec::{DeviceSpec, NodeSpec, Registry};
 use crate::device::{LanIdentity, UsbIdentity};
 use crate::simulation::{SimFaults, SimSource};
 
@@ -297,24 +295,9 @@ fn check_order(events: &[Placed<'_>], devices: &[ScenarioDevice], repeat: Option
     }
 }
 
-/// Rate of a simulated serial line, Hz: typical for the state of a motor controller.
-const SERIAL_HZ: u32 = 100;
-
 /// A simulated device with an entry's identity and format; its port may still be empty.
 fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
-    let seed = u64::from(spec.id.bit());
-    let source = match (&spec.node, spec.node.picture(), spec.node.shape().as_slice()) {
-        (NodeSpec::Process(_), ..) => SimSource::Process,
-        (_, Some(LanPicture { width, height, fps }), [_, _]) if spec.node.modality_kind() == ModalityKind::Depth => {
-            SimSource::Depth { width, height, fps, seed }
-        }
-        (_, Some(LanPicture { width, height, fps }), [_, _]) => {
-            SimSource::Camera { width, height, fps, seed, bytes: 0 }
-        }
-        (.., [channels]) => SimSource::Serial { channels: *channels as usize, hz: SERIAL_HZ, seed },
-        // A device that sends bytes has no channels: only a number of messages a second is written here.
-        _ => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
-    };
+    let source = spec.node.of_kind().simulated(u64::from(spec.id.bit()));
     let expected = spec.identity.usb();
     let lan = expected.is_none().then(|| LanIdentity {
         entry: spec.name.clone(),

@@ -8,14 +8,10 @@ mod export;
 mod form;
 mod inference;
 mod input;
-mod lan;
 mod module;
-mod motors;
-mod mounting;
 mod rig;
 mod verdict;
 
-use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -24,23 +20,27 @@ use rapid_core::sample::SampleHeader;
 use rapid_core::sync::{SyncModality, WhenStale};
 use serde::Serialize;
 
+pub use super::kinds::NodeSpec;
 pub use super::kinds::camera::{CameraSpec, PixelFormat};
+pub use super::kinds::can::{
+    BrakeSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, EffectorSpec,
+    GripperSpec, MAX_MOTORS, MOTOR_CHANNELS, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, SLCAN_BITRATES,
+    Stop, StopSpec, TipRotation, WatchSpec,
+};
+pub use super::kinds::lan::{
+    LanFind, LanPicture, LanProtocol, LanSpec, PREVIEW_DECODER, PhoneStream, Probe, RemoteSamples, own_side,
+};
+pub use super::kinds::process::ProcessSpec;
+pub use super::kinds::serial::{Framing, Parse, SerialSpec};
 pub use export::ExportSpec;
+pub(super) use form::tip_numbers;
 pub use form::{CalibrationSpec, Form, JointsSpec, POSE_ENDING, PointsSpec, PoseLayout, PoseSpec, Quantity, TipForm};
 pub use inference::{InferenceSpec, Provider};
 pub use input::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
 };
-pub use lan::{
-    LanFind, LanPicture, LanProtocol, LanSpec, PREVIEW_DECODER, PhoneStream, Probe, RemoteSamples, own_side,
-};
 pub use module::{ModuleError, ModuleSpec, TransformSpec, mounted};
-pub use motors::{
-    BrakeSpec, DamiaoSpec, EffectorSpec, GripperSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop,
-    StopSpec, TipRotation, WatchSpec,
-};
-pub use mounting::Mounting;
 pub use rig::RigSpec;
 pub use verdict::{Limits, VerdictSpec};
 
@@ -172,50 +172,6 @@ pub struct UsbSpec {
     pub port: Option<String>,
 }
 
-/// How a device is read.
-#[derive(Debug, Clone, PartialEq)]
-pub enum NodeSpec {
-    /// A V4L2 camera.
-    Camera(CameraSpec),
-    /// A serial line.
-    Serial(SerialSpec),
-    /// A program that reads the device and publishes.
-    Process(ProcessSpec),
-    /// A CAN adapter.
-    Can(CanSpec),
-    /// A device on the network, or behind a network adapter.
-    Lan(LanSpec),
-}
-
-/// `[device.NAME.tty]`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct SerialSpec {
-    /// Bits per second, default 115200.
-    pub baud: u32,
-    /// How messages are delimited, default `line`.
-    pub framing: Framing,
-    /// Content of a message, default `csv`.
-    pub parse: Parse,
-    /// Numbers in a message, `1..=1024`; 0 with `Parse::Raw`.
-    pub channels: usize,
-}
-
-/// `node = "PROGRAM"` with `[device.NAME.process]`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ProcessSpec {
-    /// The program: an absolute path, or the name as written if nothing is to be run (a
-    /// registry read from an episode).
-    pub program: PathBuf,
-    /// Its arguments, none by default.
-    pub args: Vec<String>,
-    /// Which node of the device it opens, default [`Opens::Usb`].
-    pub opens: Opens,
-    /// Content of its samples, default bytes.
-    pub kind: ModalityKind,
-    /// Image: `[height, width]`. Scalars: `[channels]`. Bytes: empty.
-    pub shape: Vec<u32>,
-}
-
 /// The node of its USB device that a program opens. The program starts when udev has created that
 /// node, and receives its path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -229,30 +185,6 @@ pub enum Opens {
     Usb,
     /// Its network interface, which has no path: read by `can` and `lan`, not by a program.
     Net,
-}
-
-/// Message boundaries on a serial line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Framing {
-    /// A newline ends a message; a carriage return before it is dropped.
-    Line,
-    /// Consistent overhead byte stuffing: a zero byte ends a message.
-    Cobs,
-    /// Messages of exactly this many bytes.
-    Fixed(usize),
-}
-
-/// Content of a serial message.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Parse {
-    /// Numbers separated by commas.
-    Csv,
-    /// A JSON array of numbers, or an object whose numeric values are taken in order.
-    Json,
-    /// Little-endian 32-bit floats.
-    F32le,
-    /// Not parsed.
-    Raw,
 }
 
 /// Position of a module (paper, section "Modular hardware").
@@ -278,55 +210,6 @@ impl DeviceSpec {
     /// The same as the synchroniser needs to know it; `capacity` samples of it are kept.
     pub const fn synchronised(&self, capacity: usize) -> SyncModality {
         SyncModality { id: self.id, when_stale: self.when_stale, latency: self.latency, capacity }
-    }
-}
-
-impl NodeSpec {
-    /// The shape of a sample, as in [`Modality`].
-    pub fn shape(&self) -> Vec<u32> {
-        match (self, self.modality_kind()) {
-            (Self::Camera(camera), _) => vec![camera.height, camera.width],
-            (Self::Process(process), _) => process.shape.clone(),
-            (Self::Lan(lan), _) => lan.shape(),
-            (_, ModalityKind::Bytes) => Vec::new(),
-            (Self::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
-            (Self::Can(can), _) => vec![u32::try_from(can.channels()).unwrap_or(u32::MAX)],
-        }
-    }
-
-    /// The format of its pictures, if it sends any and the entry states it.
-    pub fn picture(&self) -> Option<LanPicture> {
-        match self {
-            Self::Camera(CameraSpec { width, height, fps, .. }) => {
-                Some(LanPicture { width: *width, height: *height, fps: *fps })
-            }
-            Self::Lan(lan) => lan.picture(),
-            Self::Serial(_) | Self::Process(_) | Self::Can(_) => None,
-        }
-    }
-
-    /// Which node of its device it is read from.
-    pub fn opens(&self) -> Opens {
-        match self {
-            Self::Camera(_) => Opens::Video,
-            Self::Serial(_) => Opens::Tty,
-            Self::Process(process) => process.opens,
-            Self::Can(can) if can.adapter != CanAdapter::SocketCan => Opens::Tty,
-            Self::Can(_) | Self::Lan(_) => Opens::Net,
-        }
-    }
-
-    /// Content of the samples of a device that is read like this.
-    pub fn modality_kind(&self) -> ModalityKind {
-        match self {
-            Self::Camera(CameraSpec { format: PixelFormat::Z16, .. }) => ModalityKind::Depth,
-            Self::Camera(_) => ModalityKind::Image,
-            Self::Serial(serial) if serial.parse == Parse::Raw => ModalityKind::Bytes,
-            Self::Can(can) if can.protocol == CanProtocol::Raw => ModalityKind::Bytes,
-            Self::Serial(_) | Self::Can(_) => ModalityKind::Scalars,
-            Self::Process(process) => process.kind,
-            Self::Lan(lan) => lan.modality_kind(),
-        }
     }
 }
 
@@ -397,71 +280,9 @@ impl Hooks {
     }
 }
 
-/// Numbers in a sample of one motor: position rad, velocity rad/s, torque Nm, temperatures of its
-/// transistors and of its winding °C, and its error code.
-pub const MOTOR_CHANNELS: usize = 6;
-
-/// Bytes per frame in a sample of [`CanProtocol::Raw`].
-pub const CAN_RECORD: usize = 24;
-/// Frames in such a sample, at most.
-pub const CAN_BATCH: usize = 128;
-/// A controller that left the bus after too many errors is restarted after this many ms.
-pub const CAN_RESTART_MS: u32 = 100;
-/// Bit rates that slcan has a name for, `S0` to `S8`.
-pub const SLCAN_BITRATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
-
-/// `[device.NAME.can]`: a CAN adapter and what is behind it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CanSpec {
-    /// How the adapter is accessed, default `SocketCAN`.
-    pub adapter: CanAdapter,
-    /// Bits a second on the bus, `10_000..=1_000_000`, default 1,000,000.
-    pub bitrate: u32,
-    /// What is on the bus, default [`CanProtocol::Raw`].
-    pub protocol: CanProtocol,
-}
-
-/// How a CAN adapter is accessed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum CanAdapter {
-    /// The kernel has a driver for it, which makes it a network interface.
-    SocketCan,
-    /// A serial line with the protocol slcan (Lawicel).
-    Slcan,
-    /// A serial line with the framing of Damiao's adapter.
-    Damiao,
-}
-
-/// What is on the bus.
-#[derive(Debug, Clone, PartialEq)]
-pub enum CanProtocol {
-    /// Frames, not parsed. None is sent.
-    Raw,
-    /// Damiao's motors.
-    Damiao(DamiaoSpec),
-}
-
-impl CanSpec {
-    /// Numbers in a sample; 0 if it holds bytes.
-    pub fn channels(&self) -> usize {
-        match &self.protocol {
-            CanProtocol::Raw => 0,
-            CanProtocol::Damiao(damiao) => {
-                MOTOR_CHANNELS * damiao.motors.len() + damiao.effector.as_ref().map_or(0, |effector| effector.numbers())
-            }
-        }
-    }
-}
-
 rapid_core::words! {
-    /// Every kind of content and its name.
-    Parse, 4: "csv" = Csv, "json" = Json, "f32le" = F32le, "raw" = Raw;
     /// Every slot and its name.
     Mount, 4: "front" = Front, "tip" = Tip, "top" = Top, "bottom" = Bottom;
-    /// Every kind of adapter and its name.
-    CanAdapter, 3: "socketcan" = SocketCan, "slcan" = Slcan, "damiao" = Damiao;
-    /// Every way to stop and its name.
-    Stop, 4: "limp" = Limp, "damp" = Damp, "hold" = Hold, "brake" = Brake;
     /// Every node a program may open and its name.
     Opens, 3: "video" = Video, "tty" = Tty, "usb" = Usb; "net" = Net;
     /// Every order of a pose's numbers and its name.
@@ -477,60 +298,6 @@ pub(super) const KINDS: [(&str, ModalityKind); 4] = [
     ("depth", ModalityKind::Depth),
     ("bytes", ModalityKind::Bytes),
 ];
-
-impl fmt::Display for Framing {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Line => f.write_str("line"),
-            Self::Cobs => f.write_str("cobs"),
-            Self::Fixed(bytes) => write!(f, "fixed {bytes}"),
-        }
-    }
-}
-
-impl NodeSpec {
-    /// The kind of node: `camera`, `serial`, `can`, `lan` or `process`.
-    pub const fn kind(&self) -> &'static str {
-        match self {
-            Self::Camera(_) => "camera",
-            Self::Serial(_) => "serial",
-            Self::Process(_) => "process",
-            Self::Can(_) => "can",
-            Self::Lan(_) => "lan",
-        }
-    }
-
-    /// The format on one line: `640x480@30 MJPG`, `115200 baud line csv x3`, `tactile_publisher scalars x16`.
-    pub fn format(&self) -> String {
-        match self {
-            Self::Camera(camera) => format!("{}x{}@{} {}", camera.width, camera.height, camera.fps, camera.format),
-            Self::Serial(serial) if serial.parse == Parse::Raw => {
-                format!("{} baud {} raw", serial.baud, serial.framing)
-            }
-            Self::Can(can) => match &can.protocol {
-                CanProtocol::Raw => format!("{} {} bit/s raw", can.adapter, can.bitrate),
-                CanProtocol::Damiao(damiao) => {
-                    format!("{} {} bit/s damiao x{}", can.adapter, can.bitrate, damiao.motors.len())
-                }
-            },
-            Self::Lan(lan) => lan.format(),
-            Self::Serial(serial) => {
-                format!("{} baud {} {} x{}", serial.baud, serial.framing, serial.parse, serial.channels)
-            }
-            Self::Process(process) => {
-                let name = process.program.file_name().unwrap_or(process.program.as_os_str()).display();
-                match process.shape.as_slice() {
-                    [height, width] => format!("{name} {width}x{height}"),
-                    [channels] => format!("{name} scalars x{channels}"),
-                    _ => {
-                        let word = KINDS.iter().find(|(_, kind)| *kind == process.kind).map_or("", |(word, _)| word);
-                        format!("{name} {word}")
-                    }
-                }
-            }
-        }
-    }
-}
 
 #[cfg(test)]
 mod tests {

@@ -15,12 +15,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use super::HEADER;
-use crate::spec::{
-    CAN_RESTART_MS, CanProtocol, CanSpec, DeviceSpec, GpioInput, InputSpec, NodeSpec, Opens, Registry, UsbSpec,
-};
-
-/// The number of a CAN interface in `linux/if_arp.h` (`ARPHRD_CAN`).
-const ARPHRD_CAN: u32 = 280;
+use crate::spec::{CanProtocol, CanSpec, DeviceSpec, GpioInput, InputSpec, NodeSpec, Opens, Registry, UsbSpec};
 
 /// The rules of a whole registry.
 pub(super) fn rules(registry: &Registry) -> String {
@@ -34,13 +29,12 @@ pub(super) fn rules(registry: &Registry) -> String {
         let Some(usb) = device.identity.usb() else { continue };
         // Writing to a String cannot fail.
         let _ = writeln!(text, "\n# {}: {:04x}:{:04x}", device.name, usb.vid, usb.pid);
-        let bitrate = if let NodeSpec::Can(can) = &device.node { Some(can.bitrate) } else { None };
-        let _ = match (device.node.opens(), bitrate) {
-            (Opens::Net, Some(bitrate)) => match single_out(registry, device, usb) {
-                Ok(identity) => writeln!(text, "{}", bring_up(usb, &identity, bitrate)),
+        let _ = match device.node.of_kind().on_plug() {
+            Some(plug) => match single_out(registry, device, usb) {
+                Ok(identity) => writeln!(text, "{}", bring_up(usb, &identity, &plug)),
                 Err(reason) => writeln!(text, "# Not brought up: {reason}."),
             },
-            _ => match identify(registry, device) {
+            None => match identify(registry, device) {
                 Ok(identity) if registry.shares_unit(device) => {
                     writeln!(text, "{}\n{}", STREAM, rule(device, usb, &identity, false))
                 }
@@ -137,15 +131,11 @@ fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str, is_named: bool) -> S
     )
 }
 
-/// Brings up the CAN interface of a unit when it is plugged in. Not every driver returns from bus-off automatically,
-/// `gs_usb` among them: current kernels (tested with 6.1.192) then refuse the whole command that requests it ("Device
-/// doesn't support restart from Bus Off"). So it is a separate command, whose failure does not prevent the other.
-fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
+/// Brings up the interface of a unit when it is plugged in.
+fn bring_up(usb: &UsbSpec, identity: &str, [matches, commands]: &[String; 2]) -> String {
     format!(
-        "ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{{type}}==\"{ARPHRD_CAN}\", ATTRS{{idVendor}}==\"{:04x}\", \
-         ATTRS{{idProduct}}==\"{:04x}\"{identity}, \
-         RUN+=\"/usr/sbin/ip link set dev $name type can restart-ms {CAN_RESTART_MS}\", \
-         RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate {bitrate}\"",
+        "ACTION==\"add\", SUBSYSTEM==\"net\", {matches}, ATTRS{{idVendor}}==\"{:04x}\", \
+         ATTRS{{idProduct}}==\"{:04x}\"{identity}, {commands}",
         usb.vid, usb.pid,
     )
 }

@@ -5,6 +5,8 @@ use std::process::Command;
 use proptest::prelude::*;
 use yaml_rust2::{Yaml, YamlLoader};
 
+use rapid_core::modality::ModalityKind;
+
 use super::*;
 use crate::{Form, IdentitySpec};
 

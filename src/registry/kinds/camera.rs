@@ -1,10 +1,17 @@
 //! `node = "camera"`: a V4L2 camera, with its table `[device.NAME.camera]`.
 
+use rapid_core::modality::ModalityKind;
 use rapid_core::sample::Encoding;
 use serde::Serialize;
 
-use crate::keys::{Own, Words, keys, own, text, whole};
+use super::lan::LanPicture;
+use super::{Kind, NodeSpec, Settings, compressed, serial};
+use crate::keys::{About, Key, Own, Words, keys, own, table, text, whole};
+use crate::parse::program::Programs;
 use crate::section::Section;
+use crate::spec::Opens;
+
+pub(crate) const TABLE: Key = table("camera", "A camera.", || About::Table(&[CameraSpec::KEYS]));
 
 /// In um.
 const MILLIMETRE: u32 = 1000;
@@ -63,21 +70,60 @@ impl PixelFormat {
     }
 }
 
-impl CameraSpec {
-    /// Reads the table of an entry.
-    pub(crate) fn of(entry: &Section<'_>, others: &[&str]) -> Self {
-        for key in others.iter().filter(|key| entry.is_table(key)) {
-            let fix = "remove the table, or write node = \"serial\"";
-            entry.report(key, format!("a camera has no table [{}]", entry.child(key)), fix);
-        }
-        let table = entry.table_or_empty("camera");
-        let camera = Self::read(&table);
-        if table.has("depth_unit") && camera.format != PixelFormat::Z16 {
-            let message = format!("pictures in {} have no distances", camera.format);
-            table.report("depth_unit", message, "remove the key");
-        }
-        camera
+impl Kind for CameraSpec {
+    fn modality_kind(&self) -> ModalityKind {
+        if self.format == PixelFormat::Z16 { ModalityKind::Depth } else { ModalityKind::Image }
     }
+
+    fn shape(&self) -> Vec<u32> {
+        vec![self.height, self.width]
+    }
+
+    fn opens(&self) -> Opens {
+        Opens::Video
+    }
+
+    fn picture(&self) -> Option<LanPicture> {
+        Some(LanPicture { width: self.width, height: self.height, fps: self.fps })
+    }
+
+    fn format(&self) -> String {
+        format!("{}x{}@{} {}", self.width, self.height, self.fps, self.format)
+    }
+
+    fn descriptor(&self) -> String {
+        let Self { width, height, fps, format, .. } = self;
+        format!("    width: {width}\n    height: {height}\n    fps: {fps}\n    format: \"{format}\"\n")
+    }
+
+    fn sizes(&self) -> (u64, u64) {
+        let pixels = u64::from(self.width) * u64::from(self.height);
+        match self.format.encoding().pixel_bytes() {
+            Some(bytes) => (bytes as u64 * pixels, bytes as u64 * pixels),
+            None => (compressed(2 * pixels), 1024),
+        }
+    }
+
+    fn bytes_per_second(&self, max_bytes: usize) -> Option<f64> {
+        let pixels = f64::from(self.width) * f64::from(self.height);
+        let picture = self.format.encoding().pixel_bytes().map_or(max_bytes as f64, |bytes| bytes as f64 * pixels);
+        Some(picture * f64::from(self.fps))
+    }
+}
+
+#[expect(clippy::unnecessary_wraps, reason = "as of every kind")]
+pub(crate) fn read(entry: &Section<'_>, _: Programs<'_>) -> Option<Settings> {
+    for key in serial::TABLES.iter().filter(|key| entry.is_table(key)) {
+        let fix = "remove the table, or write node = \"serial\"";
+        entry.report(key, format!("a camera has no table [{}]", entry.child(key)), fix);
+    }
+    let table = entry.table_or_empty("camera");
+    let camera = CameraSpec::read(&table);
+    if table.has("depth_unit") && camera.format != PixelFormat::Z16 {
+        let message = format!("pictures in {} have no distances", camera.format);
+        table.report("depth_unit", message, "remove the key");
+    }
+    Some((NodeSpec::Camera(camera), None))
 }
 
 /// A distance, in um.

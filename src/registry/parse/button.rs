@@ -4,18 +4,84 @@ use std::time::Duration;
 
 use super::device::Draft;
 use super::identity::name_problem;
-use super::input::{self, INPUTS, LEVELS, are_one};
+use super::input::{self, GpioKeys, KeyKeys, LEVELS, LINE, NumberKeys, PortKeys, SILENCE, are_one, inputs};
+use crate::keys::{About, FLAG, Key, Keys, Own, Real, Time, Words, keys, text};
 use crate::section::Section;
 use crate::spec::{
     Bound, ButtonAction, ButtonSpec, FieldInput, GpioInput, InputSpec, InterlockSpec, KeyInput, LineInput, LineOff,
     MAX_BUTTONS,
 };
 
-const KEYS: [&str; 4] = ["press", "hold", "hold_after", "double"];
-/// A press of this length is a hold, unless its entry states otherwise.
-const HOLD_AFTER: Duration = Duration::from_secs(1);
-/// A number that is missing for this long is lost, unless its entry states otherwise.
-const SILENCE: Duration = Duration::from_millis(500);
+keys! {
+    /// `[button.NAME]`.
+    struct ButtonKeys {
+        /// What a press does.
+        press: Option<ButtonAction> = Words(&ButtonAction::WORDS), within ACTION;
+        /// What a press of `hold_after` does instead.
+        hold: Option<ButtonAction> = Words(&ButtonAction::WORDS), within ACTION;
+        /// A press of this length is a hold.
+        hold_after: Duration = Time(Duration::from_millis(200), Duration::from_secs(10)), or Duration::from_secs(1);
+        /// What two presses in a row do instead.
+        double: Option<ButtonAction> = Words(&ButtonAction::WORDS), within ACTION;
+    }
+}
+
+keys! {
+    /// Of a key.
+    struct GrabKeys {
+        /// Whether no other program gets what the device sends.
+        grab: bool = FLAG, or false;
+    }
+}
+
+keys! {
+    /// Of a line of a chip.
+    struct LevelKeys {
+        /// The level while it is pressed.
+        pressed_while: Option<bool> = Words(&LEVELS),
+            need "write pressed_while = \"low\" for a button that connects the line to ground, or \"high\"";
+    }
+}
+
+keys! {
+    /// Of a serial port.
+    struct LineKeys {
+        /// The line that is sent at each press.
+        line: Option<String> = LINE;
+        /// Instead of it, the line that is sent at a press.
+        pressed: Option<String> = LINE;
+        /// The line that is sent at the release.
+        released: Option<String> = LINE;
+        /// Lines are sent again and again: without one for this long the button is lost.
+        silence: Option<Duration> = SILENCE, usually "lines are sent at changes";
+    }
+}
+
+keys! {
+    /// Of a number.
+    struct FieldKeys {
+        /// Above this it is pressed.
+        pressed_above: Option<f64> = Real::ANY;
+        /// Below this it is pressed.
+        pressed_below: Option<f64> = Real::ANY;
+        /// Above this it is released; between the two it stays as it was.
+        released_above: Option<f64> = Real::ANY;
+        /// Below this it is released; between the two it stays as it was.
+        released_below: Option<f64> = Real::ANY;
+        /// Missing for this long it is lost.
+        silence: Duration = SILENCE, or Duration::from_millis(500);
+    }
+}
+
+const KEY: Keys = &[KeyKeys::KEYS, GrabKeys::KEYS];
+const GPIO: Keys = &[GpioKeys::KEYS, LevelKeys::KEYS];
+const SERIAL: Keys = &[PortKeys::KEYS, LineKeys::KEYS];
+const FIELD: Keys = &[NumberKeys::KEYS, FieldKeys::KEYS];
+const INPUT: [Key; 4] =
+    inputs([|| About::Table(KEY), || About::Table(GPIO), || About::Table(SERIAL), || About::Table(FIELD)]);
+/// The keys of `[button.NAME]`.
+pub(super) const KEYS: Keys = &[ButtonKeys::KEYS, &INPUT];
+const ACTION: Own<ButtonAction> = text(action, "");
 
 /// Reads the buttons, in the order of the file.
 pub(super) fn buttons(root: &Section<'_>, drafts: &[Draft<'_>], stops: &[InterlockSpec]) -> Vec<ButtonSpec> {
@@ -31,13 +97,12 @@ pub(super) fn buttons(root: &Section<'_>, drafts: &[Draft<'_>], stops: &[Interlo
             let fix = fix.replace("[device.", "[button.");
             section.report_at(section.at, format!("{name:?} cannot be a button's name"), fix);
         }
-        section.allow(&[&KEYS[..], &INPUTS].concat());
+        section.known(KEYS);
+        let ButtonKeys { press, hold, hold_after, double } = ButtonKeys::values(&section);
         let input = input(&section, drafts);
-        let [press, hold, double] = actions(&section, input.as_ref());
+        check_actions(&section, [press, hold, double], input.as_ref());
         let Some(input) = input else { continue };
         check_reader(&section, &input, stops, &buttons);
-        let range = Duration::from_millis(200)..=Duration::from_secs(10);
-        let hold_after = section.duration("hold_after", range).unwrap_or(HOLD_AFTER);
         if section.has("hold_after") && !section.has("hold") {
             section.report("hold_after", "hold_after without hold", "write hold = \"discard\", or remove hold_after");
         }
@@ -46,20 +111,21 @@ pub(super) fn buttons(root: &Section<'_>, drafts: &[Draft<'_>], stops: &[Interlo
     buttons
 }
 
+fn action(section: &Section<'_>, key: &str) -> Option<ButtonAction> {
+    if section.word(key) == Some("arm") {
+        let fix = "arm in the monitor (a, then ctrl-y) or by `rapid arm`; a button can disarm";
+        let message = "a button does not arm: whoever steps on it by mistake would move the actuator";
+        return section.refuse(key, message, fix);
+    }
+    section.choice(key, &ButtonAction::WORDS)
+}
+
 /// What a press, a hold and two presses do.
-fn actions(section: &Section<'_>, input: Option<&InputSpec>) -> [Option<ButtonAction>; 3] {
+fn check_actions(section: &Section<'_>, actions: [Option<ButtonAction>; 3], input: Option<&InputSpec>) {
     let gestures = ["press", "hold", "double"];
     if !gestures.iter().any(|key| section.has(key)) {
         section.missing("press", "write press = \"toggle\": what a press does; also hold = and double =");
     }
-    let actions = gestures.map(|key| {
-        if section.word(key) == Some("arm") {
-            let fix = "arm in the monitor (a, then ctrl-y) or by `rapid arm`; a button can disarm";
-            let message = "a button does not arm: whoever steps on it by mistake would move the actuator";
-            return section.refuse(key, message, fix);
-        }
-        section.has(key).then(|| section.choice(key, &ButtonAction::WORDS))?
-    });
     for (key, action) in gestures.into_iter().zip(actions).skip(1) {
         if section.has(key) && actions.contains(&Some(ButtonAction::Disarm)) {
             let message = format!("{key} beside disarm: it would be carried out late");
@@ -72,7 +138,6 @@ fn actions(section: &Section<'_>, input: Option<&InputSpec>) -> [Option<ButtonAc
             section.report(key, "a line of text is a whole press and cannot be held", fix);
         }
     }
-    actions
 }
 
 /// What another entry reads already, or keeps from others.
@@ -120,29 +185,22 @@ fn input(section: &Section<'_>, drafts: &[Draft<'_>]) -> Option<InputSpec> {
 }
 
 fn key(table: &Section<'_>) -> Option<KeyInput> {
-    table.allow(&["device", "code", "grab"]);
-    let (device, code) = input::key(table);
-    let grab = table.has("grab").then(|| table.flag("grab"));
-    let (code, number) = code?;
-    Some(KeyInput { device: device?, code, number, on_while_pressed: true, grab: grab.unwrap_or(Some(false))? })
+    table.known(KEY);
+    let (keys, GrabKeys { grab }) = (KeyKeys::values(table), GrabKeys::values(table));
+    let (code, number) = keys.code?;
+    Some(KeyInput { device: keys.device?, code, number, on_while_pressed: true, grab })
 }
 
 fn gpio(table: &Section<'_>) -> Option<GpioInput> {
-    table.allow(&["chip", "line", "pressed_while"]);
-    let (chip, line) = input::gpio_line(table);
-    table.need(
-        "pressed_while",
-        "write pressed_while = \"low\" for a button that connects the line to ground, or \"high\"",
-    );
-    let pressed = table.choice("pressed_while", &LEVELS);
-    Some(GpioInput { chip: chip?, line: line?, on_while_high: pressed? })
+    table.known(GPIO);
+    let (keys, level) = (GpioKeys::values(table), LevelKeys::values(table));
+    Some(GpioInput { chip: keys.chip?, line: keys.line?, on_while_high: level.pressed_while? })
 }
 
 fn line(table: &Section<'_>) -> Option<LineInput> {
-    table.allow(&["path", "baud", "line", "pressed", "released", "silence"]);
-    let (path, baud) = input::port(table);
-    let [line, pressed, released] = ["line", "pressed", "released"].map(|key| input::line(table, key));
-    let silence = table.duration("silence", Duration::from_millis(10)..=Duration::from_secs(5));
+    table.known(SERIAL);
+    let PortKeys { path, baud } = PortKeys::values(table);
+    let LineKeys { line, pressed, released, silence } = LineKeys::values(table);
     let (on, off) = if table.has("line") {
         for key in ["pressed", "released", "silence"].into_iter().filter(|key| table.has(key)) {
             let fix = "write line = for a box that sends one line per press, or pressed = and released =";
@@ -164,17 +222,19 @@ fn line(table: &Section<'_>) -> Option<LineInput> {
         }
         (pressed?, LineOff::Line(released?))
     };
-    Some(LineInput { path: path?, baud: baud?, on, off, silence })
+    Some(LineInput { path: path?, baud, on, off, silence })
 }
 
 fn field(table: &Section<'_>, drafts: &[Draft<'_>]) -> Option<FieldInput> {
-    table.allow(&["device", "index", "pressed_above", "pressed_below", "released_above", "released_below", "silence"]);
-    let (device, index) = input::number(table, drafts);
+    table.known(FIELD);
+    let (NumberKeys { device, index }, keys) = (input::number(table, drafts), FieldKeys::values(table));
     let none = "write pressed_above = 0.5, or pressed_below, for what counts as pressed";
-    let on = input::bound(table, "pressed_above", "pressed_below", "remove one", none);
+    let pressed = [("pressed_above", keys.pressed_above), ("pressed_below", keys.pressed_below)];
+    let on = input::bound(table, pressed[0], pressed[1], "remove one", none);
     let both = "remove one: released_below belongs to pressed_above, released_above to pressed_below";
-    let has_off = table.has("released_above") || table.has("released_below");
-    let off = has_off.then(|| input::bound(table, "released_above", "released_below", both, none));
+    let released = [("released_above", keys.released_above), ("released_below", keys.released_below)];
+    let has_off = released.iter().any(|(key, _)| table.has(key));
+    let off = has_off.then(|| input::bound(table, released[0], released[1], both, none));
     let (key, is_beyond) = match (on, off.flatten()) {
         (Some(Bound::Above(on)), Some(Bound::Below(off))) => ("released_below", off <= on),
         (Some(Bound::Below(on)), Some(Bound::Above(off))) => ("released_above", off >= on),
@@ -187,7 +247,6 @@ fn field(table: &Section<'_>, drafts: &[Draft<'_>]) -> Option<FieldInput> {
             "write pressed_above = 0.6 with released_below = 0.4, or pressed_below = 0.4 with released_above = 0.6";
         table.report(key, "it is pressed and released at the same numbers", fix);
     }
-    let silence = table.duration("silence", Duration::from_millis(10)..=Duration::from_secs(5)).unwrap_or(SILENCE);
     let off = off.map_or(Some(None), |off| off.map(Some))?;
-    Some(FieldInput { device: device?, index: index?, on: on?, off, silence })
+    Some(FieldInput { device: device?, index: index?, on: on?, off, silence: keys.silence })
 }

@@ -10,33 +10,29 @@ use rapid_core::action::MAX_ACTION;
 use rapid_core::modality::{ModalityId, ModalityKind};
 use rapid_core::sync::WhenStale;
 
-use super::effector::{self, EFFECTOR};
 use super::identity::name_problem;
-use super::program::{self, For, Programs};
+use super::program::{self, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{form, identity, lan, motors, node, verdict};
+use super::{form, identity, verdict};
 use crate::columns::Vector;
 use crate::keys::{About, Keys, NUMBERS, Own, Size, TEXT, TEXTS, Time, Words, keys, own, text, whole};
+use crate::kinds::process::{PROCESS, attach_is_node};
+use crate::kinds::{self, Kind, STALL_AFTER, Word, can};
 use crate::section::Section;
 use crate::spec::VerdictSpec;
 use crate::spec::{
-    ActionSpec, CameraSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hook, Hooks, IdentitySpec, LanSpec, Mount,
-    NodeSpec, Opens, PixelFormat,
+    ActionSpec, CameraSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec,
+    Opens, PixelFormat,
 };
 
-/// Kinds of node this version has a driver for.
-pub(super) const BUILT_IN: [(&str, Kind); 4] =
-    [("camera", Kind::Camera), ("serial", Kind::Serial), ("can", Kind::Can), ("lan", Kind::Lan)];
-/// States that `on_attach` is the program that reads the device.
-const PROCESS: &str = "process";
 /// Keys that state which device an entry identifies.
-pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
+pub(crate) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
 /// The further streams of a camera.
 const STREAM: &str = "stream";
 
 keys! {
     /// Which device the entry identifies, and how it is read.
-    const OF_THE_DEVICE {
+    pub(crate) const OF_THE_DEVICE {
         /// USB vendor id, as `lsusb` shows it.
         vid = USB_ID, usually "a device on the network has none";
         /// USB product id.
@@ -55,7 +51,7 @@ keys! {
 keys! {
     /// The keys that a stream of a device has too.
     #[derive(Debug)]
-    pub(super) struct StreamKeys(least_bytes: u64) {
+    pub(crate) struct StreamKeys(least_bytes: u64) {
         /// Topic on the bus and in the recording.
         topic: Option<String> = TOPIC, usually "`/rapid/` with the node and the name";
         /// Bit in the physical mask.
@@ -81,7 +77,7 @@ keys! {
         /// A camera.
         camera = About::Table(&[CameraSpec::KEYS]);
         /// Limits of the verdict for this device.
-        verdict = About::ANY_TABLE;
+        verdict = About::Table(verdict::OF_A_DEVICE);
         /// Intrinsics of its pictures.
         calibration = About::Table(&[form::CalibrationKeys::KEYS]);
     }
@@ -89,19 +85,9 @@ keys! {
 
 keys! {
     /// Tables of a device.
-    const TABLES {} below {
-        /// A camera.
-        camera = About::Table(&[CameraSpec::KEYS]);
-        /// A serial line.
-        tty = About::ANY_TABLE;
-        /// A CAN adapter.
-        can = About::ANY_TABLE;
-        /// A device on the network.
-        lan = About::ANY_TABLE;
-        /// A program that reads the device.
-        process = About::ANY_TABLE;
+    pub(crate) const TABLES {} below {
         /// Limits of the verdict for this device.
-        verdict = About::ANY_TABLE;
+        verdict = About::Table(verdict::OF_A_DEVICE);
         /// The actions of a program's actuator.
         action = About::Table(&[ActionKeys::KEYS]);
         /// Its numbers are a pose.
@@ -113,7 +99,7 @@ keys! {
         /// Its packets are those of a LiDAR.
         points = About::Table(&[form::PointsKeys::KEYS]);
         /// The tip of an arm, whose pose is commanded.
-        effector = About::ANY_TABLE;
+        effector = About::Table(&[can::EffectorKeys::KEYS]);
         /// Further streams of a camera.
         stream = About::Named(OF_A_STREAM);
     }
@@ -121,7 +107,7 @@ keys! {
 
 keys! {
     /// Programs that are run at events of the device.
-    const HOOKS {
+    pub(crate) const HOOKS {
         /// A program that is run when the device was attached, and its arguments.
         on_attach = TEXTS;
         /// Likewise, when it was removed.
@@ -135,9 +121,6 @@ keys! {
 
 /// The keys of `[device.NAME.stream.NAME]`.
 const OF_A_STREAM: Keys = &[StreamKeys::KEYS, TABLES_OF_A_STREAM];
-
-/// The keys of `[device.NAME]`.
-pub(super) const KEYS: Keys = &[OF_THE_DEVICE, StreamKeys::KEYS, TABLES, HOOKS];
 
 const TOPIC: Own<String> = text(topic, "text that begins with `/`");
 const USB_ID: Own<u16> = own(
@@ -157,46 +140,36 @@ const HIGHEST_BIT: i64 = 63;
 /// More than any sensor needs; every frame of an episode waits for the longest latency of the rig.
 const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 
-/// How a device is read, without the settings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
-    Camera,
-    Serial,
-    Can,
-    Lan,
-    Process,
-}
-
 /// An entry as far as it could be read.
 #[derive(Debug)]
-pub(super) struct Draft<'a> {
-    pub(super) name: String,
-    pub(super) section: Section<'a>,
-    pub(super) identity: Option<IdentitySpec>,
+pub(crate) struct Draft<'a> {
+    pub(crate) name: String,
+    pub(crate) section: Section<'a>,
+    pub(crate) identity: Option<IdentitySpec>,
     /// The entry of whose unit it is a further stream.
-    pub(super) stream_of: Option<String>,
-    pub(super) kind: Option<Kind>,
+    pub(crate) stream_of: Option<String>,
+    pub(crate) kind: Option<Word>,
     node: Option<NodeSpec>,
-    pub(super) topic: String,
-    pub(super) bit: Option<u8>,
-    pub(super) id: Option<ModalityId>,
-    pub(super) mount: Option<Mount>,
+    pub(crate) topic: String,
+    pub(crate) bit: Option<u8>,
+    pub(crate) id: Option<ModalityId>,
+    pub(crate) mount: Option<Mount>,
     stall_after: Duration,
-    pub(super) max_bytes: u64,
-    pub(super) depth: u64,
+    pub(crate) max_bytes: u64,
+    pub(crate) depth: u64,
     /// The depth was written in the file and must not be lowered.
-    pub(super) depth_written: bool,
+    pub(crate) depth_written: bool,
     when_stale: WhenStale,
     latency: Duration,
     verdict: VerdictTable,
-    pub(super) form: Option<Form>,
-    pub(super) action: Option<ActionSpec>,
+    pub(crate) form: Option<Form>,
+    pub(crate) action: Option<ActionSpec>,
     hooks: Hooks,
 }
 
 impl<'d> Draft<'d> {
     /// Its numbers, if it sends any; of an entry with a problem, which is reported, without a length.
-    pub(super) fn vector(&self) -> Option<Vector> {
+    pub(crate) fn vector(&self) -> Option<Vector> {
         let shape = match &self.node {
             Some(node) if node.modality_kind() != ModalityKind::Scalars => return None,
             Some(node) => node.shape(),
@@ -212,13 +185,7 @@ impl<'d> Draft<'d> {
         let node = self.node?;
         let fps = node.picture().map(|picture| f64::from(picture.fps));
         let mut usual = VerdictSpec::of(node.modality_kind(), self.stall_after, fps);
-        if node::is_gopro(&node) {
-            // Its samples report its state once a second, and are not observations: its pictures are in the clip.
-            (usual.suspect.valid, usual.bad.valid) = (None, None);
-        }
-        if node::is_remote(&node) {
-            usual = usual.of_another_computer(sync_window);
-        }
+        node.of_kind().judge(&mut usual, sync_window);
         let spec = DeviceSpec {
             verdict: verdict::changed(usual, rig, &self.verdict),
             name: self.name,
@@ -240,17 +207,17 @@ impl<'d> Draft<'d> {
     }
 
     /// How many numbers a sample holds, 0 if it holds none; `None` if a problem with the node was reported.
-    pub(super) fn numbers(&self) -> Option<usize> {
+    pub(crate) fn numbers(&self) -> Option<usize> {
         numbers_of(self.node.as_ref()?)
     }
 
     /// Which node of the unit the entry opens.
-    pub(super) fn opens(&self) -> Option<Opens> {
+    pub(crate) fn opens(&self) -> Option<Opens> {
         Some(self.node.as_ref()?.opens())
     }
 
     /// The programs that are run for it, each with the key that names it.
-    pub(super) fn programs(&self) -> impl Iterator<Item = (&'static str, &Path)> {
+    pub(crate) fn programs(&self) -> impl Iterator<Item = (&'static str, &Path)> {
         let key = if attach_is_node(&self.section) { "on_attach" } else { "node" };
         let node = self.node.as_ref().and_then(|node| match node {
             NodeSpec::Process(process) => Some((key, process.program.as_path())),
@@ -260,7 +227,7 @@ impl<'d> Draft<'d> {
     }
 
     /// The pixel format of a camera.
-    pub(super) const fn format(&self) -> Option<PixelFormat> {
+    pub(crate) const fn format(&self) -> Option<PixelFormat> {
         match &self.node {
             Some(NodeSpec::Camera(camera)) => Some(camera.format),
             _ => None,
@@ -268,7 +235,7 @@ impl<'d> Draft<'d> {
     }
 
     /// Its settings, if it is on the network.
-    pub(super) fn lan(&self) -> Option<&LanSpec> {
+    pub(crate) fn lan(&self) -> Option<&LanSpec> {
         match self.node.as_ref()? {
             NodeSpec::Lan(lan) => Some(lan),
             _ => None,
@@ -286,22 +253,22 @@ fn numbers_of(node: &NodeSpec) -> Option<usize> {
 }
 
 /// Reads one entry.
-pub(super) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>) -> Draft<'a> {
+pub(crate) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>) -> Draft<'a> {
     if let Some((message, fix)) = name_problem(name) {
         section.report_at(section.at, message, fix);
     }
-    section.known(KEYS);
+    section.known(kinds::KEYS);
     let kind = kind(&section);
     let identity = identity::identity(kind, &section);
-    if kind != Some(Kind::Camera) && section.has(STREAM) {
+    if kind != Some(Word::Camera) && section.has(STREAM) {
         section.report(STREAM, "only a camera has several streams", "remove the table, or write node = \"camera\"");
     }
     draft(name, section, (kind, identity), programs)
 }
 
 /// Reads the further streams of an entry, each an entry of its own with the same identity: `NAME_STREAM`.
-pub(super) fn streams<'a>(owner: &Draft<'a>, programs: Programs<'_>) -> Vec<Draft<'a>> {
-    let Some(streams) = owner.section.table(STREAM).filter(|_| owner.kind == Some(Kind::Camera)) else {
+pub(crate) fn streams<'a>(owner: &Draft<'a>, programs: Programs<'_>) -> Vec<Draft<'a>> {
+    let Some(streams) = owner.section.table(STREAM).filter(|_| owner.kind == Some(Word::Camera)) else {
         return Vec::new();
     };
     let usb = owner.identity.as_ref().and_then(IdentitySpec::usb);
@@ -339,45 +306,28 @@ pub(super) fn streams<'a>(owner: &Draft<'a>, programs: Programs<'_>) -> Vec<Draf
 fn draft<'a>(
     name: &str,
     section: Section<'a>,
-    (kind, identity): (Option<Kind>, Option<IdentitySpec>),
+    (kind, identity): (Option<Word>, Option<IdentitySpec>),
     programs: Programs<'_>,
 ) -> Draft<'a> {
-    let mut heartbeat = None;
-    let mut settings = match kind {
-        Some(Kind::Camera) => Some(NodeSpec::Camera(CameraSpec::of(&section, &node::TTY))),
-        Some(Kind::Serial) => node::serial(&section).map(NodeSpec::Serial),
-        Some(Kind::Can) => node::can(&section).map(NodeSpec::Can),
-        Some(Kind::Lan) => lan::lan(&section).map(NodeSpec::Lan),
-        Some(Kind::Process) => node::process(&section, program(&section, programs)).map(|(process, silent)| {
-            heartbeat = Some(silent);
-            NodeSpec::Process(process)
-        }),
-        None => None,
-    };
-    if kind.is_some_and(|kind| kind != Kind::Process) && section.has("process") {
+    let (settings, silent) = kind.and_then(|kind| kind.read(&section, programs)).unzip();
+    if kind.is_some_and(|kind| kind != Word::Process) && section.has("process") {
         let message = format!("a built-in node has no table [{}]", section.child("process"));
         section.report("process", message, "remove the table, or write node = the name of a program");
     }
-    if kind.is_some_and(|kind| kind != Kind::Can) && section.has("can") {
+    if kind.is_some_and(|kind| kind != Word::Can) && section.has("can") {
         let message = format!("only a CAN adapter has a table [{}]", section.child("can"));
         section.report("can", message, "remove the table, or write node = \"can\"");
     }
-    match &mut settings {
-        Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => {
-            damiao.effector = effector::read(&section, damiao, programs).map(Box::new);
-        }
-        Some(_) if section.has(EFFECTOR) => {
-            section.report(EFFECTOR, "only motors move an arm", "remove the table, or write protocol = \"damiao\"");
-        }
-        _ => {}
+    if settings.is_some() && kind != Some(Word::Can) {
+        can::refuse_effector(&section);
     }
-    let (bytes, least_bytes) = node::sizes(settings.as_ref());
+    let of_kind = settings.as_ref().map(NodeSpec::of_kind);
+    let (bytes, least_bytes) = of_kind.map_or((1, 1), Kind::sizes);
     let keys = StreamKeys::values(&section, least_bytes);
-    let stall_after = heartbeat.or(keys.stall_after).unwrap_or_else(|| node::default_stall(settings.as_ref()));
+    let stall_after = silent.flatten().or(keys.stall_after);
+    let stall_after = stall_after.unwrap_or_else(|| of_kind.map_or(STALL_AFTER, Kind::stall_after));
     let action = match &settings {
-        Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => {
-            Some(motors::axes(damiao, &section))
-        }
+        Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => Some(can::axes(damiao, &section)),
         settings => {
             let moves = settings.as_ref().is_none_or(|node| matches!(node, NodeSpec::Process(_)));
             action(&section, moves || programs.are_nowhere())
@@ -394,7 +344,7 @@ fn draft<'a>(
         mount: keys.slot,
         stall_after,
         max_bytes: keys.max_bytes.unwrap_or(bytes),
-        depth: keys.depth.unwrap_or_else(|| node::default_depth(settings.as_ref())),
+        depth: keys.depth.unwrap_or_else(|| of_kind.map_or(2048, Kind::depth)),
         depth_written: keys.depth.is_some(),
         when_stale: keys.when_stale,
         latency: keys.latency,
@@ -407,7 +357,7 @@ fn draft<'a>(
     }
 }
 
-fn kind(section: &Section<'_>) -> Option<Kind> {
+fn kind(section: &Section<'_>) -> Option<Word> {
     if !section.has("node") {
         section.missing("node", "write node = \"camera\", \"serial\", \"can\", \"lan\" or the name of a program");
         return None;
@@ -418,28 +368,11 @@ fn kind(section: &Section<'_>) -> Option<Kind> {
                    [\"tactile_publisher\", \"argument\"]";
         return section.refuse("node", "node \"process\" does not name the program".to_owned(), fix);
     }
-    Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
+    Some(Word::ALL.iter().find(|(name, _)| *name == text).map_or(Word::Process, |(_, kind)| *kind))
 }
 
-/// Whether `on_attach` is the program that reads the device.
-fn attach_is_node(section: &Section<'_>) -> bool {
-    section.has("on_attach") && section.word("node") == Some(PROCESS)
-}
-
-/// The program that reads the device: named by `node`, or with `node = "process"` by `on_attach`.
-fn program(section: &Section<'_>, programs: Programs<'_>) -> Option<Hook> {
-    if attach_is_node(section) {
-        return program::hook(section, "on_attach", programs);
-    }
-    let name = section.text("node")?;
-    let found = programs.find(For::Node, name);
-    let program = found.map_err(|(message, fix)| section.report("node", message, fix)).ok()?;
-    Some(Hook { program, args: Vec::new() })
-}
-
-pub(super) fn default_topic(kind: Option<Kind>, name: &str) -> String {
-    let word = BUILT_IN.iter().find(|(_, built_in)| Some(*built_in) == kind).map(|(word, _)| *word);
-    let kind = word.unwrap_or(if kind == Some(Kind::Process) { "process" } else { "device" });
+pub(crate) fn default_topic(kind: Option<Word>, name: &str) -> String {
+    let kind = kind.map_or("device", Word::word);
     format!("/rapid/{kind}/{name}")
 }
 
@@ -478,7 +411,7 @@ keys! {
 
 /// Reads the table; `None` without one, or if a problem with it was reported. A table for a device that does not `move`
 /// is such a problem.
-pub(super) fn action(section: &Section<'_>, moves: bool) -> Option<ActionSpec> {
+pub(crate) fn action(section: &Section<'_>, moves: bool) -> Option<ActionSpec> {
     let table = section.table("action")?;
     if !moves {
         let node = section.text("node").unwrap_or_default();

@@ -1,7 +1,8 @@
 //! Valid names of entries and modules, and which device an entry identifies: the keys `vid`, `pid`, `serial` and
 //! `port`.
 
-use super::device::{IDENTITY_KEYS, Kind};
+use super::device::IDENTITY_KEYS;
+use crate::kinds::Word;
 use crate::section::Section;
 use crate::spec::{IdentitySpec, UsbSpec};
 
@@ -36,9 +37,9 @@ const fn in_a_name(c: char) -> bool {
     c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_'
 }
 
-pub(super) fn identity(kind: Option<Kind>, section: &Section<'_>) -> Option<IdentitySpec> {
+pub(super) fn identity(kind: Option<Word>, section: &Section<'_>) -> Option<IdentitySpec> {
     // A device on the network has none; one behind its USB adapter has that of the adapter.
-    if kind == Some(Kind::Lan) && !IDENTITY_KEYS.iter().any(|key| section.has(key)) {
+    if kind == Some(Word::Lan) && !IDENTITY_KEYS.iter().any(|key| section.has(key)) {
         return Some(IdentitySpec::Lan {});
     }
     for key in ["vid", "pid"] {

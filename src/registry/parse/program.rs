@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 
 use super::device::Draft;
 use crate::diagnostic::nearest;
+use crate::kinds::Word;
 use crate::section::{Section, printable};
 use crate::spec::{Hook, Hooks};
 use crate::trust::distrust;
@@ -21,7 +22,7 @@ const MOST_COMPARED: usize = 1000;
 
 /// Where programs are searched for.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Programs<'a> {
+pub(crate) enum Programs<'a> {
     /// Beside this file and on `PATH`.
     Beside(&'a Path),
     /// Nowhere: no program will be run, any name is valid.
@@ -30,7 +31,7 @@ pub(super) enum Programs<'a> {
 
 /// The key that names the program, for messages.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum For {
+pub(crate) enum For {
     /// `node`, which may also be the word for a built-in node.
     Node,
     /// The first text of this key.
@@ -51,7 +52,7 @@ type Wrong = (String, String);
 
 impl Programs<'_> {
     /// The path of a file that the registry names: relative to its own.
-    pub(super) fn file(self, name: &str) -> PathBuf {
+    pub(crate) fn file(self, name: &str) -> PathBuf {
         match self {
             Self::Beside(registry) => registry.parent().unwrap_or(Path::new("")).join(name),
             Self::Nowhere => PathBuf::from(name),
@@ -59,12 +60,12 @@ impl Programs<'_> {
     }
 
     /// Whether this is a registry whose programs will not be run, such as that of an episode.
-    pub(super) const fn are_nowhere(self) -> bool {
+    pub(crate) const fn are_nowhere(self) -> bool {
         matches!(self, Self::Nowhere)
     }
 
     /// The program of this name.
-    pub(super) fn find(self, purpose: For, name: &str) -> Result<PathBuf, Wrong> {
+    pub(crate) fn find(self, purpose: For, name: &str) -> Result<PathBuf, Wrong> {
         let Self::Beside(file) = self else { return Ok(PathBuf::from(name)) };
         let found = if Path::new(name).is_absolute() {
             Some(PathBuf::from(name)).filter(|path| path.exists())
@@ -87,19 +88,19 @@ impl Programs<'_> {
 
     fn missing(self, purpose: For, name: &str) -> Wrong {
         let place = "a program must lie beside this file or on PATH, or be written with its absolute path";
-        let (message, words, otherwise) = match purpose {
+        let (message, otherwise) = match purpose {
             For::Node => (
                 format!("node {name:?} is neither built in nor a program"),
-                &super::device::BUILT_IN[..],
                 format!("built in are camera, serial, can and lan; {place}"),
             ),
-            For::Hook(key) => (format!("{key} {name:?} is not a program"), &[][..], place.to_owned()),
+            For::Hook(key) => (format!("{key} {name:?} is not a program"), place.to_owned()),
         };
         let near = match self {
             Self::Beside(file) => executables(&folder_of(file)),
             Self::Nowhere => Vec::new(),
         };
-        let known = words.iter().map(|(name, _)| *name).chain(near.iter().map(String::as_str));
+        let built_in = Word::ALL.iter().filter(|(_, kind)| matches!(purpose, For::Node) && *kind != Word::Process);
+        let known = built_in.map(|(name, _)| *name).chain(near.iter().map(String::as_str));
         let fix = match nearest(name, known) {
             Some(name) => format!("did you mean {name:?}?"),
             None => otherwise,
@@ -160,7 +161,7 @@ fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
 }
 
 /// Warns of the programs of entries that others could change. As root they have been rejected.
-pub(super) fn warn_of_distrusted(drafts: &[Draft<'_>]) {
+pub(crate) fn warn_of_distrusted(drafts: &[Draft<'_>]) {
     for (draft, (key, path)) in drafts.iter().flat_map(|draft| draft.programs().map(move |program| (draft, program))) {
         // A program that is not searched for, because it will not be run, does not exist there either.
         if let Ok(Some(reason)) = distrust(path) {
@@ -171,7 +172,7 @@ pub(super) fn warn_of_distrusted(drafts: &[Draft<'_>]) {
 }
 
 /// The hooks of an entry. With `node = "process"`, `on_attach` is the node itself and no hook.
-pub(super) fn hooks(section: &Section<'_>, attach_is_node: bool, programs: Programs<'_>) -> Hooks {
+pub(crate) fn hooks(section: &Section<'_>, attach_is_node: bool, programs: Programs<'_>) -> Hooks {
     let read = |key| hook(section, key, programs);
     Hooks {
         attach: if attach_is_node { None } else { read("on_attach") },
@@ -182,7 +183,7 @@ pub(super) fn hooks(section: &Section<'_>, attach_is_node: bool, programs: Progr
 }
 
 /// A program and its arguments; `None` without the key, or if a problem with it was reported.
-pub(super) fn hook(section: &Section<'_>, key: &'static str, programs: Programs<'_>) -> Option<Hook> {
+pub(crate) fn hook(section: &Section<'_>, key: &'static str, programs: Programs<'_>) -> Option<Hook> {
     let words = section.texts(key)?;
     let Some((name, args)) = words.split_first() else {
         let fix = format!("write {key} = [\"program\", \"argument\"], or remove it");

@@ -10,30 +10,86 @@
 use std::iter::zip;
 use std::time::Duration;
 
+use crate::keys::{About, Keys, Own, Real, keys, text};
 use crate::section::Section;
 use crate::spec::{Limits, VerdictSpec};
 
-type Share = fn(&mut Limits) -> &mut Option<f64>;
-type Time = fn(&mut Limits) -> &mut Option<Duration>;
+const SHARE: Own<Given<f64>> = text(share, "a share as `\"0.5%\"`, or `\"off\"`");
+const TIME: Own<Given<Duration>> = text(time, "a duration, 1ms to 1h, or `\"off\"`");
 
-/// Checks whose limit is a share, and whether more of it is worse.
-const SHARES: [(&str, Share, Worse); 8] = [
-    ("lost", |limits| &mut limits.lost, Worse::More),
-    ("dropped", |limits| &mut limits.dropped, Worse::More),
-    ("damaged", |limits| &mut limits.damaged, Worse::More),
-    ("duplicate", |limits| &mut limits.duplicate, Worse::More),
-    ("repeated", |limits| &mut limits.repeated, Worse::More),
-    ("late", |limits| &mut limits.late, Worse::More),
-    ("rate", |limits| &mut limits.rate, Worse::Less),
-    ("valid", |limits| &mut limits.valid, Worse::Less),
+keys! {
+    /// The limits of one grade. The defaults are those for SUSPECT, then those for BAD.
+    const LIMITS {
+        /// Samples that the device lost before they were received.
+        lost = SHARE, usually "1 %, 5 %";
+        /// Samples lost between the driver and the file.
+        dropped = SHARE, usually "0, 5 %";
+        /// Samples that the driver reported as damaged, and JPEG pictures without their beginning or end.
+        damaged = SHARE, usually "1 %, 5 %";
+        /// Samples with a non-increasing sequence number or capture time.
+        duplicate = SHARE, usually "0.1 %, 5 %";
+        /// Samples that are byte-identical to the one before.
+        repeated = SHARE, usually "10 %, 60 % of pictures; others off";
+        /// Samples that came too late for their frame.
+        late = SHARE, usually "1 %, 20 %";
+        /// Least rate while the device was attached, of the nominal one.
+        rate = SHARE, usually "90 %, 50 %";
+        /// Least share of the ticks while the device was attached that have a sample of it in `sync_window`.
+        valid = SHARE, usually "90 %, 50 %";
+        /// Longest time in which every sample is byte-identical to the one before.
+        frozen = TIME, usually "500 ms, 2 s of pictures; others off";
+        /// Longest time without a sample while the device was attached.
+        gap = TIME, usually "`stall_after`, ten times it";
+        /// Longest time in which the device was plugged in and did not run.
+        opening = TIME, usually "5 s, off";
+        /// Change of the stamps against this machine's clock over the episode.
+        clock = TIME, usually "10 ms, 100 ms";
+        /// How far the capture times of a device of another computer may be wrong.
+        uncertain = TIME, usually "half of `sync_window`, off; others off";
+    }
+}
+
+keys! {
+    /// More severe limits.
+    const BAD {} below {
+        /// Limits beyond which an episode is BAD.
+        bad = About::Table(&[LIMITS]);
+    }
+}
+
+keys! {
+    /// The nominal rate.
+    struct RateKeys {
+        /// Samples a second of the device.
+        hz: Option<f64> = Real(0.001, 100_000.0), usually "unknown; of a camera its `fps`";
+    }
+}
+
+/// The keys of `[verdict]`, and those of `[device.NAME.verdict]`.
+pub(super) const OF_THE_RIG: Keys = &[LIMITS, BAD];
+pub(super) const OF_A_DEVICE: Keys = &[LIMITS, BAD, RateKeys::KEYS];
+
+type Share = fn(&mut Limits) -> &mut Option<f64>;
+type Moment = fn(&mut Limits) -> &mut Option<Duration>;
+
+/// The first of the limits: those that are a share, and whether more of it is worse.
+const SHARES: [(Share, Worse); 8] = [
+    (|limits| &mut limits.lost, Worse::More),
+    (|limits| &mut limits.dropped, Worse::More),
+    (|limits| &mut limits.damaged, Worse::More),
+    (|limits| &mut limits.duplicate, Worse::More),
+    (|limits| &mut limits.repeated, Worse::More),
+    (|limits| &mut limits.late, Worse::More),
+    (|limits| &mut limits.rate, Worse::Less),
+    (|limits| &mut limits.valid, Worse::Less),
 ];
-/// Checks whose limit is a time; longer is worse.
-const TIMES: [(&str, Time); 5] = [
-    ("frozen", |limits| &mut limits.frozen),
-    ("gap", |limits| &mut limits.gap),
-    ("opening", |limits| &mut limits.opening),
-    ("clock", |limits| &mut limits.clock),
-    ("uncertain", |limits| &mut limits.uncertain),
+/// The others: those that are a time; longer is worse.
+const TIMES: [Moment; 5] = [
+    |limits| &mut limits.frozen,
+    |limits| &mut limits.gap,
+    |limits| &mut limits.opening,
+    |limits| &mut limits.clock,
+    |limits| &mut limits.uncertain,
 ];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,22 +129,19 @@ pub(super) enum Whose {
 pub(super) fn read(section: &Section<'_>, whose: Whose) -> VerdictTable {
     let mut table = VerdictTable::default();
     let Some(section) = section.table("verdict") else { return table };
-    let checks = SHARES.iter().map(|(key, ..)| *key).chain(TIMES.iter().map(|(key, _)| *key));
-    let mut known: Vec<&str> = checks.collect();
-    let of_bad = known.clone();
-    known.push("bad");
     if whose == Whose::Device {
-        known.push("hz");
-        table.hz = section.number("hz", 0.001..=100_000.0);
+        section.known(OF_A_DEVICE);
+        table.hz = RateKeys::values(&section).hz;
     } else if section.has("hz") {
-        known.push("hz");
+        section.known(OF_A_DEVICE);
         let fix = "write it as hz = 100 in [device.NAME.verdict]";
-        section.report("hz", "hz is the rate of one device".to_owned(), fix);
+        section.report("hz", "hz is the rate of one device", fix);
+    } else {
+        section.known(OF_THE_RIG);
     }
-    section.allow(&known);
     table.suspect = limits(&section);
     if let Some(bad) = section.table("bad") {
-        bad.allow(&of_bad);
+        bad.known(&[LIMITS]);
         table.bad = limits(&bad);
         contradictions(&table, &section, &bad);
     }
@@ -97,20 +150,25 @@ pub(super) fn read(section: &Section<'_>, whose: Whose) -> VerdictTable {
 
 fn limits(section: &Section<'_>) -> Written {
     let mut written = Written::default();
-    for ((key, ..), share) in SHARES.iter().zip(&mut written.shares) {
-        *share = read_share(section, key);
+    let (of_shares, of_times) = LIMITS.split_at(SHARES.len());
+    for (key, limit) in zip(of_shares, &mut written.shares) {
+        *limit = share(section, key.name);
     }
-    for ((key, _), time) in TIMES.iter().zip(&mut written.times) {
-        *time = match section.word(key) {
-            Some("off") => Some(None),
-            _ => section.duration(key, Duration::from_millis(1)..=Duration::from_hours(1)).map(Some),
-        };
+    for (key, limit) in zip(of_times, &mut written.times) {
+        *limit = time(section, key.name);
     }
     written
 }
 
+fn time(section: &Section<'_>, key: &str) -> Option<Given<Duration>> {
+    match section.word(key) {
+        Some("off") => Some(None),
+        _ => section.duration(key, Duration::from_millis(1)..=Duration::from_hours(1)).map(Some),
+    }
+}
+
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
-fn read_share(section: &Section<'_>, key: &str) -> Option<Given<f64>> {
+fn share(section: &Section<'_>, key: &str) -> Option<Given<f64>> {
     let usual = if ["rate", "valid"].contains(&key) { "90%" } else { "0.5%" };
     let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"{usual}\"");
     if !section.has(key) {
@@ -138,15 +196,13 @@ fn contradictions(table: &VerdictTable, section: &Section<'_>, bad: &Section<'_>
         let message = format!("{key} is BAD before it is SUSPECT by [{}] on line {line}", section.entry);
         bad.report(key, message, "make the limit for BAD the more severe of the two");
     };
-    for ((key, _, worse), written) in SHARES.iter().zip(zip(table.suspect.shares, table.bad.shares)) {
-        if matches!(written, (Some(Some(suspect)), Some(Some(bad))) if worse.is_beyond(&suspect, &bad)) {
-            report(key);
-        }
-    }
-    for ((key, _), written) in TIMES.iter().zip(zip(table.suspect.times, table.bad.times)) {
-        if matches!(written, (Some(Some(suspect)), Some(Some(bad))) if suspect > bad) {
-            report(key);
-        }
+    let shares = zip(&SHARES, zip(table.suspect.shares, table.bad.shares)).map(|((_, worse), written)| {
+        matches!(written, (Some(Some(suspect)), Some(Some(bad))) if worse.is_beyond(&suspect, &bad))
+    });
+    let times = zip(table.suspect.times, table.bad.times)
+        .map(|written| matches!(written, (Some(Some(suspect)), Some(Some(bad))) if suspect > bad));
+    for (key, _) in zip(LIMITS, shares.chain(times)).filter(|(_, is_beyond)| *is_beyond) {
+        report(key.name);
     }
 }
 
@@ -164,10 +220,10 @@ impl Worse {
 pub(super) fn changed(mut spec: VerdictSpec, rig: &VerdictTable, own: &VerdictTable) -> VerdictSpec {
     spec.hz = own.hz.or(spec.hz);
     for (table, whose) in [(rig, Whose::Rig), (own, Whose::Device)] {
-        for ((_, of, worse), written) in SHARES.iter().zip(zip(table.suspect.shares, table.bad.shares)) {
+        for ((of, worse), written) in SHARES.iter().zip(zip(table.suspect.shares, table.bad.shares)) {
             change(of(&mut spec.suspect), of(&mut spec.bad), written, whose, *worse);
         }
-        for ((_, of), written) in TIMES.iter().zip(zip(table.suspect.times, table.bad.times)) {
+        for (of, written) in TIMES.iter().zip(zip(table.suspect.times, table.bad.times)) {
             change(of(&mut spec.suspect), of(&mut spec.bad), written, whose, Worse::More);
         }
     }

@@ -95,7 +95,7 @@ impl TipForm {
 }
 
 /// Numbers of the pose of a tip, with the opening of its gripper or without.
-pub(super) const fn tip_numbers(has_opening: bool) -> usize {
+pub(crate) const fn tip_numbers(has_opening: bool) -> usize {
     7 + if has_opening { 1 } else { 0 }
 }
 

@@ -6,11 +6,75 @@ use std::time::Duration;
 use rapid_core::modality::ModalityKind;
 use rapid_core::remote;
 
-use super::device::{Draft, IDENTITY_KEYS};
+use super::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, RemoteSamples};
+use crate::keys::{About, FLAG, Key, Own, TEXT, Time, Whole, Words, keys, table, text, whole};
+use crate::kinds::camera::PixelFormat;
+use crate::kinds::{NodeSpec, Settings};
+use crate::parse::device::{Draft, IDENTITY_KEYS};
+use crate::parse::program::Programs;
 use crate::section::Section;
-use crate::spec::{KINDS, LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, PixelFormat, Probe, RemoteSamples};
+use crate::spec::KINDS;
 
-const KEYS: [&str; 8] = ["protocol", "mdns", "instance", "host", "port", "probe", "probe_port", "lease"];
+pub(crate) const TABLE: Key = table("lan", "A device on the network.", || About::Table(&[LanKeys::KEYS]));
+const PORT: Whole<u16> = whole(1, 65_535);
+const SIDE: Whole<u32> = whole(1, 8192);
+const SERVICE: Own<String> = text(service, "`\"_NAME._tcp\"` or `\"_NAME._udp\"`");
+const PATH: Own<String> = text(path, "text that begins with `/`");
+
+keys! {
+    /// `[device.NAME.lan]`. The sizes of pictures are by default 640 by 480 at 30, of a phone 1920 by 1440.
+    struct LanKeys {
+        /// Its protocol.
+        protocol: Option<Word> = Words(&Word::WORDS), need PROTOCOLS;
+        /// The service that it announces.
+        mdns: Option<String> = SERVICE;
+        /// The instance of the service, if only one is to match.
+        instance: Option<String> = TEXT, usually "any";
+        /// Its address; with `remote` the name of the other computer.
+        host: Option<String> = TEXT;
+        /// Port of the device, or that of this computer that it sends or connects to.
+        port: Option<u16> = PORT, usually "mjpeg 80 or as announced, gopro 8080, iphone 5555";
+        /// How the presence of a device at a fixed address is checked.
+        probe: Option<Probe> = Words(&PROBES), usually "by protocol";
+        /// The port that is probed.
+        probe_port: Option<u16> = PORT, usually "`port`";
+        /// How long it counts as present after data was last received from it.
+        lease: Option<Duration> = Time(Duration::from_millis(500), Duration::from_mins(1)), usually "`\"3s\"`, with `remote` `\"1s\"`";
+        /// Of mjpeg: what is requested.
+        path: String = PATH, or "/".to_owned();
+        /// Width of a picture, pixels.
+        width: Option<u32> = SIDE, usually "by protocol";
+        /// Height of a picture, pixels.
+        height: Option<u32> = SIDE, usually "by protocol";
+        /// Pictures a second.
+        fps: Option<u32> = whole::<u32>(1, 1000), usually "`30`";
+        /// Of gopro: whether its clips are downloaded after the episode.
+        download: bool = FLAG, or false;
+        /// Of gopro `"state"` or `"preview"`, of iphone `"image"` or `"pose"`: what a sample is.
+        stream: bool = Words(&STREAMS), within Words(streams(protocol)), usually "the first of the two", or false;
+        /// Of remote: name of the device there.
+        device: Option<String> = TEXT, usually "the name of the entry";
+        /// Of remote: content of a sample.
+        kind: ModalityKind = Words(&KINDS), or ModalityKind::Image;
+        /// Of remote: pixel format of its pictures.
+        format: PixelFormat = Words(&PixelFormat::WORDS), or PixelFormat::Mjpg;
+        /// Of remote: numbers in a sample.
+        channels: Option<u32> = whole::<u32>(1, 1024);
+    }
+}
+
+const PROBES: [(&str, Probe); 3] = [("tcp", Probe::Tcp), ("http", Probe::Http), ("udp", Probe::Udp)];
+/// What a sample is, each with whether it is the second choice of its protocol.
+const STREAMS: [(&str, bool); 4] = [("state", false), ("preview", true), ("image", false), ("pose", true)];
+
+const fn streams(protocol: Option<Word>) -> &'static [(&'static str, bool)] {
+    match protocol {
+        Some(Word::Gopro) => STREAMS.split_at(2).0,
+        Some(Word::Iphone) => STREAMS.split_at(2).1,
+        _ => &STREAMS,
+    }
+}
+
 /// Keys of the table that only some protocols have.
 const OWN: [(Word, &[&str]); 5] = [
     (Word::Mjpeg, &["path", "width", "height", "fps"]),
@@ -61,8 +125,12 @@ impl Word {
     }
 }
 
+pub(crate) fn read(entry: &Section<'_>, _: Programs<'_>) -> Option<Settings> {
+    lan(entry).map(|lan| (NodeSpec::Lan(lan), None))
+}
+
 /// Reads the table; `None` if a problem with it was reported.
-pub(super) fn lan(section: &Section<'_>) -> Option<LanSpec> {
+fn lan(section: &Section<'_>) -> Option<LanSpec> {
     section.no_tables(&["camera", "tty", "serial"], "a network device", "lan");
     if !section.is_table("lan") {
         let fix = PROTOCOLS.replacen("write", &format!("write [{}] with", section.child("lan")), 1);
@@ -70,31 +138,24 @@ pub(super) fn lan(section: &Section<'_>) -> Option<LanSpec> {
         return None;
     }
     let table = section.table("lan")?;
-    table.allow(&[&KEYS[..], &OPTIONAL].concat());
-    table.need("protocol", PROTOCOLS);
-    let word = table.choice("protocol", &Word::WORDS);
-    let port = port(&table, "port");
-    let lease = table.duration("lease", Duration::from_millis(500)..=Duration::from_mins(1));
-    let word = word?;
-    let lease = lease.unwrap_or(if word == Word::Remote { REMOTE_LEASE } else { DEFAULT_LEASE });
+    let keys = LanKeys::read(&table);
+    let word = keys.protocol?;
+    let lease = keys.lease.unwrap_or(if word == Word::Remote { REMOTE_LEASE } else { DEFAULT_LEASE });
     for key in OPTIONAL.into_iter().filter(|key| table.has(key) && !word.own().contains(key)) {
         let message = format!("protocol {:?} has no {key}", word.name());
         table.report(key, message, format!("remove {key}, or correct the protocol"));
     }
     if word == Word::Remote {
-        return remote(section, &table, port.unwrap_or(remote::PORT), lease);
+        return remote(section, &table, &keys, lease);
     }
-    let protocol = protocol(&table, word, port);
-    let find = find(section, &table, word, port);
+    let protocol = protocol(&table, word, &keys);
+    let find = find(section, &table, word, &keys);
     Some(LanSpec { protocol: protocol?, find: find?, lease })
 }
 
-fn port(table: &Section<'_>, key: &str) -> Option<u16> {
-    table.integer(key, 1..=65_535)
-}
-
 /// A device of another computer: the host is a name, and what is probed is `rapid-remote` on this one.
-fn remote(section: &Section<'_>, table: &Section<'_>, port: u16, lease: Duration) -> Option<LanSpec> {
+fn remote(section: &Section<'_>, table: &Section<'_>, keys: &LanKeys, lease: Duration) -> Option<LanSpec> {
+    let port = keys.port.unwrap_or(remote::PORT);
     let elsewhere = ["mdns", "instance", "probe", "probe_port"];
     for key in elsewhere.into_iter().filter(|key| table.has(key)) {
         let message = format!("a device of another computer has no {key}: rapid-remote reports when it is present");
@@ -105,14 +166,20 @@ fn remote(section: &Section<'_>, table: &Section<'_>, port: u16, lease: Duration
         section.report(key, message, format!("remove {key}; here its identity is host and device"));
     }
     table.need("host", "write host = the name that `rapid-remote serve` has on the other computer");
-    let host = name(table, "host", "the name of the other computer, for example host = \"robot-b\"");
+    let host =
+        name(table, "host", keys.host.as_deref(), "the name of the other computer, for example host = \"robot-b\"");
     let own = section.entry.strip_prefix("device.").unwrap_or_default();
     let device = if table.has("device") {
-        name(table, "device", "the name of the device in devices.toml there, for example device = \"cam_wrist\"")
+        name(
+            table,
+            "device",
+            keys.device.as_deref(),
+            "the name of the device in devices.toml there, for example device = \"cam_wrist\"",
+        )
     } else {
         Some(own.to_owned())
     };
-    let samples = samples(table);
+    let samples = samples(table, keys);
     let protocol = LanProtocol::Remote { host: host?, device: device?, port, samples };
     Some(LanSpec {
         protocol,
@@ -121,9 +188,8 @@ fn remote(section: &Section<'_>, table: &Section<'_>, port: u16, lease: Duration
     })
 }
 
-fn samples(table: &Section<'_>) -> RemoteSamples {
-    let kind = table.choice("kind", &KINDS).unwrap_or(ModalityKind::Image);
-    let (word, own): (_, &[&str]) = match kind {
+fn samples(table: &Section<'_>, keys: &LanKeys) -> RemoteSamples {
+    let (word, own): (_, &[&str]) = match keys.kind {
         ModalityKind::Image => ("image", &OF_PICTURES),
         ModalityKind::Depth => ("depth", &OF_DEPTH),
         ModalityKind::Scalars => ("scalars", &OF_NUMBERS),
@@ -136,22 +202,19 @@ fn samples(table: &Section<'_>) -> RemoteSamples {
             table.report(key, message, format!("remove {key}, or write kind = {owner:?}"));
         }
     }
-    match kind {
-        ModalityKind::Image => {
-            let format = table.choice("format", &PixelFormat::WORDS).unwrap_or(PixelFormat::Mjpg);
-            RemoteSamples::Pictures(picture(table, LanPicture::OF_A_CAMERA), format)
-        }
-        ModalityKind::Depth => RemoteSamples::Pictures(picture(table, LanPicture::OF_A_CAMERA), PixelFormat::Z16),
+    match keys.kind {
+        ModalityKind::Image => RemoteSamples::Pictures(picture(keys, LanPicture::OF_A_CAMERA), keys.format),
+        ModalityKind::Depth => RemoteSamples::Pictures(picture(keys, LanPicture::OF_A_CAMERA), PixelFormat::Z16),
         ModalityKind::Scalars => {
             table.need("channels", "write channels = the count of numbers in a sample");
-            RemoteSamples::Numbers(table.integer("channels", 1..=1024).unwrap_or(1))
+            RemoteSamples::Numbers(keys.channels.unwrap_or(1))
         }
         ModalityKind::Bytes => RemoteSamples::Bytes,
     }
 }
 
-fn name(table: &Section<'_>, key: &str, what: &str) -> Option<String> {
-    let name = table.text(key)?;
+fn name(table: &Section<'_>, key: &str, name: Option<&str>, what: &str) -> Option<String> {
+    let name = name?;
     if remote::is_name(name) {
         return Some(name.to_owned());
     }
@@ -160,69 +223,65 @@ fn name(table: &Section<'_>, key: &str, what: &str) -> Option<String> {
     table.refuse(key, message, format!("write {what}"))
 }
 
-fn protocol(table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanProtocol> {
+fn protocol(table: &Section<'_>, word: Word, keys: &LanKeys) -> Option<LanProtocol> {
+    let port = keys.port;
     Some(match word {
         // Read by `remote`.
         Word::Remote => return None,
         Word::Mjpeg => {
-            let path = path(table);
-            LanProtocol::Mjpeg { port, path, picture: picture(table, LanPicture::OF_A_CAMERA) }
+            LanProtocol::Mjpeg { port, path: keys.path.clone(), picture: picture(keys, LanPicture::OF_A_CAMERA) }
         }
         Word::Udp => {
             table.need("port", "write port = the port of this computer that the device sends to");
             LanProtocol::Udp { port: port? }
         }
         Word::Gopro => {
-            let (port, download) = (port.unwrap_or(GOPRO_PORT), table.flag("download").unwrap_or(false));
             // `reserve` is set once the whole registry is read.
-            LanProtocol::Gopro { port, download, reserve: None, preview: preview(table) }
+            let (port, preview) = (port.unwrap_or(GOPRO_PORT), preview(table, keys));
+            LanProtocol::Gopro { port, download: keys.download, reserve: None, preview }
         }
         Word::Iphone => {
-            const STREAMS: [(&str, PhoneStream); 2] = [("image", PhoneStream::Image), ("pose", PhoneStream::Pose)];
-            let stream = table.choice("stream", &STREAMS).unwrap_or(PhoneStream::Image);
-            let picture = picture(table, LanPicture::OF_A_PHONE);
+            let stream = if keys.stream { PhoneStream::Pose } else { PhoneStream::Image };
+            let picture = picture(keys, LanPicture::OF_A_PHONE);
             LanProtocol::Iphone { port: port.unwrap_or(PHONE_PORT), stream, picture }
         }
     })
 }
 
 /// The pictures of a GoPro, if they are its samples.
-fn preview(table: &Section<'_>) -> Option<LanPicture> {
-    const STREAMS: [(&str, bool); 2] = [("state", false), ("preview", true)];
-    if table.choice("stream", &STREAMS).unwrap_or(false) {
-        return Some(picture(table, LanPicture::OF_A_CAMERA));
+fn preview(table: &Section<'_>, keys: &LanKeys) -> Option<LanPicture> {
+    if keys.stream {
+        return Some(picture(keys, LanPicture::OF_A_CAMERA));
     }
-    for key in ["width", "height", "fps"].into_iter().filter(|key| table.has(key)) {
+    for key in OF_DEPTH.into_iter().filter(|key| table.has(key)) {
         let message = format!("the state of a GoPro has no {key}");
         table.report(key, message, format!("remove {key}, or write stream = \"preview\""));
     }
     None
 }
 
-fn path(table: &Section<'_>) -> String {
+fn path(table: &Section<'_>, key: &str) -> Option<String> {
     /// Servers should accept at least 8000 characters (RFC 9110, 4.1); no camera's path is nearly as long.
     const LONGEST: usize = 1000;
-    let Some(path) = table.text("path") else { return "/".to_owned() };
+    let path = table.text(key)?;
     // Characters permitted in a request line: no spaces, no control characters, only ASCII.
     if path.starts_with('/') && path.len() <= LONGEST && path.bytes().all(|b| b.is_ascii_graphic()) {
-        return path.to_owned();
+        return Some(path.to_owned());
     }
     let fix = "begin with `/` and write what is not plain as %XX, for example path = \"/video?size=1\"";
-    table.report("path", format!("{path:?} cannot be requested"), fix);
-    "/".to_owned()
+    table.refuse(key, format!("{path:?} cannot be requested"), fix)
 }
 
-fn picture(table: &Section<'_>, default: LanPicture) -> LanPicture {
-    let integer = |key, most, default| table.integer(key, 1..=most).unwrap_or(default);
+fn picture(keys: &LanKeys, default: LanPicture) -> LanPicture {
     LanPicture {
-        width: integer("width", 8192, default.width),
-        height: integer("height", 8192, default.height),
-        fps: integer("fps", 1000, default.fps),
+        width: keys.width.unwrap_or(default.width),
+        height: keys.height.unwrap_or(default.height),
+        fps: keys.fps.unwrap_or(default.fps),
     }
 }
 
 /// Two entries cannot use the same port of this computer, unless each does on a separate adapter.
-pub(super) fn check_ports(drafts: &[Draft<'_>]) {
+pub(crate) fn check_ports(drafts: &[Draft<'_>]) {
     for (index, draft) in drafts.iter().enumerate() {
         let Some((port, own)) = draft.lan().and_then(|lan| Some((lan.own_port()?, lan))) else { continue };
         let same = |earlier: &&Draft<'_>| {
@@ -239,7 +298,7 @@ pub(super) fn check_ports(drafts: &[Draft<'_>]) {
 }
 
 /// A GoPro has one shutter, and one entry: its samples are its state or its preview.
-pub(super) fn check_gopros(drafts: &[Draft<'_>]) {
+pub(crate) fn check_gopros(drafts: &[Draft<'_>]) {
     let gopro = |draft: &Draft<'_>| {
         let lan = draft.lan().filter(|lan| matches!(lan.protocol, LanProtocol::Gopro { .. }))?;
         match &lan.find {
@@ -256,7 +315,7 @@ pub(super) fn check_gopros(drafts: &[Draft<'_>]) {
 }
 
 /// An announced instance belongs to one entry: another that names it would never have a device.
-pub(super) fn check_instances(drafts: &[Draft<'_>]) {
+pub(crate) fn check_instances(drafts: &[Draft<'_>]) {
     let named = |draft: &Draft<'_>| {
         let (service, instance) = draft.lan()?.find.announced()?;
         Some((service.to_ascii_lowercase(), instance?.to_ascii_lowercase()))
@@ -272,10 +331,10 @@ pub(super) fn check_instances(drafts: &[Draft<'_>]) {
 }
 
 /// Exactly one way: the USB identity of the entry, `mdns`, or `host`.
-fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanFind> {
+fn find(section: &Section<'_>, table: &Section<'_>, word: Word, keys: &LanKeys) -> Option<LanFind> {
     let is_usb = IDENTITY_KEYS.iter().any(|key| section.has(key));
     let is_mdns = table.has("mdns");
-    let host = host(table);
+    let host = host(table, keys.host.as_deref());
     let alone = |key: &str, owner: &str| {
         let message = format!("{key} belongs to a device that is found by {owner}");
         table.report(key, message, format!("remove {key}, or write {owner}"));
@@ -303,12 +362,8 @@ fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16
             let message = "the entry gives two ways to find the device: by mdns and by host".to_owned();
             table.refuse("host", message, "keep mdns for a device that announces itself, or host, not both")
         }
-        (false, true, false) => {
-            let service = service(table);
-            let instance = table.text("instance").map(str::to_owned);
-            Some(LanFind::Mdns { service: service?, instance })
-        }
-        (false, false, true) => fixed(table, host, word, port),
+        (false, true, false) => Some(LanFind::Mdns { service: keys.mdns.clone()?, instance: keys.instance.clone() }),
+        (false, false, true) => fixed(table, host, word, keys),
         (false, false, false) => {
             let fix =
                 "write vid and pid of its USB network adapter, or mdns = \"_service._tcp\", or host = its address";
@@ -318,15 +373,15 @@ fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16
     }
 }
 
-fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16>) -> Option<LanFind> {
-    const PROBES: [(&str, Probe); 3] = [("tcp", Probe::Tcp), ("http", Probe::Http), ("udp", Probe::Udp)];
+fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, keys: &LanKeys) -> Option<LanFind> {
+    let port = keys.port;
     let default = match word {
         Word::Mjpeg | Word::Iphone => Probe::Tcp,
         Word::Remote => Probe::Remote,
         Word::Gopro => Probe::Http,
         Word::Udp => Probe::Udp,
     };
-    let probe = if table.has("probe") { table.choice("probe", &PROBES) } else { Some(default) }?;
+    let probe = if table.has("probe") { keys.probe } else { Some(default) }?;
     if probe == Probe::Udp && word != Word::Udp {
         let message = format!("probe \"udp\" listens for packets, and protocol {:?} sends none", word.name());
         return table.refuse("probe", message, "write probe = \"tcp\" or \"http\"");
@@ -343,7 +398,7 @@ fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16
         let message = "probe \"udp\" listens on port".to_owned();
         return table.refuse("probe_port", message, "remove probe_port, or write probe = \"tcp\" or \"http\"");
     }
-    let probed = if table.has("probe_port") { self::port(table, "probe_port") } else { own };
+    let probed = if table.has("probe_port") { keys.probe_port } else { own };
     if probed.is_none() && !table.has("probe_port") && (table.has("port") || word == Word::Iphone) {
         let fix = "write probe_port = a port of the device that takes connections; `port` is one of this computer";
         table.missing("probe_port", fix);
@@ -351,8 +406,8 @@ fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16
     Some(LanFind::Host { host: host?, probe, port: probed? })
 }
 
-fn host(table: &Section<'_>) -> Option<IpAddr> {
-    let host = table.text("host")?;
+fn host(table: &Section<'_>, host: Option<&str>) -> Option<IpAddr> {
+    let host = host?;
     let address = host.parse().ok().filter(|address: &IpAddr| !address.is_unspecified() && !address.is_multicast());
     if address.is_none() {
         let fix = "write its address, for example host = \"192.168.1.7\"; give the device a fixed one in your router";
@@ -362,8 +417,8 @@ fn host(table: &Section<'_>) -> Option<IpAddr> {
 }
 
 /// `_name._tcp` or `_name._udp`; the name has up to 15 letters, digits and hyphens (RFC 6763, 7).
-fn service(table: &Section<'_>) -> Option<String> {
-    let service = table.text("mdns")?;
+fn service(table: &Section<'_>, key: &str) -> Option<String> {
+    let service = table.text(key)?;
     let bare = service.trim_end_matches('.').trim_end_matches(".local");
     let legal = bare.split_once('.').is_some_and(|(name, transport)| {
         let name = name.strip_prefix('_').unwrap_or_default();
@@ -374,7 +429,7 @@ fn service(table: &Section<'_>) -> Option<String> {
     if !legal {
         let fix =
             "write it as the device announces it, for example mdns = \"_iphonevio._tcp\"; `avahi-browse -a` lists all";
-        table.report("mdns", format!("{service:?} is not a service"), fix);
+        table.report(key, format!("{service:?} is not a service"), fix);
     }
     legal.then(|| bare.to_owned())
 }

@@ -1,12 +1,19 @@
 //! `[device.NAME.lan]`: a device on the network, or behind a network adapter.
 
+mod keys;
+
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
 
 use rapid_core::modality::ModalityKind;
 use rapid_core::remote;
 
-use super::PixelFormat;
+use super::camera::PixelFormat;
+use super::{Kind, STALL_AFTER, compressed};
+use crate::artifacts::{Needs, quoted};
+use crate::spec::{Opens, VerdictSpec};
+
+pub(crate) use keys::{TABLE, check_gopros, check_instances, check_ports, read};
 
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
@@ -188,9 +195,28 @@ impl LanPicture {
     pub(crate) const OF_A_PHONE: Self = Self { width: 1920, height: 1440, fps: 30 };
     /// Pictures of a camera unless the entry states otherwise.
     pub(crate) const OF_A_CAMERA: Self = Self { width: 640, height: 480, fps: 30 };
+
+    /// Of such pictures, what is kept for a reader: about two seconds.
+    pub(crate) fn depth(self) -> u64 {
+        (2 * u64::from(self.fps)).clamp(16, 1024)
+    }
+
+    /// Ten periods of a slow camera, or what is usual.
+    pub(crate) fn stall_after(self) -> Duration {
+        (Duration::from_secs(10) / self.fps.max(1)).max(STALL_AFTER)
+    }
 }
 
 impl LanSpec {
+    /// Whether its samples are the states of a GoPro.
+    const fn is_state_of_a_gopro(&self) -> bool {
+        matches!(self.protocol, LanProtocol::Gopro { preview: None, .. })
+    }
+
+    const fn is_remote(&self) -> bool {
+        matches!(self.protocol, LanProtocol::Remote { .. })
+    }
+
     /// Applies the rig's settings for the disk.
     pub(crate) fn keep_free(&mut self, disk_reserve: Option<u64>) {
         if let LanProtocol::Gopro { reserve, .. } = &mut self.protocol {
@@ -224,6 +250,17 @@ impl LanSpec {
         }
     }
 
+    /// The format of its pictures, if it sends any.
+    pub const fn picture(&self) -> Option<LanPicture> {
+        match &self.protocol {
+            LanProtocol::Mjpeg { picture, .. }
+            | LanProtocol::Iphone { picture, .. }
+            | LanProtocol::Remote { samples: RemoteSamples::Pictures(picture, _), .. } => Some(*picture),
+            LanProtocol::Gopro { preview, .. } => *preview,
+            LanProtocol::Udp { .. } | LanProtocol::Remote { .. } => None,
+        }
+    }
+
     /// How many numbers a sample of numbers has.
     const fn numbers(&self) -> u32 {
         match &self.protocol {
@@ -238,19 +275,50 @@ impl LanSpec {
         Some(remote::request(host, device))
     }
 
-    /// The format of its pictures, if it sends any.
-    pub const fn picture(&self) -> Option<LanPicture> {
+    /// The port at which the device is reached, or at which it reaches this computer, if the entry states it.
+    pub const fn port(&self) -> Option<u16> {
         match &self.protocol {
-            LanProtocol::Mjpeg { picture, .. }
-            | LanProtocol::Iphone { picture, .. }
-            | LanProtocol::Remote { samples: RemoteSamples::Pictures(picture, _), .. } => Some(*picture),
-            LanProtocol::Gopro { preview, .. } => *preview,
-            LanProtocol::Udp { .. } | LanProtocol::Remote { .. } => None,
+            LanProtocol::Mjpeg { port, .. } => *port,
+            LanProtocol::Udp { port }
+            | LanProtocol::Gopro { port, .. }
+            | LanProtocol::Iphone { port, .. }
+            | LanProtocol::Remote { port, .. } => Some(*port),
         }
     }
 
-    /// The format on one line: `udp port 2368`.
-    pub fn format(&self) -> String {
+    /// The socket address of a device at this address.
+    pub fn server(&self, host: IpAddr) -> SocketAddr {
+        SocketAddr::new(host, self.port().unwrap_or(HTTP_PORT))
+    }
+
+    /// The port of this computer that it needs: whether it is UDP, and its number.
+    pub const fn own_port(&self) -> Option<(bool, u16)> {
+        match &self.protocol {
+            LanProtocol::Udp { port } => Some((true, *port)),
+            LanProtocol::Iphone { port, .. } => Some((false, *port)),
+            LanProtocol::Mjpeg { .. } | LanProtocol::Gopro { .. } | LanProtocol::Remote { .. } => None,
+        }
+    }
+}
+
+impl Kind for LanSpec {
+    fn modality_kind(&self) -> ModalityKind {
+        self.modality_kind()
+    }
+
+    fn shape(&self) -> Vec<u32> {
+        self.shape()
+    }
+
+    fn opens(&self) -> Opens {
+        Opens::Net
+    }
+
+    fn picture(&self) -> Option<LanPicture> {
+        self.picture()
+    }
+
+    fn format(&self) -> String {
         match &self.protocol {
             LanProtocol::Mjpeg { path, picture: LanPicture { width, height, fps }, .. } => {
                 format!("mjpeg {width}x{height} {fps} fps {path}")
@@ -277,49 +345,59 @@ impl LanSpec {
         }
     }
 
-    /// Largest payload in bytes, and the least that may be written instead.
-    pub(crate) fn max_bytes(&self) -> (u64, u64) {
-        /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
-        const SMALLEST_JPEG: u64 = 64 << 10;
+    fn descriptor(&self) -> String {
+        format!("    format: {}\n", quoted(&self.format()))
+    }
+
+    fn sizes(&self) -> (u64, u64) {
         match (self.modality_kind(), self.picture()) {
             (ModalityKind::Image | ModalityKind::Depth, Some(picture)) => {
                 let pixels = u64::from(picture.width) * u64::from(picture.height);
-                let most = match &self.protocol {
-                    // It compresses to about a fifth of a byte per pixel (quality 0.7), and its pictures are large.
-                    LanProtocol::Iphone { .. } => pixels / 2,
-                    _ => 2 * pixels,
-                };
-                (most.max(SMALLEST_JPEG), 4096)
+                // A phone compresses to about a fifth of a byte per pixel (quality 0.7), and its pictures are large.
+                let is_phone = matches!(self.protocol, LanProtocol::Iphone { .. });
+                (compressed(if is_phone { pixels / 2 } else { 2 * pixels }), 4096)
             }
             (ModalityKind::Scalars, _) => (8 * u64::from(self.numbers()), 8 * u64::from(self.numbers())),
-            (ModalityKind::Bytes, _) if matches!(self.protocol, LanProtocol::Remote { .. }) => (64 << 10, 1),
+            (ModalityKind::Bytes, _) if self.is_remote() => (64 << 10, 1),
             // The payload of an Ethernet frame is under 1500.
             _ => (2048, 64),
         }
     }
 
-    /// The port at which the device is reached, or at which it reaches this computer, if the entry states it.
-    pub const fn port(&self) -> Option<u16> {
-        match &self.protocol {
-            LanProtocol::Mjpeg { port, .. } => *port,
-            LanProtocol::Udp { port }
-            | LanProtocol::Gopro { port, .. }
-            | LanProtocol::Iphone { port, .. }
-            | LanProtocol::Remote { port, .. } => Some(*port),
+    fn depth(&self) -> u64 {
+        match self.picture() {
+            Some(picture) => picture.depth(),
+            None if self.is_state_of_a_gopro() => 16,
+            None if self.is_remote() && self.modality_kind() == ModalityKind::Bytes => 60,
+            None => 2048,
         }
     }
 
-    /// The socket address of a device at this address.
-    pub fn server(&self, host: IpAddr) -> SocketAddr {
-        SocketAddr::new(host, self.port().unwrap_or(HTTP_PORT))
+    fn stall_after(&self) -> Duration {
+        match self.picture() {
+            Some(picture) => picture.stall_after(),
+            // Its state is read every 3 s.
+            None if self.is_state_of_a_gopro() => Duration::from_secs(10),
+            None => STALL_AFTER,
+        }
     }
 
-    /// The port of this computer that it needs: whether it is UDP, and its number.
-    pub const fn own_port(&self) -> Option<(bool, u16)> {
-        match &self.protocol {
-            LanProtocol::Udp { port } => Some((true, *port)),
-            LanProtocol::Iphone { port, .. } => Some((false, *port)),
-            LanProtocol::Mjpeg { .. } | LanProtocol::Gopro { .. } | LanProtocol::Remote { .. } => None,
+    fn judge(&self, limits: &mut VerdictSpec, sync_window: Duration) {
+        if self.is_state_of_a_gopro() {
+            // Its samples report its state once a second, and are not observations: its pictures are in the clip.
+            (limits.suspect.valid, limits.bad.valid) = (None, None);
         }
+        if self.is_remote() {
+            *limits = limits.of_another_computer(sync_window);
+        }
+    }
+
+    fn bytes_per_second(&self, max_bytes: usize) -> Option<f64> {
+        Some(f64::from(self.picture()?.fps) * max_bytes as f64)
+    }
+
+    fn need(&self, needs: &mut Needs) {
+        let families = ["AF_INET", "AF_INET6"].into_iter().zip(self.find.families());
+        needs.sockets.extend(families.filter(|(_, is_needed)| *is_needed).map(|(family, _)| family));
     }
 }

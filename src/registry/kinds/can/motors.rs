@@ -6,8 +6,16 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::form::tip_numbers;
+use super::effector::EffectorSpec;
 use super::mounting::Mounting;
+use crate::keys::{About, Key, Real, Time, TimeOrNever, Words, keys};
+use crate::parse::input;
+use crate::section::of_nothing;
+
+rapid_core::words! {
+    /// Every way to stop and its name.
+    Stop, 4: "limp" = Limp, "damp" = Damp, "hold" = Hold, "brake" = Brake;
+}
 
 /// Most motors of one bus: an action has an axis each, a sample 6 numbers each.
 pub const MAX_MOTORS: usize = 10;
@@ -32,66 +40,6 @@ pub struct DamiaoSpec {
     pub silent_after: Duration,
     /// The arm that the motors are the joints of, if actions are poses of its tip.
     pub effector: Option<Box<EffectorSpec>>,
-}
-
-/// `[device.NAME.effector]`: an arm whose actions are poses of its tip, and whose samples end with that pose.
-#[derive(Debug, Clone, PartialEq)]
-pub struct EffectorSpec {
-    /// The description of the arm, a URDF file. Each of its joints between `frame` and `tip` that moves has the name of a
-    /// motor.
-    pub urdf: PathBuf,
-    /// The link in whose frame poses are given; `None` is the root of the description.
-    pub frame: Option<String>,
-    /// The link whose pose is commanded and reported.
-    pub tip: String,
-    /// How the tip is turned.
-    pub rotation: TipRotation,
-    /// The angle about the z axis of `frame` is whatever the arm makes of it: an arm of five joints has no choice.
-    pub free_yaw: bool,
-    /// What opens and closes at the tip.
-    pub gripper: Option<GripperSpec>,
-    /// Lowest position that is commanded, m: x, y, z in `frame`.
-    pub min: [f64; 3],
-    /// Highest position that is commanded, each above the lowest.
-    pub max: [f64; 3],
-}
-
-impl EffectorSpec {
-    /// Numbers of a sample after those of the motors: position, opening if there is a gripper, quaternion `x y z w`.
-    pub const fn numbers(&self) -> usize {
-        tip_numbers(self.gripper.is_some())
-    }
-
-    /// Coordinates of the tip that are commanded: as many joints are needed.
-    pub const fn commanded(&self) -> usize {
-        match self.rotation {
-            TipRotation::Free => 3,
-            TipRotation::Commanded | TipRotation::Held(_) if self.free_yaw => 5,
-            TipRotation::Commanded | TipRotation::Held(_) => 6,
-        }
-    }
-}
-
-/// How the tip of an arm is turned.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum TipRotation {
-    /// As the action has it: a quaternion `x y z w` after the position.
-    Commanded,
-    /// In any way.
-    Free,
-    /// Always so: a quaternion `x y z w` of length 1.
-    Held([f64; 4]),
-}
-
-/// The gripper at the tip of an arm: a motor, and its positions at the opening 0 and 1.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct GripperSpec {
-    /// Its index in [`DamiaoSpec::motors`].
-    pub motor: usize,
-    /// Closed: opening 0, rad, of its joint; within the position of the motor.
-    pub closed: f64,
-    /// Open: opening 1, rad; likewise, and not the same.
-    pub open: f64,
 }
 
 /// One motor.
@@ -170,64 +118,89 @@ impl BrakeSpec {
     pub const SLOWEST: Duration = Duration::from_secs(2);
 }
 
-/// How a motor stops, by fault.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct StopSpec {
-    /// At a fault of its own.
-    pub own_fault: Stop,
-    /// At another motor's.
-    pub other_fault: Stop,
-    /// At an emergency stop.
-    pub emergency: Stop,
-    /// How long it holds before it is disabled; `None` is until a disarm.
-    pub hold_for: Option<Duration>,
+keys! {
+    /// How a motor stops, by fault. A faulty joint is not driven further; the others sink slowly with it. An emergency stop
+    /// disables all.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub struct StopSpec(others: Stop) {
+        /// How it stops at a fault of its own.
+        own_fault: Stop = Words(&Stop::WORDS), or Stop::Limp;
+        /// How it stops at another motor's.
+        other_fault: Stop = Words(&Stop::WORDS), usually "`\"damp\"`, and `\"hold\"` with its own loop", or_else others;
+        /// How it stops at an emergency stop.
+        emergency: Stop = Words(&Stop::WORDS), or Stop::Limp;
+        /// How long it holds before it is disabled; never is until a disarm.
+        hold_for: Option<Duration> = TimeOrNever(Duration::from_millis(10)), or None;
+    } below {
+        /// The holding brake of its joint.
+        brake = About::Table(&BRAKE_KEYS);
+    }
 }
+
+/// The keys of the table of a brake.
+pub(crate) const BRAKE_KEYS: [&[Key]; 2] = [input::GpioKeys::KEYS, BrakeKeys::KEYS];
+
+keys! {
+    /// Those of them that a line of a GPIO chip does not have by itself.
+    pub(crate) struct BrakeKeys {
+        /// The level that releases it, best the one that a broken wire does not have.
+        released: Option<bool> = Words(&input::LEVELS), need RELEASED;
+        /// Time from the change of the level until it holds. A small spring-applied brake takes the default.
+        engages_in: Duration = Time(Duration::ZERO, BrakeSpec::SLOWEST), or Duration::from_millis(100);
+        /// Time from the change of the level until it no longer holds.
+        releases_in: Duration = Time(Duration::ZERO, BrakeSpec::SLOWEST), or Duration::from_millis(100);
+    }
+}
+
+const RELEASED: &str = "write released = \"high\" or \"low\": the level that lets the joint turn, best the one that a broken wire \
+                        does not have";
 
 impl Default for StopSpec {
-    /// A faulty joint is not driven further; the others sink slowly with it. An emergency stop disables all.
     fn default() -> Self {
-        Self { own_fault: Stop::Limp, other_fault: Stop::Damp, emergency: Stop::Limp, hold_for: None }
+        of_nothing(|table| Self::values(table, Stop::Damp))
     }
 }
 
-/// How the command of a position starts and changes. Has no effect in [`MotorMode::Velocity`], whose slew limit is an
-/// acceleration.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MotionSpec {
-    /// Highest acceleration of the command, rad/s²; above 0, infinite is no limit.
-    pub acceleration: f64,
-    /// After an arm the command reaches its highest speed in this time.
-    pub soft_start: Duration,
-    /// How far from the joint the first action after an arm may be, rad. Above 0.
-    pub first_target: f64,
+keys! {
+    /// How the command of a position starts and changes. Has no effect in [`MotorMode::Velocity`], whose slew limit is an
+    /// acceleration.
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    pub struct MotionSpec(slew: f64) {
+        /// Highest acceleration of the command, rad/s².
+        acceleration: f64 = Real(0.001, 100_000.0), usually "20 times `slew`", or_else slew / SPEEDS_UP_IN;
+        /// After an arm the command reaches its highest speed in this time.
+        soft_start: Duration = Time(Duration::ZERO, Duration::from_secs(10)), or Duration::from_secs(1);
+        /// How far from the joint the first action after an arm may be, rad.
+        first_target: f64 = Real(0.001, 200.0), or 0.5;
+    }
 }
+
+/// Time to the highest speed unless the entry states otherwise, seconds.
+const SPEEDS_UP_IN: f64 = 0.05;
 
 impl MotionSpec {
-    /// Default time to the highest speed, seconds.
-    const SPEEDS_UP_IN: f64 = 0.05;
-
     /// For a command that changes by `slew` (rad/s) at most.
     pub fn of_slew(slew: f64) -> Self {
-        Self { acceleration: slew / Self::SPEEDS_UP_IN, soft_start: Duration::from_secs(1), first_target: 0.5 }
+        of_nothing(|table| Self::values(table, slew))
     }
 }
 
-/// Which behaviour of a motor is a fault.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct WatchSpec {
-    /// How far outside its limits it may be, rad; an arm farther out is rejected. At least 0.
-    pub margin: f64,
-    /// How far it may be from the command of its own loop, rad, in [`MotorMode::PositionVelocity`]. Above 0.
-    pub lag: f64,
-    /// How long it may be blocked at its highest torque; `None` is without a limit, as for a gripper that holds
-    /// something.
-    pub blocked_after: Option<Duration>,
+keys! {
+    /// Which behaviour of a motor is a fault. The defaults suit a joint of an arm.
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    pub struct WatchSpec {
+        /// How far outside its limits it may be, rad; an arm farther out is rejected.
+        margin: f64 = Real(0.0, 1.0), or 0.1;
+        /// How far it may be from the command of its own loop, rad, in [`MotorMode::PositionVelocity`].
+        lag: f64 = Real(0.001, 10.0), or 0.3;
+        /// How long it may be blocked at its highest torque; never is for a gripper that holds something.
+        blocked_after: Option<Duration> = TimeOrNever(Duration::from_millis(500)), or Some(Duration::from_secs(2));
+    }
 }
 
 impl Default for WatchSpec {
-    /// Suitable for a joint of an arm.
     fn default() -> Self {
-        Self { margin: 0.1, lag: 0.3, blocked_after: Some(Duration::from_secs(2)) }
+        of_nothing(Self::values)
     }
 }
 
@@ -261,6 +234,9 @@ macro_rules! motor_kinds {
         impl MotorKind {
             /// All of them.
             pub const ALL: [Self; [$($name),+].len()] = [$(Self::$kind),+];
+
+            /// Each with its name.
+            pub(crate) const WORDS: [(&str, Self); Self::ALL.len()] = [$(($name, Self::$kind)),+];
 
             /// As it is written in `devices.toml`.
             pub const fn name(self) -> &'static str {

@@ -1,29 +1,111 @@
-//! The motors of `[device.NAME.can]`, and the axes of actions derived from them.
+//! Reads `[device.NAME.can]` with its motors, and derives the axes of actions from them.
 
 use std::time::Duration;
 
 use super::effector;
-use super::input::{LEVELS, gpio_line};
-use crate::diagnostic::did_you_mean;
-use crate::section::Section;
-use crate::spec::{
-    ActionSpec, BrakeSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotionSpec, MotorKind, MotorMode, MotorSpec,
-    Mounting, NodeSpec, Stop, StopSpec, WatchSpec,
+use super::motors::{
+    BRAKE_KEYS, BrakeKeys, BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop,
+    StopSpec, WatchSpec,
 };
+use super::mounting::Mounting;
+use super::{CanAdapter, CanProtocol, CanSpec, SLCAN_BITRATES};
+use crate::keys::{About, Key, Keys, NUMBERS, Own, Real, Time, TimeOrNever, Words, keys, table, text, whole};
+use crate::kinds::{NodeSpec, Settings};
+use crate::parse::input::GpioKeys;
+use crate::parse::program::Programs;
+use crate::section::Section;
+use crate::spec::{ActionSpec, DeviceSpec};
 use crate::units::show_duration;
 
-const KEYS: [&str; 11] =
-    ["name", "slave", "master", "type", "mode", "kp", "kd", "position", "velocity", "torque", "slew"];
-/// How it sits on its joint.
-const MOUNTING_KEYS: [&str; 2] = ["zero", "reversed"];
+pub(crate) const TABLE: Key = table("can", "A CAN adapter.", || About::Table(&[CanKeys::KEYS, BusKeys::KEYS]));
+const TEN_SECONDS: Time = Time(Duration::from_millis(1), Duration::from_secs(10));
+
+keys! {
+    /// `[device.NAME.can]`.
+    struct CanKeys {
+        /// How the adapter is accessed.
+        adapter: CanAdapter = Words(&CanAdapter::WORDS), or CanAdapter::SocketCan;
+        /// Bits a second on the bus.
+        bitrate: u32 = whole::<u32>(10_000, 1_000_000), or 1_000_000;
+        /// What is on the bus: frames, recorded as they are, or motors.
+        protocol: Option<bool> = Words(&PROTOCOLS), usually "`\"raw\"`";
+    }
+}
+
+keys! {
+    /// Keys that only a bus of motors has.
+    struct BusKeys {
+        /// Commands a second to each motor.
+        hz: u32 = whole::<u32>(10, 1000), or 200;
+        /// Without an action for this long the motors hold.
+        deadman: Option<Duration> = TEN_SECONDS, usually "twice the time between actions";
+        /// After holding for this long they are disabled.
+        disable_after: Option<Duration> = TimeOrNever(Duration::from_millis(10)), or None;
+        /// The motors' internal limit: without a frame for this long they stop.
+        timeout: Option<Duration> = TEN_SECONDS, usually "`\"100ms\"`, or four commands";
+        /// A motor that leaves frames unanswered for this long is silent: with two cycles at 200 Hz it is reported within
+        /// 50 ms.
+        silent_after: Duration = TEN_SECONDS, or Duration::from_millis(40);
+    } below {
+        /// The motors, one per axis.
+        motors = About::List(MOTOR_KEYS);
+    }
+}
+
+/// The keys of a motor.
+const MOTOR_KEYS: Keys =
+    &[MotorKeys::KEYS, Mounting::KEYS, MotionSpec::KEYS, WatchSpec::KEYS, StopSpec::KEYS, HeatKeys::KEYS];
 /// How the command of a position starts and changes.
 const MOTION_KEYS: [&str; 3] = ["acceleration", "soft_start", "first_target"];
-/// Which behaviour of a motor is a fault, and how it stops then.
-const FAULT_KEYS: [&str; 8] =
-    ["margin", "lag", "blocked_after", "own_fault", "other_fault", "emergency", "hold_for", "brake"];
-const TEMPERATURE_KEYS: [&str; 2] = ["max_mos", "max_rotor"];
-/// Limits: six numbers per motor, and 64 in an action or a sample.
-const MOST: usize = 10;
+
+keys! {
+    /// What a motor is, how it is driven, and its limits: slow enough to step aside.
+    struct MotorKeys {
+        /// Its name, and that of its axis.
+        name: Option<String> = NAME, need "write name = what its axis is called, for example name = \"gripper\"";
+        /// CAN id that it listens to. 0x100 and more are the ids of commands in other modes.
+        slave: Option<u16> = whole::<u16>(1, 0xff), usually "needed";
+        /// CAN id that it answers with.
+        master: Option<u16> = whole::<u16>(0, 0x7ff), usually "`slave` + 16";
+        /// Its type.
+        kind "type": Option<MotorKind> = Words(&MotorKind::WORDS), need &format!("write type = one of {}", kinds());
+        /// How it is driven: by stiffness and damping, or by its own loop.
+        mode: Option<MotorMode> = Words(&MODES), usually "`\"mit\"`";
+        /// Stiffness, Nm/rad.
+        kp: Option<f64> = Real(0.0, 500.0), usually "needed with mode mit";
+        /// Damping, Nm s/rad.
+        kd: Option<f64> = Real(0.0, 5.0), usually "needed with mode mit";
+        /// `[lowest, highest]` position, rad.
+        position: Option<Vec<f64>> = NUMBERS, usually "needed";
+        /// Highest speed, rad/s.
+        velocity: f64 = Real(0.001, 1000.0), within Real(0.001, shipped(kind)[1]), usually "2, or that of its type if it is lower",
+            or_else SPEED.min(shipped(kind)[1]);
+        /// Highest torque, Nm.
+        torque: f64 = Real(0.001, 1000.0), within Real(0.001, shipped(kind)[2]), usually "a tenth of that of its type",
+            or_else TORQUE_SHARE * shipped(kind)[2];
+        /// Highest change of the command: rad/s of a position, rad/s² of a velocity.
+        slew: f64 = Real(0.001, 100_000.0), within Real(0.001, most_slew(mode, kind)), usually "`velocity`; 10 times it of a velocity",
+            or_else default_slew(mode, velocity);
+    }
+}
+
+keys! {
+    /// What its parts tolerate.
+    struct HeatKeys {
+        /// Highest temperature of its transistors, °C; a finger tolerates less than they do.
+        max_mos: f64 = Real(20.0, 150.0), or 80.0;
+        /// Highest temperature of its winding, °C.
+        max_rotor: f64 = Real(20.0, 150.0), or 80.0;
+    }
+}
+
+const NAME: Own<String> = text(name, "letters, digits, `_`, `-` and `.`, at most 64");
+const IMPEDANCE: MotorMode = MotorMode::Mit { kp: 0.0, kd: 0.0 };
+const MODES: [(&str, MotorMode); 3] =
+    [("mit", IMPEDANCE), ("position", MotorMode::PositionVelocity), ("velocity", MotorMode::Velocity)];
+/// What can be on a bus, by its keyword: motors, or not.
+const PROTOCOLS: [(&str, bool); 2] = [("raw", false), ("damiao", true)];
+
 /// Motors that hold when no action arrives must not do so between two commands.
 const DEADMAN_PERIODS: u32 = 2;
 /// A motor that stops when it receives nothing must not do so between two commands.
@@ -34,8 +116,6 @@ const LONG_TIMEOUT: Duration = Duration::from_millis(500);
 const SPEED: f64 = 2.0;
 /// Share of the highest torque of its type, likewise.
 const TORQUE_SHARE: f64 = 0.1;
-/// The winding's insulation and the transistors tolerate more; a finger does not.
-const TEMPERATURE: f64 = 80.0;
 /// By convention a motor answers with its own id plus this.
 const MASTER_OFFSET: u16 = 0x10;
 /// Ids of commands, relative to a motor's own: MIT, position and velocity, velocity, position and force.
@@ -47,43 +127,74 @@ const PARAMETERS: u16 = 0x7ff;
 
 /// Example of a brake.
 const BRAKE: &str = "brake = { chip = \"/dev/gpiochip0\", line = 4, released = \"high\" }";
-/// A small spring-applied brake takes this long to engage or to release, unless its data sheet states otherwise.
-const BRAKE_TIME: Duration = Duration::from_millis(100);
+
+pub(crate) fn read(entry: &Section<'_>, programs: Programs<'_>) -> Option<Settings> {
+    entry.no_tables(&["camera", "tty", "serial", "lan"], "a CAN adapter", "can");
+    let table = entry.table_or_empty("can");
+    table.known(&[CanKeys::KEYS, BusKeys::KEYS]);
+    let CanKeys { adapter, bitrate, protocol } = CanKeys::values(&table);
+    check_bitrate(&table, adapter, bitrate);
+    let protocol = if protocol == Some(true) {
+        let mut damiao = damiao(&table)?;
+        damiao.effector = effector::read(entry, &damiao, programs).map(Box::new);
+        CanProtocol::Damiao(damiao)
+    } else {
+        // An unknown word has been reported; the intended protocol is unknown.
+        if protocol.is_some() || !table.has("protocol") {
+            no_motors(&table);
+        }
+        effector::refuse(entry);
+        CanProtocol::Raw
+    };
+    Some((NodeSpec::Can(CanSpec { adapter, bitrate, protocol }), None))
+}
+
+fn no_motors(table: &Section<'_>) {
+    let of_motors = std::iter::once("motors").chain(BusKeys::KEYS.iter().map(|key| key.name));
+    if let Some(key) = of_motors.into_iter().find(|key| table.has(key)) {
+        let message = format!("a bus whose frames are recorded as they are has no {key}");
+        table.report(key, message, "write protocol = \"damiao\" for a bus of motors, or remove it");
+    }
+}
+
+fn check_bitrate(table: &Section<'_>, adapter: CanAdapter, bitrate: u32) {
+    let (message, fix) = match adapter {
+        CanAdapter::Slcan if !SLCAN_BITRATES.contains(&bitrate) => {
+            let known: Vec<String> = SLCAN_BITRATES.iter().map(ToString::to_string).collect();
+            (format!("slcan has no name for {bitrate} bits a second"), format!("write one of: {}", known.join(", ")))
+        }
+        CanAdapter::Damiao if bitrate != 1_000_000 => (
+            "rapid does not set the bit rate of Damiao's adapter".to_owned(),
+            "remove bitrate; the adapter is set up with its maker's program, and its motors talk at 1000000".to_owned(),
+        ),
+        _ => return,
+    };
+    table.report("bitrate", message, fix);
+}
 
 /// Reads the keys of `protocol = "damiao"`; `None` if a problem with them was reported.
-pub(super) fn damiao(table: &Section<'_>) -> Option<DamiaoSpec> {
-    let (ms, second) = (Duration::from_millis, Duration::from_secs);
-    let hz = table.integer("hz", 10..=1000).unwrap_or(200);
-    let deadman = table.duration("deadman", ms(1)..=second(10));
-    let two = second(1) * DEADMAN_PERIODS / hz;
+fn damiao(table: &Section<'_>) -> Option<DamiaoSpec> {
+    let BusKeys { hz, deadman, disable_after, timeout, silent_after } = BusKeys::values(table);
+    let second = Duration::from_secs(1);
+    let two = second * DEADMAN_PERIODS / hz;
     if let Some(short) = deadman.filter(|deadman| *deadman < two) {
         let message = format!("deadman = {short:?} is less than {DEADMAN_PERIODS} commands at {hz} Hz take");
         let least = two.as_micros().div_ceil(1000);
         let fix = format!("write deadman = \"{least}ms\" or more, or remove it for twice the time between actions");
         table.report("deadman", message, fix);
     }
-    let disable_after = or_never(table, "disable_after", ms(10), None);
-    let silent_after = table.duration("silent_after", ms(1)..=second(10));
-    let least = second(1) * TIMEOUT_PERIODS / hz;
-    let timeout = table.duration("timeout", ms(1)..=second(10));
+    let least = second * TIMEOUT_PERIODS / hz;
     if let Some(short) = timeout.filter(|timeout| *timeout < least) {
         let message = format!("timeout = {short:?} is less than {TIMEOUT_PERIODS} commands at {hz} Hz take");
         table.report("timeout", message, format!("write timeout = \"{}ms\" or more", least.as_millis() + 1));
     }
-    let motors = motors(table);
-    Some(DamiaoSpec {
-        motors: motors?,
-        hz,
-        deadman,
-        disable_after,
-        timeout: timeout.unwrap_or(ms(100).max(least)),
-        silent_after: silent_after.unwrap_or(ms(40)),
-        effector: None,
-    })
+    let timeout = timeout.unwrap_or(Duration::from_millis(100).max(least));
+    let motors = motors(table)?;
+    Some(DamiaoSpec { motors, hz, deadman, disable_after, timeout, silent_after, effector: None })
 }
 
 /// Warns of motors that continue for long without commands.
-pub(super) fn warn_of_slow_stop(devices: &[(Section<'_>, DeviceSpec)]) {
+pub(crate) fn warn_of_slow_stop(devices: &[(Section<'_>, DeviceSpec)]) {
     for (section, device) in devices {
         let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { continue };
         if motors.timeout <= LONG_TIMEOUT {
@@ -107,8 +218,8 @@ fn motors(table: &Section<'_>) -> Option<Vec<MotorSpec>> {
     }
     let listed = table.field("motors")?.get_ref().as_array().map(|list| list.len());
     let entries = table.tables("motors")?;
-    if let Some(count) = listed.filter(|count| !(1..=MOST).contains(count)) {
-        return table.refuse("motors", format!("{count} motors"), format!("list 1 to {MOST} motors"));
+    if let Some(count) = listed.filter(|count| !(1..=MAX_MOTORS).contains(count)) {
+        return table.refuse("motors", format!("{count} motors"), format!("list 1 to {MAX_MOTORS} motors"));
     }
     if listed != Some(entries.len()) {
         return None;
@@ -120,44 +231,28 @@ fn motors(table: &Section<'_>) -> Option<Vec<MotorSpec>> {
 }
 
 fn motor(entry: &Section<'_>) -> Option<MotorSpec> {
-    entry.allow(&[&KEYS[..], &MOUNTING_KEYS, &MOTION_KEYS, &FAULT_KEYS, &TEMPERATURE_KEYS].concat());
-    let name = name(entry);
-    // 0x100 and more are the ids of commands in other modes.
-    let slave: Option<u16> = entry.integer("slave", 1..=0xff);
-    let master = entry.integer("master", 0..=0x7ff);
-    let kind = kind(entry);
+    entry.known(MOTOR_KEYS);
+    let keys = MotorKeys::values(entry);
     entry.need("slave", "write slave = the motor's CAN id, 1 to 255");
     entry.need("position", "write position = [lowest, highest] in rad, as far as the joint may go");
-    let (most_speed, most_torque) = kind.map_or((1000.0, 1000.0), |kind| {
-        let [_, velocity, torque] = kind.shipped();
-        (velocity, torque)
-    });
-    let velocity = above_zero(entry, "velocity", most_speed).unwrap_or(SPEED.min(most_speed));
-    let torque = above_zero(entry, "torque", most_torque).unwrap_or(TORQUE_SHARE * most_torque);
-    let mode = mode(entry);
-    let position = position(entry, mode);
-    let mounting = mounting(entry, kind, position);
-    // A position can change no faster than the motor turns; a speed within a hundredth of a second.
-    let most_slew = if mode == Some(MotorMode::Velocity) { 100.0 * most_speed } else { most_speed };
-    // To its highest speed within a tenth of a second.
-    let default_slew = if mode == Some(MotorMode::Velocity) { 10.0 * velocity } else { velocity };
-    let slew = above_zero(entry, "slew", most_slew).unwrap_or(default_slew);
-    let motion = motion(entry, slew, mode);
-    let (watch, stop, brake) = (watch(entry), stop(entry, mode), brake(entry));
-    let [max_mos, max_rotor] = TEMPERATURE_KEYS.map(|key| entry.number(key, 20.0..=150.0).unwrap_or(TEMPERATURE));
-    let slave = slave?;
-    let mode = mode?;
+    let mode = mode(entry, &keys);
+    let position = position(entry, keys.position, mode);
+    let mounting = mounting(entry, keys.kind, position);
+    let motion = motion(entry, keys.slew, mode);
+    let (watch, stop, brake) = (WatchSpec::values(entry), stop(entry, mode), brake(entry));
+    let HeatKeys { max_mos, max_rotor } = HeatKeys::values(entry);
+    let slave = keys.slave?;
     Some(MotorSpec {
-        name: name?,
+        name: keys.name?,
         slave,
-        master: if entry.has("master") { master? } else { slave + MASTER_OFFSET },
-        kind: kind?,
-        mode,
+        master: if entry.has("master") { keys.master? } else { slave + MASTER_OFFSET },
+        kind: keys.kind?,
+        mode: mode?,
         mounting,
         position: position?,
-        velocity,
-        torque,
-        slew,
+        velocity: keys.velocity,
+        torque: keys.torque,
+        slew: keys.slew,
         motion,
         watch,
         stop,
@@ -167,35 +262,40 @@ fn motor(entry: &Section<'_>) -> Option<MotorSpec> {
     })
 }
 
-fn name(entry: &Section<'_>) -> Option<String> {
-    if !entry.has("name") {
-        entry.missing("name", "write name = what its axis is called, for example name = \"gripper\"");
-        return None;
-    }
-    let name = entry.text("name")?;
+fn name(entry: &Section<'_>, key: &str) -> Option<String> {
+    let name = entry.text(key)?;
     let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
     if name.is_empty() || name.len() > 64 || !name.chars().all(legal) {
         let fix = "use letters, digits, `_`, `-` and `.`, at most 64";
-        return entry.refuse("name", format!("{name:?} cannot be a motor's name"), fix);
+        return entry.refuse(key, format!("{name:?} cannot be a motor's name"), fix);
     }
     Some(name.to_owned())
 }
 
-fn kind(entry: &Section<'_>) -> Option<MotorKind> {
-    let known: Vec<&str> = MotorKind::ALL.iter().map(|kind| kind.name()).collect();
-    if !entry.has("type") {
-        entry.missing("type", &format!("write type = one of {}", known.join(", ")));
-        return None;
-    }
-    let text = entry.text("type")?;
-    MotorKind::named(text)
-        .or_else(|| entry.refuse("type", format!("unknown type {text:?}"), did_you_mean(text, &known, "write one of")))
+fn kinds() -> String {
+    MotorKind::ALL.map(MotorKind::name).join(", ")
 }
 
-fn position(entry: &Section<'_>, mode: Option<MotorMode>) -> Option<[f64; 2]> {
+/// Highest position, speed and torque of a type.
+fn shipped(kind: Option<MotorKind>) -> [f64; 3] {
+    kind.map_or([1000.0; 3], MotorKind::shipped)
+}
+
+/// A position can change no faster than the motor turns; a speed within a hundredth of a second.
+fn most_slew(mode: Option<MotorMode>, kind: Option<MotorKind>) -> f64 {
+    let [_, most_speed, _] = shipped(kind);
+    if mode == Some(MotorMode::Velocity) { 100.0 * most_speed } else { most_speed }
+}
+
+/// To its highest speed within a tenth of a second.
+fn default_slew(mode: Option<MotorMode>, velocity: f64) -> f64 {
+    if mode == Some(MotorMode::Velocity) { 10.0 * velocity } else { velocity }
+}
+
+fn position(entry: &Section<'_>, limits: Option<Vec<f64>>, mode: Option<MotorMode>) -> Option<[f64; 2]> {
     // Eight times the range of the factory settings; a wheel turns continuously.
     let farthest = if mode == Some(MotorMode::Velocity) { 1000.0 } else { 100.0 };
-    let limits = entry.numbers("position")?;
+    let limits = limits?;
     match limits.as_slice() {
         [low, high] if low.abs() <= farthest && high.abs() <= farthest && low < high => Some([*low, *high]),
         _ => {
@@ -208,8 +308,8 @@ fn position(entry: &Section<'_>, mode: Option<MotorMode>) -> Option<[f64; 2]> {
 
 /// How the motor sits on its joint, whose limits are these. What it cannot report there is a mistake.
 fn mounting(entry: &Section<'_>, kind: Option<MotorKind>, limits: Option<[f64; 2]>) -> Mounting {
-    let zero = entry.number("zero", f64::MIN..=f64::MAX).unwrap_or_default();
-    let mounting = Mounting { zero, reversed: entry.flag("reversed").unwrap_or_default() };
+    let mounting = Mounting::values(entry);
+    let zero = mounting.zero;
     let Some(kind) = kind else { return mounting };
     let [most, ..] = kind.shipped();
     let is_beyond = |position: f64| position.abs() > most;
@@ -236,17 +336,9 @@ fn mounting(entry: &Section<'_>, kind: Option<MotorKind>, limits: Option<[f64; 2
     mounting
 }
 
-/// A number above zero.
-fn above_zero(entry: &Section<'_>, key: &str, most: f64) -> Option<f64> {
-    entry.number(key, 0.001..=most)
-}
-
-fn mode(entry: &Section<'_>) -> Option<MotorMode> {
-    let zero = MotorMode::Mit { kp: 0.0, kd: 0.0 };
-    let words = [("mit", zero), ("position", MotorMode::PositionVelocity), ("velocity", MotorMode::Velocity)];
-    let mode = if entry.has("mode") { entry.choice("mode", &words)? } else { zero };
-    let gains = [("kp", 500.0), ("kd", 5.0)];
-    if mode != zero {
+fn mode(entry: &Section<'_>, keys: &MotorKeys) -> Option<MotorMode> {
+    let mode = if entry.has("mode") { keys.mode? } else { IMPEDANCE };
+    if mode != IMPEDANCE {
         // Frames of these modes have no room for any of them.
         for key in ["kp", "kd", "torque"].into_iter().filter(|key| entry.has(key)) {
             let message = format!("a motor that runs its own loop takes no {key}");
@@ -254,12 +346,11 @@ fn mode(entry: &Section<'_>) -> Option<MotorMode> {
         }
         return Some(mode);
     }
-    let [kp, kd] = gains.map(|(key, most)| {
+    for (key, most) in [("kp", 500), ("kd", 5)] {
         let fix = format!("write {key} = 0 to {most}, or mode = \"position\" or \"velocity\" for the motor's own loop");
         entry.need(key, &fix);
-        entry.number(key, 0.0..=most)
-    });
-    let (kp, kd) = (kp?, kd?);
+    }
+    let (kp, kd) = (keys.kp?, keys.kd?);
     // Position control without damping oscillates: the maker's manual forbids it. A frame has 12 bits for it.
     if kp > 0.0 && kd < KD_STEP {
         let message = if kd == 0.0 {
@@ -274,83 +365,41 @@ fn mode(entry: &Section<'_>) -> Option<MotorMode> {
 
 /// How the command of a position starts and changes.
 fn motion(entry: &Section<'_>, slew: f64, mode: Option<MotorMode>) -> MotionSpec {
-    let default = MotionSpec::of_slew(slew);
-    if mode == Some(MotorMode::Velocity) {
-        for key in MOTION_KEYS.into_iter().filter(|key| entry.has(key)) {
-            let message = format!("a commanded velocity has no {key}");
-            entry.report(key, message, format!("remove {key}; slew limits its acceleration"));
-        }
-        return default;
+    if mode != Some(MotorMode::Velocity) {
+        return MotionSpec::values(entry, slew);
     }
-    let soft_start = entry.duration("soft_start", Duration::ZERO..=Duration::from_secs(10));
-    MotionSpec {
-        acceleration: above_zero(entry, "acceleration", 100_000.0).unwrap_or(default.acceleration),
-        soft_start: soft_start.unwrap_or(default.soft_start),
-        first_target: above_zero(entry, "first_target", 200.0).unwrap_or(default.first_target),
+    for key in MOTION_KEYS.into_iter().filter(|key| entry.has(key)) {
+        let message = format!("a commanded velocity has no {key}");
+        entry.report(key, message, format!("remove {key}; slew limits its acceleration"));
     }
-}
-
-/// Which behaviour of the motor is a fault.
-fn watch(entry: &Section<'_>) -> WatchSpec {
-    let default = WatchSpec::default();
-    let half_a_second = Duration::from_millis(500);
-    WatchSpec {
-        margin: entry.number("margin", 0.0..=1.0).unwrap_or(default.margin),
-        lag: above_zero(entry, "lag", 10.0).unwrap_or(default.lag),
-        blocked_after: or_never(entry, "blocked_after", half_a_second, default.blocked_after),
-    }
+    MotionSpec::of_slew(slew)
 }
 
 /// How the motor stops at a fault, or at an emergency stop.
 fn stop(entry: &Section<'_>, mode: Option<MotorMode>) -> StopSpec {
     let has_damping = mode.is_none_or(|mode| matches!(mode, MotorMode::Mit { .. }));
-    let other_fault = if has_damping { Stop::Damp } else { Stop::Hold };
-    let default = StopSpec { other_fault, ..StopSpec::default() };
-    let choice = |key| {
-        let stop = entry.has(key).then(|| entry.choice(key, &Stop::WORDS)).flatten()?;
+    let spec = StopSpec::values(entry, if has_damping { Stop::Damp } else { Stop::Hold });
+    for (key, stop) in [("own_fault", spec.own_fault), ("other_fault", spec.other_fault), ("emergency", spec.emergency)]
+    {
         if stop == Stop::Brake && !entry.has("brake") {
             let fix = format!("write {BRAKE}, or another way to stop");
             entry.report(key, format!("{key} = \"brake\", and the motor has no brake"), fix);
         }
         if stop == Stop::Damp && !has_damping {
             let fix = "write \"hold\", which it does with all its torque, \"limp\" or \"brake\"";
-            entry.report(key, "a motor that runs its own loop cannot be damped".to_owned(), fix);
+            entry.report(key, "a motor that runs its own loop cannot be damped", fix);
         }
-        Some(stop)
-    };
-    let (own_fault, other_fault) = (choice("own_fault"), choice("other_fault"));
-    let emergency = choice("emergency");
-    StopSpec {
-        own_fault: own_fault.unwrap_or(default.own_fault),
-        other_fault: other_fault.unwrap_or(default.other_fault),
-        emergency: emergency.unwrap_or(default.emergency),
-        hold_for: or_never(entry, "hold_for", Duration::from_millis(10), default.hold_for),
     }
+    spec
 }
 
 /// The brake of the joint, if it has one.
 fn brake(entry: &Section<'_>) -> Option<BrakeSpec> {
     let table = entry.table("brake")?;
-    table.allow(&["chip", "line", "released", "engages_in", "releases_in"]);
-    let (chip, line) = gpio_line(&table);
-    if !table.has("released") {
-        let fix = "write released = \"high\" or \"low\": the level that lets the joint turn, best the one that a broken wire \
-                   does not have";
-        table.missing("released", fix);
-    }
-    let released = table.choice("released", &LEVELS);
-    let time = |key| table.duration(key, Duration::ZERO..=BrakeSpec::SLOWEST).unwrap_or(BRAKE_TIME);
-    let (engages_in, releases_in) = (time("engages_in"), time("releases_in"));
+    table.known(&BRAKE_KEYS);
+    let GpioKeys { chip, line } = GpioKeys::values(&table);
+    let BrakeKeys { released, engages_in, releases_in } = BrakeKeys::values(&table);
     Some(BrakeSpec { chip: chip?, line: line?, released_high: released?, engages_in, releases_in })
-}
-
-/// A time of `least` to an hour, or the word "never".
-fn or_never(table: &Section<'_>, key: &str, least: Duration, default: Option<Duration>) -> Option<Duration> {
-    match table.word(key) {
-        _ if !table.has(key) => default,
-        Some("never") => None,
-        _ => table.duration(key, least..=Duration::from_hours(1)),
-    }
 }
 
 /// Names and ids that two motors cannot both have. An answer with the id of a command would be interpreted as
@@ -400,7 +449,7 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)]) {
 
 /// The axes of the entry's actions. They are derived from its motors, whose limits are applied, or from the tip of their
 /// arm: an additional table would have no effect.
-pub(super) fn axes(damiao: &DamiaoSpec, section: &Section<'_>) -> ActionSpec {
+pub(crate) fn axes(damiao: &DamiaoSpec, section: &Section<'_>) -> ActionSpec {
     if section.has("action") {
         let message = format!("motors take no table [{}]: their axes follow from them", section.child("action"));
         let fix = format!(

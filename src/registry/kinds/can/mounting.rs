@@ -8,13 +8,17 @@
 //! Invariant: without a zero and not reversed, every number is the same, bit for bit.
 //! Invariant: limits in order stay in order, and a position within them stays within them.
 
-/// See the module's comment: joint = (motor - `zero`), of the other sign if `reversed`.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Mounting {
-    /// What the motor reports at the zero of its joint, rad; finite.
-    pub zero: f64,
-    /// The motor turns against its joint.
-    pub reversed: bool,
+use crate::keys::{FLAG, Real, keys};
+
+keys! {
+    /// See the module's comment: joint = (motor - `zero`), of the other sign if `reversed`.
+    #[derive(Debug, Clone, Copy, PartialEq, Default)]
+    pub struct Mounting {
+        /// What the motor reports at the zero of its joint, rad.
+        zero: f64 = Real::ANY, or 0.0;
+        /// The motor turns against its joint.
+        reversed: bool = FLAG, or false;
+    }
 }
 
 impl Mounting {
