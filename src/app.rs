@@ -253,7 +253,7 @@ async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running
     let web = options.web.as_ref().map(|options| web::start(options, &board, &to_conductor)).transpose()?;
     let (shown, made) = Shown::channel();
     let mut config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
-    let (stop_states, stops) = interlocks::states(&registry);
+    let (stop_states, stops) = rapid_status::stops::states(&registry);
     (config.shown, config.stops) = (listening.is_some().then_some(shown), stops);
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let (following, to_recorder, clock) = (recorder.episode(), recorder.additions(), recorder.clock());

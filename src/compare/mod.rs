@@ -16,14 +16,14 @@ mod tests;
 
 use std::path::Path;
 
+use rapid_episode::ReadError;
+use rapid_registry::Registry;
 use serde::Serialize;
 
 use self::again::Wanted;
 pub use self::again::{Again, ChunkInputs};
 pub use self::beside::Beside;
 pub use self::difference::{AxisDifference, Difference, Spread};
-use rapid_episode::ReadError;
-use rapid_registry::Registry;
 
 use self::survey::Survey;
 use crate::policy::bundle::{Bundle, BundleErrors};

@@ -1,7 +1,7 @@
 //! Emergency stops and enabling switches: what follows from their inputs.
 //!
 //! The inputs are read by the threads of [`crate::inputs`]. The state of an input goes to the run's [`Permission`], which
-//! gives the orders, then to [`States`], from which an episode takes those of its beginning, and to the board.
+//! gives the orders, then to [`rapid_status::stops`], from which an episode takes those of its beginning, and to the board.
 //!
 //! Invariant: the order is given before anything is shown or logged.
 //! Invariant: an input that is lost does not run.
@@ -19,14 +19,6 @@ use tokio::sync::watch;
 
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
-
-/// The inputs of a rig in the order of the registry, each as it was reported last.
-pub type States = watch::Receiver<Vec<StopStatus>>;
-
-/// Where the states of the inputs of `registry` are put, and read.
-pub fn states(registry: &Registry) -> (watch::Sender<Vec<StopStatus>>, States) {
-    watch::channel(StopStatus::unreported(registry))
-}
 
 /// The stops of a registry, none of which runs.
 pub fn of(registry: &Registry) -> Interlocks {

@@ -47,7 +47,7 @@ fn run(stops: &str) -> Run {
     let permission = Arc::new(Permission::new(false).with_interlocks(of(&registry)));
     let attended = permission.attend();
     let events = board.events();
-    let reported = states(&registry).0;
+    let reported = rapid_status::stops::states(&registry).0;
     let watched = Watched::begin(&registry, &permission, &reported, &board).unwrap();
     Run { permission, attended, board, events, watched, reported }
 }

@@ -4,8 +4,9 @@
 //!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
 
-use crate::jpeg::{DecodeError, Decoder};
 use rapid_core::sample::Encoding;
+
+use crate::jpeg::{DecodeError, Decoder};
 
 /// Values of a pixel.
 pub const CHANNELS: usize = 3;

@@ -21,6 +21,7 @@ use hdrhistogram::Histogram;
 use rapid_bus::{Inbox, Writer};
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_episode::ReferenceSample;
 use rapid_registry::Registry;
 use rapid_status::{Board, Hold, Level, PolicyEnd, PolicyStatus, What};
 use rapid_system::fault;
@@ -31,7 +32,6 @@ use super::horizon::{Counts, WithoutMask};
 use super::model::Model;
 use super::pilot::{FIRST_TICK_AFTER, Pilot};
 use super::request::{Cell, Request};
-use crate::episode::ReferenceSample;
 
 /// Nice value of the computing thread; all others have 0.
 const NICE: i32 = 5;

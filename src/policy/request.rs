@@ -7,11 +7,11 @@
 use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_episode::ReferenceSample;
 use rapid_status::{Chunk, ObservedSamples, What};
 
 use super::bundle::{Bundle, ObservationSpec};
 use super::horizon::ChunkError;
-use crate::episode::ReferenceSample;
 
 /// The samples of the steps of each observation, and what was present at the last of them.
 #[derive(Debug, Clone, Default)]

@@ -16,6 +16,7 @@ pub mod palette;
 pub mod preview;
 pub mod rates;
 pub mod session;
+pub mod stops;
 
 #[cfg(test)]
 extern crate self as rapid_status;

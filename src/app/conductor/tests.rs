@@ -14,7 +14,7 @@ use super::super::Signals;
 use super::super::buttons::Buttons;
 use super::super::streaming::Streaming;
 use super::*;
-use crate::interlocks::{self, Watched};
+use crate::interlocks::Watched;
 use crate::patience::PATIENCE;
 use crate::session::journal::Plan;
 
@@ -106,7 +106,7 @@ impl Bench {
             watched: Watched::begin(
                 &Registry::builtin(),
                 &Arc::default(),
-                &interlocks::states(&Registry::builtin()).0,
+                &rapid_status::stops::states(&Registry::builtin()).0,
                 &board,
             )
             .unwrap(),

@@ -1,9 +1,10 @@
 use std::io::Write as _;
 
-use crate::recorded::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
-use proptest::prelude::*;
 use rapid_core::mask::PhysicalMask;
 use rapid_registry::scenario::ScenarioAction;
+
+use crate::recorded::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
+use proptest::prelude::*;
 
 use super::*;
 use crate::effort::{cases, every};

@@ -26,6 +26,7 @@ use rapid_bus::{Foreign, Inbox, Queues, Subscription, TopicId};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{ClockWatch, Stamp, WallClock};
 use rapid_registry::Registry;
+use rapid_status::stops::{self, States};
 use rapid_status::{Board, Episode, EpisodeReport, EpisodeWatch, Event, Level, RecordingStatus, What};
 use rapid_system::disk::Disk;
 use rapid_system::fault;
@@ -42,7 +43,6 @@ use super::space::{Asker, Finding, Space};
 use super::streams::Streams;
 use crate::ReferenceSample;
 use crate::chunk_writer::Sink;
-use crate::interlocks::{self, States};
 use crate::made::Shown;
 use crate::partial::PARTIAL;
 
@@ -139,7 +139,7 @@ impl RecorderConfig {
     /// Episodes of `registry`, reported on `board`, written to their files; its stops have not reported.
     pub fn new(registry: Arc<Registry>, board: Arc<Board>) -> Self {
         Self {
-            stops: interlocks::states(&registry).1,
+            stops: stops::states(&registry).1,
             registry,
             board,
             sink: Box::new(|file| Box::new(file)),

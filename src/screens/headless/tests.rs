@@ -1,11 +1,12 @@
 use std::sync::Mutex;
 
-use crate::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use rapid_core::interlock::{InputState, StopKind};
 use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_core::provenance::{KernelDriver, Negotiated, UnplugSource};
 use rapid_core::sample::Epoch;
 use rapid_registry::device::UsbIdentity;
+
+use crate::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use rapid_status::{
     Chunk, EpisodeReport, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState,
     StopStatus, Verdict, What,

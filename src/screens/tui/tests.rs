@@ -3,12 +3,13 @@ mod policy;
 
 use std::time::Duration;
 
-use crate::literal::{TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming};
-use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
-use insta::assert_snapshot;
 use rapid_core::interlock::{InputState, StopKind};
 use rapid_core::time::Stamp;
 use rapid_status::session::{EpisodeEntry, Label, Phase, SessionRequest, SessionStatus};
+
+use crate::literal::{TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming};
+use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+use insta::assert_snapshot;
 use rapid_status::{
     Finding, Grade, Level, Outlook, RecordingStatus, Sensors, SlotState, Snapshot, StopStatus, Verdict,
 };

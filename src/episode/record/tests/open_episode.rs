@@ -9,7 +9,7 @@ use super::super::open_episode::{Beginning, OpenEpisode};
 use super::super::provenance::Attached;
 use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
-use crate::episode::ReferenceSample;
+use crate::ReferenceSample;
 
 /// An open episode of its own clock, one second after the monotonic clock's zero.
 fn open(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> OpenEpisode {

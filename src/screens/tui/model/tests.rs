@@ -1,8 +1,9 @@
-use crate::literal::{TAKEN, every_state, id, line, recording, three_streaming};
-use crossterm::event::KeyCode;
 use rapid_core::mask::PhysicalMask;
 use rapid_status::session::{Answered, EpisodeEntry, Label, SessionRequest, SessionStatus};
 use rapid_status::{Grade, Level, UnregisteredDevice};
+
+use crate::literal::{TAKEN, every_state, id, line, recording, three_streaming};
+use crossterm::event::KeyCode;
 
 use super::*;
 

@@ -1,10 +1,11 @@
 //! The pages, and the column beside the rig.
 
-use crate::literal::id;
 use rapid_core::sample::Encoding;
 use rapid_status::detail::{Channel, DeviceDetail, Intervals};
 use rapid_status::preview::Preview;
 use rapid_status::session::Mark;
+
+use crate::literal::id;
 
 use super::*;
 

@@ -1,7 +1,8 @@
 //! The policy panel: acting, holding, dry, and with more content than fits.
 
-use crate::literal::policy;
 use rapid_status::{Hold, PolicyStatus};
+
+use crate::literal::policy;
 
 use super::*;
 
