@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::sync::mpsc::Sender;
 
 use rapid_bus::Bus;
+use rapid_episode::ReferenceSample;
 use rapid_registry::Registry;
 use rapid_status::{Board, EpisodeWatch};
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
 use super::stage::Stage;
-use crate::episode::ReferenceSample;
 use crate::rig::presence::Published;
 
 /// No policy can be given.
