@@ -166,6 +166,20 @@ fn kinds(name: &str) -> Vec<(String, PathBuf)> {
     kinds
 }
 
+/// A file of this kind that a killed process left behind. Any start of a program on this machine removes such files, also
+/// while they are being looked for: then another process is killed.
+fn left_behind(name: &str, kind: &str) -> PathBuf {
+    const ATTEMPTS: usize = 20;
+    let found = (0..ATTEMPTS).find_map(|_| {
+        let found = kinds(name).into_iter().find(|(found, _)| found == kind);
+        if found.is_none() {
+            killed(name);
+        }
+        found
+    });
+    found.unwrap_or_else(|| panic!("{ATTEMPTS} killed processes left no {kind} behind")).1
+}
+
 /// Serialises the tests: one would clear what another left behind for dead processes.
 fn alone() -> std::sync::MutexGuard<'static, ()> {
     static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
@@ -183,10 +197,7 @@ fn files_of_killed_processes_are_removed_in_every_state_of_damage() {
     }
     for (kind, _) in &all {
         for damage in Damage::ALL {
-            if files(&name).is_empty() {
-                killed(&name);
-            }
-            let (_, path) = kinds(&name).into_iter().find(|(found, _)| found == kind).unwrap();
+            let path = left_behind(&name, kind);
             damage.apply(&path);
             let opened = Home::open(Some(&name), 0);
             assert!(opened.is_ok(), "{kind} {damage:?}: {:?}", opened.err());
