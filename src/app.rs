@@ -23,13 +23,16 @@ mod free_space;
 mod inference;
 #[cfg_attr(not(feature = "foxglove"), path = "app/live_absent.rs")]
 mod live;
+mod recording;
 mod reload;
 mod requests;
 mod screen;
 mod settling;
 pub(crate) mod signals;
 mod stage;
+mod start;
 mod streaming;
+mod synchronisation;
 mod trials;
 mod watchdog;
 #[cfg_attr(not(feature = "web"), path = "app/web_absent.rs")]
@@ -47,39 +50,32 @@ use rapid_core::interlock::Interlocks;
 use rapid_core::mask::MASK_PATH;
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
-use rapid_episode::made::Shown;
-use rapid_episode::record::{EpisodeRequest, RecorderConfig};
+use rapid_episode::record::EpisodeRequest;
 use rapid_episode::recover::Repairs;
 use rapid_registry::Registry;
 use rapid_registry::scenario::Scenario;
-use rapid_registry::simulation::SimSource;
 use rapid_screens::logging::{self, Stderr};
 use rapid_screens::tui::ScreenOptions;
 use rapid_status::Board;
-use rapid_system::fault;
 use rapid_system::panics;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
-use crate::alignment::Alignment;
 use crate::interlocks::{self, Watched};
 use crate::orders::receive::{Arrival, Orders};
-use crate::rig::Rig;
 use crate::rig::presence::{Claim, Presence};
 use crate::session::journal::Plan;
-use attached::Attached;
 use buttons::Buttons;
-use collection::Collection;
 use conductor::Conductor;
 pub use error::AppError;
 pub use inference::PolicyOptions;
 pub use live::LiveOptions;
-use reload::Reload;
 use requests::Request;
 use signals::Signals;
 use stage::Stage;
+use start::Machine;
 use streaming::Streaming;
 use watchdog::Watchdog;
 pub use web::WebOptions;
@@ -147,14 +143,6 @@ pub struct Options {
     pub web: Option<WebOptions>,
 }
 
-impl Options {
-    /// Whether the run is for one episode, and not for a session of several.
-    const fn is_single(&self) -> bool {
-        let Plan { goal, episode_time, reset_time, .. } = &self.plan;
-        goal.is_none() && episode_time.is_none() && reset_time.is_none()
-    }
-}
-
 /// Where the mask of an instance is published.
 pub fn mask_path(instance: Option<&str>) -> PathBuf {
     match instance {
@@ -178,7 +166,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     }
     raise_open_files();
     // Before anything that can fail on a full or damaged machine.
-    let (permission, _orders, arrivals) = receive_orders(&options, interlocks::of(&registry))?;
+    let Received { permission, orders: _orders, arrivals } = receive_orders(&options, interlocks::of(&registry))?;
     let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
 
     rapid_bus::check_memory()?;
@@ -197,7 +185,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let reserve = registry.rig.disk_reserve;
     let machine = Machine { registry, board: Arc::clone(&board), permission, signals, presence, arrivals };
     let watchman = bus.watchman();
-    let (mut running, mut conductor) = start(machine, &bus, options).await?;
+    let (mut running, mut conductor) = start::start(machine, &bus, options).await?;
     // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
     // earlier one left unfinished.
     let _repairs = may_record.then(|| {
@@ -231,165 +219,18 @@ fn raise_open_files() {
     let _ = setrlimit(Resource::Nofile, Rlimit { current, ..limit });
 }
 
-/// What the stages of a run share.
-struct Machine {
-    registry: Arc<Registry>,
-    board: Arc<Board>,
+/// What other programs and signals have to say.
+struct Received {
     permission: Arc<Permission>,
-    signals: Signals,
-    presence: Presence,
-    /// Requests of other programs, and their screens.
+    /// Ends when this is dropped.
+    orders: Orders,
+    /// Requests to the session, and screens.
     arrivals: mpsc::Receiver<Arrival>,
-}
-
-/// Starts the stages and the screen. The bus must outlive them.
-async fn start(machine: Machine, bus: &Bus, options: Options) -> Result<(Running, Conductor), AppError> {
-    let Machine { registry, board, permission, signals, presence, arrivals } = machine;
-    let (to_conductor, requests) = mpsc::unbounded_channel();
-    let listening = match options.live {
-        Some(live) => Some(live::listen(live, &registry, &board, &permission, &to_conductor).await?),
-        None => None,
-    };
-    let web = options.web.as_ref().map(|options| web::start(options, &board, &to_conductor)).transpose()?;
-    let (shown, made) = Shown::channel();
-    let mut config = RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board));
-    let (stop_states, stops) = rapid_status::stops::states(&registry);
-    (config.shown, config.stops) = (listening.is_some().then_some(shown), stops);
-    let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
-    let (following, to_recorder, clock) = (recorder.episode(), recorder.additions(), recorder.clock());
-    let (references, mask) = (recorder.references(), presence.published());
-    let is_single = options.is_single();
-    // Ending by itself after some time is the run's, unless it has several episodes.
-    let duration = options.plan.episode_time.or(options.duration.filter(|_| is_single));
-    let is_kept = !(is_single && options.record && options.screen != Screen::Monitor);
-    let episode = EpisodeRequest { duration, ..options.episode };
-    let (modules, mountable) = watch::channel(registry.modules.clone());
-    let collection = Collection::new(recorder, episode, options.plan, is_kept, (&board, mountable))?;
-    let kind = options.screen;
-    let ((to_scenario, replugs), (to_discovery, added)) = (mpsc::unbounded_channel(), mpsc::unbounded_channel());
-    let (to_alignment, to_align) = mpsc::unbounded_channel();
-    let (trials, loaded) = (simulated(&options.devices, &board), until_loaded(options.policy.is_some()));
-    let others = || {
-        // Before the screen: errors up to here appear on an ordinary terminal.
-        let alignment = alignment(&registry, bus, &board)?.extended_by(to_align);
-        let (discovery, plugged) = discovery::start(options.devices, &registry, replugs, added, loaded.clone())?;
-        // The inputs report their first state at once.
-        let events = board.events();
-        // Until the very end: a device that is being closed may still move.
-        let watched = Watched::begin(&registry, &permission, &stop_states, &board).map_err(AppError::Interlocks)?;
-        let (commands, from_screen) = mpsc::channel(16);
-        let attached = Attached::new(Arc::clone(&board), commands.clone());
-        let screen = screen::start(kind, &board, events, commands, &permission, options.duration, options.shown);
-        let (registry, board, loaded) = (&registry, &board, &loaded);
-        let episode = options.record.then(|| following.clone());
-        let surroundings = inference::Surroundings { registry, bus, board, loaded, references, mask, episode };
-        let inference = options.policy.map(|policy| inference::start(policy, surroundings)).transpose()?;
-        let live = listening.map(|listening| listening.start(bus, board, (clock, made))).transpose()?;
-        Ok((discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live))
-    };
-    let (discovery, plugged, watched, (from_screen, attached), screen, inference, alignment, live) = match others() {
-        Ok(others) => others,
-        Err(error) => {
-            // The recorder's thread releases the bus before the bus is dropped: no files of it remain.
-            drop(collection);
-            let _ = recording.end().await;
-            return Err(error);
-        }
-    };
-    let (to_rig, rig_commands) = mpsc::channel(16);
-    let (live, to_live) = live.unzip();
-    let buttons = Buttons::begin(&registry, &permission, &board, &to_conductor);
-    let (to_registry, about_registry) = mpsc::unbounded_channel();
-    let reload = Reload {
-        registry: Arc::clone(&registry),
-        bus: bus.membership(),
-        board: Arc::clone(&board),
-        rig: to_rig.clone(),
-        discovery: to_discovery,
-        recorder: to_recorder,
-        episode: following.clone(),
-        alignment: to_alignment,
-        live: to_live,
-        modules,
-        topics: Vec::new(),
-    };
-    requests::sorted(to_conductor, from_screen, (arrivals, attached), to_rig, to_registry, to_scenario);
-    let mask_ended = presence.ended();
-    let rig = Rig::new(&registry, bus, presence, Arc::clone(&board)).following(following);
-    let taps = [watched.taps(), buttons.taps()].concat();
-    let streaming = Streaming::start(rig.obeying(&permission).tapped(&taps), plugged, rig_commands);
-    let conductor = Conductor {
-        board,
-        collection,
-        record: options.record,
-        is_single,
-        duration: options.duration,
-        begin_episode: options.record,
-        loaded,
-    };
-    let running = Running {
-        permission,
-        watched,
-        buttons,
-        discovery,
-        streaming,
-        synchronisation: synchronise(alignment),
-        recording,
-        inference,
-        live,
-        web,
-        trials,
-        reload: reload.start(about_registry),
-        mask_ended,
-        kind,
-        screen,
-        signals,
-        requests,
-    };
-    Ok((running, conductor))
-}
-
-/// Cancelled when the policy is loaded; at once if there is none.
-fn until_loaded(has_policy: bool) -> CancellationToken {
-    let loaded = CancellationToken::new();
-    if !has_policy {
-        loaded.cancel();
-    }
-    loaded
-}
-
-/// What a run of simulated devices has besides: the board has it, and the trials of the task are reported.
-fn simulated(devices: &Devices, board: &Arc<Board>) -> Option<Stage> {
-    let Devices::Simulated(scenario) = devices else { return None };
-    board.set_simulated();
-    let trial = scenario.devices.iter().find_map(|device| match &device.source {
-        SimSource::Task { trial, .. } => Some(trial.clone()),
-        _ => None,
-    });
-    Some(trials::start(trial?, Arc::clone(board)))
-}
-
-fn alignment(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Result<Alignment, AppError> {
-    let Some(writer) = bus.writer(TopicId::Observation) else { return Err(AppError::Panicked("the bus")) };
-    Ok(Alignment::new(registry, bus.queues()?, writer, Arc::clone(board)))
-}
-
-/// Starts the stage synchronisation.
-fn synchronise(alignment: Alignment) -> Stage {
-    Stage::start("the synchronisation", |stop| async move {
-        tokio::select! {
-            _ = alignment.run(stop) => Ok(()),
-            never = fault::strike("sync") => never,
-        }
-    })
 }
 
 /// Receives orders of other programs to arm and disarm motors, and their requests to the session; and disarms motors at
 /// a signal, regardless of what else the run waits for.
-fn receive_orders(
-    options: &Options,
-    interlocks: Interlocks,
-) -> Result<(Arc<Permission>, Orders, mpsc::Receiver<Arrival>), AppError> {
+fn receive_orders(options: &Options, interlocks: Interlocks) -> Result<Received, AppError> {
     let permission = Arc::new(Permission::new(options.arm).with_interlocks(interlocks));
     let (run, arrivals) = mpsc::channel(16);
     let group = options.group_control.then(|| rustix::process::getegid().as_raw());
@@ -404,7 +245,7 @@ fn receive_orders(
             }
         }
     });
-    Ok((permission, orders, arrivals))
+    Ok(Received { permission, orders, arrivals })
 }
 
 /// The screen has limits for a reader that does not read. This one is for a screen that is stuck: crossterm 0.29 reads

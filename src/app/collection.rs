@@ -120,7 +120,8 @@ impl Collection {
         episode: EpisodeRequest,
         plan: Plan,
         is_kept: bool,
-        (board, mountable): (&Arc<Board>, watch::Receiver<Vec<ModuleSpec>>),
+        board: &Arc<Board>,
+        mountable: watch::Receiver<Vec<ModuleSpec>>,
     ) -> Result<Self, AppError> {
         let (journal, before, error) = Journal::open(&episode.out);
         if let Some(error) = error {

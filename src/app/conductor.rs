@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
-use rapid_episode::record::{RecordError, Recorder, RecorderConfig, Source};
+use rapid_episode::record::RecordError;
 use rapid_status::{Board, DeviceStatus, EpisodeReport, Level, SlotState, What};
 use rapid_system::fault;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
@@ -17,7 +17,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::collection::Collection;
 use super::settling::has_settled;
-use super::stage::{Stage, join};
+use super::stage::Stage;
 use super::{AppError, Request, Running, Screen};
 
 /// Interval at which devices that are still opening are looked for.
@@ -203,23 +203,6 @@ async fn policy_ended(inference: &mut Option<Stage>) -> Result<(), AppError> {
         Some(inference) => inference.outcome().await,
         None => std::future::pending().await,
     }
-}
-
-/// Starts stage recording: the thread that writes episodes. It ends when the recorder is dropped.
-///
-/// # Errors
-/// When the system provides no thread.
-pub(super) fn record(source: impl Source + 'static, config: RecorderConfig) -> Result<(Stage, Recorder), AppError> {
-    let mut recorder = Recorder::spawn(source, config)?;
-    let (ended, thread) = (recorder.thread_ended(), recorder.hand_over());
-    let stage = Stage::start("the recorder", |_| async move {
-        ended.cancelled().await;
-        match thread {
-            Some(thread) => join(thread, "thread `writer`").await,
-            None => Ok(()),
-        }
-    });
-    Ok((stage, recorder))
 }
 
 #[cfg(test)]

@@ -26,19 +26,25 @@ const UDEV: &str = "/run/udev/control";
 /// Events that may wait for the rig, which takes them immediately.
 const DEPTH: usize = 64;
 
-/// Starts to watch; also returns the stream for the rig, which ends when the stage does. `requests` name simulated
-/// devices that are to be unplugged, or plugged in again; `added` are entries that the run takes over. A scenario begins once
-/// `loaded` is cancelled: how long a policy takes to load depends on the machine, and what happens to its sensors must not.
+/// The stage, and what the other stages need of it.
+pub(super) struct Discovery {
+    pub(super) stage: Stage,
+    /// What was plugged in and unplugged, for the rig. It ends when the stage does.
+    pub(super) plugged: HotplugStream,
+    /// Receives the names of simulated devices that are to be unplugged, or plugged in again.
+    pub(super) replugs: mpsc::UnboundedSender<String>,
+    /// Receives the entries that the run takes over.
+    pub(super) additions: mpsc::UnboundedSender<Vec<Arc<DeviceSpec>>>,
+}
+
+/// Starts to watch. A scenario begins once `loaded` is cancelled: how long a policy takes to load depends on the machine, and
+/// what happens to its sensors must not.
 ///
 /// # Errors
 /// When plug events of this machine cannot be received.
-pub(super) fn start(
-    devices: Devices,
-    registry: &Registry,
-    requests: mpsc::UnboundedReceiver<String>,
-    mut added: mpsc::UnboundedReceiver<Vec<Arc<DeviceSpec>>>,
-    loaded: CancellationToken,
-) -> Result<(Stage, HotplugStream), AppError> {
+pub(super) fn start(devices: Devices, registry: &Registry, loaded: CancellationToken) -> Result<Discovery, AppError> {
+    let (replugs, requests) = mpsc::unbounded_channel();
+    let (additions, mut added) = mpsc::unbounded_channel::<Vec<Arc<DeviceSpec>>>();
     let (is_real, cooldown) = (matches!(devices, Devices::Machine), registry.rig.cooldown);
     let mut source = open(devices, registry, requests, loaded)?;
     let (events, to_rig) = mpsc::channel(DEPTH);
@@ -62,7 +68,7 @@ pub(super) fn start(
         }
     });
     let received = futures::stream::unfold(to_rig, |mut to_rig| async { Some((to_rig.recv().await?, to_rig)) });
-    Ok((stage, Box::pin(received)))
+    Ok(Discovery { stage, plugged: Box::pin(received), replugs, additions })
 }
 
 fn open(

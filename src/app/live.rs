@@ -4,6 +4,7 @@
 
 use std::sync::{Arc, mpsc};
 
+use rapid_episode::made::Shown;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::watch;
 
@@ -31,32 +32,42 @@ pub(super) async fn listen(
     conductor: &UnboundedSender<Request>,
 ) -> Result<Listening, AppError> {
     let controls = options.control.then(|| Controls { ask: asker(conductor), permission: Arc::clone(permission) });
-    Ok(Listening(Live::listen(options, Arc::clone(registry), Arc::clone(board), controls).await?))
+    let live = Live::listen(options, Arc::clone(registry), Arc::clone(board), controls).await?;
+    let (shown, made) = Shown::channel();
+    Ok(Listening { live, made, shown })
 }
 
 /// A server that shows nothing yet.
 #[derive(Debug)]
-pub(super) struct Listening(Live);
+pub(super) struct Listening {
+    live: Live,
+    made: mpsc::Receiver<Made>,
+    /// Receives what the recorder writes besides samples.
+    pub(super) shown: Shown,
+}
+
+/// The stage, and what the other stages need of it.
+#[derive(Debug)]
+pub(super) struct Served {
+    pub(super) stage: Stage,
+    /// Receives the entries that are added.
+    pub(super) additions: mpsc::Sender<LiveAddition>,
+}
 
 impl Listening {
-    /// Shows the topics of the bus, and starts the stage. Entries that are added go to the sender.
-    pub(super) fn start(
-        self,
-        bus: &Bus,
-        board: &Board,
-        (clock, made): (watch::Receiver<WallClock>, mpsc::Receiver<Made>),
-    ) -> Result<(Stage, mpsc::Sender<LiveAddition>), AppError> {
-        let Self(mut live) = self;
+    /// Shows the topics of the bus, and starts the stage.
+    pub(super) fn start(self, bus: &Bus, board: &Board, clock: watch::Receiver<WallClock>) -> Result<Served, AppError> {
+        let Self { mut live, made, shown: _ } = self;
         let mut queues = bus.queues()?;
         if let Some(observations) = bus.observations()? {
             queues.add(observations);
         }
-        let (added, additions) = mpsc::channel();
-        live.feed(Feed { queues, events: board.events(), clock, made, additions });
+        let (additions, added) = mpsc::channel();
+        live.feed(Feed { queues, events: board.events(), clock, made, additions: added });
         let stage = Stage::start("the Foxglove server", |stop| async move {
             live.run(stop).await;
             Ok(())
         });
-        Ok((stage, added))
+        Ok(Served { stage, additions })
     }
 }

@@ -1,11 +1,13 @@
 //! Stage Foxglove of a program that was built without cargo feature `foxglove`: there is nothing to start.
 
+use std::convert::Infallible;
 use std::sync::{Arc, mpsc};
 
 use rapid_bus::{Bus, Subscription};
 use rapid_core::permission::Permission;
 use rapid_core::time::WallClock;
 use rapid_episode::made::Made;
+use rapid_episode::made::Shown;
 use rapid_registry::{DeviceSpec, Registry};
 use rapid_status::Board;
 use tokio::sync::mpsc::UnboundedSender;
@@ -34,18 +36,23 @@ pub(super) async fn listen(
     match options {}
 }
 
-/// There is none.
+/// There is none: the field has no value.
 #[derive(Debug)]
-pub(super) enum Listening {}
+pub(super) struct Listening {
+    never: Infallible,
+    pub(super) shown: Shown,
+}
+
+/// Likewise.
+#[derive(Debug)]
+pub(super) struct Served {
+    pub(super) stage: Stage,
+    pub(super) additions: mpsc::Sender<LiveAddition>,
+}
 
 impl Listening {
     /// Starts nothing.
-    pub(super) fn start(
-        self,
-        _: &Bus,
-        _: &Board,
-        _: (watch::Receiver<WallClock>, mpsc::Receiver<Made>),
-    ) -> Result<(Stage, mpsc::Sender<LiveAddition>), AppError> {
-        match self {}
+    pub(super) fn start(self, _: &Bus, _: &Board, _: watch::Receiver<WallClock>) -> Result<Served, AppError> {
+        match self.never {}
     }
 }

@@ -53,6 +53,13 @@ pub(super) struct Reload {
     pub(super) topics: Vec<Extension>,
 }
 
+/// The stage, and where it gets its requests.
+#[derive(Debug)]
+pub(super) struct Reloading {
+    pub(super) stage: Stage,
+    pub(super) requests: mpsc::UnboundedSender<(RegistryRequest, Reply)>,
+}
+
 /// An added entry whose topic is open.
 struct Opened {
     device: Arc<DeviceSpec>,
@@ -64,8 +71,9 @@ struct Opened {
 
 impl Reload {
     /// Starts the stage. It must end after all that use the topics, and before the bus is dropped.
-    pub(super) fn start(mut self, mut requests: mpsc::UnboundedReceiver<(RegistryRequest, Reply)>) -> Stage {
-        Stage::start("the registry", |stop| async move {
+    pub(super) fn start(mut self) -> Reloading {
+        let (to_registry, mut requests) = mpsc::unbounded_channel::<(RegistryRequest, Reply)>();
+        let stage = Stage::start("the registry", |stop| async move {
             loop {
                 let (request, reply) = tokio::select! {
                     biased;
@@ -88,7 +96,8 @@ impl Reload {
                 // The requester may have ended.
                 let _ = reply.map(|reply| reply.send(answer));
             }
-        })
+        });
+        Reloading { stage, requests: to_registry }
     }
 
     fn show(&self, answer: &Result<String, String>) {

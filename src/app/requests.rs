@@ -37,16 +37,24 @@ pub(super) fn asker(conductor: &mpsc::UnboundedSender<Request>) -> Asker {
     })
 }
 
-/// Sorts requests until the screen, and what receives those of other programs, have ended. Those to the conductor wait in
-/// an unbounded queue: a person types them, and other programs wait for an answer to each.
+/// Who receives requests.
+#[derive(Debug)]
+pub(super) struct Receivers {
+    /// Its requests wait in an unbounded queue: a person types them, and other programs wait for an answer to each.
+    pub(super) conductor: mpsc::UnboundedSender<Request>,
+    pub(super) rig: mpsc::Sender<RigCommand>,
+    pub(super) registry: mpsc::UnboundedSender<(RegistryRequest, Reply)>,
+    pub(super) scenario: mpsc::UnboundedSender<String>,
+}
+
+/// Sorts the commands of screens, and the requests of other programs, until those who make them have ended.
 pub(super) fn sorted(
-    conductor: mpsc::UnboundedSender<Request>,
+    receivers: Receivers,
     mut screen: mpsc::Receiver<Command>,
-    (mut arrivals, attached): (mpsc::Receiver<Arrival>, Attached),
-    rig: mpsc::Sender<RigCommand>,
-    registry: mpsc::UnboundedSender<(RegistryRequest, Reply)>,
-    scenario: mpsc::UnboundedSender<String>,
+    mut arrivals: mpsc::Receiver<Arrival>,
+    attached: Attached,
 ) {
+    let Receivers { conductor, rig, registry, scenario } = receivers;
     let (to_conductor, to_registry, board) = (conductor.clone(), registry.clone(), Arc::clone(attached.board()));
     tokio::spawn(async move {
         while let Some(arrival) = arrivals.recv().await {
@@ -108,8 +116,8 @@ mod tests {
         let attached = Attached::new(Arc::new(board(&["a"])), mpsc::channel(1).0);
         let (conductor, mut requests) = mpsc::unbounded_channel();
         let (registry, mut at_registry) = mpsc::unbounded_channel();
-        let others = (mpsc::channel(1).1, attached);
-        sorted(conductor, from_screen, others, rig, registry, mpsc::unbounded_channel().0);
+        let receivers = Receivers { conductor, rig, registry, scenario: mpsc::unbounded_channel().0 };
+        sorted(receivers, from_screen, mpsc::channel(1).1, attached);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }

@@ -9,10 +9,15 @@ use super::stage::Stage;
 use crate::hotplug::HotplugStream;
 use crate::rig::{Rig, RigCommand};
 
+/// Requests that may wait for the rig.
+const WAITING: usize = 16;
+
 /// The stage, and what the run waits for in it.
 #[derive(Debug)]
 pub(super) struct Streaming {
     pub(super) stage: Stage,
+    /// Receives requests to the rig.
+    pub(super) commands: mpsc::Sender<RigCommand>,
     /// Cancelled when the rig begins to close its devices without a request.
     pub(super) ending: CancellationToken,
     /// Cancelled when all streams have ended, or the rig has panicked. Otherwise the mask is still published.
@@ -24,7 +29,8 @@ pub(super) struct Streaming {
 }
 
 impl Streaming {
-    pub(super) fn start(rig: Rig, plugged: HotplugStream, commands: mpsc::Receiver<RigCommand>) -> Self {
+    pub(super) fn start(rig: Rig, plugged: HotplugStream) -> Self {
+        let (commands, requested) = mpsc::channel(WAITING);
         let (ending, hurry) = (rig.ending(), rig.hurry());
         let (closed, release) = (CancellationToken::new(), CancellationToken::new());
         let (is_closed, released) = (closed.clone(), release.clone());
@@ -33,7 +39,7 @@ impl Streaming {
             // On a panic too, and then before the rig is dropped and the mask ends: the cause is reported first.
             let guard = is_closed.drop_guard();
             let outcome = tokio::select! {
-                outcome = rig.run(plugged, commands, stop) => outcome,
+                outcome = rig.run(plugged, requested, stop) => outcome,
                 never = fault::strike("rig") => never,
             };
             drop(guard);
@@ -43,7 +49,7 @@ impl Streaming {
             tokio::task::spawn_blocking(move || drop(rig)).await.map_err(|_| AppError::Panicked("the rig"))?;
             Ok(outcome?)
         });
-        Self { stage, ending, closed, release, hurry }
+        Self { stage, commands, ending, closed, release, hurry }
     }
 
     /// Closes all devices and waits for it. The mask stays published as it was.

@@ -14,8 +14,8 @@ use rapid_core::interlock::{InputState, Interlocks};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
 use rapid_registry::Registry;
-use rapid_status::{Board, StopStatus};
-use tokio::sync::watch;
+use rapid_status::Board;
+use rapid_status::stops::Reported;
 
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
@@ -33,31 +33,31 @@ pub struct Watched {
 }
 
 impl Watched {
-    /// Reads the inputs of `registry` from now on, for `permission` and `states`, which were created from the same registry.
+    /// Reads the inputs of `registry` from now on, for `permission` and `reported`, which were created from the same registry.
     ///
     /// # Errors
     /// When the system provides no thread.
     pub fn begin(
         registry: &Registry,
         permission: &Arc<Permission>,
-        states: &watch::Sender<Vec<StopStatus>>,
+        reported: &Reported,
         board: &Arc<Board>,
     ) -> io::Result<Self> {
         let mut watched = Self { readers: Readers::new(true)?, is_ending: Arc::default() };
         for (index, spec) in registry.stops.iter().enumerate() {
-            let reporter = Reporter {
+            let input = Reporter {
                 index,
                 permission: Arc::clone(permission),
-                states: states.clone(),
+                reported: reported.clone(),
                 board: Arc::clone(board),
                 is_ending: Arc::clone(&watched.is_ending),
             };
             let place = Place::of(&spec.input);
             if let Place::Field(field) = &place {
                 // Before any sample can come.
-                reporter.lost(&format!("no sample of {} has come", field.device));
+                input.lost(&format!("no sample of {} has come", field.device));
             }
-            watched.readers.read(&format!("stop-{}", spec.name), place, Arc::new(reporter))?;
+            watched.readers.read(&format!("stop-{}", spec.name), place, Arc::new(input))?;
         }
         Ok(watched)
     }
@@ -79,7 +79,7 @@ impl Watched {
 struct Reporter {
     index: usize,
     permission: Arc<Permission>,
-    states: watch::Sender<Vec<StopStatus>>,
+    reported: Reported,
     board: Arc<Board>,
     /// See [`Watched::end`].
     is_ending: Arc<AtomicBool>,
@@ -92,14 +92,7 @@ impl Reporter {
         if !is_news || self.is_ending.load(Ordering::Relaxed) {
             return;
         }
-        let mut reported = None;
-        self.states.send_modify(|states| {
-            reported = states.get_mut(self.index).map(|stop| {
-                (stop.state, stop.detail) = (state, why.to_owned());
-                stop.clone()
-            });
-        });
-        if let Some(stop) = reported {
+        if let Some(stop) = self.reported.note(self.index, state, why) {
             self.board.set_stop(stop);
         }
     }

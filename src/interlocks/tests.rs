@@ -38,7 +38,7 @@ struct Run {
     board: Arc<Board>,
     events: tokio::sync::broadcast::Receiver<Event>,
     watched: Watched,
-    reported: watch::Sender<Vec<StopStatus>>,
+    reported: Reported,
 }
 
 fn run(stops: &str) -> Run {
@@ -47,7 +47,7 @@ fn run(stops: &str) -> Run {
     let permission = Arc::new(Permission::new(false).with_interlocks(of(&registry)));
     let attended = permission.attend();
     let events = board.events();
-    let reported = rapid_status::stops::states(&registry).0;
+    let reported = Reported::nothing(&registry);
     let watched = Watched::begin(&registry, &permission, &reported, &board).unwrap();
     Run { permission, attended, board, events, watched, reported }
 }
@@ -238,7 +238,7 @@ fn an_input_whose_thread_panics_is_lost() {
     let reporter = Reporter {
         index: 0,
         permission: Arc::clone(&run.permission),
-        states: run.reported.clone(),
+        reported: run.reported.clone(),
         board: Arc::clone(&run.board),
         is_ending: Arc::default(),
     };
@@ -260,7 +260,7 @@ fn an_input_whose_thread_panics_is_lost() {
     });
     assert!(panicked.join().is_err());
     assert_eq!((run.stop().state, run.orders()), (InputState::Lost, vec![Order::Disarm]));
-    assert_eq!(run.reported.borrow()[0], run.stop(), "an episode records what is shown");
+    assert_eq!(run.reported.states().borrow()[0], run.stop(), "an episode records what is shown");
 }
 
 #[test]

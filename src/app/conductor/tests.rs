@@ -3,9 +3,11 @@ use std::io;
 
 use rapid_bus::TopicId;
 use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_episode::record::Recorder;
 use rapid_episode::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use rapid_registry::Registry;
 use rapid_status::session::{Label, SessionRequest};
+use rapid_status::stops::Reported;
 use rapid_status::{Level, Snapshot};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
@@ -74,8 +76,7 @@ impl Bench {
         let (keys, requests) = mpsc::unbounded_channel();
         let episode = EpisodeRequest { out: out.path().to_owned(), ..EpisodeRequest::default() };
         let plan = Plan { task: "test".to_owned(), ..plan };
-        let collection =
-            Collection::new(recorder, episode, plan, true, (&board, watch::channel(Vec::new()).1)).unwrap();
+        let collection = Collection::new(recorder, episode, plan, true, &board, watch::channel(Vec::new()).1).unwrap();
         let conductor = Conductor {
             board: Arc::clone(&board),
             collection,
@@ -97,6 +98,7 @@ impl Bench {
             reload: idle_stage(),
             streaming: Streaming {
                 stage: idle_stage(),
+                commands: mpsc::channel(1).0,
                 ending: CancellationToken::new(),
                 closed: CancellationToken::new(),
                 release: CancellationToken::new(),
@@ -106,7 +108,7 @@ impl Bench {
             watched: Watched::begin(
                 &Registry::builtin(),
                 &Arc::default(),
-                &rapid_status::stops::states(&Registry::builtin()).0,
+                &Reported::nothing(&Registry::builtin()),
                 &board,
             )
             .unwrap(),
@@ -400,7 +402,7 @@ async fn the_file_of_an_earlier_session_is_kept_whenever_this_one_gets_its_own()
         let episode = EpisodeRequest { out: out.path().to_owned(), ..EpisodeRequest::default() };
         let plan = Plan { task: "now".to_owned(), ..Plan::default() };
         let mut collection =
-            Collection::new(recorder, episode, plan, is_kept, (&board, watch::channel(Vec::new()).1)).unwrap();
+            Collection::new(recorder, episode, plan, is_kept, &board, watch::channel(Vec::new()).1).unwrap();
         collection.start().await.unwrap();
         let label = SessionRequest::Label { episode: None, label: Label::Success, reason: String::new() };
         collection.request(&label, Stamp::now(), None).await.unwrap();

@@ -26,7 +26,7 @@ use rapid_bus::{Foreign, Inbox, Queues, Subscription, TopicId};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::{ClockWatch, Stamp, WallClock};
 use rapid_registry::Registry;
-use rapid_status::stops::{self, States};
+use rapid_status::stops::{Reported, States};
 use rapid_status::{Board, Episode, EpisodeReport, EpisodeWatch, Event, Level, RecordingStatus, What};
 use rapid_system::disk::Disk;
 use rapid_system::fault;
@@ -139,7 +139,7 @@ impl RecorderConfig {
     /// Episodes of `registry`, reported on `board`, written to their files; its stops have not reported.
     pub fn new(registry: Arc<Registry>, board: Arc<Board>) -> Self {
         Self {
-            stops: stops::states(&registry).1,
+            stops: Reported::nothing(&registry).states(),
             registry,
             board,
             sink: Box::new(|file| Box::new(file)),
