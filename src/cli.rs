@@ -359,6 +359,13 @@ pub enum Command {
         /// Shell
         shell: clap_complete::Shell,
     },
+    /// Print the keys of the registry, or their JSON schema for editors
+    #[command(hide = true, after_long_help = "Examples:\n  rapid keys\n  rapid keys --schema >devices.schema.json")]
+    Keys {
+        /// The JSON schema
+        #[arg(long)]
+        schema: bool,
+    },
     /// Write the manual pages, one per command
     #[command(
         hide = true,

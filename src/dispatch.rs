@@ -213,6 +213,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             run(global, &options, (registry, Devices::Simulated(scenario)), 0, None)
         }
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::grammar(), shell, out)?),
+        Command::Keys { schema } => Ok(commands::completions::keys(schema, out)?),
         Command::Man { to } => Ok(commands::completions::man(Cli::grammar(), &to, out)?),
     }
 }

@@ -1,7 +1,10 @@
-//! `rapid completions` and `rapid man`: completion scripts and manual pages of the commands.
+//! `rapid completions`, `rapid man` and `rapid keys`: completion scripts and manual pages of the commands; the keys of the
+//! registry.
 
 use std::io::{self, Write};
 use std::path::Path;
+
+use rapid_registry::keys;
 
 use super::artifacts::{ArtifactsError, links_for_this_user, write_file};
 
@@ -15,6 +18,15 @@ pub fn completions(command: &mut clap::Command, shell: clap_complete::Shell, out
     // The generator panics when its writer fails: it writes to memory, which does not.
     clap_complete::generate(shell, command, name, &mut script);
     out.write_all(&script)
+}
+
+/// Writes the reference of the registry's keys, or their JSON schema.
+///
+/// # Errors
+/// When `out` cannot be written.
+pub fn keys(schema: bool, out: &mut impl Write) -> io::Result<()> {
+    let text = if schema { keys::schema_text() } else { keys::reference() };
+    out.write_all(text.as_bytes())
 }
 
 /// Writes a manual page for `command` and each of its subcommands into `folder`, and lists them.

@@ -18,7 +18,7 @@ use serde_json::{Value as Json, json};
 use super::section::Section;
 use super::units::{show_duration, show_size};
 
-pub use documents::{reference, schema};
+pub use documents::{reference, schema_text};
 
 /// A key of a table.
 #[derive(Debug)]
@@ -27,15 +27,16 @@ pub(crate) struct Key {
     /// What it means, for the reference.
     pub(crate) meaning: &'static str,
     pub(crate) about: fn() -> About,
-    /// What applies without it, as it would be written, or in words.
-    pub(crate) default: fn() -> Option<String>,
-    /// A table without it is a mistake.
-    pub(crate) is_needed: bool,
+    /// What applies without it, as it would be written, or in words; [`NEEDED`] if nothing does.
+    pub(crate) default: fn() -> String,
 }
+
+/// A table without the key is a mistake.
+pub(crate) const NEEDED: &str = "needed";
 
 /// The key of a table, whose keys are declared elsewhere, and which is read by itself.
 pub(crate) const fn table(name: &'static str, meaning: &'static str, about: fn() -> About) -> Key {
-    Key { name, meaning, about, default: || None, is_needed: false }
+    Key { name, meaning, about, default: String::new }
 }
 
 /// The keys of a table, in groups.
@@ -54,12 +55,6 @@ pub(crate) enum About {
     Named(Keys),
 }
 
-impl About {
-    fn value(words: impl Into<String>, schema: Json) -> Self {
-        Self::Value(words.into(), schema)
-    }
-}
-
 /// A type of values: how one is read, written and described.
 pub(crate) trait Type {
     /// What is read.
@@ -71,7 +66,8 @@ pub(crate) trait Type {
     /// As it is written.
     fn shown(&self, value: &Self::Value) -> String;
 
-    fn about(&self) -> About;
+    /// In words, and as a schema.
+    fn about(&self) -> (String, Json);
 }
 
 /// A whole number in this range.
@@ -93,10 +89,43 @@ impl<T: TryFrom<i64> + Display> Type for Whole<T> {
         value.to_string()
     }
 
-    fn about(&self) -> About {
-        let range = json!({"type": "integer", "minimum": self.0, "maximum": self.1});
-        About::value(format!("a whole number, {} to {}", self.0, self.1), range)
+    fn about(&self) -> (String, Json) {
+        let Self(least, most, _) = self;
+        (format!("a whole number, {least} to {most}"), json!({"type": "integer", "minimum": least, "maximum": most}))
     }
+}
+
+/// Ranges of values that are written with a unit.
+macro_rules! with_unit {
+    ($($(#[$doc:meta])* $name:ident($of:ty) = $getter:ident, $what:literal, $show:ident;)+) => {$(
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy)]
+        pub(crate) struct $name(pub(crate) $of, pub(crate) $of);
+
+        impl Type for $name {
+            type Value = $of;
+
+            fn read(&self, table: &Section<'_>, key: &str) -> Option<$of> {
+                table.$getter(key, self.0..=self.1)
+            }
+
+            fn shown(&self, value: &$of) -> String {
+                format!("{:?}", $show(*value))
+            }
+
+            fn about(&self) -> (String, Json) {
+                let words = format!("{}, {} to {}", $what, $show(self.0), $show(self.1));
+                (words, json!({"type": "string", "pattern": "[0-9]"}))
+            }
+        }
+    )+};
+}
+
+with_unit! {
+    /// A duration in this range.
+    Time(Duration) = duration, "a duration", show_duration;
+    /// A size in this range, bytes.
+    Size(u64) = size, "a size", show_size;
 }
 
 /// A number in this range, finite.
@@ -119,33 +148,12 @@ impl Type for Real {
         value.to_string()
     }
 
-    fn about(&self) -> About {
-        if self.1 >= f64::MAX {
-            return About::value("a number", json!({"type": "number"}));
+    fn about(&self) -> (String, Json) {
+        let Self(least, most) = self;
+        if *most >= f64::MAX {
+            return ("a number".to_owned(), json!({"type": "number"}));
         }
-        let range = json!({"type": "number", "minimum": self.0, "maximum": self.1});
-        About::value(format!("a number, {} to {}", self.0, self.1), range)
-    }
-}
-
-/// A duration in this range.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Time(pub(crate) Duration, pub(crate) Duration);
-
-impl Type for Time {
-    type Value = Duration;
-
-    fn read(&self, table: &Section<'_>, key: &str) -> Option<Duration> {
-        table.duration(key, self.0..=self.1)
-    }
-
-    fn shown(&self, value: &Duration) -> String {
-        format!("{:?}", show_duration(*value))
-    }
-
-    fn about(&self) -> About {
-        let words = format!("a duration, {} to {}", show_duration(self.0), show_duration(self.1));
-        About::value(words, json!({"type": "string", "pattern": "[0-9]"}))
+        (format!("a number, {least} to {most}"), json!({"type": "number", "minimum": least, "maximum": most}))
     }
 }
 
@@ -170,30 +178,9 @@ impl Type for TimeOrNever {
         value.map_or_else(|| "\"never\"".to_owned(), |value| self.time().shown(&value))
     }
 
-    fn about(&self) -> About {
-        let words = format!("a duration, {} to 1h, or `\"never\"`", show_duration(self.0));
-        About::value(words, json!({"type": "string", "pattern": "[0-9]|^never$"}))
-    }
-}
-
-/// A size in this range, bytes.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Size(pub(crate) u64, pub(crate) u64);
-
-impl Type for Size {
-    type Value = u64;
-
-    fn read(&self, table: &Section<'_>, key: &str) -> Option<u64> {
-        table.size(key, self.0..=self.1)
-    }
-
-    fn shown(&self, value: &u64) -> String {
-        format!("{:?}", show_size(*value))
-    }
-
-    fn about(&self) -> About {
-        let words = format!("a size, {} to {}", show_size(self.0), show_size(self.1));
-        About::value(words, json!({"type": "string", "pattern": "[0-9]"}))
+    fn about(&self) -> (String, Json) {
+        let (words, _) = self.time().about();
+        (format!("{words}, or `\"never\"`"), json!({"type": "string", "pattern": "[0-9]|^never$"}))
     }
 }
 
@@ -213,10 +200,10 @@ impl<T: Copy + PartialEq> Type for Words<T> {
         format!("{word:?}")
     }
 
-    fn about(&self) -> About {
+    fn about(&self) -> (String, Json) {
         let words: Vec<&str> = self.0.iter().map(|(word, _)| *word).collect();
         let shown: Vec<String> = words.iter().map(|word| format!("`{word:?}`")).collect();
-        About::value(shown.join(", "), json!({"enum": words}))
+        (shown.join(", "), json!({"enum": words}))
     }
 }
 
@@ -265,8 +252,8 @@ impl<T: Debug> Type for Own<T> {
         format!("{value:?}")
     }
 
-    fn about(&self) -> About {
-        About::value(self.words, serde_json::from_str(self.schema).unwrap_or_default())
+    fn about(&self) -> (String, Json) {
+        (self.words.to_owned(), serde_json::from_str(self.schema).unwrap_or_default())
     }
 }
 
@@ -280,7 +267,7 @@ impl<T: Debug> Type for Own<T> {
 ///         width: u32 = whole::<u32>(1, 8192), or 640;         // 640 without the key
 ///         torque: f64 = Real(0.001, 200.0), within limits(kind), usually "a tenth of its type's", or_else 0.1 * most(kind);
 ///         kind "type": Option<Kind> = Words(&KINDS), need "write type = ...";
-///     } below {
+///     } => {
 ///         /// A table, whose keys are declared elsewhere, and which is read by itself.
 ///         brake = About::Table(&[BrakeKeys::KEYS]);
 ///     }
@@ -290,11 +277,11 @@ impl<T: Debug> Type for Own<T> {
 /// `within` and `or_else` may speak of the fields above, and of what is passed: `struct Example(most: f64)`. `Example::read` reads a table, `Example::values` one that has other
 /// keys too; `Example::KEYS` are its keys.
 macro_rules! keys {
-    ($(#[$meta:meta])* $vis:vis struct $name:ident $(($arg:ident: $arg_type:ty))? { $(
+    ($($(#[$meta:meta])* $vis:vis struct $name:ident $(($arg:ident: $arg_type:ty))? { $(
         $(#[doc = $doc:literal])+
         $field:ident $($key:literal)?: $of:ty = $type:expr
         $(, within $within:expr)? $(, usually $usual:literal)? $(, or $default:expr)? $(, or_else $else:expr)? $(, need $fix:expr)?;
-    )+ } $(below { $( $(#[doc = $meaning:literal])+ $table:ident = $about:expr; )+ })?) => {
+    )+ } $(=> { $( $(#[doc = $meaning:literal])+ $table:ident = $about:expr; )+ })?)+) => {$(
         $(#[$meta])*
         $vis struct $name {
             $($(#[doc = $doc])+ $vis $field: $of,)+
@@ -327,11 +314,11 @@ macro_rules! keys {
                 Self { $($field),+ }
             }
         }
-    };
+    )+};
     ($(#[$meta:meta])* $vis:vis const $name:ident { $(
         $(#[doc = $doc:literal])+
         $field:ident = $type:expr $(, usually $usual:literal)? $(, need $fix:expr)?;
-    )* } $(below { $( $(#[doc = $meaning:literal])+ $table:ident = $about:expr; )+ })?) => {
+    )* } $(=> { $( $(#[doc = $meaning:literal])+ $table:ident = $about:expr; )+ })?) => {
         $(#[$meta])*
         $vis const $name: &[$crate::keys::Key] = &[
             $($crate::keys::keys!(@key $field, ($($doc),+), $type $(, usually $usual)? $(, need $fix)?),)*
@@ -343,9 +330,11 @@ macro_rules! keys {
         $crate::keys::Key {
             name: $crate::keys::keys!(@name $field $($key)?),
             meaning: concat!($($doc),+),
-            about: || $crate::keys::Type::about(&$type),
-            default: || $crate::keys::keys!(@default $type $(, usually $usual)? $(, or $default)?),
-            is_needed: $crate::keys::keys!(@needed $($fix)?),
+            about: || {
+                let (words, schema) = $crate::keys::Type::about(&$type);
+                $crate::keys::About::Value(words, schema)
+            },
+            default: || $crate::keys::keys!(@default $type $(, usually $usual)? $(, or $default)? $(, need $fix)?),
         }
     };
     (@below $table:ident, ($($meaning:literal),+), $about:expr) => {
@@ -357,10 +346,9 @@ macro_rules! keys {
     (@either ($type:expr) ($within:expr)) => { $within };
     (@value $read:ident) => { $read };
     (@value $read:ident $default:expr) => { $read.unwrap_or_else(|| $default) };
-    (@default $type:expr, usually $usual:literal $(, or $default:expr)?) => { Some($usual.to_owned()) };
-    (@default $type:expr, or $default:expr) => { Some($crate::keys::Type::shown(&$type, &$default)) };
-    (@default $type:expr) => { None };
-    (@needed $fix:expr) => { true };
-    (@needed) => { false };
+    (@default $type:expr, usually $usual:literal $(, or $default:expr)?) => { $usual.to_owned() };
+    (@default $type:expr, or $default:expr) => { $crate::keys::Type::shown(&$type, &$default) };
+    (@default $type:expr, need $fix:expr) => { $crate::keys::NEEDED.to_owned() };
+    (@default $type:expr) => { String::new() };
 }
 pub(crate) use keys;

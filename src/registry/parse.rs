@@ -44,7 +44,7 @@ pub const BUILTIN: &str = include_str!("../../devices.toml");
 
 keys! {
     /// The tables of the file.
-    pub(super) const ROOT {} below {
+    pub(super) const ROOT {} => {
         /// The rig.
         rig = About::Table(&[RigSpec::KEYS]);
         /// What policies are computed on.

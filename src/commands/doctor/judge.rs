@@ -472,6 +472,7 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
     let mut found = Vec::new();
     let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
     // `sum` of no terms is -0.0.
+    let most = |entry: &DeviceSpec| entry.node.bytes_per_second(entry.max_bytes);
     let wanted = entries.iter().filter_map(most).fold(0.0, |sum, most| sum + most);
     let unknown = entries.iter().filter(|entry| most(entry).is_none());
     let unknown = unknown.map(|entry| format!("[device.{}]", entry.name)).collect::<Vec<_>>().join(", ");
@@ -515,18 +516,4 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
         Finding::ok("disk", what)
     });
     found
-}
-
-/// Highest data rate of a device, bytes per second; `None` if only the device, or its program, knows its rate.
-fn most(entry: &DeviceSpec) -> Option<f64> {
-    match &entry.node {
-        NodeSpec::Camera(camera) => {
-            let load = CameraLoad { name: String::new(), camera: camera.clone(), max_bytes: entry.max_bytes };
-            Some(load.bytes_per_second())
-        }
-        NodeSpec::Serial(serial) => Some(f64::from(serial.baud) / 10.0),
-        NodeSpec::Can(can) => Some(f64::from(can.bitrate) / 8.0),
-        NodeSpec::Lan(lan) => Some(f64::from(lan.picture()?.fps) * entry.max_bytes as f64),
-        NodeSpec::Process(_) => None,
-    }
 }

@@ -32,11 +32,7 @@ pub(super) struct CameraLoad {
 impl CameraLoad {
     /// Bytes per second; for compressed pictures an upper limit.
     pub(super) fn bytes_per_second(&self) -> f64 {
-        let camera = &self.camera;
-        let pixels = f64::from(camera.width) * f64::from(camera.height);
-        let picture =
-            camera.format.encoding().pixel_bytes().map_or(self.max_bytes as f64, |bytes| bytes as f64 * pixels);
-        picture * f64::from(camera.fps)
+        self.camera.bytes_per_second(self.max_bytes)
     }
 
     /// Upper limit of its reservation: one endpoint.

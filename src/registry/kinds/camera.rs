@@ -32,7 +32,7 @@ keys! {
         fps: u32 = whole::<u32>(1, 1000), or 30;
         /// Pixel format. `Z16` is distances.
         format: PixelFormat = Words(&PixelFormat::WORDS), or PixelFormat::Mjpg;
-        /// Of distances: what one count is, um.
+        /// Of distances: what one count is.
         depth_unit_um "depth_unit": u32 = DISTANCE, usually "`\"1mm\"`", or MILLIMETRE;
         /// V4L2 controls that are set at the start, by the names that `rapid devices` lists.
         controls: Vec<(String, i64)> = CONTROLS, usually "none", or Vec::new();
@@ -67,6 +67,15 @@ impl PixelFormat {
             Self::Grey => Encoding::Grey,
             Self::Z16 => Encoding::Depth,
         }
+    }
+}
+
+impl CameraSpec {
+    /// Bytes per second; for compressed pictures, of at most `max_bytes` each, an upper limit.
+    pub fn bytes_per_second(&self, max_bytes: usize) -> f64 {
+        let pixels = f64::from(self.width) * f64::from(self.height);
+        let picture = self.format.encoding().pixel_bytes().map_or(max_bytes as f64, |bytes| bytes as f64 * pixels);
+        picture * f64::from(self.fps)
     }
 }
 
@@ -105,9 +114,7 @@ impl Kind for CameraSpec {
     }
 
     fn bytes_per_second(&self, max_bytes: usize) -> Option<f64> {
-        let pixels = f64::from(self.width) * f64::from(self.height);
-        let picture = self.format.encoding().pixel_bytes().map_or(max_bytes as f64, |bytes| bytes as f64 * pixels);
-        Some(picture * f64::from(self.fps))
+        Some(self.bytes_per_second(max_bytes))
     }
 }
 

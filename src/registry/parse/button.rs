@@ -24,26 +24,20 @@ keys! {
         /// What two presses in a row do instead.
         double: Option<ButtonAction> = Words(&ButtonAction::WORDS), within ACTION;
     }
-}
 
-keys! {
     /// Of a key.
     struct GrabKeys {
         /// Whether no other program gets what the device sends.
         grab: bool = FLAG, or false;
     }
-}
 
-keys! {
     /// Of a line of a chip.
     struct LevelKeys {
         /// The level while it is pressed.
         pressed_while: Option<bool> = Words(&LEVELS),
             need "write pressed_while = \"low\" for a button that connects the line to ground, or \"high\"";
     }
-}
 
-keys! {
     /// Of a serial port.
     struct LineKeys {
         /// The line that is sent at each press.
@@ -55,9 +49,7 @@ keys! {
         /// Lines are sent again and again: without one for this long the button is lost.
         silence: Option<Duration> = SILENCE, usually "lines are sent at changes";
     }
-}
 
-keys! {
     /// Of a number.
     struct FieldKeys {
         /// Above this it is pressed.

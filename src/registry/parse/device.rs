@@ -73,7 +73,7 @@ keys! {
 
 keys! {
     /// Tables of a stream.
-    const TABLES_OF_A_STREAM {} below {
+    const TABLES_OF_A_STREAM {} => {
         /// A camera.
         camera = About::Table(&[CameraSpec::KEYS]);
         /// Limits of the verdict for this device.
@@ -85,7 +85,7 @@ keys! {
 
 keys! {
     /// Tables of a device.
-    pub(crate) const TABLES {} below {
+    pub(crate) const TABLES {} => {
         /// Limits of the verdict for this device.
         verdict = About::Table(verdict::OF_A_DEVICE);
         /// The actions of a program's actuator.

@@ -29,19 +29,15 @@ keys! {
     /// `[device.NAME.pose]`: the pose of a frame that has the name of the entry.
     pub(super) struct PoseKeys {
         /// The order of its numbers.
-        layout: Option<PoseLayout> = Words(&PoseLayout::WORDS), need "write layout = \"quaternion\", \"columns\" or \"rows\"";
+        layout: Option<PoseLayout> = Words(&PoseLayout::WORDS), usually "needed, but for a phone";
     }
-}
 
-keys! {
     /// The frame of a pose.
     pub(super) struct FrameKeys {
         /// The frame in which the pose is given.
         parent: Option<String> = TEXT, usually "`\"world\"`";
     }
-}
 
-keys! {
     /// `[device.NAME.joints]`.
     pub(super) struct JointsKeys {
         /// Names of the joints, as in the robot's description.
@@ -49,9 +45,7 @@ keys! {
         /// What the numbers of each joint are, in order: `"position"`, `"velocity"`, `"effort"`, `"other"`.
         quantities: Option<Vec<Quantity>> = QUANTITIES, usually "`[\"position\"]`";
     }
-}
 
-keys! {
     /// `[device.NAME.calibration]`.
     pub(super) struct CalibrationKeys {
         /// Model of the lens.
@@ -61,9 +55,7 @@ keys! {
         /// `[fx, 0, cx, 0, fy, cy, 0, 0, 1]`, row by row, in pixels of the pictures as they are recorded.
         intrinsics: Option<Vec<f64>> = NUMBERS, need "write intrinsics = [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels";
     }
-}
 
-keys! {
     /// `[device.NAME.points]`.
     pub(super) struct PointsKeys {
         /// The format of its packets.
@@ -224,6 +216,7 @@ fn parent(table: &Section<'_>, name: &str) -> String {
 
 fn pose(name: &str, table: &Section<'_>) -> Option<PoseSpec> {
     table.known(&POSE_KEYS);
+    table.need("layout", "write layout = \"quaternion\", \"columns\" or \"rows\"");
     let (keys, parent) = (PoseKeys::values(table), parent(table, name));
     Some(PoseSpec { layout: keys.layout?, parent })
 }

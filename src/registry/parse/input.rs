@@ -30,9 +30,7 @@ keys! {
         /// The key.
         code: Option<(String, u16)> = CODE, need "write code = \"KEY_...\" or \"BTN_...\", as `evtest` shows it";
     }
-}
 
-keys! {
     /// `gpio = { ... }`.
     pub(crate) struct GpioKeys {
         /// The chip.
@@ -40,9 +38,7 @@ keys! {
         /// The number of its line.
         line: Option<u32> = whole::<u32>(0, 65_535), need "write line = its number on the chip; `gpioinfo` lists them";
     }
-}
 
-keys! {
     /// `serial = { ... }`.
     pub(crate) struct PortKeys {
         /// The port.
@@ -50,9 +46,7 @@ keys! {
         /// Bits a second.
         baud: u32 = whole::<u32>(300, 4_000_000), or 115_200;
     }
-}
 
-keys! {
     /// `field = { ... }`.
     pub(crate) struct NumberKeys {
         /// The entry whose samples hold the number.

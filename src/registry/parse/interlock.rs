@@ -23,25 +23,19 @@ keys! {
         /// Entries of the actuators that it stops.
         actuators: Option<Vec<String>> = TEXTS, usually "all";
     }
-}
 
-keys! {
     /// Of a key.
     struct HeldKeys {
         /// The actuator may move while the key is in this state.
         runs_while: Option<bool> = Words(&[("pressed", true), ("released", false)]), usually "`\"released\"`; if enabling `\"pressed\"`";
     }
-}
 
-keys! {
     /// Of a line of a chip.
     struct LevelKeys {
         /// The level of a closed contact, so that a broken wire stops.
         runs_while: Option<bool> = Words(&LEVELS), need RUNS_WHILE;
     }
-}
 
-keys! {
     /// Of a serial port.
     struct LineKeys {
         /// The line that is sent, again and again, while the actuator may move.
@@ -51,9 +45,7 @@ keys! {
         /// Without a line for this long it stops.
         silence: Duration = SILENCE, or Duration::from_millis(200);
     }
-}
 
-keys! {
     /// Of a number.
     struct FieldKeys {
         /// Above this the actuator may move.

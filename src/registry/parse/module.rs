@@ -17,13 +17,11 @@ keys! {
         tags: Vec<String> = TEXTS, or Vec::new();
         /// Entries of its sensors.
         devices: Vec<String> = TEXTS, or Vec::new();
-    } below {
+    } => {
         /// Where a sensor sits, by the name of its entry.
         transform = About::Named(&[TransformKeys::KEYS]);
     }
-}
 
-keys! {
     /// `[module.NAME.transform.SENSOR]`.
     pub(super) struct TransformKeys {
         /// The frame in which the place is given.

@@ -51,7 +51,7 @@ keys! {
 
 keys! {
     /// More severe limits.
-    const BAD {} below {
+    const BAD {} => {
         /// Limits beyond which an episode is BAD.
         bad = About::Table(&[LIMITS]);
     }

@@ -30,9 +30,7 @@ keys! {
         /// What is on the bus: frames, recorded as they are, or motors.
         protocol: Option<bool> = Words(&PROTOCOLS), usually "`\"raw\"`";
     }
-}
 
-keys! {
     /// Keys that only a bus of motors has.
     struct BusKeys {
         /// Commands a second to each motor.
@@ -46,7 +44,7 @@ keys! {
         /// A motor that leaves frames unanswered for this long is silent: with two cycles at 200 Hz it is reported within
         /// 50 ms.
         silent_after: Duration = TEN_SECONDS, or Duration::from_millis(40);
-    } below {
+    } => {
         /// The motors, one per axis.
         motors = About::List(MOTOR_KEYS);
     }
@@ -87,9 +85,7 @@ keys! {
         slew: f64 = Real(0.001, 100_000.0), within Real(0.001, most_slew(mode, kind)), usually "`velocity`; 10 times it of a velocity",
             or_else default_slew(mode, velocity);
     }
-}
 
-keys! {
     /// What its parts tolerate.
     struct HeatKeys {
         /// Highest temperature of its transistors, °C; a finger tolerates less than they do.

@@ -131,7 +131,7 @@ keys! {
         emergency: Stop = Words(&Stop::WORDS), or Stop::Limp;
         /// How long it holds before it is disabled; never is until a disarm.
         hold_for: Option<Duration> = TimeOrNever(Duration::from_millis(10)), or None;
-    } below {
+    } => {
         /// The holding brake of its joint.
         brake = About::Table(&BRAKE_KEYS);
     }
@@ -191,7 +191,7 @@ keys! {
     pub struct WatchSpec {
         /// How far outside its limits it may be, rad; an arm farther out is rejected.
         margin: f64 = Real(0.0, 1.0), or 0.1;
-        /// How far it may be from the command of its own loop, rad, in [`MotorMode::PositionVelocity`].
+        /// How far it may be from the command of its own loop, rad, in the mode `position`.
         lag: f64 = Real(0.001, 10.0), or 0.3;
         /// How long it may be blocked at its highest torque; never is for a gripper that holds something.
         blocked_after: Option<Duration> = TimeOrNever(Duration::from_millis(500)), or Some(Duration::from_secs(2));
