@@ -224,40 +224,12 @@ impl LanSpec {
         }
     }
 
-    /// Content of its samples.
-    pub const fn modality_kind(&self) -> ModalityKind {
-        match &self.protocol {
-            LanProtocol::Mjpeg { .. }
-            | LanProtocol::Iphone { stream: PhoneStream::Image, .. }
-            | LanProtocol::Gopro { preview: Some(_), .. } => ModalityKind::Image,
-            LanProtocol::Iphone { stream: PhoneStream::Pose, .. } => ModalityKind::Scalars,
-            LanProtocol::Udp { .. } | LanProtocol::Gopro { preview: None, .. } => ModalityKind::Bytes,
-            LanProtocol::Remote { samples, .. } => match samples {
-                RemoteSamples::Pictures(_, PixelFormat::Z16) => ModalityKind::Depth,
-                RemoteSamples::Pictures(..) => ModalityKind::Image,
-                RemoteSamples::Numbers(_) => ModalityKind::Scalars,
-                RemoteSamples::Bytes => ModalityKind::Bytes,
-            },
-        }
-    }
-
     /// Image: `[height, width]`. Scalars: how many. Bytes: empty.
     pub fn shape(&self) -> Vec<u32> {
         match (self.modality_kind(), self.picture()) {
             (ModalityKind::Image | ModalityKind::Depth, Some(picture)) => vec![picture.height, picture.width],
             (ModalityKind::Scalars, _) => vec![self.numbers()],
             _ => Vec::new(),
-        }
-    }
-
-    /// The format of its pictures, if it sends any.
-    pub const fn picture(&self) -> Option<LanPicture> {
-        match &self.protocol {
-            LanProtocol::Mjpeg { picture, .. }
-            | LanProtocol::Iphone { picture, .. }
-            | LanProtocol::Remote { samples: RemoteSamples::Pictures(picture, _), .. } => Some(*picture),
-            LanProtocol::Gopro { preview, .. } => *preview,
-            LanProtocol::Udp { .. } | LanProtocol::Remote { .. } => None,
         }
     }
 
@@ -303,7 +275,19 @@ impl LanSpec {
 
 impl Kind for LanSpec {
     fn modality_kind(&self) -> ModalityKind {
-        self.modality_kind()
+        match &self.protocol {
+            LanProtocol::Mjpeg { .. }
+            | LanProtocol::Iphone { stream: PhoneStream::Image, .. }
+            | LanProtocol::Gopro { preview: Some(_), .. } => ModalityKind::Image,
+            LanProtocol::Iphone { stream: PhoneStream::Pose, .. } => ModalityKind::Scalars,
+            LanProtocol::Udp { .. } | LanProtocol::Gopro { preview: None, .. } => ModalityKind::Bytes,
+            LanProtocol::Remote { samples, .. } => match samples {
+                RemoteSamples::Pictures(_, PixelFormat::Z16) => ModalityKind::Depth,
+                RemoteSamples::Pictures(..) => ModalityKind::Image,
+                RemoteSamples::Numbers(_) => ModalityKind::Scalars,
+                RemoteSamples::Bytes => ModalityKind::Bytes,
+            },
+        }
     }
 
     fn shape(&self) -> Vec<u32> {
@@ -315,7 +299,13 @@ impl Kind for LanSpec {
     }
 
     fn picture(&self) -> Option<LanPicture> {
-        self.picture()
+        match &self.protocol {
+            LanProtocol::Mjpeg { picture, .. }
+            | LanProtocol::Iphone { picture, .. }
+            | LanProtocol::Remote { samples: RemoteSamples::Pictures(picture, _), .. } => Some(*picture),
+            LanProtocol::Gopro { preview, .. } => *preview,
+            LanProtocol::Udp { .. } | LanProtocol::Remote { .. } => None,
+        }
     }
 
     fn format(&self) -> String {

@@ -12,36 +12,24 @@ use crate::parse::program::Programs;
 use crate::section::Section;
 use crate::spec::Opens;
 
-pub(crate) const TABLE: Key = table("tty", "A serial line.", || About::Table(&[SerialKeys::KEYS]));
+pub(crate) const TABLE: Key = table("tty", "A serial line.", || About::Table(&[SerialSpec::KEYS]));
 /// Names of the table: the present one, and the one before it.
 pub(crate) const TABLES: [&str; 2] = ["tty", "serial"];
 const FRAMING: Own<Framing> = text(framing, "`\"line\"`, `\"cobs\"`, `\"fixed N\"` with N bytes");
 
 keys! {
     /// `[device.NAME.tty]`.
-    struct SerialKeys {
+    #[derive(Debug, Clone, PartialEq, Eq)]
+    pub struct SerialSpec {
         /// Bits a second.
         baud: u32 = whole::<u32>(50, 12_000_000), or 115_200;
         /// How messages are delimited.
         framing: Framing = FRAMING, usually "`\"line\"`", or Framing::Line;
         /// Content of a message.
         parse: Parse = Words(&Parse::WORDS), or Parse::Csv;
-        /// Numbers in a message.
-        channels: Option<usize> = whole::<usize>(1, 1024), usually "needed, unless messages are raw";
+        /// Numbers in a message; 0 with `parse = "raw"`.
+        channels: usize = whole::<usize>(1, 1024), usually "needed, unless messages are raw", or 0;
     }
-}
-
-/// `[device.NAME.tty]`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct SerialSpec {
-    /// Bits per second, default 115200.
-    pub baud: u32,
-    /// How messages are delimited, default `line`.
-    pub framing: Framing,
-    /// Content of a message, default `csv`.
-    pub parse: Parse,
-    /// Numbers in a message, `1..=1024`; 0 with `Parse::Raw`.
-    pub channels: usize,
 }
 
 /// Message boundaries on a serial line.
@@ -142,17 +130,20 @@ pub(crate) fn read(entry: &Section<'_>, _: Programs<'_>) -> Option<Settings> {
         entry.report("serial", message, "move its keys there and remove it");
     }
     let table = entry.table(key)?;
-    let SerialKeys { baud, framing, parse, channels } = SerialKeys::read(&table);
-    if parse == Parse::Raw {
+    let mut serial = SerialSpec::read(&table);
+    if serial.parse == Parse::Raw {
         if table.has("channels") {
             let fix = "remove channels, or write parse = \"csv\", \"json\" or \"f32le\"";
             table.report("channels", "raw messages are not parsed and have no channels", fix);
         }
-        return Some((NodeSpec::Serial(SerialSpec { baud, framing, parse, channels: 0 }), None));
+        serial.channels = 0;
+        return Some((NodeSpec::Serial(serial), None));
     }
     table.need("channels", "write channels = the count of numbers in a message");
-    let channels = channels?;
-    match (parse, framing) {
+    let channels = serial.channels;
+    match (serial.parse, serial.framing) {
+        // Missing, which was reported.
+        _ if channels == 0 => return None,
         (Parse::F32le, Framing::Fixed(bytes)) if bytes != 4 * channels => {
             let message = format!("{channels} channels of f32le take {} bytes, not {bytes}", 4 * channels);
             table.report("framing", message, format!("write framing = \"fixed {}\"", 4 * channels));
@@ -163,7 +154,7 @@ pub(crate) fn read(entry: &Section<'_>, _: Programs<'_>) -> Option<Settings> {
         }
         _ => {}
     }
-    Some((NodeSpec::Serial(SerialSpec { baud, framing, parse, channels }), None))
+    Some((NodeSpec::Serial(serial), None))
 }
 
 /// Warns of tables of serial lines that still have the name that collides with the key of the serial number.
