@@ -17,7 +17,7 @@ use super::parse::device;
 use super::parse::program::Programs;
 use super::section::Section;
 use super::simulation::SimSource;
-use super::spec::{Opens, VerdictSpec};
+use super::spec::{KINDS, Opens, VerdictSpec};
 use camera::CameraSpec;
 use can::CanSpec;
 use lan::{LanPicture, LanSpec};
@@ -107,6 +107,24 @@ pub(crate) type Settings = (NodeSpec, Option<Duration>);
 pub(crate) fn compressed(pixels: u64) -> u64 {
     const SMALLEST: u64 = 64 << 10;
     pixels.max(SMALLEST)
+}
+
+/// Notes the keys of `table` that samples of this kind do not have: those of pictures, or `channels` of numbers. Its word.
+pub(crate) fn check_samples(table: &Section<'_>, kind: ModalityKind, of_pictures: &[&str]) -> &'static str {
+    let word = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(word, _)| word);
+    for key in of_pictures.iter().copied().chain(["channels"]).filter(|key| table.has(key)) {
+        let (is_own, owner) = match (key, kind) {
+            ("channels", kind) => (kind == ModalityKind::Scalars, "scalars"),
+            // Distances have one.
+            ("format", kind) => (kind == ModalityKind::Image, "image"),
+            (_, kind) => (matches!(kind, ModalityKind::Image | ModalityKind::Depth), "image"),
+        };
+        if !is_own {
+            let message = format!("samples of kind {word:?} have no {key}");
+            table.report(key, message, format!("remove {key}, or write kind = {owner:?}"));
+        }
+    }
+    word
 }
 
 /// Lists the kinds: how each is specified, and the module that has `read`, `TABLE` and `impl Kind`. The name of the module is the

@@ -6,7 +6,7 @@ use std::time::Duration;
 use rapid_core::modality::ModalityKind;
 use toml::de::DeValue;
 
-use super::{Kind, NodeSpec, Settings, compressed};
+use super::{Kind, NodeSpec, Settings, check_samples, compressed};
 use crate::artifacts::{Needs, USB, quoted};
 use crate::keys::{About, Key, Own, Time, Words, keys, table, texts, whole};
 use crate::parse::program::{self, For, Programs};
@@ -184,19 +184,12 @@ fn args(table: &Section<'_>, key: &str) -> Option<Vec<String>> {
 
 /// The shape of a sample, from the keys for its kind.
 fn shape(table: &Section<'_>, keys: &ProcessKeys) -> Vec<u32> {
-    let (word, own): (&str, &[(&str, Option<u32>)]) = match keys.kind {
-        ModalityKind::Scalars => ("scalars", &[("channels", keys.channels)]),
-        ModalityKind::Image => ("image", &[("height", keys.height), ("width", keys.width)]),
-        ModalityKind::Depth => ("depth", &[("height", keys.height), ("width", keys.width)]),
-        ModalityKind::Bytes => ("bytes", &[]),
+    let word = check_samples(table, keys.kind, &["width", "height"]);
+    let own: &[(&str, Option<u32>)] = match keys.kind {
+        ModalityKind::Scalars => &[("channels", keys.channels)],
+        ModalityKind::Image | ModalityKind::Depth => &[("height", keys.height), ("width", keys.width)],
+        ModalityKind::Bytes => &[],
     };
-    for key in ["channels", "width", "height"] {
-        if table.has(key) && !own.iter().any(|(own, _)| *own == key) {
-            let owner = if key == "channels" { "scalars" } else { "image" };
-            let message = format!("samples of kind {word:?} have no {key}");
-            table.report(key, message, format!("remove {key}, or write kind = {owner:?}"));
-        }
-    }
     for (key, _) in own {
         table.need(key, &format!("samples of kind {word:?} need it: write {key} = a whole number"));
     }

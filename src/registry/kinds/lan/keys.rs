@@ -9,7 +9,7 @@ use rapid_core::remote;
 use super::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, RemoteSamples};
 use crate::keys::{About, FLAG, Key, Own, TEXT, Time, Whole, Words, keys, table, text, whole};
 use crate::kinds::camera::PixelFormat;
-use crate::kinds::{NodeSpec, Settings};
+use crate::kinds::{NodeSpec, Settings, check_samples};
 use crate::parse::device::{Draft, IDENTITY_KEYS};
 use crate::parse::program::Programs;
 use crate::section::Section;
@@ -85,10 +85,6 @@ const OWN: [(Word, &[&str]); 5] = [
 ];
 const OPTIONAL: [&str; 10] =
     ["path", "width", "height", "fps", "download", "stream", "device", "kind", "format", "channels"];
-/// Keys for pictures of another computer, for pictures of distances, and for its numbers.
-const OF_PICTURES: [&str; 4] = ["width", "height", "fps", "format"];
-const OF_DEPTH: [&str; 3] = ["width", "height", "fps"];
-const OF_NUMBERS: [&str; 1] = ["channels"];
 const PROTOCOLS: &str = "write protocol = \"mjpeg\", \"udp\", \"gopro\", \"iphone\" or \"remote\"";
 
 const DEFAULT_LEASE: Duration = Duration::from_secs(3);
@@ -189,19 +185,7 @@ fn remote(section: &Section<'_>, table: &Section<'_>, keys: &LanKeys, lease: Dur
 }
 
 fn samples(table: &Section<'_>, keys: &LanKeys) -> RemoteSamples {
-    let (word, own): (_, &[&str]) = match keys.kind {
-        ModalityKind::Image => ("image", &OF_PICTURES),
-        ModalityKind::Depth => ("depth", &OF_DEPTH),
-        ModalityKind::Scalars => ("scalars", &OF_NUMBERS),
-        ModalityKind::Bytes => ("bytes", &[]),
-    };
-    for key in [&OF_PICTURES[..], &OF_NUMBERS].concat() {
-        if table.has(key) && !own.contains(&key) {
-            let owner = if OF_NUMBERS.contains(&key) { "scalars" } else { "image" };
-            let message = format!("samples of kind {word:?} have no {key}");
-            table.report(key, message, format!("remove {key}, or write kind = {owner:?}"));
-        }
-    }
+    check_samples(table, keys.kind, &["width", "height", "fps", "format"]);
     match keys.kind {
         ModalityKind::Image => RemoteSamples::Pictures(picture(keys, LanPicture::OF_A_CAMERA), keys.format),
         ModalityKind::Depth => RemoteSamples::Pictures(picture(keys, LanPicture::OF_A_CAMERA), PixelFormat::Z16),
@@ -253,7 +237,7 @@ fn preview(table: &Section<'_>, keys: &LanKeys) -> Option<LanPicture> {
     if keys.stream {
         return Some(picture(keys, LanPicture::OF_A_CAMERA));
     }
-    for key in OF_DEPTH.into_iter().filter(|key| table.has(key)) {
+    for key in ["width", "height", "fps"].into_iter().filter(|key| table.has(key)) {
         let message = format!("the state of a GoPro has no {key}");
         table.report(key, message, format!("remove {key}, or write stream = \"preview\""));
     }
