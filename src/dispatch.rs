@@ -544,10 +544,10 @@ failures! {
         commands::export::ExportError::Episodes(error) => read_code(error),
         commands::export::ExportError::NoEpisodes(_)
         | commands::export::ExportError::Set(
-            crate::export::SetError::Foreign { .. }
-            | crate::export::SetError::Pictures { .. }
-            | crate::export::SetError::Ffmpeg(
-                crate::export::FfmpegError::Missing { .. } | crate::export::FfmpegError::Encoder { .. },
+            rapid_export::SetError::Foreign { .. }
+            | rapid_export::SetError::Pictures { .. }
+            | rapid_export::SetError::Ffmpeg(
+                rapid_export::FfmpegError::Missing { .. } | rapid_export::FfmpegError::Encoder { .. },
             ),
         ) => 2,
         _ => 1,

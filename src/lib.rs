@@ -19,11 +19,6 @@ pub mod driver;
 #[cfg(test)]
 #[path = "../tests/support/effort.rs"]
 mod effort;
-#[cfg(all(test, feature = "export"))]
-#[path = "../tests/support/executable.rs"]
-mod executable;
-#[cfg(feature = "export")]
-pub mod export;
 pub mod flash;
 pub mod hotplug;
 pub mod inputs;
@@ -35,8 +30,6 @@ pub mod link;
 #[cfg(test)]
 #[path = "../tests/support/literal.rs"]
 mod literal;
-#[cfg(feature = "foxglove")]
-pub mod live;
 #[cfg(feature = "policy")]
 pub mod lockstep;
 pub mod orders;

@@ -26,8 +26,8 @@ const LAYERS: &[&[&str]] = &[
     &["flash"],
     &["link", "control", "kinematics"],
     &["hotplug", "driver", "orders", "inputs", "interlocks", "calibration"],
-    &["rig", "alignment", "session", "policy", "registration", "live"],
-    &["app", "lockstep", "compare", "export"],
+    &["rig", "alignment", "session", "policy", "registration"],
+    &["app", "lockstep", "compare"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
@@ -41,14 +41,11 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).
 const HOMES: &[(&str, &[&str])] = &[
-    ("arrow_array", &["export"]),
-    ("arrow_schema", &["export"]),
     ("clap", &["cli", "dispatch", "main", "commands"]),
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("clap_mangen", &["commands"]),
     ("cobs", &["driver/serial"]),
     ("evdev", &["inputs"]),
-    ("foxglove", &["live"]),
     ("futures", &["hotplug", "driver", "rig", "app", "commands"]),
     ("hdrhistogram", &["policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan"]),
@@ -63,8 +60,6 @@ const HOMES: &[(&str, &[&str])] = &[
     ("nix", &["driver/datagram", "driver/lan/udp", "driver/can/socket"]),
     ("nokhwa", &["driver/camera"]),
     ("ort", &["policy/library", "policy/graphs"]),
-    ("parquet", &["export"]),
-    ("png", &["export"]),
     ("rustix", &[ABOVE_NOUNS]),
     ("sd_notify", &["app/watchdog"]),
     ("serde", &[ANYWHERE]),

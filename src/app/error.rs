@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 use rapid_bus::BusError;
 use rapid_episode::record::RecordError;
+#[cfg(feature = "foxglove")]
+use rapid_live::LiveError;
 use rapid_screens::logging::LoggingError;
 use rapid_screens::tui::TuiError;
 #[cfg(feature = "web")]
@@ -12,8 +14,6 @@ use rapid_web::WebError;
 
 use super::LAST_CHUNK;
 use crate::hotplug::HotplugError;
-#[cfg(feature = "foxglove")]
-use crate::live::LiveError;
 #[cfg(feature = "policy")]
 use crate::policy::{library::LibraryError, sampler::PolicyError};
 use crate::rig::RigError;

@@ -1,4 +1,4 @@
-//! Stage Foxglove: thread `foxglove`, which serves the topics of the run over a websocket ([`crate::live`]).
+//! Stage Foxglove: thread `foxglove`, which serves the topics of the run over a websocket ([`rapid_live`]).
 //!
 //! Invariant: no recording ends because of it: its failure is an error of the log.
 
@@ -8,20 +8,20 @@ use rapid_episode::made::Shown;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::watch;
 
-pub(super) use crate::live::LiveAddition;
-pub use crate::live::LiveOptions;
+pub(super) use rapid_live::LiveAddition;
+pub use rapid_live::LiveOptions;
 
 use rapid_bus::Bus;
 use rapid_core::permission::Permission;
 use rapid_core::time::WallClock;
 use rapid_episode::made::Made;
+use rapid_live::{Controls, Feed, Live};
 use rapid_registry::Registry;
 use rapid_status::Board;
 
 use super::AppError;
 use super::requests::{Request, asker};
 use super::stage::Stage;
-use crate::live::{Controls, Feed, Live};
 
 /// Listens, before anything of the run is started: a port in use is an error of the start.
 pub(super) async fn listen(

@@ -14,6 +14,10 @@ use std::thread;
 use rapid_core::text;
 use rapid_episode::record::inspect::{self, ReadError};
 use rapid_episode::sha256;
+use rapid_export::{
+    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal, SetError,
+    Survey, Verified,
+};
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
 use serde::Serialize;
@@ -21,10 +25,6 @@ use serde::Serialize;
 use super::progress::Work;
 use super::{Format, json_line};
 use crate::cli::{ExportArgs, PictureForm};
-use crate::export::{
-    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal, SetError,
-    Survey, Verified,
-};
 
 /// Why the export ended.
 #[derive(Debug, thiserror::Error)]
@@ -209,9 +209,9 @@ fn append(
             return Err(SetError::Refused(Refusal::Interrupted));
         }
         let ends = Ends { stop, failed: &failed };
-        let encode = |ffmpeg| export::encode(&folder, episode, features, ffmpeg, ends, &frames);
+        let encode = |ffmpeg| rapid_export::encode(&folder, episode, features, ffmpeg, ends, &frames);
         let encoded = ffmpeg.map_or_else(|| Ok(Encoded::default()), encode)?;
-        let prepared = export::prepare(&folder, episode, features, *position, encoded, stop)?;
+        let prepared = rapid_export::prepare(&folder, episode, features, *position, encoded, stop)?;
         if ffmpeg.is_none() {
             frames.fetch_add(episode.rows, Ordering::Relaxed);
         }
@@ -272,7 +272,9 @@ fn found(
         let sha256 = sha256(file)?;
         match set.find(&sha256) {
             Some(number) => Ok(Read::Already(number)),
-            None => export::survey(file, sha256, args.include_bad, stop).map(|survey| Read::New(Box::new(survey))),
+            None => {
+                rapid_export::survey(file, sha256, args.include_bad, stop).map(|survey| Read::New(Box::new(survey)))
+            }
         }
     };
     let mut found = Found { already: BTreeMap::new(), new: Vec::new() };
@@ -349,7 +351,7 @@ fn verify(
     let work = Work { label: "episodes", workers: workers(jobs, 1), total: files.len(), done: None };
     work.each(
         &files,
-        |file| export::verify(set, number(file), file, ffmpeg, stop),
+        |file| rapid_export::verify(set, number(file), file, ffmpeg, stop),
         |file, verified| {
             let Verified { rows, differences, psnr_db } = match verified {
                 Ok(verified) => verified,

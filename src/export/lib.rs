@@ -17,6 +17,9 @@
 //! of rows.
 
 mod cells;
+#[cfg(test)]
+#[path = "../../tests/support/executable.rs"]
+mod executable;
 mod features;
 mod ffmpeg;
 mod files;
