@@ -96,7 +96,9 @@ pub(super) struct Collection {
     operations: Vec<Operation>,
     outcomes: UnboundedReceiver<Outcome>,
     /// What became of episodes of which no end was noted.
-    found: (UnboundedSender<Found>, UnboundedReceiver<Found>),
+    found: UnboundedReceiver<Found>,
+    /// For those who examine them.
+    to_found: UnboundedSender<Found>,
     at_begin: Beginning,
     at_end: Waiting,
     answer: Option<Answered>,
@@ -131,6 +133,7 @@ impl Collection {
         let names = journal::sessions(&episode.out).0.into_iter().flat_map(SessionFile::into_names).collect();
         let (session, is_new) = Session::new(&episode.out, plan, before, names, rfc3339(realtime_ns()));
         let (keeper, outcomes) = Keeper::start(&episode.out, journal)?;
+        let (to_found, found) = unbounded_channel();
         let collection = Self {
             board: Arc::clone(board),
             recorder,
@@ -140,7 +143,8 @@ impl Collection {
             keeper,
             operations: Vec::new(),
             outcomes,
-            found: unbounded_channel(),
+            found,
+            to_found,
             at_begin: Vec::new(),
             at_end: Vec::new(),
             answer: None,
@@ -257,7 +261,7 @@ impl Collection {
                 Some(end) = self.recorder.ended() => return end,
                 Some(outcome) = self.outcomes.recv() => self.take(outcome),
                 // This holds a sender: it does not end.
-                Some(found) = self.found.1.recv() => self.examined(&found),
+                Some(found) = self.found.recv() => self.examined(&found),
             }
         }
     }
@@ -289,7 +293,7 @@ impl Collection {
 
     /// Examines the episodes of which no end was noted: the run was killed then. It is to be called where blocking is allowed.
     pub(super) fn examination(&self) -> impl FnOnce() + Send + 'static {
-        let (folder, unfinished, found) = (self.episode.out.clone(), self.session.unfinished(), self.found.0.clone());
+        let (folder, unfinished, found) = (self.episode.out.clone(), self.session.unfinished(), self.to_found.clone());
         move || unfinished.into_iter().for_each(|file| examine(&folder, file, &found))
     }
 

@@ -132,7 +132,8 @@ impl EpisodeFile {
         clock: WallClock,
         begin: Stamp,
         metadata: BTreeMap<String, String>,
-        (guard, shown): (Guard, Option<Shown>),
+        guard: Guard,
+        shown: Option<Shown>,
     ) -> io::Result<Self> {
         let (shut, written) = (Shut::default(), Arc::<AtomicU64>::default());
         let wall_ns = clock.wall_ns(begin);

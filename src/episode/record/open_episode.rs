@@ -129,7 +129,7 @@ impl OpenEpisode {
         }
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
         let guard = Guard::begin(&path);
-        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, (guard, shown))?;
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, guard, shown)?;
         let is_mounted = |module: &&ModuleSpec| configuration.modules.contains(&module.name);
         file.transforms(registry.modules.iter().filter(is_mounted), begin)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
