@@ -1,6 +1,6 @@
-//! The keys of a table of `devices.toml`, each declared once, by [`keys!`]: name, type with its range, default, meaning.
+//! The keys of a table of `devices.toml`, each declared once, by `keys!`: name, type with its range, default, meaning.
 //!
-//! From a declaration follow the struct with its fields, the read with the messages of [`Section`], the list of known keys
+//! From a declaration follow the struct with its fields, the read with the messages of `Section`, the list of known keys
 //! with "did you mean", the reference of all keys (`docs/keys.md`) and the schema for editors (`docs/devices.schema.json`).
 //!
 //! Invariant: what a key may be is not stated anywhere else.
@@ -274,8 +274,8 @@ impl<T: Debug> Type for Own<T> {
 /// }
 /// ```
 ///
-/// `within` and `or_else` may speak of the fields above, and of what is passed: `struct Example(most: f64)`. `Example::read` reads a table, `Example::values` one that has other
-/// keys too; `Example::KEYS` are its keys.
+/// `within` and `or_else` may speak of the fields above, and of what is passed: `struct Example(most: f64)`. `Example::read`
+/// reads a table, `Example::values` one that has other keys too; `Example::KEYS` are its keys.
 macro_rules! keys {
     ($($(#[$meta:meta])* $vis:vis struct $name:ident $(($arg:ident: $arg_type:ty))? { $(
         $(#[doc = $doc:literal])+
