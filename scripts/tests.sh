@@ -5,7 +5,7 @@
 # 2. The guests run, one per processor.
 # 3. The tests of the host run: those of the program, which wait more than they compute, beside all others, of which the unit
 #    tests are the last: they compute most. Those that count allocations take four times as long beside the program: they begin.
-#    The unit tests of bus::leftovers make files of killed processes, which each start of the program removes: they run before.
+#    The unit tests of the bus make files of killed processes, which each start of the program removes: they run before.
 #
 # Guests are judged by virtual time and need no idle machine; the tests of the host judge no time, but are waited for less on one.
 # At the end it lists which tests were skipped.
@@ -34,11 +34,8 @@ run() {
     return "$code"
 }
 
-# with ARGUMENT... PROGRAM: a test program with these arguments.
-with() { "${@: -1}" "${@:1:$# - 1}"; }
-
-# The same for tests that compute, beside some that wait for clocks and for programs.
-behind() { nice -n 5 "${@: -1}" "${@:1:$# - 1}"; }
+# behind PROGRAM: a test program that computes, beside some that wait for clocks and for programs.
+behind() { nice -n 5 "$1"; }
 
 jobs=()
 # Of what runs beside something else.
@@ -95,6 +92,7 @@ guest=$(of guest)
 memory=$(of memory)
 program=$(of program)
 unit=$(of rapid)
+bus=$(of rapid_bus)
 waiting() {
     local code=0
     run env <<<"$memory" || code=1
@@ -103,9 +101,9 @@ waiting() {
 }
 computing() {
     local code=0
-    run env <<<"$(grep -vE '/deps/(guest|memory|program|rapid)-[0-9a-f]*$' "$list")" || code=1
+    run env <<<"$(grep -vE '/deps/(guest|memory|program|rapid|rapid_bus)-[0-9a-f]*$' "$list")" || code=1
     "$here/models-tests.sh" || code=1
-    run behind --skip bus::leftovers <<<"$unit" || code=1
+    run behind <<<"$unit" || code=1
     echo "     Waiting for the tests of the program"
     return "$code"
 }
@@ -113,7 +111,7 @@ computing() {
 code=0
 aside run env RUST_TEST_THREADS="$(nproc)" <<<"$guest"
 ended || code=1
-aside run with bus::leftovers <<<"$unit"
+aside run env <<<"$bus"
 ended || code=1
 aside waiting </dev/null >"$output" 2>&1
 aside computing </dev/null
