@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # What is too long for every day, before a release and at night, after `make test`: guests on an emulated machine with the
 # distribution's own kernel, for a second opinion on what User-Mode Linux shows; the longest scenario; the smoke test of `make
-# bench` on its guests; every cargo feature alone; fuzzing guided by coverage (FUZZ_SECONDS=20); the suites that need
+# bench` on its guests; every crate and every cargo feature alone; fuzzing guided by coverage (FUZZ_SECONDS=20); the suites that need
 # gigabytes of Python, where those are there.
 #
 #     tests-all.sh cargo test --locked --workspace
@@ -45,12 +45,21 @@ second_opinion() {
     RAPID_VBENCH_BACKEND=qemu "$@" --test guest -- --test-threads=2 "${second[@]}"
 }
 
+# In a build of all of them a crate has the features of its dependencies that another one asks for.
+each_crate() {
+    local manifest
+    for manifest in src/*/Cargo.toml; do
+        cargo check --locked --quiet --all-targets --manifest-path "$manifest" || { echo "tests-all.sh: $manifest" >&2; return 1; }
+    done
+}
+
 "$@" --no-run --test guest --test smoke
 part "guests on an emulated machine" second_opinion "$@"
 part "90 cycles" "$@" --test guest -- --ignored
 part "sections of make bench" "$@" --test smoke -- --ignored
 part "unit tests, each case of them" env RAPID_THOROUGH=1 "$@" --lib
 part "statistics of the simulated touch" "$@" --lib -- --ignored touch::
+part "each crate alone" each_crate
 part "cargo features" scripts/features.sh '' export foxglove lan motors policy web
 part "fuzzing" env FUZZ_SECONDS="${FUZZ_SECONDS:-20}" scripts/fuzz.sh
 if [[ -x $cache/train-venv/bin/python ]]; then part "train-test" make train-test; else skip train-test "its Python is not there: make train-test fetches 6 GB"; fi
