@@ -19,7 +19,7 @@ use rapid_registry::{
 use rapid_screens::headless::{self, HeadlessOptions};
 use rapid_screens::tui::{self, ScreenOptions};
 use rapid_status::session::SessionRequest;
-use rapid_status::{Board, Command, Level, Outlook, RecordingStatus, SlotState, What};
+use rapid_status::{Board, Command, EventKind, Level, Outlook, RecordingStatus, SlotState};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -152,7 +152,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
             if state != *before {
                 *before = state;
                 board.set_slot(id, state, Epoch(1), detail(state));
-                board.announce(What::State {
+                board.announce(EventKind::State {
                     device: NAMES.get(index).copied().unwrap_or("sensor").to_owned(),
                     bit: id,
                     state,

@@ -15,7 +15,7 @@ use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
 use rapid_registry::{ButtonAction, ButtonSpec, Registry};
 use rapid_status::session::{Label, Phase, SessionRequest};
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use tokio::sync::{mpsc, oneshot};
 
 use super::conductor::reached;
@@ -210,7 +210,7 @@ impl Desk {
                 change = changes.recv() => match change {
                     Some(Change::Level(button, is_on, at)) => self.update(button, |presses| presses.level(is_on, at)),
                     Some(Change::Unknown(button, at)) => self.update(button, |presses| presses.lose(at)),
-                    Some(Change::Note(level, text)) => self.board.announce(What::Log { level, text }),
+                    Some(Change::Note(level, text)) => self.board.announce(EventKind::Log { level, text }),
                     None => return,
                 },
                 () = reached(due) => {
@@ -261,5 +261,5 @@ impl Desk {
 }
 
 fn announce(board: &Board, level: Level, name: &str, text: &str) {
-    board.announce(What::Log { level, text: format!("{name}: {text}") });
+    board.announce(EventKind::Log { level, text: format!("{name}: {text}") });
 }

@@ -17,7 +17,7 @@ use rapid_episode::record::inspect::{self, Judgement, Listed};
 use rapid_episode::record::{EpisodeRequest, RecordError, Recorder};
 use rapid_registry::{ModuleError, ModuleSpec};
 use rapid_status::session::{Answered, Phase, SessionRequest, SessionStatus};
-use rapid_status::{Board, EpisodeCounts, EpisodeReport, Level, Verdict, What};
+use rapid_status::{Board, EpisodeCounts, EpisodeReport, EventKind, Level, Verdict};
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
@@ -276,7 +276,7 @@ impl Collection {
     }
 
     fn end_noted(&mut self, end: &EpisodeReport) -> (Vec<Effect>, Option<Pending>) {
-        self.episodes.note(&What::Episode(end.clone()));
+        self.episodes.note(&EventKind::Episode(end.clone()));
         let file = end.file.display();
         let to = std::mem::take(&mut self.at_end);
         let answer = if let Some(error) = &end.error {
@@ -310,8 +310,8 @@ impl Collection {
     /// Takes an outcome of the keeper.
     fn take(&mut self, outcome: Outcome) {
         match outcome {
-            Outcome::Discarded(file) => self.moved(What::Discarded { file: self.episode.out.join(file) }),
-            Outcome::Restored(file) => self.moved(What::Restored { file: self.episode.out.join(file) }),
+            Outcome::Discarded(file) => self.moved(EventKind::Discarded { file: self.episode.out.join(file) }),
+            Outcome::Restored(file) => self.moved(EventKind::Restored { file: self.episode.out.join(file) }),
             Outcome::NotMoved(file, why) => {
                 for effect in self.session.not_moved(&file) {
                     self.change(effect);
@@ -331,13 +331,13 @@ impl Collection {
         self.show();
     }
 
-    fn moved(&mut self, what: What) {
+    fn moved(&mut self, what: EventKind) {
         self.episodes.note(&what);
         self.board.announce(what);
     }
 
     fn fail(&mut self, text: String) {
-        self.board.announce(What::Log { level: Level::Error, text: text.clone() });
+        self.board.announce(EventKind::Log { level: Level::Error, text: text.clone() });
         self.answer(Err(text), None);
     }
 
@@ -375,7 +375,7 @@ impl Collection {
             Effect::End(at) => self.recorder.end(at),
             Effect::Discard(file) => self.operations.push(Operation::Discard(file)),
             Effect::Restore(file) => self.operations.push(Operation::Restore(file)),
-            Effect::Mark(text) => self.board.announce(What::Mark { text }),
+            Effect::Mark(text) => self.board.announce(EventKind::Mark { text }),
             Effect::Close(gone) => {
                 self.archive_superseded();
                 self.operations.push(Operation::Close(self.session.at_end(rfc3339(realtime_ns())), gone));

@@ -10,7 +10,7 @@ use std::time::Duration;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
 use rapid_episode::record::RecordError;
-use rapid_status::{Board, DeviceStatus, EpisodeReport, Level, SlotState, What};
+use rapid_status::{Board, DeviceStatus, EpisodeReport, EventKind, Level, SlotState};
 use rapid_system::fault;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
@@ -86,7 +86,7 @@ impl Conductor {
                 outcome = running.synchronisation.outcome() => {
                     output = outcome.and(Err(AppError::Panicked("the synchronisation")));
                     let text = "the synchronisation panicked: no more observations are published".to_owned();
-                    self.board.announce(What::Log { level: Level::Error, text });
+                    self.board.announce(EventKind::Log { level: Level::Error, text });
                 }
                 // After the end of its episode, which explains more.
                 outcome = running.recording.outcome() => return outcome.and(Err(AppError::Panicked("the recorder"))),
@@ -121,7 +121,7 @@ impl Conductor {
             return Ok(false);
         }
         let text = "the session in this folder has as many episodes as --goal wants: none begins by itself".to_owned();
-        self.board.announce(What::Log { level: Level::Warn, text });
+        self.board.announce(EventKind::Log { level: Level::Warn, text });
         Ok(screen != Screen::Monitor)
     }
 
@@ -144,7 +144,7 @@ impl Conductor {
         let never = |device: &DeviceStatus| device.state == SlotState::Absent && device.epoch == Epoch::default();
         if !devices.is_empty() && devices.iter().all(never) {
             let text = "no device of the registry is plugged in; `rapid devices` lists what is, and which entry it is";
-            self.board.announce(What::Log { level: Level::Warn, text: text.to_owned() });
+            self.board.announce(EventKind::Log { level: Level::Warn, text: text.to_owned() });
         }
     }
 

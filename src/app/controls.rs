@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use rapid_core::modality::ModalityId;
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use tokio::task::spawn_blocking;
 
 use crate::driver::camera;
@@ -32,6 +32,6 @@ pub(super) fn set(board: &Arc<Board>, id: ModalityId, control: String, value: i6
             }
             Err(why) => (Level::Warn, format!("{device}: {control} is not set: {why}")),
         };
-        board.announce(What::Log { level, text });
+        board.announce(EventKind::Log { level, text });
     });
 }

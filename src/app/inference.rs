@@ -13,7 +13,7 @@ use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_episode::ReferenceSample;
 use rapid_registry::Registry;
-use rapid_status::{Board, EpisodeWatch, Level, What};
+use rapid_status::{Board, EpisodeWatch, EventKind, Level};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
@@ -130,7 +130,7 @@ impl Flight {
         board.announce(live.bundle.begins(library, live.dry_run));
         for (modality, time) in live.bundle.held() {
             let text = format!("policy: while {modality} is absent, its last samples stand in for it, for {time:?}");
-            board.announce(What::Log { level: Level::Info, text });
+            board.announce(EventKind::Log { level: Level::Info, text });
         }
         let live = Live::start(live, model, &registry, inbox, actions, Arc::clone(&board), references)?;
         let ended = live.ended();
@@ -153,7 +153,7 @@ impl Flight {
         let Pace { verdict, text } = Pace::of(&self.options.live.bundle, chunk);
         match verdict {
             PaceVerdict::Whole => tracing::debug!("{text}"),
-            PaceVerdict::Pauses => self.board.announce(What::Log { level: Level::Warn, text }),
+            PaceVerdict::Pauses => self.board.announce(EventKind::Log { level: Level::Warn, text }),
             PaceVerdict::TooSlow => return Err(AppError::TooSlow(text)),
         }
         Ok(())
@@ -193,7 +193,7 @@ impl Flight {
             }
             if !std::mem::replace(&mut is_reported, true) {
                 let text = format!("the policy waits for {}", missing.join(", "));
-                self.board.announce(What::Log { level: Level::Warn, text });
+                self.board.announce(EventKind::Log { level: Level::Warn, text });
             }
         }
     }

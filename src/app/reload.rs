@@ -18,7 +18,7 @@ use rapid_core::time::Stamp;
 use rapid_episode::record::RecorderAddition;
 use rapid_registry::{DeviceSpec, Difference, ModuleSpec, Registry};
 use rapid_status::session::Answered;
-use rapid_status::{Board, EpisodeWatch, Level, RegistryRequest, What};
+use rapid_status::{Board, EpisodeWatch, EventKind, Level, RegistryRequest};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_blocking;
 
@@ -104,7 +104,7 @@ impl Reload {
         let (Ok(text) | Err(text)) = answer;
         let text = text.lines().map(str::trim).collect::<Vec<_>>().join("; ");
         if answer.is_err() {
-            self.board.announce(What::Log { level: Level::Warn, text: text.clone() });
+            self.board.announce(EventKind::Log { level: Level::Warn, text: text.clone() });
         }
         self.board.set_registry_answer(Answered { at: Stamp::now(), text, refused: answer.is_err() });
     }
@@ -141,7 +141,7 @@ impl Reload {
         let names: Vec<_> = devices.chain(modules.iter().map(|name| format!("[module.{name}]"))).collect();
         let names = names.join(", ");
         let episode = if self.episode.borrow().is_some() { "; recorded from the next episode on" } else { "" };
-        self.board.announce(What::Log { level: Level::Info, text: format!("registry: added {names}{episode}") });
+        self.board.announce(EventKind::Log { level: Level::Info, text: format!("registry: added {names}{episode}") });
         // A stage that is gone has ended with the run, or ends it.
         let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(&registry), subscription: None });
         let devices = opened.iter().map(|opened| Arc::clone(&opened.device)).collect();

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_registry::simulation::task::{Ended, Outcome, SharedTrial};
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::stage::Stage;
@@ -27,7 +27,7 @@ pub(super) fn start(trial: SharedTrial, board: Arc<Board>) -> Stage {
             let ended = trial.lock().ended();
             for trial in ended {
                 sorted += u64::from(trial.outcome == Outcome::Success);
-                board.announce(What::Log { level: Level::Info, text: report(trial, sorted) });
+                board.announce(EventKind::Log { level: Level::Info, text: report(trial, sorted) });
             }
         }
     })

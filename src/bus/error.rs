@@ -10,8 +10,8 @@ use rapid_core::text;
 use rapid_registry::MAX_SUBSCRIBERS;
 use rustix::process::{Resource, getrlimit};
 
-use super::leftovers::Files;
-use super::room;
+use super::space;
+use super::stale_files::Files;
 
 /// With fewer free descriptors than this, the failure is attributed to their limit: iceoryx2 closes the descriptors of
 /// the failed step before it returns.
@@ -62,8 +62,8 @@ pub enum BusError {
     #[error(
         "{}: {} free of {}, and {} are needed; enlarge it (`sudo mount -o remount,size={}M {}`), remove what fills it, \
          or lower memory_budget under [rig]",
-        room::PLACE, text::size(*free), text::size(*size), text::size(*need), room::mebibytes(*size, *free, *need),
-        room::PLACE
+        space::PLACE, text::size(*free), text::size(*size), text::size(*need), space::mebibytes(*size, *free, *need),
+        space::PLACE
     )]
     Room {
         /// Bytes that are needed.
@@ -76,14 +76,14 @@ pub enum BusError {
     /// Shared memory in use could not be written.
     #[error(
         "{}: shared memory that is in use cannot be used any more: {} is full, or another program has truncated or \
-         overwritten a file of the bus; end that program and start again", file.display(), room::PLACE
+         overwritten a file of the bus; end that program and start again", file.display(), space::PLACE
     )]
     Lost {
         /// The file, or the folder where it is not known.
         file: PathBuf,
     },
     /// There is no shared memory, or it cannot be used.
-    #[error("{}: {what}; {fix}", room::PLACE)]
+    #[error("{}: {what}; {fix}", space::PLACE)]
     Memory {
         /// What is wrong with it.
         what: String,
@@ -96,7 +96,7 @@ pub enum BusError {
     /// The file size limit of the process is too low.
     #[error(
         "{}: files are limited to {}, and a segment of shared memory is larger; raise the limit (`ulimit -f \
-         unlimited`, or LimitFSIZE=infinity in the unit)", room::PLACE, text::size(*limit)
+         unlimited`, or LimitFSIZE=infinity in the unit)", space::PLACE, text::size(*limit)
     )]
     FileSize {
         /// The limit in bytes.
@@ -164,7 +164,7 @@ pub(super) fn or_damage(error: BusError, files: &Files) -> BusError {
 
 /// The resource that the system lacks, if any.
 pub(super) fn lacking() -> Option<BusError> {
-    room::lacking().or_else(descriptors).or_else(|| addresses(SPARE_ADDRESSES).err())
+    space::lacking().or_else(descriptors).or_else(|| addresses(SPARE_ADDRESSES).err())
 }
 
 fn descriptors() -> Option<BusError> {
@@ -182,7 +182,7 @@ pub(super) fn addresses(need: u64) -> Result<(), BusError> {
     // See proc(5): the first number is the size in pages.
     let sizes = std::fs::read_to_string("/proc/self/statm").unwrap_or_default();
     let pages: u64 = sizes.split(' ').next().and_then(|pages| pages.parse().ok()).unwrap_or(0);
-    let used = pages.saturating_mul(room::page() as u64);
+    let used = pages.saturating_mul(space::page() as u64);
     if used.saturating_add(need) > limit { Err(BusError::AddressSpace { limit, used, need }) } else { Ok(()) }
 }
 

@@ -10,7 +10,9 @@ use super::guard::{Guarded, contained};
 use super::home::Home;
 use super::inbox::Subscription;
 use super::topic::TopicSpec;
-use super::{BusError, TopicFactory, WAKE_NOTIFIERS, WAKE_SERVICE, Writer, error, open_topic, open_wake, room, sigbus};
+use super::{
+    BusError, TopicFactory, WAKE_NOTIFIERS, WAKE_SERVICE, Writer, error, open_topic, open_wake, sigbus, space,
+};
 
 /// See the module's comment. It must live as long as the run: samples that a reader has not fetched are lost with it.
 pub struct Extension {
@@ -29,7 +31,7 @@ impl std::fmt::Debug for Extension {
 impl Extension {
     pub(super) fn open(home: &Arc<Home>, device: &DeviceSpec) -> Result<Self, BusError> {
         let spec = TopicSpec::of_device(device);
-        room::check(spec.room())?;
+        space::check(spec.room())?;
         error::addresses(spec.room())?;
         let opened = contained(|| {
             let topic = open_topic(home.node(), spec)?;

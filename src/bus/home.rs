@@ -10,9 +10,9 @@ use rustix::fs::{FlockOperation, flock};
 
 use super::error::{addresses, lacking, or_damage};
 use super::guard::{Guarded, contained};
-use super::leftovers::Files;
 use super::service::Service;
-use super::{BusError, place, room, sigbus};
+use super::stale_files::Files;
+use super::{BusError, paths, sigbus, space};
 
 /// A process that scans the files takes milliseconds.
 const TURN_LIMIT: Duration = Duration::from_millis(500);
@@ -46,17 +46,17 @@ impl Home {
     /// When the bus's files belong to another user, are damaged, or have too little space.
     pub(super) fn open(instance: Option<&str>, need: u64) -> Result<Self, BusError> {
         sigbus::install()?;
-        place::memory()?;
+        paths::memory()?;
         let config = config(instance)?;
         let root = root(&config);
-        place::check(&root)?;
-        place::make(&root)?;
+        paths::check(&root)?;
+        paths::make(&root)?;
         let prefix = config.global.prefix.to_string();
         let files = Leaving { files: Files::new(prefix.clone(), root.clone()), root };
         // Held until the node exists: a scan meanwhile would take its first files for those of a dead process.
         let turn = take_turn(&files.root);
         files.files.clear(FILL_LIMIT)?;
-        room::check(need)?;
+        space::check(need)?;
         addresses(need)?;
         // Signals belong to the program, not to a library.
         let builder = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled);
@@ -64,7 +64,7 @@ impl Home {
         files.files.make_counter();
         drop(turn);
         let node = node.map_err(|error| {
-            let cause = lacking().or_else(|| place::in_the_way(&prefix));
+            let cause = lacking().or_else(|| paths::in_the_way(&prefix));
             cause.unwrap_or_else(|| or_damage(BusError::Node(error.to_string()), &files.files))
         })?;
         sigbus::watch_over(files.files.clone());
@@ -111,7 +111,7 @@ impl Drop for Leaving {
 pub(super) fn clear_others(instance: Option<&str>) {
     let Ok(config) = config(instance) else { return };
     let root = root(&config);
-    if place::check(&root).is_ok() {
+    if paths::check(&root).is_ok() {
         let _turn = take_turn(&root);
         Files::new(config.global.prefix.to_string(), root).clear_others();
     }
@@ -141,7 +141,7 @@ fn take_turn(root: &Path) -> Option<File> {
 fn config(instance: Option<&str>) -> Result<Config, BusError> {
     let mut config = Config::global_config().clone();
     config.global.creation_timeout = CREATION_LIMIT;
-    let own = place::of_this_user(&root(&config));
+    let own = paths::of_this_user(&root(&config));
     if own != root(&config) {
         let own = iceoryx2::prelude::Path::new(own.as_os_str().as_encoded_bytes());
         let own = own.map_err(|error| BusError::Node(format!("the folder of this user's bus: {error:?}")))?;

@@ -12,7 +12,7 @@
 //! topic's own stream takes the locks of its port.
 //! Invariant: every segment of this program has all its memory from its creation (`room`); if segments of other
 //! programs lose pages, the run ends in order (`sigbus`). Nothing of the bus is writable by others, and nothing
-//! outlives the processes that use it (`leftovers`).
+//! outlives the processes that use it (`stale_files`).
 //! Invariant: no topic is closed during a run; one is opened for an entry that is added ([`Extension`]).
 //! Invariant: writers live as long as the bus. Samples that a reader has not fetched are lost with their writer
 //! (iceoryx2 0.10), so a writer that ended with its device would take the last samples along.
@@ -24,18 +24,18 @@ mod guard;
 mod home;
 mod inbox;
 mod ingress;
-mod leftovers;
+mod paths;
 #[cfg(test)]
 #[path = "../../tests/support/patience.rs"]
 mod patience;
-mod place;
-mod room;
 mod service;
 mod shared;
 mod sigbus;
 #[cfg(test)]
 #[path = "../../tests/support/skip.rs"]
 mod skip;
+mod space;
+mod stale_files;
 mod topic;
 mod writer;
 
@@ -59,7 +59,7 @@ pub use error::BusError;
 pub use extension::Extension;
 pub use inbox::{Foreign, Inbox, Queues, Subscription};
 pub use ingress::{Arrivals, Given, Ingress};
-pub use place::memory as check_memory;
+pub use paths::memory as check_memory;
 pub use sigbus::lost;
 pub use topic::{TopicId, TopicSpec};
 pub use writer::Writer;
@@ -133,7 +133,7 @@ impl Bus {
     /// descriptors.
     pub fn open(registry: &Registry, instance: Option<&str>) -> Result<Self, BusError> {
         let specs: Vec<_> = specs(registry).collect();
-        let need = specs.iter().map(TopicSpec::room).fold(room::BOOKS, u64::saturating_add);
+        let need = specs.iter().map(TopicSpec::room).fold(space::BOOKS, u64::saturating_add);
         error::addresses(need.saturating_add(OTHER_ADDRESSES))?;
         let home = Arc::new(Home::open(instance, need)?);
         let opened = contained(|| Self::open_at(&home, registry, specs, instance)).and_then(|opened| opened);

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::Access;
 
 use super::BusError;
-use super::room::PLACE;
+use super::space::PLACE;
 
 /// Access to the folders: only the owner, whatever the umask.
 const MODE: u32 = 0o700;

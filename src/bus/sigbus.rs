@@ -24,8 +24,8 @@ use rustix::event::{EventfdFlags, eventfd};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use super::leftovers::Files;
-use super::{BusError, room};
+use super::stale_files::Files;
+use super::{BusError, space};
 
 /// Bytes of a line of `/proc/self/maps` that are examined: its numbers and the path.
 const LINE: usize = 320;
@@ -79,7 +79,7 @@ pub(super) fn error() -> BusError {
             let bytes = bytes.strip_suffix(b" (deleted)").unwrap_or(&bytes);
             return Path::new(OsStr::from_bytes(bytes)).to_owned();
         }
-        FILES.get().and_then(Files::damaged).unwrap_or_else(|| PathBuf::from(room::PLACE))
+        FILES.get().and_then(Files::damaged).unwrap_or_else(|| PathBuf::from(space::PLACE))
     });
     BusError::Lost { file: file.clone() }
 }
@@ -124,7 +124,7 @@ pub(super) fn install() -> Result<(), BusError> {
         before.assume_init()
     };
     let (maps_number, wake_number) = (maps.as_raw_fd(), wake.as_raw_fd());
-    let made = Handler { maps: maps_number, wake: wake_number, page: room::page(), before };
+    let made = Handler { maps: maps_number, wake: wake_number, page: space::page(), before };
     if HANDLER.set(made).is_err() {
         return Ok(());
     }

@@ -24,7 +24,7 @@ use rustix::fs::{Mode, OFlags};
 use rustix::process::{Flock, FlockType, fcntl_getlk};
 use rustix::time::{ClockId, clock_gettime};
 
-use super::{BusError, room, sigbus};
+use super::{BusError, sigbus, space};
 
 /// The first 8 bytes of each file of iceoryx2 0.10.0 in shared memory: major, minor and patch, 16 bits each.
 const VERSION: u64 = 10 << 16;
@@ -99,7 +99,7 @@ impl Files {
     /// Creates the file in which other programs count their nodes, for its owner alone: if they created it, everybody
     /// could write to it. They work without it if it cannot be created.
     pub(super) fn make_counter(&self) {
-        let path = Path::new(room::PLACE).join(format!("{}{COUNTER}", self.prefix));
+        let path = Path::new(space::PLACE).join(format!("{}{COUNTER}", self.prefix));
         // A process that finds the file with this mode waits.
         let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let Ok(file) = rustix::fs::open(&path, flags, Mode::WUSR).map(File::from) else { return };
@@ -186,7 +186,7 @@ impl Files {
 
     fn entries(&self) -> Vec<Entry> {
         let nodes = self.root.join("nodes");
-        let in_memory = list(Path::new(room::PLACE), |name| in_memory(name.strip_prefix(&self.prefix)?));
+        let in_memory = list(Path::new(space::PLACE), |name| in_memory(name.strip_prefix(&self.prefix)?));
         let sockets = list(&self.root, |name| socket(name.strip_prefix(&self.prefix)?));
         let services = list(&self.root.join("services"), |name| {
             let hash = name.strip_prefix(&self.prefix)?.strip_suffix(".service")?;

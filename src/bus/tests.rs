@@ -358,7 +358,7 @@ fn every_segment_has_exactly_its_requested_memory_once_the_bus_is_open() {
     let prefix = bus.membership().prefix();
     let mut taken = 0;
     let mut connections = 0;
-    for entry in std::fs::read_dir(room::PLACE).expect("shared memory").flatten() {
+    for entry in std::fs::read_dir(space::PLACE).expect("shared memory").flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
         let Ok(about) = entry.metadata() else { continue };
         if name.starts_with(&prefix) {
@@ -368,6 +368,6 @@ fn every_segment_has_exactly_its_requested_memory_once_the_bus_is_open() {
         }
     }
     assert_eq!(connections, 2 * MAX_SUBSCRIBERS);
-    let asked = specs(&registry).map(|spec| spec.room()).sum::<u64>() + room::BOOKS;
+    let asked = specs(&registry).map(|spec| spec.room()).sum::<u64>() + space::BOOKS;
     assert!(taken <= asked, "{taken} bytes, and {asked} were asked for");
 }

@@ -6,7 +6,7 @@ use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::observation::{HEAD_BYTES, OBSERVATION_TOPIC, SLOT_BYTES};
 use rapid_registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
-use super::room::BOOKS;
+use super::space::BOOKS;
 
 /// 4 s of mask at 500 Hz: how long a consumer may be held up without losing a sample.
 const MASK_DEPTH: usize = 2048;

@@ -18,7 +18,7 @@ use rapid_core::sample::SampleHeader;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
-use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, leftovers, room, sigbus};
+use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, sigbus, space, stale_files};
 
 type Loan = SampleMutUninit<Service, [MaybeUninit<u8>], Header>;
 type Filled = SampleMut<Service, [u8], Header>;
@@ -96,7 +96,7 @@ impl Writer {
         }
         // One system call; takes a fraction of a microsecond.
         let mut head = [0; 8];
-        let is_whole = |pool: &File| pool.read_exact_at(&mut head, 0).is_ok() && leftovers::is_head(head);
+        let is_whole = |pool: &File| pool.read_exact_at(&mut head, 0).is_ok() && stale_files::is_head(head);
         if !self.pool.as_ref().is_none_or(is_whole) {
             sigbus::damaged();
         }
@@ -142,7 +142,7 @@ fn filled(loan: Loan, header: SampleHeader, payload: &[u8]) -> Result<Filled, Bu
 /// The segment that contains a publisher's samples.
 fn pool(publisher: UniquePublisherId) -> Option<File> {
     let ending = format!("_{}.data", publisher.value());
-    let mut entries = std::fs::read_dir(room::PLACE).ok()?.flatten();
+    let mut entries = std::fs::read_dir(space::PLACE).ok()?.flatten();
     let found = entries.find(|entry| entry.file_name().to_str().is_some_and(|name| name.ends_with(&ending)))?;
     File::open(found.path()).ok()
 }

@@ -39,7 +39,7 @@ pub struct Permission {
 
 /// Why an arm does nothing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Void {
+pub enum ArmRefused {
     /// There is no actuator.
     #[error("no actuator is plugged in: plug it in, then arm it")]
     NoActuator,
@@ -95,7 +95,7 @@ impl Permission {
     ///
     /// # Errors
     /// When it does nothing, and why.
-    pub fn arm(&self, given: Stamp, now: Stamp) -> Result<(), Void> {
+    pub fn arm(&self, given: Stamp, now: Stamp) -> Result<(), ArmRefused> {
         self.allow(Order::Arm, given, now)
     }
 
@@ -103,21 +103,21 @@ impl Permission {
     ///
     /// # Errors
     /// When it does nothing, and why.
-    pub fn arm_back(&self, given: Stamp, now: Stamp) -> Result<(), Void> {
+    pub fn arm_back(&self, given: Stamp, now: Stamp) -> Result<(), ArmRefused> {
         self.allow(Order::ArmBack, given, now)
     }
 
-    fn allow(&self, arm: Order, given: Stamp, now: Stamp) -> Result<(), Void> {
+    fn allow(&self, arm: Order, given: Stamp, now: Stamp) -> Result<(), ArmRefused> {
         self.at_first_plug.store(false, Ordering::SeqCst);
         let age = now.since(given);
         if given > now {
-            return Err(Void::Early);
+            return Err(ArmRefused::Early);
         } else if age > VOID_AFTER {
-            return Err(Void::Old(age));
+            return Err(ArmRefused::Old(age));
         } else if self.is_overtaken(given) {
-            return Err(Void::Overtaken);
+            return Err(ArmRefused::Overtaken);
         } else if self.actuators.load(Ordering::SeqCst) == 0 {
-            return Err(Void::NoActuator);
+            return Err(ArmRefused::NoActuator);
         }
         self.interlocks.check()?;
         self.slot.give(arm);
@@ -134,7 +134,7 @@ impl Permission {
     ///
     /// The time of the last disarm is read before the states: an input stores its state and its time before that one, and
     /// is then seen here. Its order is not always a disarm: a joint that is to hold at an emergency stop must not fall.
-    fn stopped_since(&self, last: u64) -> Option<(Void, Order)> {
+    fn stopped_since(&self, last: u64) -> Option<(ArmRefused, Order)> {
         let is_overtaken = self.disarmed.load(Ordering::SeqCst) > last;
         let order = |index| self.interlocks.order(index).unwrap_or(Order::Disarm);
         if let Err(blocked) = self.interlocks.check() {
@@ -143,7 +143,7 @@ impl Permission {
         }
         // An input that runs again has stopped the actuator nevertheless.
         let stop = || self.interlocks.stopped_after(last).map_or(Order::Disarm, order);
-        is_overtaken.then(|| (Void::Overtaken, stop()))
+        is_overtaken.then(|| (ArmRefused::Overtaken, stop()))
     }
 
     fn is_overtaken(&self, given: Stamp) -> bool {
@@ -187,7 +187,7 @@ impl Attended {
         };
         give(stop)?;
         match void {
-            Void::Blocked(blocked) => Ok(Some(blocked)),
+            ArmRefused::Blocked(blocked) => Ok(Some(blocked)),
             _ => Ok(None),
         }
     }

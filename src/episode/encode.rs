@@ -12,7 +12,7 @@ use rapid_core::observation::Observation;
 use rapid_core::points;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_registry::{CalibrationSpec, PointsSpec};
-use rapid_status::{Event, Level, What};
+use rapid_status::{Event, EventKind, Level};
 
 use super::schema::SampleSchema;
 
@@ -137,7 +137,7 @@ impl Announced {
 /// What of an event is a `foxglove.Log` as well.
 pub fn logged(event: &Event) -> Option<(Level, &str)> {
     match &event.what {
-        What::Log { level, text } | What::Printed { level, text, .. } => Some((*level, text)),
+        EventKind::Log { level, text } | EventKind::Printed { level, text, .. } => Some((*level, text)),
         _ => None,
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rapid_core::action::{Order, Trip};
 use rapid_core::permission::Attended;
 use rapid_core::sample::Encoding;
-use rapid_status::{Event, StopStatus, What};
+use rapid_status::{Event, EventKind, StopStatus};
 use rustix::fs::OFlags;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
@@ -81,7 +81,9 @@ impl Run {
     /// The words of the announcements since the last call.
     fn announced(&mut self) -> Vec<&'static str> {
         let events = std::iter::from_fn(|| self.events.try_recv().ok());
-        events.filter_map(|event| if let What::Stop(stop) = event.what { Some(stop.word()) } else { None }).collect()
+        events
+            .filter_map(|event| if let EventKind::Stop(stop) = event.what { Some(stop.word()) } else { None })
+            .collect()
     }
 }
 

@@ -38,7 +38,7 @@ use rapid_bus::{BusError, Queues, Subscription};
 use rapid_core::time::{Stamp, WallClock};
 use rapid_episode::made::Made;
 use rapid_registry::{DeviceSpec, Registry};
-use rapid_status::{Board, Event, Level, What};
+use rapid_status::{Board, Event, EventKind, Level};
 use rapid_system::fault;
 use topics::Topics;
 
@@ -182,14 +182,14 @@ impl Live {
     fn announce(&self) {
         let LiveOptions { address, control } = self.options;
         let text = format!("Foxglove: open connection ws://{address}");
-        self.board.announce(What::Log { level: Level::Info, text });
+        self.board.announce(EventKind::Log { level: Level::Info, text });
         if !address.ip().is_loopback() {
             let moves = if control { ", begins and ends episodes, and arms motors" } else { "" };
             let text = format!(
                 "Foxglove: {address} can be reached from other machines: whoever reaches that port sees what the \
                  sensors see{moves}; there is no password. `ssh -L {PORT}:localhost:{PORT}` needs no such address"
             );
-            self.board.announce(What::Log { level: Level::Warn, text });
+            self.board.announce(EventKind::Log { level: Level::Warn, text });
         }
     }
 
@@ -208,7 +208,7 @@ impl Live {
             () = stop.cancelled() => {}
             () = self.ended.cancelled() => {
                 let text = "Foxglove: its thread panicked; the run continues without it. Please report this".to_owned();
-                self.board.announce(What::Log { level: Level::Error, text });
+                self.board.announce(EventKind::Log { level: Level::Error, text });
             }
         }
         self.stop.cancel();

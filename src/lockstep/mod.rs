@@ -26,7 +26,7 @@ use rapid_registry::scenario::{Scenario, ScenarioAction};
 use rapid_registry::simulation::task::{self, AXES, AXIS_COUNT, STEP_HZ, SharedTrial};
 use rapid_registry::simulation::{SimSource, TaskPart};
 use rapid_registry::{DeviceSpec, Registry};
-use rapid_status::{Event, Provenance, SlotState, What};
+use rapid_status::{Event, EventKind, Provenance, SlotState};
 
 use crate::driver::DriverError;
 use crate::hotplug::script::Timeline;
@@ -254,7 +254,7 @@ impl Lockstep {
     }
 
     /// Carries out one effect and returns the event to announce.
-    fn carry_out(&mut self, id: ModalityId, effect: DeviceEffect) -> Option<What> {
+    fn carry_out(&mut self, id: ModalityId, effect: DeviceEffect) -> Option<EventKind> {
         let devices = self.lanes.len();
         let lane = self.lanes.iter_mut().find(|lane| lane.spec.id == id)?;
         let (device, bit) = (lane.spec.name.clone(), id);
@@ -266,16 +266,22 @@ impl Lockstep {
             }
             DeviceEffect::Start(epoch, attachment) => {
                 let provenance = Box::new(lane.start(epoch, &attachment, self.core.attached_at(id))?);
-                What::Opened { device, bit, provenance }
+                EventKind::Opened { device, bit, provenance }
             }
             DeviceEffect::AnnounceAttach => {
                 let Attachment { node, unit, driver, .. } = self.core.attached(id)?;
-                What::Attach { device, bit, node: node.label(), unit: unit.clone(), driver: driver.as_deref().cloned() }
+                EventKind::Attach {
+                    device,
+                    bit,
+                    node: node.label(),
+                    unit: unit.clone(),
+                    driver: driver.as_deref().cloned(),
+                }
             }
-            DeviceEffect::AnnounceDetach(source) => What::Detach { device, bit, source },
+            DeviceEffect::AnnounceDetach(source) => EventKind::Detach { device, bit, source },
             DeviceEffect::State(transition) => {
                 let mask = SizedMask { mask: self.core.mask(), devices };
-                What::State { device, bit, state: transition.to, mask, detail: String::new() }
+                EventKind::State { device, bit, state: transition.to, mask, detail: String::new() }
             }
             DeviceEffect::Ended | DeviceEffect::Plugged | DeviceEffect::Unplugged => return None,
         })

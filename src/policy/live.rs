@@ -23,7 +23,7 @@ use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_episode::ReferenceSample;
 use rapid_registry::Registry;
-use rapid_status::{Board, Hold, Level, PolicyEnd, PolicyStatus, What};
+use rapid_status::{Board, EventKind, Hold, Level, PolicyEnd, PolicyStatus};
 use rapid_system::fault;
 use tokio_util::sync::CancellationToken;
 
@@ -320,14 +320,14 @@ impl Control {
         {
             let hold = Hold { device: step.missing.map(str::to_owned), reason: reason.to_string() };
             self.hold = Some(hold.clone());
-            self.board.announce(What::Hold(hold));
+            self.board.announce(EventKind::Hold(hold));
         }
         if step.hold.is_none() {
             self.hold = None;
         }
         if step.clamped_is_news {
             let text = "policy: an action beyond its limits: the limit is executed".to_owned();
-            self.board.announce(What::Log { level: Level::Warn, text });
+            self.board.announce(EventKind::Log { level: Level::Warn, text });
         }
         let Some(action) = step.action else {
             self.acting = false;
@@ -336,7 +336,7 @@ impl Control {
         self.action.clear();
         self.action.extend_from_slice(action);
         if !std::mem::replace(&mut self.acting, true) {
-            self.board.announce(What::Act { tick });
+            self.board.announce(EventKind::Act { tick });
         }
         self.publish(tick, at);
     }
@@ -364,7 +364,7 @@ impl Control {
         let now = Stamp::now();
         if self.complained.is_none_or(|at| now.since(at) >= EVERY) {
             self.complained = Some(now);
-            self.board.announce(What::Log { level: Level::Error, text: text.to_owned() });
+            self.board.announce(EventKind::Log { level: Level::Error, text: text.to_owned() });
         }
     }
 
@@ -395,7 +395,7 @@ impl Control {
     fn end(self) {
         let counts = self.pilot.queue.counts();
         let quantile = |share| self.latencies.value_at_quantile(share) as f64 / 1e3;
-        self.board.announce(What::PolicyEnd(PolicyEnd {
+        self.board.announce(EventKind::PolicyEnd(PolicyEnd {
             actions: counts.actions,
             held: counts.held_ticks,
             chunks: counts.chunks,

@@ -8,7 +8,7 @@ use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_episode::ReferenceSample;
-use rapid_status::{Chunk, ObservedSamples, What};
+use rapid_status::{Chunk, EventKind, ObservedSamples};
 
 use super::bundle::{Bundle, ObservationSpec};
 use super::horizon::ChunkError;
@@ -184,8 +184,8 @@ impl Request {
         latency_ms: f64,
         answered: Result<u64, ChunkError>,
         actions: &[f32],
-    ) -> What {
-        What::Chunk(Box::new(Chunk {
+    ) -> EventKind {
+        EventKind::Chunk(Box::new(Chunk {
             tick: self.tick,
             observed_ns: self.stamp.0,
             mask: SizedMask { mask: self.mask, devices },

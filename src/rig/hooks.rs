@@ -1,4 +1,4 @@
-//! An attendant: runs the hooks of one attached device, in the order of the device's events.
+//! Runs the hooks of one attached device, in the order of the device's events.
 //!
 //! 1. `on_attach` when it is attached.
 //! 2. `on_record_start` when an episode begins, at once if one is in progress; `on_record_stop` when
@@ -6,7 +6,7 @@
 //! 3. `on_detach` when it was removed and the program that reads it has ended. Not at the end of the run: the device
 //!    stays plugged in.
 //!
-//! Invariant: only the next attendant of the same entry and, at the very end, the run wait for an attendant.
+//! Invariant: only the next runner of the same entry and, at the very end, the run wait for a runner.
 //! Invariant: the hooks of an entry run one at a time, each for [`HOOK_LIMIT`] at most.
 //! Invariant: each `on_record_start` is followed by one `on_record_stop`, unless the run ends in a hurry.
 
@@ -28,7 +28,7 @@ use crate::driver::process::Launch;
 /// A hook that has not ended by then is killed.
 pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
 
-/// Serialises the attendants of an entry.
+/// Serialises the runners of an entry.
 #[derive(Debug)]
 pub(super) struct Post {
     programs: Programs,
@@ -59,7 +59,7 @@ impl Post {
         }
         self.removed();
         self.gone = CancellationToken::new();
-        let attendant = Attendant {
+        let runner = HookRunner {
             environment: environment(&self.spec, attachment, &self.spec.topic, &self.bus),
             programs: self.programs.clone(),
             spec: Arc::clone(&self.spec),
@@ -67,7 +67,7 @@ impl Post {
             gone: self.gone.clone(),
             episode: episode.clone(),
         };
-        self.programs.tasks.spawn(attendant.attend(Arc::clone(&self.turn)));
+        self.programs.tasks.spawn(runner.run_all(Arc::clone(&self.turn)));
     }
 
     /// It was removed.
@@ -77,7 +77,7 @@ impl Post {
 }
 
 #[derive(Debug)]
-struct Attendant {
+struct HookRunner {
     programs: Programs,
     spec: Arc<DeviceSpec>,
     environment: Environment,
@@ -86,8 +86,8 @@ struct Attendant {
     episode: EpisodeWatch,
 }
 
-impl Attendant {
-    async fn attend(mut self, turn: Arc<Mutex<()>>) {
+impl HookRunner {
+    async fn run_all(mut self, turn: Arc<Mutex<()>>) {
         let turn = turn.lock_owned().await;
         // Plugged and unplugged before its hooks could start: neither hook is run.
         if self.gone.is_cancelled() || self.programs.closing.is_cancelled() {
@@ -105,7 +105,7 @@ impl Attendant {
         }
         if self.gone.is_cancelled() {
             if let Some(node) = &self.node {
-                // A successor need not wait for this attendant.
+                // A successor need not wait for this runner.
                 drop(timeout(TERM_LIMIT + MARGIN, node.lock()).await);
             }
             self.run("on_detach", spec.hooks.detach.as_ref(), None).await;

@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time;
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use rapid_system::folder::state_directory;
 use tokio::sync::oneshot;
 use tokio::time::timeout;
@@ -123,7 +123,7 @@ fn keep(mut files: Files, inbox: Receiver<Page>, missing: &AtomicU64, board: &Bo
             complained = true;
             let folder = files.folder.display();
             let text = format!("{folder}: {error}: what programs print is in the log of this run alone");
-            board.announce(What::Log { level: Level::Warn, text });
+            board.announce(EventKind::Log { level: Level::Warn, text });
         }
     }
 }

@@ -7,8 +7,8 @@
 //! Invariant: this task never waits for a device; a stream is asked to end and then forgotten.
 //! Invariant: the end of a stream, by return or by panic, is an event like any other.
 
-mod attendant;
 pub mod core;
+mod hooks;
 mod logbook;
 mod output;
 mod owner;

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::Stamp;
-use rapid_status::{Board, Level, PrintedOn, What};
+use rapid_status::{Board, EventKind, Level, PrintedOn};
 use tokio::net::unix::pipe::Receiver;
 use tokio::time::sleep;
 
@@ -118,7 +118,7 @@ impl Output {
         }
         let text = self.keep(line);
         let (device, printed) = (self.device.clone(), if index == 0 { PrintedOn::Stdout } else { PrintedOn::Stderr });
-        self.board.announce(What::Printed { level: Level::Info, device, printed, text });
+        self.board.announce(EventKind::Printed { level: Level::Info, device, printed, text });
     }
 
     fn notify(&mut self) {
@@ -132,7 +132,7 @@ impl Output {
     /// Adds a line to the log and to the device's file.
     pub(super) fn note(&self, level: Level, line: &str) {
         let text = self.keep(line);
-        self.board.announce(What::Log { level, text });
+        self.board.announce(EventKind::Log { level, text });
     }
 
     /// Adds a line to the device's file; the line as it is for the log.
@@ -241,7 +241,7 @@ mod tests {
         assert_eq!(pipes[0].try_read(&mut [0; 8]).unwrap_err().kind(), io::ErrorKind::WouldBlock);
         output.finish(&pipes[0], &pipes[1]);
         let printed = [(); 2].map(|()| match events.try_recv().unwrap().what {
-            What::Printed { text, .. } => text,
+            EventKind::Printed { text, .. } => text,
             other => panic!("{other:?}"),
         });
         assert_eq!(printed, ["motor: out", "motor: err"]);

@@ -18,19 +18,19 @@ use rapid_core::time::Stamp;
 use rapid_registry::candidate::{Candidate, unregistered};
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, Registry};
-use rapid_status::{Board, EpisodeWatch, Level, SlotState, UnregisteredDevice, What};
+use rapid_status::{Board, EpisodeWatch, EventKind, Level, SlotState, UnregisteredDevice};
 use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::attendant::Post;
 use super::core::{Core, DeviceEffect, Effect, Input, StreamEvent, Transition};
+use super::hooks::Post;
 use super::presence::{JsonDevice, PERIOD, Presence};
 use super::programs::{BusNames, Programs};
 use super::slot::End;
 use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
-use super::worker::Seat;
+use super::worker::ProcessSlot;
 use super::{Addition, RigCommand, RigError};
 use crate::driver::{ClockOffset, DriverError};
 use crate::hotplug::HotplugStream;
@@ -81,7 +81,7 @@ struct Modality {
     /// Ends the running stream.
     stop: CancellationToken,
     /// Runs its program, if it has one.
-    seat: Option<Seat>,
+    seat: Option<ProcessSlot>,
     /// Runs its hooks, if the rig runs programs at all.
     post: Option<Post>,
     /// Its commands, if it is the actuator and no program drives it.
@@ -102,10 +102,10 @@ impl Rig {
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             let spec = Arc::new(spec.clone());
-            let seat = programs.as_ref().and_then(|programs| Seat::new(programs, &spec, bus));
+            let seat = programs.as_ref().and_then(|programs| ProcessSlot::new(programs, &spec, bus));
             let post = programs
                 .as_ref()
-                .map(|programs| Post::new(programs, &spec, names.clone(), seat.as_ref().map(Seat::turn)));
+                .map(|programs| Post::new(programs, &spec, names.clone(), seat.as_ref().map(ProcessSlot::turn)));
             // A program that drives its device subscribes to actions itself.
             let is_driven = spec.action.is_some() && seat.is_none();
             let controls = if is_driven { bus.actions().map(Controls::new) } else { None };
@@ -242,7 +242,7 @@ impl Rig {
                 Effect::Unused { unit, reason } => {
                     let serial = unit.serial().unwrap_or("no serial");
                     let device = format!("{} ({serial}) at {}", unit.model(), unit.place());
-                    self.board.announce(What::Unregistered { device, reason });
+                    self.board.announce(EventKind::Unregistered { device, reason });
                 }
                 Effect::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
                 Effect::Device(id, effect) => self.carry_out(id, effect),
@@ -283,11 +283,11 @@ impl Rig {
             DeviceEffect::AnnounceAttach => {
                 if let Some(Attachment { node, unit, driver, .. }) = self.core.attached(id) {
                     let (node, unit, driver) = (node.label(), unit.clone(), driver.as_deref().cloned());
-                    self.board.announce(What::Attach { device: device(), bit: id, node, unit, driver });
+                    self.board.announce(EventKind::Attach { device: device(), bit: id, node, unit, driver });
                 }
             }
             DeviceEffect::AnnounceDetach(source) => {
-                self.board.announce(What::Detach { device: device(), bit: id, source });
+                self.board.announce(EventKind::Detach { device: device(), bit: id, source });
             }
             DeviceEffect::Plugged => {
                 if let Some((post, attachment)) = modality.post.as_mut().zip(self.core.attached(id)) {
@@ -354,25 +354,28 @@ impl Rig {
             Report::LinkDown => {
                 modality.detail = DriverError::Unlinked.to_string();
                 let text = format!("{device}: {}; it is opened when that is over", modality.detail);
-                What::Log { level: Level::Warn, text }
+                EventKind::Log { level: Level::Warn, text }
             }
             Report::Opened(description, provenance) => {
                 modality.detail = description;
-                What::Opened { device, bit: id, provenance }
+                EventKind::Opened { device, bit: id, provenance }
             }
             Report::Silent(limit) => {
                 let limit = limit.as_secs();
                 modality.detail = format!("{}; it has sent nothing for {limit} s", modality.detail);
-                What::Log { level: Level::Warn, text: format!("{device}: open, but it has sent nothing for {limit} s") }
+                EventKind::Log {
+                    level: Level::Warn,
+                    text: format!("{device}: open, but it has sent nothing for {limit} s"),
+                }
             }
-            Report::Refused(reason) => What::Log { level: Level::Error, text: format!("{device}: {reason}") },
+            Report::Refused(reason) => EventKind::Log { level: Level::Error, text: format!("{device}: {reason}") },
             Report::Clock(ClockOffset { offset_ns, uncertainty_ns }) => {
-                What::Clock { device, bit: id, offset_ns, uncertainty_ns }
+                EventKind::Clock { device, bit: id, offset_ns, uncertainty_ns }
             }
             Report::Actuator(ActuatorNotice { arming, text, is_problem }) => {
                 modality.detail = format!("{}: {text}", arming.word());
                 modality.arming = Some(arming);
-                What::Actuator { device, bit: id, arming, is_problem, text }
+                EventKind::Actuator { device, bit: id, arming, is_problem, text }
             }
         };
         self.show(id);
@@ -414,7 +417,7 @@ impl Rig {
         let mask = SizedMask { mask: self.core.mask(), devices: self.modalities.len() };
         let Some(modality) = self.modalities.iter().find(|modality| modality.spec.id == id) else { return };
         let (device, detail) = (modality.spec.name.clone(), modality.detail.clone());
-        self.board.announce(What::State { device, bit: id, state, mask, detail });
+        self.board.announce(EventKind::State { device, bit: id, state, mask, detail });
     }
 
     /// Writes the JSON file, with mask and sequence of one publication; `false` if the current mask is not published
@@ -484,7 +487,13 @@ impl Modality {
     fn disarm(&mut self, board: &Board, is_problem: bool) {
         if self.arming.take().is_some_and(|last| !matches!(last, Arming::Disarmed | Arming::Faulted)) {
             let (device, text) = (self.spec.name.clone(), "disarmed; arm it again to resume".to_owned());
-            board.announce(What::Actuator { device, bit: self.spec.id, arming: Arming::Disarmed, is_problem, text });
+            board.announce(EventKind::Actuator {
+                device,
+                bit: self.spec.id,
+                arming: Arming::Disarmed,
+                is_problem,
+                text,
+            });
         }
     }
 

@@ -12,7 +12,7 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::attendant::HOOK_LIMIT;
+use super::hooks::HOOK_LIMIT;
 use super::logbook::Logbook;
 use super::worker::TERM_LIMIT;
 use crate::driver::process::Spawner;

@@ -26,7 +26,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::core::StreamEvent;
 use super::slot::End;
-use super::worker::Seat;
+use super::worker::ProcessSlot;
 use crate::driver::{ClockOffset, Driver, DriverError, Reading};
 use crate::inputs::tap::{Tap, lost_at_the_end};
 
@@ -116,7 +116,7 @@ pub(super) struct Stream {
     pub(super) reports: mpsc::Sender<Reported>,
     pub(super) stop: CancellationToken,
     /// Runs the program of the entry, if it has one.
-    pub(super) seat: Option<Seat>,
+    pub(super) seat: Option<ProcessSlot>,
     /// Orders and actions, if it is the actuator.
     pub(super) controls: Option<Controls>,
     /// Emergency stops and enabling switches that are numbers in its samples.

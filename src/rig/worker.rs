@@ -1,6 +1,6 @@
 //! A worker: a program that reads a device, and the samples it publishes.
 //!
-//! A stream opens a worker as it would a driver. A separate task (`keeper`) starts, monitors and ends the program; its
+//! A stream opens a worker as it would a driver. A separate task (`supervisor`) starts, monitors and ends the program; its
 //! output goes to the log (`output`); its samples are validated (`intake`) and lent to the stream, which publishes them
 //! under the rig's own header.
 //!
@@ -9,7 +9,7 @@
 //! Invariant: once the stream is asked to stop, no sample of its program counts, however long the program lives.
 
 mod intake;
-mod keeper;
+mod supervisor;
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, ProcessSpec};
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use tokio::sync::{Mutex, oneshot};
 use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
@@ -27,15 +27,15 @@ use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
 use crate::driver::process::Launch;
 use crate::driver::{DriverError, Reading};
 use intake::{Intake, Judged};
-use keeper::Keeper;
-pub(super) use keeper::{TERM_LIMIT, describe};
+use supervisor::Supervisor;
+pub(super) use supervisor::{TERM_LIMIT, describe};
 
 /// A program that is silent for this many heartbeats is started again.
 pub(super) const MOST_SILENT_BEATS: u32 = 5;
 
 /// The per-entry state that its successive programs share.
 #[derive(Debug, Clone)]
-pub(super) struct Seat {
+pub(super) struct ProcessSlot {
     programs: Programs,
     membership: Membership,
     ingress: Arc<Ingress>,
@@ -43,7 +43,7 @@ pub(super) struct Seat {
     turn: Arc<Mutex<()>>,
 }
 
-impl Seat {
+impl ProcessSlot {
     /// The seat of one entry's program; `None` if the entry has none.
     pub(super) fn new(programs: &Programs, spec: &DeviceSpec, bus: &Bus) -> Option<Self> {
         let ingress = bus.ingress(spec.id)?;
@@ -77,7 +77,7 @@ pub(super) struct Worker {
 impl Worker {
     /// Starts the program of an entry, once its predecessor has ended.
     pub(super) async fn open(
-        seat: &Seat,
+        seat: &ProcessSlot,
         spec: &DeviceSpec,
         process: &ProcessSpec,
         attachment: &Attachment,
@@ -86,7 +86,7 @@ impl Worker {
         let watch = seat.ingress.watch().map_err(|error| DriverError::Retry(error.to_string()))?;
         if seat.turn.try_lock().is_err() {
             let text = format!("{}: waits for its previous process to end", spec.name);
-            seat.programs.board.announce(What::Log { level: Level::Info, text });
+            seat.programs.board.announce(EventKind::Log { level: Level::Info, text });
         }
         let wait = timeout(TERM_LIMIT + MARGIN, Arc::clone(&seat.turn).lock_owned());
         let turn = wait.await.map_err(|_| DriverError::Retry("its previous process has not ended".to_owned()))?;
@@ -97,7 +97,7 @@ impl Worker {
         let (started, has_started) = oneshot::channel();
         let (ending, ended) = oneshot::channel();
         let programs = &seat.programs;
-        let keeper = Keeper {
+        let supervisor = Supervisor {
             name: spec.name.clone(),
             programs: programs.clone(),
             membership: seat.membership.clone(),
@@ -109,7 +109,7 @@ impl Worker {
         let mut env: Environment = environment(spec, attachment, seat.ingress.topic(), &BusNames::of(&seat.membership));
         env.push(("RAPID_EPOCH", Some(epoch.0.to_string().into())));
         let launch = Launch { program: process.program.clone(), args: process.args.clone(), env };
-        programs.tasks.spawn(keeper.keep(launch));
+        programs.tasks.spawn(supervisor.keep(launch));
         let stop = stop.drop_guard();
         let pid = has_started.await.unwrap_or_else(|_| Err(DriverError::Retry("its keeper ended".to_owned())))?;
         let program = process.program.file_name().unwrap_or_default().to_string_lossy();
@@ -156,7 +156,7 @@ impl Worker {
                 let judged = self.intake.judge(given.header(), given.bytes(), Stamp::now());
                 if let Some(text) = self.intake.complaint() {
                     let text = format!("{}: {text}", self.name);
-                    self.board.announce(What::Log { level: Level::Warn, text });
+                    self.board.announce(EventKind::Log { level: Level::Warn, text });
                 }
                 if let Some(judged) = judged {
                     return Ok((given, judged));

@@ -26,8 +26,8 @@ use super::detail::{DeviceDetail, Intervals, StaticDetail};
 use super::preview::{LOOKED_AT, Preview};
 use super::session::{Answered, SessionStatus};
 use super::{
-    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance, RecordingStatus, SlotState,
-    Snapshot, StopStatus, UnregisteredDevice, Verdict, What,
+    DeviceStatus, Event, EventKind, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance, RecordingStatus,
+    SlotState, Snapshot, StopStatus, UnregisteredDevice, Verdict,
 };
 
 /// Log lines kept for the screen.
@@ -77,11 +77,11 @@ pub struct EpisodeCounts {
 
 impl EpisodeCounts {
     /// Takes an event about an episode.
-    pub fn note(&mut self, what: &What) {
+    pub fn note(&mut self, what: &EventKind) {
         match what {
-            What::Episode(end) => self.kept.push((end.file.clone(), end.verdict.grade)),
-            What::Discarded { file } => shift(&mut self.kept, &mut self.discarded, file),
-            What::Restored { file } => shift(&mut self.discarded, &mut self.kept, file),
+            EventKind::Episode(end) => self.kept.push((end.file.clone(), end.verdict.grade)),
+            EventKind::Discarded { file } => shift(&mut self.kept, &mut self.discarded, file),
+            EventKind::Restored { file } => shift(&mut self.discarded, &mut self.kept, file),
             _ => {}
         }
     }
@@ -214,8 +214,8 @@ impl State {
         self.previews.iter().find(|preview| preview.device == id)
     }
 
-    fn note_opened(&mut self, what: &What) {
-        if let What::Opened { bit, provenance, .. } = what
+    fn note_opened(&mut self, what: &EventKind) {
+        if let EventKind::Opened { bit, provenance, .. } = what
             && let Some(opened) = self.opened.get_mut(bit.index())
         {
             *opened = Some(Provenance::clone(provenance));
@@ -309,7 +309,7 @@ impl Board {
         if let Some(shown) = self.state().stops.iter_mut().find(|shown| shown.stop == stop.stop) {
             shown.clone_from(&stop);
         }
-        self.announce(What::Stop(stop));
+        self.announce(EventKind::Stop(stop));
     }
 
     /// Reports a publication of the mask.
@@ -366,7 +366,7 @@ impl Board {
     }
 
     /// Announces an event, now, to all subscribers, and adds it to the log.
-    pub fn announce(&self, what: What) {
+    pub fn announce(&self, what: EventKind) {
         let line = what.log_line().map(|(level, text)| {
             let (device, printed) = what.source();
             plain(level, &text, device, printed)

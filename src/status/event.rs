@@ -23,13 +23,13 @@ pub struct Event {
     pub stamp: Stamp,
     /// What happened.
     #[serde(flatten)]
-    pub what: What,
+    pub what: EventKind,
 }
 
 /// What happened.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
-pub enum What {
+pub enum EventKind {
     /// A registered device was plugged in.
     Attach {
         /// Modality.
@@ -345,7 +345,7 @@ impl Description {
     }
 }
 
-impl What {
+impl EventKind {
     /// The event as text.
     pub fn describe(&self) -> Description {
         use Description as D;
@@ -493,7 +493,7 @@ mod tests {
     #[test]
     fn a_state_is_a_sentence_in_the_log() {
         let bit = ModalityId::new(1).expect("below 64");
-        let state = |state, detail: &str| What::State {
+        let state = |state, detail: &str| EventKind::State {
             device: "tactile_tip".into(),
             bit,
             state,
@@ -512,7 +512,7 @@ mod tests {
         for (what, level, text) in table {
             assert_eq!(what.log_line(), Some((level, text.to_owned())));
         }
-        let detach = What::Detach { device: "tactile_tip".into(), bit, source: UnplugSource::Kernel };
+        let detach = EventKind::Detach { device: "tactile_tip".into(), bit, source: UnplugSource::Kernel };
         assert_eq!((detach.log_line(), detach.describe().detail()), (None, "reported by kernel"));
     }
 }

@@ -42,7 +42,7 @@ use session::{Answered, SessionRequest, SessionStatus};
 
 pub use board::{Board, EpisodeCounts};
 pub use event::Description;
-pub use event::{EpisodeReport, Event, Provenance, What};
+pub use event::{EpisodeReport, Event, EventKind, Provenance};
 
 /// Creates an enum whose values have words: `word` returns it, and JSON uses it.
 macro_rules! words {

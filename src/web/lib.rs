@@ -33,7 +33,7 @@ use tokio_util::sync::CancellationToken;
 
 use door::Door;
 use rapid_status::session::Asker;
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use serve::Server;
 use token::Token;
 pub use token::TokenError;
@@ -138,7 +138,7 @@ impl Web {
             () = stop.cancelled() => {}
             () = self.ended.cancelled() => {
                 let text = "page: its thread panicked; the run continues without it. Please report this".to_owned();
-                self.board.announce(What::Log { level: Level::Error, text });
+                self.board.announce(EventKind::Log { level: Level::Error, text });
             }
         }
         self.stop.cancel();

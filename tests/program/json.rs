@@ -27,11 +27,14 @@ fn described() -> BTreeSet<String> {
     kinds.map(|kind| event(name(kind)).expect("an event")).collect()
 }
 
-/// The variants of `enum What`, as they are written in JSON.
+/// The variants of `enum EventKind`, as they are written in JSON.
 fn variants(source: &str) -> Vec<String> {
     let tokens: Vec<TokenTree> = source.parse::<TokenStream>().expect("Rust").into_iter().collect();
     let is_word = |token: &TokenTree, word: &str| matches!(token, TokenTree::Ident(ident) if ident == word);
-    let at = tokens.windows(2).position(|pair| is_word(&pair[0], "enum") && is_word(&pair[1], "What")).expect("What");
+    let at = tokens
+        .windows(2)
+        .position(|pair| is_word(&pair[0], "enum") && is_word(&pair[1], "EventKind"))
+        .expect("EventKind");
     let TokenTree::Group(body) = &tokens[at + 2] else { panic!("its variants follow its name") };
     let snake = |name: String| {
         let word = |c: char| if c.is_uppercase() { format!("_{}", c.to_lowercase()) } else { c.to_string() };

@@ -244,7 +244,7 @@ async fn the_last_episode_whose_file_fails_is_an_error_of_the_run() {
 /// More events than the channel buffers for a reader.
 fn flood(board: &Board) {
     for _ in 0..10_000 {
-        board.announce(What::Log { level: Level::Info, text: String::new() });
+        board.announce(EventKind::Log { level: Level::Info, text: String::new() });
     }
 }
 

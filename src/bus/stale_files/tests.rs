@@ -64,7 +64,7 @@ fn helper() {
 
 fn member(name: &str, stays: bool) -> (Child, String) {
     let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["--exact", "leftovers::tests::helper", "--ignored", "--nocapture"]).env("RAPID_TEST_BUS", name);
+    command.args(["--exact", "stale_files::tests::helper", "--ignored", "--nocapture"]).env("RAPID_TEST_BUS", name);
     if stays {
         command.env("RAPID_TEST_STAY", "");
     }
@@ -284,7 +284,7 @@ struct Kept {
 
 impl Kept {
     fn aside(path: &Path) -> Self {
-        let folder = if path.starts_with(room::PLACE) { room::PLACE } else { "/tmp/iceoryx2" };
+        let folder = if path.starts_with(space::PLACE) { space::PLACE } else { "/tmp/iceoryx2" };
         let aside = Path::new(folder).join(format!("rapid_test_aside_{}", std::process::id()));
         std::fs::rename(path, &aside).unwrap();
         Self { path: path.to_owned(), aside }

@@ -19,7 +19,7 @@ fn a_disarm_without_an_actuator_is_remembered_until_a_newer_arm() {
     assert!(!is_armed(&attended).unwrap());
     assert_eq!(attended.take().count(), 0);
     // Given before the disarm arrived.
-    assert_eq!(permission.arm(at(1), at(1)), Err(Void::Overtaken));
+    assert_eq!(permission.arm(at(1), at(1)), Err(ArmRefused::Overtaken));
     assert_eq!(attended.take().count(), 0);
     assert_eq!(permission.arm(Stamp(at(1).0 + 1), at(2)), Ok(()));
     assert_eq!(attended.take().collect::<Vec<_>>(), [Arm]);
@@ -28,11 +28,11 @@ fn a_disarm_without_an_actuator_is_remembered_until_a_newer_arm() {
 #[test]
 fn an_arm_that_is_too_old_or_early_or_without_an_actuator_does_nothing() {
     let permission = Arc::new(Permission::new(false));
-    assert_eq!(permission.arm(at(1), at(1)), Err(Void::NoActuator));
+    assert_eq!(permission.arm(at(1), at(1)), Err(ArmRefused::NoActuator));
     let attended = permission.attend();
     assert!(!is_armed(&attended).unwrap());
-    assert_eq!(permission.arm(at(1), at(3)), Err(Void::Old(Duration::from_secs(2))));
-    assert_eq!(permission.arm(at(4), at(3)), Err(Void::Early));
+    assert_eq!(permission.arm(at(1), at(3)), Err(ArmRefused::Old(Duration::from_secs(2))));
+    assert_eq!(permission.arm(at(4), at(3)), Err(ArmRefused::Early));
     assert_eq!(attended.take().count(), 0);
     assert_eq!(permission.arm(at(2), at(3)), Ok(()));
     drop(attended);
@@ -177,7 +177,7 @@ fn an_arm_given_before_a_trip_is_void_even_if_the_input_runs_again() {
     all_run(&permission);
     permission.report(0, InputState::Lost, at(3));
     permission.report(0, InputState::Runs, at(4));
-    assert_eq!(permission.arm(at(3), at(4)), Err(Void::Overtaken));
+    assert_eq!(permission.arm(at(3), at(4)), Err(ArmRefused::Overtaken));
     assert_eq!(attended.take().collect::<Vec<_>>(), [Order::Emergency(Trip { stop: 0, is_lost: true })]);
     assert_eq!(permission.arm(at(4), at(4)), Ok(()));
 }
@@ -238,7 +238,7 @@ proptest! {
                 prop_assert!(runs || armed.is_err());
                 is_given |= armed.is_ok();
                 if !runs && back == 0 {
-                    prop_assert!(matches!(armed, Err(Void::Blocked(_))));
+                    prop_assert!(matches!(armed, Err(ArmRefused::Blocked(_))));
                 }
             } else {
                 permission.disarm(Stamp(now));
@@ -263,7 +263,7 @@ fn a_stop_that_overtakes_an_arm_is_given_as_what_it_is() {
             assert_eq!(permission.stopped_since(at(2).0), None);
             permission.report(index, state, at(3));
             let (void, order) = permission.stopped_since(at(2).0).unwrap();
-            assert!(matches!(void, Void::Blocked(blocked) if (blocked.index, blocked.state) == (index, state)));
+            assert!(matches!(void, ArmRefused::Blocked(blocked) if (blocked.index, blocked.state) == (index, state)));
             let stop = u8::try_from(index).unwrap();
             let expected = |is_lost| match kind {
                 StopKind::Emergency => Order::Emergency(Trip { stop, is_lost }),
@@ -271,11 +271,11 @@ fn a_stop_that_overtakes_an_arm_is_given_as_what_it_is() {
             };
             assert_eq!(order, expected(state == InputState::Lost));
             permission.report(index, InputState::Runs, at(4));
-            assert_eq!(permission.stopped_since(at(2).0), Some((Void::Overtaken, expected(false))));
+            assert_eq!(permission.stopped_since(at(2).0), Some((ArmRefused::Overtaken, expected(false))));
             assert_eq!(permission.stopped_since(at(3).0), None);
             // An operator's, after it.
             permission.disarm(at(5));
-            assert_eq!(permission.stopped_since(at(4).0), Some((Void::Overtaken, Disarm)));
+            assert_eq!(permission.stopped_since(at(4).0), Some((ArmRefused::Overtaken, Disarm)));
         }
     }
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use rapid_core::text;
 use rapid_core::time::{Stamp, nanoseconds};
 use rapid_registry::{DeviceSpec, Limits, Registry};
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 
 use super::quality::{Measures, Meter};
 
@@ -45,7 +45,7 @@ pub(super) fn look(
         {
             known.at = Some(now);
             let text = format!("{}: {text}", device.name);
-            board.announce(What::Log { level: Level::Warn, text });
+            board.announce(EventKind::Log { level: Level::Warn, text });
         }
     }
 }

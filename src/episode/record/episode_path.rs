@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::time;
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use rapid_system::folder::{Folder, FolderError, Links, Missing};
 use rustix::fs::{Mode, OFlags};
 
@@ -91,7 +91,7 @@ impl EpisodePath {
         if to != self.finished && to.parent() == self.finished.parent() {
             let (file, name) = (self.finished.display(), to.file_name().unwrap_or_default().to_string_lossy());
             let why = "another program took this name while the episode was recorded";
-            board.announce(What::Log { level: Level::Warn, text: format!("{file}: {why}, which is {name} now") });
+            board.announce(EventKind::Log { level: Level::Warn, text: format!("{file}: {why}, which is {name} now") });
         }
     }
 

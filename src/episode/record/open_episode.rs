@@ -28,7 +28,7 @@ use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use rapid_core::sync::{Grid, SyncSample, Synchronizer};
 use rapid_core::time::{Stamp, WallClock};
 use rapid_registry::{DeviceSpec, ModuleSpec, Registry};
-use rapid_status::{Board, EpisodeReport, Event, Level, Outlook, RecordingStatus, What};
+use rapid_status::{Board, EpisodeReport, Event, EventKind, Level, Outlook, RecordingStatus};
 
 use super::announce::{Announced, look};
 use super::episode_path::{self, EpisodePath, EpisodeRequest};
@@ -125,7 +125,7 @@ impl OpenEpisode {
         for (named, sensed) in &configuration.contradicted {
             let text =
                 format!("module {named} was named, but the sensor in its slot is of {sensed}: recorded as {sensed}");
-            board.announce(What::Log { level: Level::Warn, text });
+            board.announce(EventKind::Log { level: Level::Warn, text });
         }
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
         let guard = Guard::begin(&path);
@@ -256,10 +256,10 @@ impl OpenEpisode {
         };
         self.failed = self.write_event(event, &report).err();
         self.events += 1;
-        if let What::Attach { bit, .. } | What::Detach { bit, .. } = &event.what {
-            self.measures.plugged(*bit, event.stamp.0, matches!(event.what, What::Attach { .. }));
+        if let EventKind::Attach { bit, .. } | EventKind::Detach { bit, .. } = &event.what {
+            self.measures.plugged(*bit, event.stamp.0, matches!(event.what, EventKind::Attach { .. }));
         }
-        if let What::Clock { bit, uncertainty_ns, .. } = &event.what {
+        if let EventKind::Clock { bit, uncertainty_ns, .. } = &event.what {
             self.measures.uncertainty(*bit, *uncertainty_ns);
         }
     }

@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 
 use rapid_core::time::Stamp;
-use rapid_status::{Event, Provenance, SlotState, What};
+use rapid_status::{Event, EventKind, Provenance, SlotState};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -40,11 +40,11 @@ impl Attached {
     pub(super) fn take(&mut self, event: &Event) {
         let Self(units) = self;
         match &event.what {
-            What::Detach { device, .. } => drop(units.serials.remove(device)),
-            What::State { device, state, .. } if has_ended(*state) => drop(units.epochs.remove(device)),
-            What::PolicyEnd { .. } => units.policy = None,
+            EventKind::Detach { device, .. } => drop(units.serials.remove(device)),
+            EventKind::State { device, state, .. } if has_ended(*state) => drop(units.epochs.remove(device)),
+            EventKind::PolicyEnd { .. } => units.policy = None,
             what => {
-                if let What::Opened { device, .. } = what {
+                if let EventKind::Opened { device, .. } = what {
                     units.epochs.remove(device);
                 }
                 units.take(event);
@@ -75,16 +75,16 @@ impl Units {
     /// Takes an event.
     pub(super) fn take(&mut self, event: &Event) {
         match &event.what {
-            What::Attach { device, unit, .. } => {
+            EventKind::Attach { device, unit, .. } => {
                 drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)));
             }
-            What::Opened { device, provenance, .. } => {
+            EventKind::Opened { device, provenance, .. } => {
                 self.end(device, event.stamp);
                 let opened = Incarnation { opened: event.stamp, ended: None, provenance: (**provenance).clone() };
                 self.epochs.entry(device.clone()).or_default().push(opened);
             }
-            What::State { device, state, .. } if has_ended(*state) => self.end(device, event.stamp),
-            What::Policy { policy, hash, dry_run, .. } => {
+            EventKind::State { device, state, .. } if has_ended(*state) => self.end(device, event.stamp),
+            EventKind::Policy { policy, hash, dry_run, .. } => {
                 self.policy = Some(Policy { name: policy.clone(), hash: hash.clone(), dry_run: *dry_run });
             }
             _ => {}
@@ -151,8 +151,13 @@ mod tests {
 
     fn attach(ms: u64, serial: &str) -> Event {
         let bit = ModalityId::new(0).unwrap();
-        let what =
-            What::Attach { device: "cam".into(), bit, node: String::new(), unit: unit(serial).into(), driver: None };
+        let what = EventKind::Attach {
+            device: "cam".into(),
+            bit,
+            node: String::new(),
+            unit: unit(serial).into(),
+            driver: None,
+        };
         Event { stamp: Stamp(ms * 1_000_000), what }
     }
 
@@ -166,12 +171,13 @@ mod tests {
             latency_ns: 0,
         };
         let (bit, provenance) = (ModalityId::new(0).unwrap(), Box::new(provenance));
-        Event { stamp: Stamp(ms * 1_000_000), what: What::Opened { device: "cam".into(), bit, provenance } }
+        Event { stamp: Stamp(ms * 1_000_000), what: EventKind::Opened { device: "cam".into(), bit, provenance } }
     }
 
     fn state(ms: u64, state: SlotState) -> Event {
         let bit = ModalityId::new(0).unwrap();
-        let what = What::State { device: "cam".into(), bit, state, mask: SizedMask::default(), detail: String::new() };
+        let what =
+            EventKind::State { device: "cam".into(), bit, state, mask: SizedMask::default(), detail: String::new() };
         Event { stamp: Stamp(ms * 1_000_000), what }
     }
 
@@ -211,7 +217,7 @@ mod tests {
     }
 
     fn policy(name: &str) -> Event {
-        let what = What::Policy {
+        let what = EventKind::Policy {
             policy: name.to_owned(),
             folder: "models/x".into(),
             hash: "ff".to_owned(),
@@ -224,7 +230,7 @@ mod tests {
 
     #[test]
     fn the_policy_of_an_episode_is_the_one_that_ran_in_it() {
-        let end = What::PolicyEnd(PolicyEnd {
+        let end = EventKind::PolicyEnd(PolicyEnd {
             actions: 0,
             held: 0,
             chunks: 0,

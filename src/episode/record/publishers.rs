@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use rapid_bus::Foreign;
 use rapid_core::text;
-use rapid_status::What;
+use rapid_status::EventKind;
 use serde::{Deserialize, Serialize};
 
 /// Key of the metadata record at the end: JSON, a list of [`Publisher`].
@@ -52,7 +52,7 @@ pub(super) struct Publishers(Vec<Publisher>);
 
 impl Publishers {
     /// Counts samples. Returns the event of a program seen for the first time.
-    pub(super) fn note(&mut self, seen: Foreign<'_>) -> Option<What> {
+    pub(super) fn note(&mut self, seen: Foreign<'_>) -> Option<EventKind> {
         let known = |known: &&mut Publisher| known.process == seen.process && known.topic == seen.topic;
         if let Some(known) = self.0.iter_mut().find(known) {
             known.samples = known.samples.saturating_add(seen.samples);
@@ -62,7 +62,7 @@ impl Publishers {
             return None;
         }
         let (topic, process, command) = (seen.topic.to_owned(), seen.process, command(seen.process));
-        let event = What::Publisher { topic: topic.clone(), process, command: command.clone() };
+        let event = EventKind::Publisher { topic: topic.clone(), process, command: command.clone() };
         self.0.push(Publisher { topic, process, command, samples: seen.samples });
         Some(event)
     }

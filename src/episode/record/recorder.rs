@@ -27,7 +27,7 @@ use rapid_core::sample::SampleHeader;
 use rapid_core::time::{ClockWatch, Stamp, WallClock};
 use rapid_registry::Registry;
 use rapid_status::stops::{Reported, States};
-use rapid_status::{Board, Episode, EpisodeReport, EpisodeWatch, Event, Level, RecordingStatus, What};
+use rapid_status::{Board, Episode, EpisodeReport, EpisodeWatch, Event, EventKind, Level, RecordingStatus};
 use rapid_system::disk::Disk;
 use rapid_system::fault;
 use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
@@ -516,10 +516,10 @@ impl Writer {
         // An episode records their state at its beginning, not only changes.
         let stops = self.config.stops.borrow().clone();
         for stop in stops {
-            open.event(&Event { stamp: begin, what: What::Stop(stop) });
+            open.event(&Event { stamp: begin, what: EventKind::Stop(stop) });
         }
         self.config.board.set_recording(Some(open.status(begin)));
-        self.config.board.announce(What::Recording { file: finished.clone() });
+        self.config.board.announce(EventKind::Recording { file: finished.clone() });
         self.open = Some(open);
         self.publishers = Publishers::default();
         self.episode.send_replace(Some(Arc::new(Episode::new(&finished))));
@@ -558,7 +558,7 @@ impl Writer {
         match found {
             Finding::Low { free, left } => {
                 let folder = open.name().parent().map(Path::to_owned).unwrap_or_default();
-                self.config.board.announce(What::DiskLow { folder, free, seconds: left.as_secs() });
+                self.config.board.announce(EventKind::DiskLow { folder, free, seconds: left.as_secs() });
             }
             Finding::Removed => {
                 let file = open.name().display();
@@ -581,7 +581,7 @@ impl Writer {
             if self.open.is_none() {
                 self.in_force.send_replace(now);
             }
-            self.config.board.announce(What::ClockStep { seconds: step_ns as f64 / 1e9 });
+            self.config.board.announce(EventKind::ClockStep { seconds: step_ns as f64 / 1e9 });
         }
     }
 
@@ -599,7 +599,7 @@ impl Writer {
         if report.file.extension().is_none_or(|extension| extension != PARTIAL) {
             board.set_last_episode(report.file.clone(), report.verdict.clone());
         }
-        board.announce(What::Episode(report.clone()));
+        board.announce(EventKind::Episode(report.clone()));
         if let Some(ended) = self.ended.take() {
             // The handle may have been dropped.
             let _ = ended.send(report);
@@ -615,7 +615,7 @@ impl Writer {
     }
 
     fn complain(&self, level: Level, text: String) {
-        self.config.board.announce(What::Log { level, text });
+        self.config.board.announce(EventKind::Log { level, text });
     }
 }
 

@@ -22,7 +22,7 @@ use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_registry::Registry;
 use rapid_registry::device::UsbIdentity;
-use rapid_status::{Board, EpisodeReport, Grade, Level, What};
+use rapid_status::{Board, EpisodeReport, EventKind, Grade, Level};
 
 use super::*;
 
@@ -230,7 +230,7 @@ impl Bench {
     }
 
     /// Half a second in which nothing is sent and these events are announced, `before` it begins and within.
-    pub(crate) async fn half_a_second(&mut self, before: Vec<What>, within: Vec<What>) -> PathBuf {
+    pub(crate) async fn half_a_second(&mut self, before: Vec<EventKind>, within: Vec<EventKind>) -> PathBuf {
         self.mask(0, 1, Stamp::now().0);
         self.script.taken().await;
         for what in before {
@@ -261,7 +261,7 @@ impl Bench {
         });
         *self.at_begin.lock().unwrap() = Some(at_begin);
         let finished = self.recorder.start(self.request(Some(Duration::from_secs(1)))).await.unwrap();
-        let attach = What::Attach {
+        let attach = EventKind::Attach {
             device: "raw".to_owned(),
             bit: id(RAW),
             node: "/dev/video7".to_owned(),
@@ -270,7 +270,7 @@ impl Bench {
             driver: None,
         };
         self.board.announce(attach);
-        self.board.announce(What::Log { level: Level::Info, text: "hello".to_owned() });
+        self.board.announce(EventKind::Log { level: Level::Info, text: "hello".to_owned() });
         (finished, reported.recv().unwrap())
     }
 
@@ -281,10 +281,10 @@ impl Bench {
         }
     }
 
-    async fn until_closed(&self, events: &mut tokio::sync::broadcast::Receiver<rapid_status::Event>) -> What {
+    async fn until_closed(&self, events: &mut tokio::sync::broadcast::Receiver<rapid_status::Event>) -> EventKind {
         loop {
             let event = events.recv().await.unwrap();
-            if matches!(event.what, What::Episode(_)) {
+            if matches!(event.what, EventKind::Episode(_)) {
                 return event.what;
             }
         }

@@ -14,7 +14,7 @@ use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant, SystemTime};
 
 use rapid_core::text;
-use rapid_status::{Board, Level, What};
+use rapid_status::{Board, EventKind, Level};
 use rapid_system::disk::Disk;
 use rustix::process::setpriority_process;
 
@@ -116,7 +116,7 @@ impl Drop for Repairs {
 fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Board, stop: &AtomicBool) {
     // Of this thread alone; if refused, it runs at normal priority.
     let _ = setpriority_process(None, NICE);
-    let log = |level, text| board.announce(What::Log { level, text });
+    let log = |level, text| board.announce(EventKind::Log { level, text });
     let entries = match entries(folder, b".mcap.partial") {
         Ok(entries) => entries,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return,
@@ -180,10 +180,10 @@ fn rest(time: Duration, stop: &AtomicBool) {
     }
 }
 
-fn event(recovered: Recovered) -> What {
+fn event(recovered: Recovered) -> EventKind {
     let (level, text) = recovered.sentence();
     match recovered.outcome {
-        RepairOutcome::Repaired(repaired) => What::Recovered {
+        RepairOutcome::Repaired(repaired) => EventKind::Recovered {
             file: repaired.to,
             seconds: repaired.seconds,
             messages: repaired.messages,
@@ -191,7 +191,7 @@ fn event(recovered: Recovered) -> What {
             damaged_chunks: repaired.damaged_chunks,
             text,
         },
-        _ => What::Log { level, text },
+        _ => EventKind::Log { level, text },
     }
 }
 

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid_registry::Diagnostic;
-use rapid_status::What;
+use rapid_status::EventKind;
 use serde::{Deserialize, Serialize};
 
 use super::file;
@@ -94,8 +94,8 @@ impl Bundle {
     }
 
     /// The event that announces its start, on the onnxruntime named `library`.
-    pub fn begins(&self, library: String, dry_run: bool) -> What {
-        What::Policy {
+    pub fn begins(&self, library: String, dry_run: bool) -> EventKind {
+        EventKind::Policy {
             policy: self.name.clone(),
             folder: self.folder.clone(),
             hash: self.hash.clone(),

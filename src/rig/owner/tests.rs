@@ -186,7 +186,7 @@ impl Bench {
                 let event = timeout(PATIENCE, self.events.recv()).await;
                 let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.reported)).expect("event");
                 self.reported.extend(word(&event.what));
-                if matches!(&event.what, What::Log { text, .. } if text.contains(wanted)) {
+                if matches!(&event.what, EventKind::Log { text, .. } if text.contains(wanted)) {
                     return;
                 }
             },
@@ -209,13 +209,13 @@ impl Bench {
     }
 }
 
-fn word(what: &What) -> Option<String> {
+fn word(what: &EventKind) -> Option<String> {
     match what {
-        What::Attach { device, unit, .. } => Some(format!("{device} at {}", unit.place())),
-        What::Detach { device, source, .. } => Some(format!("{device} gone {}", source.word())),
-        What::State { device, state, .. } => Some(format!("{device} {}", state.word())),
-        What::Unregistered { .. } => Some("unused".into()),
-        What::Actuator { device, arming, .. } => Some(format!("{device} {}", arming.word())),
+        EventKind::Attach { device, unit, .. } => Some(format!("{device} at {}", unit.place())),
+        EventKind::Detach { device, source, .. } => Some(format!("{device} gone {}", source.word())),
+        EventKind::State { device, state, .. } => Some(format!("{device} {}", state.word())),
+        EventKind::Unregistered { .. } => Some("unused".into()),
+        EventKind::Actuator { device, arming, .. } => Some(format!("{device} {}", arming.word())),
         _ => None,
     }
 }
@@ -568,7 +568,7 @@ async fn the_mask_is_published_before_the_announcement_and_its_file_agrees_with_
     let (witnessed, announced) = std::sync::mpsc::channel();
     let watching = async move {
         while let Ok(event) = events.recv().await {
-            if let What::Detach { bit, .. } = event.what {
+            if let EventKind::Detach { bit, .. } = event.what {
                 let _ = witnessed.send(wanted().contains(bit));
             }
         }

@@ -25,7 +25,7 @@ const LAST_SAMPLES: Duration = Duration::from_secs(1);
 
 /// Everything the task owns.
 #[derive(Debug)]
-pub(super) struct Keeper {
+pub(super) struct Supervisor {
     pub(super) name: String,
     pub(super) programs: Programs,
     pub(super) membership: Membership,
@@ -46,7 +46,7 @@ enum End {
     Killed,
 }
 
-impl Keeper {
+impl Supervisor {
     /// From the start of the child to its end.
     pub(super) async fn keep(self, launch: Launch) {
         let Self { name, programs, membership, stop, turn, started, ended } = self;

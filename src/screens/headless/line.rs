@@ -5,7 +5,7 @@ use rapid_core::text;
 use rapid_core::time::Stamp;
 use rapid_pictures::qr;
 use rapid_status::palette::Palette;
-use rapid_status::{DeviceStatus, Event, Snapshot, What};
+use rapid_status::{DeviceStatus, Event, EventKind, Snapshot};
 use serde::Serialize;
 
 /// An event with its time on the wall clock.
@@ -91,10 +91,14 @@ impl Columns {
         let described = event.what.describe();
         let word = format!("{:WORD$}", described.word);
         let word = match &event.what {
-            What::State { state, .. } => palette.state(*state, &word),
-            What::Episode(end) => palette.grade(end.verdict.grade, &word),
-            What::Recording { .. } | What::Act { .. } | What::Policy { dry_run: false, .. } => palette.good(&word),
-            What::Unregistered { .. } | What::Discarded { .. } | What::Policy { .. } => palette.warn(&word),
+            EventKind::State { state, .. } => palette.state(*state, &word),
+            EventKind::Episode(end) => palette.grade(end.verdict.grade, &word),
+            EventKind::Recording { .. } | EventKind::Act { .. } | EventKind::Policy { dry_run: false, .. } => {
+                palette.good(&word)
+            }
+            EventKind::Unregistered { .. } | EventKind::Discarded { .. } | EventKind::Policy { .. } => {
+                palette.warn(&word)
+            }
             _ => palette.level(described.level, &word),
         };
         let time = palette.faint(&rapid_core::time::time_of_day(wall_ns));

@@ -21,7 +21,7 @@ use tokio_util::sync::CancellationToken;
 
 use rapid_status::palette::Palette;
 use rapid_status::rates::Rates;
-use rapid_status::{Board, Event, Snapshot, What};
+use rapid_status::{Board, Event, EventKind, Snapshot};
 use totals::RunTotals;
 
 /// Maximum backlog of output; beyond it events wait, and are eventually missed.
@@ -172,8 +172,8 @@ impl Printer {
         let line = match &event.what {
             _ if self.options.json => line::json(event, wall_ns)?,
             // Chunks arrive continuously; progress shows their rate.
-            What::Chunk(chunk) if chunk.skipped == 0 => return Ok(String::new()),
-            What::Clock { .. } => return Ok(String::new()),
+            EventKind::Chunk(chunk) if chunk.skipped == 0 => return Ok(String::new()),
+            EventKind::Clock { .. } => return Ok(String::new()),
             _ => self.columns.line(event, wall_ns),
         };
         Ok(self.whole_line(&line))

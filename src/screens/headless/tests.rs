@@ -8,8 +8,8 @@ use rapid_registry::device::UsbIdentity;
 
 use crate::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use rapid_status::{
-    Chunk, EpisodeReport, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState,
-    StopStatus, Verdict, What,
+    Chunk, EpisodeReport, EventKind, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors,
+    SlotState, StopStatus, Verdict,
 };
 use serde_json::Value;
 
@@ -36,12 +36,12 @@ impl Write for Kept {
     }
 }
 
-fn event(what: What) -> Event {
+fn event(what: EventKind) -> Event {
     Event { stamp: Stamp(0), what }
 }
 
-fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> What {
-    What::State {
+fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> EventKind {
+    EventKind::State {
         device: device.to_owned(),
         bit: id(bit),
         state,
@@ -50,8 +50,8 @@ fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> What {
     }
 }
 
-fn episode(dropped: u64, error: Option<&str>) -> What {
-    What::Episode(EpisodeReport {
+fn episode(dropped: u64, error: Option<&str>) -> EventKind {
+    EventKind::Episode(EpisodeReport {
         file: if error == Some("disk full") { "out/a.mcap.partial".into() } else { "out/a.mcap".into() },
         seconds: 30.04,
         messages: 1234,
@@ -84,8 +84,8 @@ fn usb() -> UsbIdentity {
     }
 }
 
-fn chunk(skipped: u64) -> What {
-    What::Chunk(Box::new(Chunk {
+fn chunk(skipped: u64) -> EventKind {
+    EventKind::Chunk(Box::new(Chunk {
         tick: 40,
         observed_ns: 0,
         mask: SizedMask { mask: PhysicalMask(5), devices: 3 },
@@ -98,12 +98,12 @@ fn chunk(skipped: u64) -> What {
     }))
 }
 
-fn hold(device: &str, reason: &str) -> What {
-    What::Hold(Hold { device: (!device.is_empty()).then(|| device.to_owned()), reason: reason.to_owned() })
+fn hold(device: &str, reason: &str) -> EventKind {
+    EventKind::Hold(Hold { device: (!device.is_empty()).then(|| device.to_owned()), reason: reason.to_owned() })
 }
 
-fn loaded(dry_run: bool) -> What {
-    What::Policy {
+fn loaded(dry_run: bool) -> EventKind {
+    EventKind::Policy {
         policy: "tactile-id".to_owned(),
         folder: "models/tactile-id".into(),
         hash: "0123456789abcdef0123456789abcdef".to_owned(),
@@ -113,8 +113,8 @@ fn loaded(dry_run: bool) -> What {
     }
 }
 
-fn policy_end(chunks: u64) -> What {
-    What::PolicyEnd(PolicyEnd {
+fn policy_end(chunks: u64) -> EventKind {
+    EventKind::PolicyEnd(PolicyEnd {
         actions: 812,
         held: 14,
         chunks,
@@ -125,20 +125,20 @@ fn policy_end(chunks: u64) -> What {
     })
 }
 
-fn stop(kind: StopKind, state: InputState, detail: &str) -> What {
-    What::Stop(StopStatus { stop: "pendant".to_owned(), kind, state, detail: detail.to_owned() })
+fn stop(kind: StopKind, state: InputState, detail: &str) -> EventKind {
+    EventKind::Stop(StopStatus { stop: "pendant".to_owned(), kind, state, detail: detail.to_owned() })
 }
 
-fn all_events() -> Vec<What> {
+fn all_events() -> Vec<EventKind> {
     vec![
-        What::Attach {
+        EventKind::Attach {
             device: "cam_wrist".to_owned(),
             bit: id(0),
             node: "/dev/video0".to_owned(),
             unit: usb().into(),
             driver: None,
         },
-        What::Opened {
+        EventKind::Opened {
             device: "cam_wrist".to_owned(),
             bit: id(0),
             provenance: Box::new(Provenance {
@@ -154,24 +154,24 @@ fn all_events() -> Vec<What> {
             }),
         },
         state("cam_wrist", 0, SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
-        What::Detach { device: "tof".to_owned(), bit: id(12), source: UnplugSource::Kernel },
+        EventKind::Detach { device: "tof".to_owned(), bit: id(12), source: UnplugSource::Kernel },
         state("tof", 12, SlotState::Absent, ""),
-        What::Unregistered { device: "046d:0825 \nX".to_owned(), reason: "no entry has this serial".to_owned() },
-        What::Recording { file: "out/a.mcap".into() },
+        EventKind::Unregistered { device: "046d:0825 \nX".to_owned(), reason: "no entry has this serial".to_owned() },
+        EventKind::Recording { file: "out/a.mcap".into() },
         episode(0, None),
         episode(3, None),
         episode(3, Some("disk full")),
         episode(0, Some("disk nearly full")),
-        What::Discarded { file: "out/a.mcap".into() },
-        What::Restored { file: "out/a.mcap".into() },
-        What::Mark { text: "grasped".to_owned() },
-        What::Mark { text: String::new() },
-        What::DiskLow { folder: "out".into(), free: 1_500_000_000, seconds: 252 },
-        What::ClockStep { seconds: -3600.0 },
+        EventKind::Discarded { file: "out/a.mcap".into() },
+        EventKind::Restored { file: "out/a.mcap".into() },
+        EventKind::Mark { text: "grasped".to_owned() },
+        EventKind::Mark { text: String::new() },
+        EventKind::DiskLow { folder: "out".into(), free: 1_500_000_000, seconds: 252 },
+        EventKind::ClockStep { seconds: -3600.0 },
         loaded(false),
         loaded(true),
         hold("", "the next actions are still being computed"),
-        What::Act { tick: 12 },
+        EventKind::Act { tick: 12 },
         chunk(0),
         chunk(1),
         chunk(3),
@@ -181,7 +181,7 @@ fn all_events() -> Vec<What> {
         stop(StopKind::Emergency, InputState::Stopped, ""),
         stop(StopKind::Enabling, InputState::Runs, ""),
         stop(StopKind::Enabling, InputState::Lost, "nothing was received for 200ms"),
-        What::Log { level: Level::Warn, text: "something".to_owned() },
+        EventKind::Log { level: Level::Warn, text: "something".to_owned() },
     ]
 }
 
@@ -327,7 +327,7 @@ fn progress_shows_the_policy() {
 #[test]
 fn the_summary_counts_the_policy() {
     let start = three_streaming();
-    let summary = |events: &[What]| {
+    let summary = |events: &[EventKind]| {
         let mut totals = RunTotals::new(&start);
         for what in events {
             totals.count(&event(what.clone()));
@@ -352,7 +352,7 @@ fn the_summary_counts_the_policy() {
 #[test]
 fn timely_chunks_are_printed_only_as_json() {
     let snapshot = three_streaming();
-    let print = |json, what: What| {
+    let print = |json, what: EventKind| {
         let options = HeadlessOptions { json, ..HeadlessOptions::default() };
         Printer::new(&snapshot, options).event(&event(what)).unwrap()
     };
@@ -457,7 +457,7 @@ async fn every_json_line_is_an_object_and_missed_events_are_reported() {
     let output = run(Arc::clone(&board), board.events(), shutdown.clone(), options, kept.clone());
     // More than the board keeps for a slow reader.
     for _ in 0..5000 {
-        board.announce(What::Log { level: Level::Info, text: "x".to_owned() });
+        board.announce(EventKind::Log { level: Level::Info, text: "x".to_owned() });
     }
     shutdown.cancel();
     output.await.unwrap();
@@ -478,7 +478,7 @@ async fn a_closed_pipe_is_a_clean_end_without_a_shutdown() {
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
     let output = run(Arc::clone(&board), board.events(), CancellationToken::new(), HeadlessOptions::default(), writer);
-    board.announce(What::Log { level: Level::Info, text: "x".to_owned() });
+    board.announce(EventKind::Log { level: Level::Info, text: "x".to_owned() });
     output.await.unwrap();
 }
 

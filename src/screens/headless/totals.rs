@@ -9,7 +9,7 @@ use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::text;
 use rapid_core::time::Stamp;
 use rapid_status::palette::Palette;
-use rapid_status::{DeviceStatus, EpisodeReport, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
+use rapid_status::{DeviceStatus, EpisodeReport, Event, EventKind, PolicyEnd, SlotState, Snapshot, Verdict};
 use serde::Serialize;
 
 /// How long each device was present, and which episodes were closed.
@@ -155,20 +155,20 @@ impl RunTotals {
 
     pub(super) fn count(&mut self, event: &Event) {
         match &event.what {
-            What::State { bit, state, .. } => {
+            EventKind::State { bit, state, .. } => {
                 if let Some(presence) = self.present.get_mut(bit.index()) {
                     presence.set(*state, event.stamp);
                 }
             }
-            What::Episode(end) => {
+            EventKind::Episode(end) => {
                 let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = end.clone();
                 let discarded = false;
                 self.episodes.push(Episode { file, seconds, messages, bytes, dropped, error, verdict, discarded });
             }
-            What::Discarded { file } => self.discard(file, true),
-            What::Restored { file } => self.discard(file, false),
-            What::Policy { policy, dry_run, .. } => self.policy = Some((policy.clone(), *dry_run)),
-            What::PolicyEnd(end) => self.policy_end = Some(*end),
+            EventKind::Discarded { file } => self.discard(file, true),
+            EventKind::Restored { file } => self.discard(file, false),
+            EventKind::Policy { policy, dry_run, .. } => self.policy = Some((policy.clone(), *dry_run)),
+            EventKind::PolicyEnd(end) => self.policy_end = Some(*end),
             _ => {}
         }
     }

@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 use rapid_core::mask::{PhysicalMask, SizedMask};
 use rapid_status::palette::Palette;
-use rapid_status::{Chunk, Grade, Hold, Sensors, What};
+use rapid_status::{Chunk, EventKind, Grade, Hold, Sensors};
 
 use super::*;
 use crate::effort::{cases, every};
@@ -119,7 +119,7 @@ fn any_damaged_file_has_a_report() {
 #[tokio::test]
 async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
     let mut bench = Bench::new();
-    let announced = What::Policy {
+    let announced = EventKind::Policy {
         policy: "tactile-id".to_owned(),
         folder: "models/tactile-id".into(),
         hash: "0123456789abcdef".to_owned(),
@@ -128,7 +128,7 @@ async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
         dry_run: false,
     };
     let chunk = |latency_ms, skipped| {
-        What::Chunk(Box::new(Chunk {
+        EventKind::Chunk(Box::new(Chunk {
             tick: 1,
             observed_ns: 0,
             mask: SizedMask { mask: PhysicalMask(3), devices: 2 },
@@ -145,10 +145,10 @@ async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
         .half_a_second(
             vec![announced],
             vec![
-                What::Hold(Hold { device: Some("arm".to_owned()), reason: "missing".to_owned() }),
+                EventKind::Hold(Hold { device: Some("arm".to_owned()), reason: "missing".to_owned() }),
                 chunk(30.0, 0),
                 chunk(50.0, 2),
-                What::Act { tick: 3 },
+                EventKind::Act { tick: 3 },
             ],
         )
         .await;

@@ -7,7 +7,7 @@ async fn an_episode_holds_exactly_the_captured_samples() {
     let mut bench = Bench::new();
     let mut events = bench.board.events();
     let (finished, t0) = bench.one_second().await;
-    let What::Episode(EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict }) =
+    let EventKind::Episode(EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict }) =
         bench.until_closed(&mut events).await
     else {
         unreachable!()

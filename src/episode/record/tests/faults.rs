@@ -42,7 +42,7 @@ async fn a_full_disk_ends_the_episode_and_not_the_recorder() {
     }
     let closed = bench.until_closed(&mut events).await;
     let sentence = closed.describe().sentence;
-    let What::Episode(EpisodeReport { file, bytes, error, .. }) = closed else { unreachable!() };
+    let EventKind::Episode(EpisodeReport { file, bytes, error, .. }) = closed else { unreachable!() };
     assert_eq!(file, finished.with_extension("mcap.partial"));
     assert_eq!(bytes, 100_000 + Failed::mark("no storage space").len() as u64);
     let error = error.unwrap();
@@ -88,7 +88,7 @@ async fn nothing_is_written_after_a_failed_write() {
     for seq in 0..4000 {
         bench.sample(CAM, 1, seq, Stamp::now().0, 0);
     }
-    let What::Episode(EpisodeReport { file, bytes, error, .. }) = bench.until_closed(&mut events).await else {
+    let EventKind::Episode(EpisodeReport { file, bytes, error, .. }) = bench.until_closed(&mut events).await else {
         unreachable!()
     };
     assert!(error.is_some());
@@ -131,11 +131,11 @@ async fn a_failed_file_gets_no_end_that_makes_it_look_whole() {
         seq += 1;
         tokio::task::yield_now().await;
         match events.try_recv() {
-            Ok(event) if matches!(event.what, What::Episode(_)) => break event.what,
+            Ok(event) if matches!(event.what, EventKind::Episode(_)) => break event.what,
             _ => {}
         }
     };
-    let What::Episode(EpisodeReport { file, error, verdict, .. }) = closed else { unreachable!() };
+    let EventKind::Episode(EpisodeReport { file, error, verdict, .. }) = closed else { unreachable!() };
     assert!(error.unwrap().contains("cable pulled"));
     assert_eq!(verdict.grade, Grade::Bad);
     let answer = inspect::inspect(&file).unwrap();
@@ -252,7 +252,7 @@ async fn a_panic_leaves_a_finished_file_and_is_reported() {
         tokio::task::yield_now().await;
     }
     bench.script.panic();
-    let What::Episode(EpisodeReport { file, error, .. }) = bench.until_closed(&mut events).await else {
+    let EventKind::Episode(EpisodeReport { file, error, .. }) = bench.until_closed(&mut events).await else {
         unreachable!()
     };
     assert_eq!(file, finished);

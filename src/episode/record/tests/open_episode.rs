@@ -176,7 +176,7 @@ fn losses_are_announced_once_a_second_and_counted_all() {
     assert_eq!((report.error, report.dropped), (None, u64::MAX));
     let mut answer = Vec::new();
     while let Ok(event) = events.try_recv() {
-        if let What::Log { level: Level::Warn, text } = event.what {
+        if let EventKind::Log { level: Level::Warn, text } = event.what {
             answer.push(text);
         }
     }
@@ -246,9 +246,9 @@ fn every_frame_waits_for_a_slow_sensor() {
 }
 
 /// The state on the board of a device that is plugged in.
-fn attach(name: &str, bit: u8) -> What {
+fn attach(name: &str, bit: u8) -> EventKind {
     let usb = UsbIdentity { port: "1-3".to_owned(), ..UsbIdentity::default() };
-    What::Attach {
+    EventKind::Attach {
         device: name.to_owned(),
         bit: id(bit),
         node: "/dev/video9".to_owned(),
@@ -272,7 +272,7 @@ async fn a_plugged_device_that_never_sends_is_reported_by_recorder_and_inspect_a
         let finished = bench.recorder.start(bench.request(Some(Duration::from_millis(500)))).await.unwrap();
         if before && !missed {
             let (device, bit, source) = ("never".to_owned(), id(NEVER), UnplugSource::Kernel);
-            bench.board.announce(What::Detach { device, bit, source });
+            bench.board.announce(EventKind::Detach { device, bit, source });
         }
         let t0 = Stamp::now().0;
         for n in 0..45 {

@@ -18,7 +18,7 @@ fn on_disk(free: &Arc<AtomicU64>) -> Bench {
     })
 }
 
-async fn until(events: &mut tokio::sync::broadcast::Receiver<Event>, wanted: impl Fn(&What) -> bool) -> What {
+async fn until(events: &mut tokio::sync::broadcast::Receiver<Event>, wanted: impl Fn(&EventKind) -> bool) -> EventKind {
     loop {
         let event = events.recv().await.unwrap();
         if wanted(&event.what) {
@@ -35,8 +35,8 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     bench.sample(TOF, 1, 0, Stamp::now().0, 0);
     free.store(GIB + (GIB >> 1), Ordering::Relaxed);
-    let low = until(&mut events, |what| matches!(what, What::DiskLow { .. })).await;
-    let What::DiskLow { folder, free: reported, seconds } = low else { unreachable!() };
+    let low = until(&mut events, |what| matches!(what, EventKind::DiskLow { .. })).await;
+    let EventKind::DiskLow { folder, free: reported, seconds } = low else { unreachable!() };
     assert_eq!(folder, finished.parent().unwrap());
     // What is set aside for the file counts as free.
     assert!((GIB + (GIB >> 1)..2 * GIB).contains(&reported) && seconds > 0, "{reported} {seconds}");
@@ -45,10 +45,10 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     }
     free.store(GIB - (128 << 20), Ordering::Relaxed);
     let closed = until(&mut events, |what| {
-        assert!(!matches!(what, What::DiskLow { .. }), "reported twice");
-        matches!(what, What::Episode(_))
+        assert!(!matches!(what, EventKind::DiskLow { .. }), "reported twice");
+        matches!(what, EventKind::Episode(_))
     });
-    let What::Episode(EpisodeReport { file, error, .. }) = closed.await else { unreachable!() };
+    let EventKind::Episode(EpisodeReport { file, error, .. }) = closed.await else { unreachable!() };
     assert_eq!(file, finished);
     let error = error.unwrap();
     assert!(error.contains("nearly full") && error.contains("disk_reserve") && error.contains("--out"), "{error}");
@@ -157,7 +157,7 @@ async fn a_removed_file_is_reported_while_recording_and_takes_no_other_name() {
     let mut events = bench.board.events();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     std::fs::remove_file(finished.with_extension("mcap.partial")).unwrap();
-    until(&mut events, |what| matches!(what, What::Log { text, .. } if text.contains("removed while"))).await;
+    until(&mut events, |what| matches!(what, EventKind::Log { text, .. } if text.contains("removed while"))).await;
     std::fs::write(&finished, "of another program").unwrap();
     let report = bench.recorder.stop().await.unwrap();
     assert_eq!(
@@ -198,8 +198,8 @@ async fn a_clock_step_is_an_event_and_times_never_decrease() {
         bench.sample(TOF, 1, sample, Stamp::now().0, 0);
         sample += 1;
         set.fetch_add(by * MS.cast_signed(), Ordering::Relaxed);
-        let step = until(&mut events, |what| matches!(what, What::ClockStep { .. })).await;
-        assert_eq!(step, What::ClockStep { seconds: by as f64 / 1000.0 });
+        let step = until(&mut events, |what| matches!(what, EventKind::ClockStep { .. })).await;
+        assert_eq!(step, EventKind::ClockStep { seconds: by as f64 / 1000.0 });
     }
     bench.sample(TOF, 1, sample, Stamp::now().0, 0);
     bench.script.taken().await;

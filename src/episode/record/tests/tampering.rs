@@ -91,7 +91,7 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
         let (bench, finished, _, mut events) = recorded(deed).await;
         // The end is not requested.
         let closed = tokio::time::timeout(PATIENCE, bench.until_closed(&mut events)).await;
-        let What::Episode(EpisodeReport { file, error, verdict, .. }) =
+        let EventKind::Episode(EpisodeReport { file, error, verdict, .. }) =
             closed.unwrap_or_else(|_| panic!("{what}: does not end"))
         else {
             unreachable!()
@@ -274,7 +274,7 @@ async fn an_episode_whose_name_was_taken_gets_the_next_one_and_keeps_its_verdict
         assert!(!finished.with_extension("mcap.partial").exists(), "{what}");
         let mut logged = Vec::new();
         while let Ok(event) = events.try_recv() {
-            if let What::Log { level: Level::Warn, text } = event.what {
+            if let EventKind::Log { level: Level::Warn, text } = event.what {
                 logged.push(text);
             }
         }

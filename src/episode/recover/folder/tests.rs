@@ -21,11 +21,13 @@ async fn a_folder_is_repaired_and_reported_in_the_background() {
     for _ in 0..3 {
         report.push(events.recv().await.unwrap().what);
     }
-    let What::Recovered { file, messages, text, .. } = &report[0] else { panic!("{report:?}") };
+    let EventKind::Recovered { file, messages, text, .. } = &report[0] else { panic!("{report:?}") };
     assert_eq!((file, strictly(&fs::read(file).unwrap()).len() as u64), (&folder.path().join("a_001.mcap"), *messages));
     assert!(text.contains("a_001.mcap.partial: repaired, "), "{text}");
-    assert!(matches!(&report[1], What::Log { text, .. } if text.ends_with("a_002.mcap.partial: of no bytes; removed")));
-    assert!(matches!(&report[2], What::Log { text, .. } if text.contains("a_003.mcap.partial: another rapid")));
+    assert!(
+        matches!(&report[1], EventKind::Log { text, .. } if text.ends_with("a_002.mcap.partial: of no bytes; removed"))
+    );
+    assert!(matches!(&report[2], EventKind::Log { text, .. } if text.contains("a_003.mcap.partial: another rapid")));
     drop(repairs);
     // A finished file is left alone.
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_003.mcap.partial", "a_004.mcap"]);
@@ -41,7 +43,7 @@ async fn a_repair_in_the_background_leaves_disk_space_for_an_episode() {
     let mut events = board.events();
     // Three quarters of what is free: a repair would fit, and an episode be warned of.
     let _repairs = Repairs::start(folder.path().to_owned(), Some(free / 4 * 3), board, || {}).unwrap();
-    let What::Log { text, .. } = events.recv().await.unwrap().what else { panic!() };
+    let EventKind::Log { text, .. } = events.recv().await.unwrap().what else { panic!() };
     assert!(text.contains("a_001.mcap.partial: not repaired: it takes ") && text.contains("; make room and"), "{text}");
     assert!(partial.exists());
 }
