@@ -43,7 +43,7 @@ keys! {
         serial_number = TEXT;
         /// USB port, instead of the serial number: `"1-2.3"`.
         port = TEXT;
-        /// How it is read: `"camera"`, `"serial"`, `"can"`, `"lan"`, or the name of a program.
+        /// How it is read: `"camera"`, `"serial"`, `"can"`, `"lan"`, `"process"`, or the name of a program.
         node = TEXT, need "";
     }
 }

@@ -1,6 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use super::*;
+use crate::kinds::{KEYS, Word};
 
 fn committed(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path)
@@ -123,4 +124,23 @@ fn every_key_has_a_meaning_and_no_table_has_one_twice() {
         }
     }
     check("", &[ROOT]);
+}
+
+/// A kind that is only listed would be read, and no reader of the documents would learn of it.
+#[test]
+fn every_kind_of_device_is_documented_and_among_the_tests_of_registries() {
+    let schema = schema();
+    let device = &schema["properties"]["device"]["additionalProperties"]["properties"];
+    let (valid, invalid) = (texts("tests/registry/valid"), texts("tests/registry/invalid"));
+    let tables = KEYS[2];
+    assert_eq!(tables.len(), Word::ALL.len());
+    for ((word, _), table) in Word::ALL.iter().zip(tables) {
+        let written = format!("{word:?}");
+        assert!(device["node"]["description"].as_str().unwrap().contains(&written), "{written} is no value of `node`");
+        assert!(device[table.name]["properties"].is_object(), "[{}] of {written} is not in the schema", table.name);
+        for (folder, registries) in [("valid", &valid), ("invalid", &invalid)] {
+            let is_there = registries.iter().any(|(_, text)| text.contains(&format!("node = {written}")));
+            assert!(is_there, "tests/registry/{folder} has no device of kind {written}");
+        }
+    }
 }
