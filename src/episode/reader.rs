@@ -1,7 +1,7 @@
 //! The one reader of episodes: the records of a file in their order, typed.
 //!
 //! Recorder tests, inspect, replay, compare and the fuzz targets use it; repair, which copies records unchanged, uses
-//! the [`RecordIter`] below it.
+//! the `RecordIter` below it.
 //!
 //! Invariant: memory holds one record of the file at a time, and the definitions of its channels, which are bounded.
 //! Invariant: content is read on request, and only once.
@@ -110,7 +110,7 @@ impl Reader<File> {
 }
 
 impl<R: ReadAt> Reader<R> {
-    /// Starts reading `size` bytes, called `path` in errors. `boot`: see [`RecordIter::of_boot`].
+    /// Starts reading `size` bytes, called `path` in errors. `boot`: see `RecordIter::of_boot`.
     ///
     /// # Errors
     /// The file cannot be read, or is no MCAP file.
