@@ -16,7 +16,7 @@
 //! Invariant: nothing here waits, locks or, except to refuse an arm, allocates.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -109,32 +109,53 @@ pub struct Interlocks {
 #[derive(Debug)]
 struct Interlock {
     kind: StopKind,
-    state: AtomicU8,
-    /// When it was last reported not to run; 0 before the first time.
-    stopped: AtomicU64,
+    /// Its state in the lowest two bits, and above them when it was last reported not to run, 0 before the first time. One
+    /// word: an input that is lost while another thread finds that it runs is not overwritten.
+    reported: AtomicU64,
 }
 
-const RUNS: u8 = 0;
-const STOPPED: u8 = 1;
-const LOST: u8 = 2;
-const UNREPORTED: u8 = 3;
+impl Interlock {
+    fn load(&self) -> Reported {
+        Reported(self.reported.load(Ordering::SeqCst))
+    }
+}
 
-const fn state_of(code: u8) -> InputState {
-    match code {
-        RUNS => InputState::Runs,
-        STOPPED => InputState::Stopped,
-        _ => InputState::Lost,
+/// The value of [`Interlock::reported`]. Nanoseconds of the monotonic clock need 62 bits in 146 years.
+#[derive(Clone, Copy)]
+struct Reported(u64);
+
+const RUNS: u64 = 0;
+const STOPPED: u64 = 1;
+const LOST: u64 = 2;
+const UNREPORTED: u64 = 3;
+
+impl Reported {
+    const fn new(code: u64, stopped: u64) -> Self {
+        Self(stopped << 2 | code)
+    }
+
+    const fn code(self) -> u64 {
+        self.0 & 3
+    }
+
+    const fn stopped(self) -> u64 {
+        self.0 >> 2
+    }
+
+    const fn state(self) -> InputState {
+        match self.code() {
+            RUNS => InputState::Runs,
+            STOPPED => InputState::Stopped,
+            _ => InputState::Lost,
+        }
     }
 }
 
 impl Interlocks {
     /// Stops with these names, [`MAX_STOPS`] at most.
     pub fn new<'a>(stops: impl Iterator<Item = (&'a str, StopKind)>) -> Self {
-        let (names, all): (Vec<Arc<str>>, Vec<_>) = stops
-            .map(|(name, kind)| {
-                (name.into(), Interlock { kind, state: AtomicU8::new(UNREPORTED), stopped: AtomicU64::new(0) })
-            })
-            .unzip();
+        let (names, all): (Vec<Arc<str>>, Vec<_>) =
+            stops.map(|(name, kind)| (name.into(), Interlock { kind, reported: AtomicU64::new(UNREPORTED) })).unzip();
         Self { all: all.into(), names: names.into() }
     }
 
@@ -145,7 +166,7 @@ impl Interlocks {
 
     /// The state of an input.
     pub fn state(&self, index: usize) -> InputState {
-        self.all.get(index).map_or(InputState::Lost, |one| state_of(one.state.load(Ordering::SeqCst)))
+        self.all.get(index).map_or(InputState::Lost, |one| one.load().state())
     }
 
     /// Checks that every input runs.
@@ -153,7 +174,7 @@ impl Interlocks {
     /// # Errors
     /// With the first that does not.
     pub fn check(&self) -> Result<(), Blocked> {
-        let states = self.all.iter().map(|one| state_of(one.state.load(Ordering::SeqCst))).enumerate();
+        let states = self.all.iter().map(|one| one.load().state()).enumerate();
         let Some((index, state)) = states.into_iter().find(|(_, state)| *state != InputState::Runs) else {
             return Ok(());
         };
@@ -169,18 +190,22 @@ impl Interlocks {
             InputState::Lost => LOST,
         };
         let Some(one) = self.all.get(index) else { return false };
-        if code != RUNS {
-            one.stopped.store(now.0.max(1), Ordering::SeqCst);
-        } else if matches!(one.stopped.load(Ordering::SeqCst), at if at > 0 && now.since(Stamp(at)) < SETTLES_IN) {
-            return false;
-        }
-        one.state.swap(code, Ordering::SeqCst) != code
+        let next = |before: u64| {
+            let stopped = Reported(before).stopped();
+            if code != RUNS {
+                return Some(Reported::new(code, now.0.max(1)).0);
+            }
+            let has_settled = stopped == 0 || now.since(Stamp(stopped)) >= SETTLES_IN;
+            has_settled.then(|| Reported::new(RUNS, stopped).0)
+        };
+        let before = one.reported.fetch_update(Ordering::SeqCst, Ordering::SeqCst, next);
+        before.is_ok_and(|before| Reported(before).code() != code)
     }
 
     /// An input that has stopped, or was lost, after this time, whatever it reports now; an emergency stop before an enabling
     /// switch.
     pub fn stopped_after(&self, last: u64) -> Option<usize> {
-        let is_after = |one: &Interlock| one.stopped.load(Ordering::SeqCst) > last;
+        let is_after = |one: &Interlock| one.load().stopped() > last;
         let stopped = |kind| self.all.iter().position(|one| one.kind == kind && is_after(one));
         stopped(StopKind::Emergency).or_else(|| stopped(StopKind::Enabling))
     }
@@ -193,5 +218,37 @@ impl Interlocks {
             StopKind::Emergency => Order::Emergency(trip()),
             StopKind::Enabling => Order::Disarm,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Barrier;
+
+    use super::*;
+
+    /// Whichever comes first: what runs at the moment of a loss has not settled.
+    #[test]
+    fn an_input_that_is_lost_at_the_moment_when_it_runs_is_lost() {
+        let interlocks = Interlocks::new([("stop", StopKind::Emergency)].into_iter());
+        let (begin, end) = (Barrier::new(2), Barrier::new(2));
+        let at = |round: u64| Stamp(round * 1_000_000_000);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                for round in 1..=20_000 {
+                    begin.wait();
+                    interlocks.set(0, InputState::Runs, at(round));
+                    end.wait();
+                }
+            });
+            let mut ran = 0;
+            for round in 1..=20_000 {
+                begin.wait();
+                interlocks.set(0, InputState::Lost, at(round));
+                end.wait();
+                ran += u32::from(interlocks.state(0) != InputState::Lost);
+            }
+            assert_eq!(ran, 0, "of 20000 rounds, an arm was possible after the loss");
+        });
     }
 }

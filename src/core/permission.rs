@@ -82,6 +82,11 @@ impl Permission {
         is_news
     }
 
+    /// The state of input `index` of the interlocks, as it was reported last.
+    pub fn state(&self, index: usize) -> InputState {
+        self.interlocks.state(index)
+    }
+
     /// The actuator may not move, from `now` on. Returns whether one is plugged in.
     pub fn disarm(&self, now: Stamp) -> bool {
         self.at_first_plug.store(false, Ordering::SeqCst);
