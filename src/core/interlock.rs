@@ -193,7 +193,8 @@ impl Interlocks {
         let next = |before: u64| {
             let stopped = Reported(before).stopped();
             if code != RUNS {
-                return Some(Reported::new(code, now.0.max(1)).0);
+                // The later one of two threads may be the first here.
+                return Some(Reported::new(code, stopped.max(now.0).max(1)).0);
             }
             let has_settled = stopped == 0 || now.since(Stamp(stopped)) >= SETTLES_IN;
             has_settled.then(|| Reported::new(RUNS, stopped).0)
@@ -226,6 +227,15 @@ mod tests {
     use std::sync::Barrier;
 
     use super::*;
+
+    #[test]
+    fn of_two_stops_the_later_one_counts_whichever_is_reported_first() {
+        let interlocks = Interlocks::new([("stop", StopKind::Emergency)].into_iter());
+        for at in [12, 10] {
+            interlocks.set(0, InputState::Lost, Stamp(at));
+        }
+        assert_eq!([11, 12].map(|armed| interlocks.stopped_after(armed)), [Some(0), None]);
+    }
 
     /// Whichever comes first: what runs at the moment of a loss has not settled.
     #[test]

@@ -5,6 +5,7 @@
 //!
 //! Invariant: the order is given before anything is shown or logged.
 //! Invariant: an input that is lost does not run.
+//! Invariant: what is shown and recorded last is what was ordered last, whichever thread reports.
 
 use std::io;
 use std::sync::Arc;
@@ -14,8 +15,8 @@ use rapid_core::interlock::{InputState, Interlocks};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
 use rapid_registry::Registry;
-use rapid_status::Board;
 use rapid_status::stops::Reported;
+use rapid_status::{Board, EventKind, StopStatus};
 
 use crate::inputs::tap::Tap;
 use crate::inputs::{Place, Readers, Report};
@@ -92,9 +93,17 @@ impl Reporter {
         if !is_news || self.is_ending.load(Ordering::Relaxed) {
             return;
         }
-        if let Some(stop) = self.reported.note(self.index, state, why) {
-            self.board.set_stop(stop);
-        }
+        // Under the lock: what is noted is shown in the same order.
+        self.reported.update(self.index, |noted| {
+            let stop = StopStatus { state, detail: why.to_owned(), ..noted.clone() };
+            if self.permission.state(self.index) == state {
+                noted.clone_from(&stop);
+                self.board.set_stop(stop);
+            } else {
+                // Another thread has reported since, and notes it: this is only what has happened.
+                self.board.announce(EventKind::Stop(stop));
+            }
+        });
     }
 }
 

@@ -265,6 +265,35 @@ fn an_input_whose_thread_panics_is_lost() {
     assert_eq!(run.reported.states().borrow()[0], run.stop(), "an episode records what is shown");
 }
 
+/// A stream reports that its input runs while the thread that watches for silence reports its loss.
+#[test]
+fn an_input_that_is_lost_as_it_begins_to_run_is_shown_and_recorded_as_it_is() {
+    let run = run("[stop.pedal]\nkind = \"enabling\"\nfield = { device = \"buttons\", index = 0, runs_above = 0 }\n");
+    let reporter = Reporter {
+        index: 0,
+        permission: Arc::clone(&run.permission),
+        reported: run.reported.clone(),
+        board: Arc::clone(&run.board),
+        is_ending: Arc::default(),
+    };
+    for round in 0..20 {
+        let is_lost = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let end = Instant::now() + PATIENCE;
+                while run.arm().is_err() && Instant::now() < end {}
+                reporter.lost("silent");
+                is_lost.store(true, Ordering::SeqCst);
+            });
+            while !is_lost.load(Ordering::SeqCst) {
+                reporter.level(0, true);
+            }
+        });
+        let (shown, recorded) = (run.stop().state, run.reported.states().borrow()[0].state);
+        assert_eq!([shown, recorded], [run.permission.state(0); 2], "round {round}: shown and recorded");
+    }
+}
+
 #[test]
 fn a_chattering_contact_is_one_stop() {
     let (port, path) = pendant();

@@ -1,7 +1,6 @@
 //! Emergency stops and enabling switches as they were reported last: interlocks write them, an episode takes those of its
 //! beginning.
 
-use rapid_core::interlock::InputState;
 use rapid_registry::Registry;
 use tokio::sync::watch;
 
@@ -25,15 +24,12 @@ impl Reported {
         self.0.subscribe()
     }
 
-    /// The input at `index` is in this state, `why` if it is lost. Returns what it was noted as.
-    pub fn note(&self, index: usize, state: InputState, why: &str) -> Option<StopStatus> {
-        let mut noted = None;
+    /// Changes what is reported of the input at `index`. Two reporters do not change it at the same time.
+    pub fn update(&self, index: usize, change: impl FnOnce(&mut StopStatus)) {
         self.0.send_modify(|all| {
-            noted = all.get_mut(index).map(|stop| {
-                (stop.state, stop.detail) = (state, why.to_owned());
-                stop.clone()
-            });
+            if let Some(stop) = all.get_mut(index) {
+                change(stop);
+            }
         });
-        noted
     }
 }
