@@ -138,6 +138,49 @@ fn every_dependency_has_a_home() {
     assert!(homeless.is_empty(), "Cargo.toml depends on {homeless:?}: name their homes in HOMES");
 }
 
+/// What a manifest names is used by its sources, the tests among them, or is there for a feature alone.
+#[test]
+fn every_dependency_is_used() {
+    const FOR_A_FEATURE: &[&str] = &["ratatui-core"];
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut files = BTreeMap::new();
+    for folder in ["src", "tests", "examples"] {
+        collect(root, &root.join(folder), &mut files).unwrap();
+    }
+    let is_package = |folder: &&Path| root.join(folder).join("Cargo.toml").exists();
+    let (shared, own): (Vec<_>, Vec<_>) = files.iter().partition(|(path, _)| path.starts_with("tests/support"));
+    let mut sources: BTreeMap<&Path, String> = BTreeMap::new();
+    for (path, text) in own {
+        let package = path.ancestors().skip(1).find(is_package).unwrap();
+        sources.entry(package).or_default().push_str(text);
+    }
+    for (package, sources) in &mut sources {
+        // Included by `#[path]`.
+        let includes = |path: &Path| sources.contains(&format!("support/{}", path.file_name().unwrap().display()));
+        let support = shared.iter().filter(|(path, _)| *package == Path::new("") || includes(path));
+        let support: String = support.map(|(_, text)| text.as_str()).collect();
+        sources.push_str(&support);
+    }
+    let is_named = |sources: &str, name: &str| {
+        let word = name.replace('-', "_");
+        FOR_A_FEATURE.contains(&name)
+            || sources.split(|c: char| !c.is_alphanumeric() && c != '_').any(|other| other == word)
+    };
+    let dependencies = |package: &Path| -> Vec<String> {
+        let manifest: toml::Table = fs::read_to_string(root.join(package).join("Cargo.toml")).unwrap().parse().unwrap();
+        let tables =
+            ["dependencies", "dev-dependencies"].into_iter().filter_map(|table| manifest.get(table)?.as_table());
+        tables.flat_map(|table| table.keys().cloned()).collect()
+    };
+    let unused: Vec<_> = sources
+        .iter()
+        .flat_map(|(package, sources)| dependencies(package).into_iter().map(move |name| (package, sources, name)))
+        .filter(|(_, sources, name)| !is_named(sources, name))
+        .map(|(package, _, name)| (package, name))
+        .collect();
+    assert!(unused.is_empty(), "named by a Cargo.toml and by no source: {unused:?}");
+}
+
 /// `rapid-remote` is in no workspace of this repository, and its lock is not written by a build of it.
 #[test]
 fn the_lock_of_rapid_remote_has_what_every_program_needs() {
