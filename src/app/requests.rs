@@ -48,7 +48,7 @@ pub(super) struct Receivers {
 }
 
 /// Sorts the commands of screens, and the requests of other programs, until those who make them have ended.
-pub(super) fn sorted(
+pub(super) fn spawn_router(
     receivers: Receivers,
     mut screen: mpsc::Receiver<Command>,
     mut arrivals: mpsc::Receiver<Arrival>,
@@ -117,7 +117,7 @@ mod tests {
         let (conductor, mut requests) = mpsc::unbounded_channel();
         let (registry, mut at_registry) = mpsc::unbounded_channel();
         let receivers = Receivers { conductor, rig, registry, scenario: mpsc::unbounded_channel().0 };
-        sorted(receivers, from_screen, mpsc::channel(1).1, attached);
+        spawn_router(receivers, from_screen, mpsc::channel(1).1, attached);
         for _ in 0..100 {
             screen.send(Command::Session(SessionRequest::Toggle)).await.unwrap();
         }

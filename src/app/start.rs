@@ -134,7 +134,7 @@ fn stages(machine: Machine, bus: &Bus, options: Options, front: Front) -> Result
         registry: reload.requests,
         scenario: replugs,
     };
-    requests::sorted(receivers, commands, arrivals, attached);
+    requests::spawn_router(receivers, commands, arrivals, attached);
     let conductor = Conductor {
         board,
         collection,

@@ -10,7 +10,7 @@
 //! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a loan in reused memory
 //! (`shared`): once a thread has published a sample, no sample allocates (`tests/memory/stream_alloc.rs`). Only a
 //! topic's own stream takes the locks of its port.
-//! Invariant: every segment of this program has all its memory from its creation (`room`); if segments of other
+//! Invariant: every segment of this program has all its memory from its creation (`space`); if segments of other
 //! programs lose pages, the run ends in order (`sigbus`). Nothing of the bus is writable by others, and nothing
 //! outlives the processes that use it (`stale_files`).
 //! Invariant: no topic is closed during a run; one is opened for an entry that is added ([`Extension`]).

@@ -1,6 +1,6 @@
 //! The board: where stages report the data that a screen may show.
 //!
-//! It is what screens see and nothing else: what one stage tells another goes over a channel or a handle of the stage that
+//! It is what screens see and nothing else: what one stage sends another goes over a channel or a handle of the stage that
 //! owns it. One writer per item: the rig writes slots and the mask, streams write their own counters, the recorder writes the
 //! recording. A screen only takes [`Snapshot`]s.
 //!
@@ -451,7 +451,7 @@ impl Board {
     pub fn snapshot(&self) -> Snapshot {
         let mut state = self.state();
         let taken = Stamp::now();
-        // Those of devices that nobody looks at are dropped.
+        // Those of devices that no screen shows are dropped.
         state.previews.retain(|preview| self.is_looked_at(preview.device, taken));
         let (last_episode, last_verdict) = state.last_episode.clone().unzip();
         Snapshot {

@@ -77,7 +77,7 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     // Room again.
     free.store(50 * GIB, Ordering::Relaxed);
     bench.recorder.start(bench.request(None)).await.unwrap();
-    // No end is lost, also if nobody waited for it when the next episode began.
+    // No end is lost, also if nothing waited for it when the next episode began.
     assert_eq!(bench.recorder.stop().await.unwrap().error.as_ref(), Some(&error_of_first));
     assert_eq!(bench.recorder.stop().await.unwrap().error, None);
     assert_eq!(bench.recorder.stop().await, None);
