@@ -48,7 +48,7 @@ fn commit() {
     }
 }
 
-/// Packs the library that policies need for the program to carry: `src/policy/library.rs` includes
+/// Packs the library that policies need for the program to carry: `src/policy/onnxruntime.rs` includes
 /// what is written here. Without the library that is an empty file, and the build goes on: recording
 /// needs none.
 fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {

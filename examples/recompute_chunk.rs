@@ -16,7 +16,7 @@ use std::path::Path;
 use prost::Message;
 use rapid::policy::bundle::{Bundle, ObservationInput};
 use rapid::policy::compose::Composer;
-use rapid::policy::library::Environment;
+use rapid::policy::onnxruntime::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;

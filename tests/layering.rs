@@ -53,13 +53,13 @@ const HOMES: &[(&str, &[&str])] = &[
     ("hyper_util", &["driver/lan"]),
     ("if_addrs", &["driver/lan"]),
     ("indicatif", &["commands/progress"]),
-    ("libc", &["hotplug", "driver", "rig", "app", "policy/library", "inputs"]),
+    ("libc", &["hotplug", "driver", "rig", "app", "policy/onnxruntime", "inputs"]),
     ("k", &["kinematics"]),
     ("mdns_sd", &["hotplug/lan"]),
     ("memchr", &["driver/lan"]),
     ("nix", &["driver/datagram", "driver/lan/udp", "driver/can/socket"]),
     ("nokhwa", &["driver/camera"]),
-    ("ort", &["policy/library", "policy/graphs"]),
+    ("ort", &["policy/onnxruntime", "policy/graphs"]),
     ("rustix", &[ABOVE_NOUNS]),
     ("sd_notify", &["app/watchdog"]),
     ("serde", &[ANYWHERE]),
@@ -77,13 +77,13 @@ const HOMES: &[(&str, &[&str])] = &[
     ("udev", &["hotplug/udev"]),
     ("v4l", &["driver/camera"]),
     ("zip", &["commands/policy"]),
-    ("zstd", &["policy/library"]),
+    ("zstd", &["policy/onnxruntime"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
 
 /// Where `unsafe` may stand: at the borders to the kernel and to shared memory.
-const UNSAFE_HOMES: &[&str] = &["driver", "bus", "policy/library/loader", "system/peer"];
+const UNSAFE_HOMES: &[&str] = &["driver", "bus", "policy/onnxruntime/loader", "system/peer"];
 
 /// What makes one thread wait for another.
 const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaphore", "Barrier"];
@@ -98,7 +98,7 @@ const LOCK_HOMES: &[(&str, &str)] = &[
         "registry/simulation",
         "the simulated world, which its devices share, and a light that is switched for a calibration",
     ),
-    ("policy/library", "onnxruntime is loaded once, before the first chunk"),
+    ("policy/onnxruntime", "onnxruntime is loaded once, before the first chunk"),
     ("system/fault", "tests"),
     ("system/panics", "messages of panics"),
     ("screens/tui", "the monitor's terminal"),

@@ -15,7 +15,7 @@ use rapid_web::WebError;
 use super::LAST_CHUNK;
 use crate::hotplug::HotplugError;
 #[cfg(feature = "policy")]
-use crate::policy::{library::LibraryError, sampler::PolicyError};
+use crate::policy::{onnxruntime::LibraryError, sampler::PolicyError};
 use crate::rig::RigError;
 use crate::rig::presence::PresenceError;
 

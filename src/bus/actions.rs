@@ -18,8 +18,8 @@ use rapid_core::time::Stamp;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
+use super::containment::{Guarded, contained};
 use super::error::topic_error;
-use super::guard::{Guarded, contained};
 use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicSpec, Writer, sigbus};
 
 /// An event for a task to wait for; `None` where the system cannot watch it and the caller must poll.

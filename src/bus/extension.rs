@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use rapid_registry::DeviceSpec;
 
-use super::guard::{Guarded, contained};
+use super::containment::{Guarded, contained};
 use super::home::Home;
 use super::inbox::Subscription;
 use super::topic::TopicSpec;

@@ -8,8 +8,8 @@ use iceoryx2::config::Config;
 use iceoryx2::prelude::*;
 use rustix::fs::{FlockOperation, flock};
 
+use super::containment::{Guarded, contained};
 use super::error::{addresses, lacking, or_damage};
-use super::guard::{Guarded, contained};
 use super::service::Service;
 use super::stale_files::Files;
 use super::{BusError, paths, sigbus, space};

@@ -17,8 +17,8 @@ use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
 use rapid_core::sample::SampleHeader;
 
+use super::containment::{Guarded, contained};
 use super::error::topic_error;
-use super::guard::{Guarded, contained};
 use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
 
 /// The samples of every topic but that of observations, which this process makes for others. They wait in shared memory

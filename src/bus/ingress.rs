@@ -20,8 +20,8 @@ use rapid_registry::DeviceSpec;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
+use super::containment::{Guarded, contained};
 use super::error::topic_error;
-use super::guard::{Guarded, contained};
 use super::{BusError, Header, MAX_NODES, Service, service_name};
 
 /// Prefix of an ingress topic's name; the modality's topic follows.

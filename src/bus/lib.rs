@@ -18,9 +18,9 @@
 //! (iceoryx2 0.10), so a writer that ended with its device would take the last samples along.
 
 mod actions;
+mod containment;
 mod error;
 mod extension;
-mod guard;
 mod home;
 mod inbox;
 mod ingress;
@@ -49,8 +49,8 @@ use rapid_core::modality::ModalityId;
 use rapid_core::sample::SampleHeader;
 use rapid_registry::{DeviceSpec, MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 
+use containment::{Guarded, contained};
 use error::topic_error;
-use guard::{Guarded, contained};
 use home::Home;
 use service::Service;
 

@@ -5,7 +5,7 @@
 //! thread continues, and wakes the task that waits in [`lost`]: the run ends in order, with motors disabled and the
 //! episode closed.
 //!
-//! The run ends in the same way when iceoryx2 panics over an overwritten table (`guard`).
+//! The run ends in the same way when iceoryx2 panics over an overwritten table (`containment`).
 //!
 //! Invariant: the handler calls only what is safe in a signal handler: system calls and atomics.
 //! Invariant: a SIGBUS of any other memory goes to the previous handler; that of the standard library ends the process.

@@ -16,8 +16,8 @@ use iceoryx2::sample_mut_uninit::SampleMutUninit;
 use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::sample::SampleHeader;
 
+use super::containment::{Guarded, contained};
 use super::error::topic_error;
-use super::guard::{Guarded, contained};
 use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, sigbus, space, stale_files};
 
 type Loan = SampleMutUninit<Service, [MaybeUninit<u8>], Header>;

@@ -11,7 +11,7 @@ use super::progress::Bar;
 use crate::cli::ReplayArgs;
 use crate::compare::{self, Again, Beside, CompareError, Compared, Comparison, Difference, Spread, Watcher};
 use crate::policy::bundle::{Bundle, BundleErrors};
-use crate::policy::library::{Environment, LibraryError};
+use crate::policy::onnxruntime::{Environment, LibraryError};
 
 /// Differences up to this come from the order of floating-point additions, which depends on the machine.
 const USUAL_TOLERANCE: f64 = 1e-4;

@@ -16,8 +16,8 @@ use crate::cli::EvalArgs;
 use crate::lockstep::TrialError;
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, robot_time, wilson};
 use crate::policy::bundle::{Bundle, BundleErrors};
-use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
+use crate::policy::onnxruntime::{Environment, LibraryError};
 use crate::policy::sampler::PolicyError;
 
 /// Why there is no result.

@@ -17,8 +17,8 @@ use crate::policy::bundle::{
     ActionRotation, Bundle, BundleAction, BundleErrors, ObservationInput, ObservationSpec, Representation,
     VectorOperation, VectorRotation, VectorSpec, WhenAbsent,
 };
-use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
+use crate::policy::onnxruntime::{Environment, LibraryError};
 use crate::policy::pace::{Pace, PaceVerdict};
 use crate::policy::sampler::{Computing, PolicyError};
 

@@ -27,8 +27,8 @@ pub use self::difference::{AxisDifference, Difference, Spread};
 
 use self::survey::Survey;
 use crate::policy::bundle::{Bundle, BundleErrors};
-use crate::policy::library::Environment;
 use crate::policy::model::Model;
+use crate::policy::onnxruntime::Environment;
 use crate::policy::sampler::{Computing, PolicyError};
 
 /// Why there is no comparison.

@@ -1,6 +1,8 @@
 //! Orders of other programs: to the actuator (`rapid arm`, `rapid disarm`), and requests to the session (`rapid episode`,
 //! `rapid session`) and about the registry (`rapid reload`).
 //!
+//! What stops motion within the run, and every order to the actuator, is [`rapid_core::permission`]'s.
+//!
 //! They come over a socket of the abstract namespace, which needs neither a disk nor shared memory: a run can be
 //! stopped while /dev/shm, /tmp and the disk are full and its bus is damaged. [`receive`] is the run's side, [`give`]
 //! that of the sender.

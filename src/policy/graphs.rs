@@ -14,7 +14,7 @@ use ort::value::{DynValue, Outlet, PrimitiveTensorElementType, Tensor, TensorEle
 use rapid_registry::{InferenceSpec, Provider};
 
 use super::bundle::{Element, GraphShape, TensorShape};
-use super::library::Environment;
+use super::onnxruntime::Environment;
 
 /// Why a graph cannot be loaded or run.
 #[derive(Debug, thiserror::Error)]

@@ -1,7 +1,7 @@
 //! Policies: the inputs of a trained model, and the use of its answers.
 //!
 //! A policy is a folder, a [`bundle`]: two graphs and `policy.json`, with all the facts about them that a rig needs.
-//! [`library`] loads onnxruntime into the process, [`graphs`] run on it. [`picture`] and [`observation`] prepare the
+//! [`onnxruntime`] loads that library into the process, [`graphs`] run on it. [`picture`] and [`observation`] prepare the
 //! encoder's input, [`sampler`] computes action chunks from its output: [`scheduler`] removes the noise from a chunk
 //! step by step, [`normalize`] maps numbers into the range a network was trained on and back. [`model`] combines them:
 //! requests in, chunks out.
@@ -14,12 +14,12 @@ pub mod bundle;
 pub mod compose;
 pub mod graphs;
 pub mod horizon;
-pub mod library;
 pub mod live;
 pub mod model;
 pub mod normalize;
 pub mod observation;
 pub mod observer;
+pub mod onnxruntime;
 pub mod pace;
 pub mod picture;
 pub mod pilot;

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use rapid_core::sample::Encoding;
 
 use super::bundle::{Bundle, ObservationInput, VectorOperation};
-use super::library::Environment;
 use super::observation::{ObservationTensors, VectorError};
+use super::onnxruntime::Environment;
 use super::picture::{Picture, PictureError, Preprocessor};
 use super::request::{Cell, Request};
 use super::sampler::{Computing, PolicyError, Sampler};

@@ -13,9 +13,9 @@ use rapid_registry::InferenceSpec;
 
 use super::bundle::{Bundle, BundleErrors, Graph};
 use super::graphs::{BoundGraph, GraphError, LoadedGraph};
-use super::library::Environment;
 use super::normalize::Normalizer;
 use super::observation::ObservationTensors;
+use super::onnxruntime::Environment;
 use super::scheduler::{Scheduler, SchedulerError};
 
 /// The stream of a seed that the noise is drawn from.

@@ -7,7 +7,7 @@
 //! more than itself; where a format cannot express it, a comment in the file states so.
 
 mod layout;
-mod rules;
+mod udev_rules;
 mod upload;
 
 use std::collections::BTreeSet;
@@ -52,7 +52,7 @@ pub enum ArtifactKind {
 pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     let artifact = |path: PathBuf, contents, kind| Artifact { path, contents, mode: 0o644, kind };
     let mut all = vec![
-        artifact("99-rapid.rules".into(), rules::rules(registry), ArtifactKind::Rules),
+        artifact("99-rapid.rules".into(), udev_rules::rules(registry), ArtifactKind::Rules),
         artifact("rapid.service".into(), unit(registry), ArtifactKind::Unit),
         artifact("rapid-upload.service".into(), upload::service(), ArtifactKind::Unit),
         artifact("rapid-upload.timer".into(), upload::timer(), ArtifactKind::Unit),
@@ -62,7 +62,7 @@ pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     ];
     for device in &registry.devices {
         let path = PathBuf::from(DESCRIPTORS).join(format!("{}.yaml", device.name));
-        let stable_path = rules::identify(registry, device).ok().map(|_| format!("/dev/rapid/{}", device.name));
+        let stable_path = udev_rules::identify(registry, device).ok().map(|_| format!("/dev/rapid/{}", device.name));
         all.push(artifact(path, descriptor(device, stable_path.as_deref()), ArtifactKind::Descriptor));
     }
     all

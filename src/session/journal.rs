@@ -1,4 +1,4 @@
-//! The session's file: which episodes were recorded, and what people noted about them.
+//! The session's file: which episodes were recorded, and the labels, marks and notes that people gave them.
 //!
 //! `session.toml` in the folder of the episodes while the session lasts, `session-BEGUN.toml` afterwards. It is written
 //! at each change, atomically, and waits for the disk: a crash or a power cut loses none of it.

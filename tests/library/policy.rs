@@ -15,9 +15,9 @@ use crate::support::onnx::{
 };
 use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid::policy::graphs::LoadedGraph;
-use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::observation::ObservationTensors;
+use rapid::policy::onnxruntime::Environment;
 use rapid::policy::picture::{Picture, Preprocessor};
 use rapid::policy::request::Request;
 use rapid::policy::sampler::{Computing, PolicyError, Sampler};

@@ -22,9 +22,9 @@ use crate::support::onnx::{
 use rapid::policy::bundle::Bundle;
 use rapid::policy::compose::Composer;
 use rapid::policy::horizon::{ActionQueue, Situation, WithoutMask};
-use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::observer::Observer;
+use rapid::policy::onnxruntime::Environment;
 use rapid::policy::pilot::Pilot;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::Computing;

@@ -24,7 +24,7 @@ use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
 use rapid_registry::{Form, ModuleSpec, Registry, TransformSpec};
 use rapid_status::Level;
 
-use super::guard::Guard;
+use super::tampering::FileWatch;
 use crate::chunk_writer::{self, ChunkWriter, Sink, io_error};
 use crate::encode::{self, EventText};
 use crate::form::{Derived, TRANSFORM_TOPIC};
@@ -43,7 +43,7 @@ pub(super) struct EpisodeFile {
     /// Bytes that the sink took.
     written: Arc<AtomicU64>,
     /// Checks at every flush and at the end whether another program has damaged the file.
-    guard: Guard,
+    tampering: FileWatch,
     /// Where what only it writes is shown.
     shown: Option<Shown>,
     clock: WallClock,
@@ -132,7 +132,7 @@ impl EpisodeFile {
         clock: WallClock,
         begin: Stamp,
         metadata: BTreeMap<String, String>,
-        guard: Guard,
+        tampering: FileWatch,
         shown: Option<Shown>,
     ) -> io::Result<Self> {
         let (shut, written) = (Shut::default(), Arc::<AtomicU64>::default());
@@ -168,7 +168,7 @@ impl EpisodeFile {
             shut,
             writer,
             written,
-            guard,
+            tampering,
             shown,
             clock,
             message: Vec::new(),
@@ -315,7 +315,7 @@ impl EpisodeFile {
     pub(super) fn flush(&mut self) -> io::Result<()> {
         self.writer.flush().map_err(io_error)?;
         let written = self.written.load(Ordering::Relaxed);
-        self.guard.look(written)
+        self.tampering.look(written)
     }
 
     /// Ends the file with the summary and waits for the disk. A file that is dropped instead, or
@@ -324,7 +324,7 @@ impl EpisodeFile {
         self.writer.metadata(SUMMARY, summary).map_err(io_error)?;
         self.writer.finish()?;
         let written = self.written.load(Ordering::Relaxed);
-        self.guard.verify(written)
+        self.tampering.verify(written)
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {

@@ -12,7 +12,6 @@
 mod announce;
 mod episode_path;
 mod file;
-mod guard;
 pub mod inspect;
 mod metadata;
 mod open_episode;
@@ -23,6 +22,7 @@ mod recorder;
 mod space;
 pub mod stepped;
 mod streams;
+mod tampering;
 #[cfg(test)]
 pub(crate) mod tests;
 mod verdict;

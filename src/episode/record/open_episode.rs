@@ -33,12 +33,12 @@ use rapid_status::{Board, EpisodeReport, Event, EventKind, Level, Outlook, Recor
 use super::announce::{Announced, look};
 use super::episode_path::{self, EpisodePath, EpisodeRequest};
 use super::file::EpisodeFile;
-use super::guard::Guard;
 use super::metadata::{self, Configuration, Ending};
 use super::provenance::{Attached, Units};
 use super::publishers::Publisher;
 use super::quality::{Frames, Measured, Measures, Quality, SampleFacts};
 use super::streams::{Hole, MaskHistory};
+use super::tampering::FileWatch;
 use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge};
 use super::writeback::Writeback;
 use crate::ReferenceSample;
@@ -128,8 +128,8 @@ impl OpenEpisode {
             board.announce(EventKind::Log { level: Level::Warn, text });
         }
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
-        let guard = Guard::begin(&path);
-        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, guard, shown)?;
+        let tampering = FileWatch::begin(&path);
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, tampering, shown)?;
         let is_mounted = |module: &&ModuleSpec| configuration.modules.contains(&module.name);
         file.transforms(registry.modules.iter().filter(is_mounted), begin)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();

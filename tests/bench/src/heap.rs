@@ -8,8 +8,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use rapid::policy::bundle::Bundle;
-use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
+use rapid::policy::onnxruntime::Environment;
 use rapid::policy::sampler::Computing;
 use serde::{Deserialize, Serialize};
 

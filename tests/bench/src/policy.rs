@@ -7,9 +7,9 @@ use std::time::Instant;
 
 use rapid::policy::bundle::{Bundle, Graph};
 use rapid::policy::graphs::{BoundGraph, LoadedGraph};
-use rapid::policy::library::Environment;
 use rapid::policy::model::Model;
 use rapid::policy::observation::ObservationTensors;
+use rapid::policy::onnxruntime::Environment;
 use rapid::policy::request::Request;
 use rapid::policy::sampler::{Computing, Sampler};
 use rapid_core::random::Random;

@@ -77,7 +77,7 @@ mod tests {
     #[test]
     fn a_panic_in_drop_during_unwinding_is_contained_and_ends_the_use_of_the_bus() {
         let ended = std::process::Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "guard::tests::helper", "--ignored"])
+            .args(["--exact", "containment::tests::helper", "--ignored"])
             .output()
             .unwrap();
         // Of a name that fits no test nothing runs, and nothing fails.

@@ -28,7 +28,7 @@ use crate::record_iter::RecordIter;
 const EVENT_BYTES: usize = 1024;
 
 /// See the module's comment.
-pub(super) struct Guard {
+pub(super) struct FileWatch {
     file: Arc<File>,
     partial: PathBuf,
     /// None without inotify: then damage inside the file is found by its reader.
@@ -39,7 +39,7 @@ pub(super) struct Guard {
     was_written: bool,
 }
 
-impl Guard {
+impl FileWatch {
     /// Guards the file of an episode, of which nothing is written yet.
     pub(super) fn begin(path: &EpisodePath) -> Self {
         let append = fcntl_getfl(&path.file).and_then(|flags| fcntl_setfl(&path.file, flags | OFlags::APPEND));
