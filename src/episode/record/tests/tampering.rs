@@ -146,35 +146,38 @@ async fn a_file_modified_while_it_is_recorded_is_not_called_good() {
     }
 }
 
-/// Is there a whole chunk in the file? Read without any of the code under test. A chunk that is being written while the
+/// Is there a message in a whole chunk of the file? A chunk of channels alone is written if no sample came before the first
+/// flush. Read without any of the code under test. A chunk that is being written while the
 /// file is cut is continued behind the cut: of such a length, but not whole.
-fn has_chunk(bytes: &[u8]) -> bool {
-    let mut at = 8;
-    while let Some(length) = bytes.get(at + 1..at + 9) {
-        let end = u64::from_le_bytes(length.try_into().unwrap()).saturating_add(at as u64 + 9);
-        match usize::try_from(end) {
-            Ok(end) if end <= bytes.len() && bytes[at] == crate::op::CHUNK => {
-                // Two times, the size, the check value, no compression, and the size again.
-                let (head, records) = bytes[at + 9..end].split_at(40);
-                let check = u32::from_le_bytes(head[24..28].try_into().unwrap());
-                if crc32fast::hash(records) == check {
-                    return true;
-                }
-                at = end;
-            }
-            Ok(end) if end <= bytes.len() => at = end,
-            _ => return false,
+fn has_message(bytes: &[u8]) -> bool {
+    records(&bytes[bytes.len().min(8)..]).any(|(op, content)| {
+        if op != crate::op::CHUNK || content.len() < 40 {
+            return false;
         }
-    }
-    false
+        // Two times, the size, the check value, no compression, and the size again.
+        let (head, inner) = content.split_at(40);
+        let check = u32::from_le_bytes(head[24..28].try_into().unwrap());
+        crc32fast::hash(inner) == check && records(inner).any(|(op, _)| op == crate::op::MESSAGE)
+    })
+}
+
+/// Opcode and content of the whole records at the beginning of these bytes.
+fn records(mut bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
+    std::iter::from_fn(move || {
+        let (head, rest) = bytes.split_at_checked(9)?;
+        let length = usize::try_from(u64::from_le_bytes(head[1..].try_into().unwrap())).ok()?;
+        let (content, behind) = rest.split_at_checked(length)?;
+        bytes = behind;
+        Some((head[0], content))
+    })
 }
 
 #[test]
 fn a_chunk_that_is_only_as_long_as_a_whole_one_is_not_whole() {
     let bytes = testing::episode(testing::options().compression(None));
-    let mut end = (0..bytes.len()).find(|end| has_chunk(&bytes[..*end])).map(|end| bytes[..end].to_vec()).unwrap();
+    let mut end = (0..bytes.len()).find(|end| has_message(&bytes[..*end])).map(|end| bytes[..end].to_vec()).unwrap();
     *end.last_mut().unwrap() ^= 1;
-    assert!(!has_chunk(&end));
+    assert!(!has_message(&end));
 }
 
 /// The recorder's judgement is found again by every reader of the file, and in what a repair makes of it.
@@ -194,7 +197,7 @@ fn found_again(what: &str, why: &str, file: &Path) {
     let repaired = match &answer.outcome {
         recover::RepairOutcome::Repaired(repaired) => repaired,
         // What the other program left of it ends within the first chunk.
-        recover::RepairOutcome::Unreadable { kept, .. } if !has_chunk(&std::fs::read(file).unwrap()) => {
+        recover::RepairOutcome::Unreadable { kept, .. } if !has_message(&std::fs::read(file).unwrap()) => {
             return is_found(kept);
         }
         _ => panic!("{what}: {answer:?}"),
