@@ -7,9 +7,9 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rapid::driver::{Driver, DriverError, camera};
 use rapid_core::sync::WhenStale;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::{Driver, DriverError, camera};
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec};
 

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 use nokhwa::utils::{
     ApiBackend, CameraFormat, CameraIndex, FrameFormat, RequestedFormat, RequestedFormatType, Resolution,
 };
-use rapid::driver::{Driver, DriverError};
 use rapid_core::time::Stamp;
+use rapid_devices::driver::{Driver, DriverError};
 use rapid_registry::Registry;
 use rapid_registry::device::DeviceNode;
 use rustix::time::{ClockId, clock_gettime};

@@ -13,12 +13,12 @@ use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use futures::Stream;
-use rapid::hotplug::script::Script;
-use rapid::hotplug::{HotplugError, HotplugEvent};
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence, read_mask};
 use rapid_bus::{Bus, TopicId};
 use rapid_core::time::Stamp;
+use rapid_devices::hotplug::script::Script;
+use rapid_devices::hotplug::{HotplugError, HotplugEvent};
 use rapid_registry::Registry;
 use rapid_registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
 use rapid_status::Board;

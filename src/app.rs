@@ -50,6 +50,7 @@ use rapid_core::interlock::Interlocks;
 use rapid_core::mask::MASK_PATH;
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_devices::interlocks::{self, Watched};
 use rapid_episode::record::EpisodeRequest;
 use rapid_episode::recover::Repairs;
 use rapid_registry::Registry;
@@ -63,7 +64,6 @@ use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
-use crate::interlocks::{self, Watched};
 use crate::orders::receive::{Arrival, Orders};
 use crate::rig::presence::{Claim, Presence};
 use crate::session::journal::Plan;

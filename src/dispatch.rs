@@ -21,6 +21,8 @@ use std::time::Duration;
 use rapid_core::action::Order;
 use rapid_core::text;
 use rapid_core::time::Zone;
+use rapid_devices::driver::replay;
+use rapid_devices::hotplug::HotplugError;
 use rapid_episode::record::inspect::ReadError;
 use rapid_episode::record::{self, EpisodeRequest, RecordError};
 use rapid_registry::scenario::Scenario;
@@ -43,8 +45,6 @@ use crate::commands::inspect::InspectFailure;
 use crate::commands::logs::LogsOptions;
 use crate::commands::mask::MaskOptions;
 use crate::commands::{self, CommandStatus, Format};
-use crate::driver::replay;
-use crate::hotplug::HotplugError;
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::session::journal::Plan;
 

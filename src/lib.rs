@@ -7,26 +7,11 @@
 
 pub mod alignment;
 pub mod app;
-pub mod calibration;
 pub mod cli;
 pub mod commands;
 #[cfg(feature = "policy")]
 pub mod compare;
-#[cfg(feature = "motors")]
-pub mod control;
 pub mod dispatch;
-pub mod driver;
-#[cfg(test)]
-#[path = "../tests/support/effort.rs"]
-mod effort;
-pub mod flash;
-pub mod hotplug;
-pub mod inputs;
-pub mod interlocks;
-#[cfg(feature = "motors")]
-pub mod kinematics;
-#[cfg(feature = "lan")]
-pub mod link;
 #[cfg(test)]
 #[path = "../tests/support/literal.rs"]
 mod literal;
@@ -38,9 +23,6 @@ pub mod orders;
 mod patience;
 #[cfg(feature = "policy")]
 pub mod policy;
-#[cfg(test)]
-#[path = "../tests/support/ports.rs"]
-mod ports;
 #[cfg(test)]
 #[path = "../tests/support/recorded.rs"]
 mod recorded;

@@ -4,7 +4,7 @@
 use std::process::ExitCode;
 
 #[cfg(feature = "motors")]
-use rapid::driver::can::guard;
+use rapid_devices::driver::can::guard;
 
 fn main() -> ExitCode {
     #[cfg(feature = "motors")]

@@ -15,10 +15,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use motors::{Adapter, Hand, PATIENCE, spec};
-use rapid::driver::can::guard;
-use rapid::driver::can::motors::Motors;
 use rapid_core::action::{ActionSource, Order};
 use rapid_core::time::Stamp;
+use rapid_devices::driver::can::guard;
+use rapid_devices::driver::can::motors::Motors;
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{CanAdapter, CanProtocol, CanSpec, DamiaoSpec, Stop};
 use rustix::process::{Pid, Signal, kill_process};

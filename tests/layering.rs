@@ -23,67 +23,39 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["flash"],
-    &["link", "control", "kinematics"],
-    &["hotplug", "driver", "orders", "inputs", "interlocks", "calibration"],
+    &["orders"],
     &["rig", "alignment", "session", "policy", "registration"],
     &["app", "lockstep", "compare"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
 /// Imports within a layer.
-const SIDEWAYS: &[(&str, &[&str])] = &[
-    ("interlocks", &["inputs"]),
-    ("main", &["dispatch", "cli", "commands"]),
-    ("dispatch", &["cli", "commands"]),
-    ("commands", &["cli"]),
-];
+const SIDEWAYS: &[(&str, &[&str])] =
+    &[("main", &["dispatch", "cli", "commands"]), ("dispatch", &["cli", "commands"]), ("commands", &["cli"])];
 
-/// The homes of third-party crates: modules, or files of them (`driver/camera`).
+/// The homes of third-party crates: modules, or files of them (`commands/policy`).
 const HOMES: &[(&str, &[&str])] = &[
     ("clap", &["cli", "dispatch", "main", "commands"]),
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("clap_mangen", &["commands"]),
-    ("cobs", &["driver/serial"]),
-    ("evdev", &["inputs"]),
-    ("futures", &["hotplug", "driver", "rig", "app", "commands"]),
-    ("hdrhistogram", &["policy/live", "driver/can"]),
-    ("http_body_util", &["driver/lan"]),
-    ("hyper", &["driver/lan"]),
-    ("hyper_util", &["driver/lan"]),
-    ("if_addrs", &["driver/lan"]),
+    ("futures", &["rig", "app", "commands"]),
+    ("hdrhistogram", &["policy/live"]),
     ("indicatif", &["commands/progress"]),
-    ("libc", &["hotplug", "driver", "rig", "app", "policy/onnxruntime", "inputs"]),
-    ("k", &["kinematics"]),
-    ("mdns_sd", &["hotplug/lan"]),
-    ("memchr", &["driver/lan"]),
-    ("nix", &["driver/datagram", "driver/lan/udp", "driver/can/socket"]),
-    ("nokhwa", &["driver/camera"]),
+    ("libc", &["rig", "app", "policy/onnxruntime"]),
     ("ort", &["policy/onnxruntime", "policy/graphs"]),
-    ("rustix", &[ABOVE_NOUNS]),
     ("sd_notify", &["app/watchdog"]),
-    ("serde", &[ANYWHERE]),
-    ("serde_json", &[ABOVE_NOUNS]),
     ("serde_path_to_error", &["policy/bundle"]),
     ("sha2", &["policy/bundle"]),
-    ("socketcan", &["driver/can"]),
-    ("thiserror", &[ANYWHERE]),
-    ("tokio", &[ABOVE_NOUNS]),
-    ("tokio_serial", &["driver/serial"]),
-    ("tokio_util", &[ABOVE_NOUNS]),
     ("toml", &["session"]),
-    ("tracing", &[ABOVE_NOUNS]),
-    ("urdf_rs", &["kinematics"]),
-    ("udev", &["hotplug/udev"]),
-    ("v4l", &["driver/camera"]),
     ("zip", &["commands/policy"]),
     ("zstd", &["policy/onnxruntime"]),
 ];
-const ANYWHERE: &str = "*";
-const ABOVE_NOUNS: &str = "layers 1 and up";
+
+/// Third-party crates that any module may name.
+const ANYWHERE: &[&str] = &["rustix", "serde", "serde_json", "thiserror", "tokio", "tokio_util", "tracing"];
 
 /// Where `unsafe` may stand: at the borders to the kernel and to shared memory.
-const UNSAFE_HOMES: &[&str] = &["driver", "bus", "policy/onnxruntime/loader", "system/peer"];
+const UNSAFE_HOMES: &[&str] = &["devices/driver", "bus", "policy/onnxruntime/loader", "system/peer"];
 
 /// What makes one thread wait for another.
 const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaphore", "Barrier"];
@@ -131,10 +103,10 @@ fn every_dependency_has_a_home() {
     let manifest: toml::Table = fs::read_to_string(manifest).unwrap().parse().unwrap();
     let dependencies = manifest["dependencies"].as_table().unwrap();
     // What a crate of this workspace may see is said in its manifest.
-    let homeless: Vec<_> = dependencies
-        .keys()
-        .filter(|name| !name.starts_with("rapid-") && !HOMES.iter().any(|(home, _)| *home == name.replace('-', "_")))
-        .collect();
+    let has_home = |name: &str| {
+        name.starts_with("rapid_") || ANYWHERE.contains(&name) || HOMES.iter().any(|(home, _)| *home == name)
+    };
+    let homeless: Vec<_> = dependencies.keys().filter(|name| !has_home(&name.replace('-', "_"))).collect();
     assert!(homeless.is_empty(), "Cargo.toml depends on {homeless:?}: name their homes in HOMES");
 }
 
@@ -604,7 +576,7 @@ fn import(home: &str, path: &[String]) -> Option<String> {
     }
     if to == from {
         let sideways = SIDEWAYS.iter().any(|(module, seen)| *module == home && seen.contains(&target));
-        return (from > 0 && !sideways).then(|| format!("{edge}: modules of this layer do not import one another"));
+        return (!sideways).then(|| format!("{edge}: modules of this layer do not import one another"));
     }
     None
 }
@@ -612,17 +584,13 @@ fn import(home: &str, path: &[String]) -> Option<String> {
 /// What is wrong with the file at `place` naming the crate `path` begins with.
 fn third_party(source: &Source, place: &str, path: &[String]) -> Option<String> {
     let name = path.first()?;
-    // `mod udev;` in hotplug/mod.rs, `use crate::hotplug::udev;`: the name means the module there.
+    // `mod zip;` in a file, `use crate::commands::zip;`: the name means the module there.
     if source.declared.contains(name) || source.imports_module(name) {
         return None;
     }
     let (_, homes) = HOMES.iter().find(|(dependency, _)| dependency == name)?;
-    let at_home = homes.iter().any(|home| match *home {
-        ANYWHERE => true,
-        ABOVE_NOUNS => source.module.first().and_then(|module| layer(module)).is_some_and(|layer| layer > 0),
-        module => is_within(place, module),
-    });
-    (!at_home).then(|| format!("crate `{name}` is used outside its home: {}", homes.join(", ")))
+    let is_at_home = homes.iter().any(|module| is_within(place, module));
+    (!is_at_home).then(|| format!("crate `{name}` is used outside its home: {}", homes.join(", ")))
 }
 
 fn is_within(place: &str, module: &str) -> bool {
@@ -649,72 +617,61 @@ mod the_check_itself {
 
     #[test]
     fn imports_upwards_and_sideways_are_found() {
-        finds("flash.rs", "use rapid_core::modality::ModalityId;", &[]);
-        finds("flash.rs", "use crate::control::Command;", &["1: `flash` (layer 0) imports `control` (layer 1): imp"]);
-        finds(
-            "inputs/mod.rs",
-            "use crate::driver::Reading;",
-            &["1: `inputs` (layer 2) imports `driver` (layer 2): mod"],
-        );
-        finds("rig/stream.rs", "\n\nuse crate::session::Journal;", &["3: `rig` (layer 3) imports `session`"]);
-        finds("interlocks/mod.rs", "use crate::inputs::Input;", &[]);
-        finds("kinematics/mod.rs", "use crate::control::Command;", &["1: `kinematics` (layer 1) imports `control`"]);
+        finds("orders.rs", "use rapid_core::modality::ModalityId;", &[]);
+        finds("orders.rs", "use crate::rig::Rig;", &["1: `orders` (layer 0) imports `rig` (layer 1): imp"]);
+        finds("policy/mod.rs", "use crate::app::Options;", &["1: `policy` (layer 1) imports `app` (layer 2): imp"]);
+        finds("rig/stream.rs", "\n\nuse crate::session::Journal;", &["3: `rig` (layer 1) imports `session`"]);
+        finds("dispatch/mod.rs", "use crate::cli::Cli;", &[]);
+        finds("cli/mod.rs", "use crate::dispatch::run;", &["1: `cli` (layer 3) imports `dispatch`"]);
         finds("app.rs", "use crate::{rig, session};", &[]);
     }
 
     #[test]
     fn every_way_to_write_a_path_is_seen() {
-        let nested =
-            "use crate::{\n    time::Stamp,\n    control::{\n        Command,\n        spec as other,\n    },\n};";
-        finds(
-            "flash.rs",
-            nested,
-            &["4: `flash` (layer 0) imports `control`", "5: `flash` (layer 0) imports `control`"],
-        );
-        finds("flash.rs", "fn f() { let b = crate::control::Command::new(); }", &["1: `flash`"]);
-        finds("flash.rs", "type A = Vec<crate::control::Command>;", &["1: `flash`"]);
-        finds("flash.rs", "fn f() { select! { _ = async { crate::rig::run().await } => {} } }", &["1: `flash`"]);
-        finds("flash.rs", "use super::control::Command;", &["1: `flash`"]);
-        finds("driver/serial.rs", "use super::super::orders::Orders;", &["1: `driver`"]);
-        finds("driver/serial.rs", "use super::camera::Camera; use self::inner::X;", &[]);
-        finds("driver/mod.rs", "mod inner { fn f() { super::super::inputs::open() } }", &["1: `driver`"]);
-        finds("flash.rs", "pub use crate::control::*;", &["1: `flash`"]);
+        let nested = "use crate::{\n    time::Stamp,\n    rig::{\n        Rig,\n        core as other,\n    },\n};";
+        finds("orders.rs", nested, &["4: `orders` (layer 0) imports `rig`", "5: `orders` (layer 0) imports `rig`"]);
+        finds("orders.rs", "fn f() { let b = crate::rig::Rig::new(); }", &["1: `orders`"]);
+        finds("orders.rs", "type A = Vec<crate::rig::Rig>;", &["1: `orders`"]);
+        finds("orders.rs", "fn f() { select! { _ = async { crate::rig::run().await } => {} } }", &["1: `orders`"]);
+        finds("orders.rs", "use super::rig::Rig;", &["1: `orders`"]);
+        finds("rig/stream.rs", "use super::super::session::Journal;", &["1: `rig`"]);
+        finds("rig/stream.rs", "use super::core::Core; use self::inner::X;", &[]);
+        finds("rig/mod.rs", "mod inner { fn f() { super::super::session::open() } }", &["1: `rig`"]);
+        finds("orders.rs", "pub use crate::rig::*;", &["1: `orders`"]);
         finds("main.rs", "use rapid::app; fn f() { rapid::commands::run() }", &[]);
     }
 
     #[test]
     fn comments_strings_and_tests_do_not_count() {
         finds(
-            "flash.rs",
+            "orders.rs",
             "// use crate::rig::Rig;\n/// [`crate::rig::Rig`]\nconst A: &str = \"crate::rig::Rig unsafe\";",
             &[],
         );
-        finds("flash.rs", "#[cfg(test)]\nmod tests {\n use crate::rig::Rig;\n fn f() { println!() }\n}", &[]);
-        finds("flash.rs", "#[cfg(not(test))]\nmod x { use crate::rig::Rig; }", &["2: `flash`"]);
+        finds("orders.rs", "#[cfg(test)]\nmod tests {\n use crate::rig::Rig;\n fn f() { println!() }\n}", &[]);
+        finds("orders.rs", "#[cfg(not(test))]\nmod x { use crate::rig::Rig; }", &["2: `orders`"]);
         let files = BTreeMap::from([
-            (PathBuf::from("driver/grid.rs"), "#[cfg(test)]\nmod tests;".to_owned()),
-            (PathBuf::from("driver/grid/tests.rs"), "use crate::rig::Rig;".to_owned()),
+            (PathBuf::from("orders/give.rs"), "#[cfg(test)]\nmod tests;".to_owned()),
+            (PathBuf::from("orders/give/tests.rs"), "use crate::rig::Rig;".to_owned()),
         ]);
         assert_eq!(check_tree(&files, check), []);
     }
 
     #[test]
     fn a_crate_outside_its_home_is_found() {
-        finds("hotplug/udev.rs", "use udev::MonitorBuilder;", &[]);
-        finds("hotplug/mod.rs", "mod udev;\nfn f() { udev::watch() }", &[]);
-        finds("hotplug/lan.rs", "fn f() -> ::udev::Device { <A as B>::udev::c() }", &["1: crate `udev`"]);
-        finds("hotplug/lan.rs", "fn f() -> impl Future<Output = ()> + use<'_> { udev::c() }", &["1: crate `udev`"]);
+        finds("commands/policy.rs", "use zip::ZipArchive;", &[]);
+        finds("commands/mod.rs", "mod zip;\nfn f() { zip::read() }", &[]);
+        finds("commands/check.rs", "fn f() -> ::zip::Archive { <A as B>::zip::c() }", &["1: crate `zip`"]);
+        finds("commands/check.rs", "fn f() -> impl Future<Output = ()> + use<'_> { zip::c() }", &["1: crate `zip`"]);
         finds(
-            "hotplug/lan.rs",
-            "fn f(d: &::udev::Device) {}",
-            &["1: crate `udev` is used outside its home: hotplug/udev"],
+            "commands/check.rs",
+            "fn f(d: &::zip::Archive) {}",
+            &["1: crate `zip` is used outside its home: commands/policy"],
         );
-        finds("driver/camera/capture.rs", "use v4l::Device;", &[]);
-        finds("driver/camerax.rs", "use v4l::Device;", &["1: crate `v4l`"]);
-        finds("rig/mod.rs", "use {socketcan::Frame, std::io};", &["1: crate `socketcan`"]);
-        finds("flash.rs", "use tokio::sync::watch;", &["1: crate `tokio`"]);
-        finds("driver/units.rs", "use rustix::time::ClockId;", &[]);
-        finds("flash.rs", "use rustix::time::ClockId;", &["1: crate `rustix`"]);
+        finds("policy/onnxruntime/loader.rs", "use zstd::Decoder;", &[]);
+        finds("policy/onnxruntimes.rs", "use zstd::Decoder;", &["1: crate `zstd`"]);
+        finds("rig/mod.rs", "use {toml::Table, std::io};", &["1: crate `toml`"]);
+        finds("orders.rs", "use tokio::sync::watch;", &[]);
     }
 
     #[test]
@@ -743,12 +700,12 @@ mod the_check_itself {
 
     #[test]
     fn unsafe_prints_and_locks_are_found() {
-        finds("driver/mod.rs", "fn f() { unsafe { g() } }", &[]);
-        finds("rig/mod.rs", "fn f() {\n unsafe { g() } }", &["2: `unsafe` outside driver/ and bus/"]);
+        finds("policy/onnxruntime/loader.rs", "fn f() { unsafe { g() } }", &[]);
+        finds("rig/mod.rs", "fn f() {\n unsafe { g() } }", &["2: `unsafe` outside devices/driver/ and"]);
         finds("rig/mod.rs", "fn f() { if a { println!(\"x\") } }", &["1: `println!`"]);
         finds("rig/worker.rs", "use std::sync::{Arc, Mutex};", &[]);
         finds("rig/stream.rs", "use std::sync::{Arc, Mutex};", &["1: `Mutex`"]);
-        finds("driver/grid.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
+        finds("alignment.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
         let files = BTreeMap::from([(PathBuf::from("core/mask.rs"), "use std::sync::Mutex;".to_owned())]);
         assert_eq!(check_tree(&files, check_crate).len(), 1);
         let files = BTreeMap::from([(PathBuf::from("core/mask.rs"), "fn f() { unsafe { g() } }".to_owned())]);

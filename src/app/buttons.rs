@@ -1,6 +1,6 @@
 //! Buttons: foot pedals, remotes and buttons of a gripper, which request something of the session.
 //!
-//! Their inputs are read by threads of [`crate::inputs`] and by the streams of devices; a task makes requests of what they
+//! Their inputs are read by threads of [`rapid_devices::inputs`] and by the streams of devices; a task makes requests of what they
 //! report. A button moves nothing: the only order that it gives is to disarm.
 //!
 //! Invariant: a request carries the moment of the press, whenever it is decided that it was one.
@@ -13,6 +13,8 @@ use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_devices::inputs::tap::Tap;
+use rapid_devices::inputs::{Place, Readers, Report};
 use rapid_registry::{ButtonAction, ButtonSpec, Registry};
 use rapid_status::session::{Label, Phase, SessionRequest};
 use rapid_status::{Board, EventKind, Level};
@@ -20,8 +22,6 @@ use tokio::sync::{mpsc, oneshot};
 
 use super::conductor::reached;
 use super::requests::Request;
-use crate::inputs::tap::Tap;
-use crate::inputs::{Place, Readers, Report};
 use press::{Gesture, Presses, Rules};
 
 /// Reads the buttons until it is dropped.

@@ -6,10 +6,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use rapid_core::modality::ModalityId;
+use rapid_devices::driver::camera;
 use rapid_status::{Board, EventKind, Level};
 use tokio::task::spawn_blocking;
-
-use crate::driver::camera;
 
 /// Sets a control, and reports what came of it in the log, which the episode in progress contains.
 pub(super) fn set(board: &Arc<Board>, id: ModalityId, control: String, value: i64) {

@@ -8,18 +8,18 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
+use rapid_devices::driver::camera;
+use rapid_devices::hotplug::HotplugStream;
+#[cfg(feature = "lan")]
+use rapid_devices::hotplug::lan::LanMonitor;
+use rapid_devices::hotplug::script::Script;
+use rapid_devices::hotplug::udev::{Ask, UdevMonitor};
 use rapid_registry::{DeviceSpec, Registry};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use super::stage::Stage;
 use super::{AppError, Devices};
-use crate::driver::camera;
-use crate::hotplug::HotplugStream;
-#[cfg(feature = "lan")]
-use crate::hotplug::lan::LanMonitor;
-use crate::hotplug::script::Script;
-use crate::hotplug::udev::{Ask, UdevMonitor};
 
 /// Created by udev's daemon when it starts.
 const UDEV: &str = "/run/udev/control";
@@ -85,7 +85,7 @@ fn open(
         return Ok(Box::pin(futures::stream::once(script).flatten()));
     }
     #[cfg(feature = "motors")]
-    crate::driver::can::prepare(registry);
+    rapid_devices::driver::can::prepare(registry);
     if !Path::new(UDEV).exists() {
         tracing::warn!("no udev runs here ({UDEV} is missing): USB devices are not detected; start systemd-udevd");
     }

@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rapid_bus::BusError;
+use rapid_devices::hotplug::HotplugError;
 use rapid_episode::record::RecordError;
 #[cfg(feature = "foxglove")]
 use rapid_live::LiveError;
@@ -13,7 +14,6 @@ use rapid_screens::tui::TuiError;
 use rapid_web::WebError;
 
 use super::LAST_CHUNK;
-use crate::hotplug::HotplugError;
 #[cfg(feature = "policy")]
 use crate::policy::{onnxruntime::LibraryError, sampler::PolicyError};
 use crate::rig::RigError;

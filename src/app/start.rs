@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use rapid_bus::Bus;
 use rapid_core::permission::Permission;
+use rapid_devices::interlocks::Watched;
 use rapid_episode::record::EpisodeRequest;
 use rapid_registry::Registry;
 use rapid_registry::simulation::SimSource;
@@ -29,7 +30,6 @@ use super::stage::Stage;
 use super::streaming::Streaming;
 use super::synchronisation::Synchronisation;
 use super::{AppError, Devices, Options, Running, Screen, trials, web};
-use crate::interlocks::Watched;
 use crate::orders::receive::Arrival;
 use crate::rig::Rig;
 use crate::rig::presence::Presence;

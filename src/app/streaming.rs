@@ -1,12 +1,12 @@
 //! Stage streaming: the rig, from the first device to the end of the last device program.
 
+use rapid_devices::hotplug::HotplugStream;
 use rapid_system::fault;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
 use super::stage::Stage;
-use crate::hotplug::HotplugStream;
 use crate::rig::{Rig, RigCommand};
 
 /// Requests that may wait for the rig.

@@ -13,6 +13,9 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_devices::calibration::{self, Estimate, Flip, Seen, brightness};
+use rapid_devices::driver::Driver;
+use rapid_devices::flash;
 use rapid_registry::device::{Attachment, DeviceNode};
 use rapid_registry::simulation::SimDevice;
 use rapid_registry::units::show_duration;
@@ -25,10 +28,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{Format, json_line};
 use crate::app::signals::Signals;
-use crate::calibration::{self, Estimate, Flip, Seen, brightness};
 use crate::cli::LatencyArgs;
-use crate::driver::Driver;
-use crate::flash;
 
 /// A camera that has sent nothing for this long is considered silent.
 const SILENCE: Duration = Duration::from_secs(5);

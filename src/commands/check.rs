@@ -5,6 +5,8 @@ use std::path::Path;
 
 use rapid_core::interlock::StopKind;
 use rapid_core::text;
+#[cfg(feature = "motors")]
+use rapid_motors::kinematics::Arm;
 use rapid_registry::{
     ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InputSpec, InterlockSpec, Loaded,
     ModuleSpec, MotorSpec, Mount, NodeSpec, Registry, RegistryErrors, StopSpec, UsbSpec,
@@ -12,8 +14,6 @@ use rapid_registry::{
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line};
-#[cfg(feature = "motors")]
-use crate::kinematics::Arm;
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
 ///

@@ -4,12 +4,12 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use rapid_core::text;
+use rapid_devices::driver::camera::{CameraInfo, cameras, is_on_usb, name, query};
 use rapid_registry::device::{Attachment, DeviceNode, Unit};
 use rapid_registry::{Assigner, Assignment, DeviceSpec, IdentitySpec, Registry, UsbSpec};
 use serde::Serialize;
 
 use super::{Format, json_line};
-use crate::driver::camera::{CameraInfo, cameras, is_on_usb, name, query};
 
 /// A node that is plugged in.
 #[derive(Debug, Clone, Serialize)]

@@ -3,6 +3,8 @@
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
+use rapid_devices::driver::camera;
+use rapid_devices::hotplug::udev::{Ask, enumerate};
 use rapid_registry::Registry;
 use rapid_registry::device::Attachment;
 use rapid_status::palette::Palette;
@@ -13,8 +15,6 @@ use crate::cli::{Global, RegisterArgs, UnregisterArgs};
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::register::{self, Dialogue};
 use crate::commands::{self, Format};
-use crate::driver::camera;
-use crate::hotplug::udev::{Ask, enumerate};
 use crate::registration::Target;
 
 pub(super) fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
@@ -96,7 +96,7 @@ pub(super) fn connected(global: &Global) -> Result<(Registry, Vec<Attachment>), 
     let (registry, devices) = rig(global, 0)?;
     let attached = match devices {
         Devices::Machine => enumerate(&asked(Some(&registry)))?,
-        Devices::Simulated(scenario) => crate::hotplug::script::attached(&scenario),
+        Devices::Simulated(scenario) => rapid_devices::hotplug::script::attached(&scenario),
     };
     Ok((registry, attached))
 }

@@ -19,6 +19,8 @@ use rapid_core::modality::ModalityId;
 use rapid_core::provenance::Negotiated;
 use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_devices::driver::DriverError;
+use rapid_devices::hotplug::script::Timeline;
 use rapid_episode::record::RecordError;
 use rapid_episode::record::stepped::Taker;
 use rapid_registry::device::{Attachment, DeviceNode};
@@ -28,8 +30,6 @@ use rapid_registry::simulation::{SimSource, TaskPart};
 use rapid_registry::{DeviceSpec, Registry};
 use rapid_status::{Event, EventKind, Provenance, SlotState};
 
-use crate::driver::DriverError;
-use crate::hotplug::script::Timeline;
 use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
 use timing::Timing;
 

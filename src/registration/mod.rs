@@ -11,13 +11,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_devices::driver::camera::query;
 use rapid_registry::candidate::{Candidate, unregistered};
 use rapid_registry::device::{Attachment, DeviceNode};
 use rapid_registry::edit::{self, EditError, NewEntry, Setting};
 use rapid_registry::{Loaded, Registry, RegistryErrors, name_problem, read_file};
 use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
-
-use crate::driver::camera::query;
 
 /// Why the file was not written.
 #[derive(Debug, thiserror::Error)]

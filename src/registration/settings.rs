@@ -1,11 +1,10 @@
 //! Settings for the entry of a connected unit, as the unit suggests them.
 
+use rapid_devices::driver::camera::{CameraInfo, Rate, Rates, Size};
 use rapid_registry::PixelFormat;
 use rapid_registry::device::DeviceNode;
 use rapid_registry::edit::Setting;
 use rapid_registry::simulation::SimSource;
-
-use crate::driver::camera::{CameraInfo, Rate, Rates, Size};
 
 /// Settings that the device itself suggests.
 pub fn suggested(node: &DeviceNode, camera: Option<&CameraInfo>) -> Vec<(String, Setting)> {

@@ -18,12 +18,12 @@ use rapid_core::modality::ModalityId;
 use rapid_core::provenance::UnplugSource;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_devices::hotplug::HotplugEvent;
 use rapid_registry::device::{Attachment, Unit};
 use rapid_registry::{Assigner, Assignment, DeviceSpec, Registry};
 use rapid_status::SlotState;
 
 use super::slot::{self, End, Slot};
-use crate::hotplug::HotplugEvent;
 
 /// What happens to a rig.
 #[derive(Debug, Clone, PartialEq)]

@@ -13,6 +13,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_devices::driver::process::Launch;
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, Hook};
 use rapid_status::{Episode, EpisodeWatch, Level};
@@ -23,7 +24,6 @@ use tokio_util::sync::CancellationToken;
 use super::output::Output;
 use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
 use super::worker::{TERM_LIMIT, describe};
-use crate::driver::process::Launch;
 
 /// A hook that has not ended by then is killed.
 pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);

@@ -28,8 +28,8 @@ use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, Registry};
 use tokio::sync::oneshot;
 
-use crate::hotplug::HotplugError;
 use presence::PresenceError;
+use rapid_devices::hotplug::HotplugError;
 
 /// Why the rig cannot continue.
 #[derive(Debug, thiserror::Error)]

@@ -15,6 +15,9 @@ use rapid_core::modality::ModalityId;
 use rapid_core::permission::Permission;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::{ClockOffset, DriverError};
+use rapid_devices::hotplug::HotplugStream;
+use rapid_devices::inputs::tap::Tap;
 use rapid_registry::candidate::{Candidate, unregistered};
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, Registry};
@@ -32,9 +35,6 @@ use super::slot::End;
 use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
 use super::worker::ProcessSlot;
 use super::{Addition, RigCommand, RigError};
-use crate::driver::{ClockOffset, DriverError};
-use crate::hotplug::HotplugStream;
-use crate::inputs::tap::Tap;
 
 /// The JSON file is written this often, and at every change.
 const JSON_PERIOD: Duration = Duration::from_secs(1);

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_bus::{Bus, Membership};
+use rapid_devices::driver::process::Spawner;
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, NodeSpec, Registry};
 use rapid_status::Board;
@@ -15,7 +16,6 @@ use tokio_util::task::TaskTracker;
 use super::hooks::HOOK_LIMIT;
 use super::logbook::Logbook;
 use super::worker::TERM_LIMIT;
-use crate::driver::process::Spawner;
 
 /// Allowance for the kernel and a busy machine, beyond the time a program has to end.
 pub(super) const MARGIN: Duration = Duration::from_secs(2);

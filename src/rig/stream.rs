@@ -16,6 +16,8 @@ use rapid_core::action::ActuatorNotice;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_devices::driver::{ClockOffset, Driver, DriverError, Reading};
+use rapid_devices::inputs::tap::{Tap, lost_at_the_end};
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, NodeSpec};
 use rapid_status::{Board, EpisodeWatch, Provenance};
@@ -27,8 +29,6 @@ use tokio_util::sync::CancellationToken;
 use super::core::StreamEvent;
 use super::slot::End;
 use super::worker::ProcessSlot;
-use crate::driver::{ClockOffset, Driver, DriverError, Reading};
-use crate::inputs::tap::{Tap, lost_at_the_end};
 
 /// A device that does not open within this time is retried.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);

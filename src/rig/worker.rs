@@ -16,6 +16,8 @@ use std::sync::Arc;
 use rapid_bus::{Arrivals, Bus, Given, Ingress, Membership};
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::process::Launch;
+use rapid_devices::driver::{DriverError, Reading};
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, ProcessSpec};
 use rapid_status::{Board, EventKind, Level};
@@ -24,8 +26,6 @@ use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
-use crate::driver::process::Launch;
-use crate::driver::{DriverError, Reading};
 use intake::{Intake, Judged};
 use supervisor::Supervisor;
 pub(super) use supervisor::{TERM_LIMIT, describe};

@@ -5,13 +5,13 @@
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
+use rapid_motors::control::damiao::parameter::{Parameter, Reply, Value};
+use rapid_motors::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 
 use crate::support::allocations::allocations;
 use crate::support::motors::motor_spec;
-use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
-use rapid::control::damiao::parameter::{Parameter, Reply, Value};
-use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 
 const MOTORS: u16 = 7;
 

@@ -11,11 +11,11 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use rapid::driver::{Driver, DriverError, sim};
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::Encoding;
 use rapid_core::sync::WhenStale;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::{Driver, DriverError, sim};
 use rapid_registry::device::{DeviceNode, LastReceived};
 use rapid_registry::simulation::{SimDevice, SimSource};
 use rapid_registry::{

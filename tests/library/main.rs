@@ -9,10 +9,13 @@
 #[path = "../support"]
 mod support {
     pub(crate) mod allocations;
+    pub(crate) mod arm;
+    pub(crate) mod given;
     pub(crate) mod mistakes;
     pub(crate) mod motor_world;
     pub(crate) mod motors;
     pub(crate) mod onnx;
+    pub(crate) use motors::patience;
 }
 
 mod bundle;

@@ -6,12 +6,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::action::{ActionSource, ActuatorNotice, Arming, Order as Asked};
+use rapid_devices::driver::DriverError;
+use rapid_devices::driver::can::link::Link;
+use rapid_devices::driver::can::motors::Motors;
 use rapid_registry::{DamiaoSpec, Mounting};
 
 use crate::support::motors::{Adapter, Hand, PATIENCE, spec};
-use rapid::driver::DriverError;
-use rapid::driver::can::link::Link;
-use rapid::driver::can::motors::Motors;
 use tokio::sync::mpsc::Receiver;
 use tokio::time::{Instant, interval, timeout};
 use vbench::emu::order::Order;

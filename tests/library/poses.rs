@@ -4,15 +4,22 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
+use rapid_core::action::ActionSource;
 use rapid_core::mask::PhysicalMask;
+use rapid_core::rotation;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_devices::driver::can::motors::effector::Effector;
 use rapid_registry::Registry;
 
+use crate::support::arm::{COMMANDED, SIX, apart, arm_of, sample};
+use crate::support::given::{Given, next};
 use crate::support::onnx::{Change, write_bundle};
 use rapid::policy::bundle::Bundle;
+use rapid::policy::compose::Composer;
 use rapid::policy::horizon::{ChunkError, HoldReason, WithoutMask};
 use rapid::policy::model::Model;
 use rapid::policy::onnxruntime::Environment;
@@ -193,4 +200,64 @@ fn an_answer_without_a_rotation_is_not_executed() {
     }
     let counts = pilot.queue.counts();
     assert_eq!((counts.no_pose_chunks, counts.not_finite_chunks, counts.chunks), (1, 1, 0));
+}
+
+/// From the answer of a network to the motors: relative poses with a rotation are composed onto the pose of the tip in the
+/// sample of the motors, and the arm goes there.
+#[test]
+#[expect(clippy::cast_possible_truncation, reason = "a network has 32 bits")]
+fn relative_poses_of_a_policy_become_targets_that_lead_to_them() {
+    const POLICY: &str = include_str!("../bundle/valid/relative.json");
+    const MOTORS: usize = 7;
+    const ACTIONS: usize = 16;
+    // Behind the numbers of the motors: position, opening, quaternion.
+    let policy =
+        POLICY.replace("\"position\": [0, 3], \"rotation\": [3, 7]", "\"position\": [42, 45], \"rotation\": [46, 50]");
+    assert_ne!(policy, POLICY);
+    let bundle = Bundle::parse(&policy, "policy.json").unwrap_or_else(|errors| panic!("{errors}"));
+    let arm = arm_of(&SIX, COMMANDED);
+    let mut effector = Effector::new(arm.clone(), MOTORS);
+    let pose = |positions: &[f64]| {
+        let mut tip = [0.0; 8];
+        arm.state(&sample(positions), &mut tip);
+        tip
+    };
+
+    let start = [0.3, 0.2, 1.2, -0.4, 1.0, 0.5, 0.0];
+    let mut numbers = sample(&start);
+    let mut tip = [0.0; 8];
+    effector.look(&numbers, &mut tip);
+    numbers.extend(tip);
+    let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
+    let header = SampleHeader { encoding: Encoding::F64 as u32, ..SampleHeader::default() };
+    let mut request = Request::new(&bundle);
+    request.set_present(2, true);
+    request.cell_mut(2, 1).expect("the newest step").set(&header, &bytes);
+
+    // What the network answers by definition: poses that the arm has on a path of its joints, seen from where the tip is.
+    let path = |step: usize| start.map(|position| position + 0.012 * step as f64);
+    let [px, py, pz, _, qx, qy, qz, qw] = tip;
+    let back = [-qx, -qy, -qz, qw];
+    let mut output = Vec::new();
+    for step in 0..ACTIONS {
+        let [x, y, z, _, turned @ ..] = pose(&path(step));
+        let far = rotation::turned(back, [x - px, y - py, z - pz]);
+        let rows = rotation::rows(rotation::product(back, turned));
+        output.extend(far.iter().chain(rows.as_flattened()).chain(&[0.75]).map(|number| *number as f32));
+    }
+    let composer = Composer::new(&bundle);
+    let mut chunk = vec![0.0; composer.chunk_len()];
+    composer.compose(&request, &output, &mut chunk).expect("poses");
+
+    let actions = Arc::<Given>::default();
+    let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
+    for (step, action) in chunk.chunks(chunk.len() / ACTIONS).enumerate() {
+        actions.add(Ok((action.iter().map(|number| f64::from(*number)).collect(), Stamp(step as u64))));
+        let (found, _) = next(&targets).unwrap_or_else(|refused| panic!("action {step}: {refused}"));
+        let (found, wanted) = (pose(&found), pose(&path(step)));
+        let [far, off] = apart(&found, &wanted, false);
+        // Twice what the solver leaves: the network's numbers have 32 bits.
+        assert!(far < 2e-4 && off < 2e-3, "action {step}: {far} m, {off} rad: {found:?} {wanted:?}");
+        assert!((found[3] - 0.75).abs() < 1e-6, "action {step}: {found:?}");
+    }
 }

@@ -20,14 +20,14 @@ use std::time::Duration;
 
 use futures::poll;
 use rapid::alignment::Alignment;
-use rapid::driver::Driver;
-use rapid::hotplug::script::Script;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
 use rapid_bus::{Bus, Inbox, TopicId};
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::Driver;
+use rapid_devices::hotplug::script::Script;
 use rapid_registry::Registry;
 use rapid_registry::device::{DeviceNode, LastReceived};
 use rapid_registry::scenario::Scenario;

@@ -6,12 +6,12 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use rapid_bus::Bus;
+use rapid_devices::driver::sim;
 use rapid_registry::scenario::Scenario;
 use rapid_registry::{NodeSpec, Registry};
 
 use crate::shared_memory::after;
 use crate::support::{self, Episode, Place, events};
-use rapid::driver::sim;
 
 const CAMERAS: usize = 16;
 const SECONDS: usize = 4;

@@ -38,13 +38,13 @@ use std::time::Duration;
 
 use rapid_core::sync::Grid;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::sim;
 use rapid_episode::record::inspect::{Inspection, inspect};
 use rapid_registry::scenario::{Scenario, ScenarioDevice};
 use rapid_registry::simulation::{SimFaults, SimSource};
 use rapid_registry::{DeviceSpec, Registry};
 
 use crate::support::{self, Episode, EventMessage, Message, Place, events};
-use rapid::driver::sim;
 use serde::Deserialize;
 use serde_json::Value;
 

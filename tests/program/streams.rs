@@ -3,11 +3,11 @@
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
+use rapid_devices::driver::sim;
 use rapid_registry::Registry;
 use rapid_registry::scenario::Scenario;
 
 use crate::support::{self, Episode, LENIENT, Place, events};
-use rapid::driver::sim;
 use serde_json::Value;
 
 const RIG: &str = r#"

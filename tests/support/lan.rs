@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use rapid::driver::sim;
+use rapid_devices::driver::sim;
 use rapid_registry::simulation::SimSource;
 use rustix::process::Signal;
 use serde_json::Value;

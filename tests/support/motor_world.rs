@@ -26,12 +26,12 @@ pub(crate) mod motor_spec;
 
 use std::time::Duration;
 
-use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec;
-use rapid::control::damiao::parameter::Reply;
-use rapid::control::motors::{Brakes, BusState, Fault, MotorBus, Notice, Reason};
-use rapid::driver::can::guard::KEEP_FOR;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::can::guard::KEEP_FOR;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::damiao::codec;
+use rapid_motors::control::damiao::parameter::Reply;
+use rapid_motors::control::motors::{Brakes, BusState, Fault, MotorBus, Notice, Reason};
 use rapid_registry::{BrakeSpec, DamiaoSpec, MotorMode, Stop};
 use vbench::emu::can::Frame;
 use vbench::emu::can::motion::{Mit, from_unsigned, to_unsigned};

@@ -7,7 +7,7 @@
 #[allow(clippy::duplicate_mod, reason = "`motor_world` has it too")]
 pub(crate) mod motor_spec;
 #[path = "patience.rs"]
-mod patience;
+pub(crate) mod patience;
 
 use std::fs::File;
 use std::io::{Read, Write};

@@ -3,6 +3,7 @@ use std::io;
 
 use rapid_bus::TopicId;
 use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_devices::interlocks::Watched;
 use rapid_episode::record::Recorder;
 use rapid_episode::record::{EpisodeRequest, RecorderConfig, Sink, Source};
 use rapid_registry::Registry;
@@ -16,7 +17,6 @@ use super::super::Signals;
 use super::super::buttons::Buttons;
 use super::super::streaming::Streaming;
 use super::*;
-use crate::interlocks::Watched;
 use crate::patience::PATIENCE;
 use crate::session::journal::Plan;
 

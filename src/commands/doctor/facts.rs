@@ -7,10 +7,10 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::preview;
-
 #[cfg(feature = "motors")]
-use crate::driver::can::netlink;
+use rapid_devices::driver::can::netlink;
+
+use super::preview;
 
 /// Facts about the host. Those that cannot be read are `None` or missing.
 #[derive(Debug, Clone, PartialEq, Default)]

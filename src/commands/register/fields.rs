@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use rapid_core::text;
+use rapid_devices::driver::camera::query;
 use rapid_registry::candidate::Candidate;
 use rapid_registry::device::{DeviceNode, UsbIdentity};
 use rapid_registry::edit::Setting;
@@ -11,7 +12,6 @@ use serde::Serialize;
 
 use super::{Dialogue, Format, RegisterError, listen};
 use crate::cli::RegisterArgs;
-use crate::driver::camera::query;
 use crate::registration::settings::suggested;
 
 /// A unit that could be registered, as JSON.

@@ -6,13 +6,13 @@
 use std::path::Path;
 
 use rapid_core::text;
+use rapid_devices::driver::camera::query;
 use rapid_registry::candidate::kind;
 use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid_registry::edit::{NewEntry, Setting};
 use rapid_registry::import::{Foreign, devices, layout};
 use rapid_registry::{RegistryErrors, like_a_name, name_problem, read_file};
 
-use crate::driver::camera::query;
 use crate::registration::settings::suggested;
 use crate::registration::{Target, free_bit};
 

@@ -14,6 +14,8 @@ use std::time::Duration;
 
 use rapid_core::sample::Encoding;
 use rapid_core::text;
+use rapid_devices::driver::serial::Serial;
+use rapid_devices::driver::{Driver, DriverError};
 use rapid_registry::candidate::unregistered;
 use rapid_registry::device::{Attachment, DeviceNode};
 use rapid_registry::edit::{self, EditError, NewEntry, Setting};
@@ -26,8 +28,6 @@ use super::artifacts::ArtifactsError;
 use super::modules::{self, ModulesError};
 use super::{Format, artifacts};
 use crate::cli::{RegisterArgs, UnregisterArgs};
-use crate::driver::serial::Serial;
-use crate::driver::{Driver, DriverError};
 use crate::registration::settings::lines_look_like;
 use crate::registration::{Target, WriteError, comments, free_bit};
 

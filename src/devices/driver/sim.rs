@@ -20,6 +20,8 @@ use rapid_core::provenance::{Format, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::sync::Grid;
 use rapid_core::time::{Stamp, nanoseconds};
+#[cfg(feature = "motors")]
+use rapid_motors::control::can::CanFrame;
 use rapid_registry::simulation::task::{self, PictureError, SharedTrial};
 use rapid_registry::simulation::{self, SimDevice, SimSource, TaskPart};
 use rapid_registry::{CAN_RECORD, DeviceSpec, NodeSpec};
@@ -28,8 +30,6 @@ use tokio::time::Instant;
 use self::joints::Joints;
 use self::pictures::{PICTURES, Pictures, encode, fill, write_depth, write_picture};
 use super::{Agreed, DriverError, Reading, unblock};
-#[cfg(feature = "motors")]
-use crate::control::can::CanFrame;
 #[cfg(feature = "motors")]
 use crate::driver::can::{
     link::{Arrival, Received},

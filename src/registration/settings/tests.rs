@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use rapid_devices::driver::camera::Mode;
 use rapid_registry::simulation::SimDevice;
 
 use super::*;
-use crate::driver::camera::Mode;
 
 #[test]
 fn a_camera_is_configured_with_a_format_it_offers() {

@@ -10,6 +10,7 @@ use futures::future::BoxFuture;
 use rapid_core::action::Order;
 use rapid_core::provenance::UnplugSource;
 use rapid_core::sync::WhenStale;
+use rapid_devices::hotplug::{HotplugError, HotplugEvent};
 use rapid_registry::device::{DeviceNode, UsbIdentity};
 use rapid_registry::simulation::{SimDevice, SimSource};
 use rapid_registry::{
@@ -20,7 +21,6 @@ use rapid_status::Event;
 use tokio::sync::{broadcast, watch};
 
 use super::*;
-use crate::hotplug::{HotplugError, HotplugEvent};
 use crate::patience::PATIENCE;
 use crate::rig::presence::{Claim, read_mask};
 

@@ -13,11 +13,11 @@ use std::time::Duration;
 use rapid_bus::{Actions, watch};
 use rapid_core::action::{ActionSource, MAX_ACTION};
 use rapid_core::permission::{Attended, Permission};
+use rapid_devices::driver::DriverError;
 use tokio::io::unix::AsyncFd;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use super::source::Source;
-use crate::driver::DriverError;
 
 /// See the module's comment.
 #[derive(Debug, Clone)]

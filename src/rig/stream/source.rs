@@ -6,13 +6,13 @@ use std::time::Duration;
 use rapid_core::action::{ActionSource, ActuatorNotice, Order};
 use rapid_core::permission::Attended;
 use rapid_core::provenance::Negotiated;
+use rapid_devices::driver::{ClockOffset, Driver, DriverError, Reading};
 use rapid_registry::NodeSpec;
 use rapid_status::Episode;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::{CLOSE_LIMIT, Stream};
-use crate::driver::{ClockOffset, Driver, DriverError, Reading};
 use crate::rig::worker::{MOST_SILENT_BEATS, Worker};
 
 /// The source of a stream's samples.

@@ -8,6 +8,8 @@ use std::process::ExitStatus;
 use std::time::Duration;
 
 use rapid_bus::Membership;
+use rapid_devices::driver::DriverError;
+use rapid_devices::driver::process::{Child, Launch};
 use rapid_status::Level;
 use tokio::sync::{OwnedMutexGuard, oneshot};
 use tokio::time::{sleep, timeout};
@@ -15,8 +17,6 @@ use tokio_util::sync::CancellationToken;
 
 use super::super::output::Output;
 use super::super::programs::Programs;
-use crate::driver::DriverError;
-use crate::driver::process::{Child, Launch};
 
 /// How long a child has to end after SIGTERM.
 pub(in crate::rig) const TERM_LIMIT: Duration = Duration::from_secs(5);

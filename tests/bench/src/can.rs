@@ -11,10 +11,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use futures::StreamExt;
-use rapid::driver::can::raw::Raw;
-use rapid::hotplug::HotplugEvent;
 use rapid_bus::TopicId;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::can::raw::Raw;
+use rapid_devices::hotplug::HotplugEvent;
 use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid_registry::{CAN_RECORD, Registry};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -95,7 +95,7 @@ fn whole(bench: &Bench, length: Duration, full: bool) -> Result<Run, Failure> {
     };
     let plugged = || {
         let events = futures::stream::iter([Ok(HotplugEvent::Added(attachment))]);
-        Box::pin(events.chain(futures::stream::pending())) as rapid::hotplug::HotplugStream
+        Box::pin(events.chain(futures::stream::pending())) as rapid_devices::hotplug::HotplugStream
     };
     let line = adapter.try_clone()?;
     let sender = std::thread::spawn(move || send(length, full, |bytes| (&line).write(bytes)));

@@ -7,13 +7,13 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use rapid::hotplug::{HotplugEvent, HotplugStream};
 use rapid::orders::receive::Orders;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
 use rapid_bus::{Bus, TopicId};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_devices::hotplug::{HotplugEvent, HotplugStream};
 use rapid_registry::Registry;
 use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid_status::Board;

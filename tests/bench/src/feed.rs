@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use rapid::driver::sim;
 use rapid_bus::TopicId;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_devices::driver::sim;
 use rapid_episode::encode;
 use rapid_episode::schema::{self, SampleSchema};
 use rapid_registry::Registry;

@@ -5,13 +5,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use rapid::hotplug::HotplugStream;
-use rapid::hotplug::script::Script;
 use rapid::rig::Rig;
 use rapid::rig::presence::{Claim, Presence};
 use rapid_bus::{Bus, Inbox, TopicId};
 use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
+use rapid_devices::hotplug::HotplugStream;
+use rapid_devices::hotplug::script::Script;
 use rapid_episode::record::{EpisodeRequest, Recorder, RecorderConfig, Source};
 use rapid_registry::Registry;
 use rapid_status::Board;

@@ -44,7 +44,7 @@ use std::time::{Duration, Instant};
 
 use clap::{Parser, ValueEnum};
 use figure::Figure;
-use rapid::driver::can::guard;
+use rapid_devices::driver::can::guard;
 
 /// An error in a section ends it, with its text as the reason.
 type Failure = Box<dyn std::error::Error>;

@@ -11,15 +11,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use rapid::control::can::CanFrame;
-use rapid::control::motors::MotorBus;
-use rapid::driver::can::link::Link;
-use rapid::driver::can::motors::{Motors, Punctuality};
 use rapid_bus::{Bus, TopicId, Writer};
 use rapid_core::action::Order;
 use rapid_core::random::Random;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_devices::driver::can::link::Link;
+use rapid_devices::driver::can::motors::{Motors, Punctuality};
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::motors::MotorBus;
 
 use self::adapter::{Adapter, spec};
 use crate::beat::sleep_until;

@@ -8,12 +8,12 @@ use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use futures::Stream;
-use rapid::driver::Driver;
-use rapid::hotplug::script::Script;
-use rapid::hotplug::{HotplugError, HotplugEvent};
 use rapid_bus::TopicId;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
+use rapid_devices::driver::Driver;
+use rapid_devices::hotplug::script::Script;
+use rapid_devices::hotplug::{HotplugError, HotplugEvent};
 use rapid_registry::device::DeviceNode;
 use rapid_registry::scenario::{ScenarioAction, ScenarioEvent};
 use rapid_registry::simulation::SimDevice;
@@ -64,7 +64,8 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let source = scenario.devices.first().ok_or("the scenario has no such device")?.source.clone();
 
     let (plugs, plugged) = channel();
-    let script = move || Box::pin(Tap { script: Script::new(scenario), plugs }) as rapid::hotplug::HotplugStream;
+    let script =
+        move || Box::pin(Tap { script: Script::new(scenario), plugs }) as rapid_devices::hotplug::HotplugStream;
     bench.progress("replug: plugging");
     let passed = play(bench, &registry, script, ROUND * rounds)?;
     let plugged: Vec<Stamp> = plugged.try_iter().collect();
@@ -94,7 +95,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
             driver.read().await?;
             alone.push(begin.elapsed().as_secs_f64() * 1e3);
         }
-        Ok::<_, rapid::driver::DriverError>(Sorted::new(alone))
+        Ok::<_, rapid_devices::driver::DriverError>(Sorted::new(alone))
     })?;
     let note = format!(
         "{} of {} plugs; from the event at the rig's door until the recorder wrote the first sample of a 1 kHz device; \

@@ -10,10 +10,10 @@ use std::cell::Cell;
 use std::rc::Rc;
 use std::time::Duration;
 
-use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Ranges, StateCommand};
-use rapid::control::damiao::parameter::Reply;
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Ranges, StateCommand};
+use rapid_motors::control::damiao::parameter::Reply;
 use rapid_registry::{DamiaoSpec, MotorMode, Stop};
 
 use self::motor_world::motor_spec::{brake, bus, motor};

@@ -1,7 +1,7 @@
 //! CAN adapters on a serial line: their output depends on the bytes alone, not on how they were cut into reads.
 
-use rapid::control::can::CanFrame;
-use rapid::driver::can::{damiao_serial, slcan};
+use rapid_devices::driver::can::{damiao_serial, slcan};
+use rapid_motors::control::can::CanFrame;
 
 use crate::targets::short;
 

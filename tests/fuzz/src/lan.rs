@@ -1,10 +1,10 @@
 //! Devices on the network: what their servers, packets and announcements hold.
 
-use rapid::driver::lan::fuzzing;
-use rapid::hotplug::lan::fuzz_label;
 use rapid_core::points::{self, PacketFormat};
 use rapid_core::remote::{Frames, Head, Kind, request, requested};
 use rapid_core::sample::Encoding;
+use rapid_devices::driver::lan::fuzzing;
+use rapid_devices::hotplug::lan::fuzz_label;
 
 /// Of the smallest entry.
 const LARGEST: usize = 1024;

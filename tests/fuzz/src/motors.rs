@@ -5,11 +5,11 @@ mod motor_spec;
 
 use std::time::Duration;
 
-use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
-use rapid::control::damiao::parameter::{Parameter, Reply, Value};
-use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
+use rapid_motors::control::damiao::parameter::{Parameter, Reply, Value};
+use rapid_motors::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 use rapid_registry::{DamiaoSpec, MotorMode, MotorSpec};
 
 /// Bytes of one thing that happens: what, a number, and eight more.

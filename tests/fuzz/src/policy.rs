@@ -63,6 +63,6 @@ pub fn bundles() -> Vec<Vec<u8>> {
 pub fn pictures() -> Vec<Vec<u8>> {
     let raw = |kind: u8, bytes: usize| [&[kind, 16, 12][..], &vec![0x80; bytes]].concat();
     let source = rapid_registry::simulation::SimSource::Camera { width: 16, height: 12, fps: 30, seed: 1, bytes: 0 };
-    let jpeg = rapid::driver::sim::frame(&source, 0).unwrap_or_default();
+    let jpeg = rapid_devices::driver::sim::frame(&source, 0).unwrap_or_default();
     vec![[&[0, 16, 12][..], &jpeg].concat(), raw(1, 16 * 12 * 2), raw(2, 16 * 12)]
 }

@@ -7,9 +7,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid::commands;
-use rapid::driver;
 use rapid_core::mask::{MaskRecord, RECORD_LEN};
 use rapid_core::text as shown;
+use rapid_devices::driver;
 use rapid_episode::record::inspect as inspection;
 use rapid_episode::recover::recover_bytes;
 use rapid_registry::device::{Attachment, DeviceNode, Unit, UsbIdentity};

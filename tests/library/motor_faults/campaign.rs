@@ -9,9 +9,9 @@ use std::env;
 use std::fmt::Write as _;
 use std::time::Duration;
 
-use rapid::control::motors::Notice;
 use rapid_core::random::Random;
 use rapid_core::time::Stamp;
+use rapid_motors::control::motors::Notice;
 use rapid_registry::{DamiaoSpec, MotorMode, Stop};
 
 use crate::support::motor_world::motor_spec::{brake, bus, motor};

@@ -17,13 +17,13 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_motors::control::motors::Brakes as State;
 use rapid_registry::{BrakeSpec, DamiaoSpec};
 use rapid_system::gpio::Output;
 use rapid_system::realtime::{CONTROL_PRIORITY, use_fifo};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 
 use super::guard::{Guard, hand_over};
-use crate::control::motors::Brakes as State;
 
 /// Every line is set again after this, so that an unplugged chip is noticed and a replugged one opened.
 const AGAIN: Duration = Duration::from_millis(500);

@@ -11,7 +11,7 @@
 //!
 //! Invariant: no bytes make the decoder panic, and it holds less than one message of them.
 
-use crate::control::can::CanFrame;
+use rapid_motors::control::can::CanFrame;
 
 /// Bits a second of the line.
 pub const BAUD: u32 = 921_600;

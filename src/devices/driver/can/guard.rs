@@ -29,6 +29,8 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::motors::{MotorBus, stalled_after};
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{CanSpec, DamiaoSpec, MAX_MOTORS};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -40,8 +42,6 @@ use rustix::net::{
 use rustix::process::{Pid, PidfdFlags, pidfd_open, setsid};
 
 use super::link::Link;
-use crate::control::can::CanFrame;
-use crate::control::motors::{MotorBus, stalled_after};
 use crate::driver::process::leak_nothing;
 
 pub use process::run;

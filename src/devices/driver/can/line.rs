@@ -8,12 +8,12 @@ use std::path::Path;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
 use super::link::{Arrival, LinkError};
 use super::{damiao_serial, slcan};
-use crate::control::can::CanFrame;
 use crate::driver::{arrival, serial};
 
 /// Bytes taken from the kernel at once.

@@ -12,6 +12,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{CanAdapter, CanSpec};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -20,7 +21,6 @@ use tokio::io::unix::AsyncFd;
 
 use super::line::Line;
 use super::socket::Socket;
-use crate::control::can::CanFrame;
 use crate::driver::DriverError;
 
 /// What else can wake a thread that waits for the bus: orders from two places, and actions.

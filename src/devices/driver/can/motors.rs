@@ -7,7 +7,7 @@
 //! Invariant: whatever ends the driver, the motors are ordered to turn off: see `control_loop`.
 
 mod control_loop;
-mod effector;
+pub mod effector;
 mod powered;
 mod statistics;
 
@@ -19,6 +19,8 @@ use rapid_core::action::{ActionSource, ActuatorNotice, MAX_ACTION, Order};
 use rapid_core::permission::Attended;
 use rapid_core::provenance::{Format, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
+use rapid_motors::control::motors::SAMPLE_VALUES;
+use rapid_motors::kinematics::Arm;
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{CanSpec, DamiaoSpec};
 use rapid_system::panics::CONTROL_THREAD;
@@ -27,9 +29,7 @@ use tokio::sync::mpsc;
 use super::claim::Claim;
 use super::guard::Guard;
 use super::link::{Link, LinkError};
-use crate::control::motors::SAMPLE_VALUES;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
-use crate::kinematics::Arm;
 use control_loop::{ControlLoop, Sample, Shared};
 use effector::Effector;
 use powered::Powered;

@@ -9,9 +9,8 @@
 //!
 //! Invariant: no bytes make the decoder panic, and it holds at most [`LONGEST`] of them.
 
+use rapid_motors::control::can::CanFrame;
 use rapid_registry::SLCAN_BITRATES;
-
-use crate::control::can::CanFrame;
 
 /// The longest line: `T`, 8 digits of identifier, the length, 16 digits of data, 4 of a time stamp, and CR.
 pub const LONGEST: usize = 31;

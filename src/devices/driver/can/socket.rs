@@ -11,12 +11,12 @@ use std::time::Duration;
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::RcvBufForce;
 use rapid_core::time::{Stamp, WallClock};
+use rapid_motors::control::can::CanFrame;
 use rustix::net::{AddressFamily, Protocol, SendFlags, SocketFlags, SocketType};
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 
 use super::link::{Arrival, LinkError, is_overflow};
 use super::netlink::{self, Ready};
-use crate::control::can::CanFrame;
 use crate::driver::datagram::{self, Datagram};
 
 /// Bytes of a classical frame (`struct can_frame`, linux/can.h): identifier, length, three that mean nothing, data.

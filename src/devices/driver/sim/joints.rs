@@ -5,12 +5,12 @@ use std::sync::Arc;
 use rapid_core::action::{ActuatorNotice, Arming, Order};
 #[cfg(feature = "motors")]
 use rapid_core::action::{MAX_ACTION, NoAction};
+#[cfg(feature = "motors")]
+use rapid_motors::kinematics::{Arm, Solver};
 use rapid_registry::{CanProtocol, CanSpec, MOTOR_CHANNELS};
 use tokio::sync::mpsc;
 
 use crate::driver::DriverError;
-#[cfg(feature = "motors")]
-use crate::kinematics::{Arm, Solver};
 
 /// Queue length for notices.
 const NOTICES: usize = 16;

@@ -7,6 +7,8 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::damiao::codec::StateCommand;
 use rapid_registry::{BrakeSpec, CanAdapter, MAX_MOTORS};
 use rapid_system::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -16,8 +18,6 @@ use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, RecvMsg,
 
 use super::held::Held;
 use super::{BRAKE, DISMISSED, FRAME, KEEP_FOR, LONGEST, NAME, ON, decode};
-use crate::control::can::CanFrame;
-use crate::control::damiao::codec::StateCommand;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::{damiao_serial, slcan, socket};
 

@@ -21,6 +21,9 @@ use std::time::Duration;
 use rapid_core::action::{ActionSource, ActuatorNotice, Arming, MAX_ACTION, Order, OrderSlot};
 use rapid_core::permission::Attended;
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::motors::{BusState, SAMPLE_VALUES};
+use rapid_motors::control::pace::Pace;
 use rapid_registry::{DamiaoSpec, MAX_MOTORS};
 use rapid_system::fault;
 use rapid_system::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
@@ -28,9 +31,6 @@ use tokio::sync::mpsc;
 
 use super::powered::Powered;
 use super::statistics::{LoopStatistics, Punctuality};
-use crate::control::can::CanFrame;
-use crate::control::motors::{BusState, SAMPLE_VALUES};
-use crate::control::pace::Pace;
 use crate::driver::DriverError;
 use crate::driver::can::link::LinkError;
 

@@ -18,10 +18,9 @@ use rapid_core::action::{ActionSource, MAX_ACTION, NoAction};
 use rapid_core::bell::Bell;
 use rapid_core::text;
 use rapid_core::time::Stamp;
+use rapid_motors::kinematics::{Arm, Solver};
 use rapid_registry::{MAX_MOTORS, MOTOR_CHANNELS};
 use rustix::event::{PollFd, PollFlags, Timespec};
-
-use crate::kinematics::{Arm, Solver};
 
 /// The longest time that an action without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);
@@ -31,7 +30,7 @@ const ON_THE_WAY: f64 = 0.3;
 
 /// The arm of a bus of motors.
 #[derive(Debug)]
-pub(super) struct Effector {
+pub struct Effector {
     arm: Arm,
     motors: usize,
     latest: Arc<Latest>,
@@ -74,12 +73,12 @@ struct Latest {
 
 impl Effector {
     /// For so many motors.
-    pub(super) fn new(arm: Arm, motors: usize) -> Self {
+    pub fn new(arm: Arm, motors: usize) -> Self {
         Self { arm, motors, latest: Arc::default(), thread: None }
     }
 
     /// Takes the state of the motors, and writes the numbers of the tip that follow it in a sample. Returns how many.
-    pub(super) fn look(&self, motors: &[f64], tip: &mut [f64]) -> usize {
+    pub fn look(&self, motors: &[f64], tip: &mut [f64]) -> usize {
         for (place, position) in self.latest.positions.iter().zip(motors.iter().step_by(MOTOR_CHANNELS)) {
             place.store(position.to_bits(), Ordering::Relaxed);
         }
@@ -92,7 +91,7 @@ impl Effector {
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub(super) fn follow(&mut self, actions: Arc<dyn ActionSource>) -> std::io::Result<Arc<dyn ActionSource>> {
+    pub fn follow(&mut self, actions: Arc<dyn ActionSource>) -> std::io::Result<Arc<dyn ActionSource>> {
         self.stop();
         let (targets, stop) = (Arc::new(Targets::new(self.motors)), Arc::<AtomicBool>::default());
         let worker = Worker {

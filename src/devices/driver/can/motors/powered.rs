@@ -4,10 +4,10 @@ use std::io;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::motors::MotorBus;
 use rapid_registry::DamiaoSpec;
 
-use crate::control::can::CanFrame;
-use crate::control::motors::MotorBus;
 use crate::driver::can::brakes::Brakes;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::guard::Guard;

@@ -6,8 +6,7 @@ use std::time::Duration;
 use hdrhistogram::Histogram;
 use rapid_core::text;
 use rapid_core::time::nanoseconds;
-
-use crate::control::motors::Counts;
+use rapid_motors::control::motors::Counts;
 
 /// Longest time the statistics distinguish, ns.
 const LONGEST: u64 = 10_000_000_000;

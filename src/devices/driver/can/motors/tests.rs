@@ -11,15 +11,15 @@ use rapid_core::action::{Arming, NoAction};
 use rapid_core::interlock::{InputState, Interlocks, StopKind};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
+use rapid_motors::control::can::CanFrame;
+use rapid_motors::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
+use rapid_motors::control::damiao::parameter::{Parameter, Reply, Value};
 use rapid_registry::{
     EffectorSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mounting, Stop, StopSpec, TipRotation, WatchSpec,
 };
 use tokio::time::{Instant, interval, timeout};
 
 use super::*;
-use crate::control::can::CanFrame;
-use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
-use crate::control::damiao::parameter::{Parameter, Reply, Value};
 use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
 use crate::patience::PATIENCE;

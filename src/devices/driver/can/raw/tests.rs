@@ -1,8 +1,9 @@
 use std::io::Write as _;
 use std::net::UdpSocket;
 
+use rapid_motors::control::can::CanFrame;
+
 use super::*;
-use crate::control::can::CanFrame;
 use crate::driver::can::{link, socket};
 use crate::patience::PATIENCE;
 

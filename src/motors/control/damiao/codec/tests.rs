@@ -7,7 +7,7 @@ use super::*;
 use crate::control::damiao::parameter;
 
 fn golden() -> Value {
-    serde_json::from_str(include_str!("../../../../tests/golden/damiao.json")).unwrap()
+    serde_json::from_str(include_str!("../../../../../tests/golden/damiao.json")).unwrap()
 }
 
 fn hex(text: &Value) -> [u8; 8] {

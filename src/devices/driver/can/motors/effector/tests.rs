@@ -1,58 +1,20 @@
-use std::collections::VecDeque;
-use std::sync::{Mutex, PoisonError};
+use std::sync::PoisonError;
 use std::time::Instant;
 
 use rapid_registry::{CanProtocol, CanSpec, NodeSpec, Registry};
 
 use super::*;
+use crate::given::{Given, next};
 use crate::patience::PATIENCE;
 
 /// The arm of the tests, as `tests/arm/devices.toml` declares it.
 fn effector() -> Effector {
-    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/arm");
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/arm");
     let registry = Registry::load(&folder.join("devices.toml")).unwrap_or_else(|error| panic!("{error}")).registry;
     let arm = registry.named("arm").expect("an arm");
     let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &arm.node else { panic!("{arm:?}") };
     let arm = Arm::open(motors.effector.as_deref().expect("an effector"), &motors.motors).expect("it fits");
     Effector::new(arm, motors.motors.len())
-}
-
-/// Actions in the order in which they are given; without a bell.
-#[derive(Debug, Default)]
-struct Given(Mutex<VecDeque<Taken>>);
-
-type Taken = Result<(Vec<f64>, Stamp), NoAction>;
-
-impl Given {
-    fn add(&self, action: Taken) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push_back(action);
-    }
-}
-
-impl ActionSource for Given {
-    fn bell(&self) -> Option<BorrowedFd<'_>> {
-        None
-    }
-
-    fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
-        let Some(given) = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop_front() else { return Ok(None) };
-        let (numbers, tick) = given?;
-        action[..numbers.len()].copy_from_slice(&numbers);
-        Ok(Some((&action[..numbers.len()], tick)))
-    }
-}
-
-/// The next target, or why there is none.
-fn next(targets: &Arc<dyn ActionSource>) -> Taken {
-    let begun = Instant::now();
-    loop {
-        let mut action = [0.0; MAX_ACTION];
-        if let Some((found, tick)) = targets.newest(&mut action)? {
-            return Ok((found.to_vec(), tick));
-        }
-        assert!(begun.elapsed() < PATIENCE, "no target");
-        std::thread::sleep(Duration::from_millis(1));
-    }
 }
 
 /// Numbers of the motors at these positions.
@@ -146,75 +108,6 @@ fn actions_are_counted_by_what_became_of_them() {
     let tally = effector.stop().expect("it ran");
     assert_eq!(tally, Tally { followed: 3, out_of_reach: 3, invalid: 2 });
     assert_eq!(tally.to_string(), "3 actions followed, 3 out of reach, 2 invalid");
-}
-
-/// From the answer of a network to the motors: relative poses with a rotation are composed onto the pose of the tip in the
-/// sample of the motors, and the arm goes there.
-#[cfg(feature = "policy")]
-#[test]
-#[expect(clippy::cast_possible_truncation, reason = "a network has 32 bits")]
-fn relative_poses_of_a_policy_become_targets_that_lead_to_them() {
-    use rapid_core::rotation;
-    use rapid_core::sample::{Encoding, SampleHeader};
-
-    use crate::kinematics::tests::{COMMANDED, SIX, apart, arm_of};
-    use crate::policy::bundle::Bundle;
-    use crate::policy::compose::Composer;
-    use crate::policy::request::Request;
-
-    const POLICY: &str = include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/bundle/valid/relative.json"));
-    const MOTORS: usize = 7;
-    const ACTIONS: usize = 16;
-    // Behind the numbers of the motors: position, opening, quaternion.
-    let policy =
-        POLICY.replace("\"position\": [0, 3], \"rotation\": [3, 7]", "\"position\": [42, 45], \"rotation\": [46, 50]");
-    assert_ne!(policy, POLICY);
-    let bundle = Bundle::parse(&policy, "policy.json").unwrap_or_else(|errors| panic!("{errors}"));
-    let arm = arm_of(&SIX, COMMANDED);
-    let mut effector = Effector::new(arm.clone(), MOTORS);
-    let pose = |positions: &[f64]| {
-        let mut tip = [0.0; 8];
-        arm.state(&sample(positions), &mut tip);
-        tip
-    };
-
-    let start = [0.3, 0.2, 1.2, -0.4, 1.0, 0.5, 0.0];
-    let mut numbers = sample(&start);
-    let mut tip = [0.0; 8];
-    effector.look(&numbers, &mut tip);
-    numbers.extend(tip);
-    let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
-    let header = SampleHeader { encoding: Encoding::F64 as u32, ..SampleHeader::default() };
-    let mut request = Request::new(&bundle);
-    request.set_present(2, true);
-    request.cell_mut(2, 1).expect("the newest step").set(&header, &bytes);
-
-    // What the network answers by definition: poses that the arm has on a path of its joints, seen from where the tip is.
-    let path = |step: usize| start.map(|position| position + 0.012 * step as f64);
-    let [px, py, pz, _, qx, qy, qz, qw] = tip;
-    let back = [-qx, -qy, -qz, qw];
-    let mut output = Vec::new();
-    for step in 0..ACTIONS {
-        let [x, y, z, _, turned @ ..] = pose(&path(step));
-        let far = rotation::turned(back, [x - px, y - py, z - pz]);
-        let rows = rotation::rows(rotation::product(back, turned));
-        output.extend(far.iter().chain(rows.as_flattened()).chain(&[0.75]).map(|number| *number as f32));
-    }
-    let composer = Composer::new(&bundle);
-    let mut chunk = vec![0.0; composer.chunk_len()];
-    composer.compose(&request, &output, &mut chunk).expect("poses");
-
-    let actions = Arc::<Given>::default();
-    let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
-    for (step, action) in chunk.chunks(chunk.len() / ACTIONS).enumerate() {
-        actions.add(Ok((action.iter().map(|number| f64::from(*number)).collect(), Stamp(step as u64))));
-        let (found, _) = next(&targets).unwrap_or_else(|refused| panic!("action {step}: {refused}"));
-        let (found, wanted) = (pose(&found), pose(&path(step)));
-        let [far, off] = apart(&found, &wanted, false);
-        // Twice what the solver leaves: the network's numbers have 32 bits.
-        assert!(far < 2e-4 && off < 2e-3, "action {step}: {far} m, {off} rad: {found:?} {wanted:?}");
-        assert!((found[3] - 0.75).abs() < 1e-6, "action {step}: {found:?}");
-    }
 }
 
 #[test]
