@@ -1,4 +1,4 @@
-//! Names the commit of a release, and packs the libraries that policies need.
+//! Packs the libraries that policies need.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,6 @@ const LIBSTDCXX: &str = "libstdc++.so.6";
 const LEVEL: i32 = 9;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    commit();
     println!("cargo::rerun-if-changed=build.rs");
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
     if std::env::var_os("CARGO_FEATURE_POLICY").is_some() {
@@ -26,26 +25,6 @@ fn main() -> Result<(), Box<dyn Error>> {
         println!("cargo::rustc-env=RAPID_BUILT_WITH_CXX=libstdc++: none (built without `policy`)");
     }
     Ok(())
-}
-
-/// Names the commit a release is built from. A source archive has none. Builds for development have
-/// none either: each commit would rebuild them.
-fn commit() {
-    // Asked for here and not found by git itself: the archive may lie in somebody else's repository.
-    if std::env::var("PROFILE").as_deref() != Ok("release") || !Path::new(".git").exists() {
-        return;
-    }
-    let ask = |arguments: &[&str]| {
-        let output = Command::new("git").args(arguments).output().ok().filter(|output| output.status.success())?;
-        Some(String::from_utf8(output.stdout).ok()?.trim().to_owned())
-    };
-    // It grows whenever another commit is checked out or made.
-    if let Some(log) = ask(&["rev-parse", "--git-path", "logs/HEAD"]).filter(|log| Path::new(log).exists()) {
-        println!("cargo::rerun-if-changed={log}");
-    }
-    if let Some(commit) = ask(&["rev-parse", "HEAD"]) {
-        println!("cargo::rustc-env=RAPID_COMMIT={commit}");
-    }
 }
 
 /// Packs the library that policies need for the program to carry: `src/policy/onnxruntime.rs` includes

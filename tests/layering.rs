@@ -153,6 +153,26 @@ fn every_dependency_is_used() {
     assert!(unused.is_empty(), "named by a Cargo.toml and by no source: {unused:?}");
 }
 
+/// A variable that a build script gives reaches its own package alone, and without one `option_env!` is silently nothing.
+#[test]
+fn what_is_read_at_compile_time_is_given_by_the_build_of_the_same_package() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut files = BTreeMap::new();
+    collect(root, &root.join("src"), &mut files).unwrap();
+    let is_package = |folder: &&Path| root.join(folder).join("Cargo.toml").exists();
+    let mut found = 0;
+    for (path, text) in files {
+        let package = path.ancestors().skip(1).find(is_package).unwrap();
+        for (_, rest) in text.match_indices("env!(\"RAPID_").map(|(at, _)| text[at..].split_at("env!(\"".len())) {
+            let name = rest.split('"').next().unwrap();
+            let script = fs::read_to_string(root.join(package).join("build.rs")).unwrap_or_default();
+            assert!(script.contains(&format!("{name}=")), "{}: {name} is not given by its build.rs", path.display());
+            found += 1;
+        }
+    }
+    assert!(found > 2, "{found}");
+}
+
 /// `rapid-remote` is in no workspace of this repository, and its lock is not written by a build of it.
 #[test]
 fn the_lock_of_rapid_remote_has_what_every_program_needs() {
