@@ -14,15 +14,15 @@ use std::error::Error;
 use std::path::Path;
 
 use prost::Message;
-use rapid::policy::bundle::{Bundle, ObservationInput};
-use rapid::policy::compose::Composer;
-use rapid::policy::model::Model;
-use rapid::policy::onnxruntime::Environment;
-use rapid::policy::request::Request;
-use rapid::policy::sampler::Computing;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::random::Random;
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_policy::bundle::{Bundle, ObservationInput};
+use rapid_policy::compose::Composer;
+use rapid_policy::model::Model;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::request::Request;
+use rapid_policy::sampler::Computing;
 use serde::Deserialize;
 
 /// The stream of the seed that noise is drawn from: ASCII "policy".

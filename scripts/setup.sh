@@ -143,7 +143,7 @@ onnxruntime() {
     mkdir -p "$dir"
     mv "$partial/$library" "$dir/$library"
     # A program built without it is rebuilt: cargo watches this file, but not one that did not exist.
-    touch build.rs
+    touch src/policy/build.rs
     rm -rf "$partial"
     trap - EXIT
 }

@@ -64,8 +64,13 @@ pub struct Cli {
 }
 
 /// `rapid --version`; `-V` prints only the first line.
-const LONG_VERSION: &str =
-    concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"), "\n", env!("RAPID_BUILT_WITH_CXX"));
+#[cfg(feature = "policy")]
+const LONG_VERSION: &str = rapid_policy::onnxruntime::LONG_VERSION;
+#[cfg(not(feature = "policy"))]
+const LONG_VERSION: &str = concat!(
+    env!("CARGO_PKG_VERSION"),
+    "\nonnxruntime: none (built without `policy`)\nlibstdc++: none (built without `policy`)"
+);
 
 const EXAMPLES: &str = "\
 Without a command, rapid runs the rig and opens the monitor: it finds the sensors that devices.toml \

@@ -12,6 +12,9 @@ pub mod commands;
 #[cfg(feature = "policy")]
 pub mod compare;
 pub mod dispatch;
+#[cfg(all(test, feature = "policy"))]
+#[path = "../tests/support/example.rs"]
+mod example;
 #[cfg(test)]
 #[path = "../tests/support/literal.rs"]
 mod literal;
@@ -21,8 +24,6 @@ pub mod orders;
 #[cfg(test)]
 #[path = "../tests/support/patience.rs"]
 mod patience;
-#[cfg(feature = "policy")]
-pub mod policy;
 #[cfg(test)]
 #[path = "../tests/support/recorded.rs"]
 mod recorded;

@@ -8,14 +8,14 @@ use rapid_devices::hotplug::HotplugError;
 use rapid_episode::record::RecordError;
 #[cfg(feature = "foxglove")]
 use rapid_live::LiveError;
+#[cfg(feature = "policy")]
+use rapid_policy::{onnxruntime::LibraryError, sampler::PolicyError};
 use rapid_screens::logging::LoggingError;
 use rapid_screens::tui::TuiError;
 #[cfg(feature = "web")]
 use rapid_web::WebError;
 
 use super::LAST_CHUNK;
-#[cfg(feature = "policy")]
-use crate::policy::{onnxruntime::LibraryError, sampler::PolicyError};
 use crate::rig::RigError;
 use crate::rig::presence::PresenceError;
 

@@ -12,6 +12,11 @@ use rapid_bus::{Bus, Inbox, TopicId, Writer};
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_episode::ReferenceSample;
+use rapid_policy::live::{Live, LiveOptions};
+use rapid_policy::model::Model;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::pace::{Pace, PaceVerdict};
+use rapid_policy::sampler::Computing;
 use rapid_registry::Registry;
 use rapid_status::{Board, EpisodeWatch, EventKind, Level};
 use tokio::time::{Instant, MissedTickBehavior, interval};
@@ -20,11 +25,6 @@ use tokio_util::sync::CancellationToken;
 use super::AppError;
 use super::settling;
 use super::stage::Stage;
-use crate::policy::live::{Live, LiveOptions};
-use crate::policy::model::Model;
-use crate::policy::onnxruntime::Environment;
-use crate::policy::pace::{Pace, PaceVerdict};
-use crate::policy::sampler::Computing;
 use crate::rig::presence::Published;
 
 /// Interval at which the mask is checked for that.

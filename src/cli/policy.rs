@@ -6,14 +6,14 @@ use std::time::Duration;
 #[cfg(feature = "policy")]
 use clap::Subcommand;
 use clap::{Args, ValueHint};
+#[cfg(feature = "policy")]
+use rapid_policy::sampler::Computing;
 use rapid_registry::{InferenceSpec, Provider};
 
 use super::run::{RUN, RunArgs};
 use super::time;
 #[cfg(feature = "policy")]
 use crate::lockstep::evaluate::Condition;
-#[cfg(feature = "policy")]
-use crate::policy::sampler::Computing;
 
 const POLICY: &str = "Policy options";
 

@@ -4,14 +4,14 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use rapid_core::text;
+use rapid_policy::bundle::{Bundle, BundleErrors};
+use rapid_policy::onnxruntime::{Environment, LibraryError};
 use rapid_registry::InferenceSpec;
 
 use super::Format;
 use super::progress::Bar;
 use crate::cli::ReplayArgs;
 use crate::compare::{self, Again, Beside, CompareError, Compared, Comparison, Difference, Spread, Watcher};
-use crate::policy::bundle::{Bundle, BundleErrors};
-use crate::policy::onnxruntime::{Environment, LibraryError};
 
 /// Differences up to this come from the order of floating-point additions, which depends on the machine.
 const USUAL_TOLERANCE: f64 = 1e-4;

@@ -5,6 +5,10 @@ use std::io::{self, Write};
 use std::time::Instant;
 
 use rapid_core::text;
+use rapid_policy::bundle::{Bundle, BundleErrors};
+use rapid_policy::model::Model;
+use rapid_policy::onnxruntime::{Environment, LibraryError};
+use rapid_policy::sampler::PolicyError;
 use rapid_registry::Registry;
 use rapid_registry::simulation::task::Outcome;
 use rapid_status::palette::Palette;
@@ -15,10 +19,6 @@ use super::progress::Bar;
 use crate::cli::EvalArgs;
 use crate::lockstep::TrialError;
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, robot_time, wilson};
-use crate::policy::bundle::{Bundle, BundleErrors};
-use crate::policy::model::Model;
-use crate::policy::onnxruntime::{Environment, LibraryError};
-use crate::policy::sampler::PolicyError;
 
 /// Why there is no result.
 #[derive(Debug, thiserror::Error)]

@@ -7,20 +7,20 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rapid_core::text;
+use rapid_policy::bundle::{
+    ActionRotation, Bundle, BundleAction, BundleErrors, ObservationInput, ObservationSpec, Representation,
+    VectorOperation, VectorRotation, VectorSpec, WhenAbsent,
+};
+use rapid_policy::model::Model;
+use rapid_policy::onnxruntime::{Environment, LibraryError};
+use rapid_policy::pace::{Pace, PaceVerdict};
+use rapid_policy::sampler::{Computing, PolicyError};
 use rapid_registry::{InferenceSpec, Registry};
 use serde_json::{Value, json};
 
 use super::Format;
 use crate::cli::{ObserveArgs, ShowArgs};
 use crate::compare::{self, ChunkInputs, CompareError};
-use crate::policy::bundle::{
-    ActionRotation, Bundle, BundleAction, BundleErrors, ObservationInput, ObservationSpec, Representation,
-    VectorOperation, VectorRotation, VectorSpec, WhenAbsent,
-};
-use crate::policy::model::Model;
-use crate::policy::onnxruntime::{Environment, LibraryError};
-use crate::policy::pace::{Pace, PaceVerdict};
-use crate::policy::sampler::{Computing, PolicyError};
 
 /// Why a policy cannot be shown.
 #[derive(Debug, thiserror::Error)]

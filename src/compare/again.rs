@@ -11,16 +11,16 @@ use std::path::Path;
 use rapid_core::sample::SampleHeader;
 use rapid_episode::decode::{Content, Scratch};
 use rapid_episode::reader::{Item, Reader};
+use rapid_policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation, VectorOperation};
+use rapid_policy::compose::Composer;
+use rapid_policy::model::Model;
+use rapid_policy::request::Request;
 use rapid_registry::Registry;
 use serde::Serialize;
 
 use super::difference::{Difference, distance};
 use super::survey::{RecordedAction, RecordedChunk, RecordedSamples, SEQUENCE_BITS, Survey, header};
 use super::{CompareError, Ended};
-use crate::policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation, VectorOperation};
-use crate::policy::compose::Composer;
-use crate::policy::model::Model;
-use crate::policy::request::Request;
 
 /// The result.
 #[derive(Debug, Clone, Default, Serialize)]

@@ -15,17 +15,17 @@ use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_core::sync::Grid;
 use rapid_core::time::Stamp;
+use rapid_policy::bundle::Bundle;
+use rapid_policy::horizon::{Counts, WithoutMask};
+use rapid_policy::model::Model;
+use rapid_policy::pilot::Pilot;
+use rapid_policy::request::Request;
 use rapid_registry::Registry;
 use serde::Serialize;
 
 use super::difference::Difference;
 use super::survey::{Ordered, Received, Survey};
 use super::{CompareError, Ended};
-use crate::policy::bundle::Bundle;
-use crate::policy::horizon::{Counts, WithoutMask};
-use crate::policy::model::Model;
-use crate::policy::pilot::Pilot;
-use crate::policy::request::Request;
 
 /// Seed of the policy's noise.
 const SEED: u64 = 0;

@@ -2,9 +2,8 @@
 //!
 //! Invariant: NaN is infinitely far from every other value, and equal to itself.
 
+use rapid_policy::bundle::BundleAction;
 use serde::Serialize;
-
-use crate::policy::bundle::BundleAction;
 
 /// Statistics of distances.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]

@@ -17,6 +17,10 @@ mod tests;
 use std::path::Path;
 
 use rapid_episode::ReadError;
+use rapid_policy::bundle::{Bundle, BundleErrors};
+use rapid_policy::model::Model;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::sampler::{Computing, PolicyError};
 use rapid_registry::Registry;
 use serde::Serialize;
 
@@ -26,10 +30,6 @@ pub use self::beside::Beside;
 pub use self::difference::{AxisDifference, Difference, Spread};
 
 use self::survey::Survey;
-use crate::policy::bundle::{Bundle, BundleErrors};
-use crate::policy::model::Model;
-use crate::policy::onnxruntime::Environment;
-use crate::policy::sampler::{Computing, PolicyError};
 
 /// Why there is no comparison.
 #[derive(Debug, thiserror::Error)]

@@ -13,10 +13,9 @@ use rapid_episode::decode::{Content, Sample, Scratch};
 use rapid_episode::encode::EventText;
 use rapid_episode::reader::{Entry, Item, Message, Reader};
 use rapid_episode::reference;
+use rapid_policy::bundle::ObservationSpec;
 use rapid_registry::Registry;
 use serde::Deserialize;
-
-use crate::policy::bundle::ObservationSpec;
 
 /// The bits of a sample's number that a recorded message holds.
 pub(super) const SEQUENCE_BITS: u64 = 0xffff_ffff;

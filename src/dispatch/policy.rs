@@ -4,6 +4,9 @@ use std::io::{self, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use rapid_policy::bundle::{Bundle, BundleErrors};
+use rapid_policy::horizon::WithoutMask;
+use rapid_policy::live::LiveOptions;
 use rapid_registry::Registry;
 use rapid_registry::task::HANDHELD_MODULE;
 
@@ -13,9 +16,6 @@ use super::{block_on, check_writable, is_task, request, rig};
 use crate::app::PolicyOptions;
 use crate::cli::{EvalArgs, Global, PolicyArgs, PolicyCommand, ReplayArgs, RunArgs, TaskArgs};
 use crate::commands::{self, Format};
-use crate::policy::bundle::{Bundle, BundleErrors};
-use crate::policy::horizon::WithoutMask;
-use crate::policy::live::LiveOptions;
 
 /// The policy of a run, if one was requested.
 pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Result<Option<PolicyOptions>, Failure> {

@@ -13,6 +13,11 @@ use rapid_core::sample::SampleHeader;
 use rapid_core::time::Stamp;
 use rapid_episode::record::stepped::Stepped;
 use rapid_episode::record::{EpisodeRequest, RecordError};
+use rapid_policy::bundle::Bundle;
+use rapid_policy::horizon::{Counts, WithoutMask};
+use rapid_policy::model::{AnswerError, Model};
+use rapid_policy::pilot::Pilot;
+use rapid_policy::request::Request;
 use rapid_registry::scenario::{Scenario, ScenarioAction};
 use rapid_registry::simulation::task::{AXES, Outcome, Size, Texture, Touch, UNSEEN_PERIOD};
 use rapid_registry::{Registry, task};
@@ -21,11 +26,6 @@ use serde::Serialize;
 
 use super::timing::Timing;
 use super::{Lockstep, STEP, Taker, TrialError};
-use crate::policy::bundle::Bundle;
-use crate::policy::horizon::{Counts, WithoutMask};
-use crate::policy::model::{AnswerError, Model};
-use crate::policy::pilot::Pilot;
-use crate::policy::request::Request;
 
 /// The random stream of a trial's seed that determines when cables are unplugged.
 const WINDOWS: u64 = 0x7769_6e64_6f77;
@@ -486,10 +486,9 @@ pub fn robot_time(steps: u64) -> Duration {
 
 #[cfg(test)]
 mod tests {
-    use rapid_core::mask::Bits;
-
     use super::*;
-    use crate::policy::bundle::example;
+    use crate::example;
+    use rapid_core::mask::Bits;
 
     #[test]
     fn the_confidence_interval_is_that_of_wilson() {

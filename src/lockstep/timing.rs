@@ -9,11 +9,11 @@
 use std::time::Duration;
 
 use rapid_core::random::Random;
+use rapid_policy::pilot::FIRST_TICK_AFTER;
 use rapid_registry::Registry;
 use rapid_registry::scenario::Scenario;
 
 use super::STEP;
-use crate::policy::pilot::FIRST_TICK_AFTER;
 
 /// The random stream of a trial's seed that determines the timings.
 const TIMING: u64 = 0x7469_6d69_6e67;

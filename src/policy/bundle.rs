@@ -15,8 +15,6 @@
 //! Invariant: no later code checks a [`Bundle`] again.
 
 mod action;
-#[cfg(test)]
-pub(crate) mod example;
 mod external;
 mod file;
 mod files;

@@ -135,9 +135,8 @@ mod tests {
 
     #[test]
     fn slices_of_an_action_have_their_own_modes() {
-        let mut action =
-            crate::policy::bundle::Bundle::parse(crate::policy::bundle::example::POLICY, "").unwrap().action;
-        let slice = |slice, normalization| crate::policy::bundle::SliceNormalization { slice, normalization };
+        let mut action = crate::bundle::Bundle::parse(crate::example::POLICY, "").unwrap().action;
+        let slice = |slice, normalization| crate::bundle::SliceNormalization { slice, normalization };
         action.normalization = vec![
             slice(0..2, min_max()),
             slice(2..3, Normalization::Identity),

@@ -22,6 +22,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use ort::logging::LogLevel;
 /// The packed library; empty in a build without one.
+/// The version, and a line for each library inside.
+pub const LONG_VERSION: &str =
+    concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"), "\n", env!("RAPID_BUILT_WITH_CXX"));
+
 static INSIDE: &[u8] = include_bytes!(env!("RAPID_ONNXRUNTIME"));
 /// The variable that names another library.
 const VARIABLE: &str = "ORT_DYLIB_PATH";

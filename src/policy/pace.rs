@@ -63,7 +63,7 @@ impl Pace {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::policy::bundle::example;
+    use crate::example;
 
     #[test]
     fn the_verdict_follows_from_horizon_and_rate() {

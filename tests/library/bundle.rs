@@ -6,12 +6,13 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use crate::support::mistakes;
-use proptest::prelude::*;
-use rapid::policy::bundle::{
+use rapid_policy::bundle::{
     BetaSchedule, Bundle, ColorOrder, Normalization, ObservationInput, Operation, SchedulerKind, VectorOperation,
     WhenAbsent,
 };
+
+use crate::support::mistakes;
+use proptest::prelude::*;
 
 fn files(folder: &str) -> Vec<PathBuf> {
     mistakes::files(&format!("bundle/{folder}"), "json")

@@ -6,6 +6,14 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
 use rapid_core::sample::{Encoding, SampleHeader};
+use rapid_policy::bundle::{Bundle, ImageSpec, ObservationInput};
+use rapid_policy::graphs::LoadedGraph;
+use rapid_policy::model::Model;
+use rapid_policy::observation::ObservationTensors;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::picture::{Picture, Preprocessor};
+use rapid_policy::request::Request;
+use rapid_policy::sampler::{Computing, PolicyError, Sampler};
 use rapid_registry::InferenceSpec;
 
 use crate::support::allocations::allocations;
@@ -13,14 +21,6 @@ use crate::support::onnx::{
     self, ACTION, CONDITION_SHARE, Change, HISTORY, HISTORY_STEPS, HORIZON, Message, SAMPLE_SHARE, SIDE, STEPS,
     TIMESTEP_SHARE, encoder_of_history, encoder_with, external, within, write_bundle, write_graphs,
 };
-use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
-use rapid::policy::graphs::LoadedGraph;
-use rapid::policy::model::Model;
-use rapid::policy::observation::ObservationTensors;
-use rapid::policy::onnxruntime::Environment;
-use rapid::policy::picture::{Picture, Preprocessor};
-use rapid::policy::request::Request;
-use rapid::policy::sampler::{Computing, PolicyError, Sampler};
 
 fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
     let folder = tempfile::tempdir().unwrap();
@@ -282,12 +282,12 @@ fn a_jpeg_allocates_only_the_buffers_of_the_decoder() {
     let spec = ImageSpec {
         height: SIDE,
         width: SIDE,
-        color: rapid::policy::bundle::ColorOrder::Rgb,
+        color: rapid_policy::bundle::ColorOrder::Rgb,
         resize: Some([SIDE, SIDE]),
         crop: None,
         operation: None,
     };
-    let mut preprocessor = Preprocessor::new(spec, &rapid::policy::bundle::Normalization::Identity);
+    let mut preprocessor = Preprocessor::new(spec, &rapid_policy::bundle::Normalization::Identity);
     let mut jpeg = Vec::new();
     rapid_pictures::jpeg::encode(
         &vec![90; 3 * 320 * 240],

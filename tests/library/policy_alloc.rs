@@ -11,6 +11,15 @@ use std::time::Duration;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use rapid_core::time::Stamp;
+use rapid_policy::bundle::Bundle;
+use rapid_policy::compose::Composer;
+use rapid_policy::horizon::{ActionQueue, Situation, WithoutMask};
+use rapid_policy::model::Model;
+use rapid_policy::observer::Observer;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::pilot::Pilot;
+use rapid_policy::request::Request;
+use rapid_policy::sampler::Computing;
 use rapid_registry::Registry;
 use rapid_registry::simulation::task::layout;
 use rapid_registry::task::PARTS;
@@ -19,15 +28,6 @@ use crate::support::allocations::allocations;
 use crate::support::onnx::{
     ACTION, Change, HISTORY, HISTORY_STEPS, HORIZON, STEPS, encoder_of_history, write_bundle, write_graphs,
 };
-use rapid::policy::bundle::Bundle;
-use rapid::policy::compose::Composer;
-use rapid::policy::horizon::{ActionQueue, Situation, WithoutMask};
-use rapid::policy::model::Model;
-use rapid::policy::observer::Observer;
-use rapid::policy::onnxruntime::Environment;
-use rapid::policy::pilot::Pilot;
-use rapid::policy::request::Request;
-use rapid::policy::sampler::Computing;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 

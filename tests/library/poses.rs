@@ -13,19 +13,19 @@ use rapid_core::rotation;
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_devices::driver::can::motors::effector::Effector;
+use rapid_policy::bundle::Bundle;
+use rapid_policy::compose::Composer;
+use rapid_policy::horizon::{ChunkError, HoldReason, WithoutMask};
+use rapid_policy::model::Model;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::pilot::Pilot;
+use rapid_policy::request::Request;
+use rapid_policy::sampler::Computing;
 use rapid_registry::Registry;
 
 use crate::support::arm::{COMMANDED, SIX, apart, arm_of, sample};
 use crate::support::given::{Given, next};
 use crate::support::onnx::{Change, write_bundle};
-use rapid::policy::bundle::Bundle;
-use rapid::policy::compose::Composer;
-use rapid::policy::horizon::{ChunkError, HoldReason, WithoutMask};
-use rapid::policy::model::Model;
-use rapid::policy::onnxruntime::Environment;
-use rapid::policy::pilot::Pilot;
-use rapid::policy::request::Request;
-use rapid::policy::sampler::Computing;
 
 const PERIOD: Duration = Duration::from_millis(100);
 const ALL: PhysicalMask = PhysicalMask(0b111);

@@ -331,7 +331,7 @@ fn the_embedded_policy_is_available_in_any_folder_and_names_the_rig_it_fits() {
     assert_eq!(code, recorded_code(&printed), "{stderr}");
     let policy = of(&printed, "policy").next().expect("an event of the policy");
     assert_eq!((&policy["policy"], &policy["folder"]), (&"tactile-id".into(), &"inside rapid".into()));
-    let folder = rapid::policy::bundle::Bundle::load(Path::new(BUNDLE)).expect("the same as a folder");
+    let folder = rapid_policy::bundle::Bundle::load(Path::new(BUNDLE)).expect("the same as a folder");
     assert_eq!(policy["hash"], folder.hash);
 
     let builtin = place.write("builtin.toml", rapid_registry::BUILTIN).display().to_string();

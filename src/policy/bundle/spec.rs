@@ -312,9 +312,9 @@ impl BundleAction {
 }
 
 /// Values of a position.
-pub(in crate::policy) const POSITION: usize = 3;
+pub(crate) const POSITION: usize = 3;
 /// Values of a quaternion.
-pub(in crate::policy) const QUATERNION: usize = 4;
+pub(crate) const QUATERNION: usize = 4;
 
 /// What the poses of the network's output are relative to.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -3,8 +3,8 @@
 
 use rapid_registry::Registry;
 
-use super::example::{POLICY, write, write_changed};
 use super::*;
+use crate::example::{POLICY, write, write_changed};
 
 /// The smallest possible models: `ModelProto` with only a version.
 const ONE: &[u8] = &[8, 1];

@@ -7,7 +7,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::policy::bundle::example;
+use crate::example;
 
 const HORIZON: usize = 16;
 const START: usize = 1;

@@ -4,7 +4,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::policy::bundle::example;
+use crate::example;
 
 const HORIZON: u64 = 6;
 const STEPS: u64 = 3;

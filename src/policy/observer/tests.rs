@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::policy::bundle::example;
+use crate::example;
 
 const PERIOD: Duration = Duration::from_millis(100);
 const ARM: PhysicalMask = PhysicalMask(0b1);

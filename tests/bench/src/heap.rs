@@ -7,10 +7,10 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use rapid::policy::bundle::Bundle;
-use rapid::policy::model::Model;
-use rapid::policy::onnxruntime::Environment;
-use rapid::policy::sampler::Computing;
+use rapid_policy::bundle::Bundle;
+use rapid_policy::model::Model;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::sampler::Computing;
 use serde::{Deserialize, Serialize};
 
 use crate::figure::Figure;

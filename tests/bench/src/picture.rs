@@ -4,10 +4,10 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
-use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
-use rapid::policy::picture::{Picture, Preprocessor};
 use rapid_core::random::Random;
 use rapid_core::sample::Encoding;
+use rapid_policy::bundle::{Bundle, ImageSpec, ObservationInput};
+use rapid_policy::picture::{Picture, Preprocessor};
 use rapid_registry::simulation::TaskPart;
 use rapid_registry::simulation::task::{Expert, SIDE, Trial};
 use zune_jpeg::JpegDecoder;

@@ -5,15 +5,15 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use rapid::policy::bundle::{Bundle, Graph};
-use rapid::policy::graphs::{BoundGraph, LoadedGraph};
-use rapid::policy::model::Model;
-use rapid::policy::observation::ObservationTensors;
-use rapid::policy::onnxruntime::Environment;
-use rapid::policy::request::Request;
-use rapid::policy::sampler::{Computing, Sampler};
 use rapid_core::random::Random;
 use rapid_core::sample::SampleHeader;
+use rapid_policy::bundle::{Bundle, Graph};
+use rapid_policy::graphs::{BoundGraph, LoadedGraph};
+use rapid_policy::model::Model;
+use rapid_policy::observation::ObservationTensors;
+use rapid_policy::onnxruntime::Environment;
+use rapid_policy::request::Request;
+use rapid_policy::sampler::{Computing, Sampler};
 use rapid_registry::InferenceSpec;
 use rapid_registry::simulation::task::{Expert, Trial, layout};
 use rapid_registry::task::PARTS;

@@ -1,8 +1,8 @@
 //! Policies: what strangers write into `policy.json`, and what cameras send to one.
 
-use rapid::policy::bundle::{Bundle, ColorOrder, ImageSpec, Normalization, Operation};
-use rapid::policy::picture::{Picture, Preprocessor};
 use rapid_core::sample::Encoding;
+use rapid_policy::bundle::{Bundle, ColorOrder, ImageSpec, Normalization, Operation};
+use rapid_policy::picture::{Picture, Preprocessor};
 
 use crate::seeds;
 

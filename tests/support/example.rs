@@ -1,16 +1,19 @@
 //! A complete bundle for tests.
 
+#![allow(clippy::unwrap_used, reason = "what fails here fails a test")]
+#![allow(dead_code, reason = "each crate uses a part of it")]
+
 use std::path::Path;
 
 use rapid_core::text::hexadecimal;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use super::{Bundle, POLICY_FILE};
+use rapid_policy::bundle::{Bundle, POLICY_FILE};
 
 /// The text of a valid `policy.json`: two cameras of 96x96, of which one is tactile, and an arm of
 /// four numbers; 10 DDIM steps.
-pub(crate) const POLICY: &str = include_str!("../../../tests/bundle/valid/tactile.json");
+pub(crate) const POLICY: &str = include_str!("../bundle/valid/tactile.json");
 
 /// Writes a bundle with these graphs into `folder`, which must exist, and loads it.
 pub(crate) fn write(folder: &Path, encoder: &[u8], denoiser: &[u8]) -> Bundle {

@@ -12,6 +12,9 @@
 
 pub mod bundle;
 pub mod compose;
+#[cfg(test)]
+#[path = "../../tests/support/example.rs"]
+mod example;
 pub mod graphs;
 pub mod horizon;
 pub mod live;
@@ -26,3 +29,6 @@ pub mod pilot;
 pub mod request;
 pub mod sampler;
 pub mod scheduler;
+
+#[cfg(test)]
+extern crate self as rapid_policy;

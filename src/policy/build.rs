@@ -7,7 +7,7 @@ use std::process::Command;
 use sha2::{Digest as _, Sha256};
 
 /// The pinned files of onnxruntime, as `sha256sum` lists them: `<sum>  <arch>/<file>`.
-const PINNED: &str = "scripts/onnxruntime.sha256";
+const PINNED: &str = "../../scripts/onnxruntime.sha256";
 const LIBRARY: &str = "libonnxruntime.so.";
 /// What it needs beside libc, libm and `libgcc_s`, which the program itself needs.
 const LIBSTDCXX: &str = "libstdc++.so.6";
@@ -17,17 +17,11 @@ const LEVEL: i32 = 9;
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed=build.rs");
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
-    if std::env::var_os("CARGO_FEATURE_POLICY").is_some() {
-        onnxruntime(&out)?;
-        libstdcxx(&out)?;
-    } else {
-        println!("cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: none (built without `policy`)");
-        println!("cargo::rustc-env=RAPID_BUILT_WITH_CXX=libstdc++: none (built without `policy`)");
-    }
-    Ok(())
+    onnxruntime(&out)?;
+    libstdcxx(&out)
 }
 
-/// Packs the library that policies need for the program to carry: `src/policy/onnxruntime.rs` includes
+/// Packs the library that policies need for the program to carry: `onnxruntime.rs` includes
 /// what is written here. Without the library that is an empty file, and the build goes on: recording
 /// needs none.
 fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {
