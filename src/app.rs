@@ -19,10 +19,11 @@ mod controls;
 mod discovery;
 mod error;
 mod free_space;
-#[cfg_attr(not(feature = "policy"), path = "app/inference_absent.rs")]
+#[cfg(feature = "policy")]
 mod inference;
-#[cfg_attr(not(feature = "foxglove"), path = "app/live_absent.rs")]
+#[cfg(feature = "foxglove")]
 mod live;
+mod optional;
 mod recording;
 mod reload;
 mod requests;
@@ -35,7 +36,7 @@ mod streaming;
 mod synchronisation;
 mod trials;
 mod watchdog;
-#[cfg_attr(not(feature = "web"), path = "app/web_absent.rs")]
+#[cfg(feature = "web")]
 mod web;
 
 use std::panic::AssertUnwindSafe;
@@ -70,14 +71,18 @@ use crate::session::journal::Plan;
 use buttons::Buttons;
 use conductor::Conductor;
 pub use error::AppError;
+#[cfg(feature = "policy")]
 pub use inference::PolicyOptions;
+#[cfg(feature = "foxglove")]
 pub use live::LiveOptions;
+pub use optional::{Policy, Server};
 use requests::Request;
 use signals::Signals;
 use stage::Stage;
 use start::Machine;
 use streaming::Streaming;
 use watchdog::Watchdog;
+#[cfg(feature = "web")]
 pub use web::WebOptions;
 
 /// Where devices come from.
@@ -126,7 +131,7 @@ pub struct Options {
     /// What the session is to collect.
     pub plan: Plan,
     /// The policy that moves the actuator, if there is one.
-    pub policy: Option<PolicyOptions>,
+    pub policy: Option<Box<dyn Policy>>,
     /// Begin an episode at the start.
     pub record: bool,
     /// Arm the actuator once, as soon as it is attached.
@@ -137,10 +142,8 @@ pub struct Options {
     pub instance: Option<String>,
     /// Members of this process's group may attach screens and make requests, as this user may.
     pub group_control: bool,
-    /// The Foxglove server, if there is one.
-    pub live: Option<LiveOptions>,
-    /// The page, if there is one.
-    pub web: Option<WebOptions>,
+    /// The servers that were requested.
+    pub servers: Vec<Box<dyn Server>>,
 }
 
 /// Where the mask of an instance is published.
@@ -267,9 +270,8 @@ struct Running {
     synchronisation: Stage,
     recording: Stage,
     inference: Option<Stage>,
-    live: Option<Stage>,
+    servers: Vec<Stage>,
     trials: Option<Stage>,
-    web: Option<Stage>,
     reload: Stage,
     mask_ended: CancellationToken,
     kind: Screen,
@@ -313,7 +315,7 @@ async fn finish(
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
         keep_first(&mut outcome, running.discovery.end().await);
-        for server in [&mut running.live, &mut running.web, &mut running.trials].into_iter().flatten() {
+        for server in running.servers.iter_mut().chain(&mut running.trials) {
             // The last events are shown by then. It is no reason for the run to fail.
             let _ = server.end().await;
         }

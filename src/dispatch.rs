@@ -2,13 +2,9 @@
 //!
 //! Invariant: every error is printed here, once.
 
-#[cfg_attr(not(feature = "foxglove"), path = "dispatch/live_absent.rs")]
-mod live;
-#[cfg_attr(not(feature = "policy"), path = "dispatch/policy_absent.rs")]
+#[cfg(feature = "policy")]
 mod policy;
 mod registry;
-#[cfg_attr(not(feature = "web"), path = "dispatch/web_absent.rs")]
-mod web;
 
 use std::io::{self, IsTerminal};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -38,8 +34,10 @@ use self::registry::{
     connected, devices, find_registry, load, print_warning, register, registry_or_builtin, registry_path, unregister,
     usual_places,
 };
-use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Calibration, Cli, Command, Global, LatencyArgs, LevelArg, PolicyArgs, RunArgs, SessionCommand};
+use crate::app::{self, AppError, Devices, Options, Policy, Screen, Server, mask_path};
+use crate::cli::{
+    Calibration, Cli, Command, Global, LatencyArgs, LevelArg, PolicyArgs, ReplayArgs, RunArgs, SessionCommand,
+};
 use crate::commands::devices::Formats;
 use crate::commands::inspect::InspectFailure;
 use crate::commands::logs::LogsOptions;
@@ -95,7 +93,7 @@ pub fn refuse(error: &clap::Error) -> ExitCode {
 /// Runs a command line.
 pub fn dispatch(cli: Cli) -> ExitCode {
     let (json, command) = (cli.global.json, cli.name.clone());
-    match execute(cli) {
+    match check_built(&cli).and_then(|()| execute(cli)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure { text, code }) => {
             // Paths, and errors of libraries about files, are untrusted text.
@@ -201,21 +199,27 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         Command::Policy { what } => policy::about(global, &what, format, out),
         #[cfg(feature = "policy")]
         Command::Eval(args) => policy::eval(args, format),
-        Command::Replay(args) if args.infer.is_some() => policy::compare(*args, format),
-        Command::Replay(args) => {
-            let replay::Replayed { registry, scenario, length } =
-                replay::scenario(&args.file).map_err(Failure::argument)?;
-            let mut options = args.run;
-            // Without a monitor, a replay ends where the episode does.
-            if options.headless {
-                options.duration.get_or_insert(length);
-            }
-            run(global, &options, (registry, Devices::Simulated(scenario)), 0, None)
-        }
+        Command::Replay(args) => replay(global, *args, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::grammar(), shell, out)?),
         Command::Keys { schema } => Ok(commands::completions::keys(schema, out)?),
         Command::Man { to } => Ok(commands::completions::man(Cli::grammar(), &to, out)?),
     }
+}
+
+/// Plays an episode to a run, or compares a policy with it.
+#[cfg_attr(not(feature = "policy"), expect(unused_variables, reason = "for a policy"))]
+fn replay(global: &Global, args: ReplayArgs, format: Format) -> Result<(), Failure> {
+    #[cfg(feature = "policy")]
+    if args.infer.is_some() {
+        return policy::compare(args, format);
+    }
+    let replay::Replayed { registry, scenario, length } = replay::scenario(&args.file).map_err(Failure::argument)?;
+    let mut options = args.run;
+    // Without a monitor, a replay ends where the episode does.
+    if options.headless {
+        options.duration.get_or_insert(length);
+    }
+    run(global, &options, (registry, Devices::Simulated(scenario)), 0, None)
 }
 
 fn calibrate(global: &Global, args: &LatencyArgs, format: Format, out: &mut dyn io::Write) -> Result<(), Failure> {
@@ -226,6 +230,7 @@ fn calibrate(global: &Global, args: &LatencyArgs, format: Format, out: &mut dyn 
 /// Runs the rig, or records demonstrations of the simulated task.
 fn without_command(cli: Cli, format: Format) -> Result<(), Failure> {
     let global = &cli.global;
+    #[cfg(feature = "policy")]
     if cli.task.expert {
         return policy::demonstrate(global, &cli.run, &cli.task, format);
     }
@@ -366,9 +371,8 @@ fn run(
         (false, false) => Screen::Lines,
         (true, false) => Screen::Monitor,
     };
-    let policy = policy.map(|policy| policy::policy_of(policy, seed, &registry)).transpose()?.flatten();
     let options = Options {
-        policy,
+        policy: policy_of(policy, seed, &registry)?,
         registry,
         devices,
         screen,
@@ -380,10 +384,54 @@ fn run(
         duration: args.duration,
         instance: global.instance.clone(),
         group_control: args.group_control,
-        live: live::options_of(args.live)?,
-        web: web::options_of(&args.web)?,
+        servers: servers(args),
     };
     Ok(block_on(app::run(options))??)
+}
+
+/// The policy of a run, if one was requested.
+#[cfg_attr(not(feature = "policy"), expect(unused_variables, clippy::unnecessary_wraps, reason = "for a policy"))]
+fn policy_of(args: Option<PolicyArgs>, seed: u64, registry: &Registry) -> Result<Option<Box<dyn Policy>>, Failure> {
+    match args {
+        #[cfg(feature = "policy")]
+        Some(args) if args.infer.is_some() => Ok(Some(Box::new(policy::options(args, seed, registry)?))),
+        _ => Ok(None),
+    }
+}
+
+/// The servers of a run that were requested.
+#[cfg_attr(not(any(feature = "foxglove", feature = "web")), expect(unused_variables, reason = "there is no server"))]
+fn servers(args: &RunArgs) -> Vec<Box<dyn Server>> {
+    let requested: Vec<Option<Box<dyn Server>>> = Vec::from([
+        #[cfg(feature = "foxglove")]
+        args.live.foxglove.map(|address| -> Box<dyn Server> {
+            Box::new(app::LiveOptions { address, control: args.live.foxglove_control })
+        }),
+        #[cfg(feature = "web")]
+        args.web.web.map(|address| -> Box<dyn Server> {
+            Box::new(app::WebOptions { address, token: args.web.web_token.clone() })
+        }),
+    ]);
+    requested.into_iter().flatten().collect()
+}
+
+/// Refuses options of what this program was built without.
+fn check_built(cli: &Cli) -> Result<(), Failure> {
+    let replay = if let Some(Command::Replay(args)) = &cli.command { Some(args) } else { None };
+    let run = replay.map_or(&cli.run, |replay| &replay.run);
+    let infers = cli.policy.infer.is_some() || cli.task.expert || replay.is_some_and(|replay| replay.infer.is_some());
+    let requested = [
+        ("foxglove", cfg!(feature = "foxglove"), run.live.foxglove.is_some(), "--foxglove"),
+        ("policy", cfg!(feature = "policy"), infers, "--infer and --expert"),
+        ("web", cfg!(feature = "web"), run.web.web.is_some(), "--web"),
+    ];
+    let missing = requested.into_iter().find(|&(_, is_built, is_requested, _)| is_requested && !is_built);
+    missing.map_or(Ok(()), |(feature, _, _, options)| {
+        Err(Failure::argument(format_args!(
+            "this rapid was built without `{feature}`: build it with `cargo build --release --features {feature}`, or leave \
+             {options} out"
+        )))
+    })
 }
 
 /// The episodes to record, if the registry knows the modules that were named.

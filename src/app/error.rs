@@ -6,14 +6,8 @@ use std::path::{Path, PathBuf};
 use rapid_bus::BusError;
 use rapid_devices::hotplug::HotplugError;
 use rapid_episode::record::RecordError;
-#[cfg(feature = "foxglove")]
-use rapid_live::LiveError;
-#[cfg(feature = "policy")]
-use rapid_policy::{onnxruntime::LibraryError, sampler::PolicyError};
 use rapid_screens::logging::LoggingError;
 use rapid_screens::tui::TuiError;
-#[cfg(feature = "web")]
-use rapid_web::WebError;
 
 use super::LAST_CHUNK;
 use crate::rig::RigError;
@@ -43,28 +37,15 @@ pub enum AppError {
     /// The monitor.
     #[error(transparent)]
     Tui(#[from] TuiError),
-    /// The Foxglove server.
-    #[cfg(feature = "foxglove")]
+    /// A stage that a build may lack: a server, or the policy.
     #[error(transparent)]
-    Live(#[from] LiveError),
-    /// The page.
-    #[cfg(feature = "web")]
-    #[error(transparent)]
-    Web(#[from] WebError),
+    Optional(Box<dyn std::error::Error + Send + Sync>),
     /// The output of a headless run.
     #[error("output: {0}")]
     Output(io::Error),
     /// A thread or signal handler.
     #[error("system call failed: {0}")]
     System(#[from] io::Error),
-    /// onnxruntime.
-    #[cfg(feature = "policy")]
-    #[error(transparent)]
-    Library(#[from] LibraryError),
-    /// The policy cannot be loaded.
-    #[cfg(feature = "policy")]
-    #[error(transparent)]
-    Policy(#[from] PolicyError),
     /// Its chunks take longer than their actions.
     #[error("the policy is too slow on this machine: {0}")]
     TooSlow(String),
@@ -102,6 +83,14 @@ pub enum AppError {
     /// A second signal came while the run was ending.
     #[error("interrupted twice")]
     InterruptedTwice,
+}
+
+impl AppError {
+    /// The error of a stage that a build may lack.
+    #[cfg(any(feature = "foxglove", feature = "policy", feature = "web"))]
+    pub(super) fn optional(error: impl std::error::Error + Send + Sync + 'static) -> Self {
+        Self::Optional(Box::new(error))
+    }
 }
 
 fn bad(count: usize, file: &Path) -> String {

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
-use rapid_bus::{Bus, Inbox, TopicId, Writer};
+use rapid_bus::{Inbox, TopicId, Writer};
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_episode::ReferenceSample;
@@ -23,6 +23,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
 use super::AppError;
+use super::optional::{Policy, Surroundings};
 use super::settling;
 use super::stage::Stage;
 use crate::rig::presence::Published;
@@ -43,41 +44,25 @@ pub struct PolicyOptions {
     pub library: Option<PathBuf>,
 }
 
-/// What the stage is given by others.
-pub(super) struct Surroundings<'a> {
-    pub(super) registry: &'a Arc<Registry>,
-    pub(super) bus: &'a Bus,
-    pub(super) board: &'a Arc<Board>,
-    /// Cancelled by it when the policy is loaded.
-    pub(super) loaded: &'a CancellationToken,
-    /// Receives the samples that all later ones of an observation are compared with.
-    pub(super) references: Sender<ReferenceSample>,
-    pub(super) mask: Published,
-    /// The episode that is to hold everything that it observes, if it is to be recorded.
-    pub(super) episode: Option<EpisodeWatch>,
-}
-
-/// Starts the stage: it loads the policy and starts it when everything it requires is present; when it is to be
-/// recorded, after the episode has begun, so that the file holds everything it observed. `loaded` is cancelled when it is
-/// loaded.
-///
-/// # Errors
-/// When it cannot read the bus.
-pub(super) fn start(options: PolicyOptions, surroundings: Surroundings<'_>) -> Result<Stage, AppError> {
-    let Surroundings { registry, bus, board, loaded, references, mask, episode } = surroundings;
-    let flight = Flight {
-        required: required(&options, registry),
-        inbox: bus.inbox()?,
-        actions: bus.writer(TopicId::Action),
-        registry: Arc::clone(registry),
-        board: Arc::clone(board),
-        loaded: loaded.clone(),
-        references,
-        mask,
-        episode,
-        options,
-    };
-    Ok(Stage::start("the policy", |stop| flight.run(stop)))
+impl Policy for PolicyOptions {
+    /// It loads the policy and starts it when everything it requires is present; when it is to be recorded, after the
+    /// episode has begun, so that the file holds everything it observed.
+    fn start(self: Box<Self>, surroundings: Surroundings<'_>) -> Result<Stage, AppError> {
+        let Surroundings { registry, bus, board, loaded, references, mask, episode } = surroundings;
+        let flight = Flight {
+            required: required(&self, registry),
+            inbox: bus.inbox()?,
+            actions: bus.writer(TopicId::Action),
+            registry: Arc::clone(registry),
+            board: Arc::clone(board),
+            loaded: loaded.clone(),
+            references,
+            mask,
+            episode,
+            options: *self,
+        };
+        Ok(Stage::start("the policy", |stop| flight.run(stop)))
+    }
 }
 
 /// What must be present: the modalities the bundle requires, and the actuator.
@@ -110,9 +95,9 @@ impl Flight {
             let (bundle, named, computing) =
                 (Arc::clone(&self.options.live.bundle), self.options.library.clone(), self.options.computing);
             move || -> Result<(Model, String, Duration), AppError> {
-                let environment = Environment::open(named.as_deref())?;
-                let mut model = Model::load(&bundle, &environment, computing)?;
-                let chunk = model.rehearse()?;
+                let environment = Environment::open(named.as_deref()).map_err(AppError::optional)?;
+                let mut model = Model::load(&bundle, &environment, computing).map_err(AppError::optional)?;
+                let chunk = model.rehearse().map_err(AppError::optional)?;
                 Ok((model, environment.origin.to_string(), chunk))
             }
         });

@@ -22,7 +22,7 @@ use rapid_status::{Board, EpisodeWatch, EventKind, Level, RegistryRequest};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::spawn_blocking;
 
-use super::live::LiveAddition;
+use super::optional::AddedEntry;
 use super::requests::Reply;
 use super::stage::Stage;
 use crate::registration;
@@ -45,8 +45,8 @@ pub(super) struct Reload {
     pub(super) recorder: std::sync::mpsc::Sender<RecorderAddition>,
     pub(super) episode: EpisodeWatch,
     pub(super) alignment: mpsc::UnboundedSender<(Arc<DeviceSpec>, Subscription)>,
-    /// The Foxglove server, if there is one.
-    pub(super) live: Option<std::sync::mpsc::Sender<LiveAddition>>,
+    /// Servers that show samples.
+    pub(super) servers: Vec<std::sync::mpsc::Sender<AddedEntry>>,
     /// The modules that can be mounted.
     pub(super) modules: watch::Sender<Vec<ModuleSpec>>,
     /// Topics of added entries.
@@ -66,7 +66,8 @@ struct Opened {
     topic: Extension,
     recorder: Subscription,
     alignment: Subscription,
-    live: Option<Subscription>,
+    /// For each server.
+    servers: Vec<Subscription>,
 }
 
 impl Reload {
@@ -133,8 +134,8 @@ impl Reload {
         if added.is_empty() && modules.is_empty() {
             return Ok("no entry was added, and no other change needs a restart".to_owned());
         }
-        let (bus, is_live) = (self.bus.clone(), self.live.is_some());
-        let opened = blocking(move || open(&bus, added, is_live)).await?;
+        let (bus, servers) = (self.bus.clone(), self.servers.len());
+        let opened = blocking(move || open(&bus, added, servers)).await?;
         let opened = opened.map_err(|error| format!("{error}; {UNCHANGED}"))?;
         let devices =
             opened.iter().map(|opened| format!("[device.{}] as bit {}", opened.device.name, opened.device.id));
@@ -156,13 +157,13 @@ impl Reload {
     }
 
     async fn add(&mut self, opened: Opened, registry: &Arc<Registry>) -> Result<(), String> {
-        let Opened { device, topic, recorder, alignment, live } = opened;
+        let Opened { device, topic, recorder, alignment, servers } = opened;
         self.board.add(&device);
         // A stage that is gone has ended with the run, or ends it.
         let _ = self.recorder.send(RecorderAddition { registry: Arc::clone(registry), subscription: Some(recorder) });
         let _ = self.alignment.send((Arc::clone(&device), alignment));
-        if let Some((to_live, live)) = self.live.as_ref().zip(live) {
-            let _ = to_live.send((Arc::clone(&device), live));
+        for (server, samples) in self.servers.iter().zip(servers) {
+            let _ = server.send((Arc::clone(&device), samples));
         }
         let writer = topic.writer();
         self.topics.push(topic);
@@ -202,12 +203,12 @@ fn changed(running: &Registry) -> Result<Changed, String> {
 }
 
 /// Opens the topics of these entries, or none.
-fn open(bus: &Membership, added: Vec<DeviceSpec>, is_live: bool) -> Result<Vec<Opened>, BusError> {
+fn open(bus: &Membership, added: Vec<DeviceSpec>, servers: usize) -> Result<Vec<Opened>, BusError> {
     let open = |device: DeviceSpec| {
         let topic = bus.extend(&device)?;
         let (recorder, alignment) = (topic.subscribe()?, topic.subscribe()?);
-        let live = is_live.then(|| topic.subscribe()).transpose()?;
-        Ok(Opened { device: Arc::new(device), topic, recorder, alignment, live })
+        let servers = (0..servers).map(|_| topic.subscribe()).collect::<Result<_, _>>()?;
+        Ok(Opened { device: Arc::new(device), topic, recorder, alignment, servers })
     };
     added.into_iter().map(open).collect()
 }

@@ -25,7 +25,7 @@ use super::AppError;
 
 /// A running stage.
 #[derive(Debug)]
-pub(super) struct Stage {
+pub struct Stage {
     name: &'static str,
     /// Until its outcome is taken.
     task: Option<JoinHandle<Result<(), AppError>>>,

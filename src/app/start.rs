@@ -19,8 +19,7 @@ use super::buttons::Buttons;
 use super::collection::Collection;
 use super::conductor::Conductor;
 use super::discovery::{self, Discovery};
-use super::inference::{self, Surroundings};
-use super::live::{self, Listening};
+use super::optional::{Host, Listening, Surroundings};
 use super::recording::Recording;
 use super::reload::Reload;
 use super::requests::{self, Receivers, Request};
@@ -29,7 +28,7 @@ use super::signals::Signals;
 use super::stage::Stage;
 use super::streaming::Streaming;
 use super::synchronisation::Synchronisation;
-use super::{AppError, Devices, Options, Running, Screen, trials, web};
+use super::{AppError, Devices, Options, Running, Screen, trials};
 use crate::orders::receive::Arrival;
 use crate::rig::Rig;
 use crate::rig::presence::Presence;
@@ -49,8 +48,7 @@ pub(super) struct Machine {
 struct Front {
     to_conductor: mpsc::UnboundedSender<Request>,
     requests: mpsc::UnboundedReceiver<Request>,
-    live: Option<Listening>,
-    web: Option<Stage>,
+    servers: Vec<Listening>,
     reported: Reported,
     recording: Recording,
 }
@@ -59,16 +57,16 @@ struct Front {
 pub(super) async fn start(machine: Machine, bus: &Bus, mut options: Options) -> Result<(Running, Conductor), AppError> {
     let Machine { registry, board, permission, .. } = &machine;
     let (to_conductor, requests) = mpsc::unbounded_channel();
-    let live = match options.live.take() {
-        Some(options) => Some(live::listen(options, registry, board, permission, &to_conductor).await?),
-        None => None,
-    };
-    let web = options.web.as_ref().map(|options| web::start(options, board, &to_conductor)).transpose()?;
+    let host = Host { registry, board, permission, conductor: &to_conductor };
+    let mut servers = Vec::new();
+    for server in std::mem::take(&mut options.servers) {
+        servers.push(server.listen(&host).await?);
+    }
     let reported = Reported::nothing(registry);
-    let shown = live.as_ref().map(|live| live.shown.clone());
+    let shown = servers.iter().find_map(|server| server.shown.clone());
     let recording = Recording::start(registry, bus, board, reported.states(), shown)?;
     let released = recording.ended.clone();
-    let started = stages(machine, bus, options, Front { to_conductor, requests, live, web, reported, recording });
+    let started = stages(machine, bus, options, Front { to_conductor, requests, servers, reported, recording });
     if started.is_err() {
         // The recorder's thread releases the bus before the bus is dropped: no files of it remain.
         released.cancelled().await;
@@ -78,7 +76,7 @@ pub(super) async fn start(machine: Machine, bus: &Bus, mut options: Options) -> 
 
 fn stages(machine: Machine, bus: &Bus, options: Options, front: Front) -> Result<(Running, Conductor), AppError> {
     let Machine { registry, board, permission, signals, presence, arrivals } = machine;
-    let Front { to_conductor, requests, live, web, reported, recording } = front;
+    let Front { to_conductor, requests, servers, reported, recording } = front;
     let Recording { stage: recording, recorder, episode, clock, additions, references, .. } = recording;
     let is_single = options.is_single();
     let (wanted, is_kept) = (options.wanted(), options.is_kept());
@@ -105,8 +103,10 @@ fn stages(machine: Machine, bus: &Bus, options: Options, front: Front) -> Result
         mask: presence.published(),
         episode: options.record.then(|| episode.clone()),
     };
-    let inference = options.policy.map(|policy| inference::start(policy, surroundings)).transpose()?;
-    let live = live.map(|live| live.start(bus, &board, clock)).transpose()?;
+    let inference = options.policy.map(|policy| policy.start(surroundings)).transpose()?;
+    let to_servers = servers.iter().filter_map(|server| server.additions.clone()).collect();
+    let servers = servers.into_iter().map(|server| (server.start)(bus, &board, clock.clone()));
+    let servers = servers.collect::<Result<_, _>>()?;
 
     // Nothing fails from here on.
     let buttons = Buttons::begin(&registry, &permission, &board, &to_conductor);
@@ -123,7 +123,7 @@ fn stages(machine: Machine, bus: &Bus, options: Options, front: Front) -> Result
         recorder: additions,
         episode,
         alignment: synchronisation.additions.clone(),
-        live: live.as_ref().map(|live| live.additions.clone()),
+        servers: to_servers,
         modules,
         topics: Vec::new(),
     };
@@ -153,8 +153,7 @@ fn stages(machine: Machine, bus: &Bus, options: Options, front: Front) -> Result
         synchronisation: synchronisation.start(),
         recording,
         inference,
-        live: live.map(|live| live.stage),
-        web,
+        servers,
         trials,
         reload: reload.stage,
         mask_ended,

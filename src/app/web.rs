@@ -1,29 +1,29 @@
 //! Stage page: thread `web`, which serves the page for a phone ([`rapid_web`]).
-//!
-//! Invariant: no recording ends because of it: its failure is an error of the log.
 
 use std::sync::Arc;
 
-use tokio::sync::mpsc::UnboundedSender;
-
+use futures::future::{self, BoxFuture, FutureExt};
+use rapid_web::Web;
 pub use rapid_web::WebOptions;
 
-use rapid_status::Board;
-use rapid_web::Web;
-
 use super::AppError;
-use super::requests::{Request, asker};
+use super::optional::{Host, Listening, Server};
+use super::requests::asker;
 use super::stage::Stage;
 
-/// Starts the stage, before anything of the run is started: a port in use is an error of the start.
-pub(super) fn start(
-    options: &WebOptions,
-    board: &Arc<Board>,
-    conductor: &UnboundedSender<Request>,
-) -> Result<Stage, AppError> {
-    let web = Web::start(options, Arc::clone(board), asker(conductor))?;
-    Ok(Stage::start("the page", |stop| async move {
-        web.run(stop).await;
-        Ok(())
-    }))
+impl Server for WebOptions {
+    fn listen<'a>(self: Box<Self>, host: &'a Host<'a>) -> BoxFuture<'a, Result<Listening, AppError>> {
+        let web = Web::start(&self, Arc::clone(host.board), asker(host.conductor)).map_err(AppError::optional);
+        future::ready(web.map(|web| Listening {
+            shown: None,
+            additions: None,
+            start: Box::new(|_, _, _| {
+                Ok(Stage::start("the page", |stop| async move {
+                    web.run(stop).await;
+                    Ok(())
+                }))
+            }),
+        }))
+        .boxed()
+    }
 }

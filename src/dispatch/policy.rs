@@ -17,10 +17,9 @@ use crate::app::PolicyOptions;
 use crate::cli::{EvalArgs, Global, PolicyArgs, PolicyCommand, ReplayArgs, RunArgs, TaskArgs};
 use crate::commands::{self, Format};
 
-/// The policy of a run, if one was requested.
-pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Result<Option<PolicyOptions>, Failure> {
-    let Some(named) = args.infer else { return Ok(None) };
-    let bundle = Bundle::open(named.as_deref()).map_err(Failure::argument)?.holding_last(args.hold_last);
+/// The policy of a run: the one that was named, or the one that is built in.
+pub(super) fn options(args: PolicyArgs, seed: u64, registry: &Registry) -> Result<PolicyOptions, Failure> {
+    let bundle = Bundle::open(args.infer.flatten().as_deref()).map_err(Failure::argument)?.holding_last(args.hold_last);
     let unfit = |errors: BundleErrors| {
         let inside = "\nThe policy built into rapid is for the simulated task only: rapid --infer --sim task\n    fix: name the \
                       folder of a policy that was trained on this rig: rapid --infer FOLDER (models/README.md describes \
@@ -33,7 +32,7 @@ pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Res
     if !args.dry_run {
         bundle.check_actuators(actuator.as_slice()).map_err(unfit)?;
     }
-    Ok(Some(PolicyOptions {
+    Ok(PolicyOptions {
         live: LiveOptions {
             bundle: Arc::new(bundle),
             without_mask: if args.ignore_missing { WithoutMask::GoOn } else { WithoutMask::Hold },
@@ -43,7 +42,7 @@ pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Res
         wait: args.wait,
         computing: args.inference.computing(registry.inference),
         library: args.inference.ort_lib,
-    }))
+    })
 }
 
 /// Records demonstrations of the simulated task.

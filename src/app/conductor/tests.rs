@@ -89,8 +89,7 @@ impl Bench {
         conductor.loaded.cancel();
         let running = Running {
             inference: None,
-            live: None,
-            web: None,
+            servers: Vec::new(),
             trials: None,
             discovery: idle_stage(),
             recording: idle_stage(),

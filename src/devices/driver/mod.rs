@@ -6,8 +6,6 @@
 //! Invariant: no driver blocks: blocking calls during opening run on tokio's blocking pool.
 //! Invariant: no bytes from a device can make a driver panic.
 
-#[cfg(not(all(feature = "lan", feature = "motors")))]
-mod absent;
 mod arrival;
 pub mod camera;
 #[cfg(feature = "motors")]
@@ -23,6 +21,7 @@ pub mod sim;
 
 use std::sync::Arc;
 
+use futures::future::BoxFuture;
 use rapid_core::action::{ActionSource, ActuatorNotice, Order};
 use rapid_core::permission::Attended;
 use rapid_core::provenance::Negotiated;
@@ -33,10 +32,6 @@ use rapid_registry::simulation::{SimDevice, SimSource};
 use rapid_registry::{CanProtocol, DeviceSpec, NodeSpec};
 use tokio::sync::mpsc;
 
-#[cfg(not(feature = "lan"))]
-use absent::Absent as Lan;
-#[cfg(not(feature = "motors"))]
-use absent::{Absent as Motors, Absent as RawCan};
 #[cfg(feature = "motors")]
 use can::{motors::Motors, raw::Raw as RawCan};
 #[cfg(feature = "lan")]
@@ -105,10 +100,13 @@ pub enum Driver {
     /// A serial line.
     Serial(Box<serial::Serial>),
     /// Motors behind a CAN adapter.
+    #[cfg(feature = "motors")]
     Motors(Box<Motors>),
     /// The frames of a CAN bus.
+    #[cfg(feature = "motors")]
     Can(Box<RawCan>),
     /// A device on the network.
+    #[cfg(feature = "lan")]
     Lan(Box<Lan>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
@@ -116,14 +114,20 @@ pub enum Driver {
     Replay(Box<replay::Replay>),
 }
 
+/// Ends when the link to a device is up again.
+type Unlinked = BoxFuture<'static, ()>;
+
 /// Applies one expression to the driver of any kind.
 macro_rules! each {
     ($self:ident, $driver:ident => $what:expr) => {
         match $self {
             Driver::Camera($driver) => $what,
             Driver::Serial($driver) => $what,
+            #[cfg(feature = "motors")]
             Driver::Motors($driver) => $what,
+            #[cfg(feature = "motors")]
             Driver::Can($driver) => $what,
+            #[cfg(feature = "lan")]
             Driver::Lan($driver) => $what,
             Driver::Sim($driver) => $what,
             Driver::Replay($driver) => $what,
@@ -134,8 +138,12 @@ macro_rules! each {
 impl Driver {
     /// If the link to the device behind `node` is down, a future that ends when the link is up again: while a cable is
     /// unplugged, repeated opening is useless.
-    pub fn unlinked(spec: &DeviceSpec, node: &DeviceNode) -> Option<impl Future<Output = ()> + Send + use<>> {
-        if matches!(spec.node, NodeSpec::Lan(_)) { Lan::unlinked(node) } else { None }
+    pub fn unlinked(spec: &DeviceSpec, node: &DeviceNode) -> Option<Unlinked> {
+        match (&spec.node, node) {
+            #[cfg(feature = "lan")]
+            (NodeSpec::Lan(_), node) => Some(Box::pin(Lan::unlinked(node)?)),
+            _ => None,
+        }
     }
 
     /// Opens the node of `spec` and starts it.
@@ -150,26 +158,17 @@ impl Driver {
             (NodeSpec::Serial(serial), DeviceNode::Tty(path)) => {
                 Ok(Self::Serial(Box::new(serial::Serial::open(serial, path, spec.max_bytes).await?)))
             }
-            #[cfg(not(feature = "motors"))]
-            (NodeSpec::Can(_), DeviceNode::Net(_) | DeviceNode::Tty(_)) => Err(absent::not_built("motors")),
             #[cfg(feature = "motors")]
             (NodeSpec::Can(can), DeviceNode::Net(_) | DeviceNode::Tty(_)) => match &can.protocol {
                 CanProtocol::Damiao(motors) => Ok(Self::Motors(Box::new(Motors::open(can, motors, node).await?))),
                 CanProtocol::Raw => Ok(Self::Can(Box::new(RawCan::open(can, node).await?))),
             },
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
-            (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
-            (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
-            (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
-            #[cfg(not(feature = "lan"))]
-            (NodeSpec::Lan(_), DeviceNode::Net(_) | DeviceNode::Lan { .. }) => Err(absent::not_built("lan")),
             #[cfg(feature = "lan")]
             (NodeSpec::Lan(settings), node @ (DeviceNode::Net(_) | DeviceNode::Lan { .. })) => {
                 Ok(Self::Lan(Box::new(Lan::open(spec, settings, node).await?)))
             }
-            (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
-            // The rig supervises programs; `process` only starts and ends them.
-            (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
+            (_, node) => Err(not_opened(spec, node)),
         }
     }
 
@@ -197,6 +196,7 @@ impl Driver {
     /// When the device takes no actions, or different ones.
     pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         match self {
+            #[cfg(feature = "motors")]
             Self::Motors(_) => Ok(()),
             Self::Sim(driver) => driver.command(target),
             _ => Err(DriverError::Fatal("of real devices, only motors behind a CAN adapter take actions".to_owned())),
@@ -209,6 +209,7 @@ impl Driver {
     /// When it does not accept orders now.
     pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
         match self {
+            #[cfg(feature = "motors")]
             Self::Motors(driver) => driver.order(order),
             Self::Sim(driver) => {
                 driver.joints.order(order);
@@ -222,6 +223,7 @@ impl Driver {
     /// caller passes them to [`Self::order`] and [`Self::command`].
     pub fn attend(&mut self, orders: &Arc<Attended>, actions: &Arc<dyn ActionSource>) -> bool {
         match self {
+            #[cfg(feature = "motors")]
             Self::Motors(driver) => {
                 driver.attend(orders);
                 driver.follow(Arc::clone(actions));
@@ -236,6 +238,7 @@ impl Driver {
     /// The events of an actuator; `Some` at the first call only.
     pub fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
         match self {
+            #[cfg(feature = "motors")]
             Self::Motors(driver) => driver.notices(),
             Self::Sim(driver) => Some(driver.joints.notices()),
             _ => None,
@@ -250,6 +253,7 @@ impl Driver {
     /// When the device cannot do it, for people; it is still read.
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
         match self {
+            #[cfg(feature = "lan")]
             Self::Lan(driver) => driver.record(episode.map(|episode| episode.file.clone())),
             Self::Sim(driver) => {
                 driver.record(episode.is_some());
@@ -261,15 +265,21 @@ impl Driver {
 
     /// The clock of the computer that the device is on, if that is another one and it has sent a sample.
     pub fn clock(&self) -> Option<ClockOffset> {
-        if let Self::Lan(driver) = self { driver.clock() } else { None }
+        match self {
+            #[cfg(feature = "lan")]
+            Self::Lan(driver) => driver.clock(),
+            _ => None,
+        }
     }
 
     /// Ends in order the device's own activities: the run ends, or the device was unplugged. Abandoned after a moment.
     /// A driver that is only dropped was read to its end or abandoned.
     pub async fn close(self) {
         match self {
+            #[cfg(feature = "motors")]
             Self::Motors(driver) => driver.close().await,
             Self::Sim(driver) => driver.close().await,
+            #[cfg(feature = "lan")]
             Self::Lan(driver) => driver.close().await,
             _ => {}
         }
@@ -287,7 +297,22 @@ impl Driver {
     }
 }
 
-fn wrong_kind(spec: &DeviceSpec, requested: &str, node: &DeviceNode) -> DriverError {
+/// Why no driver opens this node for `spec`: the program was built without it, or the node is of another kind.
+fn not_opened(spec: &DeviceSpec, node: &DeviceNode) -> DriverError {
+    let (requested, missing) = match spec.node {
+        NodeSpec::Camera(_) => ("camera", None),
+        NodeSpec::Serial(_) => ("serial line", None),
+        NodeSpec::Can(_) => ("CAN adapter", (!cfg!(feature = "motors")).then_some("motors")),
+        NodeSpec::Lan(_) => ("network device", (!cfg!(feature = "lan")).then_some("lan")),
+        // The rig supervises programs; `process` only starts and ends them.
+        NodeSpec::Process(_) => ("program", None),
+    };
+    if let Some(feature) = missing {
+        return DriverError::Fatal(format!(
+            "this rapid was built without `{feature}`: build it with `cargo build --release --features {feature}`, or \
+             remove the entry"
+        ));
+    }
     let is = match node {
         DeviceNode::Video(_) => "a camera",
         DeviceNode::Tty(_) => "a serial line",
