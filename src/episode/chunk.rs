@@ -3,8 +3,8 @@
 use std::io::Read;
 use std::ops::Range;
 
+use super::framing::MAX_RECORD;
 use super::op;
-use super::record_iter::MAX_RECORD;
 use super::wire::Fields;
 
 /// The header of a chunk, before its records.

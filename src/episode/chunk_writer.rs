@@ -12,8 +12,9 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::write::{NoSeek, PrivateRecordOptions};
 use mcap::{Attachment, McapError, WriteOptions, Writer};
 
+use super::episode_id::EpisodeId;
 use super::op;
-use super::own::{EpisodeId, Own};
+use super::own::Own;
 
 /// Bytes of records after which a chunk is closed. The writer keeps one chunk in memory.
 const CHUNK_BYTES: u64 = 1 << 20;

@@ -9,7 +9,7 @@
 
 use std::io;
 
-use super::record_iter::MAGIC;
+use super::framing::MAGIC;
 use super::source::{ReadAt, Source};
 use super::wire::Fields;
 

@@ -4,8 +4,8 @@
 use std::io;
 
 use super::chunk::ChunkHead;
+use super::framing::MAGIC;
 use super::op;
-use super::record_iter::MAGIC;
 use super::source::{Fit, ReadAt, Source};
 use super::wire::Fields;
 

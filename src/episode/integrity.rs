@@ -2,7 +2,7 @@
 
 use rapid_core::text;
 
-use super::own::EpisodeId;
+use super::episode_id::EpisodeId;
 use super::wire::Fields;
 
 /// How a file ends.

@@ -13,8 +13,10 @@ pub mod decode;
 #[path = "../../tests/support/effort.rs"]
 mod effort;
 pub mod encode;
+mod episode_id;
 mod failed;
 pub mod form;
+mod framing;
 mod hash;
 mod index;
 mod integrity;
@@ -22,6 +24,7 @@ pub mod made;
 mod names;
 pub(crate) mod op;
 pub(crate) mod own;
+mod ownership;
 pub mod partial;
 #[cfg(test)]
 #[path = "../../tests/support/patience.rs"]
@@ -47,6 +50,7 @@ pub mod wire;
 
 pub use decode::decode;
 pub(crate) use failed::Failed;
+pub use framing::MAGIC;
 pub use hash::sha256;
 pub(crate) use integrity::Writer;
 pub use reference::ReferenceSample;

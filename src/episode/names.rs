@@ -8,8 +8,9 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use super::episode_id::EpisodeId;
 use super::op;
-use super::own::{EpisodeId, Owner, Owners};
+use super::own::{Owner, Owners};
 use super::wire::Fields;
 
 /// Maximum bytes of definitions and metadata: many times those of an episode of 64 devices that are replugged all day.

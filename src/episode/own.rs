@@ -10,39 +10,22 @@
 //! The episode of a file follows from its metadata `rapid`, or from its first chunk if everything before that is valid.
 //! Otherwise it follows from all valid chunks, see [`Owners`].
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io;
 
-use super::chunk::{Records, take};
+use super::chunk::take;
+use super::episode_id::{EpisodeId, about};
+use super::framing::{HEAD, MAGIC};
 use super::integrity::{LARGEST_HEADER, Writer, writer};
 use super::op;
-use super::record_iter::{HEAD, MAGIC, RecordIter};
 use super::source::{ReadAt, Source};
 use super::wire::Fields;
-use super::{ABOUT, BOOT_ID};
 
 /// Distinguishes the record from another program's of the same opcode.
 const MARK: [u8; 8] = *b"rapid/1\n";
 /// Maximum bytes of definitions repeated in every chunk: otherwise the repair of a hostile file could grow without
 /// bound. An episode of 64 devices has about 30 KiB.
 const LARGEST: usize = 256 << 10;
-
-/// Identifies an episode among several in one file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct EpisodeId([u8; 16]);
-
-impl EpisodeId {
-    /// Of an episode that begins now: ns since 1970, and ns of the monotonic clock, whose combination is unique.
-    pub(crate) fn new(wall_ns: u64, monotonic_ns: u64) -> Self {
-        Self((u128::from(wall_ns) << 64 | u128::from(monotonic_ns)).to_le_bytes())
-    }
-
-    /// Of the episode whose metadata [`ABOUT`] are these.
-    pub(crate) fn of(about: &BTreeMap<String, String>) -> Option<Self> {
-        let number = |key: &str| about.get(key)?.parse().ok();
-        Some(Self::new(number("begin_wall_ns")?, number("begin_monotonic_ns")?))
-    }
-}
 
 /// Which episode the chunks of a file belong to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -103,119 +86,11 @@ pub(crate) fn is(content: &[u8]) -> bool {
 }
 
 /// The record's episode and its definitions, if the first of these records is one.
-fn first(records: &[u8]) -> Option<(EpisodeId, Fields<'_>)> {
+pub(super) fn first(records: &[u8]) -> Option<(EpisodeId, Fields<'_>)> {
     let (opcode, content) = take(&mut Fields(records))?;
     let rest = content.strip_prefix(&MARK).filter(|_| opcode == op::OWN)?;
     let (episode, definitions) = rest.split_first_chunk()?;
     Some((EpisodeId(*episode), Fields(definitions)))
-}
-
-impl<R: ReadAt> RecordIter<R> {
-    /// The episode that the chunks shown so far belong to; `None` also if they name none.
-    pub(crate) fn episode(&self) -> Option<EpisodeId> {
-        match self.names.owner {
-            Owner::Episode(episode) => Some(episode),
-            Owner::Unknown | Owner::Any | Owner::Unnamed => None,
-        }
-    }
-
-    /// Whether the file is an episode of ours, as far as its contents show.
-    pub(super) fn is_episode(&mut self) -> io::Result<bool> {
-        self.look_for_owner()?;
-        Ok(matches!(self.names.owner, Owner::Episode(_) | Owner::Any))
-    }
-
-    /// Whether these records name an episode of ours.
-    pub(super) fn is_owned(&self, records: &Records) -> bool {
-        first(self.bytes(records)).is_some()
-    }
-
-    pub(super) fn bytes(&self, records: &Records) -> &[u8] {
-        let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
-        bytes.get(records.range.clone()).unwrap_or_default()
-    }
-
-    /// Learns from a valid chunk; `false` if it does not belong to this file.
-    pub(super) fn learn(&mut self, records: &Records) -> io::Result<bool> {
-        let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
-        if self.names.owner == Owner::Unknown {
-            // The metadata at the beginning name the episode; without them its first chunk does.
-            let is_named = self.names.named.is_none_or(|named| owner == Owner::Episode(named));
-            if self.checked && is_named {
-                self.names.owner = owner;
-            } else {
-                self.look_for_owner()?;
-            }
-        }
-        if matches!(self.names.owner, Owner::Episode(_)) && self.names.owner != owner {
-            self.integrity.left_out.other_chunks += 1;
-            self.checked = false;
-            return Ok(false);
-        }
-        let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
-        let bytes = bytes.get(records.range.clone()).unwrap_or_default();
-        if self.names.owner == Owner::Any {
-            self.names.owners.take(owner, bytes);
-        }
-        let mut definitions = first(bytes).map_or(Fields(&[]), |(_, definitions)| definitions);
-        while let Some((opcode, data)) = take(&mut definitions) {
-            self.names.wait(opcode, data);
-        }
-        Ok(true)
-    }
-
-    /// What the file states about itself at its beginning.
-    pub(super) fn remember(&mut self, opcode: u8) {
-        if opcode != op::METADATA || self.begin_ns.is_some() {
-            return;
-        }
-        let Some(about) = about(&self.buffer) else { return };
-        self.begin_ns = about.get("begin_wall_ns").and_then(|ns| ns.parse().ok());
-        self.same_boot = self.boot.is_some() && about.get(BOOT_ID) == self.boot.as_ref();
-        // Records after damage may belong to another file.
-        self.names.named = if self.checked && !self.chunked { EpisodeId::of(&about) } else { None };
-    }
-
-    /// Whether these records, found after damage, belong to this file. If no chunk names an episode, they do unless
-    /// they contradict it.
-    pub(super) fn is_own(&mut self, records: &Records) -> io::Result<bool> {
-        let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
-        self.look_for_owner()?;
-        Ok(match self.names.owner {
-            Owner::Any => true,
-            known @ Owner::Episode(_) => known == owner,
-            Owner::Unnamed if owner != Owner::Unnamed => false,
-            Owner::Unnamed | Owner::Unknown => self.is_consistent(self.bytes(records)),
-        })
-    }
-
-    /// Reads the file once more to determine its owner, unless that is known or was tried before.
-    fn look_for_owner(&mut self) -> io::Result<()> {
-        if self.names.owner != Owner::Unknown {
-            return Ok(());
-        }
-        self.names.owner = Owner::Unnamed;
-        let Some(mut records) = RecordIter::begin(self.source.again(), Some(Owner::Any))? else { return Ok(()) };
-        while records.advance()? {}
-        let owners = records.names.owners;
-        let is_foreign = self.integrity.writer == Writer::Another;
-        self.names.owner = owners.owner(self.names.named, self.checked, is_foreign, &mut self.source)?;
-        Ok(())
-    }
-
-    /// Where the episode of a found chunk begins, if its beginning lies before the chunk, after other bytes.
-    pub(super) fn beginning(&mut self) -> io::Result<Option<u64>> {
-        let Some(episode) = self.episode() else { return Ok(None) };
-        let begun = beginnings(&mut self.source, self.at)?;
-        Ok(begun.into_iter().find_map(|(at, begun)| (begun == episode).then_some(at)))
-    }
-}
-
-/// The metadata [`ABOUT`], if the content of a metadata record is those.
-fn about(content: &[u8]) -> Option<BTreeMap<String, String>> {
-    let mut fields = Fields(content);
-    fields.string().filter(|name| *name == ABOUT)?;
-    fields.map()
 }
 
 /// The episode named by each [`MARK`] in `bytes` after the first.
@@ -316,7 +191,7 @@ impl Owners {
 }
 
 /// Where episodes begin that have a name of their own: magic number, header and metadata, before `end`.
-fn beginnings<R: ReadAt>(source: &mut Source<R>, end: u64) -> io::Result<Vec<(u64, EpisodeId)>> {
+pub(super) fn beginnings<R: ReadAt>(source: &mut Source<R>, end: u64) -> io::Result<Vec<(u64, EpisodeId)>> {
     let (mut at, mut begun) = (0, Vec::new());
     while at < end && begun.len() < MOST {
         let window = source.peek(at, MAGIC.len())?;

@@ -18,6 +18,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 
 use super::chunk::{self, ChunkHead, Opened, Records, take};
+use super::framing::{HEAD, MAGIC, MAX_RECORD};
 use super::index::Index;
 use super::integrity::{LARGEST_HEADER, Writer, writer};
 use super::names::Names;
@@ -29,12 +30,6 @@ pub use super::integrity::{FileEnd, LeftOut};
 pub(crate) use super::integrity::{Integrity, Record};
 pub(crate) use super::op;
 
-/// At the beginning of a file and at its end.
-pub const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
-/// Largest record that is read: a greater length counts as damaged. A 4K raw picture has 16 MiB.
-pub(crate) const MAX_RECORD: u64 = 256 << 20;
-/// An opcode, and the length of what follows as u64.
-pub(super) const HEAD: u64 = 9;
 /// Bytes that may be decompressed, including an overhead per record: for any file, and per byte of it.
 const UNPACKED: (u64, u64) = (256 << 20, 200);
 /// Bytes that may be searched in vain for a chunk: in any file, and per byte of it.

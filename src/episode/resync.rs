@@ -16,9 +16,10 @@
 use std::io;
 
 use super::chunk::{self, ChunkHead, Opened, Packing, may_begin, take};
+use super::framing::{HEAD, MAGIC, MAX_RECORD};
 use super::index::{Index, Place, TAIL, footer};
 use super::op;
-use super::record_iter::{FileEnd, HEAD, Known, LEAST, MAGIC, MAX_RECORD, RecordIter, Step};
+use super::record_iter::{FileEnd, Known, LEAST, RecordIter, Step};
 use super::source::{Fit, ReadAt, is_known};
 use super::wire::Fields;
 

@@ -1,7 +1,8 @@
 //! Files that were made to break a reader.
 
+use super::framing::MAGIC;
 use super::op;
-use super::record_iter::{FileEnd, Integrity, MAGIC, RecordIter};
+use super::record_iter::{FileEnd, Integrity, RecordIter};
 use super::testing::{episode, layouts, mutated, mutations};
 use crate::effort::{cases, every};
 use proptest::prelude::*;

@@ -14,14 +14,15 @@ use parquet::errors::ParquetError;
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use rapid_system::folder::{Folder, Links, Missing, Sync};
 
+use super::error::SetError;
 use super::features::IMAGES;
-use super::set::SetError;
-use super::table::CREATED_BY;
 
 /// Files of a folder; also `chunks_size` in `info.json`.
 pub(super) const CHUNK: u64 = 1000;
 /// Folder of the videos.
 pub(super) const VIDEOS: &str = "videos";
+/// What is in a file of Parquet about its writer.
+pub(super) const CREATED_BY: &str = concat!("rapid ", env!("CARGO_PKG_VERSION"));
 /// What the name of a file ends with that is not complete.
 const TEMPORARY: &str = ".tmp";
 

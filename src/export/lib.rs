@@ -17,6 +17,7 @@
 //! of rows.
 
 mod cells;
+mod error;
 #[cfg(test)]
 #[path = "../../tests/support/executable.rs"]
 mod executable;
@@ -34,11 +35,12 @@ mod tests;
 mod verify;
 mod video;
 
+pub use error::SetError;
 pub use features::{Features, Known};
 pub use ffmpeg::{Ffmpeg, FfmpegError};
 pub use picture::{Codec, Pictures};
 pub use rows::Refusal;
-pub use set::{DataSet, Prepared, SetError, prepare};
+pub use set::{DataSet, Prepared, prepare};
 pub use survey::{Survey, survey};
 pub use table::Position;
 pub use verify::{Difference, Verified, verify};

@@ -14,7 +14,6 @@
 use std::collections::{BTreeMap, HashMap};
 use std::ffi::OsStr;
 use std::fs::File;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -25,15 +24,14 @@ use arrow_array::types::{Float64Type, Int64Type};
 use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
-use parquet::errors::ParquetError;
 use rapid_episode::sha256;
-use rapid_system::folder::{Folder, FolderError, Links, Missing};
+use rapid_system::folder::{Folder, Links, Missing};
 use rustix::fs::FlockOperation;
 use serde_json::{Map, Value, json};
 
 use super::cells::CellMaker;
+use super::error::SetError;
 use super::features::{Features, IMAGES, OWN};
-use super::ffmpeg::FfmpegError;
 use super::files::{self, CHUNK, NewFile, VIDEOS, numbered, write, write_parquet};
 use super::picture::Pictures;
 use super::rows::{Index, Refusal};
@@ -51,57 +49,6 @@ const BYTES: &str = "rapid/bytes";
 const VERDICT: &str = "rapid/verdict";
 /// As pandas names an index without a name.
 const TASK: &str = "__index_level_0__";
-
-/// Why a dataset cannot be read or written.
-#[derive(Debug, thiserror::Error)]
-pub enum SetError {
-    /// A folder.
-    #[error(transparent)]
-    Folder(#[from] FolderError),
-    /// A file.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// A table.
-    #[error("{}: {source}", path.display())]
-    Parquet {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        source: ParquetError,
-    },
-    /// A video.
-    #[error(transparent)]
-    Ffmpeg(FfmpegError),
-    /// The dataset has its pictures otherwise.
-    #[error("{}: its pictures are {of_set}, and --pictures is {requested}: leave it out, or name another --out", folder.display())]
-    Pictures {
-        /// The dataset.
-        folder: PathBuf,
-        /// How it has them.
-        of_set: Pictures,
-        /// What was asked for.
-        requested: Pictures,
-    },
-    /// A file that this program did not write.
-    #[error("{}: {problem}; --out takes a new folder, or a dataset that `rapid export` made", path.display())]
-    Foreign {
-        /// The file or folder.
-        path: PathBuf,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// Another program writes to it.
-    #[error("{}: another `rapid export` writes to this dataset: wait for its end", .0.display())]
-    Busy(PathBuf),
-    /// The episode.
-    #[error(transparent)]
-    Refused(#[from] Refusal),
-}
 
 /// An episode of a dataset.
 #[derive(Debug, Clone)]

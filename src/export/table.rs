@@ -23,14 +23,12 @@ use parquet::schema::types::ColumnPath;
 
 use super::cells::Cells;
 use super::features::{ACTION, AGE, Feature, Features, MASK, OWN, PLUGGED, STATE, TIME, VALID};
+use super::files::CREATED_BY;
 
 /// Bytes of pictures, and rows, of a group of rows: a reader loads a group at once.
 const GROUP: (usize, usize) = (32 << 20, 1000);
 /// Rows read at once.
 const READ: usize = 64;
-
-/// What is in a file of Parquet about its writer.
-pub(super) const CREATED_BY: &str = concat!("rapid ", env!("CARGO_PKG_VERSION"));
 
 /// Where an episode is in a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

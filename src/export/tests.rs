@@ -18,10 +18,11 @@ use rapid_registry::ExportSpec;
 use rapid_status::Grade;
 
 use super::cells::CellMaker;
+use super::error::SetError;
 use super::features::{Axis, Features, MASK, Origin, PLUGGED, STATE, VALID};
 use super::picture::{Codec, Pictures, Shape};
 use super::rows::{Index, Listed, Refusal, Row};
-use super::set::{DataSet, SetError, prepare};
+use super::set::{DataSet, prepare};
 use super::statistics::Column;
 use super::survey::{Content, Stream, Survey};
 use super::table::{Position, Rows, Table};

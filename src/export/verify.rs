@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::cells::{CellMaker, Cells};
+use super::error::SetError;
 use super::features::{ACTION, AGE, Features, MASK, OWN, PLUGGED, STATE, TIME, VALID};
 use super::ffmpeg::{Ffmpeg, FfmpegError, Running};
 use super::rows::{Index, Row};
-use super::set::{DataSet, SetError};
+use super::set::DataSet;
 use super::table::{Position, RowView, Rows, timestamp};
 use super::video::{self, Damaged, FrameMaker, Shown};
 

@@ -9,12 +9,12 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
 
+use super::error::SetError;
 use super::features::Features;
-use super::ffmpeg::{Ffmpeg, FfmpegError, Running, Stop};
+use super::ffmpeg::{Ffmpeg, Running, Stop};
 use super::files::{NewFile, VIDEOS};
 use super::picture::{self, Shape};
-use super::rows::{Index, Payload, Refusal, Row};
-use super::set::SetError;
+use super::rows::{Index, Payload, Row};
 use super::survey::Survey;
 
 /// Rows of which a camera's picture cannot be decoded: the place of the camera among the modalities, and the row.
@@ -133,15 +133,6 @@ pub fn encode(
 pub(super) fn psnr(found: &[u8], expected: &[u8]) -> f64 {
     let squares = rapid_pictures::jpeg::squares(found, expected);
     (10.0 * (255.0_f64.powi(2) * expected.len() as f64 / squares as f64).log10()).min(100.0)
-}
-
-impl From<FfmpegError> for SetError {
-    fn from(error: FfmpegError) -> Self {
-        match error {
-            FfmpegError::Interrupted => Self::Refused(Refusal::Interrupted),
-            error => Self::Ffmpeg(error),
-        }
-    }
 }
 
 #[cfg(test)]

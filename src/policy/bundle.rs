@@ -18,12 +18,14 @@ mod action;
 mod external;
 mod file;
 mod files;
+mod normalization;
 mod read;
 mod spec;
 mod suits;
 #[cfg(test)]
 mod tests;
 mod validate;
+mod values;
 
 pub use files::{Graph, POLICY_FILE};
 pub use spec::{

@@ -11,7 +11,6 @@
 //! Invariant: each `on_record_start` is followed by one `on_record_stop`, unless the run ends in a hurry.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use rapid_devices::driver::process::Launch;
 use rapid_registry::device::Attachment;
@@ -22,11 +21,8 @@ use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::output::Output;
-use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
-use super::worker::{TERM_LIMIT, describe};
-
-/// A hook that has not ended by then is killed.
-pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
+use super::programs::{BusNames, Environment, HOOK_LIMIT, MARGIN, Programs, TERM_LIMIT, environment};
+use super::worker::describe;
 
 /// Serialises the runners of an entry.
 #[derive(Debug)]

@@ -13,10 +13,12 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::hooks::HOOK_LIMIT;
 use super::logbook::Logbook;
-use super::worker::TERM_LIMIT;
 
+/// How long a child has to end after SIGTERM.
+pub(super) const TERM_LIMIT: Duration = Duration::from_secs(5);
+/// A hook that has not ended by then is killed.
+pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
 /// Allowance for the kernel and a busy machine, beyond the time a program has to end.
 pub(super) const MARGIN: Duration = Duration::from_secs(2);
 

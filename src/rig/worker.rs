@@ -25,10 +25,10 @@ use tokio::sync::{Mutex, oneshot};
 use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::programs::{BusNames, Environment, MARGIN, Programs, environment};
+use super::programs::{BusNames, Environment, MARGIN, Programs, TERM_LIMIT, environment};
 use intake::{Intake, Judged};
 use supervisor::Supervisor;
-pub(super) use supervisor::{TERM_LIMIT, describe};
+pub(super) use supervisor::describe;
 
 /// A program that is silent for this many heartbeats is started again.
 pub(super) const MOST_SILENT_BEATS: u32 = 5;

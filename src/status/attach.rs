@@ -15,7 +15,7 @@ use std::sync::Arc;
 use rapid_core::text::unanswered;
 use serde::{Deserialize, Serialize};
 
-use super::preview::Preview;
+use super::preview::{LARGEST_PREVIEW, Preview};
 use super::{LogLine, Snapshot};
 
 /// Changes when the messages do.
@@ -24,8 +24,6 @@ pub const PROTOCOL: u32 = 1;
 pub const ATTACH: [&str; 2] = ["attach", "attach read-only"];
 /// Longest message without its preview, in bytes: 64 devices, a session and the whole log are a tenth of it.
 pub const LONGEST_MESSAGE: u64 = 8 << 20;
-/// Largest preview, in bytes: a picture of 4096 x 2160 in YUYV.
-pub const LARGEST_PREVIEW: usize = 4096 * 2160 * 2;
 /// Lines of the log that a screen keeps.
 const LOG_LINES: usize = 2000;
 

@@ -13,6 +13,8 @@ use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_core::time::Stamp;
 use serde::{Deserialize, Serialize};
 
+/// Largest preview, in bytes: a picture of 4096 x 2160 in YUYV.
+pub(crate) const LARGEST_PREVIEW: usize = 4096 * 2160 * 2;
 /// How long a screen receives previews after it has asked for them.
 pub const LOOKED_AT: Duration = Duration::from_secs(2);
 /// Time between two previews of pictures and other large samples...
@@ -51,7 +53,7 @@ impl Preview {
     /// Of a published sample; `None` if its encoding is unknown or it is too large to be sent to a screen.
     pub fn of(device: ModalityId, header: &SampleHeader, payload: &[u8]) -> Option<Self> {
         let encoding = Encoding::from_raw(header.encoding)?;
-        (payload.len() <= super::attach::LARGEST_PREVIEW).then(|| Self {
+        (payload.len() <= LARGEST_PREVIEW).then(|| Self {
             device,
             seq: header.seq,
             captured: Stamp(header.capture_ns),

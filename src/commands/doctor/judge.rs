@@ -12,54 +12,14 @@ use std::path::PathBuf;
 use rapid_core::text;
 use rapid_registry::device::{Attachment, DeviceNode, UsbIdentity};
 use rapid_registry::{Assigner, DeviceSpec, InputSpec, NodeSpec, Opens, PixelFormat, Registry};
-use serde::Serialize;
 
 use super::facts::{Facts, Node, UsbDevice};
+use super::finding::Finding;
 use super::load::{CameraLoad, budget, fitting, taken};
 use super::preview;
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
 const SLOWEST: f64 = 480.0;
-
-/// Severity of a finding.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub(super) enum Level {
-    /// In order.
-    Ok,
-    /// Works, with limitations.
-    Warn,
-    /// Something will not work.
-    Bad,
-}
-
-/// The result of one check.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(super) struct Finding {
-    /// Severity.
-    pub(super) level: Level,
-    /// Its subject, in one word.
-    pub(super) about: &'static str,
-    /// The observation.
-    pub(super) what: String,
-    /// What to do, a command if possible.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) fix: Option<String>,
-}
-
-impl Finding {
-    pub(super) fn ok(about: &'static str, what: impl Into<String>) -> Self {
-        Self { level: Level::Ok, about, what: what.into(), fix: None }
-    }
-
-    pub(super) fn warn(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { level: Level::Warn, about, what: what.into(), fix: Some(fix.into()) }
-    }
-
-    pub(super) fn bad(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { level: Level::Bad, about, what: what.into(), fix: Some(fix.into()) }
-    }
-}
 
 /// All findings. `rules` are the rules that `rapid artifacts` would write.
 pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&str>) -> Vec<Finding> {

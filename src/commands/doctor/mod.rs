@@ -3,6 +3,7 @@
 //! `facts` collects, `judge` decides, this module writes.
 
 mod facts;
+mod finding;
 mod judge;
 mod load;
 mod preview;
@@ -19,7 +20,7 @@ use serde::Serialize;
 
 use self::facts::UsbDevice;
 use self::facts::{Disk, Facts};
-use self::judge::{Finding, Level};
+use self::finding::{Finding, Level};
 use super::Format;
 
 /// Diagnoses the machine and writes the findings; true if none is bad.

@@ -4,7 +4,7 @@ use std::ffi::OsStr;
 
 use rapid_registry::{DeviceSpec, LanProtocol, LanSpec, NodeSpec, PREVIEW_DECODER as DECODER};
 
-use super::judge::Finding;
+use super::finding::Finding;
 
 /// Whether there is such a program in the folders of `path`.
 pub(super) fn is_on(path: Option<&OsStr>) -> bool {

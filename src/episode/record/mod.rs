@@ -12,7 +12,9 @@
 mod announce;
 mod episode_path;
 mod file;
+mod hole;
 pub mod inspect;
+mod mask_history;
 mod metadata;
 mod open_episode;
 mod provenance;

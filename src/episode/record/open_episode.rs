@@ -33,11 +33,12 @@ use rapid_status::{Board, EpisodeReport, Event, EventKind, Level, Outlook, Recor
 use super::announce::{Announced, look};
 use super::episode_path::{self, EpisodePath, EpisodeRequest};
 use super::file::EpisodeFile;
+use super::hole::Hole;
+use super::mask_history::MaskHistory;
 use super::metadata::{self, Configuration, Ending};
 use super::provenance::{Attached, Units};
 use super::publishers::Publisher;
 use super::quality::{Frames, Measured, Measures, Quality, SampleFacts};
-use super::streams::{Hole, MaskHistory};
 use super::tampering::FileWatch;
 use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge};
 use super::writeback::Writeback;

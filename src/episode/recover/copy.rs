@@ -14,9 +14,9 @@ use rapid_core::time;
 use super::super::chunk_writer::{Channel, ChunkWriter, Sink, io_error};
 use super::super::reader::Entry;
 use super::super::record_iter::{Record, RecordIter, op};
-use super::report;
+use super::report::{self, About, Copied};
 use super::{ProgressFn, Repaired, summary::Summary};
-use crate::{Failed, RECOVERED, ReadAt, SUMMARY, hash, own};
+use crate::{RECOVERED, ReadAt, SUMMARY, hash, own};
 
 /// Bytes read between two calls of a [`ProgressFn`], including those searched in vain for a chunk.
 const WATCH_EVERY: u64 = 1 << 20;
@@ -27,31 +27,6 @@ pub(super) enum Error {
     Read(io::Error),
     Write(io::Error),
     Interrupted,
-}
-
-/// Facts about the repair itself.
-#[derive(Debug, Clone)]
-pub(super) struct About<'a> {
-    /// The original.
-    pub(super) name: &'a str,
-    /// Its SHA-256, hexadecimal.
-    pub(super) sha256: String,
-    /// Wall time now.
-    pub(super) time_ns: u64,
-    /// The present boot, if it is to prove the last writes: see [`RecordIter::of_boot`].
-    pub(super) boot: Option<String>,
-    /// The mark that the original's recorder appended, if any.
-    pub(super) failed: Option<&'a Failed>,
-}
-
-/// A whole file was written.
-#[derive(Debug)]
-pub(super) struct Copied {
-    pub(super) summary: Summary,
-    /// Its content and losses; the caller adds its name and that of the original.
-    pub(super) repaired: Repaired,
-    /// Nothing of the original is left out but a torn end.
-    pub(super) is_lossless: bool,
 }
 
 /// The content of a file. `None`: not an MCAP file.

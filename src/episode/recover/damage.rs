@@ -13,9 +13,9 @@ use super::copy::recover_bytes;
 use super::tests::{keep_going, names, put, recorded};
 use super::{FileEnd, RecoverError, RepairOutcome, left_behind, recover};
 use crate::effort::every;
+use crate::episode_id::EpisodeId;
+use crate::framing::MAGIC;
 use crate::op;
-use crate::own::EpisodeId;
-use crate::record_iter::MAGIC;
 use crate::testing::{self, Message, metadata, strictly};
 
 /// Mutations of each file.

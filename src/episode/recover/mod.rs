@@ -43,13 +43,13 @@ use rapid_core::{text, time};
 use serde::Serialize;
 
 use super::partial::{self, Lock};
-use crate::record_iter::MAGIC;
+use crate::framing::MAGIC;
 use crate::{Failed, ReadError};
 
-use self::copy::Copied;
 pub use self::copy::recover_bytes;
 pub use self::folder::{Repairs, finished, is_damaged, left_behind};
 use self::names::{Names, set_aside};
+use self::report::{About, Copied};
 use self::summary::Summary;
 pub use super::record_iter::{FileEnd, LeftOut};
 
@@ -304,7 +304,7 @@ impl Source<'_> {
     fn copy(&self, to: &Path, sha256: String, watch: &mut ProgressFn<'_>) -> Result<Option<Copied>, RecoverError> {
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
         let (time_ns, boot, failed) = (time::realtime_ns(), crate::boot_id(), self.failed.as_ref());
-        let about = copy::About { name: &name, sha256, time_ns, boot, failed };
+        let about = About { name: &name, sha256, time_ns, boot, failed };
         let copied = names::create(to).map_err(copy::Error::Write).and_then(|file| {
             let copied = copy::copy(&self.file, self.size, &about, file, watch);
             if !matches!(copied, Ok(Some(_))) {

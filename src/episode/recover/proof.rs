@@ -9,9 +9,9 @@ use super::damage::{Chunk, chunks, largest, unfinished};
 use super::tests::{keep_going, names, put, recorded, repaired};
 use super::{FileEnd, RecoverError, RepairOutcome, recover};
 use crate::effort::every;
-use crate::own::EpisodeId;
+use crate::episode_id::EpisodeId;
+use crate::framing::MAGIC;
 use crate::record::inspect::{Inspection, inspect};
-use crate::record_iter::MAGIC;
 use crate::testing::{Message, metadata, strictly};
 
 /// Makes something of this name.

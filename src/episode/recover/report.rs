@@ -7,10 +7,34 @@ use rapid_core::time;
 use rapid_status::{Grade, Level};
 use serde_json::{Map, Value, json};
 
-use super::copy::{About, Copied};
 use super::summary::{LOSSLESS, SHA256, Summary};
 use super::{FileEnd, LeftOut, Recovered, RepairOutcome, Repaired};
-use crate::{FAILED, text_map};
+use crate::{FAILED, Failed, text_map};
+
+/// Facts about the repair itself.
+#[derive(Debug, Clone)]
+pub(super) struct About<'a> {
+    /// The original.
+    pub(super) name: &'a str,
+    /// Its SHA-256, hexadecimal.
+    pub(super) sha256: String,
+    /// Wall time now.
+    pub(super) time_ns: u64,
+    /// The present boot, if it is to prove the last writes: see [`RecordIter::of_boot`].
+    pub(super) boot: Option<String>,
+    /// The mark that the original's recorder appended, if any.
+    pub(super) failed: Option<&'a Failed>,
+}
+
+/// A whole file was written.
+#[derive(Debug)]
+pub(super) struct Copied {
+    pub(super) summary: Summary,
+    /// Its content and losses; the caller adds its name and that of the original.
+    pub(super) repaired: Repaired,
+    /// Nothing of the original is left out but a torn end.
+    pub(super) is_lossless: bool,
+}
 
 /// The metadata record `rapid/summary` of an episode whose recorder wrote none, as far as it is
 /// known. Same keys as the recorder's, without those that only the recorder could count.

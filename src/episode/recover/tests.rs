@@ -7,7 +7,8 @@ use std::time::Duration;
 use proptest::prelude::*;
 use rapid_status::{Grade, Level};
 
-use super::copy::{About, Error};
+use super::copy::Error;
+use super::report::About;
 use super::*;
 use crate::effort::every;
 use crate::record::Sink;

@@ -6,12 +6,12 @@ use rapid_registry::did_you_mean;
 use serde_json::Value;
 
 use super::file::{ActionFile, BaseFile, Limits, RepresentationWord, Sliced};
+use super::normalization::{check_length, normalization};
 use super::read::{Problems, read};
 use super::spec::{
     ActionRotation, BasePose, BundleAction, ObservationInput, ObservationSpec, POSITION, QUATERNION, Representation,
     SliceNormalization,
 };
-use super::validate::{check_length, normalization};
 
 /// The fix for a shape that is none of a pose.
 const NO_POSE: &str =

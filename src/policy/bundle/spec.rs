@@ -11,7 +11,7 @@ use rapid_registry::Diagnostic;
 use rapid_status::EventKind;
 use serde::{Deserialize, Serialize};
 
-use super::file;
+use super::values;
 
 /// A checked bundle.
 #[derive(Debug, Clone, PartialEq)]
@@ -236,26 +236,26 @@ pub enum Normalization {
     /// `(v - min) / (max - min) * 2 - 1`.
     MinMax {
         /// Smallest values.
-        #[serde(deserialize_with = "file::numbers")]
+        #[serde(deserialize_with = "values::numbers")]
         min: Vec<f32>,
         /// Largest values, each above the smallest.
-        #[serde(deserialize_with = "file::numbers")]
+        #[serde(deserialize_with = "values::numbers")]
         max: Vec<f32>,
     },
     /// `(v - mean) / (std + eps)`.
     MeanStd {
         /// Means.
-        #[serde(deserialize_with = "file::numbers")]
+        #[serde(deserialize_with = "values::numbers")]
         mean: Vec<f32>,
         /// Standard deviations, at least 0; with `eps` added above 0.
-        #[serde(deserialize_with = "file::numbers")]
+        #[serde(deserialize_with = "values::numbers")]
         std: Vec<f32>,
         /// At least 0; 0 if the file gives none.
         #[serde(default)]
         eps: f32,
     },
     /// `v`.
-    #[serde(deserialize_with = "file::no_keys")]
+    #[serde(deserialize_with = "values::no_keys")]
     Identity,
 }
 
@@ -403,20 +403,20 @@ pub struct SliceNormalization {
 #[serde(deny_unknown_fields)]
 pub struct SchedulerSpec {
     /// `type`.
-    #[serde(rename = "type", deserialize_with = "file::word")]
+    #[serde(rename = "type", deserialize_with = "values::word")]
     pub kind: SchedulerKind,
     /// Steps of the forward process, `1..=10000`.
-    #[serde(deserialize_with = "file::whole::<_, 1, 10_000>")]
+    #[serde(deserialize_with = "values::whole::<_, 1, 10_000>")]
     pub num_train_timesteps: usize,
     /// How the noise grows.
-    #[serde(deserialize_with = "file::word")]
+    #[serde(deserialize_with = "values::word")]
     pub beta_schedule: BetaSchedule,
     /// First beta, `1e-6..=0.999`; not used by `squaredcos_cap_v2`.
     pub beta_start: f64,
     /// Last beta, in the same range and not below the first; not used by `squaredcos_cap_v2`.
     pub beta_end: f64,
     /// What the denoiser predicts.
-    #[serde(deserialize_with = "file::word")]
+    #[serde(deserialize_with = "values::word")]
     pub prediction_type: PredictionType,
     /// Whether the predicted clean sample is clipped.
     pub clip_sample: bool,
@@ -425,13 +425,13 @@ pub struct SchedulerSpec {
     /// DDIM: whether the last step's alpha is 1 rather than that of timestep 0.
     pub set_alpha_to_one: bool,
     /// Added to every timestep with `leading` spacing.
-    #[serde(deserialize_with = "file::whole::<_, 0, 10_000>")]
+    #[serde(deserialize_with = "values::whole::<_, 0, 10_000>")]
     pub steps_offset: usize,
     /// How the timesteps are spaced.
-    #[serde(deserialize_with = "file::word")]
+    #[serde(deserialize_with = "values::word")]
     pub timestep_spacing: TimestepSpacing,
     /// Number of denoising steps, `1..=num_train_timesteps`.
-    #[serde(deserialize_with = "file::whole::<_, 1, 10_000>")]
+    #[serde(deserialize_with = "values::whole::<_, 1, 10_000>")]
     pub num_inference_steps: usize,
 }
 
@@ -489,10 +489,10 @@ pub enum TimestepSpacing {
 #[serde(deny_unknown_fields)]
 pub struct GraphFile {
     /// `file`: its name in the bundle's folder.
-    #[serde(deserialize_with = "file::file_name")]
+    #[serde(deserialize_with = "values::file_name")]
     pub file: String,
     /// `sha256` of its bytes, lower-case hexadecimal.
-    #[serde(deserialize_with = "file::sha256")]
+    #[serde(deserialize_with = "values::sha256")]
     pub sha256: String,
 }
 

@@ -16,10 +16,8 @@ use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::super::output::Output;
-use super::super::programs::Programs;
+use super::super::programs::{Programs, TERM_LIMIT};
 
-/// How long a child has to end after SIGTERM.
-pub(in crate::rig) const TERM_LIMIT: Duration = Duration::from_secs(5);
 /// How long a child's last samples are kept for their reader.
 const LAST_SAMPLES: Duration = Duration::from_secs(1);
 

@@ -8,14 +8,13 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rapid_core::provenance::{Format, Negotiated};
+use rapid_core::provenance::{Format, KernelDriver, Negotiated};
 use rapid_core::sample::{Encoding, FLAG_ERROR};
 use rapid_core::time::Stamp;
 use rapid_registry::{CameraSpec, PixelFormat};
 use serde::Serialize;
 
 use super::super::DriverError;
-use super::node::Card;
 
 /// Tolerance of a rate: many cameras call 30000/1001 30.
 const RATE_TOLERANCE: f64 = 0.005;
@@ -273,6 +272,14 @@ pub(super) fn not_offered(name: &str, spec: &CameraSpec, path: &Path, offered: &
         spec.fps,
         modes_text(offered)
     )
+}
+
+/// The camera as reported by its driver.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Card {
+    pub(super) name: String,
+    pub(super) driver: KernelDriver,
+    pub(super) bus: String,
 }
 
 /// The agreed settings, for people.

@@ -29,7 +29,7 @@ use v4l::v4l_sys::{
 use v4l::v4l2::{self, vidioc};
 
 use super::super::DriverError;
-use super::format::{Agreed, ControlInfo, Frame, Rate, fourcc};
+use super::format::{Agreed, Card, ControlInfo, Frame, Rate, fourcc};
 
 /// `V4L2_BUF_TYPE_VIDEO_CAPTURE`.
 pub(super) const CAPTURE: u32 = v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE;
@@ -233,14 +233,6 @@ impl AsFd for Node {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.fd.as_fd()
     }
-}
-
-/// The camera as reported by its driver.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Card {
-    pub(super) name: String,
-    pub(super) driver: KernelDriver,
-    pub(super) bus: String,
 }
 
 /// Text up to its first zero byte, with anything that does not belong in a line of text replaced, because it comes from

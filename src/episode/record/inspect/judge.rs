@@ -22,37 +22,15 @@ use super::super::publishers::Publishers;
 use super::super::quality::{Frames, Measured, Measures, Quality, SampleFacts, Spread};
 use super::super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
 use super::ModalityReport;
-use super::state::{self, Counted, file_state};
+use super::state::{self, Ending, file_state};
 use crate::decode::{FrameSlot, Sample};
 use crate::reader::Message;
-use crate::record_iter::Integrity;
 use crate::{ABOUT, SUMMARY};
 
 /// No registry is longer; the text of a hostile file may be.
 const LONGEST_REGISTRY: usize = 1 << 20;
 /// Patience with a modality without one in the registry.
 const STALL_AFTER: Duration = Duration::from_millis(500);
-
-/// How a file ended.
-#[derive(Debug)]
-pub(super) struct Ending<'a> {
-    /// What was found in it.
-    pub(super) file: Integrity,
-    /// Length of the episode, seconds.
-    pub(super) seconds: f64,
-    /// What it states about itself at its beginning.
-    pub(super) about: &'a BTreeMap<String, String>,
-    /// The recorder's summary; empty without one.
-    pub(super) summary: &'a BTreeMap<String, String>,
-    /// It was repaired from one that was not whole: the reason.
-    pub(super) repaired: Option<&'a str>,
-    /// Why its recorder called it BAD after it had written its summary, or without one.
-    pub(super) failed: Option<&'a str>,
-    /// What is left out if parts of it are damaged.
-    pub(super) damage: &'a str,
-    /// What was counted in it.
-    pub(super) counted: Counted,
-}
 
 /// Numbers of samples as they come, of which a message holds the lower 32 bits, and how many are missing.
 #[derive(Debug, Clone, Copy, Default)]

@@ -12,8 +12,7 @@ use serde_json::Value;
 use super::super::metadata::CUT_SHORT;
 use super::super::verdict::{FileState, Missing};
 use super::ModalityReport;
-use super::judge::Ending;
-use crate::own::EpisodeId;
+use crate::episode_id::EpisodeId;
 use crate::record::Quality;
 use crate::record_iter::{FileEnd, Integrity, LeftOut};
 use crate::{ABOUT, SUMMARY};
@@ -23,6 +22,27 @@ const ROUNDING: u64 = 1_000;
 
 const UNFINISHED: &str = "the recorder has not finished it";
 const UNPROVEN: &str = "check values are missing in it, so that damage would not show";
+
+/// How a file ended.
+#[derive(Debug)]
+pub(super) struct Ending<'a> {
+    /// What was found in it.
+    pub(super) file: Integrity,
+    /// Length of the episode, seconds.
+    pub(super) seconds: f64,
+    /// What it states about itself at its beginning.
+    pub(super) about: &'a BTreeMap<String, String>,
+    /// The recorder's summary; empty without one.
+    pub(super) summary: &'a BTreeMap<String, String>,
+    /// It was repaired from one that was not whole: the reason.
+    pub(super) repaired: Option<&'a str>,
+    /// Why its recorder called it BAD after it had written its summary, or without one.
+    pub(super) failed: Option<&'a str>,
+    /// What is left out if parts of it are damaged.
+    pub(super) damage: &'a str,
+    /// What was counted in it.
+    pub(super) counted: Counted,
+}
 
 pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
     let Ending { file: integrity, summary, repaired, failed, damage, .. } = ending;

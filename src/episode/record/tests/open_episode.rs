@@ -5,9 +5,11 @@ use rapid_core::text::counted;
 use rapid_core::time::WallClock;
 
 use super::super::episode_path::EpisodePath;
+use super::super::hole::Hole;
+use super::super::mask_history::MaskHistory;
 use super::super::open_episode::{Beginning, OpenEpisode};
 use super::super::provenance::Attached;
-use super::super::streams::{Hole, MaskHistory, Streams};
+use super::super::streams::Streams;
 use super::*;
 use crate::ReferenceSample;
 
