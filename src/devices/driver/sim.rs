@@ -32,7 +32,7 @@ use self::pictures::{PICTURES, Pictures, encode, fill, write_depth, write_pictur
 use super::{Agreed, DriverError, Reading, unblock};
 #[cfg(feature = "motors")]
 use crate::driver::can::{
-    link::{Arrival, Received},
+    outcome::{Arrival, Received},
     raw,
 };
 

@@ -10,7 +10,7 @@ use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
 
 use rapid_system::peer::Peer;
 
-use super::link::LinkError;
+use super::outcome::LinkError;
 
 /// The motors behind an interface are ours until this is dropped.
 #[derive(Debug)]

@@ -12,7 +12,7 @@ use rapid_motors::control::can::CanFrame;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
-use super::link::{Arrival, LinkError};
+use super::outcome::{Arrival, LinkError};
 use super::{damiao_serial, slcan};
 use crate::driver::{arrival, serial};
 

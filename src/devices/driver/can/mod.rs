@@ -13,6 +13,7 @@ mod line;
 pub mod link;
 pub mod motors;
 pub mod netlink;
+pub mod outcome;
 pub mod raw;
 pub mod slcan;
 mod socket;

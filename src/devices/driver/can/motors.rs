@@ -28,7 +28,8 @@ use tokio::sync::mpsc;
 
 use super::claim::Claim;
 use super::guard::Guard;
-use super::link::{Link, LinkError};
+use super::link::Link;
+use super::outcome::LinkError;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
 use control_loop::{ControlLoop, Sample, Shared};
 use effector::Effector;

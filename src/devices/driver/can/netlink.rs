@@ -13,7 +13,7 @@ use serde::Serialize;
 use socketcan::CanInterface;
 use socketcan::nl::{CanState, InterfaceDetails, NlError};
 
-use super::link::LinkError;
+use super::outcome::LinkError;
 
 /// The state of a CAN interface.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]

@@ -28,7 +28,8 @@ use rapid_core::time::Stamp;
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{CAN_BATCH, CAN_RECORD, CanSpec};
 
-use super::link::{AsyncLink, Link, LinkError, Received, is_bus_off};
+use super::link::{AsyncLink, Link};
+use super::outcome::{LinkError, Received, is_bus_off};
 use super::socket::can_id;
 use crate::driver::{Agreed, DriverError, Reading, unblock};
 

@@ -15,8 +15,8 @@ use rapid_motors::control::can::CanFrame;
 use rustix::net::{AddressFamily, Protocol, SendFlags, SocketFlags, SocketType};
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 
-use super::link::{Arrival, LinkError, is_overflow};
 use super::netlink::{self, Ready};
+use super::outcome::{Arrival, LinkError, is_overflow};
 use crate::driver::datagram::{self, Datagram};
 
 /// Bytes of a classical frame (`struct can_frame`, linux/can.h): identifier, length, three that mean nothing, data.

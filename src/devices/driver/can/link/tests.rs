@@ -9,6 +9,7 @@ use crate::ports::may_be_opened;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
 use super::*;
+use crate::driver::DriverError;
 use crate::driver::can::slcan;
 use crate::patience::PATIENCE;
 

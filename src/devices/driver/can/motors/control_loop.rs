@@ -32,7 +32,7 @@ use tokio::sync::mpsc;
 use super::powered::Powered;
 use super::statistics::{LoopStatistics, Punctuality};
 use crate::driver::DriverError;
-use crate::driver::can::link::LinkError;
+use crate::driver::can::outcome::LinkError;
 
 /// Frames taken after the deadline of a cycle: a flooded bus must not keep the motors from their commands.
 const LATE_FRAMES: usize = 64;

@@ -11,7 +11,8 @@ use rapid_registry::DamiaoSpec;
 use crate::driver::can::brakes::Brakes;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::guard::Guard;
-use crate::driver::can::link::{Link, LinkError};
+use crate::driver::can::link::Link;
+use crate::driver::can::outcome::LinkError;
 
 /// The least number of times that motors are ordered to turn off, [`AGAIN`] apart: a frame may be lost.
 const TURN_OFF: usize = 3;
