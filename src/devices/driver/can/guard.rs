@@ -8,10 +8,7 @@
 //!
 //! The guard is this program started once more, under the name [`NAME`], when an adapter with motors is opened. It has one
 //! end of a pair of sockets as its standard input, the adapter as its standard output, and no other open file of ours.
-//! A message is a byte, `OFF`, `ON`, `DISMISSED` or `BRAKE`. After `ON` come the bits of the motors whose brakes are
-//! to be engaged at once (u16, little endian; the others are when the motors are disabled), and a frame of `FRAME` bytes
-//! for each motor; after `BRAKE` the bits of the motors of a brake, and the level that engages it, 0 or 1, with the open
-//! line as a descriptor, or without one when it was closed.
+//! What it is told is in `message`.
 //!
 //! Invariant: the guard sends nothing while cycles arrive or no motor is on.
 //! Invariant: the guard leaves the answers of motors to the guarded process while that runs.
@@ -20,6 +17,7 @@
 //! would get another name when replugged.
 
 mod held;
+mod message;
 mod process;
 
 use std::io::{self, IoSlice};
@@ -29,10 +27,9 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use rapid_motors::control::can::CanFrame;
 use rapid_motors::control::motors::{MotorBus, stalled_after};
 use rapid_registry::device::DeviceNode;
-use rapid_registry::{CanSpec, DamiaoSpec, MAX_MOTORS};
+use rapid_registry::{CanSpec, DamiaoSpec};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::net::{
@@ -44,26 +41,10 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open, setsid};
 use super::link::Link;
 use crate::driver::process::leak_nothing;
 
+use message::{BRAKE, DISMISSED, FRAME, LONGEST, OFF, ON, encode};
+pub use message::{KEEP_FOR, NAME};
 pub use process::run;
 
-/// Argument 0 of the guard. It does not contain "rapid": `pkill rapid` must not end the guard.
-pub const NAME: &str = "motor-guard";
-/// How long motors that are not to be limp are damped, or hold, before they are disabled: a damped joint has sunk to
-/// rest by then, and nothing stays on unattended for longer.
-pub const KEEP_FOR: Duration = Duration::from_secs(5);
-
-/// No motor is on.
-const OFF: u8 = 0;
-/// Motors are on; their last will follows.
-const ON: u8 = 1;
-/// It is no longer needed.
-const DISMISSED: u8 = 2;
-/// The line of a brake.
-const BRAKE: u8 = 3;
-/// Bytes of a frame: identifier (u32, little endian), length, three zeros, data.
-const FRAME: usize = 16;
-/// Longest message.
-const LONGEST: usize = 3 + MAX_MOTORS * FRAME;
 /// When dismissed it ends within this, or is killed.
 const ENDS_WITHIN: Duration = Duration::from_millis(200);
 
@@ -194,17 +175,4 @@ fn prepare() -> io::Result<()> {
     }
     leak_nothing();
     Ok(())
-}
-
-fn encode(frame: &CanFrame) -> [u8; FRAME] {
-    let mut bytes = [0; FRAME];
-    bytes[..4].copy_from_slice(&frame.id.to_le_bytes());
-    bytes[4] = frame.len;
-    bytes[8..].copy_from_slice(&frame.data);
-    bytes
-}
-
-fn decode(bytes: &[u8; FRAME]) -> CanFrame {
-    let [a, b, c, d, len, _, _, _, data @ ..] = *bytes;
-    CanFrame { id: u32::from_le_bytes([a, b, c, d]), len: len.min(8), data, ..CanFrame::default() }
 }

@@ -17,7 +17,7 @@ use rustix::io::Errno;
 use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, RecvMsg, recvmsg};
 
 use super::held::Held;
-use super::{BRAKE, DISMISSED, FRAME, KEEP_FOR, LONGEST, NAME, ON, decode};
+use super::message::{BRAKE, DISMISSED, FRAME, KEEP_FOR, LONGEST, NAME, ON, decode};
 use crate::driver::can::claim::Claim;
 use crate::driver::can::{damiao_serial, slcan, socket};
 
@@ -263,7 +263,7 @@ fn discard(adapter: CanAdapter, output: BorrowedFd<'_>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::driver::can::guard::{OFF, encode};
+    use crate::driver::can::guard::message::{OFF, encode};
 
     fn ward() -> Ward {
         let args = ["socketcan", "75", "can0", "5", "6"].map(OsString::from);
