@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use rapid_core::action::Trip;
 
-use super::words::Words;
 use crate::control::damiao::codec::MotorStatus;
 use crate::control::damiao::parameter::{Parameter, Value};
 
@@ -214,10 +213,5 @@ impl Fault {
             | Self::Strange { what: Strange::Driven { .. } | Strange::Beyond { .. }, .. } => None,
             _ => self.motor(),
         }
-    }
-
-    /// In words; `names` are those of the motors.
-    pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
-        Words::new(self, names)
     }
 }

@@ -1,7 +1,6 @@
 //! Notices of a bus of motors, for the log and for events; their text: `words`.
 
 use super::fault::{Fault, Part, Strange};
-use super::words::Words;
 use crate::control::damiao::codec::{MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
 
@@ -192,10 +191,5 @@ impl Notice {
             | Self::Clamped { .. }
             | Self::Refused(_) => true,
         }
-    }
-
-    /// In words; `names` are those of the motors.
-    pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
-        Words::new(self, names)
     }
 }

@@ -16,18 +16,33 @@ pub struct Words<'a, T> {
 }
 
 impl<'a, T> Words<'a, T> {
-    pub(super) const fn new(what: &'a T, names: &'a [String]) -> Self {
-        Self { what, names, stops: &[] }
-    }
-
     /// With the names of emergency stops.
     #[must_use]
     pub const fn with_stops(self, stops: &'a [Arc<str>]) -> Self {
         Self { stops, ..self }
     }
 
+    /// Something else, with the same names.
+    const fn of<U>(&self, what: &'a U) -> Words<'a, U> {
+        Words { what, names: self.names, stops: self.stops }
+    }
+
     fn name(&self, motor: usize) -> &str {
         self.names.get(motor).map_or("?", String::as_str)
+    }
+}
+
+impl Fault {
+    /// In words; `names` are those of the motors.
+    pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
+        Words { what: self, names, stops: &[] }
+    }
+}
+
+impl Notice {
+    /// In words; `names` are those of the motors.
+    pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
+        Words { what: self, names, stops: &[] }
     }
 }
 
@@ -179,7 +194,7 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::Disabled(Reason::Asked) => f.write_str("motors are disabled"),
             Notice::Disabled(Reason::Deadman) => f.write_str("no action came for too long: motors are disabled"),
             Notice::Fault(fault) => {
-                write!(f, "{}: all motors are stopped", fault.words(self.names).with_stops(self.stops))
+                write!(f, "{}: all motors are stopped", self.of(fault))
             }
             Notice::Kept { damped, held, braked } => {
                 let parts = [
@@ -205,7 +220,7 @@ impl fmt::Display for Words<'_, Notice> {
                 write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
             }
             Notice::Refused(refusal) => {
-                write!(f, "an action is refused: {}", Words { what: refusal, names: self.names, stops: self.stops })
+                write!(f, "an action is refused: {}", self.of(refusal))
             }
         }
     }
