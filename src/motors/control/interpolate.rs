@@ -44,33 +44,38 @@ impl Interpolator {
         }
     }
 
-    /// Holds `command` from now on and forgets the target period.
-    pub fn restart(&mut self, command: &[f64]) {
-        self.hold(command);
+    /// Holds `commands` from now on and forgets the target period.
+    pub fn restart(&mut self, commands: impl IntoIterator<Item = f64>) {
+        self.hold(commands);
         self.tick = None;
         (self.gap, self.period) = (FIRST_PERIOD, FIRST_PERIOD);
     }
 
-    /// Holds `command` from now on.
-    pub fn hold(&mut self, command: &[f64]) {
-        for ((from, to), command) in self.from.iter_mut().zip(&mut self.to).zip(command) {
-            *from = *command;
-            *to = *command;
+    /// Holds `commands` from now on.
+    pub fn hold(&mut self, commands: impl IntoIterator<Item = f64>) {
+        for ((from, to), command) in self.from.iter_mut().zip(&mut self.to).zip(commands) {
+            (*from, *to) = (command, command);
         }
         self.takes = Duration::ZERO;
     }
 
-    /// Moves from `command`, in force at `begin`, towards `target`, the action of `tick`.
-    pub fn head_for(&mut self, target: &[f64], tick: Stamp, command: &[f64], begin: Stamp) {
+    /// Moves from `commands`, in force at `begin`, towards `targets`, the action of `tick`.
+    pub fn head_for(
+        &mut self,
+        targets: impl IntoIterator<Item = f64>,
+        tick: Stamp,
+        commands: impl IntoIterator<Item = f64>,
+        begin: Stamp,
+    ) {
         if let Some(apart) = self.tick.map(|last| tick.since(last)).filter(|apart| *apart <= LONGEST) {
             let gap = apart.max(SHORTEST);
             self.period = gap.min(self.gap);
             self.gap = gap;
         }
         self.tick = Some(tick);
-        for ((from, to), (command, target)) in self.from.iter_mut().zip(&mut self.to).zip(command.iter().zip(target)) {
-            *from = *command;
-            *to = *target;
+        let ends = self.from.iter_mut().zip(&mut self.to);
+        for ((from, to), (command, target)) in ends.zip(commands.into_iter().zip(targets)) {
+            (*from, *to) = (command, target);
         }
         self.begin = begin;
         self.takes = self.period;

@@ -46,7 +46,6 @@ mod notice;
 mod notices;
 mod refusing;
 mod returning;
-mod watch;
 mod words;
 
 use std::time::Duration;
@@ -55,9 +54,9 @@ pub use brakes::Brakes;
 pub use fault::{Fault, Part, Strange};
 pub use last_will::stalled_after;
 use motor::Motor;
+pub use motor::{RETURN_SPEED, SAMPLE_VALUES};
 pub use notice::{BusState, Notice, Reason, Refusal};
 use notices::{Notices, Seldom};
-pub use returning::RETURN_SPEED;
 pub use words::Words;
 
 use rapid_core::action::Trip;
@@ -65,16 +64,11 @@ use rapid_core::time::Stamp;
 use rapid_registry::DamiaoSpec;
 
 use super::can::CanFrame;
-use super::damiao::codec::{self, StateCommand};
+use super::damiao::codec;
 use super::damiao::parameter::Reply;
 use super::deadman::Deadman;
 use super::interpolate::Interpolator;
-use super::limits::Limits;
-use super::ramp::Ramp;
 
-/// Values per motor in a sample: position rad, velocity rad/s and torque Nm of its joint, temperature of the transistors °C,
-/// of the winding °C, and the code of its status.
-pub const SAMPLE_VALUES: usize = 6;
 /// A motor may leave the frames of this many cycles unanswered, however short the configured time.
 const SILENT_CYCLES: u32 = 3;
 /// A step that is later than this many cycles moves no farther than after this many.
@@ -85,10 +79,6 @@ const LATE_CYCLES: u32 = 2;
 pub struct MotorBus {
     motors: Vec<Motor>,
     names: Vec<String>,
-    limits: Vec<Limits>,
-    commands: Vec<f64>,
-    targets: Vec<f64>,
-    ramps: Vec<Ramp>,
     /// The newest action, followed or not, and its tick.
     asked: (Vec<f64>, Stamp),
     line: Interpolator,
@@ -100,14 +90,12 @@ pub struct MotorBus {
     cycle: Duration,
     /// The longest release time of any brake.
     slowest_brake: Duration,
-    silent_after: Duration,
     stalled_after: Duration,
     stepped: Option<Stamp>,
     armed: Stamp,
     refusing: Option<Refusal>,
-    /// Refused actions, and targets beyond the limits of each axis: reported once a second at most.
+    /// Refused actions are reported once a second at most.
     refused: Seldom,
-    clamped: Vec<Seldom>,
     /// The motor that another program commanded last, and when.
     other_master: Option<(usize, Stamp)>,
     /// Joints outside their limits are being driven back into them, or will be once they are armed.
@@ -140,14 +128,11 @@ impl MotorBus {
     pub fn new(spec: &DamiaoSpec, now: Stamp) -> Self {
         let cycle = Duration::from_secs(1) / spec.hz.max(1);
         let axes = spec.motors.len();
+        let silent_after = spec.silent_after.max(cycle * SILENT_CYCLES);
         let motors = spec.motors.iter().enumerate();
         Self {
-            motors: motors.map(|(index, motor)| Motor::new(index, motor, spec.timeout)).collect(),
+            motors: motors.map(|(index, motor)| Motor::new(index, motor, spec.timeout, silent_after)).collect(),
             names: spec.motors.iter().map(|motor| motor.name.clone()).collect(),
-            limits: spec.motors.iter().map(motor::limits).collect(),
-            commands: vec![0.0; axes],
-            targets: vec![0.0; axes],
-            ramps: spec.motors.iter().map(motor::ramp).collect(),
             asked: (vec![0.0; axes], Stamp(0)),
             line: Interpolator::new(axes),
             deadman: Deadman::new(spec.deadman, spec.disable_after, cycle),
@@ -156,13 +141,11 @@ impl MotorBus {
             reason: Reason::Asked,
             cycle,
             slowest_brake: brakes::slowest(spec),
-            silent_after: spec.silent_after.max(cycle * SILENT_CYCLES),
             stalled_after: stalled_after(spec),
             stepped: None,
             armed: now,
             refusing: None,
             refused: Seldom::default(),
-            clamped: vec![Seldom::default(); axes],
             other_master: None,
             is_returning: false,
             first: 0,
@@ -187,13 +170,13 @@ impl MotorBus {
     }
 
     /// The command to each motor as of the last step, rad or rad/s. Means nothing unless armed.
-    pub fn commands(&self) -> &[f64] {
-        &self.commands
+    pub fn commands(&self) -> impl Iterator<Item = f64> {
+        self.motors.iter().map(Motor::command)
     }
 
     /// What has happened so far.
     pub fn counts(&self) -> Counts {
-        let clamped = self.limits.iter().map(Limits::clamped).sum();
+        let clamped = self.motors.iter().map(Motor::clamped).sum();
         Counts { clamped, lost_notices: self.notices.lost(), ..self.counts }
     }
 
@@ -221,11 +204,7 @@ impl MotorBus {
             return;
         };
         let Some(motor) = self.motors.get_mut(index) else { return };
-        let taken = if let Some(reply) = reply {
-            motor.take_reply(&reply, &mut self.notices)
-        } else {
-            motor.take_feedback(frame, now, &mut self.notices)
-        };
+        let taken = motor.take(frame, reply.as_ref(), now, &mut self.notices);
         // At once: the next report of a motor must not mask it.
         if self.state != BusState::Stopped
             && let Some(fault) = taken.err().or_else(|| self.judge(index))
@@ -259,19 +238,13 @@ impl MotorBus {
         if refusal.is_some() || !self.is_armed() || tick < self.armed || !is_newer {
             return false;
         }
-        for (motor, target) in target.iter().enumerate() {
-            let Some(clamped) = self.limits.get_mut(motor).and_then(|limits| limits.clamp(*target)) else { continue };
-            let is_beyond = clamped.is_beyond;
-            if self.clamped.get_mut(motor).is_some_and(|seldom| seldom.look(is_beyond, now)) {
-                self.notices.notify(Notice::Clamped { motor, target: *target, used: clamped.value });
-            }
-            if let Some(slot) = self.targets.get_mut(motor) {
-                *slot = clamped.value;
-            }
+        for (motor, target) in self.motors.iter_mut().zip(target) {
+            motor.aim(*target, now, &mut self.notices);
         }
         // The line begins at the last step, whose command is in force, so that the next step already moves.
         let begin = self.stepped.map_or(now, |last| last.max(now.before(self.cycle * LATE_CYCLES)));
-        self.line.head_for(&self.targets, tick, &self.commands, begin);
+        let motors = &self.motors;
+        self.line.head_for(motors.iter().map(Motor::target), tick, motors.iter().map(Motor::command), begin);
         self.deadman.feed(tick.min(now));
         self.counts.actions += 1;
         if self.state == BusState::Holding {
@@ -321,35 +294,25 @@ impl MotorBus {
     /// The frames that disable every motor, for every way to end. No other frame follows them; they may be taken again.
     pub fn stop_frames(&mut self) -> impl Iterator<Item = CanFrame> + '_ {
         self.state = BusState::Stopped;
-        self.motors.iter_mut().map(|motor| {
-            motor.stop();
-            StateCommand::Disable.frame(motor.spec.slave)
-        })
+        self.motors.iter_mut().map(Motor::stop)
     }
 
     /// Names of the motors that may be on: ordered or reported to be on, and not reported off since the last disable.
     pub fn still_on(&self) -> impl Iterator<Item = &str> {
-        self.motors.iter().filter(|motor| motor.may_be_on).map(|motor| motor.spec.name.as_str())
+        self.motors.iter().filter(|motor| motor.may_be_on()).map(Motor::name)
     }
 
     /// Fills `out` with [`SAMPLE_VALUES`] values per motor if every motor has answered since the last sample, and
     /// returns the time of the earliest answer. Also `None` if `out` has another length.
     pub fn sample(&mut self, out: &mut [f64]) -> Option<Stamp> {
-        if out.len() != self.motors.len() * SAMPLE_VALUES || !self.motors.iter().all(|motor| motor.is_new) {
+        if out.len() != self.motors.len() * SAMPLE_VALUES
+            || !self.motors.iter().all(|motor| motor.unsampled().is_some())
+        {
             return None;
         }
-        let captured = self.motors.iter().map(|motor| motor.seen).min()?;
+        let captured = self.motors.iter().filter_map(Motor::unsampled).min()?;
         for (values, motor) in out.chunks_exact_mut(SAMPLE_VALUES).zip(&mut self.motors) {
-            let feedback = motor.feedback?;
-            motor.is_new = false;
-            values.copy_from_slice(&[
-                feedback.q,
-                feedback.dq,
-                feedback.tau,
-                f64::from(feedback.mos),
-                f64::from(feedback.rotor),
-                f64::from(feedback.status.code()),
-            ]);
+            values.copy_from_slice(&motor.sample()?);
         }
         Some(captured)
     }
@@ -367,11 +330,8 @@ impl MotorBus {
         self.advance(now, passed);
         let count = self.motors.len().max(1);
         for at in self.first..self.first + count {
-            let (Some(motor), Some(command)) = (self.motors.get_mut(at % count), self.commands.get(at % count)) else {
-                continue;
-            };
-            let is_silent = motor.unanswered(now) >= self.silent_after;
-            motor.step(*command, now, is_silent, &mut send);
+            let Some(motor) = self.motors.get_mut(at % count) else { continue };
+            motor.step(now).for_each(&mut send);
         }
         self.first = (self.first + 1) % count;
     }

@@ -56,7 +56,7 @@ pub fn motors(bytes: &[u8]) {
                 });
                 assert!(sent <= 4);
                 if bus.is_armed() {
-                    axes.iter().zip(bus.commands()).for_each(|(axis, command)| axis.judge(*command));
+                    axes.iter().zip(bus.commands()).for_each(|(axis, command)| axis.judge(command));
                 }
             }
             TARGET => {

@@ -10,7 +10,7 @@ use rapid_core::time::Stamp;
 use rapid_registry::{DamiaoSpec, Stop};
 
 use super::motor::BrakeIs;
-use super::{BusState, Fault, Motor, MotorBus, Notice};
+use super::{BusState, Fault, Motor, MotorBus};
 
 /// States of brakes, a bit for each motor, the first one the lowest; without any bit set a brake is engaged. Bits of
 /// motors without a brake mean nothing.
@@ -60,13 +60,7 @@ impl MotorBus {
     /// a joint that is armed, or being armed, cannot be driven.
     pub fn feed_brakes(&mut self, brakes: Brakes, now: Stamp) {
         for (index, motor) in self.motors.iter_mut().enumerate() {
-            // A brake that is to be released may already be moving: it counts as engaged only once engagement is
-            // wanted.
-            let is = brakes.of(index);
-            motor.take_brake(if is == BrakeIs::Engaged && motor.releases() { BrakeIs::Moving } else { is }, now);
-            if motor.misses_brake() {
-                self.notices.notify(Notice::NotBraked { motor: index });
-            }
+            motor.take_brake(brakes.of(index), now, &mut self.notices);
         }
         let is_needed = matches!(self.state, BusState::Arming | BusState::Following | BusState::Holding);
         let broken = self.motors.iter().position(Motor::has_broken_brake).filter(|_| is_needed);

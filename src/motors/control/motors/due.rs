@@ -4,15 +4,13 @@ use std::time::Duration;
 
 use rapid_core::action::Trip;
 use rapid_core::time::Stamp;
-use rapid_registry::{MotorMode, Stop};
+use rapid_registry::Stop;
 
 use super::MotorBus;
 use super::fault::Fault;
-use super::motor::{Motor, Phase};
+use super::motor::Motor;
 use super::notice::{BusState, Notice, Reason};
-use super::watch::Commanded;
 use crate::control::deadman::Verdict;
-use crate::control::ramp::Ramp;
 
 /// An arm that took longer has failed...
 const ARM_WITHIN: Duration = Duration::from_secs(1);
@@ -28,8 +26,7 @@ const DISABLE_WITHIN: Duration = Duration::from_millis(500);
 impl MotorBus {
     /// Handles motors that do not answer.
     pub(super) fn listen(&mut self, now: Stamp) {
-        let silent = |motor: &Motor| motor.unanswered(now) >= self.silent_after;
-        let Some(motor) = self.motors.iter().position(silent) else { return };
+        let Some(motor) = self.motors.iter().position(|motor| motor.is_silent(now)) else { return };
         match self.state {
             BusState::Probing | BusState::Faulted(_) | BusState::Stopped => {}
             _ => self.fail(Fault::Silent { motor }, now),
@@ -40,15 +37,17 @@ impl MotorBus {
     pub(super) fn judge(&self, index: usize) -> Option<Fault> {
         let motor = self.motors.get(index)?;
         let status = || motor.status_fault();
-        match (self.state, motor.phase) {
-            (BusState::Disarmed | BusState::Following | BusState::Holding, _)
-            | (BusState::Arming, Phase::Enabling | Phase::On) => status().or_else(|| motor.heat_fault()),
-            (BusState::Arming, _) => motor.heat_fault(),
+        match self.state {
+            BusState::Arming if !motor.is_ordered_on() => motor.heat_fault(),
+            BusState::Disarmed | BusState::Arming | BusState::Following | BusState::Holding => {
+                status().or_else(|| motor.heat_fault())
+            }
+            BusState::Faulted(_) if motor.kept().is_none() => None,
             // It was stopped for this fault, as configured.
-            (BusState::Faulted(Fault::Hot { motor, .. }), Phase::Kept(_)) if motor == index => status(),
+            BusState::Faulted(Fault::Hot { motor, .. }) if motor == index => status(),
             // It was stopped, and is still on.
-            (BusState::Faulted(_), Phase::Kept(_)) => status().or_else(|| motor.heat_fault()),
-            _ => None,
+            BusState::Faulted(_) => status().or_else(|| motor.heat_fault()),
+            BusState::Probing | BusState::Disabling | BusState::Stopped => None,
         }
     }
 
@@ -87,34 +86,18 @@ impl MotorBus {
 
     /// Handles motors that were stopped by a fault and are still on.
     fn keep(&mut self, waited: Duration, now: Stamp) {
-        for motor in &mut self.motors {
-            if motor.was_kept(waited, now) || motor.is_kept() && motor.unanswered(now) >= self.silent_after {
-                motor.turn_off();
-            }
-        }
+        self.motors.iter_mut().for_each(|motor| motor.let_go(waited, now));
     }
 
     /// Queries motors whose ranges are still unknown after probing: they had no power then, or an arm interrupted it.
     fn ask_late(&mut self, now: Stamp) {
-        for motor in &mut self.motors {
-            let is_silent = motor.unanswered(now) >= self.silent_after;
-            match motor.phase {
-                Phase::Off { .. } if motor.ranges.is_none() && motor.is_off() && !is_silent => motor.probe(),
-                // It may receive although its own frames do not arrive.
-                Phase::Asked { .. } | Phase::Probed if is_silent => motor.turn_off(),
-                _ => {}
-            }
-        }
+        self.motors.iter_mut().for_each(|motor| motor.ask_late(now));
     }
 
     /// Queries the parameters of motors that are off. Returns whether all have reported them.
     fn ask(&mut self) -> bool {
-        for motor in &mut self.motors {
-            if matches!(motor.phase, Phase::Off { .. }) && motor.is_off() {
-                motor.probe();
-            }
-        }
-        !self.motors.iter().any(|motor| matches!(motor.phase, Phase::Off { .. } | Phase::Asked { .. }))
+        self.motors.iter_mut().for_each(Motor::ask);
+        self.motors.iter().all(Motor::has_told)
     }
 
     fn probe(&mut self, waited: Duration, now: Stamp) {
@@ -122,12 +105,10 @@ impl MotorBus {
             self.enter(BusState::Disarmed, now);
             self.notices.notify(Notice::Ready);
         } else if waited >= PROBE_WITHIN {
-            let missed = |motor: &Motor| motor.phase != Phase::Probed && !motor.missed;
-            while let Some(motor) = self.motors.iter().position(missed) {
-                if let Some(missed) = self.motors.get_mut(motor) {
-                    missed.missed = true;
+            for (motor, asked) in self.motors.iter_mut().enumerate() {
+                if asked.misses_probe() {
+                    self.notices.notify(Notice::Unanswered { motor });
                 }
-                self.notices.notify(Notice::Unanswered { motor });
             }
         }
     }
@@ -157,20 +138,18 @@ impl MotorBus {
             return;
         }
         if self.ask() {
-            let axes = self.motors.iter_mut().zip(&mut self.commands).zip(&mut self.limits);
-            let mut enabled = axes.map(|((motor, command), limits)| {
-                motor.enable(command, limits, (passed, self.is_returning), &mut self.notices)
-            });
-            if let Some(fault) = enabled.find_map(Result::err) {
+            let mut motors = self.motors.iter_mut();
+            let enabled = motors.try_for_each(|motor| motor.enable(passed, self.is_returning, &mut self.notices));
+            if let Err(fault) = enabled {
                 self.fail(fault, now);
                 return;
             }
         }
-        if self.motors.iter().all(|motor| motor.phase == Phase::On && motor.is_free(now)) {
+        if self.motors.iter().all(|motor| motor.is_ready(now)) {
             self.armed = now;
             self.deadman.arm(now);
-            self.line.restart(&self.commands);
-            self.ramps.iter_mut().for_each(Ramp::restart);
+            self.line.restart(self.motors.iter().map(Motor::command));
+            self.motors.iter_mut().for_each(Motor::restart);
             self.hold(now);
             self.notices.notify(if self.is_returning { Notice::Returning } else { Notice::Armed });
         } else if waited >= ARM_WITHIN.max(self.cycle * ARM_CYCLES) + self.slowest_brake
@@ -187,46 +166,24 @@ impl MotorBus {
             return None;
         }
         let motor = self.far(target)?;
-        let position = self.motors.get(motor)?.feedback?.q;
+        let position = self.motors.get(motor)?.position()?;
         Some(Fault::Far { motor, position, target: *target.get(motor)? })
     }
 
     /// Holds the last command, or stops as soon as it can.
     pub(super) fn hold(&mut self, now: Stamp) {
-        let axes = self.targets.iter_mut().zip(&self.commands).zip(&self.motors).zip(&self.ramps).zip(&self.limits);
-        for ((((target, command), motor), ramp), limits) in axes {
-            let [low, high] = limits.range();
-            *target = match motor.spec.mode {
-                MotorMode::Velocity => 0.0,
-                // A joint beyond its limits stays there.
-                _ => ramp.stops_at(*command).clamp(low.min(*command), high.max(*command)),
-            };
-        }
-        self.line.hold(&self.targets);
+        self.motors.iter_mut().for_each(Motor::hold);
+        self.line.hold(self.motors.iter().map(Motor::target));
         self.enter(BusState::Holding, now);
     }
 
     /// The commands of this cycle, and whether each motor follows its own.
     fn follow(&mut self, now: Stamp, passed: Duration) {
-        let axes = self.motors.iter_mut().zip(&self.limits).zip(&mut self.commands).zip(&mut self.ramps);
         let (mut first, is_led) = (None, self.line.tick().is_some());
-        for (axis, (((motor, limits), command), ramp)) in axes.enumerate() {
-            let (before, target) = (*command, self.line.at(axis, now));
-            let wanted = match motor.spec.mode {
-                _ if self.is_returning => motor.way_back(before, limits, passed),
-                MotorMode::Velocity => limits.slew(before, target, passed),
-                _ => ramp.next(limits, before, target, passed),
-            };
-            let bound = motor.bound(wanted, limits);
-            // A reported position moves the command no faster than an action does.
-            *command = if motor.spec.mode == MotorMode::Velocity { bound } else { limits.slew(before, bound, passed) };
-            ramp.took(*command - before, passed, is_led);
-            let fault = motor.strange(
-                Commanded { command: *command, wanted, is_returning: self.is_returning },
-                now,
-                &mut self.notices,
-            );
-            first = first.or(fault);
+        for (axis, motor) in self.motors.iter_mut().enumerate() {
+            let target = (!self.is_returning).then(|| self.line.at(axis, now));
+            // Each follows, even after one that is at fault.
+            first = first.or(motor.follow(target, (now, passed), is_led, &mut self.notices));
         }
         if let Some(fault) = first {
             self.fail(fault, now);
@@ -250,8 +207,8 @@ impl MotorBus {
         let own = fault.own();
         // The first fault is the one that is reported.
         let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
-        for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {
-            motor.stop_at_fault(Some(index) == own, command);
+        for (index, motor) in self.motors.iter_mut().enumerate() {
+            motor.stop_at_fault(Some(index) == own);
         }
         if !is_keeping {
             self.enter(BusState::Faulted(fault), now);
@@ -266,9 +223,7 @@ impl MotorBus {
         if !(self.is_armed() || self.state == BusState::Arming || is_news && self.is_keeping()) {
             return;
         }
-        for (motor, command) in self.motors.iter_mut().zip(&mut self.commands) {
-            motor.stop_at_emergency(command);
-        }
+        self.motors.iter_mut().for_each(Motor::stop_at_emergency);
         self.enter(BusState::Faulted(Fault::EmergencyStop(trip)), now);
         self.report_stopped(Fault::EmergencyStop(trip));
     }
@@ -278,7 +233,7 @@ impl MotorBus {
         self.notices.notify(Notice::Fault(fault));
         self.name_latched(Some(fault));
         let braked = self.bits(Motor::waits_for_brake);
-        let kept = |stop| self.bits(|motor| motor.phase == Phase::Kept(stop)) & !braked;
+        let kept = |stop| self.bits(|motor| motor.kept() == Some(stop)) & !braked;
         let [damped, held] = [Stop::Damp, Stop::Hold].map(kept);
         if damped | held | braked != 0 {
             self.notices.notify(Notice::Kept { damped, held, braked });
@@ -287,17 +242,12 @@ impl MotorBus {
 
     /// Reports every latched fault once; the next arm clears them.
     pub(super) fn name_latched(&mut self, reported: Option<Fault>) {
-        for (motor, latching) in self.motors.iter_mut().enumerate() {
-            let Some(status) = latching.status.filter(|status| status.is_fault()) else { continue };
-            if latching.named.replace(status) != Some(status) && reported != Some(Fault::Latched { motor, status }) {
-                self.notices.notify(Notice::Latched { motor, status });
-            }
-        }
+        self.motors.iter_mut().for_each(|motor| motor.name_latched(reported, &mut self.notices));
     }
 
     /// Is any motor still on that was stopped by a fault?
     pub(super) fn is_keeping(&self) -> bool {
-        self.motors.iter().any(Motor::is_kept)
+        self.motors.iter().any(|motor| motor.kept().is_some())
     }
 
     pub(super) const fn enter(&mut self, state: BusState, now: Stamp) {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use rapid_core::time::Stamp;
 use rapid_registry::DamiaoSpec;
 
-use super::{BusState, Fault, MotorBus};
+use super::{BusState, Fault, Motor, MotorBus};
 use crate::control::can::CanFrame;
 
 /// A program that misses this many cycles has not stalled yet.
@@ -23,9 +23,8 @@ impl MotorBus {
     /// process that outlives this one; `None` if no motor is on.
     pub fn last_will(&self) -> Option<impl Iterator<Item = CanFrame> + '_> {
         // Already before the first motor is ordered to turn on.
-        let is_on = self.state == BusState::Arming || self.motors.iter().any(|motor| motor.may_be_on);
-        let axes = self.motors.iter().zip(&self.commands);
-        is_on.then(|| axes.map(|(motor, command)| motor.last_will(*command)))
+        let is_on = self.state == BusState::Arming || self.motors.iter().any(Motor::may_be_on);
+        is_on.then(|| self.motors.iter().map(Motor::last_will))
     }
 
     /// To be called before feeding frames that waited while nothing ran; [`Self::step`] does so itself.

@@ -12,367 +12,537 @@
 //!
 //! Invariant: a new command is sent only in `Enabling` and `On`; in `Kept` the last one is repeated.
 //! Invariant: a motor found enabled without an arm is disabled.
-//! Invariant: a number of the motor itself is in its frames alone; all others are of its joint (see `frames`).
+//! Invariant: a number of the motor itself is in its frames alone; all others are of its joint (see [`Joint`]).
+//!
+//! Made of what is asked of it ([`Probe`]), what it reports ([`Report`], [`Status`]) and how that is judged
+//! ([`Supervision`]), its [`Brake`], what it is commanded ([`Axis`]), and what is left of a motor that was stopped
+//! ([`Kept`]); each owns its state, and the phase decides what goes to which.
 
+mod axis;
 mod brake;
-mod frames;
-mod judged;
-mod last_will;
-mod parameters;
-mod stopping;
+mod joint;
+mod kept;
+mod probe;
+mod report;
+mod status;
+mod supervision;
 
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
-use rapid_registry::{MotorMode, MotorSpec, Stop};
+use rapid_registry::{MotorMode, MotorSpec, Stop, StopSpec};
 
-use super::fault::{Fault, Part};
+use super::fault::Fault;
 use super::notice::Notice;
 use super::notices::Notices;
-use super::watch::{Supervision, is_near};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
-use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
-use crate::control::limits::{Limits, stiffness, within_torque};
-use crate::control::ramp::Ramp;
+use crate::control::damiao::parameter::{self, Reply};
+use axis::Axis;
+pub use axis::RETURN_SPEED;
 use brake::Brake;
 pub(super) use brake::BrakeIs;
-use frames::within;
-use parameters::PROBE;
-
-/// Ids of commands, relative to the motor's own.
-const COMMANDS: [u32; 4] = [0, 0x100, 0x200, 0x300];
-/// A motor counts as warm from this many °C below its limit...
-const WARM: f64 = 10.0;
-/// ...until it has cooled by this much.
-const COOLER: f64 = 5.0;
+use joint::Joint;
+use kept::Kept;
+use probe::Probe;
+use report::Report;
+pub use report::SAMPLE_VALUES;
+use status::Status;
+use supervision::{Supervision, beyond, hot, is_near, unfit};
 
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Phase {
+enum Phase {
     /// To be disabled; `reported` is set once a frame was sent.
     Off {
         reported: bool,
     },
-    /// Asked for `PROBE[at]`, or ordered to change it from its old value.
-    Asked {
-        at: usize,
-        setting: Option<Value>,
-    },
+    Asked,
     Probed,
     Clearing,
     Enabling,
     On,
     /// Stopped by a fault of the bus, and still enabled.
-    Kept(Stop),
-}
-
-/// The limits of a motor's axis.
-pub(super) fn limits(spec: &MotorSpec) -> Limits {
-    match spec.mode {
-        MotorMode::Velocity => Limits::new(-spec.velocity, spec.velocity, spec.slew),
-        MotorMode::Mit { .. } | MotorMode::PositionVelocity => {
-            let [low, high] = spec.position;
-            Limits::new(low, high, spec.slew.min(spec.velocity))
-        }
-    }
-}
-
-/// How the command of a motor's axis starts and changes.
-pub(super) const fn ramp(spec: &MotorSpec) -> Ramp {
-    Ramp::new(spec.motion.acceleration, spec.motion.soft_start)
+    Kept(Kept),
 }
 
 /// See the module's comment.
 #[derive(Debug)]
-#[expect(clippy::struct_excessive_bools, reason = "each is a fact of its own about the motor")]
 pub(super) struct Motor {
-    pub(super) spec: MotorSpec,
-    pub(super) phase: Phase,
-    /// The ranges it encodes; `None` until they were read.
-    pub(super) ranges: Option<Ranges>,
-    /// Its newest feedback, of its joint, once its ranges are known.
-    pub(super) feedback: Option<Feedback>,
-    /// When the feedback arrived.
-    pub(super) seen: Stamp,
-    /// The feedback is newer than the last sample.
-    pub(super) is_new: bool,
-    /// Its status since it was last ordered to turn off.
-    pub(super) status: Option<MotorStatus>,
-    /// Time of the first frame sent since its last answer.
-    asked: Option<Stamp>,
-    /// Consecutive frames that report it as not enabled although it was.
-    off_frames: u8,
-    /// Its newest two positions are consistent.
-    agrees: bool,
-    index: usize,
-    timeout: u32,
-    read: [f64; 3],
-    warm: [bool; 2],
-    watch: Supervision,
+    joint: Joint,
+    phase: Phase,
+    probe: Probe,
+    report: Report,
+    status: Status,
+    supervision: Supervision,
     brake: Brake,
-    /// When the next parameter is read again, and which.
-    look: Option<Stamp>,
-    looks: usize,
-    differs: bool,
-    /// Its latched fault, once reported: the next arm clears it.
-    pub(super) named: Option<MotorStatus>,
-    /// Its silence was reported.
-    pub(super) missed: bool,
-    /// It was ordered or reported to be on, and has not reported off since the last disable.
-    pub(super) may_be_on: bool,
+    axis: Axis,
 }
 
 impl Motor {
-    pub(super) fn new(index: usize, spec: &MotorSpec, timeout: Duration) -> Self {
-        let units = timeout.as_micros().div_ceil(u128::from(TIMEOUT_UNIT_US)).max(1);
+    /// A motor in an unknown state, by its position in the entry.
+    pub(super) fn new(index: usize, spec: &MotorSpec, timeout: Duration, silent_after: Duration) -> Self {
         Self {
-            spec: spec.clone(),
+            joint: Joint { index, spec: spec.clone() },
             phase: Phase::Off { reported: false },
-            ranges: None,
-            feedback: None,
-            seen: Stamp(0),
-            is_new: false,
-            status: None,
-            asked: None,
-            off_frames: 0,
-            agrees: false,
-            index,
-            timeout: u32::try_from(units).unwrap_or(u32::MAX),
-            read: [0.0; 3],
-            warm: [false; 2],
-            watch: Supervision::default(),
-            brake: Brake::default(),
-            look: None,
-            looks: 0,
-            differs: false,
-            named: None,
-            missed: false,
-            may_be_on: false,
+            probe: Probe::new(timeout),
+            report: Report::new(silent_after),
+            status: Status::default(),
+            supervision: Supervision::default(),
+            brake: Brake::new(spec.brake.clone()),
+            axis: Axis::new(spec),
         }
+    }
+
+    /// Its name.
+    pub(super) fn name(&self) -> &str {
+        &self.joint.spec.name
     }
 
     /// Is this frame one of its answers?
     pub(super) fn sent(&self, frame: &CanFrame, reply: Option<&Reply>) -> bool {
-        let id = u16::from(frame.data[0] & 0xf);
-        let slave_fits = reply.map_or(self.spec.slave & 0xf == id, |reply| reply.slave == self.spec.slave);
-        frame.id == u32::from(self.spec.master) && slave_fits
+        self.joint.sent(frame, reply)
     }
 
-    /// Does another program command it, or set one of its parameters, by this frame? Our own frames are not received.
+    /// Does another program command it, or set one of its parameters, by this frame?
     pub(super) fn is_commanded_by(&self, frame: &CanFrame) -> bool {
-        let slave = u32::from(self.spec.slave);
-        let writes = parameter::is_write(frame) == Some(self.spec.slave);
-        writes || frame.id.checked_sub(slave).is_some_and(|offset| COMMANDS.contains(&offset))
+        self.joint.is_commanded_by(frame)
     }
 
-    /// Turns it off, from the next frame on.
-    pub(super) fn turn_off(&mut self) {
-        self.watch.reset();
-        self.dismiss_brake();
-        self.phase = Phase::Off { reported: false };
+    /// What is commanded, rad or rad/s.
+    pub(super) const fn command(&self) -> f64 {
+        self.axis.command()
     }
 
-    /// It was stopped by a fault and is still enabled.
-    pub(super) const fn is_kept(&self) -> bool {
-        matches!(self.phase, Phase::Kept(_))
+    /// What is aimed at, rad or rad/s.
+    pub(super) const fn target(&self) -> f64 {
+        self.axis.target()
     }
 
-    /// Marks it as ordered to turn off for the last time.
-    pub(super) const fn stop(&mut self) {
-        if !matches!(self.phase, Phase::Off { reported: true }) {
-            self.phase = Phase::Off { reported: true };
-            self.status = None;
-        }
+    /// Targets that were beyond its limits.
+    pub(super) const fn clamped(&self) -> u64 {
+        self.axis.clamped()
+    }
+
+    /// Where its joint is, rad, once that is known.
+    pub(super) fn position(&self) -> Option<f64> {
+        self.report.feedback().map(|feedback| feedback.q)
+    }
+
+    /// When its newest feedback arrived, if it is in no sample yet.
+    pub(super) fn unsampled(&self) -> Option<Stamp> {
+        self.report.unsampled()
+    }
+
+    /// Its part of a sample.
+    pub(super) fn sample(&mut self) -> Option<[f64; SAMPLE_VALUES]> {
+        self.report.sample()
+    }
+
+    /// Has it left our frames unanswered for too long?
+    pub(super) fn is_silent(&self, now: Stamp) -> bool {
+        self.report.is_silent(now)
+    }
+
+    /// It was ordered or reported to be on, and has not reported off since the last disable.
+    pub(super) const fn may_be_on(&self) -> bool {
+        self.status.may_be_on()
     }
 
     /// It was ordered to turn off, and has since reported that it is not enabled.
     pub(super) fn is_off(&self) -> bool {
         match self.phase {
-            Phase::Off { reported } => reported && self.status.is_some_and(|status| status != MotorStatus::Enabled),
-            Phase::Asked { .. } | Phase::Probed => true,
+            Phase::Off { reported } => reported && self.status.is_off(),
+            Phase::Asked | Phase::Probed => true,
             Phase::Clearing | Phase::Enabling | Phase::On | Phase::Kept(_) => false,
         }
     }
 
-    /// How long it has left our frames unanswered.
-    pub(super) fn unanswered(&self, now: Stamp) -> Duration {
-        self.asked.map_or(Duration::ZERO, |asked| now.since(asked))
+    /// It is on, or ordered to turn on.
+    pub(super) const fn is_ordered_on(&self) -> bool {
+        matches!(self.phase, Phase::Enabling | Phase::On)
     }
 
-    /// Takes its feedback.
-    pub(super) fn take_feedback(&mut self, frame: &CanFrame, now: Stamp, notices: &mut Notices) -> Result<(), Fault> {
+    /// It is on, and its brake lets it turn.
+    pub(super) fn is_ready(&self, now: Stamp) -> bool {
+        self.phase == Phase::On && self.brake.is_free(now)
+    }
+
+    /// How it was stopped, if it was stopped by a fault and is still enabled.
+    pub(super) const fn kept(&self) -> Option<Stop> {
+        if let Phase::Kept(kept) = &self.phase { Some(kept.stop()) } else { None }
+    }
+
+    /// It is kept until its brake holds the joint.
+    pub(super) const fn waits_for_brake(&self) -> bool {
+        matches!(&self.phase, Phase::Kept(kept) if kept.waits_for_brake())
+    }
+
+    /// Is its brake to be released? Not before it holds the joint itself, and no longer.
+    pub(super) const fn releases(&self) -> bool {
+        match &self.phase {
+            Phase::On => true,
+            Phase::Kept(kept) => kept.releases(),
+            _ => false,
+        }
+    }
+
+    /// It has a brake, which can be neither engaged nor released.
+    pub(super) const fn has_broken_brake(&self) -> bool {
+        self.brake.is_broken()
+    }
+
+    /// Takes what its brake is.
+    pub(super) fn take_brake(&mut self, is: BrakeIs, now: Stamp, notices: &mut Notices) {
+        // A brake that is to be released may already be moving: it counts as engaged only once engagement is wanted.
+        let is = if is == BrakeIs::Engaged && self.releases() { BrakeIs::Moving } else { is };
+        self.brake.take(is, now);
+        if let Phase::Kept(kept) = &mut self.phase
+            && kept.misses(&self.brake)
+        {
+            notices.notify(Notice::NotBraked { motor: self.joint.index });
+        }
+    }
+
+    /// Takes a frame of it, which is a reply or a feedback.
+    ///
+    /// # Errors
+    /// What it reports is a fault, whatever the bus does.
+    pub(super) fn take(
+        &mut self,
+        frame: &CanFrame,
+        reply: Option<&Reply>,
+        now: Stamp,
+        notices: &mut Notices,
+    ) -> Result<(), Fault> {
+        match reply {
+            Some(reply) => self.take_reply(reply, notices),
+            None => self.take_feedback(frame, now, notices),
+        }
+    }
+
+    fn take_reply(&mut self, reply: &Reply, notices: &mut Notices) -> Result<(), Fault> {
+        self.report.answer();
+        match self.phase {
+            Phase::On | Phase::Kept(_) => self.probe.compare(&self.joint, reply),
+            Phase::Asked => {
+                let before = self.probe.ranges().copied();
+                if self.probe.take(&self.joint, reply, notices)? {
+                    self.phase = Phase::Probed;
+                    if self.probe.ranges() != before.as_ref() {
+                        self.report.forget();
+                    }
+                }
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn take_feedback(&mut self, frame: &CanFrame, now: Stamp, notices: &mut Notices) -> Result<(), Fault> {
+        let (joint, ranges) = (&self.joint, self.probe.ranges());
         // Before its ranges are known, only its reported state counts.
-        let Some(feedback) = self.ranges.or(Ranges::new(1.0, 1.0, 1.0)).and_then(|r| self.read_feedback(frame, &r))
+        let Some(feedback) =
+            ranges.copied().or(Ranges::new(1.0, 1.0, 1.0)).and_then(|ranges| joint.feedback(frame, &ranges))
         else {
             return Ok(());
         };
-        self.asked = None;
-        let mut is_possible = true;
-        if let Some(ranges) = self.ranges {
-            is_possible = self.is_possible(&feedback, &ranges, now, notices)?;
-        }
-        // Nothing in a damaged frame is trusted.
-        if !is_possible {
-            return Ok(());
-        }
-        self.count_as_off(feedback.status);
-        self.status = Some(feedback.status);
-        self.named = self.named.filter(|named| *named == feedback.status);
-        self.may_be_on = feedback.status == MotorStatus::Enabled || self.may_be_on && !self.is_off();
-        if let Some(ranges) = self.ranges {
-            self.agrees = self
-                .feedback
-                .is_some_and(|before| is_near(&before, &feedback, (&self.spec, &ranges), now.since(self.seen)));
-            self.feedback = Some(feedback);
-            self.seen = now;
-            self.is_new = true;
-        }
-        for (at, (part, celsius, limit)) in self.temperatures(&feedback).into_iter().enumerate() {
-            let Some(warm) = self.warm.get_mut(at) else { continue };
-            if celsius >= limit - WARM && !*warm {
-                *warm = true;
-                notices.notify(Notice::Warm { motor: self.index, part, celsius, limit });
-            } else if celsius < limit - WARM - COOLER {
-                *warm = false;
+        self.report.answer();
+        // One that is off may be turned by hand, and its zero set; one that is damped sinks without regard to where it is.
+        let is_steady = match &self.phase {
+            Phase::Enabling | Phase::On => true,
+            Phase::Kept(kept) => kept.stop() != Stop::Damp,
+            _ => false,
+        };
+        if let Some(ranges) = ranges {
+            let before = self.report.feedback().filter(|_| is_steady);
+            // Nothing in a damaged frame is trusted.
+            if !self.supervision.receive(before, &feedback, (joint, ranges), now, notices)? {
+                return Ok(());
             }
+            let is_near = |before: &Feedback, passed| is_near(before, &feedback, (&joint.spec, ranges), passed);
+            self.report.take(feedback, now, is_near);
         }
+        let is_on = matches!(self.phase, Phase::On | Phase::Kept(_));
+        let is_ordered_off = matches!(self.phase, Phase::Off { reported: true } | Phase::Asked | Phase::Probed);
+        self.status.take(feedback.status, is_on, is_ordered_off);
+        self.supervision.feel(joint, &feedback, notices);
         Ok(())
     }
 
-    fn temperatures(&self, feedback: &Feedback) -> [(Part, f64, f64); 2] {
-        [
-            (Part::Mos, f64::from(feedback.mos), self.spec.max_mos),
-            (Part::Rotor, f64::from(feedback.rotor), self.spec.max_rotor),
-        ]
+    /// What is wrong with a motor that should be enabled, or disabled, according to its reported state.
+    pub(super) fn status_fault(&self) -> Option<Fault> {
+        let is_kept = self.kept().is_some();
+        self.status.fault(self.joint.index, is_kept || self.phase == Phase::On, is_kept)
+    }
+
+    /// Is it hotter than it may be?
+    pub(super) fn heat_fault(&self) -> Option<Fault> {
+        hot(&self.joint, self.report.feedback()?)
+    }
+
+    /// Reports its latched fault, once, unless it is the one that is `reported` already; the next arm clears it.
+    pub(super) fn name_latched(&mut self, reported: Option<Fault>, notices: &mut Notices) {
+        let motor = self.joint.index;
+        if let Some(status) = self.status.name()
+            && reported != Some(Fault::Latched { motor, status })
+        {
+            notices.notify(Notice::Latched { motor, status });
+        }
+    }
+
+    /// Asks for its parameters if it is off.
+    pub(super) fn ask(&mut self) {
+        if matches!(self.phase, Phase::Off { .. }) && self.is_off() {
+            self.probe.start();
+            self.phase = Phase::Asked;
+        }
+    }
+
+    /// Has it reported its parameters since it was off?
+    pub(super) const fn has_told(&self) -> bool {
+        !matches!(self.phase, Phase::Off { .. } | Phase::Asked)
+    }
+
+    /// As [`Self::ask`], if its ranges are still unknown: it had no power, or an arm interrupted it.
+    pub(super) fn ask_late(&mut self, now: Stamp) {
+        match self.phase {
+            // It may receive although its own frames do not arrive.
+            Phase::Asked | Phase::Probed if self.is_silent(now) => self.turn_off(),
+            Phase::Off { .. } if self.probe.ranges().is_none() && !self.is_silent(now) => self.ask(),
+            _ => {}
+        }
+    }
+
+    /// It has not reported its parameters; `true` once.
+    pub(super) fn misses_probe(&mut self) -> bool {
+        self.phase != Phase::Probed && self.probe.misses()
     }
 
     /// Enables it once its parameters are read; faults are cleared first. Until then its command is its position.
     ///
     /// # Errors
     /// It must not be armed at its position, or has latched a fault that was not reported yet.
-    pub(super) fn enable(
-        &mut self,
-        command: &mut f64,
-        limits: &mut Limits,
-        (passed, is_returning): (Duration, bool),
-        notices: &mut Notices,
-    ) -> Result<(), Fault> {
-        let (Some(ranges), Some(feedback), Some(status)) = (self.ranges, self.feedback, self.status) else {
+    pub(super) fn enable(&mut self, passed: Duration, is_returning: bool, notices: &mut Notices) -> Result<(), Fault> {
+        let (joint, motor) = (&self.joint, self.joint.index);
+        let (Some(ranges), Some(feedback), Some(status)) =
+            (self.probe.ranges(), self.report.feedback(), self.status.newest())
+        else {
             return Ok(());
         };
         if self.phase == Phase::Probed {
             // One of the two frames may be damaged: the position of the joint is unknown.
-            if !self.agrees {
+            if !self.report.agrees() {
                 return Ok(());
             }
-            if let Some(fault) = self.unfit(is_returning) {
+            if let Some(fault) = unfit(joint, feedback, is_returning) {
                 return Err(fault);
             }
-            if status.is_fault() && self.named != Some(status) {
-                return Err(Fault::Latched { motor: self.index, status });
+            if status.is_fault() {
+                if !self.status.is_named(status) {
+                    return Err(Fault::Latched { motor, status });
+                }
+                notices.notify(Notice::Cleared { motor, status });
             }
             self.phase = Phase::Clearing;
-            if status.is_fault() {
-                notices.notify(Notice::Cleared { motor: self.index, status });
-            }
-            if self.spec.mode != MotorMode::Velocity {
-                let [low, high] = within(&self.spec, ranges.position());
-                limits.set_range(low, high);
-            }
+            self.axis.narrow(joint, ranges);
         }
         if self.phase == Phase::Clearing && status == MotorStatus::Disabled {
             self.phase = Phase::Enabling;
         }
         if self.phase == Phase::Enabling {
-            *command = if self.spec.mode == MotorMode::Velocity { 0.0 } else { feedback.q };
+            self.axis.start_at(joint, feedback.q);
             if status == MotorStatus::Enabled {
                 self.phase = Phase::On;
             }
         } else if self.phase == Phase::On {
-            // It waits for the others, and a person may push it meanwhile.
-            *command = limits.slew(*command, self.bound(*command, limits), passed);
+            self.axis.stay(joint, (feedback.q, ranges), passed);
         }
         Ok(())
     }
 
-    /// The command nearest to `command` that the position of the joint allows.
-    pub(super) fn bound(&self, command: f64, limits: &Limits) -> f64 {
-        let (Some(Feedback { q, .. }), Some(ranges)) = (self.feedback, &self.ranges) else { return command };
-        match self.spec.mode {
-            MotorMode::Mit { kp, .. } => within_torque(command, q, self.spec.torque, kp),
-            MotorMode::PositionVelocity => command,
-            MotorMode::Velocity => limits.brake(command, q, within(&self.spec, ranges.position())),
+    /// Why it is not enabled by now, if it is not.
+    pub(super) fn arm_fault(&self) -> Option<Fault> {
+        let motor = self.joint.index;
+        match (self.phase, self.status.newest()) {
+            (Phase::On, _) if self.brake.may_hold() => Some(Fault::NotReleased { motor }),
+            (Phase::Probed, _) if !self.report.agrees() => Some(Fault::NotEnabled { motor }),
+            // Who is probed waits for the others, which come to their own.
+            (Phase::On | Phase::Probed, _) => None,
+            (Phase::Off { .. }, Some(MotorStatus::Enabled)) | (Phase::Kept(_), _) => Some(Fault::NotDisabled { motor }),
+            (Phase::Off { .. }, _) => Some(Fault::Silent { motor }),
+            (Phase::Asked, _) => Some(Fault::Unread { motor, parameter: self.probe.asked_for() }),
+            (Phase::Clearing, Some(status)) if status != MotorStatus::Disabled => {
+                Some(Fault::Latched { motor, status })
+            }
+            (Phase::Clearing | Phase::Enabling, _) => Some(Fault::NotEnabled { motor }),
         }
     }
 
-    /// Sends the frames of this cycle. `command` is the current position or velocity command.
-    pub(super) fn step(&mut self, command: f64, now: Stamp, is_silent: bool, send: &mut impl FnMut(CanFrame)) {
-        let slave = self.spec.slave;
-        if matches!(self.phase, Phase::Asked { .. } | Phase::Probed) && self.status == Some(MotorStatus::Enabled) {
+    /// All motors are enabled: it starts softly from here.
+    pub(super) const fn restart(&mut self) {
+        self.axis.restart();
+    }
+
+    /// Aims at a target, as far as its limits allow.
+    pub(super) fn aim(&mut self, target: f64, now: Stamp, notices: &mut Notices) {
+        self.axis.aim(self.joint.index, target, now, notices);
+    }
+
+    /// Aims at its last command, or where it can stop.
+    pub(super) fn hold(&mut self) {
+        self.axis.hold(&self.joint);
+    }
+
+    /// Is it too far from an action for that to be the first after an arm?
+    pub(super) fn is_far(&self, target: f64) -> bool {
+        self.position().is_some_and(|q| self.axis.is_far(&self.joint, q, target))
+    }
+
+    /// A cycle of its command, towards `target` or back into its limits; see [`Axis::follow`]. A joint whose position is
+    /// unknown is not moved. Returns what is wrong with what it does, once that is a fault.
+    pub(super) fn follow(
+        &mut self,
+        target: Option<f64>,
+        (now, passed): (Stamp, Duration),
+        is_led: bool,
+        notices: &mut Notices,
+    ) -> Option<Fault> {
+        let (joint, feedback) = (&self.joint, self.report.feedback()?);
+        let commanded = self.axis.follow(joint, (feedback.q, self.probe.ranges()?), target, passed, is_led);
+        self.supervision.look(joint, feedback, commanded, now, notices)
+    }
+
+    /// Has it returned into its limits?
+    pub(super) fn is_back(&self) -> bool {
+        let is_within = |feedback| beyond(&self.joint.spec, feedback).is_none();
+        self.axis.is_back(&self.joint) && self.report.feedback().is_some_and(is_within)
+    }
+
+    /// Turns it off, from the next frame on.
+    pub(super) fn turn_off(&mut self) {
+        self.supervision.reset();
+        self.phase = Phase::Off { reported: false };
+    }
+
+    /// Turns it off for the last time, by this frame, which may be taken again.
+    pub(super) fn stop(&mut self) -> CanFrame {
+        if self.phase != (Phase::Off { reported: true }) {
+            self.phase = Phase::Off { reported: true };
+            self.status.order_off();
+        }
+        self.state_frame(StateCommand::Disable)
+    }
+
+    /// Stops it at a fault; `is_own`: its own. One that is not on is turned off; one that is kept already stays so, but for
+    /// a fault of its own, with which nothing is known of it any more.
+    pub(super) fn stop_at_fault(&mut self, is_own: bool) {
+        let StopSpec { own_fault, other_fault, .. } = self.joint.spec.stop;
+        match (self.phase, is_own) {
+            (Phase::Kept(_), true) => self.turn_off(),
+            (Phase::Kept(_), false) => {}
+            (_, true) => self.stop_as(own_fault),
+            (_, false) => self.stop_as(other_fault),
+        }
+    }
+
+    /// Stops it at an emergency stop. What a fault has left on may hold no more than before.
+    pub(super) fn stop_at_emergency(&mut self) {
+        let stop = self.joint.spec.stop.emergency;
+        let Phase::Kept(kept) = &mut self.phase else { return self.stop_as(stop) };
+        if !kept.stop_at_emergency(stop, &self.brake) {
             self.turn_off();
         }
-        match self.phase {
-            Phase::Off { .. } if self.is_off() && !is_silent => send(parameter::refresh(slave)),
+    }
+
+    fn stop_as(&mut self, stop: Stop) {
+        let has_damping = matches!(self.joint.spec.mode, MotorMode::Mit { .. });
+        let stop = if stop == Stop::Damp && !has_damping { Stop::Hold } else { stop };
+        // One that has turned itself off, or reports a fault, follows no command.
+        match Kept::new(stop).filter(|_| self.phase == Phase::On && self.status.may_follow()) {
+            Some(kept) => {
+                self.supervision.reset();
+                self.phase = Phase::Kept(kept);
+            }
+            None => self.turn_off(),
+        }
+    }
+
+    /// Turns it off if it was kept for long enough, `waited` after the stop, or does not answer.
+    pub(super) fn let_go(&mut self, waited: Duration, now: Stamp) {
+        let hold_for = self.joint.spec.stop.hold_for;
+        if let Phase::Kept(kept) = &mut self.phase
+            && (kept.is_over(hold_for, &self.brake, (waited, now)) || self.report.is_silent(now))
+        {
+            self.turn_off();
+        }
+    }
+
+    /// A cycle: its frames, in the order in which they are to be sent.
+    pub(super) fn step(&mut self, now: Stamp) -> impl Iterator<Item = CanFrame> + use<> {
+        if matches!(self.phase, Phase::Asked | Phase::Probed) && self.status.is_enabled() {
+            self.turn_off();
+        }
+        let refresh = parameter::refresh(self.joint.spec.slave);
+        let frames = match self.phase {
+            Phase::Off { .. } if self.is_off() && !self.is_silent(now) => [Some(refresh), None],
             Phase::Off { reported } => {
-                send(StateCommand::Disable.frame(slave));
                 if !reported {
-                    // An earlier report does not answer this.
-                    self.status = None;
+                    self.status.order_off();
                 }
                 self.phase = Phase::Off { reported: true };
+                [Some(self.state_frame(StateCommand::Disable)), None]
             }
-            Phase::Asked { at, setting } => {
-                let parameter = PROBE.get(at).copied().unwrap_or(Parameter::ControlMode);
-                send(match self.wanted(parameter).filter(|_| setting.is_some()) {
-                    Some(value) => parameter::write(slave, parameter, value),
-                    None => parameter::read(slave, parameter),
-                });
-                send(parameter::refresh(slave));
-            }
-            Phase::Probed => send(parameter::refresh(slave)),
-            Phase::Clearing => {
-                send(StateCommand::ClearError.frame(slave));
-                send(parameter::refresh(slave));
-            }
+            Phase::Asked => [Some(self.probe.question(&self.joint)), Some(refresh)],
+            Phase::Probed => [Some(refresh), None],
+            Phase::Clearing => [Some(self.state_frame(StateCommand::ClearError)), Some(refresh)],
             Phase::Enabling => {
-                send(StateCommand::Enable.frame(slave));
-                self.may_be_on = true;
-                self.command(command, send);
+                self.status.order_on();
+                [Some(self.state_frame(StateCommand::Enable)), self.frame_to(self.axis.command())]
             }
-            Phase::On => {
-                self.command(command, send);
-                self.look_again(now, send);
-            }
-            Phase::Kept(stop) => self.keep(stop, command, send),
-        }
-        self.asked.get_or_insert(now);
+            Phase::On => [self.frame_to(self.axis.command()), self.probe.look_again(&self.joint, now)],
+            Phase::Kept(kept) => [self.stop_frame(kept.stop()), None],
+        };
+        self.report.ask(now);
+        frames.into_iter().flatten()
     }
 
-    /// Holds or damps it.
-    fn keep(&self, stop: Stop, command: f64, send: &mut impl FnMut(CanFrame)) {
-        let (MotorMode::Mit { kd, .. }, Stop::Damp) = (self.spec.mode, stop) else {
-            return self.command(command, send);
-        };
-        let (Some(ranges), Some(Feedback { q, .. })) = (&self.ranges, self.feedback) else { return };
-        if let Ok(frame) = self.mit_frame(q, [0.0, kd], ranges) {
-            send(frame);
+    /// The frame that keeps the motor from falling, or from falling fast, while no program reads what it reports; one that
+    /// disables it where it is to be limp.
+    ///
+    /// A joint in MIT mode that is to hold is damped: with nothing to lower the stiffness, a joint that is pushed away
+    /// would push back with more than its torque limit.
+    pub(super) fn last_will(&self) -> CanFrame {
+        let kept = if self.last_stop() == Stop::Limp { None } else { self.stop_frame(Stop::Damp) };
+        kept.unwrap_or_else(|| self.state_frame(StateCommand::Disable))
+    }
+
+    /// How it stops when this program can command it no more.
+    pub(super) const fn last_stop(&self) -> Stop {
+        match &self.phase {
+            Phase::On => self.joint.spec.stop.other_fault,
+            Phase::Kept(kept) => kept.stop(),
+            _ => Stop::Limp,
         }
     }
 
-    fn command(&self, command: f64, send: &mut impl FnMut(CanFrame)) {
-        let Some(ranges) = &self.ranges else { return };
-        let frame = match self.spec.mode {
-            MotorMode::Mit { kp, kd } => {
-                let error = self.feedback.map_or(0.0, |feedback| command - feedback.q);
-                self.mit_frame(command, [stiffness(kp, error, self.spec.torque), kd], ranges)
+    const fn state_frame(&self, command: StateCommand) -> CanFrame {
+        command.frame(self.joint.spec.slave)
+    }
+
+    /// Commands are finite: targets are, and so are the values of a motor.
+    fn frame_to(&self, command: f64) -> Option<CanFrame> {
+        self.joint.command(command, self.report.feedback()?.q, self.probe.ranges()?)
+    }
+
+    /// What damps it, or keeps it where it is: at rest if its command is a velocity.
+    fn stop_frame(&self, stop: Stop) -> Option<CanFrame> {
+        match self.joint.spec.mode {
+            MotorMode::Mit { .. } if stop == Stop::Damp => {
+                self.joint.damping(self.report.feedback()?.q, self.probe.ranges()?)
             }
-            MotorMode::PositionVelocity => self.position_frame(command),
-            MotorMode::Velocity => self.velocity_frame(command),
-        };
-        // Commands are finite: targets are, and so are the values of a motor.
-        if let Ok(frame) = frame {
-            send(frame);
+            MotorMode::Velocity => self.frame_to(0.0),
+            _ => self.frame_to(self.axis.command()),
         }
     }
 }

@@ -33,7 +33,6 @@ impl MotorBus {
 
     /// The first motor that is too far from an action for it to be the first after an arm.
     pub(super) fn far(&self, target: &[f64]) -> Option<usize> {
-        let mut axes = self.motors.iter().zip(&self.limits).zip(target);
-        axes.position(|((motor, limits), target)| motor.is_far(*target, limits))
+        self.motors.iter().zip(target).position(|(motor, target)| motor.is_far(*target))
     }
 }

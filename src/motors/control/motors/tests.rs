@@ -17,7 +17,7 @@ use std::time::Duration;
 use rapid_registry::MotorMode;
 
 use super::*;
-use crate::control::damiao::codec::MotorStatus;
+use crate::control::damiao::codec::{MotorStatus, StateCommand};
 use crate::control::damiao::parameter::{Parameter, Value};
 use world::{MIT, Sim, World, motor, spec};
 

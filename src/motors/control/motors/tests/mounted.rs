@@ -144,7 +144,7 @@ fn the_last_frames_are_of_the_motor() {
             spec.motors.iter_mut().for_each(|motor| motor.stop.other_fault = Stop::Hold);
             let world = World::following(spec);
             let frame = world.bus.last_will().unwrap().next().unwrap();
-            let held = mounting.zero + sign(mounting) * world.bus.commands()[0];
+            let held = mounting.zero + sign(mounting) * world.command(0);
             match mode {
                 MotorMode::Mit { .. } => {
                     let [a, b, _, d, e, ..] = frame.data;

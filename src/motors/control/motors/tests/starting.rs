@@ -66,14 +66,14 @@ fn the_first_motion_is_soft_and_no_motion_jerks() {
     let mut world = ready(2.0);
     world.arm();
     world.run_until(BusState::Holding);
-    let (mut before, mut speed, mut fastest) = (world.bus.commands()[0], 0.0_f64, Vec::new());
+    let (mut before, mut speed, mut fastest) = (world.command(0), 0.0_f64, Vec::new());
     for cycle in 0..600 {
         if cycle % 20 == 0 {
             // It turns round every second.
             world.target(&[if cycle / 200 % 2 == 0 { 0.7 } else { -0.2 }]);
         }
         world.cycle();
-        let command = world.bus.commands()[0];
+        let command = world.command(0);
         let now = (command - before) / CYCLE.as_secs_f64();
         assert!((now - speed).abs() <= 40.0 * CYCLE.as_secs_f64() + 1e-6, "from {speed} to {now} rad/s in a cycle");
         (before, speed) = (command, now);
@@ -95,16 +95,16 @@ fn a_pause_of_the_actions_stops_the_joint_softly() {
     }
     world.target(&[-2.0]);
     world.run(25);
-    let (before, mut speed) = (world.bus.commands()[0], -2.0_f64);
+    let (before, mut speed) = (world.command(0), -2.0_f64);
     world.run_until(BusState::Holding);
     for _ in 0..40 {
-        let last = world.bus.commands()[0];
+        let last = world.command(0);
         world.cycle();
-        let now = (world.bus.commands()[0] - last) / CYCLE.as_secs_f64();
+        let now = (world.command(0) - last) / CYCLE.as_secs_f64();
         assert!((now - speed).abs() <= 40.0 * CYCLE.as_secs_f64() + 0.1, "from {speed} to {now} rad/s");
         speed = now;
     }
-    assert!(speed.abs() < 1e-9 && world.bus.commands()[0] < before);
+    assert!(speed.abs() < 1e-9 && world.command(0) < before);
 }
 
 #[test]
@@ -151,12 +151,12 @@ fn leaning_on_a_joint_before_the_first_action_does_not_shorten_its_soft_start() 
         world.sims[0].q += push;
         world.run(400);
         let target = world.sims[0].q + 0.4;
-        let (mut before, mut fastest) = (world.bus.commands()[0], 0.0_f64);
+        let (mut before, mut fastest) = (world.command(0), 0.0_f64);
         for _ in 0..10 {
             world.target(&[target]);
             world.run(1);
-            fastest = fastest.max((world.bus.commands()[0] - before).abs() / CYCLE.as_secs_f64());
-            before = world.bus.commands()[0];
+            fastest = fastest.max((world.command(0) - before).abs() / CYCLE.as_secs_f64());
+            before = world.command(0);
         }
         fastest
     };

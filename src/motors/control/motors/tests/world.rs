@@ -357,6 +357,11 @@ impl World {
         self.bus.stop_frames().collect()
     }
 
+    /// What a motor is commanded.
+    pub(super) fn command(&self, motor: usize) -> f64 {
+        self.bus.commands().nth(motor).unwrap()
+    }
+
     pub(super) fn target(&mut self, target: &[f64]) -> bool {
         self.bus.target(target, self.now, self.now)
     }

@@ -1,4 +1,4 @@
-//! Are the reports of a motor possible, and does it follow its command?
+//! Are the reports of a motor possible, is it too hot, and does it follow its command?
 //!
 //! A problem is first a notice and, if it lasts, a fault: a frame may be damaged, a joint may be pushed for a moment.
 //!
@@ -9,10 +9,12 @@ use std::time::Duration;
 use rapid_core::time::Stamp;
 use rapid_registry::{MotorMode, MotorSpec};
 
-use super::fault::Strange;
-use super::notice::Notice;
-use super::notices::Notices;
+use super::axis::Commanded;
+use super::joint::Joint;
 use crate::control::damiao::codec::{Feedback, Ranges};
+use crate::control::motors::fault::{Fault, Part, Strange};
+use crate::control::motors::notice::Notice;
+use crate::control::motors::notices::Notices;
 
 /// Consecutive frames with an impossible position that make a fault: a single one may be damaged.
 const JUMPS: u32 = 3;
@@ -46,6 +48,10 @@ const BLOCKED_WORD: Duration = Duration::from_millis(40);
 const ABSENT: u8 = 2;
 /// A notice is not repeated within this, even if its condition ended and returned.
 const AGAIN: Duration = Duration::from_secs(1);
+/// A motor counts as warm from this many °C below its limit...
+const WARM: f64 = 10.0;
+/// ...until it has cooled by this much.
+const COOLER: f64 = 5.0;
 
 /// How long a condition has held.
 #[derive(Debug, Clone, Copy, Default)]
@@ -95,6 +101,8 @@ pub(super) struct Supervision {
     jumps: u32,
     still: Option<Still>,
     spells: [Spell; 7],
+    /// That its transistors, and its winding, are close to their limits was reported.
+    warm: [bool; 2],
 }
 
 /// Frames that all report a speed in one direction, and one position.
@@ -106,25 +114,14 @@ struct Still {
     speed: f64,
 }
 
-/// The command of a joint in this cycle, rad or rad/s.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Commanded {
-    /// The command.
-    pub(super) command: f64,
-    /// The command without the torque bound.
-    pub(super) wanted: f64,
-    /// The joint is outside its limits and returning.
-    pub(super) is_returning: bool,
-}
-
 impl Supervision {
     /// Forgets everything, when the motor is turned off.
     pub(super) fn reset(&mut self) {
-        *self = Self { received: self.received, ..Self::default() };
+        *self = Self { received: self.received, warm: self.warm, ..Self::default() };
     }
 
-    /// A frame of a motor that is on arrived at `now`, after one with the feedback `before`. Can the motor have reached
-    /// its position?
+    /// A frame arrived at `now`, after one with the feedback `before` if the motor has been on since. Can the motor have
+    /// reached its position?
     ///
     /// # Errors
     /// When it is the last of several impossible positions.
@@ -132,20 +129,39 @@ impl Supervision {
         &mut self,
         before: Option<&Feedback>,
         feedback: &Feedback,
-        (spec, ranges): (&MotorSpec, &Ranges),
+        (joint, ranges): (&Joint, &Ranges),
         now: Stamp,
-    ) -> Result<Option<Strange>, Strange> {
+        notices: &mut Notices,
+    ) -> Result<bool, Fault> {
+        let motor = joint.index;
         let last = self.received.replace(now);
         let step = 2.0 * ranges.position() / f64::from(u16::MAX);
         self.compare_speed(feedback, step, now);
-        let (Some(before), Some(last)) = (before, last) else { return Ok(None) };
-        if is_near(before, feedback, (spec, ranges), now.since(last)) {
+        let (Some(before), Some(last)) = (before, last) else { return Ok(true) };
+        if is_near(before, feedback, (&joint.spec, ranges), now.since(last)) {
             self.jumps = 0;
-            return Ok(None);
+            return Ok(true);
         }
-        let jump = Strange::Jump { from: before.q, to: feedback.q };
+        let what = Strange::Jump { from: before.q, to: feedback.q };
         self.jumps += 1;
-        if self.jumps < JUMPS { Ok(Some(jump)) } else { Err(jump) }
+        match self.jumps {
+            1 => notices.notify(Notice::Strange { motor, what }),
+            JUMPS.. => return Err(Fault::Strange { motor, what }),
+            _ => {}
+        }
+        Ok(false)
+    }
+
+    /// Reports a motor that comes close to a limit of its temperature.
+    pub(super) fn feel(&mut self, joint: &Joint, feedback: &Feedback, notices: &mut Notices) {
+        for (warm, (part, celsius, limit)) in self.warm.iter_mut().zip(temperatures(&joint.spec, feedback)) {
+            if celsius >= limit - WARM && !*warm {
+                *warm = true;
+                notices.notify(Notice::Warm { motor: joint.index, part, celsius, limit });
+            } else if celsius < limit - WARM - COOLER {
+                *warm = false;
+            }
+        }
     }
 
     /// Does the position change according to the speed?
@@ -167,21 +183,17 @@ impl Supervision {
         Some((what, still.newest.since(still.since)))
     }
 
-    /// The first of the impossible positions?
-    pub(super) const fn is_first_jump(&self) -> bool {
-        self.jumps == 1
-    }
-
     /// The problem of a motor that is on, once it has lasted long enough to be a fault.
     pub(super) fn look(
         &mut self,
-        (index, spec): (usize, &MotorSpec),
+        joint: &Joint,
         feedback: &Feedback,
         commanded: Commanded,
         now: Stamp,
         notices: &mut Notices,
-    ) -> Option<Strange> {
-        let mut notify = |what| notices.notify(Notice::Strange { motor: index, what });
+    ) -> Option<Fault> {
+        let (motor, spec) = (joint.index, &joint.spec);
+        let mut notify = |what| notices.notify(Notice::Strange { motor, what });
         let at_once = Duration::ZERO;
         let never = Duration::MAX;
         // Time passes without a frame.
@@ -198,10 +210,29 @@ impl Supervision {
         let looks = self.spells.iter_mut().zip(table);
         let lasting = looks.map(|(spell, (strange, limits))| spell.look(strange, now, limits, &mut notify));
         // Every condition is updated, even after one that lasts.
-        lasting.fold(None, Option::or)
+        lasting.fold(None, Option::or).map(|what| Fault::Strange { motor, what })
     }
 }
 
+/// Is it hotter than it may be?
+pub(super) fn hot(joint: &Joint, feedback: &Feedback) -> Option<Fault> {
+    let motor = joint.index;
+    let hot = |(part, celsius, limit)| (celsius >= limit).then_some(Fault::Hot { motor, part, celsius, limit });
+    temperatures(&joint.spec, feedback).into_iter().find_map(hot)
+}
+
+fn temperatures(spec: &MotorSpec, feedback: &Feedback) -> [(Part, f64, f64); 2] {
+    [(Part::Mos, f64::from(feedback.mos), spec.max_mos), (Part::Rotor, f64::from(feedback.rotor), spec.max_rotor)]
+}
+
+/// Is it too far outside its limits, or too fast, to be armed? One that is to return may be outside.
+pub(super) fn unfit(joint: &Joint, feedback: &Feedback, is_returning: bool) -> Option<Fault> {
+    let spec = &joint.spec;
+    let what = beyond(spec, feedback).filter(|_| !is_returning).or_else(|| fast(spec, feedback))?;
+    Some(Fault::Strange { motor: joint.index, what })
+}
+
+/// Is it outside its limits?
 pub(super) fn beyond(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     let [low, high] = spec.position;
     let outside = (low - feedback.q).max(feedback.q - high);
@@ -225,7 +256,7 @@ fn too_fast(spec: &MotorSpec) -> f64 {
     spec.velocity * (1.0 + SHARE) + SLOW
 }
 
-pub(super) fn fast(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
+fn fast(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     let is_fast = feedback.dq.abs() > too_fast(spec);
     is_fast.then_some(Strange::Fast { velocity: feedback.dq, limit: spec.velocity })
 }
