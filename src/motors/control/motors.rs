@@ -37,71 +37,68 @@
 //! Invariant: a motor that answers eventually appears in samples, whatever happened to the bus before its ranges were
 //! read, unless the ranges are unusable.
 
+mod actions;
 mod brakes;
-mod due;
 mod fault;
-mod last_will;
 mod motor;
 mod notice;
 mod notices;
-mod refusing;
-mod returning;
+mod schedule;
 mod words;
 
 use std::time::Duration;
 
+use actions::Actions;
 pub use brakes::Brakes;
 pub use fault::{Fault, Part, Strange};
-pub use last_will::stalled_after;
 use motor::Motor;
 pub use motor::{RETURN_SPEED, SAMPLE_VALUES};
 pub use notice::{BusState, Notice, Reason, Refusal};
-use notices::{Notices, Seldom};
+use notices::Notices;
+use schedule::Schedule;
+pub use schedule::stalled_after;
 pub use words::Words;
 
 use rapid_core::action::Trip;
 use rapid_core::time::Stamp;
-use rapid_registry::DamiaoSpec;
+use rapid_registry::{DamiaoSpec, Stop};
 
 use super::can::CanFrame;
 use super::damiao::codec;
 use super::damiao::parameter::Reply;
-use super::deadman::Deadman;
-use super::interpolate::Interpolator;
+use super::deadman::Verdict;
 
 /// A motor may leave the frames of this many cycles unanswered, however short the configured time.
 const SILENT_CYCLES: u32 = 3;
-/// A step that is later than this many cycles moves no farther than after this many.
-const LATE_CYCLES: u32 = 2;
+/// An arm that took longer has failed...
+const ARM_WITHIN: Duration = Duration::from_secs(1);
+/// ...and more cycles: reading a parameter takes one, setting it another, and answers may take several.
+const ARM_CYCLES: u32 = 40;
+/// A motor that has not reported its parameters after this is named in a notice.
+const PROBE_WITHIN: Duration = Duration::from_secs(1);
+/// An armed motor must not have been commanded by another program for this long.
+const ONE_MASTER: Duration = Duration::from_secs(1);
+/// Motors that answer must turn off within this.
+const DISABLE_WITHIN: Duration = Duration::from_millis(500);
 
 /// See the module's comment.
 #[derive(Debug)]
 pub struct MotorBus {
     motors: Vec<Motor>,
     names: Vec<String>,
-    /// The newest action, followed or not, and its tick.
-    asked: (Vec<f64>, Stamp),
-    line: Interpolator,
-    deadman: Deadman,
     state: BusState,
     /// When the state began.
     since: Stamp,
+    /// Why the motors are being disabled.
     reason: Reason,
-    cycle: Duration,
-    /// The longest release time of any brake.
-    slowest_brake: Duration,
-    stalled_after: Duration,
-    stepped: Option<Stamp>,
-    armed: Stamp,
-    refusing: Option<Refusal>,
-    /// Refused actions are reported once a second at most.
-    refused: Seldom,
-    /// The motor that another program commanded last, and when.
-    other_master: Option<(usize, Stamp)>,
     /// Joints outside their limits are being driven back into them, or will be once they are armed.
     is_returning: bool,
-    /// The motor whose frames are sent first; it rotates, so that a full queue does not always hit the same motor.
-    first: usize,
+    /// An arm that took longer, the release of brakes included, has failed.
+    arm_within: Duration,
+    schedule: Schedule,
+    actions: Actions,
+    /// The motor that another program commanded last, and when.
+    other_master: Option<(usize, Stamp)>,
     notices: Notices,
     counts: Counts,
 }
@@ -126,29 +123,20 @@ pub struct Counts {
 impl MotorBus {
     /// All motors of an entry, in an unknown state.
     pub fn new(spec: &DamiaoSpec, now: Stamp) -> Self {
-        let cycle = Duration::from_secs(1) / spec.hz.max(1);
-        let axes = spec.motors.len();
+        let cycle = schedule::cycle(spec);
         let silent_after = spec.silent_after.max(cycle * SILENT_CYCLES);
         let motors = spec.motors.iter().enumerate();
         Self {
             motors: motors.map(|(index, motor)| Motor::new(index, motor, spec.timeout, silent_after)).collect(),
             names: spec.motors.iter().map(|motor| motor.name.clone()).collect(),
-            asked: (vec![0.0; axes], Stamp(0)),
-            line: Interpolator::new(axes),
-            deadman: Deadman::new(spec.deadman, spec.disable_after, cycle),
             state: BusState::Probing,
             since: now,
             reason: Reason::Asked,
-            cycle,
-            slowest_brake: brakes::slowest(spec),
-            stalled_after: stalled_after(spec),
-            stepped: None,
-            armed: now,
-            refusing: None,
-            refused: Seldom::default(),
-            other_master: None,
             is_returning: false,
-            first: 0,
+            arm_within: ARM_WITHIN.max(cycle * ARM_CYCLES) + brakes::slowest(spec),
+            schedule: Schedule::new(spec),
+            actions: Actions::new(spec, now),
+            other_master: None,
             notices: Notices::new(),
             counts: Counts::default(),
         }
@@ -162,6 +150,11 @@ impl MotorBus {
     /// Are all motors enabled?
     pub const fn is_armed(&self) -> bool {
         matches!(self.state, BusState::Following | BusState::Holding)
+    }
+
+    /// Are all motors enabled, or being enabled?
+    const fn is_arming(&self) -> bool {
+        self.is_armed() || matches!(self.state, BusState::Arming)
     }
 
     /// Names of the motors, for [`Notice::words`].
@@ -185,20 +178,59 @@ impl MotorBus {
         self.notices.take()
     }
 
+    /// The brakes that must be released after the last step, one bit per motor; all others must be engaged.
+    pub fn releases(&self) -> u16 {
+        self.bits(Motor::releases)
+    }
+
+    /// The brakes that are to engage at once when this program can no longer command: those of joints that stop by
+    /// their brake, and of joints that nothing else keeps from falling.
+    pub fn engages_at_death(&self) -> u16 {
+        self.bits(|motor| matches!(motor.last_stop(), Stop::Limp | Stop::Brake))
+    }
+
+    fn bits(&self, is_set: impl Fn(&Motor) -> bool) -> u16 {
+        let set = self.motors.iter().enumerate().filter(|(_, motor)| is_set(motor));
+        set.fold(0, |bits, (index, _)| bits | 1 << (index % 16))
+    }
+
+    /// A frame per motor that stops it as configured for the fault of another motor, to be sent repeatedly by the
+    /// process that outlives this one (`driver::can::guard`) when this one is killed, stopped or hangs; `None` if no motor is
+    /// on.
+    pub fn last_will(&self) -> Option<impl Iterator<Item = CanFrame> + '_> {
+        // Already before the first motor is ordered to turn on.
+        let is_on = self.state == BusState::Arming || self.motors.iter().any(Motor::may_be_on);
+        is_on.then(|| self.motors.iter().map(Motor::last_will))
+    }
+
+    /// Names of the motors that may be on: ordered or reported to be on, and not reported off since the last disable.
+    pub fn still_on(&self) -> impl Iterator<Item = &str> {
+        self.motors.iter().filter(|motor| motor.may_be_on()).map(Motor::name)
+    }
+
+    /// Fills `out` with [`SAMPLE_VALUES`] values per motor if every motor has answered since the last sample, and
+    /// returns the time of the earliest answer. Also `None` if `out` has another length.
+    pub fn sample(&mut self, out: &mut [f64]) -> Option<Stamp> {
+        if out.len() != self.motors.len() * SAMPLE_VALUES {
+            return None;
+        }
+        let captured = self.motors.iter().map(Motor::unsampled).min()??;
+        for (values, motor) in out.chunks_exact_mut(SAMPLE_VALUES).zip(&mut self.motors) {
+            values.copy_from_slice(&motor.sample()?);
+        }
+        Some(captured)
+    }
+
     /// A frame came from the bus.
     pub fn feed(&mut self, frame: &CanFrame, now: Stamp) {
-        if codec::data_of(frame).is_none() {
+        let reply = Reply::decode(frame);
+        let is_full = codec::data_of(frame).is_some();
+        let sender = self.motors.iter().position(|motor| is_full && motor.sent(frame, reply.as_ref()));
+        let Some(index) = sender else {
+            self.counts.strangers += u64::from(is_full);
             // A command of one or two values may be shorter.
             let is_frame = !(frame.extended || frame.remote || frame.error);
             if let Some(motor) = self.motors.iter().position(|motor| is_frame && motor.is_commanded_by(frame)) {
-                self.received_master(motor, now);
-            }
-            return;
-        }
-        let reply = Reply::decode(frame);
-        let Some(index) = self.motors.iter().position(|motor| motor.sent(frame, reply.as_ref())) else {
-            self.counts.strangers += 1;
-            if let Some(motor) = self.motors.iter().position(|motor| motor.is_commanded_by(frame)) {
                 self.received_master(motor, now);
             }
             return;
@@ -216,36 +248,68 @@ impl MotorBus {
         }
     }
 
+    /// The fault that a motor reports, if any.
+    fn judge(&self, index: usize) -> Option<Fault> {
+        let motor = self.motors.get(index)?;
+        let status = || motor.status_fault();
+        match self.state {
+            BusState::Arming if !motor.is_ordered_on() => motor.heat_fault(),
+            BusState::Disarmed | BusState::Arming | BusState::Following | BusState::Holding => {
+                status().or_else(|| motor.heat_fault())
+            }
+            BusState::Faulted(_) if motor.kept().is_none() => None,
+            // It was stopped for this fault, as configured.
+            BusState::Faulted(Fault::Hot { motor, .. }) if motor == index => status(),
+            // It was stopped, and is still on.
+            BusState::Faulted(_) => status().or_else(|| motor.heat_fault()),
+            BusState::Probing | BusState::Disabling | BusState::Stopped => None,
+        }
+    }
+
+    /// Another program commands a motor: an arm with a second master is a fault.
+    fn received_master(&mut self, motor: usize, now: Stamp) {
+        let is_news = self.other_master.replace((motor, now)).is_none_or(|(_, last)| now.since(last) >= ONE_MASTER);
+        if self.is_arming() {
+            self.fail(Fault::OtherMaster { motor }, now);
+        } else if is_news && self.state != BusState::Stopped {
+            self.notices.notify(Notice::OtherMaster { motor });
+        }
+    }
+
+    /// Takes the states of the brakes; to be called before each step if a motor has one. It is a fault if the brake of
+    /// a joint that is armed, or being armed, cannot be driven.
+    pub fn feed_brakes(&mut self, brakes: Brakes, now: Stamp) {
+        for (index, motor) in self.motors.iter_mut().enumerate() {
+            motor.take_brake(brakes.of(index), now, &mut self.notices);
+        }
+        let broken = self.motors.iter().position(Motor::has_broken_brake).filter(|_| self.is_arming());
+        if let Some(motor) = broken {
+            self.fail(Fault::Brake { motor }, now);
+        }
+    }
+
     /// An action: a number for each motor, and its tick. Returns whether it is followed.
     pub fn target(&mut self, target: &[f64], tick: Stamp, now: Stamp) -> bool {
-        let refusal = self.refuse(target, tick, now);
-        let is_same = self.refusing == refusal;
-        self.refusing = refusal;
+        let is_armed = self.is_armed();
+        let far = || self.far(target).filter(|_| is_armed);
+        let refusal = self.actions.refusal(target, (tick, now), is_armed && self.is_returning, far);
         if let Some(refusal) = refusal {
             self.counts.refused += 1;
-            // Another reason begins a new spell.
-            if self.refused.look(is_same, now) || self.refused.look(true, now) {
+            if self.actions.refuse(refusal, now) {
                 self.notices.notify(Notice::Refused(refusal));
             }
-        } else {
-            self.refused.look(false, now);
+            return false;
         }
-        if refusal.is_none() && tick >= self.asked.1 {
-            self.asked.0.copy_from_slice(target);
-            self.asked.1 = tick;
-        }
-        let is_newer = self.line.tick().is_none_or(|last| tick > last);
-        if refusal.is_some() || !self.is_armed() || tick < self.armed || !is_newer {
+        self.actions.accept(target, tick, now);
+        if !is_armed || !self.actions.is_next(tick) {
             return false;
         }
         for (motor, target) in self.motors.iter_mut().zip(target) {
             motor.aim(*target, now, &mut self.notices);
         }
-        // The line begins at the last step, whose command is in force, so that the next step already moves.
-        let begin = self.stepped.map_or(now, |last| last.max(now.before(self.cycle * LATE_CYCLES)));
         let motors = &self.motors;
-        self.line.head_for(motors.iter().map(Motor::target), tick, motors.iter().map(Motor::command), begin);
-        self.deadman.feed(tick.min(now));
+        let [targets, commands] = [Motor::target, Motor::command].map(|of| motors.iter().map(of));
+        self.actions.follow(targets, tick, commands, (self.schedule.in_force(now), now));
         self.counts.actions += 1;
         if self.state == BusState::Holding {
             self.enter(BusState::Following, now);
@@ -254,26 +318,26 @@ impl MotorBus {
         true
     }
 
+    /// The first motor that is too far from an action for it to be the first after an arm.
+    fn far(&self, target: &[f64]) -> Option<usize> {
+        self.motors.iter().zip(target).position(|(motor, target)| motor.is_far(*target))
+    }
+
     /// Enables all motors, after reading their parameters and clearing their faults. A notice reports
     /// whether that succeeded. Does nothing while they are enabled or being enabled.
     pub fn arm(&mut self, now: Stamp) {
-        if matches!(self.state, BusState::Probing | BusState::Disarmed | BusState::Faulted(_) | BusState::Disabling) {
-            let passed = self.stepped.map_or(Duration::ZERO, |last| now.since(last));
-            if passed >= self.stalled_after {
-                // The order may be that old too.
-                self.fail(Fault::Stalled { after: passed }, now);
-                return;
-            }
-            self.turn_off();
-            self.is_returning = false;
-            self.enter(BusState::Arming, now);
-            self.notices.notify(Notice::Arming);
+        if self.is_arming() || self.state == BusState::Stopped {
+            return;
         }
-    }
-
-    /// Stops all motors at an emergency stop, each as configured, until the next arm.
-    pub fn emergency(&mut self, trip: Trip, now: Stamp) {
-        self.stop_at_emergency(trip, now);
+        if let Some(fault) = self.schedule.stall(now) {
+            // The order may be that old too.
+            self.fail(fault, now);
+            return;
+        }
+        self.turn_off();
+        self.is_returning = false;
+        self.enter(BusState::Arming, now);
+        self.notices.notify(Notice::Arming);
     }
 
     /// As [`Self::arm`], also where joints are outside their limits: those are driven back first, at
@@ -286,8 +350,19 @@ impl MotorBus {
 
     /// Disables all motors.
     pub fn disarm(&mut self, now: Stamp) {
-        if self.is_armed() || self.state == BusState::Arming || self.is_keeping() {
+        if self.is_arming() || self.is_keeping() {
             self.disable(Reason::Asked, now);
+        }
+    }
+
+    /// Stops all motors at an emergency stop, each as configured, until the next arm; also those that a fault has left on.
+    /// Only once per arm; motors that are disabled, or being disabled, stay so.
+    pub fn emergency(&mut self, trip: Trip, now: Stamp) {
+        let is_news = !matches!(self.state, BusState::Faulted(Fault::EmergencyStop(_)));
+        if self.is_arming() || is_news && self.is_keeping() {
+            self.motors.iter_mut().for_each(Motor::stop_at_emergency);
+            self.enter(BusState::Faulted(Fault::EmergencyStop(trip)), now);
+            self.report_stopped(Fault::EmergencyStop(trip));
         }
     }
 
@@ -297,24 +372,14 @@ impl MotorBus {
         self.motors.iter_mut().map(Motor::stop)
     }
 
-    /// Names of the motors that may be on: ordered or reported to be on, and not reported off since the last disable.
-    pub fn still_on(&self) -> impl Iterator<Item = &str> {
-        self.motors.iter().filter(|motor| motor.may_be_on()).map(Motor::name)
-    }
-
-    /// Fills `out` with [`SAMPLE_VALUES`] values per motor if every motor has answered since the last sample, and
-    /// returns the time of the earliest answer. Also `None` if `out` has another length.
-    pub fn sample(&mut self, out: &mut [f64]) -> Option<Stamp> {
-        if out.len() != self.motors.len() * SAMPLE_VALUES
-            || !self.motors.iter().all(|motor| motor.unsampled().is_some())
-        {
-            return None;
+    /// To be called before feeding frames that waited while nothing ran; [`Self::step`] does so itself.
+    ///
+    /// After a pause longer than [`stalled_after`] the motors may have been stopped by their own limit or by the guard,
+    /// and the positions of the joints are unknown. The pause is reported as the fault, not its consequences.
+    pub fn look_for_stall(&mut self, now: Stamp) {
+        if let Some(fault) = self.schedule.stall(now).filter(|_| self.is_arming()) {
+            self.fail(fault, now);
         }
-        let captured = self.motors.iter().filter_map(Motor::unsampled).min()?;
-        for (values, motor) in out.chunks_exact_mut(SAMPLE_VALUES).zip(&mut self.motors) {
-            values.copy_from_slice(&motor.sample()?);
-        }
-        Some(captured)
     }
 
     /// One cycle: decides what is due and passes its frames to `send`, at most two per motor. Feed all received frames
@@ -324,16 +389,201 @@ impl MotorBus {
             return;
         }
         self.look_for_stall(now);
-        let passed = self.stepped.map_or(self.cycle, |last| now.since(last)).min(self.cycle * LATE_CYCLES);
-        self.stepped = Some(now);
+        let passed = self.schedule.begin(now);
         self.listen(now);
         self.advance(now, passed);
-        let count = self.motors.len().max(1);
-        for at in self.first..self.first + count {
-            let Some(motor) = self.motors.get_mut(at % count) else { continue };
-            motor.step(now).for_each(&mut send);
+        for index in self.schedule.turn(self.motors.len()) {
+            if let Some(motor) = self.motors.get_mut(index) {
+                motor.step(now).for_each(&mut send);
+            }
         }
-        self.first = (self.first + 1) % count;
+    }
+
+    /// Handles motors that do not answer.
+    fn listen(&mut self, now: Stamp) {
+        let Some(motor) = self.motors.iter().position(|motor| motor.is_silent(now)) else { return };
+        if !matches!(self.state, BusState::Probing | BusState::Faulted(_)) {
+            self.fail(Fault::Silent { motor }, now);
+        }
+    }
+
+    /// What is due in a cycle, by the state of the bus.
+    fn advance(&mut self, now: Stamp, passed: Duration) {
+        let waited = now.since(self.since);
+        match self.state {
+            BusState::Probing => self.probe(waited, now),
+            BusState::Arming => self.enable(waited, now, passed),
+            BusState::Following | BusState::Holding => match self.actions.verdict(now) {
+                Verdict::Disable => self.disable(Reason::Deadman, now),
+                Verdict::Hold if self.state == BusState::Following => {
+                    self.hold(now);
+                    self.notices.notify(Notice::Holding);
+                    self.follow(now, passed);
+                }
+                Verdict::Hold | Verdict::Follow => self.follow(now, passed),
+            },
+            BusState::Disabling => match self.motors.iter().position(|motor| !motor.is_off()) {
+                None => {
+                    self.enter(BusState::Disarmed, now);
+                    self.notices.notify(Notice::Disabled(self.reason));
+                }
+                Some(motor) if waited >= DISABLE_WITHIN => self.fail(Fault::NotDisabled { motor }, now),
+                Some(_) => {}
+            },
+            BusState::Faulted(fault) => {
+                self.motors.iter_mut().for_each(|motor| motor.let_go(waited, now));
+                // An arm would find the same fault again.
+                if !matches!(fault, Fault::Unusable { .. }) {
+                    self.ask_late(now);
+                }
+            }
+            BusState::Disarmed => self.ask_late(now),
+            BusState::Stopped => {}
+        }
+    }
+
+    /// Queries motors whose ranges are still unknown after probing: they had no power then, or an arm interrupted it.
+    fn ask_late(&mut self, now: Stamp) {
+        self.motors.iter_mut().for_each(|motor| motor.ask_late(now));
+    }
+
+    /// Queries the parameters of motors that are off. Returns whether all have reported them.
+    fn ask(&mut self) -> bool {
+        self.motors.iter_mut().for_each(Motor::ask);
+        self.motors.iter().all(Motor::has_told)
+    }
+
+    fn probe(&mut self, waited: Duration, now: Stamp) {
+        if self.ask() {
+            self.enter(BusState::Disarmed, now);
+            self.notices.notify(Notice::Ready);
+        } else if waited >= PROBE_WITHIN {
+            for (motor, asked) in self.motors.iter_mut().enumerate() {
+                if asked.misses_probe() {
+                    self.notices.notify(Notice::Unanswered { motor });
+                }
+            }
+        }
+    }
+
+    fn enable(&mut self, waited: Duration, now: Stamp, passed: Duration) {
+        let other = self.other_master.filter(|(_, last)| now.since(*last) < ONE_MASTER);
+        let other = other.map(|(motor, _)| Fault::OtherMaster { motor });
+        if let Some(fault) = other.or_else(|| self.far_from_actions(now)) {
+            self.fail(fault, now);
+            return;
+        }
+        if self.ask() {
+            let mut motors = self.motors.iter_mut();
+            let enabled = motors.try_for_each(|motor| motor.enable(passed, self.is_returning, &mut self.notices));
+            if let Err(fault) = enabled {
+                self.fail(fault, now);
+                return;
+            }
+        }
+        if self.motors.iter().all(|motor| motor.is_ready(now)) {
+            self.motors.iter_mut().for_each(Motor::restart);
+            self.actions.arm(self.motors.iter().map(Motor::command), now);
+            self.hold(now);
+            self.notices.notify(if self.is_returning { Notice::Returning } else { Notice::Armed });
+        } else if waited >= self.arm_within
+            && let Some(fault) = self.motors.iter().find_map(Motor::arm_fault)
+        {
+            self.fail(fault, now);
+        }
+    }
+
+    /// The target of incoming actions, if it is far from a motor that is not enabled yet. Joints that are driven back may be
+    /// anywhere.
+    fn far_from_actions(&self, now: Stamp) -> Option<Fault> {
+        let target = self.actions.newest(now).filter(|_| !self.is_returning)?;
+        let motor = self.far(target)?;
+        let position = self.motors.get(motor)?.position()?;
+        Some(Fault::Far { motor, position, target: *target.get(motor)? })
+    }
+
+    /// Holds the last command, or stops as soon as it can.
+    fn hold(&mut self, now: Stamp) {
+        self.motors.iter_mut().for_each(Motor::hold);
+        self.actions.hold(self.motors.iter().map(Motor::target));
+        self.enter(BusState::Holding, now);
+    }
+
+    /// The commands of this cycle, and whether each motor follows its own.
+    fn follow(&mut self, now: Stamp, passed: Duration) {
+        let (mut first, is_led) = (None, self.actions.is_led());
+        for (axis, motor) in self.motors.iter_mut().enumerate() {
+            let target = (!self.is_returning).then(|| self.actions.target(axis, now));
+            // Each follows, even after one that is at fault.
+            first = first.or(motor.follow(target, (now, passed), is_led, &mut self.notices));
+        }
+        if let Some(fault) = first {
+            self.fail(fault, now);
+        } else if self.is_returning {
+            self.look_for_return(now);
+        }
+    }
+
+    /// Ends the return once every joint is within its limits.
+    fn look_for_return(&mut self, now: Stamp) {
+        // The return needs no actions, however long it takes.
+        self.actions.postpone(now);
+        if self.motors.iter().all(Motor::is_back) {
+            self.is_returning = false;
+            self.hold(now);
+            self.notices.notify(Notice::Returned);
+        }
+    }
+
+    fn turn_off(&mut self) {
+        self.motors.iter_mut().for_each(Motor::turn_off);
+    }
+
+    fn disable(&mut self, reason: Reason, now: Stamp) {
+        self.turn_off();
+        self.reason = reason;
+        self.enter(BusState::Disabling, now);
+    }
+
+    /// Stops all motors, each as configured; of motors that are already stopped only the one with the fault.
+    fn fail(&mut self, fault: Fault, now: Stamp) {
+        let own = fault.own();
+        // The first fault is the one that is reported.
+        let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
+        for (index, motor) in self.motors.iter_mut().enumerate() {
+            motor.stop_at_fault(Some(index) == own);
+        }
+        if !is_keeping {
+            self.enter(BusState::Faulted(fault), now);
+        }
+        self.report_stopped(fault);
+    }
+
+    fn report_stopped(&mut self, fault: Fault) {
+        self.counts.faults += 1;
+        self.notices.notify(Notice::Fault(fault));
+        self.name_latched(Some(fault));
+        let braked = self.bits(Motor::waits_for_brake);
+        let kept = |stop| self.bits(|motor| motor.kept() == Some(stop)) & !braked;
+        let [damped, held] = [Stop::Damp, Stop::Hold].map(kept);
+        if damped | held | braked != 0 {
+            self.notices.notify(Notice::Kept { damped, held, braked });
+        }
+    }
+
+    /// Reports every latched fault once; the next arm clears them.
+    fn name_latched(&mut self, reported: Option<Fault>) {
+        self.motors.iter_mut().for_each(|motor| motor.name_latched(reported, &mut self.notices));
+    }
+
+    /// Is any motor still on that was stopped by a fault?
+    fn is_keeping(&self) -> bool {
+        self.motors.iter().any(|motor| motor.kept().is_some())
+    }
+
+    const fn enter(&mut self, state: BusState, now: Stamp) {
+        self.state = state;
+        self.since = now;
     }
 }
 

@@ -6,11 +6,9 @@
 
 use std::time::Duration;
 
-use rapid_core::time::Stamp;
-use rapid_registry::{DamiaoSpec, Stop};
+use rapid_registry::DamiaoSpec;
 
 use super::motor::BrakeIs;
-use super::{BusState, Fault, Motor, MotorBus};
 
 /// States of brakes, a bit for each motor, the first one the lowest; without any bit set a brake is engaged. Bits of
 /// motors without a brake mean nothing.
@@ -26,7 +24,7 @@ pub struct Brakes {
 
 impl Brakes {
     /// Of a motor, by its position in the entry.
-    fn of(self, index: usize) -> BrakeIs {
+    pub(super) fn of(self, index: usize) -> BrakeIs {
         let [broken, moving, released] =
             [self.broken, self.moving, self.released].map(|bits| bits >> (index % 16) & 1 == 1);
         match (broken, moving, released) {
@@ -42,35 +40,4 @@ impl Brakes {
 pub(super) fn slowest(spec: &DamiaoSpec) -> Duration {
     let times = spec.motors.iter().filter_map(|motor| motor.brake.as_ref()).map(|brake| brake.releases_in);
     times.max().unwrap_or_default()
-}
-
-impl MotorBus {
-    /// The brakes that must be released after the last step, one bit per motor; all others must be engaged.
-    pub fn releases(&self) -> u16 {
-        self.bits(Motor::releases)
-    }
-
-    /// The brakes that are to engage at once when this program can no longer command: those of joints that stop by
-    /// their brake, and of joints that nothing else keeps from falling.
-    pub fn engages_at_death(&self) -> u16 {
-        self.bits(|motor| matches!(motor.last_stop(), Stop::Limp | Stop::Brake))
-    }
-
-    /// Takes the states of the brakes; to be called before each step if a motor has one. It is a fault if the brake of
-    /// a joint that is armed, or being armed, cannot be driven.
-    pub fn feed_brakes(&mut self, brakes: Brakes, now: Stamp) {
-        for (index, motor) in self.motors.iter_mut().enumerate() {
-            motor.take_brake(brakes.of(index), now, &mut self.notices);
-        }
-        let is_needed = matches!(self.state, BusState::Arming | BusState::Following | BusState::Holding);
-        let broken = self.motors.iter().position(Motor::has_broken_brake).filter(|_| is_needed);
-        if let Some(motor) = broken {
-            self.fail(Fault::Brake { motor }, now);
-        }
-    }
-
-    pub(super) fn bits(&self, is_set: impl Fn(&Motor) -> bool) -> u16 {
-        let set = self.motors.iter().enumerate().filter(|(_, motor)| is_set(motor));
-        set.fold(0, |bits, (index, _)| bits | 1 << (index % 16))
-    }
 }
