@@ -3,7 +3,6 @@
 //! Invariant: what concerns episodes is decided by the session ([`Collection`]), and nothing of it here.
 
 use std::ops::ControlFlow;
-use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -51,7 +50,6 @@ impl Conductor {
         let mut has_looked = false;
         // How the output ended, once it has no reader.
         let mut output = Ok(());
-        let mut bus_lost = pin!(rapid_bus::lost());
         loop {
             let due = self.collection.due();
             let end = length.map(|length| begun + length);
@@ -61,7 +59,6 @@ impl Conductor {
                 // The outcome is taken during the shutdown.
                 () = running.streaming.ending.cancelled() => return output,
                 () = running.streaming.closed.cancelled() => return output,
-                error = &mut bus_lost => return Err(error.into()),
                 () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
                 // It ends without a request only when it cannot continue.
                 outcome = policy_ended(&mut running.inference) => return outcome,

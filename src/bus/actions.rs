@@ -18,9 +18,8 @@ use rapid_core::time::Stamp;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use super::containment::{Guarded, contained};
 use super::error::topic_error;
-use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicSpec, Writer, sigbus};
+use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicSpec, Writer};
 
 /// An event for a task to wait for; `None` where the system cannot watch it and the caller must poll.
 pub fn watch(bell: BorrowedFd<'_>) -> Option<AsyncFd<OwnedFd>> {
@@ -33,8 +32,8 @@ pub fn watch(bell: BorrowedFd<'_>) -> Option<AsyncFd<OwnedFd>> {
 pub struct Actions {
     topic: String,
     depth: usize,
-    subscriber: Guarded<Subscriber<Service, [u8], Header>>,
-    listener: Guarded<Listener<Service>>,
+    subscriber: Subscriber<Service, [u8], Header>,
+    listener: Listener<Service>,
     /// Publisher of this process.
     writer: UniquePublisherId,
     /// Set once `writer` has published.
@@ -55,9 +54,9 @@ impl Actions {
         writer: &Writer,
     ) -> Result<Self, BusError> {
         let subscriber = factory.subscriber_builder().buffer_size(spec.depth).create();
-        let subscriber = Guarded::new(subscriber.map_err(|error| topic_error(&spec.name, &error))?);
+        let subscriber = subscriber.map_err(|error| topic_error(&spec.name, &error))?;
         let listener = wake.listener_builder().create();
-        let listener = Guarded::new(listener.map_err(|error| topic_error(&spec.name, &error))?);
+        let listener = listener.map_err(|error| topic_error(&spec.name, &error))?;
         Ok(Self {
             topic: spec.name.clone(),
             depth: spec.depth,
@@ -83,11 +82,10 @@ impl ActionSource for Actions {
 
     fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
         // First clear the event: what it announced is received below.
-        let _ = contained(|| self.listener.try_wait(|_| {}));
+        let _ = self.listener.try_wait(|_| {});
         let (mut newest, mut refused) = (None, None);
         for _ in 0..self.depth {
-            let Ok(Ok(Some(sample))) = contained(|| self.subscriber.receive()) else { break };
-            let sample = Guarded::new(sample);
+            let Ok(Some(sample)) = self.subscriber.receive() else { break };
             if sample.header().publisher_id() == self.writer {
                 self.is_written.store(true, Ordering::Relaxed);
             } else if self.is_written.load(Ordering::Relaxed) {
@@ -106,10 +104,6 @@ impl ActionSource for Actions {
                 *place = f64::from_le_bytes(*number);
             }
             newest = Some((numbers.len(), Stamp(sample.user_header().capture_ns)));
-        }
-        // The bytes read may be zeros of a lost page rather than an action.
-        if sigbus::happened() {
-            return Ok(None);
         }
         match (newest, refused) {
             (Some((axes, tick)), _) => Ok(action.get(..axes).map(|numbers| (numbers, tick))),

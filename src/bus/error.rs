@@ -73,15 +73,6 @@ pub enum BusError {
         /// Bytes of the file system.
         size: u64,
     },
-    /// Shared memory in use could not be written.
-    #[error(
-        "{}: shared memory that is in use cannot be used any more: {} is full, or another program has truncated or \
-         overwritten a file of the bus; end that program and start again", file.display(), space::PLACE
-    )]
-    Lost {
-        /// The file, or the folder where it is not known.
-        file: PathBuf,
-    },
     /// There is no shared memory, or it cannot be used.
     #[error("{}: {what}; {fix}", space::PLACE)]
     Memory {

@@ -6,19 +6,16 @@ use std::sync::Arc;
 
 use rapid_registry::DeviceSpec;
 
-use super::containment::{Guarded, contained};
 use super::home::Home;
 use super::inbox::Subscription;
 use super::topic::TopicSpec;
-use super::{
-    BusError, TopicFactory, WAKE_NOTIFIERS, WAKE_SERVICE, Writer, error, open_topic, open_wake, sigbus, space,
-};
+use super::{BusError, TopicFactory, WAKE_NOTIFIERS, WAKE_SERVICE, Writer, error, open_topic, open_wake, space};
 
 /// See the module's comment. It must live as long as the run: samples that a reader has not fetched are lost with it.
 pub struct Extension {
     // Declared in the order they must be dropped: port, service, node.
     writer: Arc<Writer>,
-    topic: (TopicSpec, Guarded<TopicFactory>),
+    topic: (TopicSpec, TopicFactory),
     home: Arc<Home>,
 }
 
@@ -33,17 +30,13 @@ impl Extension {
         let spec = TopicSpec::of_device(device);
         space::check(spec.room())?;
         error::addresses(spec.room())?;
-        let opened = contained(|| {
+        let open = || {
             let topic = open_topic(home.node(), spec)?;
             let wake = open_wake(home.node(), WAKE_SERVICE, WAKE_NOTIFIERS)?;
             let writer = Arc::new(Writer::open(&topic.0, &topic.1, &wake, None)?);
             Ok(Self { writer, topic, home: Arc::clone(home) })
-        });
-        match opened.and_then(|opened| opened) {
-            Err(error) => Err(home.explain(error)),
-            Ok(_) if sigbus::happened() => Err(sigbus::error()),
-            opened => opened,
-        }
+        };
+        open().map_err(|error| home.explain(error))
     }
 
     /// Its one writer.
@@ -57,7 +50,6 @@ impl Extension {
     /// When the topic has no free slot for another subscriber, or the system lacks memory or descriptors.
     pub fn subscribe(&self) -> Result<Subscription, BusError> {
         let (spec, factory) = &self.topic;
-        let opened = contained(|| Subscription::open(spec, factory, &self.writer)).and_then(|opened| opened);
-        opened.map_err(|error| self.home.explain(error))
+        Subscription::open(spec, factory, &self.writer).map_err(|error| self.home.explain(error))
     }
 }

@@ -8,11 +8,10 @@ use iceoryx2::config::Config;
 use iceoryx2::prelude::*;
 use rustix::fs::{FlockOperation, flock};
 
-use super::containment::{Guarded, contained};
 use super::error::{addresses, lacking, or_damage};
 use super::service::Service;
 use super::stale_files::Files;
-use super::{BusError, paths, sigbus, space};
+use super::{BusError, paths, space};
 
 /// A process that scans the files takes milliseconds.
 const TURN_LIMIT: Duration = Duration::from_millis(500);
@@ -28,7 +27,7 @@ const _: () = assert!(FILL_LIMIT.as_millis() + CREATION_LIMIT.as_millis() < 1000
 #[derive(Debug)]
 pub(super) struct Home {
     // Declared in the order they must be dropped.
-    node: Guarded<Node<Service>>,
+    node: Node<Service>,
     files: Leaving,
 }
 
@@ -45,7 +44,7 @@ impl Home {
     /// # Errors
     /// When the bus's files belong to another user, are damaged, or have too little space.
     pub(super) fn open(instance: Option<&str>, need: u64) -> Result<Self, BusError> {
-        sigbus::install()?;
+        paths::processes()?;
         paths::memory()?;
         let config = config(instance)?;
         let root = root(&config);
@@ -60,15 +59,14 @@ impl Home {
         addresses(need)?;
         // Signals belong to the program, not to a library.
         let builder = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled);
-        let node = contained(|| builder.create::<Service>())?;
+        let node = builder.create::<Service>();
         files.files.make_counter();
         drop(turn);
         let node = node.map_err(|error| {
             let cause = lacking().or_else(|| paths::in_the_way(&prefix));
             cause.unwrap_or_else(|| or_damage(BusError::Node(error.to_string()), &files.files))
         })?;
-        sigbus::watch_over(files.files.clone());
-        Ok(Self { node: Guarded::new(node), files })
+        Ok(Self { node, files })
     }
 
     pub(super) fn node(&self) -> &Node<Service> {
@@ -77,7 +75,7 @@ impl Home {
 
     /// `error`, or its cause: a damaged file or missing space.
     pub(super) fn explain(&self, error: BusError) -> BusError {
-        if sigbus::happened() { sigbus::error() } else { or_damage(error, &self.files.files) }
+        or_damage(error, &self.files.files)
     }
 
     /// The files that this process needs while it is on the bus.
@@ -87,7 +85,7 @@ impl Home {
 
     /// Releases the resources of killed programs. Blocks while it scans the files.
     pub(super) fn sweep(&self) {
-        let _ = contained(|| self.node.try_cleanup_dead_nodes());
+        self.node.try_cleanup_dead_nodes();
         self.files.clear();
     }
 }

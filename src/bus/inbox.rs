@@ -17,9 +17,8 @@ use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
 use rapid_core::sample::SampleHeader;
 
-use super::containment::{Guarded, contained};
 use super::error::topic_error;
-use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
+use super::{BusError, EventFactory, Header, Service, TopicFactory, TopicId, TopicSpec, Writer};
 
 /// The samples of every topic but that of observations, which this process makes for others. They wait in shared memory
 /// until they are drained.
@@ -30,7 +29,7 @@ pub struct Queues {
 /// A consumer of these samples that can wait for them.
 pub struct Inbox {
     queues: Queues,
-    wake: Guarded<Listener<Service>>,
+    wake: Listener<Service>,
 }
 
 /// The samples of one topic, for one consumer.
@@ -39,7 +38,7 @@ pub struct Subscription {
     name: String,
     /// Maximum number of samples in the queue.
     depth: usize,
-    subscriber: Guarded<Subscriber<Service, [u8], Header>>,
+    subscriber: Subscriber<Service, [u8], Header>,
     /// Publisher id of the topic's one writer.
     writer: UniquePublisherId,
     /// The writer has published since this inbox was opened.
@@ -70,7 +69,7 @@ impl Subscription {
             id: spec.id,
             name: spec.name.clone(),
             depth: spec.depth,
-            subscriber: Guarded::new(subscriber),
+            subscriber,
             writer: writer.id(),
             is_written: Cell::new(false),
             other: Cell::new(None),
@@ -114,7 +113,7 @@ impl std::fmt::Debug for Inbox {
 impl Inbox {
     pub(super) fn open(queues: Queues, wake: &EventFactory<Service>) -> Result<Self, BusError> {
         let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
-        Ok(Self { queues, wake: Guarded::new(wake) })
+        Ok(Self { queues, wake })
     }
 
     /// Blocks until a modality is published, `timeout` passes, or the process is continued after a stop. The mask alone
@@ -123,8 +122,7 @@ impl Inbox {
     /// # Errors
     /// When the event service is broken.
     pub fn wait(&self, timeout: Duration) -> Result<(), BusError> {
-        let waited = contained(|| self.wake.timed_wait(|_| {}, timeout))?;
-        match waited {
+        match self.wake.timed_wait(|_| {}, timeout) {
             Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
             Err(error) => Err(topic_error(super::WAKE_SERVICE, &error)),
         }
@@ -149,10 +147,10 @@ impl Deref for Inbox {
 impl Queues {
     /// `writers` has the same order as `topics`.
     pub(super) fn open<'a>(
-        topics: &[(TopicSpec, Guarded<TopicFactory>)],
+        topics: &[(TopicSpec, TopicFactory)],
         writers: impl Iterator<Item = &'a Writer>,
     ) -> Result<Self, BusError> {
-        let subscribe = |((spec, factory), writer): (&(TopicSpec, Guarded<TopicFactory>), &Writer)| {
+        let subscribe = |((spec, factory), writer): (&(TopicSpec, TopicFactory), &Writer)| {
             Subscription::open(spec, factory, writer)
         };
         let is_consumed = |((spec, _), _): &(&(TopicSpec, _), _)| spec.id != TopicId::Observation;
@@ -169,17 +167,11 @@ impl Queues {
         self.topics.insert(at, subscription);
     }
 
-    /// An error once memory of the bus has been lost: from then on samples may be mixed or empty.
-    pub fn lost(&self) -> Option<BusError> {
-        sigbus::happened().then(sigbus::error)
-    }
-
     /// Hands over every sample that is queued at the time of the call, oldest first within a topic; the bytes are
     /// borrowed from shared memory for the call. It terminates however fast samples are published.
     ///
     /// # Errors
-    /// The first topic that cannot be read; the others are still handed over. Nothing is handed over once bus memory is
-    /// lost.
+    /// The first topic that cannot be read; the others are still handed over.
     pub fn drain(&self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), BusError> {
         self.drain_some(usize::MAX, take).1
     }
@@ -194,22 +186,14 @@ impl Queues {
         most: usize,
         take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8]),
     ) -> (bool, Result<(), BusError>) {
-        if let Some(error) = self.lost() {
-            return (false, Err(error));
-        }
         let (mut is_more, mut result) = (false, Ok(()));
         for topic in &self.topics {
             // No more than this are queued at any time: a topic that is filled faster than `take` empties it must not
             // hold up the others or the caller.
             let most = most.min(topic.depth);
             for number in 1..=most {
-                let received = match contained(|| topic.subscriber.receive()) {
-                    Ok(received) => received,
-                    Err(error) => return (false, Err(error)),
-                };
-                match received {
+                match topic.subscriber.receive() {
                     Ok(Some(sample)) => {
-                        let sample = Guarded::new(sample);
                         if !topic.is_foreign(sample.header().publisher_id()) || topic.id == TopicId::Action {
                             take(topic.id, sample.user_header(), sample.payload());
                         }

@@ -20,7 +20,6 @@ use rapid_registry::DeviceSpec;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use super::containment::{Guarded, contained};
 use super::error::topic_error;
 use super::{BusError, Header, MAX_NODES, Service, service_name};
 
@@ -40,8 +39,8 @@ const LARGE: usize = 64 << 10;
 pub struct Ingress {
     topic: String,
     depth: usize,
-    subscriber: Guarded<Subscriber<Service, [u8], Header>>,
-    listener: Guarded<Listener<Service>>,
+    subscriber: Subscriber<Service, [u8], Header>,
+    listener: Listener<Service>,
 }
 
 impl std::fmt::Debug for Ingress {
@@ -79,7 +78,6 @@ impl Ingress {
             .open_or_create()
             .map_err(|error| failed(&error))?;
         let listener = wake.listener_builder().create().map_err(|error| failed(&error))?;
-        let (subscriber, listener) = (Guarded::new(subscriber), Guarded::new(listener));
         Ok(Self { topic, depth, subscriber, listener })
     }
 
@@ -93,11 +91,8 @@ impl Ingress {
     /// # Errors
     /// When the topic cannot be read.
     pub fn take(&self) -> Result<Option<Given>, BusError> {
-        match contained(|| self.subscriber.receive())? {
-            Ok(sample) => {
-                let sample = sample.map(Guarded::new);
-                Ok(sample.map(|sample| Given { header: sample.user_header().0, sample }))
-            }
+        match self.subscriber.receive() {
+            Ok(sample) => Ok(sample.map(|sample| Given { header: sample.user_header().0, sample })),
             Err(error) => Err(BusError::Transfer { topic: self.topic.clone(), reason: format!("{error:?}") }),
         }
     }
@@ -127,7 +122,7 @@ impl Ingress {
 /// A sample as its program published it; nothing in it has been checked.
 pub struct Given {
     header: SampleHeader,
-    sample: Guarded<Sample<Service, [u8], Header>>,
+    sample: Sample<Service, [u8], Header>,
 }
 
 impl std::fmt::Debug for Given {
@@ -159,7 +154,7 @@ impl Arrivals {
     pub async fn wait(&self) {
         let Ok(Ok(mut ready)) = tokio::time::timeout(LOOK, self.descriptor.readable()).await else { return };
         // Samples announced here were published before; the caller looks next.
-        if !matches!(contained(|| self.descriptor.get_ref().0.listener.try_wait(|_| {})), Ok(Ok(1..))) {
+        if !matches!(self.descriptor.get_ref().0.listener.try_wait(|_| {}), Ok(1..)) {
             ready.clear_ready();
         }
     }

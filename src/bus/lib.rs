@@ -10,15 +10,14 @@
 //! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a loan in reused memory
 //! (`shared`): once a thread has published a sample, no sample allocates (`tests/memory/stream_alloc.rs`). Only a
 //! topic's own stream takes the locks of its port.
-//! Invariant: every segment of this program has all its memory from its creation (`space`); if segments of other
-//! programs lose pages, the run ends in order (`sigbus`). Nothing of the bus is writable by others, and nothing
-//! outlives the processes that use it (`stale_files`).
+//! Invariant: every segment of this program has all its memory from its creation (`space`). A program of this user that
+//! truncates one, or overwrites iceoryx2's tables in it, ends this process. Nothing of the bus is writable by others,
+//! and nothing outlives the processes that use it (`stale_files`).
 //! Invariant: no topic is closed during a run; one is opened for an entry that is added ([`Extension`]).
 //! Invariant: writers live as long as the bus. Samples that a reader has not fetched are lost with their writer
 //! (iceoryx2 0.10), so a writer that ended with its device would take the last samples along.
 
 mod actions;
-mod containment;
 mod error;
 mod extension;
 mod home;
@@ -30,7 +29,6 @@ mod paths;
 mod patience;
 mod service;
 mod shared;
-mod sigbus;
 #[cfg(test)]
 #[path = "../../tests/support/skip.rs"]
 mod skip;
@@ -49,7 +47,6 @@ use rapid_core::modality::ModalityId;
 use rapid_core::sample::SampleHeader;
 use rapid_registry::{DeviceSpec, MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 
-use containment::{Guarded, contained};
 use error::topic_error;
 use home::Home;
 use service::Service;
@@ -60,7 +57,6 @@ pub use extension::Extension;
 pub use inbox::{Foreign, Inbox, Queues, Subscription};
 pub use ingress::{Arrivals, Given, Ingress};
 pub use paths::memory as check_memory;
-pub use sigbus::lost;
 pub use topic::{TopicId, TopicSpec};
 pub use writer::Writer;
 
@@ -103,8 +99,8 @@ pub struct Bus {
     writers: Vec<(TopicId, Arc<Writer>)>,
     /// `None` without an actuator.
     actions: Option<Arc<Actions>>,
-    topics: Vec<(TopicSpec, Guarded<TopicFactory>)>,
-    wake: Guarded<EventFactory<Service>>,
+    topics: Vec<(TopicSpec, TopicFactory)>,
+    wake: EventFactory<Service>,
     ingresses: Vec<(ModalityId, Arc<Ingress>)>,
     instance: Option<String>,
     home: Arc<Home>,
@@ -136,12 +132,7 @@ impl Bus {
         let need = specs.iter().map(TopicSpec::room).fold(space::BOOKS, u64::saturating_add);
         error::addresses(need.saturating_add(OTHER_ADDRESSES))?;
         let home = Arc::new(Home::open(instance, need)?);
-        let opened = contained(|| Self::open_at(&home, registry, specs, instance)).and_then(|opened| opened);
-        match opened {
-            Err(error) => Err(home.explain(error)),
-            Ok(_) if sigbus::happened() => Err(sigbus::error()),
-            opened => opened,
-        }
+        Self::open_at(&home, registry, specs, instance).map_err(|error| home.explain(error))
     }
 
     fn open_at(
@@ -158,7 +149,7 @@ impl Bus {
         let writers = topics
             .iter()
             .map(|(spec, factory)| {
-                let own = action.as_ref().filter(|(topic, _)| topic.0.id == spec.id).map(|(_, wake)| &**wake);
+                let own = action.as_ref().filter(|(topic, _)| topic.0.id == spec.id).map(|(_, wake)| wake);
                 Ok((spec.id, Arc::new(Writer::open(spec, factory, &wake, own)?)))
             })
             .collect::<Result<Vec<_>, BusError>>()?;
@@ -203,7 +194,7 @@ impl Bus {
     /// When the topics have no free slot for another subscriber.
     pub fn inbox(&self) -> Result<Inbox, BusError> {
         let queues = self.queues()?;
-        contained(|| Inbox::open(queues, &self.wake))?
+        Inbox::open(queues, &self.wake)
     }
 
     /// The same for a consumer that never waits for samples, and that no sample wakes.
@@ -211,7 +202,7 @@ impl Bus {
     /// # Errors
     /// As [`Self::inbox`].
     pub fn queues(&self) -> Result<Queues, BusError> {
-        contained(|| Queues::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref())))?
+        Queues::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref()))
     }
 
     /// The observations from now on, which are in no [`Queues`] by themselves.
@@ -222,7 +213,7 @@ impl Bus {
         let mut topics = self.topics.iter().zip(&self.writers);
         let topic = topics.find(|((spec, _), _)| spec.id == TopicId::Observation);
         let Some(((spec, factory), (_, writer))) = topic else { return Ok(None) };
-        contained(|| Subscription::open(spec, factory, writer))?.map(Some)
+        Subscription::open(spec, factory, writer).map(Some)
     }
 
     /// Actions for the actuator; `None` without an actuator in the registry.
@@ -302,7 +293,7 @@ fn specs(registry: &Registry) -> impl Iterator<Item = TopicSpec> {
     registry.devices.iter().map(TopicSpec::of_device).chain(own).chain(action)
 }
 
-fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Guarded<TopicFactory>), BusError> {
+fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, TopicFactory), BusError> {
     let factory = node
         .service_builder(&service_name(&spec.name)?)
         .publish_subscribe::<[u8]>()
@@ -316,11 +307,11 @@ fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Guard
         .enable_safe_overflow(true)
         .open_or_create()
         .map_err(|error| topic_error(&spec.name, &error))?;
-    Ok((spec, Guarded::new(factory)))
+    Ok((spec, factory))
 }
 
 /// Opens an event service of that name.
-fn open_wake(node: &Node<Service>, name: &str, notifiers: usize) -> Result<Guarded<EventFactory<Service>>, BusError> {
+fn open_wake(node: &Node<Service>, name: &str, notifiers: usize) -> Result<EventFactory<Service>, BusError> {
     let service = node
         .service_builder(&service_name(name)?)
         .event()
@@ -329,7 +320,7 @@ fn open_wake(node: &Node<Service>, name: &str, notifiers: usize) -> Result<Guard
         .max_nodes(MAX_NODES)
         .event_id_max_value(255)
         .open_or_create();
-    service.map(Guarded::new).map_err(|error| topic_error(name, &error))
+    service.map_err(|error| topic_error(name, &error))
 }
 
 fn service_name(name: &str) -> Result<ServiceName, BusError> {

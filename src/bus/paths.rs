@@ -50,6 +50,11 @@ pub(super) fn check(folder: &Path) -> Result<(), BusError> {
     }
 }
 
+/// Refuses a machine without `/proc`, from which it is known whose files are in use.
+pub(super) fn processes() -> Result<(), BusError> {
+    if Path::new("/proc/self").exists() { Ok(()) } else { Err(BusError::NoProc) }
+}
+
 /// Refuses shared memory that is missing or not writable.
 ///
 /// # Errors

@@ -2,7 +2,11 @@
 //!
 //! iceoryx2 0.10 creates a segment with the C library's `ftruncate`, which reserves nothing on tmpfs: the first write
 //! to a page without space ends the process with SIGBUS at any later time. The [`ftruncate`] here replaces that
-//! function in this program. The standard library and rustix do not use it.
+//! function in this program, and is all that reserves those segments. The standard library and rustix do not use it.
+//!
+//! What another program of this user takes away later is not survived: it truncates a segment, and the process dies.
+//! So it is with a segment of another program, which is not reserved, once it cannot get a page. Motors are then stopped
+//! by their guard, and the episode is repaired.
 //!
 //! Invariant: a segment on tmpfs that this program created, at the start or for a later subscriber, has all its pages;
 //! otherwise it was not created, and iceoryx2 reports it.

@@ -24,7 +24,7 @@ use rustix::fs::{Mode, OFlags};
 use rustix::process::{Flock, FlockType, fcntl_getlk};
 use rustix::time::{ClockId, clock_gettime};
 
-use super::{BusError, sigbus, space};
+use super::{BusError, space};
 
 /// The first 8 bytes of each file of iceoryx2 0.10.0 in shared memory: major, minor and patch, 16 bits each.
 const VERSION: u64 = 10 << 16;
@@ -134,14 +134,6 @@ impl Files {
         })
     }
 
-    /// The same, judged by its name alone.
-    pub(super) fn damaged(&self) -> Option<PathBuf> {
-        match self.unreadable()? {
-            BusError::Damaged { path, .. } => Some(path),
-            _ => None,
-        }
-    }
-
     /// The files this process needs while it is on the bus. Connections come and go with other processes.
     pub(super) fn needed(&self) -> Vec<PathBuf> {
         let own = std::process::id();
@@ -223,9 +215,7 @@ impl Files {
         let nodes = self.root.join("nodes");
         let lock = nodes.join(format!("{}{node}.node_monitor", self.prefix));
         if process(node) == std::process::id() {
-            // Once memory has been lost, a node is left in place.
-            let is_locked = |lock: Metadata| is_locked_by_us(lock.ino());
-            return !sigbus::happened() && std::fs::symlink_metadata(&lock).is_ok_and(is_locked);
+            return std::fs::symlink_metadata(&lock).is_ok_and(|lock| is_locked_by_us(lock.ino()));
         }
         let flags = OFlags::RDWR | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
         let asked = Flock::from(FlockType::WriteLock);
@@ -400,7 +390,7 @@ fn strange(path: PathBuf) -> BusError {
 }
 
 /// Whether these are the first bytes of a file in shared memory.
-pub(super) fn is_head(bytes: [u8; 8]) -> bool {
+fn is_head(bytes: [u8; 8]) -> bool {
     u64::from_le_bytes(bytes) == VERSION
 }
 

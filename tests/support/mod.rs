@@ -249,6 +249,12 @@ impl Running {
         rustix::process::kill_process(pid, signal).expect("signal");
     }
 
+    /// Waits for the end; returns the signal that killed it.
+    pub(crate) fn died_of(mut self) -> Option<i32> {
+        use std::os::unix::process::ExitStatusExt;
+        self.child.take().expect("running").wait_with_output().expect("wait").status.signal()
+    }
+
     /// Waits for the end; returns exit code, standard output and standard error.
     pub(crate) fn end(mut self) -> (Option<i32>, String, String) {
         let child = self.child.take().expect("running");

@@ -83,11 +83,6 @@ pub trait Source: Send {
     fn add(&mut self, subscription: Subscription) {
         drop(subscription);
     }
-
-    /// Why drained samples can no longer be trusted.
-    fn lost(&self) -> Option<String> {
-        None
-    }
 }
 
 impl Source for Inbox {
@@ -105,10 +100,6 @@ impl Source for Inbox {
 
     fn add(&mut self, subscription: Subscription) {
         Self::add(self, subscription);
-    }
-
-    fn lost(&self) -> Option<String> {
-        Queues::lost(self).map(|error| error.to_string())
     }
 }
 
@@ -416,9 +407,7 @@ impl Writer {
         let now = Stamp::now();
         let Self { streams, open, .. } = self;
         let drained = source.drain(&mut |topic, header, payload| streams.take(open.as_mut(), topic, header, payload));
-        if let Some(reason) = source.lost() {
-            self.finish(now, Some(reason));
-        } else if let Err(error) = drained {
+        if let Err(error) = drained {
             self.complain_about_bus(&error);
         }
         let Self { publishers, config, .. } = self;
