@@ -11,7 +11,6 @@
 //! Invariant: an episode ends at the moment its end was requested, however slowly something closes after that.
 
 mod attached;
-mod bus_files;
 mod buttons;
 mod collection;
 mod conductor;
@@ -187,7 +186,6 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let may_record = options.record || options.policy.is_none() || options.screen == Screen::Monitor;
     let reserve = registry.rig.disk_reserve;
     let machine = Machine { registry, board: Arc::clone(&board), permission, signals, presence, arrivals };
-    let watchman = bus.watchman();
     let (mut running, mut conductor) = start::start(machine, &bus, options).await?;
     // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
     // earlier one left unfinished.
@@ -199,7 +197,6 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let conducted = async {
         tokio::select! {
             outcome = conductor.conduct(&mut running) => outcome,
-            never = bus_files::watch(watchman) => never,
             never = free_space::watch(&out, &board) => never,
         }
     };

@@ -78,11 +78,6 @@ impl Home {
         or_damage(error, &self.files.files)
     }
 
-    /// The files that this process needs while it is on the bus.
-    pub(super) fn needed(&self) -> Vec<PathBuf> {
-        self.files.files.needed()
-    }
-
     /// Releases the resources of killed programs. Blocks while it scans the files.
     pub(super) fn sweep(&self) {
         self.node.try_cleanup_dead_nodes();

@@ -38,7 +38,6 @@ mod topic;
 mod writer;
 
 use std::ops::Deref;
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use iceoryx2::prelude::*;
@@ -221,28 +220,9 @@ impl Bus {
         self.actions.clone()
     }
 
-    /// Monitors, from now on, the files of the bus that this process needs.
-    pub fn watchman(&self) -> Watchman {
-        Watchman { files: self.home.needed() }
-    }
-
     /// Bytes of shared memory that the pools of all topics reserve.
     pub fn reserved_bytes(&self) -> u64 {
         self.topics.iter().map(|(spec, _)| spec.pool_bytes()).sum()
-    }
-}
-
-/// Detects removed files of the bus: programs that start later cannot join then, and get no reason.
-#[derive(Debug)]
-pub struct Watchman {
-    files: Vec<PathBuf>,
-}
-
-impl Watchman {
-    /// The files removed since the last call.
-    pub fn removed(&mut self) -> Vec<PathBuf> {
-        let is_gone = |path: &mut PathBuf| std::fs::symlink_metadata(path).is_err();
-        self.files.extract_if(.., is_gone).collect()
     }
 }
 

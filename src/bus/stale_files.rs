@@ -134,17 +134,6 @@ impl Files {
         })
     }
 
-    /// The files this process needs while it is on the bus. Connections come and go with other processes.
-    pub(super) fn needed(&self) -> Vec<PathBuf> {
-        let own = std::process::id();
-        let is_needed = |used: &Use| match used {
-            Use::Ports(owners) => owners.as_slice() == [own],
-            Use::Node(node) => process(*node) == own,
-            Use::Common => true,
-        };
-        self.entries().into_iter().filter(|entry| is_needed(&entry.used)).map(|entry| entry.path).collect()
-    }
-
     /// Removes what dead processes left of other buses. A bus with no node in our folder may have its nodes elsewhere.
     pub(super) fn clear_others(&self) {
         let monitors = std::fs::read_dir(self.root.join("nodes")).into_iter().flatten().flatten();
