@@ -37,8 +37,8 @@ pub enum UnplugSource {
     Lease,
     /// The link to a device on the network is down.
     Link,
-    /// A scenario.
-    Script,
+    /// A scenario, or the key that unplugs a simulated device.
+    Scenario,
 }
 
 impl UnplugSource {
@@ -52,7 +52,7 @@ impl UnplugSource {
             Self::Goodbye => "goodbye",
             Self::Lease => "lease",
             Self::Link => "link",
-            Self::Script => "script",
+            Self::Scenario => "scenario",
         }
     }
 }

@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 /// Packs the library that policies need for the program to carry: `onnxruntime.rs` includes
-/// what is written here. Without the library that is an empty file, and the build goes on: recording
+/// what is written here. Without the library that is an empty file, and the build continues: recording
 /// needs none.
 fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed={PINNED}");
@@ -48,16 +48,14 @@ fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {
             "cargo::warning=built without onnxruntime, which `make setup` fetches: recording needs none, policies \
              will need --ort-lib or ORT_DYLIB_PATH"
         );
-        println!(
-            "cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: none inside (a policy needs --ort-lib or ORT_DYLIB_PATH)"
-        );
+        println!("cargo::rustc-env=RAPID_BUILT_WITH=none built in (a policy needs --ort-lib or ORT_DYLIB_PATH)");
         let none = out.join("onnxruntime-none.zst");
         std::fs::write(&none, [])?;
         println!("cargo::rustc-env=RAPID_ONNXRUNTIME={}", none.display());
         return Ok(());
     };
     println!("cargo::rerun-if-changed={}", library.display());
-    println!("cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: {version} inside");
+    println!("cargo::rustc-env=RAPID_BUILT_WITH={version} (built in)");
     let bytes = std::fs::read(&library)?;
     if sha256(&bytes) != sum {
         return Err(
@@ -83,7 +81,7 @@ fn libstdcxx(out: &Path) -> Result<(), Box<dyn Error>> {
     });
     let Some(library) = found else {
         println!("cargo::warning=built without {LIBSTDCXX}: a policy will need that of the machine it runs on");
-        println!("cargo::rustc-env=RAPID_BUILT_WITH_CXX=libstdc++: none inside (a policy needs {LIBSTDCXX})");
+        println!("cargo::rustc-env=RAPID_BUILT_WITH_CXX=none built in (a policy needs {LIBSTDCXX})");
         let none = out.join("libstdcxx-none.zst");
         std::fs::write(&none, [])?;
         println!("cargo::rustc-env=RAPID_LIBSTDCXX={}", none.display());
@@ -91,7 +89,7 @@ fn libstdcxx(out: &Path) -> Result<(), Box<dyn Error>> {
     };
     println!("cargo::rerun-if-changed={}", library.display());
     let name = library.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    println!("cargo::rustc-env=RAPID_BUILT_WITH_CXX=libstdc++: {name} inside");
+    println!("cargo::rustc-env=RAPID_BUILT_WITH_CXX={name} (built in)");
     println!("cargo::rustc-env=RAPID_LIBSTDCXX={}", pack(out, "libstdcxx", &std::fs::read(&library)?)?.display());
     Ok(())
 }

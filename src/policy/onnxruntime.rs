@@ -21,11 +21,16 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use ort::logging::LogLevel;
-/// The packed library; empty in a build without one.
-/// The version, and a line for each library inside.
-pub const LONG_VERSION: &str =
-    concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"), "\n", env!("RAPID_BUILT_WITH_CXX"));
+/// The version of the program, and a line for each library that is built in.
+pub const LONG_VERSION: &str = concat!(
+    env!("CARGO_PKG_VERSION"),
+    "\nonnxruntime: ",
+    env!("RAPID_BUILT_WITH"),
+    "\nlibstdc++: ",
+    env!("RAPID_BUILT_WITH_CXX")
+);
 
+/// The packed library; empty in a build without one.
 static INSIDE: &[u8] = include_bytes!(env!("RAPID_ONNXRUNTIME"));
 /// The variable that names another library.
 const VARIABLE: &str = "ORT_DYLIB_PATH";
@@ -60,7 +65,7 @@ impl std::fmt::Display for Origin {
         match self {
             Self::Option(path) => write!(f, "{} (--ort-lib)", path.display()),
             Self::Variable(path) => write!(f, "{} ({VARIABLE})", path.display()),
-            Self::Inside => f.write_str("the library inside rapid"),
+            Self::Inside => f.write_str(if INSIDE.is_empty() { "built in" } else { env!("RAPID_BUILT_WITH") }),
         }
     }
 }

@@ -500,7 +500,7 @@ impl Modality {
     /// Keeps, for people, why the slot is in its new state.
     fn describe(&mut self, Transition { from, to, wait, source }: Transition) {
         if let Some(source) = source {
-            self.detail = format!("unplugged, reported by {}", source.word());
+            self.detail = format!("unplugged ({})", source.word());
         }
         if let Some(wait) = wait {
             let reason = if from == SlotState::Absent { "cooldown" } else { self.detail.as_str() };

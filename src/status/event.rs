@@ -361,8 +361,8 @@ impl EventKind {
                 D::joined(Level::Info, device, "opened", " in ", &rest).with_bit(*bit)
             }
             Self::Detach { device, bit, source } => {
-                let rest = format!("reported by {}", source.word());
-                D::joined(Level::Warn, device, "detached", ", ", &rest).with_bit(*bit)
+                let rest = format!("({})", source.word());
+                D::joined(Level::Warn, device, "detached", " ", &rest).with_bit(*bit)
             }
             Self::State { device, bit, state, mask, detail } => {
                 let detail = if detail.is_empty() { String::new() } else { format!(": {detail}") };
@@ -502,9 +502,9 @@ mod tests {
         };
         let table = [
             (
-                state(SlotState::Absent, "unplugged, reported by kernel"),
+                state(SlotState::Absent, "unplugged (kernel)"),
                 Level::Info,
-                "tactile_tip absent, mask 0x05: unplugged, reported by kernel",
+                "tactile_tip absent, mask 0x05: unplugged (kernel)",
             ),
             (state(SlotState::Streaming, ""), Level::Info, "tactile_tip streaming, mask 0x05"),
             (state(SlotState::Failed, "busy"), Level::Error, "tactile_tip failed, mask 0x05: busy"),
@@ -513,6 +513,6 @@ mod tests {
             assert_eq!(what.log_line(), Some((level, text.to_owned())));
         }
         let detach = EventKind::Detach { device: "tactile_tip".into(), bit, source: UnplugSource::Kernel };
-        assert_eq!((detach.log_line(), detach.describe().detail()), (None, "reported by kernel"));
+        assert_eq!((detach.log_line(), detach.describe().detail()), (None, "(kernel)"));
     }
 }

@@ -83,7 +83,8 @@ fn one_file_runs_a_policy_on_a_machine_without_the_c_plus_plus_library() {
     let reported = events(&printed);
     assert!(reported.iter().any(|event| event["event"] == "act"), "{reported:?}");
     let policy = reported.iter().find(|event| event["event"] == "policy").expect("the policy");
-    assert_eq!((&policy["folder"], &policy["library"]), (&"inside rapid".into(), &"the library inside rapid".into()));
+    assert_eq!(policy["folder"], "inside rapid");
+    assert!(policy["library"].as_str().is_some_and(|library| library.ends_with(" (built in)")), "{policy}");
     let folder = root.join("data/in/a/folder");
     let file = std::fs::read_dir(&folder).expect("the folder").flatten().next().expect("an episode");
     assert!(Episode::read(&file.path()).topic("/action").count() > 0);

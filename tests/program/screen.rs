@@ -125,8 +125,8 @@ fn ten_episodes_are_counted_down_recorded_and_counted() {
         assert!(seen.iter().any(|screen| screen.contains(words)), "{words:?} in none of {} screens", seen.len());
     }
     let count = |screen: &str| {
-        let rest = screen.split_once(", disk lasts")?.0.rsplit_once("episode ")?.1;
-        rest.strip_suffix(" of 10")?.parse::<usize>().ok()
+        let rest = screen.split_once(" of disk left")?.0.rsplit_once("episode ")?.1;
+        rest.split_once(" of 10, ")?.0.parse::<usize>().ok()
     };
     let mut counts: Vec<_> = seen.iter().filter_map(|screen| count(screen)).collect();
     assert!(counts.is_sorted() && counts.iter().all(|count| (1..=10).contains(count)), "{counts:?}");

@@ -45,7 +45,7 @@ pub struct SyncModality {
     pub id: ModalityId,
     /// What an observation holds when it is attached but no sample lies in the window.
     pub when_stale: WhenStale,
-    /// How long before its capture what a sample shows happened.
+    /// From an event to the capture time of the sample that shows it.
     pub latency: Duration,
     /// Samples kept, at least 1: those of the longest time between a sample's capture and the
     /// evaluation of the last tick that may want it.

@@ -139,7 +139,7 @@ impl Timeline {
         let Some((syspath, sim)) = self.plugged.remove(name) else { return };
         sim.unplug();
         self.sequences.insert(name.to_owned(), sim.sequence.load(Ordering::Relaxed));
-        self.queue.push_back(HotplugEvent::Removed { syspath, noticed: now, source: UnplugSource::Script });
+        self.queue.push_back(HotplugEvent::Removed { syspath, noticed: now, source: UnplugSource::Scenario });
     }
 
     /// Unplugs a device, or plugs it in where it was last.

@@ -66,7 +66,7 @@ keys! {
         depth: Option<u64> = whole::<u64>(2, 4096), usually "by kind";
         /// At a tick without a sample in the window: the newest with its age, or zeros.
         when_stale: WhenStale = Words(&WhenStale::WORDS), or WhenStale::default();
-        /// How long before its capture the content of a sample happened.
+        /// From an event to the capture time of the sample that shows it.
         latency: Duration = Time(Duration::ZERO, LONGEST_LATENCY), or Duration::ZERO;
     }
 }

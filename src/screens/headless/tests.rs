@@ -193,7 +193,7 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0, port 1-2.3, serial CAM [2J00
     22:13:20.000Z  cam_wrist  bit 0   opened        epoch 3: unit CAM [2J00
     22:13:20.000Z  cam_wrist  bit 0   streaming     mask 0x05: /dev/video0 MJPG 640x480@30
-    22:13:20.000Z  tof        bit 12  detached      reported by kernel
+    22:13:20.000Z  tof        bit 12  detached      (kernel)
     22:13:20.000Z  tof        bit 12  absent        mask 0x05
     22:13:20.000Z  device             unregistered  046d:0825  X not registered: no entry has this serial
     22:13:20.000Z  episode            recording     out/a.mcap

@@ -771,7 +771,7 @@ impl Model {
         self.readings.get(id.index()).copied().unwrap_or_default()
     }
 
-    /// How long the disk lasts at the rate at which the devices deliver now; `None` if unknown, or longer than anyone plans
+    /// How long there is disk space at the rate at which the devices deliver now; `None` if unknown, or longer than anyone plans
     /// for: most devices are out then.
     pub fn disk_left(&self) -> Option<Duration> {
         const A_MONTH: Duration = Duration::from_hours(30 * 24);

@@ -30,7 +30,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     }
 }
 
-/// How many episodes there are, and for how long the disk lasts.
+/// How many episodes there are, and for how long there is disk space.
 fn remark(model: &Model, theme: Theme) -> Line<'static> {
     let session = model.latest().session.as_ref();
     let progress = session.filter(|session| session.goal.is_some() || session.counted > 0);
@@ -39,7 +39,7 @@ fn remark(model: &Model, theme: Theme) -> Line<'static> {
         Some(_) => format!("{} episodes", session.progress()),
         None => text::counted(session.counted as u64, "episode"),
     });
-    let left = model.disk_left().map(|left| format!("disk lasts {}", text::about(left)));
+    let left = model.disk_left().map(|left| format!("{} of disk left", text::about(left)));
     let parts: Vec<_> = count.into_iter().chain(left).collect();
     Line::styled(parts.join(", "), theme.faint())
 }

@@ -321,7 +321,7 @@ fn the_report_on_a_screen() {
                 at: 3.2,
                 kind: "detach".to_owned(),
                 device: "cam_wrist".to_owned(),
-                text: "cam_wrist detached, reported by stream".to_owned(),
+                text: "cam_wrist detached (stream)".to_owned(),
             },
         ],
     };
