@@ -154,7 +154,7 @@ impl Topic {
                     Err(_) => return Ok(None),
                 }
             }
-            _ => return Err(format!("{}: its samples are no array: see examples/subscribe.rs", self.name).into()),
+            _ => return Err(format!("{}: its samples are not an array: see examples/subscribe.rs", self.name).into()),
         };
         if shape != self.shape {
             let (found, wanted) = (shown(&shape), shown(&self.shape));

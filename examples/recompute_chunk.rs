@@ -133,7 +133,7 @@ fn contents(bytes: &[u8], modalities: &[Modality]) -> Result<(Vec<Chunk>, Sample
     Ok((chunks, samples))
 }
 
-/// What the policy was asked for; `None` if a sample is not in the file, an action is no number, or the chunk is of another policy.
+/// What the policy was asked for; `None` if a sample is not in the file, an action is not a number, or the chunk is of another policy.
 fn request(chunk: &Chunk, samples: &Samples, modalities: &[Modality], bundle: &Bundle) -> Option<Request> {
     let mut request = Request::new(bundle);
     request.tick = chunk.tick;
@@ -208,5 +208,5 @@ fn modalities(bytes: &[u8]) -> Result<Vec<Modality>, Box<dyn Error>> {
             return Ok(serde_json::from_str(record.metadata.get("modalities").ok_or("no modalities")?)?);
         }
     }
-    Err("no metadata: the file is no episode".into())
+    Err("no metadata: the file is not an episode".into())
 }

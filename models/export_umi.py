@@ -291,7 +291,7 @@ def robot(name: str, pose: Columns, width: Columns, numbers: dict, buffer: Buffe
     if len(wrong):
         at = rows[wrong[0]]
         episode, frame = (numbers[key][at, 0] for key in ("episode_index", "frame_index"))
-        raise Unfit(f"--pose {pose.text}: episode {episode}, frame {frame}: its numbers are no rotation")
+        raise Unfit(f"--pose {pose.text}: episode {episode}, frame {frame}: its numbers are not a rotation")
     begins = [0, *buffer.ends[:-1]]
     lengths = numpy.diff([0, *buffer.ends])
     return {

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Tests what needs more than a rig: the upload, the page for a phone in Chromium, sensors of another computer, a cluster's export,
-# UMI's replay buffer, Rerun. Fetches 2 GB of Go's modules, crates, Python packages and a browser once, and is no part of
+# UMI's replay buffer, Rerun. Fetches 2 GB of Go's modules, crates, Python packages and a browser once, and is not part of
 # `make test`.
 #
 # RAPID_BIN is the program, which `make fleet-test` builds. The last lines are a table: each part, and whether it ran, was skipped

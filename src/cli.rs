@@ -93,7 +93,7 @@ Exit codes: 0 success, 1 failed while running, 2 invalid configuration or argume
 const INSPECT: &str = "\
 One file gives a report; a folder or several files one line each: GOOD, SUSPECT or BAD. With --plot each gives a \
 picture instead, X.svg beside X.mcap: verdict, and the presence, rate, losses and pictures of each sensor over time. \
-A file of that name that is no such picture is not replaced.
+A file of that name that is not such a picture is not replaced.
 
 Examples:
   rapid inspect episodes/20260101_place-block_001.mcap

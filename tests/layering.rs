@@ -522,7 +522,7 @@ fn is_path_sep(tokens: &[TokenTree], at: usize) -> bool {
     is_punct(tokens.get(at), ':') && is_punct(tokens.get(at + 1), ':')
 }
 
-/// `Vec::<u8>::new`, `<T as Trait>::make`: what stands here belongs to a type, and is no crate or module.
+/// `Vec::<u8>::new`, `<T as Trait>::make`: what stands here belongs to a type, and is not a crate or module.
 fn is_after_generics(tokens: &[TokenTree], at: usize) -> bool {
     let arrow = at >= 4 && is_punct(tokens.get(at - 4), '-');
     at >= 3 && is_path_sep(tokens, at - 2) && is_punct(tokens.get(at - 3), '>') && !arrow
@@ -580,7 +580,7 @@ fn layer(module: &str) -> Option<usize> {
 fn import(home: &str, path: &[String]) -> Option<String> {
     let [root, target, ..] = path else { return None };
     let target = target.as_str();
-    // Names that are no modules are the crate's own re-exports.
+    // Names that are not modules are the crate's own re-exports.
     let (from, to) = (layer(home)?, layer(target)?);
     if root != "crate" || target == home {
         return None;

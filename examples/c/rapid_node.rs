@@ -1,6 +1,6 @@
 //! `librapid_node.a`: what `rapid_node.h` declares.
 //!
-//! It is no binding of iceoryx2. A program that has one can do without this library: topic, types and header
+//! It is not a binding of iceoryx2. A program that has one can do without this library: topic, types and header
 //! are those of docs/interfaces.md.
 
 use std::cell::RefCell;

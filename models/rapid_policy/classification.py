@@ -21,7 +21,7 @@ class Input(Observation):
     @model_validator(mode="after")
     def _check_use(self) -> Input:
         if self.kind != "image":
-            raise mistake("kind", f"{self.kind!r} is no picture", 'write kind = "image"')
+            raise mistake("kind", f"{self.kind!r} is not a picture", 'write kind = "image"')
         for key in sorted(self.model_fields_set - _USED):
             raise mistake(key, "of no use to a classifier of single pictures", "remove it")
         if self.augmentation.brightness:
@@ -88,7 +88,7 @@ class Classification(Section):
             check_picture(self.encoder, o, f"input.{i}")
         differences = [o.key for o in self.input if o.operation == "diff_to_reference"]
         if self.contact.input not in differences:
-            cause = f"{self.contact.input!r} is no input that is a difference"
+            cause = f"{self.contact.input!r} is not an input that is a difference"
             fix = f"write one of them: {', '.join(differences) or 'none yet'}"
             raise mistake("contact.input", cause, fix)
         return self

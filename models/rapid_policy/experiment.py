@@ -37,7 +37,7 @@ def known(meaning: str, example: Any, default: Any = ..., **limits: Any) -> Any:
 
 def _plain(name: str) -> str:
     if not name or not name.replace("_", "").replace("-", "").isalnum():
-        raise mistake("", f"{name!r} is no name", "use letters, digits, - and _")
+        raise mistake("", f"{name!r} is not a name", "use letters, digits, - and _")
     return name
 
 
@@ -230,7 +230,7 @@ class Observation(Section):
             raise mistake("columns", cause, "write either columns of the modality, or parts")
         if self.columns and list(self.columns) != list(range(self.columns[0], self.columns[-1] + 1)):
             fix = "name neighbours in order, or several observations"
-            raise mistake("columns", f"{list(self.columns)} is no range, which is all a bundle can take", fix)
+            raise mistake("columns", f"{list(self.columns)} is not a range, which is all a bundle can take", fix)
         if self.slice and self.slice[1] - self.slice[0] != self.shape[0] and not self.turned:
             cause = f"{self.slice[1] - self.slice[0]} numbers, where the parts have {self.shape[0]}"
             raise mistake("slice", cause, f"write [{self.slice[0]}, {self.slice[0] + self.shape[0]}], or other parts")

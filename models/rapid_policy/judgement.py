@@ -41,7 +41,7 @@ def program() -> str:
     named = os.environ.get("RAPID_BIN")
     found = shutil.which(named or "rapid")
     if found is None:
-        what = f"RAPID_BIN={named} is no program" if named else "no program `rapid` in the PATH"
+        what = f"RAPID_BIN={named} is not a program" if named else "no program `rapid` in the PATH"
         raise JudgementError(
             f"{what}: build it (cargo build --release) and set RAPID_BIN=/path/to/target/release/rapid"
         )

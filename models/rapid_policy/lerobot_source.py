@@ -126,7 +126,7 @@ def _names(feature: dict[str, Any], names: Any) -> list[str]:
 
 
 def pictures(rows: dict[str, Any], modality: str) -> Iterator[NDArray[np.uint8] | None] | None:
-    """The pictures of a camera where it is present; none if the dataset has no such camera. A damaged picture is none;
+    """The pictures of a camera where it is present; none if the dataset has no such camera. A damaged picture is absent;
     nothing of a damaged video is used: frames after the damage may be wrong and look right."""
     feature = _camera(rows, modality)
     if feature is None:

@@ -26,7 +26,7 @@ class MinMax:
     def of(what: str, values: NDArray[np.float64], turns: Iterable[int] = ()) -> MinMax:
         """The range of `values` [N, D]; a dimension that never changes cannot be normalised.
 
-        The dimensions `turns` belong to a rotation and keep their range, -1 to 1: scaled separately they would be no rotation.
+        The dimensions `turns` belong to a rotation and keep their range, -1 to 1: scaled separately they would not be a rotation.
         """
         low, high = values.min(0), values.max(0)
         low[list(turns)], high[list(turns)] = -1.0, 1.0

@@ -48,7 +48,7 @@ def decode(schema: str, message: Any) -> Pixels:
             raise PixelError(str(error)) from error
     if schema == RAW:
         return _raw(message)
-    raise FormatError(f"messages of {schema} are no pictures that are read: expected {COMPRESSED} or {RAW}")
+    raise FormatError(f"messages of {schema} are not pictures that are read: expected {COMPRESSED} or {RAW}")
 
 
 def _raw(message: Any) -> Pixels:

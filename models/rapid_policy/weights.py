@@ -184,7 +184,7 @@ def _spec(described: dict[str, Any], encoder: dict[str, torch.Tensor], denoiser:
                 "policy": {key: described[key] for key in horizon}
                 | {"inference_steps": described["scheduler"]["num_inference_steps"]},
                 "observation": [_observation(o) for o in described["observations"]],
-                # Where the actions came from is no part of a bundle; what they are is in `policy.json`.
+                # Where the actions came from is not part of a bundle; what they are is in `policy.json`.
                 "action": {"actuator": action["actuator"], "names": action["names"], "units": action["units"]},
                 **network,
                 "training": {"iterations": 1},

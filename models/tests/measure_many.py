@@ -103,7 +103,7 @@ def timed(work) -> float:
 
 
 def anonymous() -> float:
-    """MB of this process that are no pages of files."""
+    """MB of this process that are not pages of files."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     (line,) = (line for line in status.splitlines() if line.startswith("RssAnon"))
     return int(line.split()[1]) / 1e3

@@ -119,7 +119,7 @@ class Windows(unittest.TestCase):
         batch, given = drawn(dataset, 500)
         outcomes = dataset.ranges["action"].invert(batch.outcomes.numpy())[:, 0].round().astype(int)
         self.assertEqual(set(outcomes.tolist()), {4, 27, 19})
-        # A window of the first episode can be told by a tick that the third has not.
+        # A window of the first episode is recognised by a tick that the third has not.
         seen = ((given["wrist"][:, -1, 0, 0, 0] + 1) * 127.5).round().int().numpy()
         self.assertEqual(set(outcomes[seen >= 20].tolist()), {27})
         self.assertEqual(set(outcomes[seen == 11].tolist()), {19})
@@ -330,7 +330,7 @@ class Histories(unittest.TestCase):
         broken = by_hand(100)
         broken.present("phone")[40] = False
         dataset = Dataset(remembering(), [by_hand(100), broken])
-        # The last tick of an episode and the two around a pose that is none have no action.
+        # The last tick of an episode and the two around an invalid pose have no action.
         dataset.windows = dataset.windows[np.isin(dataset.windows[:, 0], [0, 100 + 12, 100 + 47])]
         tick, _, found = self.shown(dataset)
         expected = {0: (*[None] * 11, 0), 12: (*[None] * 9, 2, 7, 12), 47: (*[None] * 10, 42, 47)}

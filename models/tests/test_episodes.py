@@ -120,7 +120,7 @@ class Recorded(Folder):
             (Source("cam_head", "image", size=(96, 96)), "no modality 'cam_head'; it has arm, "),
             (Source("cam_wrist", "image", size=(48, 48)), "cam_wrist: a picture of 96x96, the policy takes 48x48"),
             (Source("tactile_tip", "vector"), "tactile_tip: messages of foxglove.CompressedImage"),
-            (Source("arm", "image", size=(96, 96)), "arm: messages of rapid.Scalars are no pictures"),
+            (Source("arm", "image", size=(96, 96)), "arm: messages of rapid.Scalars are not pictures"),
         ):
             with self.assertRaisesRegex(EpisodeError, message):
                 read_episode(self.path, (wrong,))

@@ -44,7 +44,7 @@ class Present(unittest.TestCase):
         theirs["observation.images.cam"] = [b""] * 4
         for modality, there in (("arm", True), ("cam", True), ("film", True), ("tactile", False)):
             found = lerobot_source.presence(theirs, modality, 4)
-            # What is not in the dataset is unplugged, which is no stall.
+            # What is not in the dataset is unplugged, which is not a stall.
             for name in ("plugged", "running"):
                 self.assertEqual(found[name].tolist(), [there] * 4, (modality, name))
 

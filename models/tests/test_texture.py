@@ -51,7 +51,7 @@ class Experiments(unittest.TestCase):
     def test_every_mistake_has_file_key_cause_and_fix(self):
         text = FILE.read_text(encoding="utf-8")
         for given, instead, expected in (
-            ('input = "difference"', 'input = "tactile"', "contact.input: 'tactile' is no input that is a difference: write one of them: difference"),
+            ('input = "difference"', 'input = "tactile"', "contact.input: 'tactile' is not an input that is a difference: write one of them: difference"),
             ("folds = 10", "folds = 1", "test.folds: 1: input should be greater than or equal to 2: write for example folds = 10 "
              "(parts of the episodes, each tested by a classifier trained on the others)"),
             ("pictures = 64", "windows = 64", "training.windows: unknown: remove it; there are iterations, pictures, learning_rate, seed"),

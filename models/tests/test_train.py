@@ -382,7 +382,7 @@ class CommandLine(Case):
 
     def setUp(self):
         super().setUp()
-        # Files of a test are no files of the program: a program that calls them GOOD stands in its place.
+        # Files of a test are not files of the program: a program that calls them GOOD stands in its place.
         self.judge = self.folder / "rapid"
         self.judge.write_text(
             f"#!{sys.executable}\nimport json, sys\n"

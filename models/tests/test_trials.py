@@ -343,7 +343,7 @@ class Training(Case):
         words = [str(MODELS / "experiments" / "transformer.toml"), "--out", str(self.folder / "none")]
         argv = ["train", *words, "--rapid", "/no/program", "--evaluate-every", "5"]
         with mock.patch.object(sys, "argv", argv), mock.patch.dict(os.environ):
-            with self.assertRaisesRegex(Exception, "RAPID_BIN=/no/program is no program: build it"):
+            with self.assertRaisesRegex(Exception, "RAPID_BIN=/no/program is not a program: build it"):
                 prepare(parse(), mock.Mock())
         self.assertFalse((self.folder / "none").exists())
 

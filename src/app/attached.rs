@@ -72,7 +72,7 @@ impl Attached {
         let (board, commands) = (Arc::clone(&self.board), self.commands.clone());
         tokio::spawn(async move {
             if let Ok(stream) = stream.set_nonblocking(true).and_then(|()| UnixStream::from_std(stream)) {
-                // A screen that has left, or is stuck, is no error of the run.
+                // A screen that has left, or is stuck, is not an error of the run.
                 let _ = serve(stream, place, &board, &commands, read_only).await;
             }
         });

@@ -28,7 +28,7 @@ pub enum ListError {
     /// A folder cannot be read.
     #[error(transparent)]
     Episode(#[from] ReadError),
-    /// A date is none.
+    /// A date is invalid.
     #[error("{option}: {why}")]
     Date {
         /// The option.
@@ -131,7 +131,7 @@ impl<'a> Filter<'a> {
 /// [`CommandStatus::Done`].
 ///
 /// # Errors
-/// When a folder cannot be read, a date is none, or nothing can be written to `out`.
+/// When a folder cannot be read, a date is invalid, or nothing can be written to `out`.
 pub fn list(
     args: &ListArgs,
     format: Format,

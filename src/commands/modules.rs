@@ -12,7 +12,7 @@ use super::Format;
 /// Why there is no descriptor.
 #[derive(Debug, thiserror::Error)]
 pub enum ModulesError {
-    /// It is none, or not known.
+    /// It is invalid or unknown.
     #[error(transparent)]
     Catalogue(#[from] CatalogueError),
     /// Its file cannot be read.
@@ -26,7 +26,7 @@ pub enum ModulesError {
 /// The descriptor of this name, or in this file: what contains `/`, or has an extension, is a path.
 ///
 /// # Errors
-/// When there is none.
+/// When it cannot be read, or is invalid or unknown.
 pub fn descriptor(name: &str) -> Result<Descriptor, ModulesError> {
     let is_path = name.contains('/') || Path::new(name).extension().is_some();
     if is_path {
@@ -39,7 +39,7 @@ pub fn descriptor(name: &str) -> Result<Descriptor, ModulesError> {
 /// Prints one descriptor, or a list of all.
 ///
 /// # Errors
-/// When there is none of this name.
+/// When none has this name, or nothing can be written.
 pub fn modules(
     name: Option<&str>,
     registry: Option<&Registry>,

@@ -375,7 +375,7 @@ impl Work<'_> {
             let Some(reference) = self.references.get_mut(at).filter(|reference| **reference != Reference::None) else {
                 continue;
             };
-            // One that this policy cannot use is none.
+            // One that this policy cannot use is ignored.
             if observe_alone(self.model, &mut self.request, at, (header, bytes)) {
                 *reference = Reference::Known;
             }
@@ -465,7 +465,7 @@ fn planned(chunk: &RecordedChunk, action: &RecordedAction, bundle: &Bundle) -> O
 /// sample of the chunk is there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reference {
-    /// There is none: its samples are used as they are.
+    /// It needs none: its samples are used as they are.
     None,
     /// The next sample becomes the reference.
     Next,

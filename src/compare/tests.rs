@@ -341,7 +341,7 @@ fn a_reference_from_before_the_episode_is_attached_to_it() {
         let last = chunks.iter().rev().find_map(|chunk| of_chunk(chunk, at).last().copied()).unwrap();
         let wrong = again(recorded.attached(key, topic, last));
         assert!(wrong.difference.all.largest > 1e-5, "{key}: {wrong:?}");
-        // One that cannot be read is none, as is that of another policy's observation.
+        // One that cannot be read is ignored, as is that of another policy's observation.
         let [mut cut, mut foreign] = [(); 2].map(|()| recorded.attached(key, topic, last));
         cut.data.to_mut().truncate(9);
         foreign.name = "reference/other".to_owned();

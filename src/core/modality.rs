@@ -17,9 +17,9 @@ pub const MAX_MODALITIES: usize = 64;
 #[serde(try_from = "u8", into = "u8")]
 pub struct ModalityId(u8);
 
-/// A number that is no bit of the mask.
+/// A number that is not a bit of the mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("{0} is no bit of the mask: 0 to 63 are")]
+#[error("{0} is not a bit of the mask: 0 to 63 are")]
 pub struct NoModality(u8);
 
 impl TryFrom<u8> for ModalityId {

@@ -125,7 +125,7 @@ impl Observation {
         }
     }
 
-    /// Reads the published form of the observation of `tick`; `None` if it is none.
+    /// Reads the published form of the observation of `tick`; `None` if the bytes are not an observation.
     pub fn decode(tick: Stamp, bytes: &[u8]) -> Option<Self> {
         let (mask, slots) = bytes.split_first_chunk()?;
         let (slots, []) = slots.as_chunks::<SLOT_BYTES>() else { return None };

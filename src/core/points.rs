@@ -2,7 +2,7 @@
 //!
 //! Velodyne's sensors with 16 lasers (VLP-16 user manual 63-9243, sections 6, 9 and appendix A): a data packet has 1206
 //! bytes: 12 blocks of 100 bytes, a time of 4 bytes, the return mode and the model. A block is `ff ee`, the azimuth in
-//! hundredths of a degree (u16), and 32 returns of 3 bytes: distance in 2 mm (u16; 0 is none) and reflectivity. The 16 lasers
+//! hundredths of a degree (u16), and 32 returns of 3 bytes: distance in 2 mm (u16; 0 is no return) and reflectivity. The 16 lasers
 //! fire twice in a block, the second time half way to the azimuth of the next; the laser of return n is n modulo 16. All
 //! of a firing get its azimuth: the last fires a tenth to a quarter of a degree later.
 //!
@@ -37,7 +37,7 @@ pub struct Point {
     pub reflectivity: u8,
 }
 
-/// Passes each point of a packet on, in its order; false, and nothing passed on, if it is no packet of points.
+/// Passes each point of a packet on, in its order; false, and nothing passed on, if it is not a packet of points.
 pub fn read(format: PacketFormat, packet: &[u8], each: impl FnMut(Point)) -> bool {
     match format {
         PacketFormat::Velodyne => velodyne::read(packet, each).is_some(),

@@ -78,11 +78,11 @@ pub struct Head {
     pub height: u32,
 }
 
-/// Why bytes are no frame.
+/// Why bytes are not a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum FrameError {
     /// They do not begin as a frame does.
-    #[error("what came is no frame of rapid-remote, or of another version of it")]
+    #[error("what came is not a frame of rapid-remote, or of another version of it")]
     Foreign,
     /// A field has a value that it cannot have.
     #[error("a frame has the {0} {1}")]
@@ -142,7 +142,7 @@ impl Head {
     /// The head of a frame whose payload is at most `most` bytes.
     ///
     /// # Errors
-    /// When it is none.
+    /// When these bytes are not the head of a frame, or its payload is larger.
     pub fn read(bytes: &[u8; HEAD], most: usize) -> Result<Self, FrameError> {
         if bytes[..MAGIC.len()] != MAGIC {
             return Err(FrameError::Foreign);
@@ -227,7 +227,7 @@ impl Frames {
     /// So many bytes were put into the room. Returns the head of a frame that is complete.
     ///
     /// # Errors
-    /// When they are no frame. What comes next cannot be one either.
+    /// When they are not a frame. What comes next cannot be one either.
     pub fn filled(&mut self, count: usize) -> Result<Option<Head>, FrameError> {
         self.have = self.have.saturating_add(count).min(self.need);
         if self.head.is_none()

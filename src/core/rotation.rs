@@ -50,7 +50,7 @@ pub fn rows(q: Quaternion) -> [[f64; 3]; 2] {
 }
 
 /// The inverse of [`rows`] for numbers of a network: the first row keeps its direction, the second is made
-/// perpendicular to it. `None` if a row is none, or both are parallel: these numbers are no rotation.
+/// perpendicular to it. `None` if a row is zero or not finite, or both are parallel: these numbers are not a rotation.
 pub fn of_rows([first, second]: [[f64; 3]; 2]) -> Option<Quaternion> {
     let unit = |row: [f64; 3]| {
         let length = dot(row, row).sqrt();
@@ -67,7 +67,7 @@ pub fn of_rows([first, second]: [[f64; 3]; 2]) -> Option<Quaternion> {
     normalized(of_matrix([first, second, third]))
 }
 
-/// The four numbers that a network gives for a quaternion, of length 1. `None` if they are none.
+/// The four numbers that a network gives for a quaternion, of length 1. `None` if they are zero or not finite.
 pub fn of_four(q: Quaternion) -> Option<Quaternion> {
     let length = q.iter().map(|part| part * part).sum::<f64>().sqrt();
     (length > SMALLEST).then_some(q).and_then(normalized)

@@ -178,14 +178,14 @@ impl Zone {
     /// offset for a time of another zone.
     ///
     /// # Errors
-    /// When it is none, or before 1970; the text states what was expected.
+    /// When it is not a time, or before 1970; the text states what was expected.
     pub fn wall_ns(&self, text: &str) -> Result<u64, String> {
         let own = || text.parse::<Timestamp>().ok();
         let here = || {
             text.parse::<civil::DateTime>().ok()?.to_zoned_datetime(self.0.clone()).ok().map(|zoned| zoned.timestamp())
         };
         let moment = own().or_else(here).and_then(|moment| u64::try_from(moment.as_nanosecond()).ok());
-        moment.ok_or_else(|| format!("{text:?} is no date since 1970: write 2026-02-05 or 2026-02-05T11:30"))
+        moment.ok_or_else(|| format!("{text:?} is not a date since 1970: write 2026-02-05 or 2026-02-05T11:30"))
     }
 
     fn zoned(&self, wall_ns: u64) -> ZonedDateTime {

@@ -253,7 +253,7 @@ const POINT: u8 = 13;
 /// Its fields: name, place, and type (`foxglove.PackedElementField.NumericType`: 1 UINT8, 7 FLOAT32).
 const POINT_FIELDS: [(&str, u32, u64); 4] = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 1)];
 
-/// Writes a `foxglove.PointCloud` of a packet; false if it is none.
+/// Writes a `foxglove.PointCloud` of a packet; false if it is not a packet of points.
 pub fn points(out: &mut Vec<u8>, wall_ns: u64, spec: &PointsSpec, packet: &[u8]) -> bool {
     let mut count = 0;
     if !points::read(spec.format, packet, |_| count += 1) {

@@ -16,7 +16,7 @@ const PIECE: usize = 256 << 10;
 /// The SHA-256 of the file at `path`.
 ///
 /// # Errors
-/// When it cannot be read, or is no file.
+/// When it cannot be read, or is not a file.
 pub fn sha256(path: &Path) -> Result<String, ReadError> {
     let (file, size) = open(path)?;
     sha256_of(&file, size, |_| ()).map_err(|source| ReadError::Io { path: path.to_owned(), source })

@@ -126,7 +126,7 @@ impl<R: ReadAt> Reader<R> {
     /// Moves to the next record; `false` at the end.
     ///
     /// # Errors
-    /// The file cannot be read. Bytes that are damaged are no error: they are left out.
+    /// The file cannot be read. Bytes that are damaged are not an error: they are left out.
     pub fn advance(&mut self) -> Result<bool, ReadError> {
         let advanced = self.records.advance().map_err(|source| ReadError::Io { path: self.path.clone(), source })?;
         let record = self.records.record();

@@ -2,7 +2,7 @@
 //!
 //! The modalities of `rapid.mask`, `rapid.plugged`, `rapid.valid` and `rapid.age` are those of the registry, ascending by
 //! bit, also those whose samples are not exported. A feature whose name begins with `observation.` is an input of a policy in
-//! LeRobot; those four are none.
+//! LeRobot; those four are not.
 
 use std::collections::BTreeMap;
 
@@ -555,7 +555,10 @@ mod tests {
         let joined = of(&episode, &["force", "arm.position"], &["arm.tip", "arm.0"]).unwrap();
         assert_eq!(joined.state, [axis(2, 0, "force.0"), arm[0].clone()]);
         assert_eq!(joined.action, [arm[2].clone(), arm[0].clone()]);
-        assert_eq!(of(&episode, &["raw"], &[]).unwrap_err(), "\"raw\" is no sensor of numbers; those are arm, force");
+        assert_eq!(
+            of(&episode, &["raw"], &[]).unwrap_err(),
+            "\"raw\" is not a sensor of numbers; those are arm, force"
+        );
         for chosen in ["/action", "/action.0"] {
             let refused = of(&episode, &[], &["arm", chosen]).unwrap_err();
             assert!(refused.starts_with("no action was sent in this episode"), "{refused}");
@@ -564,7 +567,7 @@ mod tests {
             of(&episode, &["arm.3"], &[]).unwrap_err().contains("arm has no column \"3\"; it has 0-2: hip.position")
         );
         assert_eq!(of(&episode, &["arm", "arm.1"], &[]).unwrap_err(), "\"arm.1\" is chosen twice");
-        // Actions have the names of their channel, and are no state.
+        // Actions have the names of their channel, and are not states.
         episode.action = Some(vec![Column::default(); 2]);
         assert_eq!(of(&episode, &[], &[]).unwrap().action, [topic(0, "action.0"), topic(1, "action.1")]);
         episode.action_names = texts(&["x", "grip"]);

@@ -407,7 +407,7 @@ impl Packets {
 mod tests {
     use super::*;
 
-    /// A program that is none.
+    /// A script in the place of ffmpeg.
     fn script(folder: &Path, body: &str) -> Ffmpeg {
         let program = folder.join("ffmpeg");
         crate::executable::script(&program, &format!("#!/bin/sh\n{body}\n"));

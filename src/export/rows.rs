@@ -54,7 +54,7 @@ pub enum Refusal {
         /// What is wrong with it.
         problem: String,
     },
-    /// Observations that are no whole number a second.
+    /// Observations that are not a whole number a second.
     #[error("{0} observations a second, and LeRobot takes whole numbers only: record with `--rate 30`")]
     Rate(f64),
     /// Without a frame index.
@@ -181,7 +181,7 @@ impl Payload {
                 Some(Self::Picture { encoding, width, height, bytes: sample.payload.to_owned() })
             }
             Encoding::F64 => Some(Self::Numbers(numbers(sample.payload))),
-            // Distances are no picture for LeRobot.
+            // Depth is not an image for LeRobot.
             Encoding::Bytes | Encoding::Mask | Encoding::Depth => None,
         }
     }
@@ -395,7 +395,7 @@ fn modalities(text: Option<&str>) -> Result<Vec<Listed>, Refusal> {
     }
     // LeRobot takes no such name for a feature.
     match listed.iter().find(|modality| modality.name.is_empty() || modality.name.contains(['/', '.'])) {
-        Some(modality) => Err(wrong(format!("{:?} is no name of a modality", modality.name))),
+        Some(modality) => Err(wrong(format!("{:?} is not the name of a modality", modality.name))),
         None => Ok(listed),
     }
 }

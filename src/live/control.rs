@@ -107,7 +107,7 @@ impl Controls {
         wanted.map(|(name, value)| Parameter { name: name.to_owned(), r#type: None, value: Some(value) }).collect()
     }
 
-    /// Changes what the next episodes are of. What is no task and no tag changes nothing.
+    /// Changes what the next episodes are of. What is neither a task nor a tag changes nothing.
     async fn change(&self, parameters: Vec<Parameter>) {
         let Some(plan) = plan(parameters) else { return };
         let (Ok(text) | Err(text)) = self.request(plan).await;

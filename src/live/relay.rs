@@ -7,7 +7,7 @@
 //! Invariant: of a topic that a client subscribes to, no more than [`TOPIC_BYTES`] wait for it, or one message that is
 //! larger; the oldest are left out. So a picture of half of that or more waits alone until a newer one replaces it, and a
 //! topic of small messages is complete unless its client stays behind for as long as these take to be as many.
-//! Invariant: what is no message of a topic (channels, answers of services) is never left out: a client that leaves more
+//! Invariant: what is not a message of a topic (channels, answers of services) is never left out: a client that leaves more
 //! than [`OTHER_BYTES`] of it unread is disconnected, and so is one for which more than [`CLIENT_BYTES`] wait altogether.
 //! Invariant: a connection without a handshake ends after [`LIMIT`], and so does one whose server has ended.
 

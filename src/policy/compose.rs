@@ -70,7 +70,7 @@ impl Composer {
     /// action queue refuses it.
     ///
     /// # Errors
-    /// When `output` or `actions` has another length, a rotation of the output is none, or the request has no pose that
+    /// When `output` or `actions` has another length, a rotation of the output is invalid, or the request has no pose that
     /// the output is relative to.
     pub fn compose(&self, request: &Request, output: &[f32], actions: &mut [f32]) -> Result<(), ChunkError> {
         let composed = self.try_compose(request, output, actions);
@@ -124,7 +124,7 @@ impl Composer {
         Ok(true)
     }
 
-    /// The pose of an action in the output, and the rest of it. `None` if its rotation is none.
+    /// The pose of an action in the output, and the rest of it. `None` if its rotation is invalid.
     fn given<'a>(&self, output: &'a [f32]) -> Option<(Pose, &'a [f32])> {
         let (position, rest) = output.split_first_chunk::<POSITION>()?;
         let (rotation, rest) = match self.rotation {

@@ -125,10 +125,10 @@ pub enum ChunkError {
     /// NaN or infinity.
     #[error("a chunk with values that are not finite numbers")]
     NotFinite,
-    /// A rotation in it is none.
+    /// A rotation in it is invalid.
     #[error("a chunk with an invalid rotation: its rows are zero or parallel, or its quaternion is zero")]
     NoRotation,
-    /// The pose that its actions are relative to is none.
+    /// The pose that its actions are relative to is invalid.
     #[error("a chunk relative to a sample that has no pose: it is too short, not finite, or its quaternion is zero")]
     NoBase,
     /// Its observation precedes the start of the last hold.
@@ -160,7 +160,7 @@ pub struct Counts {
     pub expired_chunks: u64,
     /// Chunks with NaN or infinity.
     pub not_finite_chunks: u64,
-    /// Chunks from which no poses follow: a rotation is none, or what they are relative to.
+    /// Chunks from which no poses follow: a rotation, or the pose that they are relative to, is invalid.
     pub no_pose_chunks: u64,
     /// Chunks of the wrong length.
     pub wrong_length_chunks: u64,
@@ -229,7 +229,7 @@ impl ActionQueue {
     pub fn new(bundle: &Bundle, registry: &Registry, without_mask: WithoutMask) -> Self {
         let is_picture = |observation: &ObservationSpec| matches!(observation.input, ObservationInput::Image(_));
         let modality = |(at, observation): (usize, &ObservationSpec)| {
-            // A history is no picture besides those that its modality is observed by now.
+            // A history is not a picture besides those that its modality is observed by now.
             let counted = |(other_at, other): (usize, &ObservationSpec)| {
                 let goes_before = other.history.is_none() || other_at < at;
                 other.modality == observation.modality && is_picture(other) && goes_before

@@ -25,7 +25,7 @@ pub enum VectorError {
         /// The expected numbers, in words.
         wanted: String,
     },
-    /// Numbers that are to be a rotation are none.
+    /// A rotation is invalid.
     #[error("observation `{0}` is a rotation, but the quaternion of the sample is invalid: zero, or not finite")]
     Rotation(String),
 }

@@ -89,7 +89,7 @@ pub fn named(name: &str) -> Result<Descriptor, CatalogueError> {
 /// Reads a descriptor.
 ///
 /// # Errors
-/// When it is none.
+/// When it is not a descriptor.
 pub fn parse(text: &str) -> Result<Descriptor, CatalogueError> {
     let wrong = |what: &str| CatalogueError::Wrong(what.to_owned());
     let root: Table =
@@ -102,7 +102,7 @@ pub fn parse(text: &str) -> Result<Descriptor, CatalogueError> {
     let (Some((name, module)), 1) = (modules.iter().next(), modules.len()) else {
         return Err(wrong("it describes one module: write one [module.NAME]"));
     };
-    let module = module.as_table().ok_or_else(|| wrong("[module.NAME] is no table"))?;
+    let module = module.as_table().ok_or_else(|| wrong("[module.NAME] is not a table"))?;
     if let Some(other) = module.keys().find(|key| !["slot", "tags", "devices", TRANSFORM].contains(&key.as_str())) {
         return Err(CatalogueError::Wrong(format!(
             "[module.{name}] has no key {other:?}: slot, tags, devices and transform"
@@ -110,16 +110,16 @@ pub fn parse(text: &str) -> Result<Descriptor, CatalogueError> {
     }
     let slot = module.get("slot").and_then(Value::as_str).unwrap_or_default();
     let mount = Mount::WORDS.iter().find(|(word, _)| *word == slot).map(|(_, mount)| *mount);
-    let mount = mount.ok_or_else(|| wrong("its slot is none of front, tip, top and bottom"))?;
+    let mount = mount.ok_or_else(|| wrong("its slot is not one of front, tip, top and bottom"))?;
     let texts = |key: &str| -> Result<Vec<String>, CatalogueError> {
         let list = module.get(key).map_or(Some(&[][..]), |value| value.as_array().map(Vec::as_slice));
         let texts = list.and_then(|list| list.iter().map(|item| item.as_str().map(str::to_owned)).collect());
-        texts.ok_or_else(|| CatalogueError::Wrong(format!("{key} is no list of texts")))
+        texts.ok_or_else(|| CatalogueError::Wrong(format!("{key} is not a list of texts")))
     };
     let devices = texts("devices")?;
     let mut sensors = Vec::new();
     for (sensor, value) in tables("device").into_iter().flatten() {
-        let table = value.as_table().ok_or_else(|| wrong("[device.NAME] is no table"))?;
+        let table = value.as_table().ok_or_else(|| wrong("[device.NAME] is not a table"))?;
         if !devices.contains(sensor) {
             return Err(CatalogueError::Wrong(format!(
                 "[device.{sensor}] is not among the devices of [module.{name}]"
@@ -263,9 +263,9 @@ mod tests {
             ("[module]", "it describes one module"),
             ("[module.a]\nslot = \"tip\"\n[module.b]\nslot = \"tip\"", "it describes one module"),
             ("module = 3", "it has no [module.NAME]"),
-            ("[module.a]", "its slot is none of front"),
+            ("[module.a]", "its slot is not one of front"),
             ("[module.a]\nslot = \"tip\"\ncolour = \"red\"", "no key \"colour\""),
-            ("[module.a]\nslot = \"tip\"\ntags = \"x\"", "tags is no list of texts"),
+            ("[module.a]\nslot = \"tip\"\ntags = \"x\"", "tags is not a list of texts"),
             ("[rig]\n[module.a]\nslot = \"tip\"", "\"rig\" is neither"),
             ("[module.a]\nslot = \"tip\"\n[device.b]\nnode = \"camera\"", "not among the devices"),
             ("[module.a]\nslot = \"tip\"\ndevices = [\"b\"]\n[device.b]\ndepth = 8", "[device.b] has no node"),

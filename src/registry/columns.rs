@@ -24,7 +24,7 @@ pub struct Vector {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ColumnError {
     /// No vector has the name.
-    #[error("{name:?} is no sensor of numbers; those are {}", if known.is_empty() { "none" } else { known })]
+    #[error("{name:?} is not a sensor of numbers; those are {}", if known.is_empty() { "none" } else { known })]
     Unknown {
         /// The name.
         name: String,
@@ -178,7 +178,7 @@ mod tests {
     #[test]
     fn what_names_nothing_is_refused_with_what_there_is() {
         let refused = |parts: &[&str]| chosen(parts).unwrap_err();
-        assert_eq!(refused(&["arm.0"]), "\"arm\" is no sensor of numbers; those are leg, force, late");
+        assert_eq!(refused(&["arm.0"]), "\"arm\" is not a sensor of numbers; those are leg, force, late");
         let known = "it has 0-3: hip.position, hip.velocity, knee.position, knee.velocity";
         for which in ["4", "2-4", "3-2", "99999999999999999999999", "hips", "hip.", "", "1-", "-1"] {
             assert_eq!(

@@ -157,7 +157,7 @@ impl Type for Real {
     }
 }
 
-/// A duration of at least this and at most an hour, or "never", which is none.
+/// A duration of at least this and at most an hour, or "never": no duration.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TimeOrNever(pub(crate) Duration);
 

@@ -18,7 +18,7 @@ const SIZES: [(&str, u64); 9] = [
 ];
 
 /// `25ms`, `1.5s`, `2 min`, `1h 30min`: numbers, whole or decimal, each with its unit, from `ns` to years; only `0` needs
-/// no unit. Each is rounded to whole ns. `None` when the text is no duration, or longer than 2^64 ns (584 years).
+/// no unit. Each is rounded to whole ns. `None` when the text is not a duration, or longer than 2^64 ns (584 years).
 pub fn parse_duration(text: &str) -> Option<Duration> {
     let total = terms(text).try_fold(0_u128, |sum, term| sum.checked_add(nanoseconds(term)?))?;
     u64::try_from(total).ok().map(Duration::from_nanos)

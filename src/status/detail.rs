@@ -167,7 +167,7 @@ mod tests {
         let intervals = Intervals::default();
         intervals.count(Duration::ZERO);
         intervals.count(Duration::from_secs(100));
-        assert_eq!(intervals.counts().iter().sum::<u64>(), 1, "an absence is no interval");
+        assert_eq!(intervals.counts().iter().sum::<u64>(), 1, "an absence is not an interval");
         assert!(bounds.last().is_some_and(|last| (Duration::from_secs(4)..Duration::from_secs(5)).contains(last)));
     }
 }

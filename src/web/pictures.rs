@@ -3,7 +3,7 @@
 //! Cameras leave out the tables that a browser needs, send pixels that are not compressed, or pictures of many megapixels:
 //! each becomes the same kind of small JPEG.
 //!
-//! Invariant: a picture is encoded once, however many pages show it. A damaged one is none.
+//! Invariant: a picture is encoded once, however many pages show it. A damaged one is not shown.
 
 use hyper::body::Bytes;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};

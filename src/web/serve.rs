@@ -158,7 +158,7 @@ impl Server {
         let _ = stream.set_nodelay(true);
         let served = http1::Builder::new().max_buf_size(LONGEST_HEAD).serve_connection(TokioIo::new(stream), service);
         tokio::select! {
-            // What is no HTTP, or a client that has gone, is no error of the run.
+            // What is not HTTP, or a client that has gone, is not an error of the run.
             _ = served => {}
             () = connection.stuck() => {}
         }
@@ -306,7 +306,7 @@ impl Server {
         const NOT_HERE: Refusal = (StatusCode::FORBIDDEN, "the page does not request this");
         let body = body(request).await?;
         let wanted: SessionRequest = serde_json::from_slice(&body)
-            .map_err(|_| (StatusCode::BAD_REQUEST, "this is no request to the session"))?;
+            .map_err(|_| (StatusCode::BAD_REQUEST, "this is not a request to the session"))?;
         if !is_offered(&wanted) {
             return Err(NOT_HERE);
         }

@@ -177,7 +177,7 @@ def changes(upload, read_back, variables, rig):
 
 
 def closes_late(upload, variables, place, rig):
-    """An episode that is closed once the copy has begun is left to the next start, which is no failure of this one."""
+    """An episode that is closed once the copy has begun is left to the next start, which is not a failure of this one."""
     late, tools = Path(variables["EPISODES"]) / "a_007.mcap", place / "tools"
     tools.mkdir()
     # In the place of rclone: the episode appears before the check begins, old as one that was repaired.

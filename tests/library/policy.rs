@@ -226,7 +226,7 @@ fn the_encoder_gets_the_steps_of_a_history_and_which_of_them_there_are() {
         [some(20), None, None, some(60)],
         // In another order, and one several times.
         [some(60), some(60), some(20), some(10)],
-        // One that cannot be decoded is none.
+        // One that cannot be decoded is absent.
         [some(60), Some(Err(())), None, some(70)],
         [None; 4],
     ] {

@@ -474,7 +474,7 @@ fn limits_of_the_verdict_are_the_defaults_then_the_rigs_then_the_devices() {
     assert_eq!((screen.suspect.gap, screen.bad.gap, screen.hz), (ms(2000), ms(5000), Some(30.0)));
     assert_eq!((cam.suspect.frozen, cam.bad.frozen, cam.compares()), (ms(1000), ms(2000), true));
     assert_eq!((screen.suspect.frozen, screen.bad.frozen, screen.compares()), (None, None, false));
-    // Equal numbers are no fault unless the device's own table makes them one.
+    // Equal numbers are not a fault unless the device's own table makes them one.
     assert_eq!((imu.suspect.frozen, imu.bad.frozen, imu.compares()), (None, ms(5000), true));
     assert_eq!((imu.suspect.rate, imu.bad.rate, imu.hz), (Some(0.9), Some(0.8), Some(200.0)));
 }

@@ -112,7 +112,7 @@ fn impossible_values_are_rejected_with_the_valid_ones() {
             && printed.contains("Next: soft with vision"),
         "{printed}"
     );
-    // Files that are no episodes are reported and not counted.
+    // Files that are not episodes are reported and not counted.
     std::fs::create_dir(place.path("episodes")).expect("folder");
     place.write("episodes/x.mcap", "not an episode");
     let output = place.run(&["ablation"]);

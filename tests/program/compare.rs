@@ -118,7 +118,7 @@ fn a_demonstration_is_compared_tick_by_tick_and_each_figure_is_that_of_the_file(
     let numbers: Vec<&str> = row.split_whitespace().collect();
     assert_eq!(numbers[2..4], [format!("{mean:.4}"), format!("{largest:.4}")], "{text}");
 
-    // It was no policy that acted: nothing is computed again, and no tolerance can be met.
+    // It was not a policy that acted: nothing is computed again, and no tolerance can be met.
     let output = place.run(&["replay", &file, "--infer", &bundle, "--tolerance", "100"]);
     assert_eq!(output.status.code(), Some(1));
     assert!(errors(&output).contains("no policy recorded it"), "{}", errors(&output));

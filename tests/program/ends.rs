@@ -320,7 +320,7 @@ fn end_of_episode(place: &Place, what: &str) -> SystemTime {
     SystemTime::UNIX_EPOCH + Duration::from_nanos(begin) + Duration::from_secs_f64(seconds)
 }
 
-/// What closes slowly after the end of an episode was asked for is no part of the episode: it ended before the device
+/// What closes slowly after the end of an episode was asked for is not part of the episode: it ended before the device
 /// began to close, which was this long before the program ended.
 fn ended_before_its_devices_closed(place: &Place, exited: SystemTime, what: &str) {
     let before = exited.duration_since(end_of_episode(place, what)).expect("an episode ends before its program");

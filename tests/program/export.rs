@@ -171,7 +171,7 @@ fn manipulated(place: &Place, wrist: &[Pictured]) {
     assert_eq!(difference["feature"], "observation.images.cam_wrist");
     assert!(difference["what"].as_str().expect("text").contains("from byte 321 on"), "{difference}");
 
-    // A table that is none any more.
+    // A table that can no longer be read.
     std::fs::write(place.path(DATA), &whole[..whole.len() - 10]).expect("written");
     let (objects, code) = export(place, &["out", "--verify"]);
     assert!(code == 1 && of(&objects, "difference").len() == 1, "{objects:?}");
@@ -238,7 +238,7 @@ fn nothing_left(place: &Place, short: &str, slow: &str) {
     };
     let unknown = state(&["--state", "cam_wrist"]);
     let text = String::from_utf8_lossy(&unknown.stderr).into_owned();
-    assert!(text.contains("\"cam_wrist\" is no sensor of numbers; those are motor_state"), "{text}");
+    assert!(text.contains("\"cam_wrist\" is not a sensor of numbers; those are motor_state"), "{text}");
     assert!(text.contains("error: nothing exported: none of 1 episode"), "{text}");
     assert_eq!((unknown.status.code(), place.path("other").exists()), (Some(1), false));
     let as_action = state(&["--state", "motor_state", "--action", "motor_state"]);

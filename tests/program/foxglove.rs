@@ -351,7 +351,7 @@ fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
     assert_eq!(of(topics[1]).len(), of(topics[2]).len());
     assert_eq!(of("/rapid/camera/wrist").len(), of("/rapid/camera/wrist/calibration").len());
     assert!(counts["/rapid/camera/wrist/calibration"] > 10, "{counts:?}");
-    // They are no devices of their own.
+    // They are not devices of their own.
     let report = place.run(&["inspect", "--json", &file]).stdout;
     let report: Value = serde_json::from_slice(&report).expect("JSON");
     assert_eq!(report["modalities"].as_array().map(Vec::len), Some(4), "{report}");
@@ -646,7 +646,7 @@ fn a_ninth_client_gets_nothing_and_why() {
     ninth.read();
     assert!(ninth.received.is_empty(), "{}", ninth.received.len());
     drop(clients);
-    // One that comes before their places are free is told so, and gets nothing.
+    // One that comes before their places are free is answered so, and gets nothing.
     until("a place is free", || {
         let mut next = Client::connect(&address);
         next.read_until("masks or the reason", |client| client.count("/rapid/mask") > 0 || !client.answers.is_empty());

@@ -298,7 +298,7 @@ fn an_invalid_policy_or_one_for_another_rig_is_rejected_and_named() {
     assert!(stderr.contains(&format!("{text} (--ort-lib): it cannot be loaded: ")), "{stderr}");
 }
 
-/// A device that does not move is no actuator, whatever the registry states.
+/// A device that does not move is not an actuator, whatever the registry states.
 #[test]
 fn a_device_that_takes_no_actions_is_refused_before_anything_starts() {
     let place = Place::new();
@@ -422,7 +422,7 @@ fn chunks_of_an_episode_that_begins_while_the_policy_acts_can_be_computed_again(
     ask(&["episode", "stop"]);
     running.signal(Signal::INT);
     let (code, _, stderr) = running.end();
-    assert_eq!(code, Some(0), "the verdict on an episode that was ordered is no result of the run: {stderr}");
+    assert_eq!(code, Some(0), "the verdict on an episode that was ordered is not a result of the run: {stderr}");
 
     let file = place.path("out").join(&place.episodes("out")[0]).display().to_string();
     let replayed = place.run(&["--json", "replay", &file, "--infer", BUNDLE, "--tolerance", "1e-5"]);

@@ -247,7 +247,7 @@ fn the_hash_of_a_file_is_that_of_sha256sum() {
     let path = place.path("out").join(&episode);
     let bytes = std::fs::read(&path).expect("the episode");
     assert!(bytes.len() > 256 << 10, "several pieces are read: {}", bytes.len());
-    // A file that differs in its last byte, and one that is no episode at all.
+    // A file that differs in its last byte, and one that is not an episode at all.
     std::fs::write(place.path("out/other.mcap"), [&bytes[..bytes.len() - 1], b"x"].concat()).expect("a file");
     std::fs::write(place.path("out/text.mcap"), "no episode").expect("a file");
     let one = place.run(&["inspect", &format!("out/{episode}"), "--json"]);

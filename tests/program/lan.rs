@@ -124,7 +124,7 @@ fn packets_of_a_lidar_are_recorded_with_their_points() {
     place.write("devices.toml", &lidar_rig(port));
     let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
     let packets = Packets::send(port, |number| {
-        // Each tenth is none: it is recorded all the same.
+        // Each tenth is not a packet of points: it is recorded all the same.
         let packet = lidar::packet(number, 0);
         packet[..if number % 10 == 9 { 1205 } else { packet.len() }].to_vec()
     });

@@ -140,7 +140,7 @@ fn the_catalogue_is_listed_and_a_file_describes_a_type_of_the_user() {
         (["register", "--module", "wrist_mount"], "[module.wrist_mount] is in the registry already"),
         (["register", "--module=tip_soft", "--bit=9"], "has no sensor that needs an entry"),
         (["register", "--module", "tip_sofd"], "did you mean \"tip_soft\"?"),
-        (["register", "--module", "wrong.toml"], "its slot is none of front"),
+        (["register", "--module", "wrong.toml"], "its slot is not one of front"),
         (["register", "--module", "missing.toml"], "missing.toml"),
         (["modules", "--json", "tip_sofd"], "tip_sofd"),
     ] {

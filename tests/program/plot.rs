@@ -82,7 +82,7 @@ fn an_episode_is_drawn_with_presence_pictures_marks_and_notes() {
     damaged(&place, &episode);
 }
 
-/// Pictures of what is left of the episode after damage, and of what is none.
+/// Pictures of what is left of the episode after damage, and of what is not an episode.
 fn damaged(place: &Place, episode: &str) {
     let whole = std::fs::read(place.path("out").join(episode)).expect("the episode");
     std::fs::create_dir(place.path("bad")).expect("a folder");

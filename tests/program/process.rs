@@ -206,7 +206,11 @@ fn every_frame_tells_a_crash_from_an_unplug() {
         "it ran, and crashed: {phases:?} {text}"
     );
     assert_eq!(phases.last(), Some(&(false, false)), "it is unplugged: {phases:?}");
-    assert_eq!(phases.iter().filter(|phase| **phase == (false, false)).count(), 1, "a crash is no unplug: {phases:?}");
+    assert_eq!(
+        phases.iter().filter(|phase| **phase == (false, false)).count(),
+        1,
+        "a crash is not an unplug: {phases:?}"
+    );
     assert!(!phases.contains(&(true, false)), "what runs is plugged in: {phases:?}");
     // The topic of the mask carries the same.
     let bits = |message: &support::Message| {

@@ -587,7 +587,7 @@ fn a_stopped_and_continued_monitor_has_its_terminal_again() {
     rustix::process::kill_process(pid.expect("a process"), rustix::process::Signal::STOP).expect("stopped");
     // Of what the shell prints, the rest of an interrupted frame may swallow anything.
     until("the shell has the terminal", || pane.program() == "sh");
-    // This shell leaves the terminal as it finds it: return is no end of a line there.
+    // This shell leaves the terminal as it finds it: return is not the end of a line there.
     pane.type_in("fg");
     pane.press("C-j");
     until("the monitor has it again", || pane.program() == "rapid");

@@ -18,7 +18,7 @@ use rustix::process::Signal;
 const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out", "out"];
 const RUN: [&str; 5] = ["--sim", "--headless", "--json", "--duration", "300ms"];
 const RECORDING: &str = "\"event\":\"recording\"";
-/// Where iceoryx2 keeps what is no memory.
+/// Where iceoryx2 keeps what is not memory.
 const FOLDER: &str = "/tmp/iceoryx2";
 
 /// `rapid ARGUMENTS` after `first` has been run in the same shell.
@@ -208,7 +208,7 @@ fn memory_filled_by_another_program_does_not_end_a_run() {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/subscribe.py");
     enter(Command::new(python()).arg(script).args(["/rapid/camera/wrist", "5", "2"]));
     let (code, output, errors) = running.end();
-    // A busy machine may make a BAD episode of it, which is no error of the bus.
+    // A busy machine may make a BAD episode of it, which is not an error of the bus.
     assert!(matches!(code, Some(0 | 4)), "{code:?}: {errors}{output}");
     let reported = support::events(&output);
     let ended = reported.iter().find(|event| event["event"] == "episode").expect("the end of the episode");

@@ -226,7 +226,7 @@ fn pictures_are_small_and_as_old_as_they_are() {
         }
         is_next
     });
-    // Numbers, a bit without an entry, and what is none.
+    // Numbers, a bit without an entry, and what is not a path of a picture.
     for path in ["/picture/2", "/picture/63", "/picture/64", "/picture/-1", "/picture/", "/picture/0/0", "/pictures"] {
         assert_eq!(client.get(path).status, 404, "{path}");
     }
@@ -277,7 +277,7 @@ fn pages_of_other_sites_and_other_names_are_refused() {
         let read = if status == 421 || headers.contains("cross-site") { status } else { 200 };
         assert_eq!(client.with(&of_other).get("/picture/9").status, if read == 200 { 404 } else { read }, "{of_other}");
     }
-    // What the page does not offer, and what is no request.
+    // What the page does not offer, and what is not a request.
     for (body, status) in [
         (r#"{"do":"end_session"}"#, 403),
         (r#"{"do":"discard"}"#, 403),
@@ -343,7 +343,7 @@ fn without_the_token_there_is_nothing_but_the_page() {
     let running = start(&place, &with_token[1..]);
     assert_eq!(link(&running).1, token);
     end(running);
-    // A file that others may read is none.
+    // A file that others may read is refused.
     std::fs::set_permissions(place.path("page.token"), std::fs::Permissions::from_mode(0o644)).expect("permissions");
     let refused = place.run(&[&RUN[..], &with_token[1..]].concat());
     assert_eq!(refused.status.code(), Some(1));

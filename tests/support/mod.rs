@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 
 pub(crate) use patience::PATIENCE;
 
-/// Lines of a registry. A busy machine is no defect of the program, and a simulated camera that it delays loses pictures: what
+/// Lines of a registry. A busy machine is not a defect of the program, and a simulated camera that it delays loses pictures: what
 /// remains is what the recorder drops, and damage.
 pub(crate) const LENIENT: &str = "\n[verdict]\nlate = \"off\"\ngap = \"off\"\nclock = \"off\"\nrate = \"off\"\n\
     valid = \"off\"\nopening = \"off\"\nfrozen = \"off\"\nlost = \"50%\"\n";

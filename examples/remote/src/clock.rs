@@ -41,7 +41,7 @@ pub struct Estimate {
 }
 
 impl Clock {
-    /// Takes an exchange. One whose answer came before its request is none.
+    /// Takes an exchange. One whose answer came before its request is ignored.
     pub fn exchange(&mut self, sent: u64, there: u64, received: u64) {
         if received < sent {
             return;

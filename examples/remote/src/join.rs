@@ -180,7 +180,7 @@ async fn answer(mut stream: TcpStream, session: &Session, hosts: &Hosts) -> Resu
     let line = timeout(WRITE_LIMIT, line(&mut stream)).await??;
     let (mut reader, mut writer) = stream.into_split();
     let Some((host, device)) = requested(&line) else {
-        return refuse(&mut writer, "what came is no request of rapid").await;
+        return refuse(&mut writer, "what came is not a request of rapid").await;
     };
     if let Err(absent) = hosts.sensor(host, device, Stamp::now()) {
         return refuse(&mut writer, &format!("{device} of {host}: {absent}")).await;

@@ -117,7 +117,7 @@ fn read(session: &Session, host: &str, device: &DeviceSpec, place: &Place, runni
     let work = move || {
         bus::read(&place, &running, &topic, depth, |header, payload| {
             let Ok(length) = u32::try_from(payload.len()) else { return };
-            // Nobody reads it there.
+            // Nothing reads it there.
             if !publisher.matching_status().wait().is_ok_and(|status| status.matching()) {
                 on_the_way.clear();
                 return;

@@ -105,7 +105,7 @@ def inputs(raw: dict, refuse) -> tuple[dict[str, list[int]], int]:
     for key, feature in found.items():
         kind = feature.get("type")
         if kind == "ENV":
-            raise refuse(f"input_features.{key}", "the state of a simulated environment is no sensor: not supported")
+            raise refuse(f"input_features.{key}", "the state of a simulated environment is not a sensor: not supported")
         if kind == "VISUAL":
             if len(feature["shape"]) != 3 or feature["shape"][0] != 3:
                 raise refuse(f"input_features.{key}.shape", f"{feature['shape']} is not [3, height, width]")

@@ -81,7 +81,7 @@ def reason(error: Exception) -> str:
     text = str(error)
     if found := re.search(r"GLOBAL (\S+)", text):
         return (
-            f"its pickle uses {found[1].rstrip('.')}, which is no plain data, and running a checkpoint's code "
+            f"its pickle uses {found[1].rstrip('.')}, which is not plain data, and running a checkpoint's code "
             "is not safe: save it again with cfg and state_dicts alone"
         )
     lines = text.rpartition("WeightsUnpickler error:")[2].split("\n")

@@ -11,7 +11,7 @@ from .. import Unsupported
 
 POSITION, ROTATION, WIDTH = "robot0_eef_pos", "robot0_eef_rot_axis_angle", "robot0_gripper_width"
 SINCE_START = "robot0_eef_rot_axis_angle_wrt_start"
-# Numbers of each observation that is no picture.
+# Numbers of each observation that is not a picture.
 LENGTHS = {POSITION: 3, ROTATION: 6, SINCE_START: 6, WIDTH: 1}
 ACTION_LEN = 10
 # Largest distance of two observation steps, in ticks, and what else a bundle may state at most.
@@ -19,12 +19,12 @@ MOST_APART = 64
 MOST_STEPS, MOST_ACTIONS, MOST_TIMESTEPS = 64, 1024, 10_000
 # Larger pictures, widths and kernels are of no network that is known here.
 MOST_SIDE, MOST_WIDTH, MOST_KERNEL = 2048, 65_536, 63
-# Whole numbers from there on are no floats.
+# Whole numbers from there on are not floats.
 MOST_WHOLE = 2**53
 POLICY = "diffusion_policy.policy.diffusion_unet_timm_policy.DiffusionUnetTimmPolicy"
 ENCODER = "diffusion_policy.model.vision.timm_obs_encoder.TimmObsEncoder"
 AGGREGATIONS = ("avg", "max", "soft_attention", "spatial_embedding", "attention_pool_2d")
-# Random changes of a picture, of which the middle is none. UMI makes them when it acts, too.
+# Random changes of a picture, of which the middle changes nothing. UMI makes them when it acts, too.
 AUGMENTATIONS = {
     f"torchvision.transforms.{name}"
     for name in ("ColorJitter", "RandomRotation", "RandomPerspective", "ElasticTransform", "RandomGrayscale")

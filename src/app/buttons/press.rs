@@ -4,7 +4,7 @@
 //! else, when that is decided. It always carries the moment at which the button was pressed first.
 //!
 //! Invariant: pure: no clock; time comes with the levels.
-//! Invariant: what is pressed when the level becomes known is no press: it counts after it was released.
+//! Invariant: what is pressed when the level becomes known is not a press: it counts after it was released.
 //! Invariant: a contact that chatters presses once.
 
 use std::time::Duration;
@@ -16,7 +16,7 @@ use rapid_status::session::PRESS_AGAIN;
 const CHATTER: Duration = Duration::from_millis(30);
 
 /// The kernel releases the keys of a device that is unplugged (`input_unregister_device`), some time before its reader sees
-/// it go: a release followed by a loss within this time was no release.
+/// it go: a release followed by a loss within this time was not a release.
 const UNPLUGGED_WITHIN: Duration = Duration::from_millis(200);
 
 /// What was done with a button.
@@ -158,7 +158,7 @@ impl Presses {
         done
     }
 
-    /// How long a release must last: one that decides that it was no hold must not be that of an unplugged device.
+    /// How long a release must last: one that decides that it was not a hold must not be that of an unplugged device.
     fn settles_in(&self) -> Duration {
         match self.state {
             State::Pressed { is_done: false, .. } if !self.rules.has_double => UNPLUGGED_WITHIN,

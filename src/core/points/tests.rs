@@ -34,7 +34,7 @@ fn livox(kind: u8, points: &[Vec<u8>]) -> Vec<u8> {
 fn points(format: PacketFormat, packet: &[u8]) -> Option<Vec<Point>> {
     let mut points = Vec::new();
     let is_packet = read(format, packet, |point| points.push(point));
-    assert!(is_packet || points.is_empty(), "points of what is no packet");
+    assert!(is_packet || points.is_empty(), "points of what is not a packet");
     is_packet.then_some(points)
 }
 
@@ -105,7 +105,7 @@ fn packets_of_livox_have_points_in_three_forms() {
         let one = [coordinates, vec![77, 1]].concat();
         let packet = livox(kind, &[one.clone(), none, one]);
         let read = points(PacketFormat::Livox, &packet).unwrap();
-        assert_eq!(read.len(), 2, "{kind}: what has no distance is no point");
+        assert_eq!(read.len(), 2, "{kind}: what has no distance is not a point");
         assert!(read.iter().all(|point| is_near(*point, wanted) && point.reflectivity == 77), "{kind}: {read:?}");
         assert_eq!(points(PacketFormat::Livox, &packet[..packet.len() - 1]), None, "{kind}: cut");
     }

@@ -71,7 +71,7 @@ fn what_is_no_frame_is_refused_with_the_reason() {
     assert_eq!(with(0, 0), Some(FrameError::Foreign));
     assert_eq!(with(4, 4), Some(FrameError::Field("kind", 4)));
     assert_eq!(with(12, 7), Some(FrameError::Field("encoding", 7)));
-    // A mask is no sample of a device.
+    // A mask is not a sample of a device.
     assert_eq!(with(12, 5), Some(FrameError::Field("encoding", 5)));
     assert_eq!(with(48, 4), Some(FrameError::Field("flags", 4)));
     assert_eq!(with(8, 101), Some(FrameError::TooLong { length: 101, most: 100 }));

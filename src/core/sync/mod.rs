@@ -62,7 +62,7 @@ pub struct SyncModality {
 /// 1. A sample counts only if it was received by `now` and stands for no later moment.
 /// 2. A sample of an older epoch than the newest one of which a sample that counts by rule 1 lies
 ///    before the end of the window does not count: what was seen before the device was last
-///    attached is no evidence of what is attached. A replug later than that is another tick's:
+///    attached is not evidence of what is attached. A replug later than that is another tick's:
 ///    who looks back at a tick sees what was to be seen at it.
 /// 3. Bit clear in the mask: absent. Not valid, not stale, nothing kept, whatever the ring holds.
 /// 4. Bit set: of the samples that count, the one nearest to the tick is chosen if it lies

@@ -7,7 +7,7 @@ use rapid_pictures::jpeg::{DecodeError, Decoder};
 #[derive(Debug, thiserror::Error)]
 pub enum BrightnessError {
     /// It is not a picture.
-    #[error("the samples are no pictures")]
+    #[error("the samples are not pictures")]
     NoPicture,
     /// It cannot be decoded.
     #[error("{0}")]

@@ -278,7 +278,7 @@ pub fn set_control(path: &Path, name: &str, value: i64) -> Result<i64, String> {
 /// program streams from it.
 ///
 /// # Errors
-/// When the node cannot be opened or is no camera.
+/// When the node cannot be opened or is not a camera.
 pub fn query(path: &Path) -> Result<CameraInfo, DriverError> {
     let (card, controls) = {
         let node = Node::open(path)?;

@@ -158,7 +158,7 @@ impl Sim {
     /// Sets the action of the arm of the simulated task: one number per axis.
     ///
     /// # Errors
-    /// When the device is no actuator, or takes another number of values.
+    /// When the device is not an actuator, or takes another number of values.
     pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         if self.joints.command(target) {
             return Ok(());
@@ -169,7 +169,7 @@ impl Sim {
                 let text = format!("{} takes {} numbers, not {}", self.device.name, task::AXES, target.len());
                 return Err(DriverError::Retry(text));
             }
-            _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
+            _ => return Err(DriverError::Fatal(format!("{} is not an actuator", self.device.name))),
         }
         Ok(())
     }

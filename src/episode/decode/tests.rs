@@ -124,7 +124,7 @@ fn packed_and_unpacked_numbers_are_decoded() {
     let packed = Scalars { timestamp: Some(now()), values: values.clone() }.encode_to_vec();
     assert_eq!(read(SampleSchema::Scalars, &packed), Some((bytes.clone(), shape)));
     assert_eq!(read(SampleSchema::Scalars, &Loose { values }.encode_to_vec()), Some((bytes, shape)));
-    assert_eq!(read(SampleSchema::Scalars, &[0x12, 3, 1, 2, 3]), None, "three bytes are no doubles");
+    assert_eq!(read(SampleSchema::Scalars, &[0x12, 3, 1, 2, 3]), None, "three bytes are not doubles");
 }
 
 #[test]

@@ -189,7 +189,7 @@ fn a_packet_of_a_lidar_is_a_cloud_of_its_points() {
     let data = cloud.get_field_by_name("data").unwrap().as_bytes().unwrap().clone();
     let coordinates = [2.5_f32, -1.5, 0.04].map(f32::to_le_bytes).concat();
     assert_eq!(data.as_ref(), [&coordinates[..], &[200]].concat(), "the first has no distance");
-    // Another kind of packet, and bytes that are none.
+    // Another kind of packet, and bytes that are not a packet.
     packet[10] = 0;
     for other in [&packet[..], b"", b"packet"] {
         assert!(!Derived::Points.encode(&mut out, WALL, "lidar", &form, (SampleSchema::Bytes, other)));

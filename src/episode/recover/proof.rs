@@ -308,7 +308,7 @@ fn boundaries(bytes: &[u8]) -> Vec<usize> {
     all
 }
 
-/// An episode that is cut anywhere, and another one behind it: the second is no part of the first, whichever record the cut
+/// An episode that is cut anywhere, and another one behind it: the second is not part of the first, whichever record the cut
 /// goes through or stands before, and whichever of them is longer.
 #[tokio::test]
 async fn unread_bytes_are_reported_and_the_original_is_kept() {

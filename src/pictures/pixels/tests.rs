@@ -69,7 +69,7 @@ fn ppm(bytes: &[u8]) -> ([usize; 2], &[u8]) {
 /// Training decodes with Pillow, which made `tests/golden/jpeg` (`models/tests/test_jpeg_golden.py`). The decoders round at
 /// different places. Where colours are sampled at every second pixel, zune-jpeg rounds halves up, and libjpeg-turbo up and
 /// down in turns. Where a picture ends within a block, libjpeg-turbo repeats the last colour, and zune-jpeg takes the rest of
-/// the block, which is no part of the picture.
+/// the block, which is not part of the picture.
 #[test]
 fn pictures_differ_from_those_of_training_by_no_more_than_documented() {
     let cases = [

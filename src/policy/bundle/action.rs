@@ -13,9 +13,9 @@ use super::spec::{
     SliceNormalization,
 };
 
-/// The fix for a shape that is none of a pose.
+/// The fix for a shape that is not that of a pose.
 const NO_POSE: &str =
-    "correct it; if these are no poses, leave rotation out and write \"representation\": \"absolute\"";
+    "correct it; if these are not poses, leave rotation out and write \"representation\": \"absolute\"";
 
 /// Checks the action of a policy with these `observations`, as far as they could be read.
 pub(super) fn check_action(

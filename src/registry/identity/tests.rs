@@ -133,7 +133,7 @@ fn the_streams_of_a_camera_are_told_apart_by_their_formats() {
     assert_eq!(assigner.attach(&node(0, "L", "1-4", &depth)), entry(0));
     assert!(waits(&assigner.attach(&node(9, "L", "1-4", &depth))), "a second node of a taken stream");
     assert_eq!(assigner.attach(&node(4, "L", "1-4", &colour)), entry(3));
-    // A node that does not answer is no stream, and takes that of no other.
+    // A node that does not answer is not a stream, and does not take that of another.
     let mut assigner = Assigner::new(&registry);
     assert!(matches!(assigner.attach(&node(0, "R", "1-2", &[])), Assignment::WrongNode { .. }));
     assert_eq!(assigner.attach(&node(2, "R", "1-2", &depth)), entry(2));

@@ -140,7 +140,7 @@ fn distance(table: &Section<'_>, key: &str) -> Option<u32> {
     let um = number("um").or_else(|| number("mm")?.checked_mul(MILLIMETRE));
     um.filter(|um| (1..=100 * MILLIMETRE).contains(um)).or_else(|| {
         let fix = "write a whole number of mm or um, such as \"1mm\" or \"100um\"";
-        table.refuse(key, format!("{text:?} is no distance"), fix)
+        table.refuse(key, format!("{text:?} is not a distance"), fix)
     })
 }
 

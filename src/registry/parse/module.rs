@@ -102,7 +102,7 @@ fn transforms(section: &Section<'_>, devices: &[String]) -> Vec<TransformSpec> {
                 [] => "name it in its `devices`, or remove the table".to_owned(),
                 devices => did_you_mean(sensor, devices, "its `devices` are"),
             };
-            tables.report_child(at, sensor, format!("{sensor:?} is no sensor of this module"), fix);
+            tables.report_child(at, sensor, format!("{sensor:?} is not a sensor of this module"), fix);
             continue;
         }
         let Some(table) = tables.table(sensor) else { continue };

@@ -301,7 +301,7 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
             &["a gone stream", "a absent", "a at 1", "a backoff", "a opening", "a streaming"],
         ),
         (
-            "removal and replug in one breath: the old stream's end is no second unplug",
+            "removal and replug in one breath: the old stream's end is not a second unplug",
             &[
                 Plug("1", CHANNELS),
                 Until("a streaming"),
@@ -351,7 +351,7 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
             ],
         ),
         (
-            "silence is no removal",
+            "silence is not a removal",
             &[
                 Plug("1", CHANNELS),
                 Until("a streaming"),

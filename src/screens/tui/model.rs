@@ -599,7 +599,7 @@ impl Model {
         self.shown().previews.iter().find(|preview| preview.device == id).map(|preview| &**preview)
     }
 
-    /// It as a picture, or why it is none that can be shown; `None` if it is something else.
+    /// It as a picture, or why it cannot be shown as one; `None` if it is something else.
     pub(super) fn picture(&self, id: ModalityId) -> Option<&Result<Picture, String>> {
         self.seen.picture.as_ref().filter(|_| self.seen.device == Some(id))
     }

@@ -21,7 +21,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     let columns = |lines: &[Line<'_>]| lines.iter().map(Line::width).max().unwrap_or(0) + usize::from(BORDER);
     let code: Vec<_> = code.into_iter().map(|row| Line::styled(row, theme.code())).collect();
     let room = usize::from(area.height.saturating_sub(BORDER)).saturating_sub(1);
-    // A piece of a code is none.
+    // A part of a code cannot be read.
     let code = if code.len() <= room && columns(&code) <= usize::from(area.width) {
         code
     } else {

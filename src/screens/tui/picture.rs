@@ -36,7 +36,7 @@ pub(super) struct Picture {
 }
 
 impl Picture {
-    /// Decodes a preview; `None` if it is no picture.
+    /// Decodes a preview; `None` if it is not a picture.
     ///
     /// # Errors
     /// When it is damaged: why.

@@ -140,7 +140,7 @@ fn check_rules(registry: &Registry, text: &str) {
         };
         assert!(named.insert(link.to_owned()), "two rules for {link}");
         let device = registry.devices.iter().find(|device| format!("rapid/{}", device.name) == link);
-        let device = device.unwrap_or_else(|| panic!("a rule for {link}, which is no device"));
+        let device = device.unwrap_or_else(|| panic!("a rule for {link}, which is not a device"));
         let (own, serial_key) =
             if value("SUBSYSTEM") == Some("usb") { (OF_USB, "ATTR{serial}") } else { (OF_OTHERS, "ATTRS{serial}") };
         for Token { key, operator, .. } in rule {

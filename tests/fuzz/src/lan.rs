@@ -84,7 +84,7 @@ pub fn label(bytes: &[u8]) {
     }
 }
 
-/// Packets of LiDARs: what is no packet gives no point, and every point lies where its numbers can be.
+/// Packets of LiDARs: what is not a packet gives no point, and every point lies where its numbers can be.
 pub fn points(bytes: &[u8]) {
     for (_, format) in PacketFormat::WORDS {
         let mut count = 0;

@@ -285,7 +285,7 @@ impl Campaign {
         self.pause(0);
     }
 
-    /// What is seen from now on, and for so long, is no news of the joints.
+    /// What is seen from now on, and for so long, is not news of the joints.
     fn pause(&mut self, ms: u64) {
         self.paused = self.paused.max(self.world.now.after(Duration::from_millis(ms)));
     }

@@ -140,7 +140,7 @@ fn process(place: &Place, name: &str) -> u32 {
     found.expect("a number")
 }
 
-/// Waits until a process has ended; nobody may have waited for it.
+/// Waits until a process has ended, also one that its parent has not waited for.
 fn gone(process: u32) {
     until("the program ends", || {
         let state = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();

@@ -123,7 +123,7 @@ impl Gopro {
         let state = match &mut self.preview {
             None => self.states.recv().await.unwrap_or_else(ended)?,
             Some(preview) => {
-                // A state is no sample then, but that it cannot be had ends the stream.
+                // A state is not a sample then, but that it cannot be had ends the stream.
                 let failed = async {
                     loop {
                         if let Err(error) = self.states.recv().await.unwrap_or_else(ended) {

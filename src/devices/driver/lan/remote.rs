@@ -21,7 +21,7 @@ use crate::driver::{ClockOffset, DriverError, Reading};
 
 /// More samples at once are not missing: their numbers began again.
 const MOST_MISSING: u64 = 1 << 20;
-/// A capture time further in the past, or in the future, is none.
+/// A capture time further in the past, or in the future, is not believed.
 const OLDEST: Duration = Duration::from_mins(1);
 const FURTHEST: Duration = Duration::from_secs(1);
 
@@ -113,7 +113,7 @@ impl Remote {
         })
     }
 
-    /// The next frame that is no refusal.
+    /// The next frame that is not a refusal.
     async fn frame(&mut self) -> Result<Head, DriverError> {
         loop {
             let ends = self.received + self.lease;

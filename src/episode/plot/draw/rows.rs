@@ -220,7 +220,7 @@ fn curve(page: &mut Svg, band: &Band, row: &Row, timeline: &Timeline, y: f64) {
         let (from, to) = ((step * wide) as f64 / BINS as f64, (step * wide + bins.len()) as f64 / BINS as f64);
         let whole = (to - from) * timeline.span.seconds;
         let (present, from, to) = overlap(band.present.as_deref(), from, to);
-        // A few samples beside a presence are no high rate.
+        // A few samples beside a presence are not a high rate.
         let time = (present * timeline.span.seconds).max(whole / 4.0);
         let share = samples as f64 / (band.hz * time);
         let height = (share * NOMINAL).clamp(0.0, 1.0) * BAND;

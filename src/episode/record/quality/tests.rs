@@ -257,7 +257,7 @@ fn a_clock_at_another_rate_drifts_and_one_that_is_ahead_is_in_the_future() {
     };
     for seconds in [4, 30, 600] {
         let report = run(0, 5, seconds);
-        assert!(report.clock_drift.unwrap().abs() < 1e-9, "jitter is no drift: {report:?}");
+        assert!(report.clock_drift.unwrap().abs() < 1e-9, "jitter is not drift: {report:?}");
         assert!(report.clock_ahead.abs() < 1e-9);
     }
     // From the earliest of the first quarter to that of the last lie three quarters of an episode.

@@ -56,7 +56,7 @@ fn scalars(seq: u64, capture_ms: u64, recv_ms: u64) -> SampleHeader {
     }
 }
 
-/// The mask of before the beginning that is on its way while the episode begins is no hole in the file.
+/// The mask of before the beginning that is on its way while the episode begins is not a hole in the file.
 #[test]
 fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
     let folder = tempfile::tempdir().unwrap();

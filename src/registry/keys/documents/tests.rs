@@ -13,7 +13,7 @@ fn texts(folder: &str) -> Vec<(String, String)> {
     registries.map(|path| (path.display().to_string(), std::fs::read_to_string(path).unwrap())).collect()
 }
 
-/// Why a value is none of the schema, as far as types, keys, words and ranges tell.
+/// Why a value does not match the schema, as far as types, keys, words and ranges tell.
 fn mistake(schema: &Json, value: &Json, at: &str) -> Option<String> {
     let wrong = |what: &str| Some(format!("{at}: {what}"));
     if let Some(ways) = schema["anyOf"].as_array() {
@@ -136,7 +136,10 @@ fn every_kind_of_device_is_documented_and_among_the_tests_of_registries() {
     assert_eq!(tables.len(), Word::ALL.len());
     for ((word, _), table) in Word::ALL.iter().zip(tables) {
         let written = format!("{word:?}");
-        assert!(device["node"]["description"].as_str().unwrap().contains(&written), "{written} is no value of `node`");
+        assert!(
+            device["node"]["description"].as_str().unwrap().contains(&written),
+            "{written} is not a value of `node`"
+        );
         assert!(device[table.name]["properties"].is_object(), "[{}] of {written} is not in the schema", table.name);
         for (folder, registries) in [("valid", &valid), ("invalid", &invalid)] {
             let is_there = registries.iter().any(|(_, text)| text.contains(&format!("node = {written}")));

@@ -151,7 +151,7 @@ pub(crate) fn read(section: &Section<'_>, damiao: &DamiaoSpec, programs: Program
     Some(spec)
 }
 
-/// Notes the table of a device that is no bus of motors.
+/// Notes the table of a device that is not a bus of motors.
 pub(crate) fn refuse(entry: &Section<'_>) {
     if entry.has(EFFECTOR) {
         entry.report(EFFECTOR, "only motors move an arm", "remove the table, or write protocol = \"damiao\"");

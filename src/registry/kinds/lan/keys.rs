@@ -203,7 +203,7 @@ fn name(table: &Section<'_>, key: &str, name: Option<&str>, what: &str) -> Optio
         return Some(name.to_owned());
     }
     let most = remote::LONGEST_NAME;
-    let message = format!("{name:?} is no name: up to {most} letters, digits, `_` and `-` are");
+    let message = format!("{name:?} is not a name: up to {most} letters, digits, `_` and `-` are");
     table.refuse(key, message, format!("write {what}"))
 }
 

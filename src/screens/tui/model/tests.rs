@@ -40,7 +40,7 @@ fn keys_become_commands() {
         ("a key let go", false, vec![released(KeyCode::Char('q'))], Effect::None),
         ("quit when idle", false, vec![press(KeyCode::Char('q'))], quit.clone()),
         ("ctrl-c when idle", false, vec![control('c')], quit.clone()),
-        ("ctrl-q is no q", false, vec![control('q')], Effect::None),
+        ("ctrl-q is not q", false, vec![control('q')], Effect::None),
         ("quit while recording asks", true, vec![press(KeyCode::Char('q'))], Effect::None),
         ("quit twice", true, vec![press(KeyCode::Char('q')), press(KeyCode::Char('q'))], quit.clone()),
         (

@@ -7,7 +7,7 @@ root=$1/root
 mkdir "$root"
 # The kernel fills /dev; a user cannot make device nodes.
 tar -xf "$1/rootfs.tar" -C "$root" --no-same-owner --same-permissions --exclude='./dev/*'
-# A program with the bit would run as that user, who is no root in the guest: an ordinary user's guest could not even mount.
+# A program with the bit would run as that user, who is not root in the guest: an ordinary user's guest could not even mount.
 find "$root" -type f -perm /6000 -exec chmod ug-s {} +
 rm -rf "$root"/var/cache/apt/* "$root"/var/lib/apt/lists/*
 # The kernel's modules are mounted here.

@@ -46,7 +46,7 @@ pub enum ContentError {
     #[error(transparent)]
     Feed(#[from] FeedError),
     /// A record of the feed is not a picture for this camera.
-    #[error("record {0} of the feed is no whole JPEG that fits {1}x{2}")]
+    #[error("record {0} of the feed is not a whole JPEG that fits {1}x{2}")]
     NotPicture(usize, u16, u16),
 }
 

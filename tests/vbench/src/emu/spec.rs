@@ -183,7 +183,7 @@ impl DeviceSpec {
     pub fn motor(mut self, slave: u16, master: u16, kind: &str) -> Self {
         let text = format!("{slave:x}/{master:x}/{kind}");
         if let Kind::Can { motors, .. } = &mut self.kind {
-            motors.push(MotorSpec::parse(&text).unwrap_or_else(|| panic!("{text} is no motor")));
+            motors.push(MotorSpec::parse(&text).unwrap_or_else(|| panic!("{text} is not a motor")));
         }
         self
     }

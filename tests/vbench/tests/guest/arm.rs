@@ -59,7 +59,7 @@ date +%s%N >$out/killed
 kill -KILL $rapid_pid
 wait_for 60 off || fail 'a motor stays on'
 wait $rapid_pid
-# It disables them for a moment longer, and a bus that another program commands is none to move motors on.
+# It disables them for a moment longer, and on a bus that another program commands no motors are moved.
 gone() { ! pgrep -x motor-guard >/dev/null; }
 wait_for 5 gone || fail 'the guard is left'
 "${rapid[@]}" recover $out/first >$out/recover.txt 2>&1 || fail "not repaired: $(cat $out/recover.txt)"

@@ -79,7 +79,7 @@ kill $grab
 emu plug 0
 wait_for 30 test -c /dev/panel || fail 'no GPIO chip'
 wait_for 30 in_log 'button panel is back' || fail 'the chip is not found'
-# A line that nothing pulls low is high, and so pressed when the chip appears: that is no press.
+# A line that nothing pulls low is high, and so pressed when the chip appears: that is not a press.
 sleep 0.5
 in_log 'panel: marked at' && fail 'a panel that appears pressed is pressed'
 emu level 0.2 0

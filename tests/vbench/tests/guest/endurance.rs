@@ -66,7 +66,7 @@ fn ninety_cycles_leave_a_correct_mask_and_nothing_else() {
 
 const SCRIPT: &str = r#"
 # settled NAME: the same, with the fewest descriptors and threads of some time. A thread of the pool that looks at the disk or
-# opened a device ends after ten seconds without work, and what it opened for a moment is no loss either.
+# opened a device ends after ten seconds without work, and what it opened for a moment is not a loss either.
 settled() {
   local fds=$(held fd) threads=$(held task) now
   for _ in {1..14}; do

@@ -102,7 +102,7 @@ fn packets(outcome: &Outcome, episode: &Recording) {
     let mut numbers: Vec<(u64, u64)> = Vec::new();
     for message in episode.topic(LIDAR) {
         let packet = proto::bytes(&message.data, 2);
-        let number = lidar::number(packet).unwrap_or_else(|| panic!("{} bytes are no packet", packet.len()));
+        let number = lidar::number(packet).unwrap_or_else(|| panic!("{} bytes are not a packet", packet.len()));
         numbers.push((message.log_time, number.into()));
     }
     let edges = episode.mask_edges();
@@ -126,7 +126,7 @@ fn packets(outcome: &Outcome, episode: &Recording) {
     assert_eq!(reported.lines().filter(witness).count(), 1, "the pulled cable has its witness: {reported}");
     let comes = |line: &&str| line.contains("\"event\":\"attach\"") && line.contains("\"bit\":1");
     assert_eq!(reported.lines().filter(comes).count(), 3, "at the start, and with each return: {reported}");
-    assert!(!reported.contains("\"state\":\"failed\""), "a cable that is out is no failure: {reported}");
+    assert!(!reported.contains("\"state\":\"failed\""), "a cable that is out is not a failure: {reported}");
 
     // What the adapter sends between the kernel's taking of it and the socket's opening is received by no one: each stay by itself.
     for (from, to) in [(0, pulled), (rose[0], down), (rose[1], u64::MAX)] {

@@ -175,7 +175,7 @@ fn chunks(outcome: &Outcome) -> Vec<Chunk> {
 
 /// The tick at which the first chunk was asked for with the camera there or not, after its bit changed; `changed` is the
 /// first tick after that. It must be asked for within one control step, or one of the moment when the policy was done with
-/// what it was asked before. Ticks that a busy guest left out are none.
+/// what it was asked before. Ticks that a busy guest left out do not count.
 fn first_asked(chunks: &[Chunk], changed: u64, there: bool, ticks: &[(u64, u64)]) -> u64 {
     let found = chunks.iter().position(|chunk| chunk.tick + 1 >= changed && chunk.tactile.is_empty() != there);
     let found = found.expect("a chunk after the change");

@@ -85,14 +85,14 @@ pub(super) fn state(answer: &[u8], asked: Stamp) -> Option<State> {
 /// The newest clip, from the answer to `last_captured`; `None` if the card has none.
 pub(super) fn newest(answer: &[u8]) -> Result<Option<Name>, String> {
     let answer: serde_json::Value = serde_json::from_slice(answer).map_err(|error| error.to_string())?;
-    let answer = answer.as_object().ok_or("it is no object")?;
+    let answer = answer.as_object().ok_or("it is not an object")?;
     let word = |key: &str| answer.get(key).and_then(serde_json::Value::as_str).unwrap_or_default();
     let (folder, file) = (word("folder"), word("file"));
     if folder.is_empty() && file.is_empty() {
         return Ok(None);
     }
     let name = |key: &str, name: &str| {
-        if is_plain(name) { Ok(name.to_owned()) } else { Err(format!("{key} {name:?} is no plain name")) }
+        if is_plain(name) { Ok(name.to_owned()) } else { Err(format!("{key} {name:?} is not a plain name")) }
     };
     Ok(Some(Name { folder: name("folder", folder)?, file: name("file", file)? }))
 }

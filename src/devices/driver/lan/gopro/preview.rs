@@ -160,7 +160,7 @@ impl Preview {
 }
 
 fn parser(largest: usize) -> Result<Multipart, DriverError> {
-    Multipart::new(BOUNDARY, largest).ok_or_else(|| DriverError::Fatal(format!("{BOUNDARY} is no boundary")))
+    Multipart::new(BOUNDARY, largest).ok_or_else(|| DriverError::Fatal(format!("{BOUNDARY} is not a boundary")))
 }
 
 /// The camera's stream.

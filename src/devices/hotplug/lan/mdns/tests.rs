@@ -227,7 +227,7 @@ async fn a_link_that_was_down_for_a_moment_brings_its_device_back() {
     std::fs::write(&state, "0\n").expect("written");
     bench.service.wanted[0].watch.lead_over(Link::of(folder.path().to_str().expect("plain text")));
     assert_eq!(bench.pass(1000).await, (0, vec!["-/lan/phone link".to_owned()]));
-    // Another instance's announcement is no evidence of this one.
+    // Another instance's announcement is not evidence of this one.
     assert_eq!(bench.announced("b", &["127.0.0.1:6"]).await, ["+phone b 127.0.0.1:6"]);
     assert_eq!(bench.removed("b").await, ["-/lan/phone goodbye"]);
     std::fs::write(&state, "1\n").expect("written");

@@ -102,7 +102,7 @@ async fn packets_of_the_device_are_received_and_the_port_is_released() {
     assert_eq!(answer, Answer::Here);
     drop(received);
     UdpSocket::bind(port).await.expect("the port is free for the driver");
-    // Such packets are no evidence of another device.
+    // Such packets are not evidence of another device.
     let elsewhere = SocketAddr::from(([127, 0, 0, 9], closed_port().port()));
     let mut received = Box::pin(ask(Arc::new(Question::Udp), elsewhere));
     let answer = loop {

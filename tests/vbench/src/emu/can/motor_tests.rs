@@ -106,7 +106,7 @@ fn parameters_are_read_written_and_saved() {
     assert_eq!(motor.receive(&Frame::data(0x7ff, [0x06, 0, 0x33, 22, 0, 0, 0, 0]), 0), None, "another motor's");
     let pmax = f32::NAN.to_le_bytes();
     let refused = ask(&mut motor, 0x7ff, [0x05, 0, 0x55, 21, pmax[0], pmax[1], pmax[2], pmax[3]], 0);
-    assert_eq!(refused[4..], 12.5_f32.to_le_bytes(), "a limit that is no number");
+    assert_eq!(refused[4..], 12.5_f32.to_le_bytes(), "a limit that is not a number");
 
     motor.apply(Order::Power(false), 0);
     motor.apply(Order::Power(true), 0);
