@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use rapid_registry::Registry;
-use rapid_registry::artifacts::{Artifact, ArtifactKind, DESCRIPTORS, HEADER, SYSTEM_REGISTRY, artifacts};
+use rapid_registry::system_files::{DESCRIPTORS, HEADER, SYSTEM_REGISTRY, SystemFile, SystemFileKind, system_files};
 use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
 
-/// Why the artifacts could not be written or installed.
+/// Why the system files could not be written or installed.
 #[derive(Debug, thiserror::Error)]
 pub enum ArtifactsError {
     /// Only root may write where udev and systemd read.
@@ -42,17 +42,17 @@ pub enum ArtifactsError {
     Output(#[from] io::Error),
 }
 
-/// Writes the artifacts below `folder` (`udev` by default) and deletes descriptors of entries that no longer
+/// Writes the system files below `folder` (`udev` by default) and deletes descriptors of entries that no longer
 /// exist.
 ///
 /// # Errors
 /// When a file cannot be written.
 pub fn write(registry: &Registry, folder: &Path, out: &mut dyn Write) -> Result<(), ArtifactsError> {
-    let place = |artifact: &Artifact| folder.join(&artifact.path);
+    let place = |file: &SystemFile| folder.join(&file.path);
     put(registry, place, &folder.join(DESCRIPTORS), links_for_this_user(), "wrote", out)
 }
 
-/// Installs the artifacts where udev and systemd read them, and makes udev apply the rules.
+/// Installs the system files where udev and systemd read them, and makes udev apply the rules.
 ///
 /// # Errors
 /// When not root, or when a file cannot be written, or when udev does not accept the rules.
@@ -81,31 +81,31 @@ pub fn install(registry: &Registry, out: &mut dyn Write) -> Result<(), Artifacts
 /// Installs below `root`, which is `/` except in tests.
 fn install_below(registry: &Registry, root: &Path, out: &mut dyn Write) -> Result<(), ArtifactsError> {
     let descriptors = root.join("etc/rapid").join(DESCRIPTORS);
-    let place = |artifact: &Artifact| {
-        let folder = match artifact.kind {
-            ArtifactKind::Rules => root.join("etc/udev/rules.d"),
-            ArtifactKind::Unit => root.join("etc/systemd/system"),
-            ArtifactKind::Descriptor => descriptors.clone(),
-            ArtifactKind::Layout => root.join("etc/rapid"),
+    let place = |file: &SystemFile| {
+        let folder = match file.kind {
+            SystemFileKind::Rules => root.join("etc/udev/rules.d"),
+            SystemFileKind::Unit => root.join("etc/systemd/system"),
+            SystemFileKind::Descriptor => descriptors.clone(),
+            SystemFileKind::Layout => root.join("etc/rapid"),
         };
-        folder.join(artifact.path.file_name().unwrap_or_default())
+        folder.join(file.path.file_name().unwrap_or_default())
     };
     put(registry, place, &descriptors, Links::Refused, "installed", out)
 }
 
-/// Writes each artifact to its place, and deletes descriptors of entries that no longer exist.
+/// Writes each file to its place, and deletes descriptors of entries that no longer exist.
 fn put(
     registry: &Registry,
-    place: impl Fn(&Artifact) -> PathBuf,
+    place: impl Fn(&SystemFile) -> PathBuf,
     descriptors: &Path,
     links: Links,
     done: &str,
     out: &mut dyn Write,
 ) -> Result<(), ArtifactsError> {
-    let all = artifacts(registry);
-    for artifact in &all {
-        let path = place(artifact);
-        write_file(&path, artifact.contents.as_bytes(), artifact.mode, links)?;
+    let all = system_files(registry);
+    for file in &all {
+        let path = place(file);
+        write_file(&path, file.contents.as_bytes(), file.mode, links)?;
         writeln!(out, "{done} {}", path.display())?;
     }
     remove_stale(descriptors, &all, links, out)
@@ -124,14 +124,14 @@ pub(super) fn write_file(path: &Path, contents: &[u8], mode: u32, links: Links) 
 }
 
 /// Deletes descriptors written for entries that no longer exist.
-fn remove_stale(path: &Path, all: &[Artifact], links: Links, out: &mut dyn Write) -> Result<(), ArtifactsError> {
+fn remove_stale(path: &Path, all: &[SystemFile], links: Links, out: &mut dyn Write) -> Result<(), ArtifactsError> {
     let explain = |error: io::Error| ArtifactsError::Write { path: path.to_path_buf(), error };
     let folder = Folder::open(path, links, Missing::All)?;
     let entries = rustix::fs::Dir::read_from(folder.descriptor()).map_err(|errno| explain(errno.into()))?;
     for entry in entries {
         let entry = entry.map_err(|errno| explain(errno.into()))?;
         let name = entry.file_name().to_string_lossy().into_owned();
-        let current = all.iter().any(|artifact| artifact.path.file_name().is_some_and(|file| *file == *name));
+        let current = all.iter().any(|file| file.path.file_name().is_some_and(|file| *file == *name));
         if current
             || Path::new(&name).extension().is_none_or(|extension| extension != "yaml")
             || !is_ours(&folder, &name)

@@ -11,13 +11,13 @@ use std::time::Duration;
 
 use rapid_core::modality::ModalityKind;
 
-use super::artifacts::Needs;
 use super::keys::Keys;
 use super::parse::device;
 use super::parse::program::Programs;
 use super::section::Section;
 use super::simulation::SimSource;
 use super::spec::{KINDS, Opens, VerdictSpec};
+use super::system_files::Needs;
 use camera::CameraSpec;
 use can::CanSpec;
 use lan::{LanPicture, LanSpec};

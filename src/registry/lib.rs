@@ -2,10 +2,9 @@
 //!
 //! Text -> `section` (tables with positions) -> `parse` -> [`Registry`]; from it are derived the assignment of
 //! attached devices to entries (`identity`), the content of a simulation (`scenario_file`) and the
-//! files read by udev and systemd (`artifacts`).
+//! files read by udev and systemd (`system_files`).
 
 pub mod ablation;
-pub mod artifacts;
 pub mod candidate;
 pub mod catalogue;
 pub mod columns;
@@ -26,6 +25,7 @@ pub mod simulation;
 #[path = "../../tests/support/skip.rs"]
 mod skip;
 mod spec;
+pub mod system_files;
 pub mod task;
 pub mod trust;
 pub mod units;

@@ -10,8 +10,8 @@ use std::time::Duration;
 use rapid_core::interlock::StopKind;
 use rapid_core::modality::ModalityKind;
 use rapid_core::points::PacketFormat;
-use rapid_registry::artifacts::{ArtifactKind, artifacts};
 use rapid_registry::scenario::Scenario;
+use rapid_registry::system_files::{SystemFileKind, system_files};
 use rapid_registry::{
     BUILTIN, Bound, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Form, Framing, Hook, InputSpec, JointsSpec,
     LanFind, LanPicture, LanProtocol, LineOff, Loaded, ModuleSpec, MotionSpec, MotorKind, MotorMode, Mounting,
@@ -554,8 +554,8 @@ fn check_any(text: &str) {
             }
             let total: u64 = devices.iter().map(|device| device.max_bytes as u64 * device.depth as u64).sum();
             assert!(total <= loaded.registry.rig.memory_budget);
-            let files = artifacts(&loaded.registry);
-            let descriptors = files.iter().filter(|file| file.kind == ArtifactKind::Descriptor).count();
+            let files = system_files(&loaded.registry);
+            let descriptors = files.iter().filter(|file| file.kind == SystemFileKind::Descriptor).count();
             assert_eq!(descriptors, devices.len());
             let paths: BTreeSet<_> = files.iter().map(|file| &file.path).collect();
             assert_eq!(paths.len(), files.len(), "no file replaces another");

@@ -2,8 +2,8 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 
 use super::*;
 
-fn one() -> Artifact {
-    artifacts(&Registry::builtin()).remove(0)
+fn one() -> SystemFile {
+    system_files(&Registry::builtin()).remove(0)
 }
 
 #[test]
@@ -15,9 +15,9 @@ fn all_files_are_written_and_stale_ones_are_removed() {
     std::fs::write(folder.join("descriptors/theirs.yaml"), "module: theirs\n").unwrap();
     let mut out = Vec::new();
     write(&Registry::builtin(), &folder, &mut out).unwrap();
-    for artifact in artifacts(&Registry::builtin()) {
-        let path = folder.join(&artifact.path);
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), artifact.contents);
+    for file in system_files(&Registry::builtin()) {
+        let path = folder.join(&file.path);
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), file.contents);
         assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o644);
     }
     let mut names: Vec<_> = std::fs::read_dir(folder.join(DESCRIPTORS))

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use rapid_core::text;
 use rapid_registry::Registry;
-use rapid_registry::artifacts::{ArtifactKind, artifacts};
+use rapid_registry::system_files::{SystemFileKind as ArtifactKind, system_files as artifacts};
 use rapid_system::folder::{Folder, Links, Missing};
 use serde::Serialize;
 

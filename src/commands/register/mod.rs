@@ -68,8 +68,8 @@ pub enum RegisterError {
     /// The file cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
-    /// The registry is written, its artifacts are not.
-    #[error("the registry is written, its artifacts are not: {0}")]
+    /// The registry is written, its system files are not.
+    #[error("the registry is written, its system files are not: {0}")]
     Artifacts(#[from] ArtifactsError),
     /// The type of module.
     #[error(transparent)]
@@ -422,7 +422,7 @@ impl Dialogue<'_> {
     }
 }
 
-/// Writes this text to the file, and the artifacts beside it.
+/// Writes this text to the file, and the system files beside it.
 fn write(target: &Target, new: &str, registry: &Registry, out: &mut dyn Write) -> Result<(), RegisterError> {
     let parent = target.write(new)?;
     writeln!(out, "wrote {}", target.path.display())?;

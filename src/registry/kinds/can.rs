@@ -8,8 +8,8 @@ mod mounting;
 use rapid_core::modality::ModalityKind;
 
 use super::Kind;
-use crate::artifacts::{GPIO, Needs};
 use crate::spec::Opens;
+use crate::system_files::{GPIO, Needs};
 
 pub(crate) use effector::{EffectorKeys, refuse as refuse_effector};
 pub use effector::{EffectorSpec, GripperSpec, TipRotation};

@@ -10,8 +10,8 @@ use rapid_core::remote;
 
 use super::camera::PixelFormat;
 use super::{Kind, STALL_AFTER, compressed};
-use crate::artifacts::{Needs, quoted};
 use crate::spec::{Opens, VerdictSpec};
+use crate::system_files::{Needs, quoted};
 
 pub(crate) use keys::{TABLE, check_gopros, check_instances, check_ports, read};
 

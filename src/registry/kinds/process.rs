@@ -7,12 +7,12 @@ use rapid_core::modality::ModalityKind;
 use toml::de::DeValue;
 
 use super::{Kind, NodeSpec, Settings, check_samples, compressed};
-use crate::artifacts::{Needs, USB, quoted};
 use crate::keys::{About, Key, Own, Time, Words, keys, table, texts, whole};
 use crate::parse::program::{self, For, Programs};
 use crate::section::Section;
 use crate::simulation::SimSource;
 use crate::spec::{Hook, KINDS, Opens};
+use crate::system_files::{Needs, USB, quoted};
 
 pub(crate) const TABLE: Key =
     table("process", "A program that reads the device.", || About::Table(&[ProcessKeys::KEYS]));

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use rapid_core::modality::ModalityKind;
-use rapid_registry::artifacts::{ArtifactKind, artifacts};
+use rapid_registry::system_files::{SystemFileKind, system_files};
 use rapid_registry::{
     ButtonSpec, CanProtocol, CanSpec, DeviceSpec, Hook, InputSpec, InterlockSpec, LanFind, LanProtocol, LanSpec,
     NodeSpec, ProcessSpec, Registry,
@@ -25,17 +25,17 @@ pub(crate) fn check(registry: &Registry) {
     harmless.stops = registry.stops.iter().map(harmless_stop).collect();
     harmless.buttons = registry.buttons.iter().map(harmless_button).collect();
     harmless.rig.name.clone_from(&registry.rig.name);
-    let harmless = artifacts(&harmless);
-    for artifact in artifacts(registry) {
-        let text = &artifact.contents;
-        match artifact.kind {
-            ArtifactKind::Rules => check_rules(registry, text),
-            ArtifactKind::Unit => {
-                let expected = harmless.iter().find(|other| other.path == artifact.path).expect("the same units");
-                assert_eq!(*text, expected.contents, "{} has more of the registry", artifact.path.display());
+    let harmless = system_files(&harmless);
+    for file in system_files(registry) {
+        let text = &file.contents;
+        match file.kind {
+            SystemFileKind::Rules => check_rules(registry, text),
+            SystemFileKind::Unit => {
+                let expected = harmless.iter().find(|other| other.path == file.path).expect("the same units");
+                assert_eq!(*text, expected.contents, "{} has more of the registry", file.path.display());
             }
-            ArtifactKind::Descriptor => check_descriptor(registry, &artifact.path, text),
-            ArtifactKind::Layout => check_layout(registry, text),
+            SystemFileKind::Descriptor => check_descriptor(registry, &file.path, text),
+            SystemFileKind::Layout => check_layout(registry, text),
         }
     }
 }

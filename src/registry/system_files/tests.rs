@@ -10,8 +10,8 @@ use rapid_core::modality::ModalityKind;
 use super::*;
 use crate::{Form, IdentitySpec};
 
-fn text_of(all: &[Artifact], path: &str) -> String {
-    all.iter().find(|artifact| artifact.path == Path::new(path)).unwrap().contents.clone()
+fn text_of(all: &[SystemFile], path: &str) -> String {
+    all.iter().find(|file| file.path == Path::new(path)).unwrap().contents.clone()
 }
 
 fn rule_lines(rules: &str) -> Vec<&str> {
@@ -26,15 +26,15 @@ fn with_serial(serial: &str) -> Registry {
 }
 
 #[test]
-fn the_repository_contains_the_artifacts_of_devices_toml() {
+fn the_repository_contains_the_system_files_of_devices_toml() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../udev");
-    let all = artifacts(&Registry::builtin());
-    for artifact in &all {
-        let path = folder.join(&artifact.path);
+    let all = system_files(&Registry::builtin());
+    for file in &all {
+        let path = folder.join(&file.path);
         let found = std::fs::read_to_string(&path).unwrap_or_default();
-        assert_eq!(found, artifact.contents, "{}: run `rapid artifacts`", path.display());
+        assert_eq!(found, file.contents, "{}: run `rapid artifacts`", path.display());
     }
-    let expected: BTreeSet<_> = all.iter().map(|artifact| folder.join(&artifact.path)).collect();
+    let expected: BTreeSet<_> = all.iter().map(|file| folder.join(&file.path)).collect();
     let here = |dir: &Path| std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();
     let found: BTreeSet<_> =
         here(&folder).into_iter().chain(here(&folder.join(DESCRIPTORS))).filter(|path| path.is_file()).collect();
@@ -186,7 +186,7 @@ fn a_unit_is_matched_by_serial_by_port_or_as_the_only_one_of_its_model() {
         node = "camera"
     "#;
     let registry = Registry::parse(text, None).unwrap().registry;
-    let rules = text_of(&artifacts(&registry), "99-rapid.rules");
+    let rules = text_of(&system_files(&registry), "99-rapid.rules");
     assert_eq!(
         rule_lines(&rules),
         [
@@ -198,7 +198,7 @@ fn a_unit_is_matched_by_serial_by_port_or_as_the_only_one_of_its_model() {
         ]
     );
     assert_eq!(rules.matches("# No stable name: several entries are of this model").count(), 2);
-    let descriptor = text_of(&artifacts(&registry), "descriptors/three.yaml");
+    let descriptor = text_of(&system_files(&registry), "descriptors/three.yaml");
     assert!(descriptor.contains("\npath: null\n"), "{descriptor}");
 }
 
@@ -206,7 +206,7 @@ fn a_unit_is_matched_by_serial_by_port_or_as_the_only_one_of_its_model() {
 fn a_can_interface_is_brought_up_with_the_bit_rate_of_its_entry() {
     let text = "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nserial_number = \"A '%k` $x\"\nnode = \"can\"\n\
                 [device.arm.can]\nbitrate = 500000\n";
-    let all = artifacts(&Registry::parse(text, None).unwrap().registry);
+    let all = system_files(&Registry::parse(text, None).unwrap().registry);
     let rules = text_of(&all, "99-rapid.rules");
     assert_eq!(
         rule_lines(&rules),
@@ -219,7 +219,7 @@ fn a_can_interface_is_brought_up_with_the_bit_rate_of_its_entry() {
     assert_eq!(families(&unit), ["AF_UNIX", "AF_NETLINK", "AF_CAN"], "{unit}");
     // An adapter on a serial line is treated like any other serial line.
     let slcan = format!("{text}adapter = \"slcan\"\n");
-    let line = text_of(&artifacts(&Registry::parse(&slcan, None).unwrap().registry), "99-rapid.rules");
+    let line = text_of(&system_files(&Registry::parse(&slcan, None).unwrap().registry), "99-rapid.rules");
     assert!(rule_lines(&line)[0].starts_with("SUBSYSTEM==\"tty\"") && !line.contains("RUN+="), "{line}");
 }
 
@@ -228,7 +228,7 @@ fn the_service_may_open_usb_devices_only_where_a_program_does() {
     let program = "[device.a]\nvid = \"1\"\npid = \"1\"\nnode = \"p\"\n";
     let tty = format!("{program}[device.a.process]\nopens = \"tty\"\n");
     for (text, usb) in [(program, true), (tty.as_str(), false), (crate::BUILTIN, false)] {
-        let all = artifacts(&Registry::parse(text, None).unwrap().registry);
+        let all = system_files(&Registry::parse(text, None).unwrap().registry);
         let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
         let lines: Vec<_> = unit.lines().collect();
         assert_eq!(rules.contains("GROUP=\"plugdev\""), usb, "{rules}");
@@ -258,7 +258,7 @@ fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_or_button_needs_th
         (panel, false, true),
     ] {
         let text = format!("{}{stops}", crate::BUILTIN);
-        let all = artifacts(&Registry::parse(&text, None).unwrap().registry);
+        let all = system_files(&Registry::parse(&text, None).unwrap().registry);
         let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
         assert_eq!(rules.contains("SUBSYSTEM==\"gpio\", KERNEL==\"gpiochip3\", GROUP=\"gpio\""), chips, "{rules}");
         let has = |line: &str| unit.lines().any(|is| is == line);
@@ -290,7 +290,7 @@ fn a_chip_with_several_used_lines_has_one_rule() {
         motor("lift", 5),
         motor("turn", 6)
     );
-    let rules = text_of(&artifacts(&Registry::parse(&text, None).unwrap().registry), "99-rapid.rules");
+    let rules = text_of(&system_files(&Registry::parse(&text, None).unwrap().registry), "99-rapid.rules");
     let rule = "# stop door, brake of lift, brake of turn\nSUBSYSTEM==\"gpio\", KERNEL==\"gpiochip2\"";
     assert!(rules.contains(rule), "{rules}");
     assert_eq!(rules.matches("KERNEL==\"gpiochip2\"").count(), 1, "{rules}");
@@ -315,7 +315,7 @@ fn the_service_may_open_the_chips_of_brakes_and_the_serial_ports_of_the_board_wh
         (arm("") + &stop("/dev/ttyAMA0"), false, true),
         (arm("") + "[button.a]\nserial = { path = \"/dev/ttyS0\", line = \"a\" }\npress = \"mark\"\n", false, true),
     ] {
-        let all = artifacts(&Registry::parse(&text, None).unwrap().registry);
+        let all = system_files(&Registry::parse(&text, None).unwrap().registry);
         let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
         let rule = "# brake of lift\nSUBSYSTEM==\"gpio\", KERNEL==\"gpiochip2\", GROUP=\"gpio\"";
         assert_eq!(rules.contains(rule), chips, "{rules}");
@@ -382,7 +382,7 @@ fn families(unit: &str) -> Vec<String> {
 #[test]
 fn the_service_may_open_the_kinds_of_sockets_that_its_entries_need_and_no_others() {
     for rig in rigs() {
-        let unit = text_of(&artifacts(&registry_of(&rig)), "rapid.service");
+        let unit = text_of(&system_files(&registry_of(&rig)), "rapid.service");
         let needed = KINDS.iter().filter(|(name, ..)| rig.contains(name)).flat_map(|(.., needed)| *needed);
         let expected: BTreeSet<&str> = needed.copied().chain(["AF_UNIX", "AF_NETLINK"]).collect();
         let found = families(&unit);
@@ -402,7 +402,7 @@ fn the_exposure_of_every_unit_is_2_or_better() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("rapid.service");
     for rig in rigs() {
-        std::fs::write(&path, text_of(&artifacts(&registry_of(&rig)), "rapid.service")).expect("written");
+        std::fs::write(&path, text_of(&system_files(&registry_of(&rig)), "rapid.service")).expect("written");
         let judged = Command::new("systemd-analyze")
             .args(["security", "--no-pager", "--offline=true", "--threshold=20"])
             .arg(&path)
@@ -422,7 +422,7 @@ fn the_exposure_of_every_unit_is_2_or_better() {
 #[test]
 fn files_of_the_service_are_readable_by_its_group_and_by_no_one_else() {
     for rig in rigs() {
-        let unit = text_of(&artifacts(&registry_of(&rig)), "rapid.service");
+        let unit = text_of(&system_files(&registry_of(&rig)), "rapid.service");
         for setting in ["UMask=0027", "StateDirectoryMode=0750", "User=rapid"] {
             assert!(unit.lines().any(|line| line == setting), "{setting} not in {unit}");
         }
@@ -432,7 +432,7 @@ fn files_of_the_service_are_readable_by_its_group_and_by_no_one_else() {
 
 #[test]
 fn a_serial_number_that_no_rule_can_match_gets_a_comment() {
-    let rules = text_of(&artifacts(&with_serial("a\", RUN+=\"reboot")), "99-rapid.rules");
+    let rules = text_of(&system_files(&with_serial("a\", RUN+=\"reboot")), "99-rapid.rules");
     assert_eq!(rule_lines(&rules).len(), 2);
     assert!(rules.contains("# No stable name: its serial number contains characters"));
     assert!(!rules.contains("reboot"));
@@ -465,7 +465,7 @@ proptest! {
     fn no_serial_number_adds_a_line_or_matches_another(
         serial in prop_oneof![any::<String>(), "[ -~]{1,20}", "[*?\\[\\]a\"|\\\\]{1,8}"],
     ) {
-        let all = artifacts(&with_serial(&serial));
+        let all = system_files(&with_serial(&serial));
         let rules = text_of(&all, "99-rapid.rules");
         let lines = rule_lines(&rules);
         prop_assert_eq!(rules.lines().filter(|line| line.starts_with("# cam_wrist")).count(), 1);

@@ -19,25 +19,25 @@ use super::spec::{DeviceSpec, IdentitySpec, InputSpec, NodeSpec, Registry};
 /// First line of every generated file but the layout, which is JSON: a file that begins otherwise must not be removed.
 pub const HEADER: &str = "# Written by `rapid artifacts` from devices.toml: change that file and run it again.";
 
-/// Folder of the descriptors among the artifacts.
+/// Folder of the descriptors among the system files.
 pub const DESCRIPTORS: &str = "descriptors";
 
 /// One file.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Artifact {
-    /// Relative to the folder of artifacts, `udev/` in the repository.
+pub struct SystemFile {
+    /// Relative to the folder of system files, `udev/` in the repository.
     pub path: PathBuf,
     /// Its text.
     pub contents: String,
     /// Its permissions.
     pub mode: u32,
     /// Its purpose.
-    pub kind: ArtifactKind,
+    pub kind: SystemFileKind,
 }
 
 /// The purpose of a file; decides where it is installed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ArtifactKind {
+pub enum SystemFileKind {
     /// udev rules.
     Rules,
     /// systemd unit.
@@ -49,21 +49,21 @@ pub enum ArtifactKind {
 }
 
 /// Every file generated from `registry`.
-pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
-    let artifact = |path: PathBuf, contents, kind| Artifact { path, contents, mode: 0o644, kind };
+pub fn system_files(registry: &Registry) -> Vec<SystemFile> {
+    let file = |path: PathBuf, contents, kind| SystemFile { path, contents, mode: 0o644, kind };
     let mut all = vec![
-        artifact("99-rapid.rules".into(), udev_rules::rules(registry), ArtifactKind::Rules),
-        artifact("rapid.service".into(), unit(registry), ArtifactKind::Unit),
-        artifact("rapid-upload.service".into(), upload::service(), ArtifactKind::Unit),
-        artifact("rapid-upload.timer".into(), upload::timer(), ArtifactKind::Unit),
-        artifact("rapid-upload-check.service".into(), upload::check_service(), ArtifactKind::Unit),
-        artifact("rapid-upload-check.timer".into(), upload::check_timer(), ArtifactKind::Unit),
-        artifact("foxglove.json".into(), layout::layout(registry), ArtifactKind::Layout),
+        file("99-rapid.rules".into(), udev_rules::rules(registry), SystemFileKind::Rules),
+        file("rapid.service".into(), unit(registry), SystemFileKind::Unit),
+        file("rapid-upload.service".into(), upload::service(), SystemFileKind::Unit),
+        file("rapid-upload.timer".into(), upload::timer(), SystemFileKind::Unit),
+        file("rapid-upload-check.service".into(), upload::check_service(), SystemFileKind::Unit),
+        file("rapid-upload-check.timer".into(), upload::check_timer(), SystemFileKind::Unit),
+        file("foxglove.json".into(), layout::layout(registry), SystemFileKind::Layout),
     ];
     for device in &registry.devices {
         let path = PathBuf::from(DESCRIPTORS).join(format!("{}.yaml", device.name));
         let stable_path = udev_rules::identify(registry, device).ok().map(|_| format!("/dev/rapid/{}", device.name));
-        all.push(artifact(path, descriptor(device, stable_path.as_deref()), ArtifactKind::Descriptor));
+        all.push(file(path, descriptor(device, stable_path.as_deref()), SystemFileKind::Descriptor));
     }
     all
 }
