@@ -2,7 +2,7 @@
 //!
 //!     observe 5 /rapid/camera/wrist=480x640x3 /rapid/serial/motor=3
 //!
-//! Pictures are `HEIGHTxWIDTHx3`, distances `HEIGHTxWIDTH`, numbers their count. Of a topic that is absent, or whose sample
+//! Pictures are `HEIGHTxWIDTHx3`, depth `HEIGHTxWIDTH`, numbers their count. Of a topic that is absent, or whose sample
 //! cannot be used, the array is zeros. It ends after so many observations. `RAPID_INSTANCE` is what that `rapid` was given as
 //! `--instance`.
 

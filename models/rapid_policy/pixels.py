@@ -84,7 +84,7 @@ def _yuv(rows: Pixels, y: int) -> Pixels:
 
 
 def _shades(pairs: Pixels) -> Pixels:
-    """Distances: from white at 0 to black at 16 x 255 counts, and black where there is none."""
+    """Depth: from white at 0 to black at 16 x 255 counts, and black where there is none."""
     counts = pairs.astype(np.int32) @ np.array([1, 256], np.int32)
     shade = np.where(counts == 0, 0, 255 - np.minimum(counts // 16, 255)).astype(np.uint8)
     return np.repeat(shade[:, :, None], 3, 2)

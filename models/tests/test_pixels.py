@@ -26,7 +26,7 @@ class Formats(unittest.TestCase):
         grey = COLORED[:, :, 0]
         padded = np.concatenate([COLORED.reshape(4, 18), np.zeros((4, 2), np.uint8)], 1)
         alpha = np.concatenate([COLORED, np.full((4, 6, 1), 9, np.uint8)], 2)
-        distances = np.array([[0, 1, 16, 4080, 65535, 160]] * 4, "<u2")
+        depth = np.array([[0, 1, 16, 4080, 65535, 160]] * 4, "<u2")
         for name, message, expected in (
             ("rgb8", raw("rgb8", COLORED), COLORED),
             ("rows with a rest", raw("rgb8", padded), COLORED),
@@ -37,7 +37,7 @@ class Formats(unittest.TestCase):
             ("mono8", raw("mono8", grey), np.repeat(grey[:, :, None], 3, 2)),
             ("8UC1", raw("8UC1", grey), np.repeat(grey[:, :, None], 3, 2)),
             # The shades of the program's own test.
-            ("16UC1", raw("16UC1", distances), np.tile(np.array([0, 255, 254, 0, 0, 245])[None, :, None], (4, 1, 3))),
+            ("16UC1", raw("16UC1", depth), np.tile(np.array([0, 255, 254, 0, 0, 245])[None, :, None], (4, 1, 3))),
         ):
             with self.subTest(name):
                 np.testing.assert_array_equal(decode(RAW, message), expected)

@@ -55,7 +55,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Com
 #[cfg(feature = "motors")]
 fn with_arms(loaded: Loaded) -> Result<Loaded, RegistryErrors> {
     let file = loaded.registry.path.as_ref().map(|path| path.display().to_string()).unwrap_or_default();
-    let mistakes = loaded.registry.devices.iter().filter_map(|device| {
+    let errors = loaded.registry.devices.iter().filter_map(|device| {
         let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { return None };
         let error = Arm::open(motors.effector.as_deref()?, &motors.motors).err()?;
         Some(Diagnostic {
@@ -67,7 +67,7 @@ fn with_arms(loaded: Loaded) -> Result<Loaded, RegistryErrors> {
             fix: Some(error.fix().to_owned()),
         })
     });
-    let diagnostics: Vec<_> = mistakes.collect();
+    let diagnostics: Vec<_> = errors.collect();
     if diagnostics.is_empty() { Ok(loaded) } else { Err(RegistryErrors { diagnostics }) }
 }
 

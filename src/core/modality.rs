@@ -65,7 +65,7 @@ impl std::fmt::Display for ModalityId {
 pub enum ModalityKind {
     /// Pictures, as the camera encodes them.
     Image,
-    /// Pictures of 16-bit distances.
+    /// Depth images of 16 bits.
     Depth,
     /// A vector of numbers per sample.
     Scalars,

@@ -36,7 +36,7 @@ pub enum Encoding {
     F64 = 4,
     /// A mask value: u64 mask, u64 sequence, little endian.
     Mask = 5,
-    /// 16-bit distances, little-endian, row by row; 0 is no distance. V4L2 calls it `Z16 `.
+    /// 16-bit depth, little-endian, row by row; 0 where there is none. V4L2 calls it `Z16 `.
     Depth = 6,
 }
 

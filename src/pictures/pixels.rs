@@ -1,6 +1,6 @@
 //! Pictures of a camera as pixels: 8-bit red, green, blue, row by row.
 //!
-//! Distances become shades for people: from white at 0 to black at 16 x 255 counts (4 m in mm) and where there is none.
+//! Depth becomes shades for people: from white at 0 to black at 16 x 255 counts (4 m in mm) and where there is none.
 //!
 //! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
 

@@ -11,7 +11,7 @@
 //! is then compared with the registry ([`Bundle::check_registry`]) and with the inputs and outputs of the graphs
 //! ([`Bundle::check_graphs`]).
 //!
-//! Invariant: every check reports all mistakes at once, each with the path of its key and a fix.
+//! Invariant: every check reports all errors at once, each with the path of its key and a fix.
 //! Invariant: no later code checks a [`Bundle`] again.
 
 mod action;

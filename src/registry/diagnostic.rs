@@ -1,4 +1,4 @@
-//! Mistakes in a file written by a person, worded so that the person can fix them.
+//! Errors in a file written by a person, worded so that the person can fix them.
 //!
 //! Invariant: text taken from the file is shown escaped: no file can send control characters to a
 //! terminal.

@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_named_with_their_place() {
+    fn errors_are_named_with_their_place() {
         for (text, expected) in [
             ("", "no [[device]] in it"),
             ("[device.cam]\nvid = \"1\"\n", "this is not a registry of rapid_driver"),

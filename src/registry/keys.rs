@@ -31,7 +31,7 @@ pub(crate) struct Key {
     pub(crate) default: fn() -> String,
 }
 
-/// A table without the key is a mistake.
+/// A table without the key is an error.
 pub(crate) const NEEDED: &str = "needed";
 
 /// The key of a table, whose keys are declared elsewhere, and which is read by itself.

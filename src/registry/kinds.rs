@@ -1,4 +1,4 @@
-//! The kinds of devices that a registry can name. A kind is one module here: the table of its keys with their mistakes, and
+//! The kinds of devices that a registry can name. A kind is one module here: the table of its keys with their errors, and
 //! what follows from its specification alone. [`kinds!`] lists them.
 
 pub(crate) mod camera;
@@ -115,7 +115,7 @@ pub(crate) fn check_samples(table: &Section<'_>, kind: ModalityKind, of_pictures
     for key in of_pictures.iter().copied().chain(["channels"]).filter(|key| table.has(key)) {
         let (is_own, owner) = match (key, kind) {
             ("channels", kind) => (kind == ModalityKind::Scalars, "scalars"),
-            // Distances have one.
+            // Depth has one.
             ("format", kind) => (kind == ModalityKind::Image, "image"),
             (_, kind) => (matches!(kind, ModalityKind::Image | ModalityKind::Depth), "image"),
         };

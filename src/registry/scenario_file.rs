@@ -156,7 +156,7 @@ fn device(section: &Section<'_>, registry: &Registry) -> Option<ScenarioDevice> 
     device.usb.vid = section.usb_id("vid").unwrap_or(device.usb.vid);
     device.usb.pid = section.usb_id("pid").unwrap_or(device.usb.pid);
     if let Some(serial) = section.text("serial") {
-        // The identity that a device reports is never a mistake of the file.
+        // The identity that a device reports is never an error of the file.
         device.usb.serial = (!serial.is_empty()).then(|| serial.to_owned());
     }
     if let Some(port) = port(section) {

@@ -74,7 +74,7 @@ pub(super) struct StaticDetail {
 impl StaticDetail {
     pub(super) fn of(device: &DeviceSpec) -> Self {
         let fact = |name: &str, value: String| (name.to_owned(), value);
-        let mut facts = vec![fact("wanted", device.node.format())];
+        let mut facts = vec![fact("target", device.node.format())];
         if let Some(usb) = device.identity.usb() {
             let serial = usb.serial.as_ref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
             let port = usb.port.as_ref().map(|port| format!(", port {port}")).unwrap_or_default();

@@ -46,7 +46,7 @@ fn a_motor_may_report_its_limits_as_far_as_it_counts() {
     let text = mistakes::read(&path);
     for (was, is) in [
         ("zero = 12", "zero = 11.5"),
-        // Its limits are from 10 to 13 rad of the motor with one sense, and from 11 to 14 rad with the other.
+        // Its limits are from 10 to 13 rad of the motor in one direction, and from 11 to 14 rad in the other.
         ("position = [-1, 2]", "position = [-0.5, 2]"),
         // A motor that was set to count farther.
         ("position = [-1, 2]", "position = [-20, 20]"),

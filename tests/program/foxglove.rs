@@ -358,7 +358,7 @@ fn poses_and_joints_are_derived_from_the_numbers_live_and_recorded() {
 }
 
 #[test]
-fn distances_are_shown_as_they_are_recorded_and_observations_name_what_is_recorded() {
+fn depth_is_shown_as_it_is_recorded_and_observations_name_what_is_recorded() {
     const DEPTH: &str = "/rapid/camera/wrist/depth";
     const OBSERVATION: &str = "/rapid/observation";
     /// Bits and topics of what is plugged in. Bit 1 is not.

@@ -1,4 +1,4 @@
-//! A camera with several streams, and pictures of distances: recorded byte for byte, replayed, shown and left out of
+//! A camera with several streams, and depth images: recorded byte for byte, replayed, shown and left out of
 //! datasets.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
@@ -54,7 +54,7 @@ struct Raw {
 }
 
 #[test]
-fn distances_are_recorded_replayed_and_shown() {
+fn depth_is_recorded_replayed_and_shown() {
     let place = Place::new();
     place.write("devices.toml", &[RIG, LENIENT].concat());
     // The scenario has a clock of its own: the stream is gone until the recording shows it gone.

@@ -1,7 +1,7 @@
 use super::*;
 
 #[test]
-fn distances_are_shades_and_their_length_is_checked() {
+fn depth_is_shades_and_its_length_is_checked() {
     let bytes = [0_u16, 1, 16, 4080, u16::MAX, 160].map(u16::to_le_bytes).concat();
     let mut pixels = Pixels::default();
     let picture = |bytes| Picture { encoding: Encoding::Depth, width: 3, height: 2, bytes };

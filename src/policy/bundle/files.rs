@@ -58,7 +58,7 @@ impl Bundle {
     /// Reads the bundle in `folder` and checks that its graphs match byte for byte and contain all their tensors.
     ///
     /// # Errors
-    /// All mistakes in `policy.json`, or otherwise those in the graphs' files.
+    /// All errors in `policy.json`, or otherwise those in the graphs' files.
     pub fn load(folder: &Path) -> Result<Self, BundleErrors> {
         let path = folder.join(POLICY_FILE);
         let label = path.display().to_string();
@@ -99,7 +99,7 @@ impl Bundle {
     /// Parses the text of a `policy.json`; messages name it `file`. The bundle's folder is empty, and no graph is read.
     ///
     /// # Errors
-    /// All mistakes in it.
+    /// All errors in it.
     pub fn parse(text: &str, file: &str) -> Result<Self, BundleErrors> {
         let mut bundle = parse(text, file)?;
         let mut hasher = Sha256::new();
@@ -174,7 +174,7 @@ fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// The mistake in the bytes of a graph, and its fix.
+/// The error in the bytes of a graph, and its fix.
 fn wrong(file: &GraphFile, bytes: &[u8]) -> Option<(String, String)> {
     let (name, found) = (&file.file, text::hexadecimal(&Sha256::digest(bytes)));
     if found != file.sha256 {

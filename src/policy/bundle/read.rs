@@ -1,6 +1,6 @@
-//! Reads a part of `policy.json` into a type that derives `Deserialize`, and reports every mistake with its path.
+//! Reads a part of `policy.json` into a type that derives `Deserialize`, and reports every error with its path.
 //!
-//! serde stops at the first mistake. To report all of them in one pass, a wrong value is replaced by the example of its
+//! serde stops at the first error. To report all of them in one pass, a wrong value is replaced by the example of its
 //! key (see [`KEYS`]) and the part is read again; the result of such a pass is discarded.
 //!
 //! Invariant: text taken from the file is shown without control characters.
@@ -84,7 +84,7 @@ pub(super) fn read_tagged<T: DeserializeOwned>(
     let mut keys = object(entry, value, problems)?;
     match keys.remove(tag) {
         Some(Value::String(variant)) => {
-            // The form in which serde itself tags enums: it preserves the path to the mistake.
+            // The form in which serde itself tags enums: it preserves the path to the error.
             let tagged = Value::Object(Map::from_iter([(variant, Value::Object(keys))]));
             return read_part(entry, tag, tagged, problems);
         }
@@ -108,9 +108,9 @@ fn read_part<T: DeserializeOwned>(entry: &str, tag: &str, mut value: Value, prob
             Err(error) => error,
         };
         is_whole = false;
-        let mistake = Mistake::new(entry, tag, &error);
-        problems.report(&mistake.entry, &mistake.message, &mistake.fix);
-        if mistake.repair(&mut value).is_none() {
+        let error = KeyError::new(entry, tag, &error);
+        problems.report(&error.entry, &error.message, &error.fix);
+        if error.repair(&mut value).is_none() {
             break;
         }
     }
@@ -118,7 +118,7 @@ fn read_part<T: DeserializeOwned>(entry: &str, tag: &str, mut value: Value, prob
 }
 
 /// An error of serde, for people.
-struct Mistake {
+struct KeyError {
     /// The path of its key.
     entry: String,
     message: String,
@@ -129,7 +129,7 @@ struct Mistake {
     example: Option<Value>,
 }
 
-impl Mistake {
+impl KeyError {
     fn new(entry: &str, tag: &str, error: &serde_path_to_error::Error<serde_json::Error>) -> Self {
         let mut path: Vec<Segment> = error.path().iter().cloned().collect();
         let cause = error.inner().to_string();

@@ -496,7 +496,7 @@ pub struct GraphFile {
     pub sha256: String,
 }
 
-/// All mistakes of a bundle. Never empty.
+/// All errors of a bundle. Never empty.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", self.diagnostics.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
 pub struct BundleErrors {

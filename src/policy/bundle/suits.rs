@@ -117,7 +117,7 @@ impl Bundle {
                     };
                     let given = match kind {
                         ModalityKind::Image => "pictures",
-                        ModalityKind::Depth => "pictures of distances",
+                        ModalityKind::Depth => "depth images",
                         ModalityKind::Scalars => "numbers",
                         ModalityKind::Bytes => "bytes without a known structure",
                     };

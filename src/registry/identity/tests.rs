@@ -96,7 +96,7 @@ fn waits(assignment: &Assignment) -> bool {
     matches!(assignment, Assignment::Waiting { .. })
 }
 
-/// Two cameras of one model, each with a stream of colours and one of distances.
+/// Two cameras of one model, each with a stream of colours and one of depth.
 fn with_streams() -> Registry {
     let camera = |name: &str, serial: &str, bits: [u8; 2]| {
         format!(

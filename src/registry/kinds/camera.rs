@@ -30,9 +30,9 @@ keys! {
         height: u32 = whole::<u32>(1, 8192), or 480;
         /// Pictures a second.
         fps: u32 = whole::<u32>(1, 1000), or 30;
-        /// Pixel format. `Z16` is distances.
+        /// Pixel format. `Z16` is depth.
         format: PixelFormat = Words(&PixelFormat::WORDS), or PixelFormat::Mjpg;
-        /// Of distances: what one count is.
+        /// Of depth: what one count is.
         depth_unit_um "depth_unit": u32 = DISTANCE, usually "`\"1mm\"`", or MILLIMETRE;
         /// V4L2 controls that are set at the start, by the names that `rapid devices` lists.
         controls: Vec<(String, i64)> = CONTROLS, usually "none", or Vec::new();
@@ -49,7 +49,7 @@ pub enum PixelFormat {
     Yuyv,
     /// 8-bit luminance.
     Grey,
-    /// 16-bit distances.
+    /// 16-bit depth.
     Z16,
 }
 
@@ -127,7 +127,7 @@ pub(crate) fn read(entry: &Section<'_>, _: Programs<'_>) -> Option<Settings> {
     let table = entry.table_or_empty("camera");
     let camera = CameraSpec::read(&table);
     if table.has("depth_unit") && camera.format != PixelFormat::Z16 {
-        let message = format!("pictures in {} have no distances", camera.format);
+        let message = format!("pictures in {} have no depth", camera.format);
         table.report("depth_unit", message, "remove the key");
     }
     Some((NodeSpec::Camera(camera), None))

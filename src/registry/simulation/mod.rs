@@ -54,7 +54,7 @@ pub enum SimSource {
         /// Least size of a picture, which is padded to it. 0: as the encoder produces it.
         bytes: usize,
     },
-    /// Pictures of distances of these dimensions in pixels; bytes are a function of seed and sequence.
+    /// Depth images of these dimensions in pixels; bytes are a function of seed and sequence.
     Depth {
         /// Pixels.
         width: u32,

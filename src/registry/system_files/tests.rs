@@ -49,7 +49,7 @@ fn leaves(layout: &serde_json::Value) -> Vec<&str> {
     }
 }
 
-/// Registries whose samples have a meaning, an arm with a description, and a camera with distances.
+/// Registries whose samples have a meaning, an arm with a description, and a camera with depth.
 const FORMS: &str = include_str!("../../../tests/registry/valid/forms.toml");
 const EFFECTOR: &str = include_str!("../../../tests/registry/valid/effector.toml");
 const STREAMS: &str = include_str!("../../../tests/registry/valid/streams.toml");

@@ -169,7 +169,7 @@ impl Remote {
                 Ok(())
             }
             (RemoteSamples::Pictures(..), Some(PixelFormat::Z16)) => {
-                wrong(format!("its pictures are distances: write kind = \"depth\" in {table}, without a format"))
+                wrong(format!("its pictures are depth images: write kind = \"depth\" in {table}, without a format"))
             }
             (RemoteSamples::Pictures(..), Some(sent)) => {
                 wrong(format!("its pictures are {sent}: write kind = \"image\" and format = \"{sent}\" in {table}"))

@@ -14,10 +14,10 @@ fn texts(folder: &str) -> Vec<(String, String)> {
 }
 
 /// Why a value does not match the schema, as far as types, keys, words and ranges tell.
-fn mistake(schema: &Json, value: &Json, at: &str) -> Option<String> {
+fn mismatch(schema: &Json, value: &Json, at: &str) -> Option<String> {
     let wrong = |what: &str| Some(format!("{at}: {what}"));
     if let Some(ways) = schema["anyOf"].as_array() {
-        let fits = ways.iter().any(|way| mistake(way, value, at).is_none());
+        let fits = ways.iter().any(|way| mismatch(way, value, at).is_none());
         return if fits { None } else { wrong("none of several") };
     }
     if let Some(words) = schema["enum"].as_array() {
@@ -46,7 +46,7 @@ fn mistake(schema: &Json, value: &Json, at: &str) -> Option<String> {
         return wrong(&format!("{value} is out of range"));
     }
     if let (Some(items), false) = (value.as_array(), schema["items"].is_null()) {
-        return items.iter().find_map(|item| mistake(&schema["items"], item, &format!("{at}[]")));
+        return items.iter().find_map(|item| mismatch(&schema["items"], item, &format!("{at}[]")));
     }
     let (Some(fields), false) = (value.as_object(), schema["additionalProperties"].is_null()) else { return None };
     let missing =
@@ -55,9 +55,9 @@ fn mistake(schema: &Json, value: &Json, at: &str) -> Option<String> {
         fields.iter().find_map(|(key, value)| {
             let path = format!("{at}.{key}");
             match (schema["properties"].get(key), &schema["additionalProperties"]) {
-                (Some(own), _) => mistake(own, value, &path),
+                (Some(own), _) => mismatch(own, value, &path),
                 (None, Json::Bool(false)) => Some(format!("{path}: unknown key")),
-                (None, any) => mistake(any, value, &path),
+                (None, any) => mismatch(any, value, &path),
             }
         })
     })
@@ -65,7 +65,7 @@ fn mistake(schema: &Json, value: &Json, at: &str) -> Option<String> {
 
 fn judged(text: &str) -> Option<String> {
     let value: Json = toml::from_str(text).unwrap();
-    mistake(&schema(), &value, "")
+    mismatch(&schema(), &value, "")
 }
 
 #[test]
@@ -101,8 +101,8 @@ fn an_unknown_key_a_wrong_type_or_word_does_not_fit_the_schema() {
         .map(|(path, text)| (path, judged(text)))
         .collect();
     assert!(judged.len() > 20, "{}", judged.len());
-    for (path, mistake) in judged {
-        assert!(mistake.is_some(), "{path}");
+    for (path, mismatch) in judged {
+        assert!(mismatch.is_some(), "{path}");
     }
 }
 

@@ -302,7 +302,7 @@ fn position(entry: &Section<'_>, limits: Option<Vec<f64>>, mode: Option<MotorMod
     }
 }
 
-/// How the motor sits on its joint, whose limits are these. What it cannot report there is a mistake.
+/// How the motor sits on its joint, whose limits are these. What it cannot report there is an error.
 fn mounting(entry: &Section<'_>, kind: Option<MotorKind>, limits: Option<[f64; 2]>) -> Mounting {
     let mounting = Mounting::values(entry);
     let zero = mounting.zero;

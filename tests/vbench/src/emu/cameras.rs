@@ -1,4 +1,4 @@
-//! The cameras of one USB device. Most devices have one; a depth camera has one for distances and one for colour.
+//! The cameras of one USB device. Most devices have one; a depth camera has one for depth and one for colour.
 //!
 //! Invariant: there are at most `spec::CAMERAS`, each with its own pair of interfaces, endpoint, stream and numbers; a
 //! request changes only one.

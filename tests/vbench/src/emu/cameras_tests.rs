@@ -5,7 +5,7 @@ use crate::emu::source::Source;
 use crate::emu::spec::{Format, Mode};
 use crate::emu::uvc::Pictures;
 
-/// A camera for distances and one for colour.
+/// A camera for depth and one for colour.
 fn pair() -> Cameras {
     let content = |format, fps| vec![(Mode { format, width: 64, height: 48, fps: vec![fps] }, Pictures::default())];
     Cameras::new(vec![content(Format::Z16, 15), content(Format::Yuyv, 30)], first_number(2))

@@ -108,7 +108,7 @@ pub enum Format {
     Mjpg,
     /// YUV 4:2:2, packed.
     Yuyv,
-    /// Distances of 16 bits.
+    /// Depth of 16 bits.
     Z16,
 }
 

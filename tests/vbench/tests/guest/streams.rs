@@ -1,4 +1,4 @@
-//! Depth cameras: devices with one camera for distances and one for colour behind one cable, each a capture node of its own.
+//! Depth cameras: devices with one camera for depth and one for colour behind one cable, each a capture node of its own.
 //!
 //! Two of them differ in the order of their nodes, so that only the formats tell a node's stream.
 
