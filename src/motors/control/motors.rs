@@ -51,7 +51,7 @@ use std::time::Duration;
 use actions::Actions;
 pub use brakes::Brakes;
 pub use fault::{Fault, Part, Strange};
-use motor::Motor;
+use motor::{Axis, Motor};
 pub use motor::{RETURN_SPEED, SAMPLE_VALUES};
 pub use notice::{BusState, Notice, Reason, Refusal};
 use notices::Notices;
@@ -164,12 +164,12 @@ impl MotorBus {
 
     /// The command to each motor as of the last step, rad or rad/s. Means nothing unless armed.
     pub fn commands(&self) -> impl Iterator<Item = f64> {
-        self.motors.iter().map(Motor::command)
+        self.motors.iter().map(|motor| motor.axis.command())
     }
 
     /// What has happened so far.
     pub fn counts(&self) -> Counts {
-        let clamped = self.motors.iter().map(Motor::clamped).sum();
+        let clamped = self.motors.iter().map(|motor| motor.axis.clamped()).sum();
         Counts { clamped, lost_notices: self.notices.lost(), ..self.counts }
     }
 
@@ -199,13 +199,13 @@ impl MotorBus {
     /// on.
     pub fn last_will(&self) -> Option<impl Iterator<Item = CanFrame> + '_> {
         // Already before the first motor is ordered to turn on.
-        let is_on = self.state == BusState::Arming || self.motors.iter().any(Motor::may_be_on);
+        let is_on = self.state == BusState::Arming || self.motors.iter().any(|motor| motor.status.may_be_on());
         is_on.then(|| self.motors.iter().map(Motor::last_will))
     }
 
     /// Names of the motors that may be on: ordered or reported to be on, and not reported off since the last disable.
     pub fn still_on(&self) -> impl Iterator<Item = &str> {
-        self.motors.iter().filter(|motor| motor.may_be_on()).map(Motor::name)
+        self.motors.iter().filter(|motor| motor.status.may_be_on()).map(|motor| motor.joint.name())
     }
 
     /// Fills `out` with [`SAMPLE_VALUES`] values per motor if every motor has answered since the last sample, and
@@ -214,7 +214,7 @@ impl MotorBus {
         if out.len() != self.motors.len() * SAMPLE_VALUES {
             return None;
         }
-        let captured = self.motors.iter().map(Motor::unsampled).min()??;
+        let captured = self.motors.iter().map(|motor| motor.report.unsampled()).min()??;
         for (values, motor) in out.chunks_exact_mut(SAMPLE_VALUES).zip(&mut self.motors) {
             values.copy_from_slice(&motor.sample()?);
         }
@@ -225,12 +225,12 @@ impl MotorBus {
     pub fn feed(&mut self, frame: &CanFrame, now: Stamp) {
         let reply = Reply::decode(frame);
         let is_full = codec::data_of(frame).is_some();
-        let sender = self.motors.iter().position(|motor| is_full && motor.sent(frame, reply.as_ref()));
+        let sender = self.motors.iter().position(|motor| is_full && motor.joint.sent(frame, reply.as_ref()));
         let Some(index) = sender else {
             self.counts.strangers += u64::from(is_full);
             // A command of one or two values may be shorter.
             let is_frame = !(frame.extended || frame.remote || frame.error);
-            if let Some(motor) = self.motors.iter().position(|motor| is_frame && motor.is_commanded_by(frame)) {
+            if let Some(motor) = self.motors.iter().position(|motor| is_frame && motor.joint.is_commanded_by(frame)) {
                 self.received_master(motor, now);
             }
             return;
@@ -282,7 +282,7 @@ impl MotorBus {
         for (index, motor) in self.motors.iter_mut().enumerate() {
             motor.take_brake(brakes.of(index), now, &mut self.notices);
         }
-        let broken = self.motors.iter().position(Motor::has_broken_brake).filter(|_| self.is_arming());
+        let broken = self.motors.iter().position(|motor| motor.brake.is_broken()).filter(|_| self.is_arming());
         if let Some(motor) = broken {
             self.fail(Fault::Brake { motor }, now);
         }
@@ -308,7 +308,8 @@ impl MotorBus {
             motor.aim(*target, now, &mut self.notices);
         }
         let motors = &self.motors;
-        let [targets, commands] = [Motor::target, Motor::command].map(|of| motors.iter().map(of));
+        let [targets, commands] =
+            [Axis::target, Axis::command].map(|of| motors.iter().map(move |motor| of(&motor.axis)));
         self.actions.follow(targets, tick, commands, (self.schedule.in_force(now), now));
         self.counts.actions += 1;
         if self.state == BusState::Holding {
@@ -401,7 +402,7 @@ impl MotorBus {
 
     /// Handles motors that do not answer.
     fn listen(&mut self, now: Stamp) {
-        let Some(motor) = self.motors.iter().position(|motor| motor.is_silent(now)) else { return };
+        let Some(motor) = self.motors.iter().position(|motor| motor.report.is_silent(now)) else { return };
         if !matches!(self.state, BusState::Probing | BusState::Faulted(_)) {
             self.fail(Fault::Silent { motor }, now);
         }
@@ -483,7 +484,7 @@ impl MotorBus {
         }
         if self.motors.iter().all(|motor| motor.is_ready(now)) {
             self.motors.iter_mut().for_each(Motor::restart);
-            self.actions.arm(self.motors.iter().map(Motor::command), now);
+            self.actions.arm(self.motors.iter().map(|motor| motor.axis.command()), now);
             self.hold(now);
             self.notices.notify(if self.is_returning { Notice::Returning } else { Notice::Armed });
         } else if waited >= self.arm_within
@@ -505,7 +506,7 @@ impl MotorBus {
     /// Holds the last command, or stops as soon as it can.
     fn hold(&mut self, now: Stamp) {
         self.motors.iter_mut().for_each(Motor::hold);
-        self.actions.hold(self.motors.iter().map(Motor::target));
+        self.actions.hold(self.motors.iter().map(|motor| motor.axis.target()));
         self.enter(BusState::Holding, now);
     }
 

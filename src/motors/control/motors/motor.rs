@@ -16,7 +16,7 @@
 //!
 //! Made of what is asked of it ([`Probe`]), what it reports ([`Report`], [`Status`]) and how that is judged
 //! ([`Supervision`]), its [`Brake`], what it is commanded ([`Axis`]), and what is left of a motor that was stopped
-//! ([`Kept`]); each owns its state, and the phase decides what goes to which.
+//! ([`Kept`]); each owns its state, and the phase decides what goes to which. The bus reads of them what needs no phase.
 
 mod axis;
 mod brake;
@@ -38,7 +38,7 @@ use super::notices::Notices;
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges, StateCommand};
 use crate::control::damiao::parameter::{self, Reply};
-use axis::Axis;
+pub(super) use axis::Axis;
 pub use axis::RETURN_SPEED;
 use brake::Brake;
 pub(super) use brake::BrakeIs;
@@ -69,14 +69,14 @@ enum Phase {
 /// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Motor {
-    joint: Joint,
+    pub(super) joint: Joint,
+    pub(super) report: Report,
+    pub(super) status: Status,
+    pub(super) brake: Brake,
+    pub(super) axis: Axis,
     phase: Phase,
     probe: Probe,
-    report: Report,
-    status: Status,
     supervision: Supervision,
-    brake: Brake,
-    axis: Axis,
 }
 
 impl Motor {
@@ -94,59 +94,14 @@ impl Motor {
         }
     }
 
-    /// Its name.
-    pub(super) fn name(&self) -> &str {
-        &self.joint.spec.name
-    }
-
-    /// Is this frame one of its answers?
-    pub(super) fn sent(&self, frame: &CanFrame, reply: Option<&Reply>) -> bool {
-        self.joint.sent(frame, reply)
-    }
-
-    /// Does another program command it, or set one of its parameters, by this frame?
-    pub(super) fn is_commanded_by(&self, frame: &CanFrame) -> bool {
-        self.joint.is_commanded_by(frame)
-    }
-
-    /// What is commanded, rad or rad/s.
-    pub(super) const fn command(&self) -> f64 {
-        self.axis.command()
-    }
-
-    /// What is aimed at, rad or rad/s.
-    pub(super) const fn target(&self) -> f64 {
-        self.axis.target()
-    }
-
-    /// Targets that were beyond its limits.
-    pub(super) const fn clamped(&self) -> u64 {
-        self.axis.clamped()
-    }
-
     /// Where its joint is, rad, once that is known.
     pub(super) fn position(&self) -> Option<f64> {
         self.report.feedback().map(|feedback| feedback.q)
     }
 
-    /// When its newest feedback arrived, if it is in no sample yet.
-    pub(super) fn unsampled(&self) -> Option<Stamp> {
-        self.report.unsampled()
-    }
-
     /// Its part of a sample.
     pub(super) fn sample(&mut self) -> Option<[f64; SAMPLE_VALUES]> {
         self.report.sample()
-    }
-
-    /// Has it left our frames unanswered for too long?
-    pub(super) fn is_silent(&self, now: Stamp) -> bool {
-        self.report.is_silent(now)
-    }
-
-    /// It was ordered or reported to be on, and has not reported off since the last disable.
-    pub(super) const fn may_be_on(&self) -> bool {
-        self.status.may_be_on()
     }
 
     /// It was ordered to turn off, and has since reported that it is not enabled.
@@ -185,11 +140,6 @@ impl Motor {
             Phase::Kept(kept) => kept.releases(),
             _ => false,
         }
-    }
-
-    /// It has a brake, which can be neither engaged nor released.
-    pub(super) const fn has_broken_brake(&self) -> bool {
-        self.brake.is_broken()
     }
 
     /// Takes what its brake is.
@@ -308,8 +258,8 @@ impl Motor {
     pub(super) fn ask_late(&mut self, now: Stamp) {
         match self.phase {
             // It may receive although its own frames do not arrive.
-            Phase::Asked | Phase::Probed if self.is_silent(now) => self.turn_off(),
-            Phase::Off { .. } if self.probe.ranges().is_none() && !self.is_silent(now) => self.ask(),
+            Phase::Asked | Phase::Probed if self.report.is_silent(now) => self.turn_off(),
+            Phase::Off { .. } if self.probe.ranges().is_none() && !self.report.is_silent(now) => self.ask(),
             _ => {}
         }
     }
@@ -485,7 +435,7 @@ impl Motor {
         }
         let refresh = parameter::refresh(self.joint.spec.slave);
         let frames = match self.phase {
-            Phase::Off { .. } if self.is_off() && !self.is_silent(now) => [Some(refresh), None],
+            Phase::Off { .. } if self.is_off() && !self.report.is_silent(now) => [Some(refresh), None],
             Phase::Off { reported } => {
                 if !reported {
                     self.status.order_off();

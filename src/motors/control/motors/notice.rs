@@ -167,29 +167,15 @@ pub enum Notice {
 impl Notice {
     /// Does it need the attention of an operator?
     pub const fn is_problem(&self) -> bool {
-        match self {
+        !matches!(
+            self,
             Self::Ready
-            | Self::ParameterSet { .. }
-            | Self::Arming
-            | Self::Armed
-            | Self::Returned
-            | Self::Following
-            | Self::Disabled(Reason::Asked) => false,
-            Self::Unanswered { .. }
-            | Self::RangesDiffer { .. }
-            | Self::Warm { .. }
-            | Self::Holding
-            | Self::Returning
-            | Self::Disabled(Reason::Deadman)
-            | Self::Fault(_)
-            | Self::Strange { .. }
-            | Self::OtherMaster { .. }
-            | Self::Kept { .. }
-            | Self::NotBraked { .. }
-            | Self::Cleared { .. }
-            | Self::Latched { .. }
-            | Self::Clamped { .. }
-            | Self::Refused(_) => true,
-        }
+                | Self::ParameterSet { .. }
+                | Self::Arming
+                | Self::Armed
+                | Self::Returned
+                | Self::Following
+                | Self::Disabled(Reason::Asked)
+        )
     }
 }

@@ -20,7 +20,7 @@ pub const RETURN_SPEED: f64 = 0.1;
 
 /// See the module's comment.
 #[derive(Debug)]
-pub(super) struct Axis {
+pub(in crate::control::motors) struct Axis {
     limits: Limits,
     ramp: Ramp,
     /// What is commanded, rad or rad/s.
@@ -56,17 +56,17 @@ impl Axis {
     }
 
     /// What is commanded, rad or rad/s.
-    pub(super) const fn command(&self) -> f64 {
+    pub(in crate::control::motors) const fn command(&self) -> f64 {
         self.command
     }
 
     /// What is aimed at, within the limits.
-    pub(super) const fn target(&self) -> f64 {
+    pub(in crate::control::motors) const fn target(&self) -> f64 {
         self.target
     }
 
     /// Targets that were beyond the limits.
-    pub(super) const fn clamped(&self) -> u64 {
+    pub(in crate::control::motors) const fn clamped(&self) -> u64 {
         self.limits.clamped()
     }
 

@@ -9,7 +9,7 @@ use rapid_registry::BrakeSpec;
 
 /// See the module's comment.
 #[derive(Debug)]
-pub(super) struct Brake {
+pub(in crate::control::motors) struct Brake {
     /// `None` if the joint has no brake.
     spec: Option<BrakeSpec>,
     is: BrakeIs,
@@ -47,7 +47,7 @@ impl Brake {
     }
 
     /// Is there one that can be neither engaged nor released?
-    pub(super) const fn is_broken(&self) -> bool {
+    pub(in crate::control::motors) const fn is_broken(&self) -> bool {
         self.exists() && matches!(self.is, BrakeIs::Broken)
     }
 

@@ -15,7 +15,7 @@ const COMMANDS: [u32; 4] = [0, 0x100, 0x200, 0x300];
 
 /// See the module's comment.
 #[derive(Debug)]
-pub(super) struct Joint {
+pub(in crate::control::motors) struct Joint {
     /// Its position in the entry.
     pub(super) index: usize,
     pub(super) spec: MotorSpec,
@@ -23,14 +23,19 @@ pub(super) struct Joint {
 
 impl Joint {
     /// Is this frame one of its answers?
-    pub(super) fn sent(&self, frame: &CanFrame, reply: Option<&Reply>) -> bool {
+    pub(in crate::control::motors) fn sent(&self, frame: &CanFrame, reply: Option<&Reply>) -> bool {
         let id = u16::from(frame.data[0] & 0xf);
         let slave_fits = reply.map_or(self.spec.slave & 0xf == id, |reply| reply.slave == self.spec.slave);
         frame.id == u32::from(self.spec.master) && slave_fits
     }
 
+    /// Its name.
+    pub(in crate::control::motors) fn name(&self) -> &str {
+        &self.spec.name
+    }
+
     /// Does another program command it, or set one of its parameters, by this frame? Our own frames are not received.
-    pub(super) fn is_commanded_by(&self, frame: &CanFrame) -> bool {
+    pub(in crate::control::motors) fn is_commanded_by(&self, frame: &CanFrame) -> bool {
         let slave = u32::from(self.spec.slave);
         let writes = parameter::is_write(frame) == Some(self.spec.slave);
         writes || frame.id.checked_sub(slave).is_some_and(|offset| COMMANDS.contains(&offset))

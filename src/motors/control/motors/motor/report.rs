@@ -14,7 +14,7 @@ pub const SAMPLE_VALUES: usize = 6;
 
 /// See the module's comment.
 #[derive(Debug)]
-pub(super) struct Report {
+pub(in crate::control::motors) struct Report {
     /// `None` before its ranges are known.
     feedback: Option<Feedback>,
     /// When the feedback arrived.
@@ -45,7 +45,7 @@ impl Report {
     }
 
     /// Has it left our frames unanswered for too long?
-    pub(super) fn is_silent(&self, now: Stamp) -> bool {
+    pub(in crate::control::motors) fn is_silent(&self, now: Stamp) -> bool {
         self.asked.is_some_and(|asked| now.since(asked) >= self.silent_after)
     }
 
@@ -71,7 +71,7 @@ impl Report {
     }
 
     /// When the feedback arrived, if it is newer than the last sample.
-    pub(super) fn unsampled(&self) -> Option<Stamp> {
+    pub(in crate::control::motors) fn unsampled(&self) -> Option<Stamp> {
         self.is_new.then_some(self.seen)
     }
 

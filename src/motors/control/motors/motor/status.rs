@@ -11,7 +11,7 @@ const SURE: u8 = 2;
 
 /// See the module's comment.
 #[derive(Debug, Default)]
-pub(super) struct Status {
+pub(in crate::control::motors) struct Status {
     /// Since it was last ordered to turn off.
     newest: Option<MotorStatus>,
     /// Consecutive frames that report it as not enabled although it was.
@@ -57,7 +57,7 @@ impl Status {
     }
 
     /// It was ordered or reported to be on, and has not reported off since the last disable.
-    pub(super) const fn may_be_on(&self) -> bool {
+    pub(in crate::control::motors) const fn may_be_on(&self) -> bool {
         self.may_be_on
     }
 
