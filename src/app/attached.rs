@@ -39,9 +39,9 @@ pub(super) struct Attached {
 }
 
 /// The place of a screen, which is free again when this is dropped.
-struct Place(Arc<AtomicUsize>);
+struct ScreenGuard(Arc<AtomicUsize>);
 
-impl Place {
+impl ScreenGuard {
     /// `None` when [`SCREENS`] are attached.
     fn take(count: &Arc<AtomicUsize>) -> Option<Self> {
         let place = Self(Arc::clone(count));
@@ -49,7 +49,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for ScreenGuard {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Relaxed);
     }
@@ -68,7 +68,7 @@ impl Attached {
     /// Attaches a screen until it or the run ends.
     pub(super) fn attach(&self, viewer: Viewer) {
         let Viewer { stream, read_only } = viewer;
-        let place = Place::take(&self.count);
+        let place = ScreenGuard::take(&self.count);
         let (board, commands) = (Arc::clone(&self.board), self.commands.clone());
         tokio::spawn(async move {
             if let Ok(stream) = stream.set_nonblocking(true).and_then(|()| UnixStream::from_std(stream)) {
@@ -81,7 +81,7 @@ impl Attached {
 
 async fn serve(
     stream: UnixStream,
-    place: Option<Place>,
+    place: Option<ScreenGuard>,
     board: &Board,
     commands: &mpsc::Sender<Command>,
     read_only: bool,

@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
 use rapid_devices::inputs::tap::Tap;
-use rapid_devices::inputs::{Place, Readers, Report};
+use rapid_devices::inputs::{InputGroup, Readers, Report};
 use rapid_registry::{ButtonAction, ButtonSpec, Registry};
 use rapid_status::session::{Label, Phase, SessionRequest};
 use rapid_status::{Board, EventKind, Level};
@@ -46,7 +46,7 @@ impl Buttons {
         }
         let (changes, reported) = mpsc::unbounded_channel();
         let read = Readers::new(false).and_then(|mut readers| {
-            for (place, own) in Place::of_all(registry.buttons.iter().map(|button| &button.input)) {
+            for (place, own) in InputGroup::of_all(registry.buttons.iter().map(|button| &button.input)) {
                 let names: Vec<&str> =
                     own.iter().filter_map(|at| Some(registry.buttons.get(*at)?.name.as_str())).collect();
                 let thread = format!("button-{}", names.first().unwrap_or(&""));

@@ -45,14 +45,14 @@ fn reply_all(to: Waiting, answer: &Result<String, String>) {
 }
 
 /// What became of an episode of which no end was noted.
-struct Found {
+struct ExaminedEpisode {
     file: String,
     /// Its length in seconds and its verdict; `None` if nothing was recorded.
     end: Option<(f64, Verdict)>,
 }
 
 /// Reads an episode of which no end was noted: the run was killed then. Blocks. One that waits to be repaired stays as it is.
-fn examine(folder: &Path, file: String, found: &UnboundedSender<Found>) {
+fn examine(folder: &Path, file: String, found: &UnboundedSender<ExaminedEpisode>) {
     let is_there = |ending: &str| folder.join(format!("{file}{ending}")).symlink_metadata().is_ok();
     let end = if is_there("") {
         let Listed { verdict: Judgement::Episode(verdict), seconds, .. } = inspect::list(&folder.join(&file)) else {
@@ -65,7 +65,7 @@ fn examine(folder: &Path, file: String, found: &UnboundedSender<Found>) {
         None
     };
     // The run may have ended.
-    let _ = found.send(Found { file, end });
+    let _ = found.send(ExaminedEpisode { file, end });
 }
 
 /// Dismounts every declared module.
@@ -96,9 +96,9 @@ pub(super) struct Collection {
     operations: Vec<Operation>,
     outcomes: UnboundedReceiver<Outcome>,
     /// What became of episodes of which no end was noted.
-    found: UnboundedReceiver<Found>,
+    found: UnboundedReceiver<ExaminedEpisode>,
     /// For those who examine them.
-    to_found: UnboundedSender<Found>,
+    to_found: UnboundedSender<ExaminedEpisode>,
     at_begin: Beginning,
     at_end: Waiting,
     answer: Option<Answered>,
@@ -298,7 +298,7 @@ impl Collection {
     }
 
     /// What became of an episode of which no end was noted.
-    fn examined(&mut self, Found { file, end }: &Found) {
+    fn examined(&mut self, ExaminedEpisode { file, end }: &ExaminedEpisode) {
         let end = end.as_ref().map(|(seconds, verdict)| (*seconds, verdict));
         for effect in self.session.examined(file, end) {
             self.change(effect);

@@ -15,7 +15,7 @@ use rapid_episode::ReferenceSample;
 use rapid_policy::live::{Live, LiveOptions};
 use rapid_policy::model::Model;
 use rapid_policy::onnxruntime::Environment;
-use rapid_policy::pace::{Pace, PaceVerdict};
+use rapid_policy::pace::{PaceReport, PaceVerdict};
 use rapid_policy::sampler::Computing;
 use rapid_registry::Registry;
 use rapid_status::{Board, EpisodeWatch, EventKind, Level};
@@ -135,7 +135,7 @@ impl Flight {
 
     /// Whether the time of a chunk suits the rate of its actions.
     fn judge(&self, chunk: Duration) -> Result<(), AppError> {
-        let Pace { verdict, text } = Pace::of(&self.options.live.bundle, chunk);
+        let PaceReport { verdict, text } = PaceReport::of(&self.options.live.bundle, chunk);
         match verdict {
             PaceVerdict::Whole => tracing::debug!("{text}"),
             PaceVerdict::Pauses => self.board.announce(EventKind::Log { level: Level::Warn, text }),

@@ -248,7 +248,7 @@ fn interrupted(set: &DataSet, stop: &AtomicBool) -> Result<(), ExportError> {
 }
 
 /// The files, as they were found.
-struct Found {
+struct SurveyedFiles {
     /// By number in the set.
     already: BTreeMap<usize, PathBuf>,
     new: Vec<Survey>,
@@ -260,7 +260,7 @@ fn found(
     set: &DataSet,
     stop: &AtomicBool,
     report: &mut Report<'_>,
-) -> Result<Found, ExportError> {
+) -> Result<SurveyedFiles, ExportError> {
     enum Read {
         Already(usize),
         New(Box<Survey>),
@@ -277,7 +277,7 @@ fn found(
             }
         }
     };
-    let mut found = Found { already: BTreeMap::new(), new: Vec::new() };
+    let mut found = SurveyedFiles { already: BTreeMap::new(), new: Vec::new() };
     let work = Work { label: "episodes", workers: workers(args.jobs, 1), total: files.len(), done: None };
     work.each(
         files,

@@ -13,7 +13,7 @@ use rapid_core::action::Order;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::time::Stamp;
 use rapid_screens::tui::model::{Effect, Msg};
-use rapid_screens::tui::{self, Closed, Link, LinkState, ScreenOptions, TuiError};
+use rapid_screens::tui::{self, Closed, LinkState, RigLink, ScreenOptions, TuiError};
 use rapid_status::attach::{Decoder, LinkError};
 use rapid_status::{Command, SlotState, Snapshot};
 use rapid_system::peer::ProcessState;
@@ -244,7 +244,7 @@ fn send(outgoing: &Receiver<Outgoing>, failures: &Sender<Msg>) {
     }
 }
 
-impl Link for Remote {
+impl RigLink for Remote {
     fn snapshot(&mut self) -> Snapshot {
         let View { mut snapshot, state } = self.view.borrow().clone();
         if matches!(state, LinkState::Lost { runs: false, .. }) {

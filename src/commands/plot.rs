@@ -83,7 +83,7 @@ struct Written<'a> {
 }
 
 /// Where the pictures go.
-enum Place<'a> {
+enum Destination<'a> {
     Beside,
     In(&'a Path),
     Named(&'a Path),
@@ -105,18 +105,18 @@ pub fn plot(
 ) -> Result<CommandStatus, PlotError> {
     let files = inspect::episodes(paths)?;
     let place = match to {
-        None => Place::Beside,
-        Some(to) if to.as_os_str() == "-" => Place::Stdout,
-        Some(to) if to.is_dir() => Place::In(to),
+        None => Destination::Beside,
+        Some(to) if to.as_os_str() == "-" => Destination::Stdout,
+        Some(to) if to.is_dir() => Destination::In(to),
         Some(to) if to.as_os_str().as_encoded_bytes().ends_with(b"/") => {
             return Err(PlotError::NoFolder(to.to_owned()));
         }
-        Some(to) => Place::Named(to),
+        Some(to) => Destination::Named(to),
     };
-    if let (Place::Named(_) | Place::Stdout, Some(to), 2..) = (&place, to, files.len()) {
+    if let (Destination::Named(_) | Destination::Stdout, Some(to), 2..) = (&place, to, files.len()) {
         return Err(PlotError::Several { count: files.len(), to: to.to_owned() });
     }
-    if let Place::In(folder) = place {
+    if let Destination::In(folder) = place {
         let mut names = BTreeMap::new();
         for file in &files {
             if let Some(other) = names.insert(picture_of(file), file) {
@@ -144,13 +144,13 @@ pub fn plot(
             Err(error) => return Err(error.into()),
         };
         let name = match place {
-            Place::Stdout => {
+            Destination::Stdout => {
                 out.write_all(svg.as_bytes())?;
                 continue;
             }
-            Place::Named(name) => name.to_owned(),
-            Place::Beside => file.with_file_name(picture_of(file)),
-            Place::In(folder) => folder.join(picture_of(file)),
+            Destination::Named(name) => name.to_owned(),
+            Destination::Beside => file.with_file_name(picture_of(file)),
+            Destination::In(folder) => folder.join(picture_of(file)),
         };
         write(&name, &svg)?;
         let written = Written { file, verdict: &report.verdict, svg: &name, bytes: svg.len() };

@@ -24,7 +24,7 @@ const INTERFACES: &str = "/sys/class/net";
 
 /// See the module's comment. The default is a link that cannot go down.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Link {
+pub struct NetworkLink {
     /// The file of its carrier in sysfs.
     carrier: Option<PathBuf>,
 }
@@ -42,7 +42,7 @@ pub enum LinkState {
     Gone,
 }
 
-impl Link {
+impl NetworkLink {
     /// The link of the interface of this name.
     pub fn of(interface: &str) -> Self {
         Self { carrier: Some(Path::new(INTERFACES).join(interface).join("carrier")) }
@@ -88,13 +88,13 @@ impl Link {
 /// A link that is watched beside a stream: waiting for it again and again costs nothing between two looks.
 #[derive(Debug)]
 pub struct LinkWatch {
-    link: Link,
+    link: NetworkLink,
     look: Interval,
 }
 
 impl LinkWatch {
     /// Watches this link.
-    pub fn of(link: Link) -> Self {
+    pub fn of(link: NetworkLink) -> Self {
         Self { link, look: looks() }
     }
 
@@ -225,17 +225,17 @@ mod tests {
 
     #[test]
     fn a_loopback_address_has_no_link_that_goes_down() {
-        assert_eq!(Link::to(([127, 0, 0, 1], 80).into()), Link::default());
-        assert_eq!(Link::default().state(), LinkState::Up);
-        assert_eq!(Link::of("no-such-interface").state(), LinkState::Gone);
-        assert_eq!(Link::of("lo").state(), LinkState::Up);
+        assert_eq!(NetworkLink::to(([127, 0, 0, 1], 80).into()), NetworkLink::default());
+        assert_eq!(NetworkLink::default().state(), LinkState::Up);
+        assert_eq!(NetworkLink::of("no-such-interface").state(), LinkState::Gone);
+        assert_eq!(NetworkLink::of("lo").state(), LinkState::Up);
     }
 
     #[tokio::test]
     async fn changes_of_a_link_are_waited_for() {
         let folder = tempfile::tempdir().expect("a folder");
         let report = |carrier: &str| fs::write(folder.path().join("carrier"), carrier).expect("written");
-        let link = Link { carrier: Some(folder.path().join("carrier")) };
+        let link = NetworkLink { carrier: Some(folder.path().join("carrier")) };
         let is_lost = async || timeout(3 * LOOK_EVERY, LinkWatch::of(link.clone()).lost()).await.is_ok();
         let is_restored = async || timeout(3 * LOOK_EVERY, link.restored()).await.is_ok();
 

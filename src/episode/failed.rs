@@ -10,7 +10,7 @@
 use std::io;
 
 use super::framing::MAGIC;
-use super::source::{ReadAt, Source};
+use super::source::{ReadAt, WindowedFile};
 use super::wire::Fields;
 
 /// The last bytes of such a file.
@@ -43,7 +43,7 @@ impl Failed {
     pub(crate) fn of(file: &(impl ReadAt + ?Sized), size: u64) -> io::Result<Option<Self>> {
         let mut end = Vec::new();
         let from = size.saturating_sub(SEARCHED);
-        if !Source::new(file, size).read(from, size - from, &mut end)? || end.ends_with(&MAGIC) {
+        if !WindowedFile::new(file, size).read(from, size - from, &mut end)? || end.ends_with(&MAGIC) {
             return Ok(None);
         }
         // A reason may contain the text of a mark, but not a valid mark.

@@ -6,7 +6,7 @@ use std::io;
 use super::chunk::ChunkHead;
 use super::framing::MAGIC;
 use super::op;
-use super::source::{Fit, ReadAt, Source};
+use super::source::{Fit, ReadAt, WindowedFile};
 use super::wire::Fields;
 
 /// The footer's record and the magic number behind it, bytes.
@@ -18,7 +18,7 @@ const PIECE: u64 = 1 << 20;
 
 /// A place of a record that the index names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Place {
+pub(super) enum IndexedRecord {
     /// A chunk, and the contents of its head.
     Chunk { times: (u64, u64), size: u64, packed: u64 },
     /// Metadata or an attachment.
@@ -27,7 +27,7 @@ pub(super) enum Place {
     Summary,
 }
 
-impl Place {
+impl IndexedRecord {
     /// Is this the head of the chunk meant?
     pub(super) fn is(&self, head: &ChunkHead) -> bool {
         matches!(self, Self::Chunk { times, size, packed }
@@ -39,13 +39,13 @@ impl Place {
 #[derive(Debug)]
 pub(super) struct Index {
     /// Ascending.
-    pub(super) places: Vec<(u64, Place)>,
+    pub(super) places: Vec<(u64, IndexedRecord)>,
     /// Schemas and channels: opcode, content's place and length.
     pub(super) definitions: Vec<(u8, u64, u64)>,
 }
 
 /// If the file ends like a finished one: where its summary begins, and the summary's check value.
-pub(super) fn footer<R: ReadAt>(source: &mut Source<R>) -> io::Result<Option<(u64, u32)>> {
+pub(super) fn footer<R: ReadAt>(source: &mut WindowedFile<R>) -> io::Result<Option<(u64, u32)>> {
     let Some(at) = source.size.checked_sub(TAIL).filter(|at| *at >= MAGIC.len() as u64) else { return Ok(None) };
     let mut fields = Fields(source.peek(at, 37)?);
     Ok((|| {
@@ -57,7 +57,7 @@ pub(super) fn footer<R: ReadAt>(source: &mut Source<R>) -> io::Result<Option<(u6
 
 impl Index {
     /// Reads the index, if there is a valid one.
-    pub(super) fn read<R: ReadAt>(source: &mut Source<R>) -> io::Result<Option<Self>> {
+    pub(super) fn read<R: ReadAt>(source: &mut WindowedFile<R>) -> io::Result<Option<Self>> {
         let Some((summary, crc)) = footer(source)? else { return Ok(None) };
         let end = source.size.saturating_sub(TAIL);
         if crc == 0 || summary < MAGIC.len() as u64 || summary >= end || end - summary > LARGEST {
@@ -79,8 +79,8 @@ impl Index {
         Self::records(source, summary, end)
     }
 
-    fn records<R: ReadAt>(source: &mut Source<R>, summary: u64, end: u64) -> io::Result<Option<Self>> {
-        let mut index = Self { places: vec![(summary, Place::Summary)], definitions: Vec::new() };
+    fn records<R: ReadAt>(source: &mut WindowedFile<R>, summary: u64, end: u64) -> io::Result<Option<Self>> {
+        let mut index = Self { places: vec![(summary, IndexedRecord::Summary)], definitions: Vec::new() };
         let mut at = summary;
         while at < end {
             let mut head = Fields(source.peek(at, 64)?);
@@ -93,10 +93,10 @@ impl Index {
             at = content + length;
             let place = match place {
                 // The part before its sizes grows with the number of channels.
-                Some((place, Place::Chunk { times, .. })) => {
+                Some((place, IndexedRecord::Chunk { times, .. })) => {
                     let mut sizes = Fields(source.peek(at.saturating_sub(16), 16)?);
                     let (packed, size) = (sizes.u64().unwrap_or(0), sizes.u64().unwrap_or(0));
-                    Some((place, Place::Chunk { times, size, packed }))
+                    Some((place, IndexedRecord::Chunk { times, size, packed }))
                 }
                 place => place,
             };
@@ -113,16 +113,16 @@ impl Index {
 }
 
 /// The place that a record of the index names.
-fn place(opcode: u8, mut fields: Fields<'_>) -> Option<(u64, Place)> {
+fn place(opcode: u8, mut fields: Fields<'_>) -> Option<(u64, IndexedRecord)> {
     match opcode {
         op::CHUNK_INDEX => {
             let (times, at, _length) = ((fields.u64()?, fields.u64()?), fields.u64()?, fields.u64()?);
-            Some((at, Place::Chunk { times, size: 0, packed: 0 }))
+            Some((at, IndexedRecord::Chunk { times, size: 0, packed: 0 }))
         }
         op::METADATA_INDEX | op::ATTACHMENT_INDEX => {
             let (at, length) = (fields.u64()?, fields.u64()?);
             let opcode = if opcode == op::METADATA_INDEX { op::METADATA } else { op::ATTACHMENT };
-            Some((at, Place::Record { opcode, length: length.checked_sub(9)? }))
+            Some((at, IndexedRecord::Record { opcode, length: length.checked_sub(9)? }))
         }
         _ => None,
     }

@@ -18,7 +18,7 @@ use super::episode_id::{EpisodeId, about};
 use super::framing::{HEAD, MAGIC};
 use super::integrity::{LARGEST_HEADER, Writer, writer};
 use super::op;
-use super::source::{ReadAt, Source};
+use super::source::{ReadAt, WindowedFile};
 use super::wire::Fields;
 
 /// Distinguishes the record from another program's of the same opcode.
@@ -171,7 +171,7 @@ impl Owners {
         named: Option<EpisodeId>,
         checked: bool,
         is_foreign: bool,
-        source: &mut Source<R>,
+        source: &mut WindowedFile<R>,
     ) -> io::Result<Owner> {
         // After damage a chunk of another episode belongs to a message; before any damage the file contradicts itself.
         let is_there = |named: &EpisodeId| self.seen.iter().any(|seen| seen.episode == *named);
@@ -191,7 +191,7 @@ impl Owners {
 }
 
 /// Where episodes begin that have a name of their own: magic number, header and metadata, before `end`.
-pub(super) fn beginnings<R: ReadAt>(source: &mut Source<R>, end: u64) -> io::Result<Vec<(u64, EpisodeId)>> {
+pub(super) fn beginnings<R: ReadAt>(source: &mut WindowedFile<R>, end: u64) -> io::Result<Vec<(u64, EpisodeId)>> {
     let (mut at, mut begun) = (0, Vec::new());
     while at < end && begun.len() < MOST {
         let window = source.peek(at, MAGIC.len())?;
@@ -212,7 +212,7 @@ pub(super) fn beginnings<R: ReadAt>(source: &mut Source<R>, end: u64) -> io::Res
 }
 
 /// The episode that begins at `at`.
-fn beginning<R: ReadAt>(source: &mut Source<R>, at: u64) -> io::Result<Option<EpisodeId>> {
+fn beginning<R: ReadAt>(source: &mut WindowedFile<R>, at: u64) -> io::Result<Option<EpisodeId>> {
     let mut content = Vec::new();
     let mut at = at + MAGIC.len() as u64;
     for wanted in [op::HEADER, op::METADATA] {

@@ -23,7 +23,7 @@ use super::index::Index;
 use super::integrity::{LARGEST_HEADER, Writer, writer};
 use super::names::Names;
 use super::own::Owner;
-use super::source::{Fit, ReadAt, Source, is_known, is_opaque};
+use super::source::{Fit, ReadAt, WindowedFile, is_known, is_opaque};
 use super::wire::Fields;
 
 pub use super::integrity::{FileEnd, LeftOut};
@@ -45,7 +45,7 @@ const EARLY: (u64, u64) = (4096, 64 << 10);
 /// A file being read.
 #[allow(clippy::struct_excessive_bools, reason = "each is a fact of its own about the file")]
 pub(crate) struct RecordIter<R> {
-    pub(super) source: Source<R>,
+    pub(super) source: WindowedFile<R>,
     /// Where the next record of the file begins.
     pub(super) at: u64,
     /// Up to here it is known which bytes belong to which record: a record without a check value may lack some, unless
@@ -66,7 +66,7 @@ pub(crate) struct RecordIter<R> {
     pub(super) unpacked: Vec<u8>,
     /// The chunk being shown.
     pub(super) chunk: Option<Records>,
-    found: Option<Found>,
+    found: Option<RecordPlace>,
     /// A definition shown.
     defined: Vec<u8>,
     /// A chunk was read.
@@ -115,7 +115,7 @@ pub(super) enum Step {
 }
 
 /// The place of a record that is shown.
-enum Found {
+enum RecordPlace {
     Buffer(u8),
     Defined(u8),
     Chunk { opcode: u8, unpacked: bool, range: std::ops::Range<usize> },
@@ -124,11 +124,11 @@ enum Found {
 impl<R: ReadAt> RecordIter<R> {
     /// Starts reading a file of `size` bytes. `None`: not an MCAP file.
     pub(crate) fn new(file: R, size: u64) -> io::Result<Option<Self>> {
-        Self::begin(Source::new(file, size), None)
+        Self::begin(WindowedFile::new(file, size), None)
     }
 
     /// With an owner only the definitions of its chunks are used.
-    pub(super) fn begin(source: Source<R>, owner: Option<Owner>) -> io::Result<Option<Self>> {
+    pub(super) fn begin(source: WindowedFile<R>, owner: Option<Owner>) -> io::Result<Option<Self>> {
         let mut records = Self::of(source, owner);
         if records.source.peek(0, MAGIC.len())?.starts_with(&MAGIC) {
             records.begin_read();
@@ -152,7 +152,7 @@ impl<R: ReadAt> RecordIter<R> {
         (self.sure, self.integrity.bytes) = (self.at, self.at);
     }
 
-    fn of(source: Source<R>, owner: Option<Owner>) -> Self {
+    fn of(source: WindowedFile<R>, owner: Option<Owner>) -> Self {
         let allowed = |(least, each): (u64, u64)| source.size.saturating_mul(each).saturating_add(least);
         let budget = (allowed(UNPACKED), allowed(TRIED));
         let early = EARLY.0 + source.size / EARLY.1;
@@ -210,9 +210,9 @@ impl<R: ReadAt> RecordIter<R> {
     pub(crate) fn record(&self) -> Record<'_> {
         match &self.found {
             None => Record { opcode: 0, data: &[] },
-            Some(Found::Buffer(opcode)) => Record { opcode: *opcode, data: &self.buffer },
-            Some(Found::Defined(opcode)) => Record { opcode: *opcode, data: &self.defined },
-            Some(Found::Chunk { opcode, unpacked, range }) => {
+            Some(RecordPlace::Buffer(opcode)) => Record { opcode: *opcode, data: &self.buffer },
+            Some(RecordPlace::Defined(opcode)) => Record { opcode: *opcode, data: &self.defined },
+            Some(RecordPlace::Chunk { opcode, unpacked, range }) => {
                 let bytes = if *unpacked { &self.unpacked } else { &self.buffer };
                 Record { opcode: *opcode, data: bytes.get(range.clone()).unwrap_or_default() }
             }
@@ -229,11 +229,11 @@ impl<R: ReadAt> RecordIter<R> {
         &self.names.unknown
     }
 
-    fn find(&mut self) -> io::Result<Option<Found>> {
+    fn find(&mut self) -> io::Result<Option<RecordPlace>> {
         loop {
             if let Some((opcode, data)) = self.names.next() {
                 self.defined = data;
-                return Ok(Some(Found::Defined(opcode)));
+                return Ok(Some(RecordPlace::Defined(opcode)));
             }
             if let Some(found) = self.next_in_chunk() {
                 return Ok(Some(found));
@@ -250,7 +250,7 @@ impl<R: ReadAt> RecordIter<R> {
                 Step::Show(opcode) => {
                     self.remember(opcode);
                     if self.names.admit(opcode, &self.buffer) {
-                        return Ok(Some(Found::Buffer(opcode)));
+                        return Ok(Some(RecordPlace::Buffer(opcode)));
                     }
                 }
                 Step::Again => {}
@@ -272,7 +272,7 @@ impl<R: ReadAt> RecordIter<R> {
         self.integrity.proven = self.integrity.sound && self.proven;
     }
 
-    fn next_in_chunk(&mut self) -> Option<Found> {
+    fn next_in_chunk(&mut self) -> Option<RecordPlace> {
         loop {
             let chunk = self.chunk.as_mut()?;
             let bytes = if chunk.unpacked { &self.unpacked } else { &self.buffer };
@@ -294,7 +294,7 @@ impl<R: ReadAt> RecordIter<R> {
             }
             if self.names.admit(opcode, data) {
                 self.integrity.ordered_messages += u64::from(self.cut && opcode == op::MESSAGE);
-                return Some(Found::Chunk { opcode, unpacked: chunk.unpacked, range: end - data.len()..end });
+                return Some(RecordPlace::Chunk { opcode, unpacked: chunk.unpacked, range: end - data.len()..end });
             }
         }
     }

@@ -17,7 +17,7 @@ use std::io;
 
 use super::chunk::{self, ChunkHead, Opened, Packing, may_begin, take};
 use super::framing::{HEAD, MAGIC, MAX_RECORD};
-use super::index::{Index, Place, TAIL, footer};
+use super::index::{Index, IndexedRecord, TAIL, footer};
 use super::op;
 use super::record_iter::{FileEnd, Known, LEAST, RecordIter, Step};
 use super::source::{Fit, ReadAt, is_known};
@@ -146,21 +146,21 @@ impl<R: ReadAt> RecordIter<R> {
         let first = index.places.partition_point(|(place, _)| *place < at);
         for (place, what) in index.places.get(first..).unwrap_or_default() {
             let is_there = match what {
-                Place::Chunk { .. } => {
+                IndexedRecord::Chunk { .. } => {
                     let head = ChunkHead::read(self.source.peek(place + HEAD, LOOK)?);
                     match head.filter(|head| what.is(head)) {
                         Some(head) => self.try_chunk(place + HEAD, &head, true)?,
                         None => false,
                     }
                 }
-                Place::Record { opcode, length } => {
+                IndexedRecord::Record { opcode, length } => {
                     let mut head = Fields(self.source.peek(*place, 9)?);
                     let is_named = (head.u8(), head.u64()) == (Some(*opcode), Some(*length));
                     let is_there = is_named && self.source.fit(*opcode, place + HEAD, *length)? == Fit::Exact;
                     self.at = if is_there { *place } else { self.at };
                     is_there
                 }
-                Place::Summary => {
+                IndexedRecord::Summary => {
                     self.summary_at(*place);
                     true
                 }

@@ -48,7 +48,7 @@ impl<T: ReadAt + ?Sized> ReadAt for &T {
 }
 
 /// A file with a window around the last place read.
-pub(super) struct Source<R> {
+pub(super) struct WindowedFile<R> {
     pub(super) file: R,
     /// Bytes before the file: places are relative to its beginning.
     base: u64,
@@ -58,14 +58,14 @@ pub(super) struct Source<R> {
     at: u64,
 }
 
-impl<R: ReadAt> Source<R> {
+impl<R: ReadAt> WindowedFile<R> {
     pub(super) fn new(file: R, size: u64) -> Self {
         Self { file, base: 0, size, window: Vec::new(), at: 0 }
     }
 
     /// The same, once more.
-    pub(super) fn again(&self) -> Source<&dyn ReadAt> {
-        Source { file: &self.file, base: self.base, size: self.size, window: Vec::new(), at: 0 }
+    pub(super) fn again(&self) -> WindowedFile<&dyn ReadAt> {
+        WindowedFile { file: &self.file, base: self.base, size: self.size, window: Vec::new(), at: 0 }
     }
 
     /// What begins at `base`.

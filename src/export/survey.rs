@@ -93,9 +93,9 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
     if index.modalities.iter().all(|modality| matches!(modality.kind, ModalityKind::Bytes | ModalityKind::Depth)) {
         return Err(Refusal::Nothing);
     }
-    let mut found = Found::new(&index);
+    let mut found = RowCollector::new(&index);
     index.rows(path, stop, |row| found.take(row))?;
-    let Found { gatherers, time_ns: mut times, actions, unusable, .. } = found;
+    let RowCollector { gatherers, time_ns: mut times, actions, unusable, .. } = found;
     let rows = index.ticks.len();
     let (registry, unread_registry) = registry_of(&index.registry);
     let named = |gatherer: Gatherer| {
@@ -154,7 +154,7 @@ fn judged(inspection: &Inspection, include_bad: bool) -> Result<Grade, Refusal> 
 }
 
 /// Collects what is in the rows.
-struct Found {
+struct RowCollector {
     gatherers: Vec<Gatherer>,
     time_ns: Vec<f64>,
     /// By axis.
@@ -162,7 +162,7 @@ struct Found {
     unusable: u64,
 }
 
-impl Found {
+impl RowCollector {
     fn new(index: &Index) -> Self {
         let of = |(at, modality)| Gatherer::new(modality, pictured_rows(index, at));
         let gatherers = index.modalities.iter().enumerate().map(of).collect();

@@ -62,7 +62,7 @@ pub fn verify(
     let mut rows = Rows::open(open(&data)?).map_err(wrong)?;
     let position = Position { episode: episode as u64, first: entry.first, task: entry.task };
     let index = Index::read(path, stop)?;
-    let mut found = Found { features, position, verified: Verified::default() };
+    let mut found = Findings { features, position, verified: Verified::default() };
     let names: Vec<&str> = index.modalities.iter().map(|modality| modality.name.as_str()).collect();
     if names != features.modalities {
         let (of_set, of_episode) = (features.modalities.join(", "), names.join(", "));
@@ -121,7 +121,7 @@ impl<'a> Videos<'a> {
     }
 
     /// Each has a frame for each row, at its time.
-    fn check(&self, index: &Index, found: &mut Found<'_>) -> Result<(), SetError> {
+    fn check(&self, index: &Index, found: &mut Findings<'_>) -> Result<(), SetError> {
         for (path, (key, _)) in self.paths.iter().zip(found.features.videos()) {
             let stop = || self.stop.load(Ordering::Relaxed);
             match self.ffmpeg.check(open(path)?, index.ticks.len(), index.fps, &stop) {
@@ -134,7 +134,7 @@ impl<'a> Videos<'a> {
     }
 
     /// Compares the frames of a row with its pictures, which are added to `damaged` where they have none.
-    fn compare(&mut self, row: &Row<'_>, damaged: &mut Damaged, found: &mut Found<'_>) -> Result<(), SetError> {
+    fn compare(&mut self, row: &Row<'_>, damaged: &mut Damaged, found: &mut Findings<'_>) -> Result<(), SetError> {
         let features = found.features;
         for ((place, shape), running) in features.cameras.iter().zip(&mut self.running) {
             let (expected, shown) = self.maker.frame(row, *place, *shape);
@@ -169,13 +169,13 @@ impl<'a> Videos<'a> {
     }
 }
 
-struct Found<'a> {
+struct Findings<'a> {
     features: &'a Features,
     position: Position,
     verified: Verified,
 }
 
-impl Found<'_> {
+impl Findings<'_> {
     fn add(&mut self, frame: Option<usize>, feature: Option<&str>, what: String) {
         if self.verified.differences.len() < MOST {
             self.verified.differences.push(Difference { frame, feature: feature.map(str::to_owned), what });

@@ -14,12 +14,12 @@ const JITTER: Duration = Duration::from_millis(8);
 
 /// Decides for one topic.
 #[derive(Debug, Default)]
-pub(super) struct Pace {
+pub(super) struct RateLimit {
     /// When the next picture is due.
     due: Stamp,
 }
 
-impl Pace {
+impl RateLimit {
     /// Whether a picture captured at `captured` is sent; the next one is then due an interval later.
     pub(super) fn admits(&mut self, captured: Stamp) -> bool {
         if captured.after(JITTER) < self.due {
@@ -38,7 +38,7 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     fn sent(captured: impl Iterator<Item = u64>) -> usize {
-        let mut pace = Pace::default();
+        let mut pace = RateLimit::default();
         captured.filter(|captured| pace.admits(Stamp(*captured))).count()
     }
 

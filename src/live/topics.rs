@@ -26,7 +26,7 @@ use rapid_episode::schema::{self, PROTOBUF, SampleSchema, Schema};
 use rapid_registry::{DeviceSpec, Form, Registry};
 use rapid_status::Event;
 
-use super::pictures::Pace;
+use super::pictures::RateLimit;
 
 /// Time between two messages about where a sensor sits.
 const PLACES_EVERY: Duration = Duration::from_secs(1);
@@ -66,7 +66,7 @@ struct Track {
     channels: [Option<Arc<RawChannel>>; SampleSchema::COUNT],
     form: Option<Form>,
     derived: Vec<(Derived, Arc<RawChannel>)>,
-    pace: Pace,
+    pace: RateLimit,
     /// The newest picture that was not sent yet: its schema and its log time.
     waiting: Option<(SampleSchema, u64)>,
     /// Its message.
@@ -110,7 +110,7 @@ impl Topics {
             channels: [const { None }; SampleSchema::COUNT],
             form: device.form.clone(),
             derived: Vec::new(),
-            pace: Pace::default(),
+            pace: RateLimit::default(),
             waiting: None,
             picture: Vec::new(),
         };

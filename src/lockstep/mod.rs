@@ -54,7 +54,7 @@ pub enum TrialError {
 pub struct Lockstep {
     timeline: Timeline,
     core: Core,
-    lanes: Vec<Lane>,
+    stepped: Vec<SteppedDevice>,
     trial: SharedTrial,
     mask_sequence: u64,
     now: Stamp,
@@ -65,7 +65,7 @@ pub struct Lockstep {
 
 /// A modality: the device that runs in its slot.
 #[derive(Debug)]
-struct Lane {
+struct SteppedDevice {
     spec: DeviceSpec,
     running: Option<(Epoch, TaskPart)>,
     sequence: u64,
@@ -97,7 +97,7 @@ impl Lockstep {
             _ => None,
         });
         let timings = timings.iter().copied().chain(std::iter::repeat(Timing::LOCKED));
-        let lane = |(spec, timing): (&DeviceSpec, Timing)| Lane {
+        let device = |(spec, timing): (&DeviceSpec, Timing)| SteppedDevice {
             spec: spec.clone(),
             running: None,
             sequence: 0,
@@ -109,7 +109,7 @@ impl Lockstep {
             trial: trial.ok_or_else(|| DriverError::Fatal("a scenario without the simulated task".into()))?,
             timeline: Timeline::new(scenario, begun),
             core: Core::new(registry),
-            lanes: registry.devices.iter().zip(timings).map(lane).collect(),
+            stepped: registry.devices.iter().zip(timings).map(device).collect(),
             mask_sequence: 0,
             now: begun,
             stepping: None,
@@ -144,7 +144,7 @@ impl Lockstep {
             if publish <= self.now {
                 publish = publish.after(MASK_PERIOD);
             }
-            let moments = self.lanes.iter().flat_map(Lane::moments);
+            let moments = self.stepped.iter().flat_map(SteppedDevice::moments);
             self.now = moments.fold(publish.min(end), Stamp::min).max(self.now);
             self.plug(taker);
             if publish <= self.now {
@@ -183,25 +183,25 @@ impl Lockstep {
 
     /// Takes the captures that are due, and delivers the samples whose latency has passed.
     fn sense(&mut self, taker: &mut dyn Taker) -> Result<(), DriverError> {
-        let Self { lanes, trial, now, stepping, .. } = self;
+        let Self { stepped, trial, now, stepping, .. } = self;
         let (now, stepping) = (*now, *stepping);
-        for lane in &mut *lanes {
-            while lane.due <= now {
-                let at = lane.due;
-                lane.due = at.after(STEP);
-                let Some((epoch, part)) = lane.running else { continue };
+        for device in &mut *stepped {
+            while device.due <= now {
+                let at = device.due;
+                device.due = at.after(STEP);
+                let Some((epoch, part)) = device.running else { continue };
                 let share = stepping.map_or(1.0, |begun| at.since(begun).as_secs_f64() / STEP.as_secs_f64());
                 let mut payload = Vec::new();
                 trial.lock().sample_part_way(part, share, &mut payload)?;
-                lane.transit.push_back(Captured { epoch, part, at, payload });
+                device.transit.push_back(Captured { epoch, part, at, payload });
             }
         }
-        for index in 0..self.lanes.len() {
-            while let Some(lane) = self.lanes.get_mut(index) {
-                let Some(sample) = lane.seen_by(now) else { break };
-                let header = header(lane, &sample);
-                lane.sequence += 1;
-                let id = lane.spec.id;
+        for index in 0..self.stepped.len() {
+            while let Some(device) = self.stepped.get_mut(index) {
+                let Some(sample) = device.seen_by(now) else { break };
+                let header = header(device, &sample);
+                device.sequence += 1;
+                let id = device.spec.id;
                 taker.take(TopicId::Modality(id), &header, &sample.payload);
                 if self.core.state(id).0 == SlotState::Opening {
                     self.apply(Input::Stream { id, epoch: sample.epoch, event: StreamEvent::Started }, taker);
@@ -255,17 +255,17 @@ impl Lockstep {
 
     /// Carries out one effect and returns the event to announce.
     fn carry_out(&mut self, id: ModalityId, effect: DeviceEffect) -> Option<EventKind> {
-        let devices = self.lanes.len();
-        let lane = self.lanes.iter_mut().find(|lane| lane.spec.id == id)?;
-        let (device, bit) = (lane.spec.name.clone(), id);
+        let devices = self.stepped.len();
+        let stepped = self.stepped.iter_mut().find(|stepped| stepped.spec.id == id)?;
+        let (device, bit) = (stepped.spec.name.clone(), id);
         Some(match effect {
             DeviceEffect::Stop => {
-                lane.running = None;
-                lane.transit.clear();
+                stepped.running = None;
+                stepped.transit.clear();
                 return None;
             }
             DeviceEffect::Start(epoch, attachment) => {
-                let provenance = Box::new(lane.start(epoch, &attachment, self.core.attached_at(id))?);
+                let provenance = Box::new(stepped.start(epoch, &attachment, self.core.attached_at(id))?);
                 EventKind::Opened { device, bit, provenance }
             }
             DeviceEffect::AnnounceAttach => {
@@ -301,7 +301,7 @@ impl Lockstep {
     }
 }
 
-impl Lane {
+impl SteppedDevice {
     /// Opens the attached part of the simulated task; `None` for a device of another kind.
     fn start(&mut self, epoch: Epoch, attachment: &Attachment, attached: Stamp) -> Option<Provenance> {
         let DeviceNode::Sim(device) = &attachment.node else { return None };
@@ -331,14 +331,14 @@ impl Lane {
     }
 }
 
-fn header(lane: &Lane, sample: &Captured) -> SampleHeader {
+fn header(device: &SteppedDevice, sample: &Captured) -> SampleHeader {
     let (encoding, width, height) = task::layout(sample.part);
     SampleHeader {
-        seq: lane.sequence,
+        seq: device.sequence,
         lost: 0,
         capture_ns: sample.at.0,
-        recv_ns: sample.at.after(lane.latency).0,
-        id: u32::from(lane.spec.id.bit()),
+        recv_ns: sample.at.after(device.latency).0,
+        id: u32::from(device.spec.id.bit()),
         epoch: sample.epoch.0,
         encoding: encoding as u32,
         flags: FLAG_DEVICE_TIME,

@@ -51,13 +51,13 @@ const REHEARSALS: usize = 3;
 /// See the module's comment.
 #[derive(Debug)]
 pub struct Model {
-    lanes: Vec<Lane>,
+    inputs: Vec<InputBuffer>,
     tensors: ObservationTensors,
     sampler: Sampler,
 }
 
 #[derive(Debug)]
-struct Lane {
+struct InputBuffer {
     modality: String,
     /// `None` for a vector.
     pictures: Option<Preprocessor>,
@@ -80,7 +80,7 @@ impl Model {
     /// # Errors
     /// When the graphs do not match the bundle.
     pub fn load(bundle: &Bundle, environment: &Environment, computing: Computing) -> Result<Self, PolicyError> {
-        let lanes = bundle.observations.iter().map(|observation| Lane {
+        let inputs = bundle.observations.iter().map(|observation| InputBuffer {
             modality: observation.modality.clone(),
             pictures: match observation.input {
                 ObservationInput::Image(image) => Some(Preprocessor::new(image, &observation.normalization)),
@@ -95,7 +95,7 @@ impl Model {
             written: vec![None; observation.history.as_ref().map_or(0, |history| history.steps)],
         });
         let sampler = Sampler::new(bundle, environment, computing)?;
-        Ok(Self { lanes: lanes.collect(), tensors: ObservationTensors::new(bundle), sampler })
+        Ok(Self { inputs: inputs.collect(), tensors: ObservationTensors::new(bundle), sampler })
     }
 
     /// The median time of a chunk, after a first one, which is slower. The observation is empty: the work is the same.
@@ -132,17 +132,17 @@ impl Model {
 
     /// The samples that became references since the last call, each with the position of its observation.
     pub fn take_firsts(&mut self) -> impl Iterator<Item = (usize, Cell)> {
-        self.lanes.iter_mut().enumerate().filter_map(|(at, lane)| Some((at, lane.first.take()?)))
+        self.inputs.iter_mut().enumerate().filter_map(|(at, input)| Some((at, input.first.take()?)))
     }
 
     /// A new episode: the next sample of each modality is its first.
     pub fn reset(&mut self) {
-        for lane in &mut self.lanes {
-            lane.first = None;
-            lane.has_first = lane.has_first.map(|_| false);
+        for input in &mut self.inputs {
+            input.first = None;
+            input.has_first = input.has_first.map(|_| false);
             // They were compared with the reference of the last episode.
-            lane.written.fill(None);
-            if let Some(reference) = lane.pictures.as_mut().and_then(Preprocessor::reference) {
+            input.written.fill(None);
+            if let Some(reference) = input.pictures.as_mut().and_then(Preprocessor::reference) {
                 reference.reset();
             }
         }
@@ -162,25 +162,25 @@ impl Model {
     /// # Errors
     /// When a sample cannot be used.
     pub fn observe(&mut self, request: &Request) -> Result<&ObservationTensors, AnswerError> {
-        for (at, lane) in self.lanes.iter_mut().enumerate() {
+        for (at, input) in self.inputs.iter_mut().enumerate() {
             self.tensors.set_present(at, request.is_present(at));
             for step in 0..request.steps(at) {
                 let written = match request.sample(at, step) {
                     sample if request.has_history(at) => {
                         let is_newest = step + 1 == request.steps(at);
-                        lane.write_history(sample, (at, step), is_newest, &mut self.tensors)
+                        input.write_history(sample, (at, step), is_newest, &mut self.tensors)
                     }
-                    Some(cell) => lane.write(cell, at, step, &mut self.tensors),
+                    Some(cell) => input.write(cell, at, step, &mut self.tensors),
                     None => Ok(()),
                 };
-                written.map_err(|reason| AnswerError::Sample { modality: lane.modality.clone(), reason })?;
+                written.map_err(|reason| AnswerError::Sample { modality: input.modality.clone(), reason })?;
             }
         }
         Ok(&self.tensors)
     }
 }
 
-impl Lane {
+impl InputBuffer {
     /// Writes a step of a history, the oldest first: the first picture becomes the reference of the others. The newest
     /// must be usable, as that of any observation; an older one that is not is as good as none: it would end the policy's
     /// answers for as long as it is a step.

@@ -28,18 +28,18 @@ use super::request::Request;
 #[derive(Debug)]
 pub struct Observer {
     sync: Synchronizer<usize>,
-    lanes: Vec<Lane>,
+    buffers: Vec<ObservationBuffer>,
     /// Of the last tick that was observed.
     number: Option<u64>,
 }
 
 /// One observation of the bundle.
 #[derive(Debug)]
-struct Lane {
+struct ObservationBuffer {
     id: Option<ModalityId>,
     /// The newest samples, each at the index of its ring entry; behind these, if steps are more than a tick apart or a
     /// history, copies of the chosen ones, as many as ticks are remembered.
-    places: Vec<Place>,
+    places: Vec<StoredSample>,
     /// How many of them are the newest samples.
     newest: usize,
     next: usize,
@@ -60,7 +60,7 @@ struct Lane {
     kept_at: Option<Stamp>,
 }
 
-impl Lane {
+impl ObservationBuffer {
     /// The choices that are shown to the policy at `tick`; `None` if the modality is absent.
     fn shown(&self, tick: Stamp) -> Option<&[Option<Chosen>]> {
         if self.chosen.first().is_some_and(Option::is_some) {
@@ -87,7 +87,7 @@ impl Lane {
         let Some(sample) = samples.get(chosen.place).filter(|_| !copies.is_empty()) else { return chosen };
         let (next, ticks) = (self.next_copy, copies.len());
         let last = (next + ticks - 1) % ticks;
-        let which = |place: &Place| (place.header.seq, place.header.epoch, place.header.capture_ns);
+        let which = |place: &StoredSample| (place.header.seq, place.header.epoch, place.header.capture_ns);
         // Of a device slower than the grid it is the sample of the tick before.
         if copies.get(last).is_some_and(|copy| which(copy) == which(sample)) {
             return Chosen { place: self.newest + last, ..chosen };
@@ -100,7 +100,7 @@ impl Lane {
     }
 
     /// A chosen sample; `None` if it has been overwritten.
-    fn sample(&self, chosen: Chosen) -> Option<&Place> {
+    fn sample(&self, chosen: Chosen) -> Option<&StoredSample> {
         self.places.get(chosen.place).filter(|place| place.header.seq == chosen.seq)
     }
 
@@ -117,12 +117,12 @@ impl Lane {
 }
 
 #[derive(Debug, Clone, Default)]
-struct Place {
+struct StoredSample {
     header: SampleHeader,
     bytes: Vec<u8>,
 }
 
-impl Place {
+impl StoredSample {
     fn set(&mut self, header: &SampleHeader, bytes: &[u8]) {
         self.header = *header;
         self.bytes.clear();
@@ -150,14 +150,14 @@ impl Observer {
                 capacity: device.depth,
             })
             .collect();
-        let lanes = devices().zip(&bundle.observations).map(|(device, observation)| {
+        let buffers = devices().zip(&bundle.observations).map(|(device, observation)| {
             let (steps, apart) = (bundle.steps_of(observation), observation.down_sample_steps);
             let ticks = (steps - 1) * apart + 1;
             let has_history = observation.history.is_some();
             let newest = device.map_or(0, |device| device.depth);
-            Lane {
+            ObservationBuffer {
                 id: device.map(|device| device.id),
-                places: vec![Place::default(); newest + if apart > 1 || has_history { ticks } else { 0 }],
+                places: vec![StoredSample::default(); newest + if apart > 1 || has_history { ticks } else { 0 }],
                 newest,
                 next: 0,
                 next_copy: 0,
@@ -173,7 +173,11 @@ impl Observer {
                 kept_at: None,
             }
         });
-        Self { lanes: lanes.collect(), sync: Synchronizer::new(&modalities, registry.rig.sync_window), number: None }
+        Self {
+            buffers: buffers.collect(),
+            sync: Synchronizer::new(&modalities, registry.rig.sync_window),
+            number: None,
+        }
     }
 
     /// Stores a sample; ignores samples of modalities that the policy does not observe, and samples marked as damaged
@@ -185,11 +189,11 @@ impl Observer {
         // Observations of one modality (two ways to process one camera) use the same index: the first of them
         // determines it.
         let mut kept = None;
-        for lane in self.lanes.iter_mut().filter(|lane| lane.id == Some(id)) {
-            let at = lane.next;
-            let Some(place) = lane.places.get_mut(at).filter(|_| at < lane.newest) else { continue };
+        for buffer in self.buffers.iter_mut().filter(|buffer| buffer.id == Some(id)) {
+            let at = buffer.next;
+            let Some(place) = buffer.places.get_mut(at).filter(|_| at < buffer.newest) else { continue };
             place.set(header, payload);
-            lane.next = (at + 1) % lane.newest;
+            buffer.next = (at + 1) % buffer.newest;
             kept = Some(at);
         }
         let Some(keep) = kept else { return };
@@ -199,8 +203,10 @@ impl Observer {
 
     /// The capture time of the newest sample, once every present modality has sent one.
     pub fn first_sight(&self, mask: PhysicalMask) -> Option<Stamp> {
-        let present = self.lanes.iter().filter(|lane| lane.id.is_some_and(|id| mask.contains(id)));
-        let newest = |lane: &Lane| lane.places.iter().map(|place| place.header.capture_ns).max().filter(|ns| *ns > 0);
+        let present = self.buffers.iter().filter(|buffer| buffer.id.is_some_and(|id| mask.contains(id)));
+        let newest = |buffer: &ObservationBuffer| {
+            buffer.places.iter().map(|place| place.header.capture_ns).max().filter(|ns| *ns > 0)
+        };
         // `None` if any present modality has no sample.
         let newest = present.map(newest).collect::<Option<Vec<u64>>>()?;
         newest.into_iter().max().map(Stamp)
@@ -213,19 +219,20 @@ impl Observer {
         let ticks = self.number.replace(number).map_or(1, |last| number.saturating_sub(last));
         let mut oldest = None;
         let mut whole = true;
-        for lane in &mut self.lanes {
-            lane.advance(ticks);
-            let Some(slot) = lane.id.and_then(|id| self.sync.observation().slot(id)).filter(|slot| slot.present) else {
+        for buffer in &mut self.buffers {
+            buffer.advance(ticks);
+            let Some(slot) = buffer.id.and_then(|id| self.sync.observation().slot(id)).filter(|slot| slot.present)
+            else {
                 continue;
             };
             let sample = self.sync.sample(slot);
             let chosen = sample.map(|sample| Chosen { place: sample.keep, seq: sample.seq });
-            let chosen = chosen.map(|chosen| lane.keep(chosen));
+            let chosen = chosen.map(|chosen| buffer.keep(chosen));
             whole &= chosen.is_some();
-            if let Some(newest) = lane.chosen.first_mut().filter(|_| chosen.is_some()) {
+            if let Some(newest) = buffer.chosen.first_mut().filter(|_| chosen.is_some()) {
                 *newest = chosen;
-                lane.kept.copy_from_slice(&lane.chosen);
-                lane.kept_at = Some(tick);
+                buffer.kept.copy_from_slice(&buffer.chosen);
+                buffer.kept_at = Some(tick);
             }
             let age = Duration::from_nanos(u64::try_from(slot.age_ns).unwrap_or(0));
             oldest = oldest.max(Some(age));
@@ -235,23 +242,23 @@ impl Observer {
 
     /// Fills `request` with the samples chosen in the last ticks, up to its own tick.
     pub fn fill(&self, request: &mut Request) {
-        for (at, lane) in self.lanes.iter().enumerate() {
-            if lane.has_history {
-                lane.fill_history(at, request);
+        for (at, buffer) in self.buffers.iter().enumerate() {
+            if buffer.has_history {
+                buffer.fill_history(at, request);
                 continue;
             }
-            let shown = lane.shown(request.stamp);
+            let shown = buffer.shown(request.stamp);
             request.set_present(at, shown.is_some());
             let Some(shown) = shown else { continue };
             let mut chosen = None;
             // From the newest step back: a step without a sample uses that of the following step, and so does one whose
             // sample has been overwritten.
-            for (back, step) in (0..lane.steps).rev().enumerate() {
-                let kept = shown.get(back * lane.apart).copied().flatten();
-                let kept = kept.filter(|kept| lane.sample(*kept).is_some());
+            for (back, step) in (0..buffer.steps).rev().enumerate() {
+                let kept = shown.get(back * buffer.apart).copied().flatten();
+                let kept = kept.filter(|kept| buffer.sample(*kept).is_some());
                 chosen = kept.or(chosen);
                 let (Some(kept), Some(cell)) = (chosen, request.cell_mut(at, step)) else { continue };
-                if let Some(place) = lane.places.get(kept.place) {
+                if let Some(place) = buffer.places.get(kept.place) {
                     cell.set(&place.header, &place.bytes);
                 }
             }
@@ -262,11 +269,11 @@ impl Observer {
     pub fn clear(&mut self) {
         self.sync.clear();
         self.number = None;
-        for lane in &mut self.lanes {
-            lane.chosen.fill(None);
-            lane.kept_at = None;
-            lane.next = 0;
-            for place in &mut lane.places {
+        for buffer in &mut self.buffers {
+            buffer.chosen.fill(None);
+            buffer.kept_at = None;
+            buffer.next = 0;
+            for place in &mut buffer.places {
                 place.header = SampleHeader::default();
             }
         }

@@ -22,14 +22,14 @@ use rustix::fs::{FileType, Stat};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Distrust {
     /// The object that others can change.
-    place: Place,
+    place: EntryType,
     /// Its path.
     path: PathBuf,
     why: Why,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Place {
+enum EntryType {
     File,
     Folder,
     Link,
@@ -48,15 +48,17 @@ impl Distrust {
     pub fn fix(&self) -> String {
         let path = shown(&self.path);
         match (self.place, self.why) {
-            (Place::Link, _) => "name the real file instead of the link".to_owned(),
-            (Place::File, Why::Owner(_)) => format!("chown {} {path}", rustix::process::geteuid().as_raw()),
-            (Place::Folder, Why::Owner(_)) if rustix::process::geteuid().is_root() => {
+            (EntryType::Link, _) => "name the real file instead of the link".to_owned(),
+            (EntryType::File, Why::Owner(_)) => format!("chown {} {path}", rustix::process::geteuid().as_raw()),
+            (EntryType::Folder, Why::Owner(_)) if rustix::process::geteuid().is_root() => {
                 "copy it to where only root may write, and name it there: sudo install -D -m 644 devices.toml \
                  /etc/rapid/devices.toml, then --config /etc/rapid/devices.toml"
                     .to_owned()
             }
-            (Place::Folder, Why::Owner(_)) => "copy the file into a folder of your own and name it there".to_owned(),
-            (Place::File | Place::Folder, Why::Mode(_)) => format!("chmod go-w {path}"),
+            (EntryType::Folder, Why::Owner(_)) => {
+                "copy the file into a folder of your own and name it there".to_owned()
+            }
+            (EntryType::File | EntryType::Folder, Why::Mode(_)) => format!("chmod go-w {path}"),
         }
     }
 }
@@ -66,15 +68,15 @@ impl fmt::Display for Distrust {
         let path = shown(&self.path);
         let gain = if rustix::process::geteuid().is_root() { "could change what root runs" } else { "could change it" };
         match (self.place, self.why) {
-            (Place::File, Why::Owner(uid)) => write!(f, "it belongs to user {uid}, who {gain}"),
-            (Place::File, Why::Mode(mode)) => write!(f, "other users may write to it (mode {mode:04o})"),
-            (Place::Folder, Why::Owner(uid)) => write!(f, "the folder {path} belongs to user {uid}, who {gain}"),
-            (Place::Folder, Why::Mode(mode)) => {
+            (EntryType::File, Why::Owner(uid)) => write!(f, "it belongs to user {uid}, who {gain}"),
+            (EntryType::File, Why::Mode(mode)) => write!(f, "other users may write to it (mode {mode:04o})"),
+            (EntryType::Folder, Why::Owner(uid)) => write!(f, "the folder {path} belongs to user {uid}, who {gain}"),
+            (EntryType::Folder, Why::Mode(mode)) => {
                 write!(f, "other users may write to the folder {path} (mode {mode:04o}) and {gain}")
             }
-            (Place::Link, Why::Owner(uid)) => write!(f, "the link {path} belongs to user {uid}, who {gain}"),
+            (EntryType::Link, Why::Owner(uid)) => write!(f, "the link {path} belongs to user {uid}, who {gain}"),
             // The mode of a link has no meaning.
-            (Place::Link, Why::Mode(_)) => write!(f, "others {gain}"),
+            (EntryType::Link, Why::Mode(_)) => write!(f, "others {gain}"),
         }
     }
 }
@@ -93,9 +95,9 @@ pub fn distrust(path: &Path) -> io::Result<Option<Distrust>> {
     let mut found = None;
     let mut check = |part: &Path, stat: &Stat| {
         let place = match FileType::from_raw_mode(stat.st_mode) {
-            FileType::Symlink => Place::Link,
-            FileType::Directory => Place::Folder,
-            _ => Place::File,
+            FileType::Symlink => EntryType::Link,
+            FileType::Directory => EntryType::Folder,
+            _ => EntryType::File,
         };
         let bits = Bits { mode: stat.st_mode & 0o7777, owner: stat.st_uid, group: stat.st_gid };
         let Some(why) = judge(place, bits, euid) else { return Ok(()) };
@@ -117,12 +119,12 @@ struct Bits {
     group: u32,
 }
 
-fn judge(place: Place, bits: Bits, euid: u32) -> Option<Why> {
+fn judge(place: EntryType, bits: Bits, euid: u32) -> Option<Why> {
     let Bits { mode, owner, group } = bits;
     if owner != 0 && owner != euid {
         return Some(Why::Owner(owner));
     }
-    if place == Place::Link || (place == Place::Folder && mode & 0o1000 != 0) {
+    if place == EntryType::Link || (place == EntryType::Folder && mode & 0o1000 != 0) {
         return None;
     }
     // A user's own group, numbered like the user, has no other members; files are 0664 where each
@@ -145,7 +147,7 @@ mod tests {
 
     #[test]
     fn write_access_follows_owner_and_mode() {
-        use Place::{File, Folder, Link};
+        use EntryType::{File, Folder, Link};
         let why = |place, mode, owner, group, euid| judge(place, Bits { mode, owner, group }, euid);
         for (place, mode, owner, group, euid, expected) in [
             (File, 0o644, 0, 0, 0, None),
@@ -189,7 +191,7 @@ mod tests {
         }
     }
 
-    fn found(path: &Path) -> Option<(Place, PathBuf)> {
+    fn found(path: &Path) -> Option<(EntryType, PathBuf)> {
         distrust(path).unwrap().map(|found| (found.place, found.path))
     }
 
@@ -198,16 +200,16 @@ mod tests {
         let (tree, file) = Tree::new();
         assert_eq!(found(&file), None);
         fs::set_permissions(tree.at("a"), PermissionsExt::from_mode(0o777)).unwrap();
-        assert_eq!(found(&file), Some((Place::Folder, tree.at("a"))));
+        assert_eq!(found(&file), Some((EntryType::Folder, tree.at("a"))));
         // A detour through a good folder does not help, nor one through `..`.
         symlink("a", tree.at("link")).unwrap();
-        assert_eq!(found(&tree.at("link/b/file")), Some((Place::Folder, tree.at("a"))));
-        assert_eq!(found(&tree.at("a/b/../b/file")), Some((Place::Folder, tree.at("a"))));
+        assert_eq!(found(&tree.at("link/b/file")), Some((EntryType::Folder, tree.at("a"))));
+        assert_eq!(found(&tree.at("a/b/../b/file")), Some((EntryType::Folder, tree.at("a"))));
         fs::set_permissions(tree.at("a"), PermissionsExt::from_mode(0o1777)).unwrap();
         assert_eq!(found(&tree.at("link/b/file")), None);
         fs::set_permissions(&file, PermissionsExt::from_mode(0o666)).unwrap();
         symlink(&file, tree.at("absolute")).unwrap();
-        assert_eq!(found(&tree.at("absolute")), Some((Place::File, file.clone())));
+        assert_eq!(found(&tree.at("absolute")), Some((EntryType::File, file.clone())));
         let reason = distrust(&tree.at("absolute")).unwrap().unwrap();
         assert_eq!(reason.to_string(), "other users may write to it (mode 0666)");
         assert_eq!(reason.fix(), format!("chmod go-w {}", file.display()));
@@ -230,12 +232,12 @@ mod tests {
             crate::skip::skipped("only root can give files away");
             return;
         }
-        assert_eq!(found(&file), Some((Place::File, file.clone())));
+        assert_eq!(found(&file), Some((EntryType::File, file.clone())));
         chown(&file, Some(0), None).unwrap();
         symlink(&file, tree.at("link")).unwrap();
         lchown(tree.at("link"), Some(OTHER), None).unwrap();
-        assert_eq!(found(&tree.at("link")), Some((Place::Link, tree.at("link"))));
+        assert_eq!(found(&tree.at("link")), Some((EntryType::Link, tree.at("link"))));
         chown(tree.at("a"), Some(OTHER), None).unwrap();
-        assert_eq!(found(&file), Some((Place::Folder, tree.at("a"))));
+        assert_eq!(found(&file), Some((EntryType::Folder, tree.at("a"))));
     }
 }

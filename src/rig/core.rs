@@ -124,7 +124,7 @@ pub struct Transition {
 /// See the module's comment.
 #[derive(Debug, Clone)]
 pub struct Core {
-    lanes: Vec<Lane>,
+    modalities: Vec<ModalityState>,
     assigner: Assigner,
     mask: PhysicalMask,
     cooldown: Duration,
@@ -132,7 +132,7 @@ pub struct Core {
 
 /// One modality.
 #[derive(Debug, Clone)]
-struct Lane {
+struct ModalityState {
     id: ModalityId,
     slot: Slot<Attachment>,
     /// When the newest device was attached.
@@ -141,7 +141,7 @@ struct Lane {
     is_announced_gone: bool,
 }
 
-impl Lane {
+impl ModalityState {
     fn new(id: ModalityId, cooldown: Duration) -> Self {
         Self { id, slot: Slot::new(cooldown), attached_at: Stamp::default(), is_announced_gone: false }
     }
@@ -152,7 +152,7 @@ impl Core {
     pub fn new(registry: &Registry) -> Self {
         let cooldown = registry.rig.cooldown;
         Self {
-            lanes: registry.devices.iter().map(|device| Lane::new(device.id, cooldown)).collect(),
+            modalities: registry.devices.iter().map(|device| ModalityState::new(device.id, cooldown)).collect(),
             assigner: Assigner::new(registry),
             mask: PhysicalMask::EMPTY,
             cooldown,
@@ -174,9 +174,10 @@ impl Core {
             Input::Restart(id) => self.apply(id, slot::Input::Restart, None, now, effects),
             Input::Register(device) => self.register(&device, now, effects),
             Input::Timer => {
-                for index in 0..self.lanes.len() {
-                    let due = |lane: &&Lane| lane.slot.deadline().is_some_and(|deadline| deadline <= now);
-                    if let Some(id) = self.lanes.get(index).filter(due).map(|lane| lane.id) {
+                for index in 0..self.modalities.len() {
+                    let due =
+                        |modality: &&ModalityState| modality.slot.deadline().is_some_and(|deadline| deadline <= now);
+                    if let Some(id) = self.modalities.get(index).filter(due).map(|modality| modality.id) {
                         self.apply(id, slot::Input::Timer, None, now, effects);
                     }
                 }
@@ -195,34 +196,36 @@ impl Core {
 
     /// The mask in force, and what is plugged in.
     pub fn bits(&self) -> Bits {
-        let is_plugged = |lane: &&Lane| lane.slot.attached().is_some() && !lane.is_announced_gone;
-        let plugged = self.lanes.iter().filter(is_plugged).fold(self.mask, |all, lane| all.with(lane.id, true));
+        let is_plugged = |modality: &&ModalityState| modality.slot.attached().is_some() && !modality.is_announced_gone;
+        let plugged =
+            self.modalities.iter().filter(is_plugged).fold(self.mask, |all, modality| all.with(modality.id, true));
         Bits { mask: self.mask, plugged }
     }
 
     /// When [`Input::Timer`] is due, if no other input comes before.
     pub fn deadline(&self) -> Option<Stamp> {
-        self.lanes.iter().filter_map(|lane| lane.slot.deadline()).min()
+        self.modalities.iter().filter_map(|modality| modality.slot.deadline()).min()
     }
 
     /// Whether this stream runs now. Reports of any other stream have no effect.
     pub fn is_current(&self, id: ModalityId, epoch: Epoch) -> bool {
-        self.lane(id).is_some_and(|lane| lane.slot.is_current(epoch))
+        self.modality(id).is_some_and(|modality| modality.slot.is_current(epoch))
     }
 
     /// State and newest epoch of a modality; absent if there is no such modality.
     pub fn state(&self, id: ModalityId) -> (SlotState, Epoch) {
-        self.lane(id).map_or((SlotState::Absent, Epoch(0)), |lane| (lane.slot.state(), lane.slot.epoch()))
+        self.modality(id)
+            .map_or((SlotState::Absent, Epoch(0)), |modality| (modality.slot.state(), modality.slot.epoch()))
     }
 
     /// The device that is attached as this modality.
     pub fn attached(&self, id: ModalityId) -> Option<&Attachment> {
-        self.lane(id)?.slot.attached()
+        self.modality(id)?.slot.attached()
     }
 
     /// When the newest device of this modality was attached.
     pub fn attached_at(&self, id: ModalityId) -> Stamp {
-        self.lane(id).map(|lane| lane.attached_at).unwrap_or_default()
+        self.modality(id).map(|modality| modality.attached_at).unwrap_or_default()
     }
 
     /// Every attached node, in the order in which they were attached.
@@ -231,11 +234,11 @@ impl Core {
     }
 
     fn register(&mut self, device: &DeviceSpec, now: Stamp, effects: &mut Vec<Effect>) {
-        if self.lane(device.id).is_some() {
+        if self.modality(device.id).is_some() {
             return;
         }
-        let at = self.lanes.partition_point(|lane| lane.id < device.id);
-        self.lanes.insert(at, Lane::new(device.id, self.cooldown));
+        let at = self.modalities.partition_point(|modality| modality.id < device.id);
+        self.modalities.insert(at, ModalityState::new(device.id, self.cooldown));
         for (id, attachment) in self.assigner.add(device) {
             self.attach(id, attachment, now, effects);
         }
@@ -268,9 +271,12 @@ impl Core {
 
     /// The assigner gave this device to `id`. A repeated report is the same attachment.
     fn attach(&mut self, id: ModalityId, attachment: Attachment, now: Stamp, effects: &mut Vec<Effect>) {
-        let Some(lane) = self.lane_mut(id).filter(|lane| lane.slot.attached() != Some(&attachment)) else { return };
-        lane.attached_at = now;
-        lane.is_announced_gone = false;
+        let Some(modality) = self.modality_mut(id).filter(|modality| modality.slot.attached() != Some(&attachment))
+        else {
+            return;
+        };
+        modality.attached_at = now;
+        modality.is_announced_gone = false;
         effects.push(Effect::Device(id, DeviceEffect::AnnounceAttach));
         effects.push(Effect::Device(id, DeviceEffect::Plugged));
         self.apply(id, slot::Input::Attached(attachment), None, now, effects);
@@ -282,8 +288,8 @@ impl Core {
             StreamEvent::LinkDown => return self.announce_detach(id, UnplugSource::Link, effects),
             // A removal that hot-plug did not report: the link is up again, or the device never left.
             StreamEvent::Opened => {
-                if let Some(lane) = self.lane_mut(id)
-                    && std::mem::take(&mut lane.is_announced_gone)
+                if let Some(modality) = self.modality_mut(id)
+                    && std::mem::take(&mut modality.is_announced_gone)
                 {
                     effects.push(Effect::Device(id, DeviceEffect::AnnounceAttach));
                 }
@@ -309,8 +315,8 @@ impl Core {
 
     /// Announces which source noticed a removal, unless it was already announced.
     fn announce_detach(&mut self, id: ModalityId, source: UnplugSource, effects: &mut Vec<Effect>) {
-        if let Some(lane) = self.lane_mut(id)
-            && !std::mem::replace(&mut lane.is_announced_gone, true)
+        if let Some(modality) = self.modality_mut(id)
+            && !std::mem::replace(&mut modality.is_announced_gone, true)
         {
             effects.push(Effect::Device(id, DeviceEffect::AnnounceDetach(source)));
         }
@@ -324,36 +330,37 @@ impl Core {
         now: Stamp,
         effects: &mut Vec<Effect>,
     ) {
-        let Some(lane) = self.lanes.iter_mut().find(|lane| lane.id == id) else { return };
-        let (from, epoch) = (lane.slot.state(), lane.slot.epoch());
-        let ran = lane.slot.is_current(epoch);
-        let slot::Effects { stop, start } = lane.slot.apply(input, now);
-        self.mask = self.mask.with(id, lane.slot.is_present());
+        let Some(modality) = self.modalities.iter_mut().find(|modality| modality.id == id) else { return };
+        let (from, epoch) = (modality.slot.state(), modality.slot.epoch());
+        let ran = modality.slot.is_current(epoch);
+        let slot::Effects { stop, start } = modality.slot.apply(input, now);
+        self.mask = self.mask.with(id, modality.slot.is_present());
         let mut push = |effect| effects.push(Effect::Device(id, effect));
         if stop.is_some() {
             push(DeviceEffect::Stop);
         }
-        if ran && !lane.slot.is_current(epoch) {
+        if ran && !modality.slot.is_current(epoch) {
             push(DeviceEffect::Ended);
         }
-        let to = lane.slot.state();
+        let to = modality.slot.state();
         let is_changed = to != from || start.is_some();
         if let Some((epoch, attachment)) = start {
             push(DeviceEffect::Start(epoch, attachment));
         }
         if is_changed {
-            let wait = lane.slot.deadline().filter(|_| to == SlotState::Backoff).map(|deadline| deadline.since(now));
+            let wait =
+                modality.slot.deadline().filter(|_| to == SlotState::Backoff).map(|deadline| deadline.since(now));
             let source = source.filter(|_| to == SlotState::Absent);
             push(DeviceEffect::State(Transition { from, to, wait, source }));
         }
     }
 
-    fn lane(&self, id: ModalityId) -> Option<&Lane> {
-        self.lanes.iter().find(|lane| lane.id == id)
+    fn modality(&self, id: ModalityId) -> Option<&ModalityState> {
+        self.modalities.iter().find(|modality| modality.id == id)
     }
 
-    fn lane_mut(&mut self, id: ModalityId) -> Option<&mut Lane> {
-        self.lanes.iter_mut().find(|lane| lane.id == id)
+    fn modality_mut(&mut self, id: ModalityId) -> Option<&mut ModalityState> {
+        self.modalities.iter_mut().find(|modality| modality.id == id)
     }
 }
 

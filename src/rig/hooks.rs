@@ -26,7 +26,7 @@ use super::worker::describe;
 
 /// Serialises the runners of an entry.
 #[derive(Debug)]
-pub(super) struct Post {
+pub(super) struct HookQueue {
     programs: Programs,
     spec: Arc<DeviceSpec>,
     bus: BusNames,
@@ -37,7 +37,7 @@ pub(super) struct Post {
     gone: CancellationToken,
 }
 
-impl Post {
+impl HookQueue {
     pub(super) fn new(
         programs: &Programs,
         spec: &Arc<DeviceSpec>,

@@ -28,7 +28,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::core::{Core, DeviceEffect, Effect, Input, StreamEvent, Transition};
-use super::hooks::Post;
+use super::hooks::HookQueue;
 use super::presence::{JsonDevice, PERIOD, Presence};
 use super::programs::{BusNames, Programs};
 use super::slot::End;
@@ -83,7 +83,7 @@ struct Modality {
     /// Runs its program, if it has one.
     seat: Option<ProcessSlot>,
     /// Runs its hooks, if the rig runs programs at all.
-    post: Option<Post>,
+    hooks: Option<HookQueue>,
     /// Its commands, if it is the actuator and no program drives it.
     controls: Option<Controls>,
     /// Emergency stops and enabling switches that are numbers in its samples.
@@ -103,13 +103,13 @@ impl Rig {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             let spec = Arc::new(spec.clone());
             let seat = programs.as_ref().and_then(|programs| ProcessSlot::new(programs, &spec, bus));
-            let post = programs
+            let hooks = programs
                 .as_ref()
-                .map(|programs| Post::new(programs, &spec, names.clone(), seat.as_ref().map(ProcessSlot::turn)));
+                .map(|programs| HookQueue::new(programs, &spec, names.clone(), seat.as_ref().map(ProcessSlot::turn)));
             // A program that drives its device subscribes to actions itself.
             let is_driven = spec.action.is_some() && seat.is_none();
             let controls = if is_driven { bus.actions().map(Controls::new) } else { None };
-            Some(Modality { seat, post, controls, ..Modality::new(spec, writer) })
+            Some(Modality { seat, hooks, controls, ..Modality::new(spec, writer) })
         };
         Self {
             core: Core::new(registry),
@@ -290,11 +290,11 @@ impl Rig {
                 self.board.announce(EventKind::Detach { device: device(), bit: id, source });
             }
             DeviceEffect::Plugged => {
-                if let Some((post, attachment)) = modality.post.as_mut().zip(self.core.attached(id)) {
-                    post.attached(attachment, &self.episode);
+                if let Some((hooks, attachment)) = modality.hooks.as_mut().zip(self.core.attached(id)) {
+                    hooks.attached(attachment, &self.episode);
                 }
             }
-            DeviceEffect::Unplugged => modality.post.iter().for_each(Post::removed),
+            DeviceEffect::Unplugged => modality.hooks.iter().for_each(HookQueue::removed),
             DeviceEffect::Start(epoch, attachment) => {
                 modality.detail = attachment.node.label();
                 self.start(id, epoch, attachment);
@@ -474,7 +474,7 @@ impl Modality {
             numbers: Arc::default(),
             stop: CancellationToken::new(),
             seat: None,
-            post: None,
+            hooks: None,
             controls: None,
             taps: Arc::from([]),
             arming: None,

@@ -46,7 +46,7 @@ const CLOSE_LIMIT: Duration = Duration::from_secs(4);
 
 use controls::Controlled;
 pub(super) use controls::Controls;
-use source::Source;
+use source::SampleSource;
 
 /// Reports of a running stream to the rig.
 #[derive(Debug, Clone, PartialEq)]
@@ -136,7 +136,7 @@ impl Stream {
                 self.report(Report::LinkDown).await;
                 is_up.await;
             }
-            timeout(OPEN_LIMIT, Source::open(&self)).await
+            timeout(OPEN_LIMIT, SampleSource::open(&self)).await
         };
         let opened = tokio::select! {
             biased;
@@ -162,7 +162,7 @@ impl Stream {
         stopped()
     }
 
-    async fn read(&self, source: &mut Source, notices: &mut Notices) -> Ended {
+    async fn read(&self, source: &mut SampleSource, notices: &mut Notices) -> Ended {
         self.report(Report::Opened(source.description(), Box::new(self.provenance(source)))).await;
         let patience = source.patience(self.spec.stall_after);
         let mut progress = StreamProgress::default();
@@ -249,7 +249,12 @@ impl Stream {
     }
 
     /// Passes the actuator the orders and the newest action since the last call.
-    async fn pass_on_orders(&self, source: &mut Source, controls: &mut Controlled, progress: &mut StreamProgress) {
+    async fn pass_on_orders(
+        &self,
+        source: &mut SampleSource,
+        controls: &mut Controlled,
+        progress: &mut StreamProgress,
+    ) {
         if let Err(error) = controls.pass_on_orders(source) {
             self.report(Report::Refused(format!("an order is not carried out: {error}"))).await;
         }
@@ -261,7 +266,7 @@ impl Stream {
     }
 
     /// Notifies the device if the episode in progress has changed.
-    async fn pass_on_episode(&self, source: &mut Source, episode: &mut EpisodeWatch) {
+    async fn pass_on_episode(&self, source: &mut SampleSource, episode: &mut EpisodeWatch) {
         if !episode.has_changed().unwrap_or(false) {
             return;
         }
@@ -294,7 +299,7 @@ impl Stream {
         format!("open, but sent nothing for {} s", limit.as_secs())
     }
 
-    fn provenance(&self, source: &Source) -> Provenance {
+    fn provenance(&self, source: &SampleSource) -> Provenance {
         let mut negotiated = source.negotiated();
         negotiated.driver = negotiated.driver.or_else(|| self.attachment.driver.as_deref().cloned());
         Provenance {

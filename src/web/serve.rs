@@ -94,16 +94,16 @@ pub(super) struct Server {
 }
 
 /// The place of a connection, which is free again when this is dropped, by a panic too.
-struct Place(Rc<Server>);
+struct ConnectionGuard(Rc<Server>);
 
-impl Place {
+impl ConnectionGuard {
     fn take(server: &Rc<Server>) -> Self {
         server.connections.set(server.connections.get() + 1);
         Self(Rc::clone(server))
     }
 }
 
-impl Drop for Place {
+impl Drop for ConnectionGuard {
     fn drop(&mut self) {
         self.0.connections.set(self.0.connections.get().saturating_sub(1));
     }
@@ -143,12 +143,12 @@ impl Server {
                 continue;
             }
             // From now on, and not from when its task first runs.
-            let place = Place::take(self);
+            let place = ConnectionGuard::take(self);
             spawn_local(Rc::clone(self).connect(stream, peer, place));
         }
     }
 
-    async fn connect(self: Rc<Self>, stream: TcpStream, peer: SocketAddr, _place: Place) {
+    async fn connect(self: Rc<Self>, stream: TcpStream, peer: SocketAddr, _place: ConnectionGuard) {
         let connection = Rc::new(Connection { peer, last: Cell::new(Instant::now()), waits: Cell::new(false) });
         let service = service_fn(|request| {
             let (server, connection) = (Rc::clone(&self), Rc::clone(&connection));

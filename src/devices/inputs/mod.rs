@@ -1,7 +1,7 @@
 //! Inputs with two levels: a key, a line of a GPIO chip, lines of text on a serial port, a number in the samples of a
 //! device. Emergency stops, enabling switches and buttons are read by it.
 //!
-//! Inputs that only one reader can have open, the keys of a device and the lines of a port, are one [`Place`]. Each place
+//! Inputs that only one reader can have open, the keys of a device and the lines of a port, are one [`InputGroup`]. Each place
 //! has a thread, which sleeps until the kernel has something to read or the input has been silent for too long; it opens
 //! the place again after a loss. For a number in the samples of a device the thread only waits for silence, and the
 //! device's stream evaluates the number ([`tap`]).
@@ -40,7 +40,7 @@ pub trait Report: fmt::Debug + Send + Sync {
 
 /// What one reader reads.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Place {
+pub enum InputGroup {
     /// Keys of an input device.
     Keys(Vec<KeyInput>),
     /// A line of a GPIO chip.
@@ -51,7 +51,7 @@ pub enum Place {
     Field(FieldInput),
 }
 
-impl Place {
+impl InputGroup {
     /// The place of one input.
     pub fn of(input: &InputSpec) -> Self {
         match input.clone() {
@@ -112,10 +112,10 @@ impl Readers {
     ///
     /// # Errors
     /// When the system provides no thread.
-    pub fn read(&mut self, thread: &str, place: Place, report: Arc<dyn Report>) -> io::Result<()> {
+    pub fn read(&mut self, thread: &str, place: InputGroup, report: Arc<dyn Report>) -> io::Result<()> {
         let stop = Arc::clone(&self.stop);
         let work: Box<dyn FnOnce() + Send> = match place {
-            Place::Field(field) => {
+            InputGroup::Field(field) => {
                 let tap = Tap::new(&field, report)?;
                 self.taps.push(tap.clone());
                 Box::new(move || tap.watch(&stop))
@@ -182,7 +182,7 @@ mod tests {
         };
         let gpio = |line| InputSpec::Gpio(GpioInput { chip: "/dev/gpiochip0".into(), line, on_while_high: false });
         let all = [key("a", 1), line("/p", "x"), gpio(1), key("b", 1), key("a", 2), gpio(2), line("/p", "y")];
-        let places = Place::of_all(all.iter());
+        let places = InputGroup::of_all(all.iter());
         let own: Vec<_> = places.iter().map(|(_, own)| own.as_slice()).collect();
         assert_eq!(own, [&[0, 4][..], &[1, 6], &[2], &[3], &[5]]);
     }

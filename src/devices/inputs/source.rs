@@ -5,30 +5,30 @@ use std::time::Duration;
 
 use rapid_system::gpio::Input;
 
-use super::Place;
+use super::InputGroup;
 use super::gpio::Gpio;
 use super::key::{self, Keys};
 use super::line::Lines;
 
 /// See the module's comment.
 #[derive(Debug)]
-pub(super) enum Source {
+pub(super) enum InputSource {
     Keys(Box<Keys>),
     Gpio(Gpio),
     Lines(Lines),
 }
 
-impl Source {
+impl InputSource {
     /// Opens it.
     ///
     /// # Errors
     /// Why it cannot be opened, as text for the user.
-    pub(super) fn open(place: &Place) -> Result<Self, String> {
+    pub(super) fn open(place: &InputGroup) -> Result<Self, String> {
         match place {
-            Place::Keys(keys) => Ok(Self::Keys(Box::new(Keys::open(keys)?))),
-            Place::Gpio(gpio) => Ok(Self::Gpio(Gpio::open(gpio)?)),
-            Place::Lines(lines) => Ok(Self::Lines(Lines::open(lines)?)),
-            Place::Field(field) => Err(format!("{} is read by its stream", field.device)),
+            InputGroup::Keys(keys) => Ok(Self::Keys(Box::new(Keys::open(keys)?))),
+            InputGroup::Gpio(gpio) => Ok(Self::Gpio(Gpio::open(gpio)?)),
+            InputGroup::Lines(lines) => Ok(Self::Lines(Lines::open(lines)?)),
+            InputGroup::Field(field) => Err(format!("{} is read by its stream", field.device)),
         }
     }
 

@@ -9,8 +9,8 @@ use std::time::Duration;
 use rapid_core::time::Stamp;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::source::Source;
-use super::{Place, Report, lost_at_a_panic};
+use super::source::InputSource;
+use super::{InputGroup, Report, lost_at_a_panic};
 
 /// Time between a loss of a place and its reopening.
 const AGAIN: Duration = Duration::from_millis(500);
@@ -53,10 +53,10 @@ pub(super) fn wait(stop: &OwnedFd, input: Option<&dyn AsFd>, until: Option<Stamp
 }
 
 /// Follows `place` until `stop`.
-pub(super) fn watch(place: &Place, report: &dyn Report, stop: &OwnedFd) {
+pub(super) fn watch(place: &InputGroup, report: &dyn Report, stop: &OwnedFd) {
     let _lost = lost_at_a_panic(report);
     loop {
-        let why = match Source::open(place) {
+        let why = match InputSource::open(place) {
             Ok(mut source) => follow(&mut source, report, stop),
             Err(why) => Some(why),
         };
@@ -69,7 +69,7 @@ pub(super) fn watch(place: &Place, report: &dyn Report, stop: &OwnedFd) {
 }
 
 /// Why an open place was lost; `None` at the end of the run.
-fn follow(source: &mut Source, report: &dyn Report, stop: &OwnedFd) -> Option<String> {
+fn follow(source: &mut InputSource, report: &dyn Report, stop: &OwnedFd) -> Option<String> {
     let silence = source.silence();
     let mut received_at = Stamp::now();
     let mut is_silent = false;

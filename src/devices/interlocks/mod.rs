@@ -19,7 +19,7 @@ use rapid_status::stops::Reported;
 use rapid_status::{Board, EventKind, StopStatus};
 
 use crate::inputs::tap::Tap;
-use crate::inputs::{Place, Readers, Report};
+use crate::inputs::{InputGroup, Readers, Report};
 
 /// The stops of a registry, none of which runs.
 pub fn of(registry: &Registry) -> Interlocks {
@@ -53,8 +53,8 @@ impl Watched {
                 board: Arc::clone(board),
                 is_ending: Arc::clone(&watched.is_ending),
             };
-            let place = Place::of(&spec.input);
-            if let Place::Field(field) = &place {
+            let place = InputGroup::of(&spec.input);
+            if let InputGroup::Field(field) = &place {
                 // Before any sample can come.
                 input.lost(&format!("no sample of {} has come", field.device));
             }

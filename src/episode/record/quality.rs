@@ -153,13 +153,13 @@ pub(super) struct Measures {
     wait_ns: u64,
     begin_ns: u64,
     presence: PresenceHistory,
-    lanes: Vec<Option<Lane>>,
+    modalities: Vec<Option<ModalityMeters>>,
     /// Between the earliest and the latest sample of a frame.
     skew: DurationHistogram,
 }
 
 #[derive(Debug)]
-struct Lane {
+struct ModalityMeters {
     measured: Measured,
     meter: Meter,
     longest_gap_ns: u64,
@@ -169,13 +169,13 @@ struct Lane {
 }
 
 impl Measures {
-    pub(super) fn new(modalities: &[Measured], frames: Frames) -> Self {
-        let mut lanes = Vec::new();
-        lanes.resize_with(MAX_MODALITIES, || None);
-        for measured in modalities {
+    pub(super) fn new(all: &[Measured], frames: Frames) -> Self {
+        let mut modalities = Vec::new();
+        modalities.resize_with(MAX_MODALITIES, || None);
+        for measured in all {
             let compares = measured.limits.compares();
-            if let Some(lane) = lanes.get_mut(measured.id.index()) {
-                *lane = Some(Lane {
+            if let Some(modality) = modalities.get_mut(measured.id.index()) {
+                *modality = Some(ModalityMeters {
                     measured: measured.clone(),
                     meter: Meter::new(frames.begin_ns, compares),
                     longest_gap_ns: 0,
@@ -191,37 +191,37 @@ impl Measures {
             wait_ns: nanoseconds(frames.wait),
             begin_ns: frames.begin_ns,
             presence: PresenceHistory::new(frames.begin_ns),
-            lanes,
+            modalities,
             skew: DurationHistogram::default(),
         }
     }
 
     /// Takes a sample that belongs to the episode.
     pub(super) fn sample(&mut self, id: ModalityId, seen: &SampleFacts<'_>) {
-        let Some(Some(lane)) = self.lanes.get(id.index()) else { return };
-        let shown = seen.capture_ns.saturating_sub(lane.measured.latency_ns);
+        let Some(Some(modality)) = self.modalities.get(id.index()) else { return };
+        let shown = seen.capture_ns.saturating_sub(modality.measured.latency_ns);
         let tick = self.nearest_tick(shown);
         // No frame waits for a sample between the windows: it has the deadline that its own frame would have.
         let due = if shown.abs_diff(tick) <= self.window_ns { tick } else { shown };
         let deadline = due.saturating_add(self.wait_ns);
-        let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
-        if lane.meter.repeats.len() >= MOST_PENDING {
-            lane.settle(&self.presence);
+        let Some(Some(modality)) = self.modalities.get_mut(id.index()) else { return };
+        if modality.meter.repeats.len() >= MOST_PENDING {
+            modality.settle(&self.presence);
         }
-        let Some((from, to)) = lane.meter.sample(seen, deadline) else { return };
-        if to - from > lane.longest_gap_ns {
-            if lane.pending.len() >= MOST_PENDING {
-                lane.settle(&self.presence);
+        let Some((from, to)) = modality.meter.sample(seen, deadline) else { return };
+        if to - from > modality.longest_gap_ns {
+            if modality.pending.len() >= MOST_PENDING {
+                modality.settle(&self.presence);
             }
-            lane.pending.push((from, to));
+            modality.pending.push((from, to));
         }
     }
 
     /// Counts samples that are missing.
     pub(super) fn missing(&mut self, id: ModalityId, lost: u64, dropped: u64) {
-        if let Some(Some(lane)) = self.lanes.get_mut(id.index()) {
+        if let Some(Some(modality)) = self.modalities.get_mut(id.index()) {
             // Saturating: the numbers come from the publisher.
-            let counts = &mut lane.meter.counts;
+            let counts = &mut modality.meter.counts;
             counts.lost = counts.lost.saturating_add(lost);
             counts.dropped = counts.dropped.saturating_add(dropped);
         }
@@ -234,15 +234,15 @@ impl Measures {
 
     /// Records that a device was plugged in or out; one that was there before counts from the beginning.
     pub(super) fn plugged(&mut self, id: ModalityId, at_ns: u64, there: bool) {
-        if let Some(Some(lane)) = self.lanes.get_mut(id.index()) {
-            lane.plugged.push(at_ns, there);
+        if let Some(Some(modality)) = self.modalities.get_mut(id.index()) {
+            modality.plugged.push(at_ns, there);
         }
     }
 
     /// Takes how far the capture times of a device of another computer may be wrong.
     pub(super) fn uncertainty(&mut self, id: ModalityId, ns: u64) {
-        if let Some(Some(lane)) = self.lanes.get_mut(id.index()) {
-            lane.uncertainty_ns = lane.uncertainty_ns.max(Some(ns));
+        if let Some(Some(modality)) = self.modalities.get_mut(id.index()) {
+            modality.uncertainty_ns = modality.uncertainty_ns.max(Some(ns));
         }
     }
 
@@ -251,7 +251,7 @@ impl Measures {
     pub(super) fn frame(&mut self, slots: impl Iterator<Item = (ModalityId, bool, Option<i64>)>) {
         let mut ages: Option<(i64, i64)> = None;
         for (id, present, age) in slots {
-            let Some(Some(Lane { meter, .. })) = self.lanes.get_mut(id.index()) else { continue };
+            let Some(Some(ModalityMeters { meter, .. })) = self.modalities.get_mut(id.index()) else { continue };
             meter.frame(present, age.is_some());
             let Some(age) = age else { continue };
             meter.offset.push(age.unsigned_abs());
@@ -264,19 +264,19 @@ impl Measures {
 
     /// Call once every mask published before the samples so far has been taken.
     pub(super) fn settle(&mut self) {
-        for lane in self.lanes.iter_mut().flatten() {
-            lane.settle(&self.presence);
+        for modality in self.modalities.iter_mut().flatten() {
+            modality.settle(&self.presence);
         }
     }
 
     /// The counts of a modality so far.
     pub(super) fn meter(&self, id: ModalityId) -> Option<&Meter> {
-        self.lanes.get(id.index())?.as_ref().map(|lane| &lane.meter)
+        self.modalities.get(id.index())?.as_ref().map(|modality| &modality.meter)
     }
 
     /// Samples dropped so far, of all modalities.
     pub(super) fn dropped(&self) -> u64 {
-        self.lanes.iter().flatten().fold(0, |sum, lane| sum.saturating_add(lane.meter.counts.dropped))
+        self.modalities.iter().flatten().fold(0, |sum, modality| sum.saturating_add(modality.meter.counts.dropped))
     }
 
     /// Between the earliest and the latest sample of a frame, ms.
@@ -286,8 +286,8 @@ impl Measures {
 
     /// The quality of a modality in an episode that ended at `end_ns`; `None` if it is not measured.
     pub(super) fn quality(&self, id: ModalityId, end_ns: u64) -> Option<Quality> {
-        let Lane { measured, meter, longest_gap_ns, pending, plugged, uncertainty_ns } =
-            self.lanes.get(id.index())?.as_ref()?;
+        let ModalityMeters { measured, meter, longest_gap_ns, pending, plugged, uncertainty_ns } =
+            self.modalities.get(id.index())?.as_ref()?;
         let gaps = pending.iter().copied().chain([(meter.latest_ns, end_ns)]);
         let longest_gap_ns =
             gaps.fold(*longest_gap_ns, |longest, (from, to)| longest.max(self.presence.longest(id, from, to)));
@@ -324,7 +324,7 @@ impl Measures {
     }
 }
 
-impl Lane {
+impl ModalityMeters {
     fn settle(&mut self, presence: &PresenceHistory) {
         for (from, to) in self.pending.drain(..) {
             let gap = presence.longest(self.measured.id, from, to);

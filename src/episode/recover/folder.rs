@@ -18,7 +18,7 @@ use rapid_status::{Board, EventKind, Level};
 use rapid_system::disk::Disk;
 use rustix::process::setpriority_process;
 
-use super::{Names, ProgressFn, RecoverError, Recovered, RepairOutcome, Source, recover};
+use super::{LockedFile, Names, ProgressFn, RecoverError, Recovered, RepairOutcome, recover};
 use crate::Failed;
 
 /// How soon a repair in the background notices that it is to end.
@@ -51,7 +51,7 @@ pub fn finished(folder: &Path) -> io::Result<Vec<PathBuf>> {
 pub fn is_damaged(path: &Path, watch: &mut ProgressFn<'_>) -> Result<bool, RecoverError> {
     let (file, size) = crate::open(path)?;
     let failed = Failed::of(&file, size).map_err(|source| super::io_of(path, source))?;
-    let source = Source { path, file, size, failed };
+    let source = LockedFile { path, file, size, failed };
     let Some(known) = source.read(watch)? else { return Ok(false) };
     if source.failed.is_none() && known.is_whole() {
         return Ok(false);

@@ -214,13 +214,13 @@ pub fn recover(path: &Path, watch: &mut ProgressFn<'_>) -> Result<Recovered, Rec
     // From here on no other program writes it.
     let size = file.metadata().map_err(io)?.len();
     let failed = Failed::of(&file, size).map_err(io)?;
-    let mut source = Source { path, file, size, failed };
+    let mut source = LockedFile { path, file, size, failed };
     let outcome = if names.is_partial { source.partial(&names, watch) } else { source.finished(&names, watch) };
     outcome.map(|outcome| Recovered { file: path.to_owned(), outcome })
 }
 
 /// The file being repaired, under its lock.
-struct Source<'a> {
+struct LockedFile<'a> {
     path: &'a Path,
     file: File,
     size: u64,
@@ -228,7 +228,7 @@ struct Source<'a> {
     failed: Option<Failed>,
 }
 
-impl Source<'_> {
+impl LockedFile<'_> {
     fn partial(&mut self, names: &Names, watch: &mut ProgressFn<'_>) -> Result<RepairOutcome, RecoverError> {
         if self.size == 0 {
             fs::remove_file(self.path).map_err(|source| self.io(source))?;

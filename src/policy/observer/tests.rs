@@ -42,7 +42,7 @@ fn at(tick: u64) -> Stamp {
 fn push(observer: &mut Observer, tick: u64, before: Duration, seq: u64, epoch: u32) {
     let captured = at(tick).0 - u64::try_from(before.as_nanos()).unwrap();
     let header = SampleHeader { seq, capture_ns: captured, recv_ns: captured, epoch, ..SampleHeader::default() };
-    let id = observer.lanes[0].id.unwrap();
+    let id = observer.buffers[0].id.unwrap();
     observer.push(id, &header, &seq.to_le_bytes());
 }
 

@@ -17,7 +17,7 @@ use rapid_devices::driver::DriverError;
 use tokio::io::unix::AsyncFd;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
-use super::source::Source;
+use super::source::SampleSource;
 
 /// See the module's comment.
 #[derive(Debug, Clone)]
@@ -53,7 +53,7 @@ impl Controls {
     ///
     /// # Errors
     /// When it cannot be armed.
-    pub(super) fn begin(&self, source: &mut Source) -> Result<Option<Controlled>, DriverError> {
+    pub(super) fn begin(&self, source: &mut SampleSource) -> Result<Option<Controlled>, DriverError> {
         self.actions.discard();
         let orders = Arc::new(self.permission.attend());
         let actions = Arc::clone(&self.actions);
@@ -96,7 +96,7 @@ impl Controlled {
     ///
     /// # Errors
     /// When it does not accept one.
-    pub(super) fn pass_on_orders(&mut self, source: &mut Source) -> Result<(), DriverError> {
+    pub(super) fn pass_on_orders(&mut self, source: &mut SampleSource) -> Result<(), DriverError> {
         self.orders.take().try_for_each(|order| source.order(order))
     }
 
@@ -104,7 +104,7 @@ impl Controlled {
     ///
     /// # Errors
     /// When it does not accept the action, or the action must not be followed.
-    pub(super) fn pass_on_action(&mut self, source: &mut Source) -> Result<(), DriverError> {
+    pub(super) fn pass_on_action(&mut self, source: &mut SampleSource) -> Result<(), DriverError> {
         match self.actions.newest(&mut self.action) {
             Ok(Some((target, _))) => source.command(target),
             Ok(None) => Ok(()),

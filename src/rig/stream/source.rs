@@ -17,12 +17,12 @@ use crate::rig::worker::{MOST_SILENT_BEATS, Worker};
 
 /// The source of a stream's samples.
 #[derive(Debug)]
-pub(super) enum Source {
+pub(super) enum SampleSource {
     Driver(Driver),
     Worker(Box<Worker>),
 }
 
-impl Source {
+impl SampleSource {
     pub(super) async fn open(stream: &Stream) -> Result<Self, DriverError> {
         let Stream { spec, attachment, epoch, seat, .. } = stream;
         match (&spec.node, seat) {

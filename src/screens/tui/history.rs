@@ -56,7 +56,7 @@ const UNSEEN: Duration = Duration::from_secs(3);
 /// The last minute of all devices, and the last five of the mask.
 #[derive(Debug, Clone)]
 pub(super) struct History {
-    lanes: Box<[Lane]>,
+    devices: Box<[DeviceHistory]>,
     mask: Box<[Second]>,
     /// The current second of the mask.
     current: Option<Second>,
@@ -67,7 +67,7 @@ pub(super) struct History {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Lane {
+struct DeviceHistory {
     cells: [Cell; SECONDS],
     /// Samples when the current second began.
     samples: u64,
@@ -79,9 +79,9 @@ struct Lane {
 
 impl Default for History {
     fn default() -> Self {
-        let lane = Lane { cells: [Cell::Unknown; SECONDS], samples: 0, was_absent: false, highest: 0.0 };
+        let history = DeviceHistory { cells: [Cell::Unknown; SECONDS], samples: 0, was_absent: false, highest: 0.0 };
         let mask = vec![Second::default(); MASK_SECONDS].into_boxed_slice();
-        Self { lanes: vec![lane; MAX_MODALITIES].into_boxed_slice(), mask, current: None, begun: None, seconds: 0 }
+        Self { devices: vec![history; MAX_MODALITIES].into_boxed_slice(), mask, current: None, begun: None, seconds: 0 }
     }
 }
 
@@ -106,11 +106,11 @@ impl History {
             self.current = Some(Second { always: mask, ever: mask });
         }
         for device in &snapshot.devices {
-            if let Some(lane) = self.lanes.get_mut(device.id.index()) {
-                lane.was_absent |= !device.state.is_present();
+            if let Some(history) = self.devices.get_mut(device.id.index()) {
+                history.was_absent |= !device.state.is_present();
                 if is_over || elapsed.is_zero() {
-                    let cell = lane.end(device, elapsed);
-                    if is_over && let Some(place) = lane.cells.get_mut(self.seconds % SECONDS) {
+                    let cell = history.end(device, elapsed);
+                    if is_over && let Some(place) = history.cells.get_mut(self.seconds % SECONDS) {
                         *place = cell;
                     }
                 }
@@ -128,11 +128,11 @@ impl History {
             if let Some(place) = self.mask.get_mut(self.seconds % MASK_SECONDS) {
                 *place = MISSED;
             }
-            for lane in &mut self.lanes {
-                if let Some(place) = lane.cells.get_mut(self.seconds % SECONDS) {
+            for history in &mut self.devices {
+                if let Some(place) = history.cells.get_mut(self.seconds % SECONDS) {
                     *place = Cell::Unknown;
                 }
-                lane.was_absent = false;
+                history.was_absent = false;
             }
             self.seconds += 1;
         }
@@ -164,14 +164,14 @@ impl History {
 
     /// The last minute in so many cells, the oldest first; `columns` divides [`SECONDS`].
     pub(super) fn strip(&self, id: ModalityId, columns: usize) -> Vec<Cell> {
-        let Some(lane) = self.lanes.get(id.index()) else { return Vec::new() };
+        let Some(history) = self.devices.get(id.index()) else { return Vec::new() };
         let each = SECONDS.checked_div(columns).unwrap_or(SECONDS).max(1);
         // Cells stand for the same seconds until they leave: a strip that is regrouped at each second flickers.
         let newest = self.seconds.next_multiple_of(each);
         let oldest = newest.saturating_sub(SECONDS);
         let cell = |second: usize| {
             let is_kept = second < self.seconds && second + SECONDS >= self.seconds;
-            lane.cells.get(second % SECONDS).copied().filter(|_| is_kept).unwrap_or_default()
+            history.cells.get(second % SECONDS).copied().filter(|_| is_kept).unwrap_or_default()
         };
         let worst = |first: usize| {
             let cells = (first..first + each).map(cell);
@@ -182,7 +182,7 @@ impl History {
     }
 }
 
-impl Lane {
+impl DeviceHistory {
     /// The second that ends, of this length; the next one begins.
     fn end(&mut self, device: &DeviceStatus, length: Duration) -> Cell {
         let arrived = device.samples.saturating_sub(self.samples);

@@ -40,7 +40,7 @@ pub enum LinkState {
 }
 
 /// See the module's comment.
-pub trait Link {
+pub trait RigLink {
     /// The newest snapshot.
     fn snapshot(&mut self) -> Snapshot;
 
@@ -82,7 +82,7 @@ impl Own {
     }
 }
 
-impl Link for Own {
+impl RigLink for Own {
     fn snapshot(&mut self) -> Snapshot {
         self.board.snapshot()
     }

@@ -1,7 +1,7 @@
 //! The monitor: a full-screen view of the rig while data is collected.
 //!
 //! Snapshots, fifteen per second, and the user's keys change the [`model`]; the `view` draws it. Where snapshots come from
-//! and requests go is the [`Link`]: the board of this process, or a run of another process.
+//! and requests go is the [`RigLink`]: the board of this process, or a run of another process.
 //!
 //! Invariant: the terminal is restored to its previous state, however the screen ends.
 //! Invariant: a blocked terminal delays nothing: a separate thread writes the frames, and frames are dropped
@@ -38,7 +38,7 @@ use std::time::Duration;
 
 use crossterm::event::{Event, EventStream, MouseButton, MouseEvent, MouseEventKind};
 use futures::{FutureExt, Stream, StreamExt};
-pub use link::{Closed, Link, LinkState, Own};
+pub use link::{Closed, LinkState, Own, RigLink};
 use model::{Model, Msg};
 use rapid_core::permission::Permission;
 use rapid_core::time::Zone;
@@ -122,7 +122,7 @@ pub async fn run(
 ///
 /// # Errors
 /// When there is no terminal, or it goes away.
-pub async fn show(mut link: impl Link, options: ScreenOptions, shutdown: CancellationToken) -> Result<(), TuiError> {
+pub async fn show(mut link: impl RigLink, options: ScreenOptions, shutdown: CancellationToken) -> Result<(), TuiError> {
     let theme = Theme::detect(Palette::of(&io::stdout()), |name| std::env::var(name).ok());
     let mut screen = Screen::open(options.mouse).map_err(TuiError::NoTerminal)?;
     let size = crossterm::terminal::size().ok();
@@ -145,7 +145,7 @@ pub async fn show(mut link: impl Link, options: ScreenOptions, shutdown: Cancell
 /// The loop itself, with any source of terminal events and any way to draw: one that returns false has drawn nothing, and is
 /// repeated when `room` is notified.
 async fn drive(
-    link: &mut impl Link,
+    link: &mut impl RigLink,
     shutdown: &CancellationToken,
     events: impl Stream<Item = io::Result<Event>>,
     options: ScreenOptions,

@@ -37,11 +37,11 @@ use tokio::time::sleep;
 use tokio_util::task::AbortOnDropHandle;
 
 use self::answer::{Name, State};
-use self::camera::{Camera, Pace, ReportedEpisode};
+use self::camera::{Camera, ReportedEpisode, TimeLimits};
 use self::clip::Clip;
 use self::preview::Preview;
+use super::address::{DeviceAddress, Server};
 use super::http;
-use super::place::{Place, Server};
 use crate::driver::{DriverError, Reading};
 
 /// The camera answers within a tenth of a second, even while encoding.
@@ -79,7 +79,7 @@ impl Gopro {
     /// `preview`: the samples are pictures of this size, of at most so many bytes.
     pub(super) async fn open(
         name: &str,
-        place: &Place,
+        place: &DeviceAddress,
         port: u16,
         clips: Clips,
         preview: Option<(LanPicture, usize)>,
@@ -89,7 +89,7 @@ impl Gopro {
             None => place.at(address(place).await?.into()),
         };
         let server = place.server(port)?;
-        let mut camera = Self::begin(name, server.clone(), clips, state_directory(), Pace::USUAL).await?;
+        let mut camera = Self::begin(name, server.clone(), clips, state_directory(), TimeLimits::USUAL).await?;
         if let Some((picture, largest)) = preview {
             camera.preview = Some(Preview::begin(name, &server, picture, largest).await?);
         }
@@ -102,7 +102,7 @@ impl Gopro {
         server: Server,
         clips: Clips,
         state: Option<PathBuf>,
-        pace: Pace,
+        limits: TimeLimits,
     ) -> Result<Self, DriverError> {
         ask(&server, "/gopro/camera/control/wired_usb?p=1").await?;
         let info = ask(&server, "/gopro/camera/info").await?;
@@ -113,7 +113,7 @@ impl Gopro {
         let books = Books::open(state.as_deref(), serial.as_deref().unwrap_or(name)).await;
         let (notify, states) = mpsc::channel(4);
         let (reported, tasks) = watch::channel(None);
-        let camera = Camera::new(name, server, clips, books, notify, pace).await;
+        let camera = Camera::new(name, server, clips, books, notify, limits).await;
         let task = AbortOnDropHandle::new(tokio::spawn(camera.run(tasks)));
         Ok(Self { states, reported, task, model: answer::model(&info), payload: Vec::new(), preview: None })
     }
@@ -185,7 +185,7 @@ async fn ask(server: &Server, path: &str) -> Result<Vec<u8>, DriverError> {
 }
 
 /// The camera's address, once the host has one in its network.
-async fn address(place: &Place) -> Result<Ipv4Addr, DriverError> {
+async fn address(place: &DeviceAddress) -> Result<Ipv4Addr, DriverError> {
     let looks = ADDRESS_LIMIT.as_millis() / LOOK_FOR_ADDRESS.as_millis();
     for _ in 0..looks {
         if let Some(camera) = place.own_address(is_gopros).map(camera_of) {

@@ -11,7 +11,7 @@ use hyper_util::rt::TokioIo;
 use tokio::time::timeout;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::place::Server;
+use super::address::Server;
 use crate::driver::DriverError;
 
 /// Maximum bytes of a reply's headers.

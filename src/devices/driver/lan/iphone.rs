@@ -29,8 +29,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Instant;
 
 use self::packet::{Cut, FRAME_HEAD, Frame, Packets};
+use super::address::DeviceAddress;
 use super::mjpeg::check_size;
-use super::place::Place;
 use super::{PATIENCE, jpeg};
 use crate::driver::{DriverError, Reading};
 
@@ -47,7 +47,7 @@ const COMMENT: usize = 2 << 10;
 #[derive(Debug)]
 pub(super) struct Phone {
     name: String,
-    place: Place,
+    place: DeviceAddress,
     listener: TcpListener,
     connection: Option<Connection>,
     stream: PhoneStream,
@@ -74,7 +74,7 @@ struct Connection {
 impl Phone {
     pub(super) fn open(
         name: &str,
-        place: Place,
+        place: DeviceAddress,
         port: u16,
         stream: PhoneStream,
         picture: LanPicture,

@@ -12,9 +12,9 @@ use rapid_core::time::Stamp;
 use rapid_registry::LanPicture;
 use tokio::time::{Instant, timeout_at};
 
+use super::address::Server;
 use super::http::{self, Reply};
 use super::multipart::{Cut, Multipart, boundary};
-use super::place::Server;
 use super::{PATIENCE, jpeg};
 use crate::driver::{DriverError, Reading};
 

@@ -10,13 +10,13 @@
 //! Invariant: everything a server sends is bounded: headers, bodies, pictures, packets, and their duration.
 //! Invariant: only the entry's own device is accepted.
 
+mod address;
 mod gopro;
 mod http;
 mod iphone;
 mod jpeg;
 mod mjpeg;
 mod multipart;
-mod place;
 mod remote;
 mod udp;
 
@@ -27,8 +27,8 @@ use rapid_registry::device::DeviceNode;
 use rapid_registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec, RemoteSamples};
 
 use super::{Agreed, ClockOffset, DriverError, Reading};
-use crate::link::{Link, LinkState, LinkWatch};
-use place::Place;
+use crate::link::{LinkState, LinkWatch, NetworkLink};
+use address::DeviceAddress;
 
 /// A camera or a phone that sends no complete sample for this long is reconnected. Six of these and the delays between
 /// them fit into the minute in which five restarts are allowed.
@@ -67,7 +67,7 @@ impl Lan {
             LanFind::Adapter { host } => *host,
             LanFind::Mdns { .. } | LanFind::Host { .. } => None,
         };
-        let place = Place::new(node, host)?;
+        let place = DeviceAddress::new(node, host)?;
         let at = place.to_string();
         let protocol = match &lan.protocol {
             LanProtocol::Mjpeg { port, path, picture } => {
@@ -145,8 +145,8 @@ impl Lan {
 
 /// The link of a network adapter, which stays plugged in when its cable, or the device behind it, is pulled. For a
 /// device found on the network, discovery monitors the link.
-fn link_of(node: &DeviceNode) -> Link {
-    if let DeviceNode::Net(interface) = node { Link::of(interface) } else { Link::default() }
+fn link_of(node: &DeviceNode) -> NetworkLink {
+    if let DeviceNode::Net(interface) = node { NetworkLink::of(interface) } else { NetworkLink::default() }
 }
 
 fn describe(lan: &LanSpec, at: &str) -> (String, Option<Format>) {

@@ -16,7 +16,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout, timeout_at};
 
-use super::place::Server;
+use super::address::Server;
 use crate::driver::{ClockOffset, DriverError, Reading};
 
 /// More samples at once are not missing: their numbers began again.

@@ -24,7 +24,7 @@ use tokio::io::unix::AsyncFd;
 use tokio::task::coop::consume_budget;
 use tokio::time::timeout;
 
-use super::place::{Place, port_error};
+use super::address::{DeviceAddress, port_error};
 use crate::driver::datagram::{self, Datagram};
 use crate::driver::{DriverError, Reading};
 
@@ -37,7 +37,7 @@ const LONGEST_WAIT: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub(super) struct Packets {
     socket: AsyncFd<OwnedFd>,
-    place: Place,
+    place: DeviceAddress,
     packet: Vec<u8>,
     filled: usize,
     /// Number of packets that the kernel has dropped so far.
@@ -49,7 +49,7 @@ pub(super) struct Packets {
 
 impl Packets {
     /// Receives packets at `port`; a packet has at most `max_bytes`.
-    pub(super) fn open(place: Place, port: u16, max_bytes: usize) -> Result<Self, DriverError> {
+    pub(super) fn open(place: DeviceAddress, port: u16, max_bytes: usize) -> Result<Self, DriverError> {
         let socket = bind(&place, port).map_err(|error| port_error(port, &error))?;
         // SAFETY: the registered value owns the descriptor.
         let socket = unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }
@@ -127,7 +127,7 @@ fn stamp(kernel: Option<u64>, now: Stamp, wall: u64) -> (Stamp, u32) {
     }
 }
 
-fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
+fn bind(place: &DeviceAddress, port: u16) -> io::Result<OwnedFd> {
     let own = SocketAddr::new(own_side(place.peer()), port);
     let family = if own.is_ipv6() { AddressFamily::INET6 } else { AddressFamily::INET };
     let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
@@ -167,7 +167,7 @@ mod tests {
         ] {
             let host: IpAddr = host.parse().expect("an address");
             let node = DeviceNode::Lan { address: SocketAddr::new(host, 2368), last_received: LastReceived::default() };
-            let place = Place::new(&node, None).expect("a place");
+            let place = DeviceAddress::new(&node, None).expect("a place");
             let expected = expected.unwrap_or(host);
             match bind(&place, 0) {
                 Ok(socket) => {

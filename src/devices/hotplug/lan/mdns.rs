@@ -24,7 +24,7 @@ use tokio::time::{MissedTickBehavior, interval};
 
 use super::super::UnplugSource;
 use super::watch::Watch;
-use crate::link::{LOOK_EVERY, Link, LinkState};
+use crate::link::{LOOK_EVERY, LinkState, NetworkLink};
 
 /// More devices of one service than a rig has.
 const MOST_INSTANCES: usize = 64;
@@ -64,7 +64,7 @@ pub(super) struct Wanted {
 
 /// An instance that is announced.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Found {
+struct AnnouncedDevice {
     /// Its own name, without the service's.
     name: String,
     /// At least one; the best first.
@@ -122,10 +122,10 @@ struct Service {
     domain: String,
     wanted: Vec<Wanted>,
     /// Announced instances, by full name.
-    known: BTreeMap<String, Found>,
+    known: BTreeMap<String, AnnouncedDevice>,
     /// Instances whose link went down, with that link: they are reported again when it is up. The library reports
     /// nothing then, because their announcements have not changed.
-    cut: BTreeMap<String, Link>,
+    cut: BTreeMap<String, NetworkLink>,
 }
 
 impl Service {
@@ -155,7 +155,7 @@ impl Service {
         }
     }
 
-    async fn announced(&mut self, full: String, found: Found, now: Stamp) {
+    async fn announced(&mut self, full: String, found: AnnouncedDevice, now: Stamp) {
         if self.known.len() >= MOST_INSTANCES && !self.known.contains_key(&full) {
             return;
         }
@@ -178,11 +178,11 @@ impl Service {
                     !self.cut.contains_key(*full)
                         && !self.wanted.iter().any(|other| other.current.as_ref() == Some(full))
                 };
-                let names = |wanted: &Wanted, found: &Found| {
+                let names = |wanted: &Wanted, found: &AnnouncedDevice| {
                     wanted.instance.as_ref().is_some_and(|name| name.eq_ignore_ascii_case(&found.name))
                 };
                 // An instance that another entry names belongs to that entry, even if it is announced first.
-                let fits = |found: &Found| match wanted.instance {
+                let fits = |found: &AnnouncedDevice| match wanted.instance {
                     Some(_) => names(wanted, found),
                     None => !self.wanted.iter().any(|other| names(other, found)),
                 };
@@ -281,10 +281,10 @@ fn pause(lease: Duration) -> Duration {
     PAUSE.min(lease / 3)
 }
 
-fn found(service: &ResolvedService, domain: &str) -> Option<(String, Found)> {
+fn found(service: &ResolvedService, domain: &str) -> Option<(String, AnnouncedDevice)> {
     let name = service.fullname.strip_suffix(domain)?.strip_suffix('.')?;
     let addresses = ordered(service.addresses.iter().filter_map(scoped), service.port);
-    (!addresses.is_empty()).then(|| (service.fullname.clone(), Found { name: unescaped(name), addresses }))
+    (!addresses.is_empty()).then(|| (service.fullname.clone(), AnnouncedDevice { name: unescaped(name), addresses }))
 }
 
 /// An address, with the scope that a link-local one needs. Of this computer's own addresses only those announced on it:

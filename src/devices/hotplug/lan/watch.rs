@@ -14,7 +14,7 @@ use rapid_registry::device::{Attachment, DeviceNode, LanIdentity, LastReceived, 
 use tokio::sync::mpsc;
 
 use super::super::{HotplugEvent, UnplugSource};
-use crate::link::{Link, LinkState};
+use crate::link::{LinkState, NetworkLink};
 
 /// See the module's comment.
 #[derive(Debug)]
@@ -26,7 +26,7 @@ pub(super) struct Watch {
     lease: Lease,
     /// When the driver last received.
     pub(super) last_received: LastReceived,
-    pub(super) link: Link,
+    pub(super) link: NetworkLink,
     /// The address of the device, while it is present.
     pub(super) address: Option<SocketAddr>,
     events: mpsc::Sender<HotplugEvent>,
@@ -40,7 +40,7 @@ impl Watch {
             grace: Duration::ZERO,
             lease: Lease::new(length),
             last_received: LastReceived::default(),
-            link: Link::default(),
+            link: NetworkLink::default(),
             address: None,
             events,
         }
@@ -70,7 +70,7 @@ impl Watch {
         // A new address is reported again, so that the rig sees another unit at its path.
         self.address = Some(address);
         self.last_received = LastReceived::default();
-        self.link = Link::to(address);
+        self.link = NetworkLink::to(address);
         let unit = LanIdentity {
             entry: self.entry.clone(),
             address: address.to_string(),
@@ -124,7 +124,7 @@ impl Watch {
     }
 
     #[cfg(test)]
-    pub(super) fn lead_over(&mut self, link: Link) {
+    pub(super) fn lead_over(&mut self, link: NetworkLink) {
         self.link = link;
     }
 

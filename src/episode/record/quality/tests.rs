@@ -412,7 +412,7 @@ fn samples_waiting_for_the_mask_are_bounded_and_judged() {
         // Longer from one to the next.
         at += seq;
         measures.sample(id(0), &seen(seq, at, 0, b"x"));
-        assert!(measures.lanes[0].as_ref().is_some_and(|lane| lane.pending.len() <= MOST_PENDING));
+        assert!(measures.modalities[0].as_ref().is_some_and(|modality| modality.pending.len() <= MOST_PENDING));
     }
     // The last is the longest.
     let longest = (3 * MOST_PENDING as u64 - 1) as f64 / 1e3;

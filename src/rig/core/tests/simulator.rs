@@ -362,8 +362,8 @@ impl Storm {
     fn check_state(&self, input: &Input) -> Result<(), String> {
         for model in &self.models {
             let id = model.id;
-            let Some(lane) = self.core.lane(id) else { return Err(format!("no lane {id}")) };
-            let attached = lane.slot.attached();
+            let Some(modality) = self.core.modality(id) else { return Err(format!("no modality {id}")) };
+            let attached = modality.slot.attached();
             let (state, epoch) = self.core.state(id);
             ensure(state == model.state, || format!("{id} is {state:?}, announced as {:?}", model.state))?;
             let runs = matches!(state, SlotState::Opening | SlotState::Streaming | SlotState::Stalled);
@@ -379,7 +379,7 @@ impl Storm {
             })?;
             // Every waiting state has a deadline.
             let waits = state == SlotState::Backoff || state == SlotState::Absent && attached.is_some();
-            let deadline = lane.slot.deadline();
+            let deadline = modality.slot.deadline();
             ensure(waits == deadline.is_some(), || format!("{id} is {state:?} with deadline {deadline:?}"))?;
             let is_due = deadline.is_some_and(|deadline| deadline <= self.now);
             ensure(*input != Input::Timer || !is_due, || format!("the deadline of {id} was ignored"))?;

@@ -19,8 +19,8 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep};
 use tokio_util::task::AbortOnDropHandle;
 
+use super::super::address::Server;
 use super::super::http;
-use super::super::place::Server;
 use super::answer::{self, Name, State};
 use super::clip::{self, Clip, Failure};
 use super::{ANSWER_LIMIT, Clips, LARGEST_ANSWER, TRIES, ask};
@@ -32,7 +32,7 @@ pub(super) type ReportedEpisode = Option<Option<PathBuf>>;
 
 /// Time limits.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Pace {
+pub(super) struct TimeLimits {
     /// The camera switches itself off when it receives nothing for longer than this (Open GoPro, "keep alive").
     pub(super) keep_alive: Duration,
     /// A stopped clip appears in the camera's list after a moment, usually within 1.5 s.
@@ -41,7 +41,7 @@ pub(super) struct Pace {
     pub(super) listed_at_the_latest: Duration,
 }
 
-impl Pace {
+impl TimeLimits {
     pub(super) const USUAL: Self = Self {
         keep_alive: Duration::from_secs(3),
         listed_within: Duration::from_secs(4),
@@ -56,7 +56,7 @@ const LOOK_FOR_CLIP: Duration = Duration::from_millis(100);
 pub(super) struct Camera {
     name: String,
     server: Server,
-    pace: Pace,
+    limits: TimeLimits,
     clips: Clips,
     states: mpsc::Sender<Result<State, DriverError>>,
     books: Books,
@@ -81,12 +81,12 @@ impl Camera {
         clips: Clips,
         books: Books,
         states: mpsc::Sender<Result<State, DriverError>>,
-        pace: Pace,
+        limits: TimeLimits,
     ) -> Self {
         let mut camera = Self {
             name: name.to_owned(),
             server,
-            pace,
+            limits,
             clips,
             states,
             is_inherited: books.shutter().is_some(),
@@ -125,7 +125,7 @@ impl Camera {
 
     /// Runs until its owner is dropped, or the camera does not answer.
     pub(super) async fn run(mut self, mut reported: watch::Receiver<ReportedEpisode>) {
-        let mut ticks = interval(self.pace.keep_alive);
+        let mut ticks = interval(self.limits.keep_alive);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut is_first = true;
         loop {
@@ -209,7 +209,7 @@ impl Camera {
         self.list().await;
         if let Some((shutter, _)) = self.unlisted.take() {
             self.unknown(&shutter, "it was not listed when the next episode began").await;
-            self.unclear_until = Some(Instant::now() + self.pace.listed_at_the_latest);
+            self.unclear_until = Some(Instant::now() + self.limits.listed_at_the_latest);
         }
         let before = if self.unclear_until.is_some_and(|until| Instant::now() < until) {
             Before::Unknown("clips of episodes before it were not listed yet when it began".to_owned())
@@ -253,17 +253,17 @@ impl Camera {
         self.is_stated = false;
         if let Before::Unknown(reason) = &shutter.before {
             self.unknown(&shutter, reason).await;
-            self.unclear_until = Some(Instant::now() + self.pace.listed_at_the_latest);
+            self.unclear_until = Some(Instant::now() + self.limits.listed_at_the_latest);
             return true;
         }
         let stopped = Instant::now();
-        self.unlisted = Some((shutter, stopped + self.pace.listed_at_the_latest));
+        self.unlisted = Some((shutter, stopped + self.limits.listed_at_the_latest));
         loop {
             self.list().await;
             if self.unlisted.is_none() {
                 return true;
             }
-            if stopped.elapsed() >= self.pace.listed_within {
+            if stopped.elapsed() >= self.limits.listed_within {
                 tracing::warn!(device = self.name, "it does not list its new clip yet");
                 return true;
             }

@@ -21,8 +21,8 @@ use rustix::fs::FlockOperation;
 use rustix::io::Errno;
 use tokio::time::timeout;
 
+use super::super::address::Server;
 use super::super::http::{self, Reply};
-use super::super::place::Server;
 use super::answer::{Name, is_plain};
 
 const HEAD_LIMIT: Duration = Duration::from_secs(5);

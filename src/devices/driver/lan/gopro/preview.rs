@@ -27,9 +27,9 @@ use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 use tokio_util::task::AbortOnDropHandle;
 
+use super::super::address::Server;
 use super::super::jpeg;
 use super::super::multipart::{Cut, Multipart};
-use super::super::place::Server;
 use super::ask;
 use crate::driver::{DriverError, Reading};
 

@@ -40,8 +40,8 @@ async fn camera(clip: Vec<u8>, breaks: usize) -> (Server, Arc<AtomicUsize>) {
             let _ = stream.write_all(sent).await;
         }
     });
-    let place =
-        Place::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None).expect("a place");
+    let place = DeviceAddress::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None)
+        .expect("a place");
     (place.server(address.port()).expect("a server"), asked)
 }
 
@@ -208,8 +208,8 @@ impl Fake {
                 let _ = stream.write_all(&[head.as_bytes(), &body].concat()).await;
             }
         });
-        let place =
-            Place::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None).expect("a place");
+        let place = DeviceAddress::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None)
+            .expect("a place");
         (fake, place.server(address.port()).expect("a server"))
     }
 
@@ -269,7 +269,7 @@ impl Fake {
     }
 }
 
-const QUICK: Pace = Pace {
+const QUICK: TimeLimits = TimeLimits {
     keep_alive: Duration::from_millis(50),
     listed_within: Duration::from_millis(300),
     listed_at_the_latest: Duration::from_secs(30),
@@ -484,8 +484,8 @@ async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result
             let _ = stream.write_all(&answer).await;
         }
     });
-    let place =
-        Place::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None).expect("a place");
+    let place = DeviceAddress::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None)
+        .expect("a place");
     let server = place.server(address.port()).expect("a server");
     let folder = tempfile::tempdir().expect("a folder");
     let clip = Clip::new(named(1), size, folder.path().join("ep_001.mcap"), "gopro");

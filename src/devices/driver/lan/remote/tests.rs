@@ -5,7 +5,7 @@ use rapid_registry::LanPicture;
 use rapid_registry::device::{DeviceNode, LastReceived};
 use tokio::net::TcpListener;
 
-use super::super::place::Place;
+use super::super::address::DeviceAddress;
 use super::*;
 
 const PICTURES: RemoteSamples = RemoteSamples::Pictures(LanPicture { width: 4, height: 2, fps: 30 }, PixelFormat::Grey);
@@ -46,7 +46,7 @@ async fn open(samples: RemoteSamples, sent: Vec<Vec<u8>>, lease: Duration, stays
         }
     });
     let node = DeviceNode::Lan { address, last_received: LastReceived::default() };
-    let server = Place::new(&node, None)?.server(address.port())?;
+    let server = DeviceAddress::new(&node, None)?.server(address.port())?;
     let wanted = Wanted { host: "robot-b", device: "cam", samples, lease };
     Remote::open("x", server, wanted, 8).await
 }
@@ -148,7 +148,7 @@ async fn a_refusal_the_end_and_silence_mean_that_it_is_gone() {
         listener.local_addr().expect("an address")
     };
     let node = DeviceNode::Lan { address: closed, last_received: LastReceived::default() };
-    let server = Place::new(&node, None).and_then(|place| place.server(closed.port())).expect("a server");
+    let server = DeviceAddress::new(&node, None).and_then(|place| place.server(closed.port())).expect("a server");
     let wanted = Wanted { host: "robot-b", device: "cam", samples: PICTURES, lease: LEASE };
     assert!(matches!(Remote::open("x", server, wanted, 8).await, Err(DriverError::Retry(_))));
 }

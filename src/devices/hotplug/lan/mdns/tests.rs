@@ -35,7 +35,7 @@ impl Bench {
 
     async fn announced(&mut self, name: &str, addresses: &[&str]) -> Vec<String> {
         let addresses = addresses.iter().map(|address| address.parse().expect("an address")).collect();
-        let found = Found { name: name.into(), addresses };
+        let found = AnnouncedDevice { name: name.into(), addresses };
         self.service.announced(format!("{name}._s._tcp.local."), found, self.now).await;
         self.reported()
     }
@@ -43,7 +43,7 @@ impl Bench {
     /// Instance a was announced so long ago: what its driver receives has the machine's time.
     async fn attached(&mut self, ago: Duration) -> Attachment {
         self.now = Stamp::now().before(ago);
-        let found = Found { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
+        let found = AnnouncedDevice { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
         self.service.announced("a._s._tcp.local.".into(), found, self.now).await;
         let Ok(HotplugEvent::Added(attachment)) = self.reported.try_recv() else { panic!("not reported") };
         attachment
@@ -225,7 +225,7 @@ async fn a_link_that_was_down_for_a_moment_brings_its_device_back() {
     bench.announced("a", &["127.0.0.1:5"]).await;
     bench.pass(200).await;
     std::fs::write(&state, "0\n").expect("written");
-    bench.service.wanted[0].watch.lead_over(Link::of(folder.path().to_str().expect("plain text")));
+    bench.service.wanted[0].watch.lead_over(NetworkLink::of(folder.path().to_str().expect("plain text")));
     assert_eq!(bench.pass(1000).await, (0, vec!["-/lan/phone link".to_owned()]));
     // Another instance's announcement is not evidence of this one.
     assert_eq!(bench.announced("b", &["127.0.0.1:6"]).await, ["+phone b 127.0.0.1:6"]);
@@ -242,7 +242,7 @@ async fn an_announcement_over_another_link_counts_at_once() {
     std::fs::write(folder.path().join("carrier"), "0\n").expect("written");
     let mut bench = Bench::new(&[("phone", None)]);
     bench.announced("a", &["127.0.0.1:5"]).await;
-    bench.service.wanted[0].watch.lead_over(Link::of(folder.path().to_str().expect("plain text")));
+    bench.service.wanted[0].watch.lead_over(NetworkLink::of(folder.path().to_str().expect("plain text")));
     assert_eq!(bench.pass(500).await.1, ["-/lan/phone link"]);
     assert_eq!(bench.announced("a", &["127.0.0.2:5"]).await, ["+phone a 127.0.0.2:5"]);
 }

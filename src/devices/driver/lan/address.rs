@@ -10,7 +10,7 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::timeout;
 
 use crate::driver::DriverError;
-use crate::link::{Link, LinkState};
+use crate::link::{LinkState, NetworkLink};
 
 /// A device on the same network answers within milliseconds.
 const CONNECT_LIMIT: Duration = Duration::from_secs(2);
@@ -19,7 +19,7 @@ const BACKLOG: u32 = 4;
 
 /// See the module's comment.
 #[derive(Debug, Clone)]
-pub(super) struct Place {
+pub(super) struct DeviceAddress {
     interface: Option<String>,
     /// With the scope of a link-local address.
     address: Option<SocketAddr>,
@@ -29,11 +29,11 @@ pub(super) struct Place {
 /// A server of a device.
 #[derive(Debug, Clone)]
 pub(super) struct Server {
-    pub(super) place: Place,
+    pub(super) place: DeviceAddress,
     pub(super) address: SocketAddr,
 }
 
-impl Place {
+impl DeviceAddress {
     /// `host` is the device's address if the node is only an interface.
     pub(super) fn new(node: &DeviceNode, host: Option<IpAddr>) -> Result<Self, DriverError> {
         match node {
@@ -88,7 +88,7 @@ impl Place {
 
     /// Whether the interface, and so the device, is gone.
     pub(super) fn is_gone(&self) -> bool {
-        self.interface.as_ref().is_some_and(|interface| Link::of(interface).state() == LinkState::Gone)
+        self.interface.as_ref().is_some_and(|interface| NetworkLink::of(interface).state() == LinkState::Gone)
     }
 
     /// The error for a device that no longer answers.
@@ -142,7 +142,7 @@ impl Server {
     }
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for DeviceAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match (self.peer(), &self.interface) {
             (Some(peer), Some(interface)) => write!(f, "{peer} at {interface}"),
