@@ -121,7 +121,7 @@ async fn what_does_not_fit_the_entry_is_named_with_its_fix() {
     assert_eq!(ends(sized, vec![sample(0, Grey, &[0; 8])]).await, expected);
     let foreign =
         ends(PICTURES, vec![b"HTTP/1.1 400 Bad Request\r\n\r\n and what a server may send then".to_vec(); 2]).await;
-    assert!(foreign.contains("no frame of rapid-remote"), "{foreign}");
+    assert!(foreign.contains("not a frame of rapid-remote"), "{foreign}");
     let head = |capture_ns| {
         let encoding = Some(Grey);
         Head { kind: Kind::Sample, encoding, capture_ns, width: 4, height: 2, ..Head::default() }.bytes().to_vec()
