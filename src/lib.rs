@@ -1,7 +1,14 @@
 #![doc = include_str!("../docs/architecture.md")]
 // The whole program is linted with all features; with fewer, code that only they use is unused.
 #![cfg_attr(
-    not(all(feature = "foxglove", feature = "lan", feature = "motors", feature = "policy", feature = "web")),
+    not(all(
+        feature = "cameras",
+        feature = "foxglove",
+        feature = "lan",
+        feature = "motors",
+        feature = "policy",
+        feature = "web"
+    )),
     allow(dead_code, unused_imports, unused_variables, clippy::match_same_arms, clippy::needless_pass_by_value)
 )]
 

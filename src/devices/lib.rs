@@ -3,7 +3,7 @@
 //! Invariant: nothing here knows a mask, a slot or an episode in progress: the rig decides.
 
 #![cfg_attr(
-    not(all(feature = "lan", feature = "motors")),
+    not(all(feature = "cameras", feature = "lan", feature = "motors")),
     allow(dead_code, unused_imports, unused_variables, clippy::match_same_arms, clippy::needless_pass_by_value)
 )]
 

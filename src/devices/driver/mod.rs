@@ -96,6 +96,7 @@ pub enum DriverError {
 #[derive(Debug)]
 pub enum Driver {
     /// A V4L2 camera.
+    #[cfg(feature = "cameras")]
     Camera(Box<camera::Camera>),
     /// A serial line.
     Serial(Box<serial::Serial>),
@@ -121,6 +122,7 @@ type Unlinked = BoxFuture<'static, ()>;
 macro_rules! each {
     ($self:ident, $driver:ident => $what:expr) => {
         match $self {
+            #[cfg(feature = "cameras")]
             Driver::Camera($driver) => $what,
             Driver::Serial($driver) => $what,
             #[cfg(feature = "motors")]
@@ -152,6 +154,7 @@ impl Driver {
     /// When the node is gone, cannot be opened, or cannot do what `spec` requests.
     pub async fn open(spec: &DeviceSpec, node: &DeviceNode) -> Result<Self, DriverError> {
         match (&spec.node, node) {
+            #[cfg(feature = "cameras")]
             (NodeSpec::Camera(camera), DeviceNode::Video(path)) => {
                 Ok(Self::Camera(Box::new(camera::Camera::open(&spec.name, camera, path).await?)))
             }
@@ -300,7 +303,7 @@ impl Driver {
 /// Why no driver opens this node for `spec`: the program was built without it, or the node is of another kind.
 fn not_opened(spec: &DeviceSpec, node: &DeviceNode) -> DriverError {
     let (requested, missing) = match spec.node {
-        NodeSpec::Camera(_) => ("camera", None),
+        NodeSpec::Camera(_) => ("camera", (!cfg!(feature = "cameras")).then_some("cameras")),
         NodeSpec::Serial(_) => ("serial line", None),
         NodeSpec::Can(_) => ("CAN adapter", (!cfg!(feature = "motors")).then_some("motors")),
         NodeSpec::Lan(_) => ("network device", (!cfg!(feature = "lan")).then_some("lan")),
@@ -308,10 +311,7 @@ fn not_opened(spec: &DeviceSpec, node: &DeviceNode) -> DriverError {
         NodeSpec::Process(_) => ("program", None),
     };
     if let Some(feature) = missing {
-        return DriverError::Fatal(format!(
-            "this rapid was built without `{feature}`: build it with `cargo build --release --features {feature}`, or \
-             remove the entry"
-        ));
+        return built_without(feature);
     }
     let is = match node {
         DeviceNode::Video(_) => "a camera",
@@ -336,4 +336,12 @@ async fn unblock<T: Send + 'static>(
         Ok(result) => result,
         Err(ended) => Err(DriverError::Retry(format!("opening ended early: {ended}"))),
     }
+}
+
+/// Why there is no driver: a feature of the build is missing.
+fn built_without(feature: &str) -> DriverError {
+    DriverError::Fatal(format!(
+        "this rapid was built without `{feature}`: build it with `cargo build --release --features {feature}`, or remove \
+         the entry"
+    ))
 }
