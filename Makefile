@@ -80,7 +80,7 @@ test-all: setup-all test ## before a release and at night: make test, then guest
 	$(TESTED) scripts/tests-all.sh $(TESTS)
 
 features: ## compile the program with no cargo feature, and with each alone
-	$(TESTED) scripts/features.sh '' cameras export foxglove lan motors policy web
+	$(TESTED) scripts/features.sh '' cameras export foxglove graphics lan motors policy web
 
 lint: ## format and clippy
 	cargo fmt --all --check

@@ -60,7 +60,7 @@ part "sections of make bench" "$@" --test smoke -- --ignored
 part "unit tests, each case of them" env RAPID_THOROUGH=1 "$@" --lib
 part "statistics of the simulated touch" "$@" --lib -- --ignored touch::
 part "each crate alone" each_crate
-part "cargo features" scripts/features.sh '' cameras export foxglove lan motors policy web
+part "cargo features" scripts/features.sh '' cameras export foxglove graphics lan motors policy web
 part "fuzzing" env FUZZ_SECONDS="${FUZZ_SECONDS:-20}" scripts/fuzz.sh
 if [[ -x $cache/train-venv/bin/python ]]; then part "train-test" make train-test; else skip train-test "its Python is not there: make train-test fetches 6 GB"; fi
 if [[ -x $cache/venv-lerobot/bin/python ]]; then part "lerobot-test" make lerobot-test; else skip lerobot-test "its Python is not there: make lerobot-test fetches 8 GB"; fi

@@ -4,18 +4,20 @@
 //! Invariant: what a terminal can show follows from the environment and from the size of its window, so that the first frame
 //! waits for no answer. Only one that calls itself kitty is asked for its version, because an old one would show boxes.
 
-use image::imageops::FilterType;
-use image::{DynamicImage, RgbImage};
+#[cfg(feature = "graphics")]
+mod graphics;
+
+use std::ops::Range;
+
 use rapid_core::modality::ModalityId;
 use rapid_pictures::pixels::{self, Pixels};
 use rapid_status::palette::Palette;
 use rapid_status::preview::Preview;
 use ratatui::Frame;
+use ratatui::buffer::Buffer;
 use ratatui::layout::{Rect, Size};
+use ratatui::style::{Color, Style};
 use ratatui::text::Line;
-use ratatui_image::picker::{Picker, ProtocolType};
-use ratatui_image::protocol::Protocol;
-use ratatui_image::{FontSize, Image, Resize};
 
 use super::theme::Theme;
 
@@ -58,12 +60,11 @@ impl Picture {
         Self { device: preview.device, seq: preview.seq, width, height, rgb }
     }
 
-    /// Every n-th pixel, so that none of its sides is much longer than the larger of `sides`.
-    fn image(&self, [width, height]: [usize; 2]) -> Option<DynamicImage> {
-        let step = (self.width / width.max(1)).min(self.height / height.max(1)).max(1);
-        let (width, height, rgb) = pixels::every(step, [self.height, self.width], &self.rgb);
-        let side = |side: usize| u32::try_from(side).ok();
-        Some(DynamicImage::ImageRgb8(RgbImage::from_raw(side(width)?, side(height)?, rgb)?))
+    /// Width, height and every n-th pixel, so that none of its sides is shorter than those of `sides`, nor much longer than
+    /// twice the larger.
+    fn scaled_down(&self, [width, height]: [usize; 2]) -> (usize, usize, Vec<u8>) {
+        let step = (self.width / (2 * width).max(1)).min(self.height / (2 * height).max(1)).max(1);
+        pixels::every(step, [self.height, self.width], &self.rgb)
     }
 
     /// Brightness, 0 to 1, at a place given by shares of width and height.
@@ -77,12 +78,28 @@ impl Picture {
     }
 }
 
+/// How a terminal shows pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Protocol {
+    /// Half blocks in two colours, two pixels to a cell.
+    Blocks,
+    /// Kitty's graphics protocol, with placeholders among the text.
+    Kitty,
+    /// iTerm2's inline images.
+    Iterm2,
+    /// DEC's sixels.
+    Sixel,
+}
+
 /// Where pictures are drawn, and the last one as the terminal takes it.
 #[derive(Default)]
 pub struct Canvas {
     /// `None`: as characters.
-    picker: Option<Picker>,
-    last: Option<(Key, Protocol)>,
+    protocol: Option<Protocol>,
+    /// Of a cell, in pixels.
+    #[cfg(feature = "graphics")]
+    cell: (u16, u16),
+    last: Option<(Key, Encoded)>,
     /// Where this frame, and the one before it, have a picture.
     drawn: [Option<Rect>; 2],
 }
@@ -90,11 +107,16 @@ pub struct Canvas {
 /// What a drawn picture depends on.
 type Key = (ModalityId, u64, Size);
 
+/// A picture as it is written to the terminal.
+enum Encoded {
+    Blocks(Blocks),
+    #[cfg(feature = "graphics")]
+    Graphics(graphics::Graphics),
+}
+
 impl std::fmt::Debug for Canvas {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Canvas")
-            .field("protocol", &self.picker.as_ref().map(Picker::protocol_type))
-            .finish_non_exhaustive()
+        f.debug_struct("Canvas").field("protocol", &self.protocol).finish_non_exhaustive()
     }
 }
 
@@ -117,35 +139,35 @@ impl Canvas {
         let in_multiplexer = set("TMUX").is_some() || is("TERM", &["screen", "tmux"]);
         let protocol = match wanted.as_str() {
             "text" => return Self::default(),
-            "kitty" => ProtocolType::Kitty,
-            "iterm2" => ProtocolType::Iterm2,
-            "sixel" => ProtocolType::Sixel,
-            "blocks" => ProtocolType::Halfblocks,
+            "kitty" => Protocol::Kitty,
+            "iterm2" => Protocol::Iterm2,
+            "sixel" => Protocol::Sixel,
+            "blocks" => Protocol::Blocks,
             // A multiplexer passes graphics on only where it is set up for them.
-            _ if in_multiplexer => ProtocolType::Halfblocks,
+            _ if in_multiplexer => Protocol::Blocks,
             _ if set("KITTY_WINDOW_ID").is_some() || is("TERM", &["kitty", "ghostty"]) => {
                 // Not needed where it reports no size.
-                if cell.is_some() && places_pictures_in_text() { ProtocolType::Kitty } else { ProtocolType::Halfblocks }
+                if cell.is_some() && places_pictures_in_text() { Protocol::Kitty } else { Protocol::Blocks }
             }
             _ if is("TERM_PROGRAM", &["iTerm", "WezTerm"])
                 || is("LC_TERMINAL", &["iTerm"])
                 || set("KONSOLE_VERSION").is_some() =>
             {
-                ProtocolType::Iterm2
+                Protocol::Iterm2
             }
-            _ if is("TERM", &["foot", "mlterm", "sixel", "yaft", "contour"]) => ProtocolType::Sixel,
-            _ => ProtocolType::Halfblocks,
+            _ if is("TERM", &["foot", "mlterm", "sixel", "yaft", "contour"]) => Protocol::Sixel,
+            _ => Protocol::Blocks,
         };
         // The kernel's console has 16 colours.
-        if protocol == ProtocolType::Halfblocks && is("TERM", &["linux", "dumb", "vt"]) && wanted.is_empty() {
+        if protocol == Protocol::Blocks && is("TERM", &["linux", "dumb", "vt"]) && wanted.is_empty() {
             return Self::default();
         }
-        // A half block is a pixel: nothing larger than what is shown is computed.
-        let (width, height) = cell.filter(|_| protocol != ProtocolType::Halfblocks).unwrap_or((1, 2));
-        #[expect(deprecated, reason = "the alternative queries the terminal and waits for its answer")]
-        let mut picker = Picker::from_fontsize(FontSize { width, height });
-        picker.set_protocol_type(if cell.is_some() { protocol } else { ProtocolType::Halfblocks });
-        Self { picker: Some(picker), ..Self::default() }
+        Self {
+            protocol: Some(if cell.is_some() && cfg!(feature = "graphics") { protocol } else { Protocol::Blocks }),
+            #[cfg(feature = "graphics")]
+            cell: cell.unwrap_or((1, 2)),
+            ..Self::default()
+        }
     }
 
     /// Begins a frame.
@@ -157,8 +179,7 @@ impl Canvas {
     /// terminals (Konsole) keep a picture beneath the text that is written over it.
     pub(super) fn leaves_a_trace(&self) -> bool {
         let [now, before] = self.drawn;
-        let stays = |picker: &Picker| matches!(picker.protocol_type(), ProtocolType::Sixel | ProtocolType::Iterm2);
-        before.is_some() && before != now && self.picker.as_ref().is_some_and(stays)
+        before.is_some() && before != now && matches!(self.protocol, Some(Protocol::Sixel | Protocol::Iterm2))
     }
 
     /// Draws a picture as large as it fits, in its proportions.
@@ -166,28 +187,93 @@ impl Canvas {
         if area.is_empty() {
             return;
         }
-        let Some(picker) = self.picker.as_ref().filter(|_| theme.palette == Palette::Ansi) else {
+        let Some(protocol) = self.protocol.filter(|_| theme.palette == Palette::Ansi) else {
             return as_text(frame, area, picture);
         };
         let size = Size::new(area.width, area.height);
         let key = (picture.device, picture.seq, size);
         if self.last.as_ref().is_none_or(|(last, _)| *last != key) {
-            let FontSize { width, height } = picker.font_size();
-            let pixels = [(size.width, width), (size.height, height)]
-                .map(|(cells, side)| usize::from(cells) * usize::from(side));
-            let scaled = Resize::Scale(Some(FilterType::Triangle));
-            let image = picture.image(pixels.map(|side| side * 2));
-            let protocol = image.and_then(|image| picker.new_protocol(image, size, scaled).ok());
-            self.last = protocol.map(|protocol| (key, protocol));
+            self.last = self.encode(protocol, picture, size).map(|encoded| (key, encoded));
         }
         match &self.last {
-            Some((_, protocol)) => {
-                frame.render_widget(Image::new(protocol), area);
-                self.drawn[0] = Some(area);
-            }
-            None => as_text(frame, area, picture),
+            Some((_, Encoded::Blocks(blocks))) => blocks.draw(frame.buffer_mut(), area),
+            #[cfg(feature = "graphics")]
+            Some((_, Encoded::Graphics(graphics))) => graphics.draw(frame, area),
+            None => return as_text(frame, area, picture),
+        }
+        self.drawn[0] = Some(area);
+    }
+
+    /// `None` if it cannot be encoded.
+    #[cfg_attr(not(feature = "graphics"), expect(clippy::unused_self, reason = "half blocks need no size of a cell"))]
+    fn encode(&self, protocol: Protocol, picture: &Picture, size: Size) -> Option<Encoded> {
+        match protocol {
+            Protocol::Blocks => Some(Encoded::Blocks(Blocks::new(picture, size))),
+            #[cfg(feature = "graphics")]
+            _ => graphics::Graphics::new(protocol, picture, self.cell, size).map(Encoded::Graphics),
+            #[cfg(not(feature = "graphics"))]
+            _ => None,
         }
     }
+}
+
+/// A picture in half blocks.
+struct Blocks {
+    width: usize,
+    /// Row by row, the colours of both pixels of each cell; none below an odd number of rows.
+    cells: Vec<(Color, Option<Color>)>,
+}
+
+impl Blocks {
+    /// As large as it fits into `size`, in its proportions: a pixel is as high as it is wide.
+    fn new(picture: &Picture, size: Size) -> Self {
+        let (columns, rows) = (usize::from(size.width), 2 * usize::from(size.height));
+        let (width, height) = (picture.width.max(1), picture.height.max(1));
+        // The side that the area limits is filled, the other one follows.
+        let (columns, rows) = if columns * height <= rows * width {
+            (columns, (columns * height).div_euclid(width).max(1))
+        } else {
+            ((rows * width).div_euclid(height).max(1), rows)
+        };
+        let (width, height, rgb) = picture.scaled_down([columns, rows]);
+        let pixel = |column: usize, row: usize| {
+            let [xs, ys] = [(column, columns, width), (row, rows, height)].map(|(at, of, side)| {
+                let first = (at * side / of).min(side.saturating_sub(1));
+                first..((at + 1) * side).div_ceil(of).clamp(first + 1, side.max(first + 1))
+            });
+            mean(&rgb, width, xs, ys)
+        };
+        let cell = |row: usize, column: usize| (pixel(column, row), (row + 1 < rows).then(|| pixel(column, row + 1)));
+        let cells = (0..rows).step_by(2).flat_map(|row| (0..columns).map(move |column| (row, column)));
+        Self { width: columns, cells: cells.map(|(row, column)| cell(row, column)).collect() }
+    }
+
+    fn draw(&self, buffer: &mut Buffer, area: Rect) {
+        for (row, cells) in area.rows().zip(self.cells.chunks(self.width.max(1))) {
+            for (position, (upper, lower)) in row.positions().zip(cells) {
+                if let Some(cell) = buffer.cell_mut(position) {
+                    let style = Style::reset().fg(*upper);
+                    cell.set_symbol("▀").set_style(lower.map_or(style, |lower| style.bg(lower)));
+                }
+            }
+        }
+    }
+}
+
+/// The mean colour of a part of a picture.
+fn mean(rgb: &[u8], width: usize, xs: Range<usize>, ys: Range<usize>) -> Color {
+    let mut sums = [0; pixels::CHANNELS];
+    let mut count = 0;
+    for y in ys {
+        let row = rgb.get((y * width + xs.start) * pixels::CHANNELS..(y * width + xs.end) * pixels::CHANNELS);
+        for pixel in row.unwrap_or_default().chunks_exact(pixels::CHANNELS) {
+            sums.iter_mut().zip(pixel).for_each(|(sum, value)| *sum += usize::from(*value));
+            count += 1;
+        }
+    }
+    // Means of bytes.
+    let [red, green, blue] = sums.map(|sum| u8::try_from(sum / count.max(1)).unwrap_or(u8::MAX));
+    Color::Rgb(red, green, blue)
 }
 
 /// A character per cell, by brightness.
@@ -242,23 +328,63 @@ mod tests {
                 cell,
                 || true,
             );
-            canvas.picker.map(|picker| picker.protocol_type())
+            canvas.protocol
         };
         let cell = Some((8, 16));
         for (environment, cell, expected) in [
-            (&[("TERM", "xterm-256color")][..], cell, Some(ProtocolType::Halfblocks)),
-            (&[("TERM", "xterm-kitty")], cell, Some(ProtocolType::Kitty)),
-            (&[("TERM", "xterm-256color"), ("KONSOLE_VERSION", "221203")], cell, Some(ProtocolType::Iterm2)),
-            (&[("TERM", "xterm-kitty")], None, Some(ProtocolType::Halfblocks)),
-            (&[("TERM", "xterm-kitty"), ("TMUX", "/tmp/x")], cell, Some(ProtocolType::Halfblocks)),
-            (&[("TERM", "xterm-256color"), ("LC_TERMINAL", "iTerm2")], cell, Some(ProtocolType::Iterm2)),
-            (&[("TERM", "foot")], cell, Some(ProtocolType::Sixel)),
+            (&[("TERM", "xterm-256color")][..], cell, Some(Protocol::Blocks)),
+            (&[("TERM", "xterm-kitty")], cell, Some(Protocol::Kitty)),
+            (&[("TERM", "xterm-256color"), ("KONSOLE_VERSION", "221203")], cell, Some(Protocol::Iterm2)),
+            (&[("TERM", "xterm-kitty")], None, Some(Protocol::Blocks)),
+            (&[("TERM", "xterm-kitty"), ("TMUX", "/tmp/x")], cell, Some(Protocol::Blocks)),
+            (&[("TERM", "xterm-256color"), ("LC_TERMINAL", "iTerm2")], cell, Some(Protocol::Iterm2)),
+            (&[("TERM", "foot")], cell, Some(Protocol::Sixel)),
             (&[("TERM", "linux")], cell, None),
-            (&[("TERM", "linux"), ("RAPID_PICTURES", "blocks")], cell, Some(ProtocolType::Halfblocks)),
+            (&[("TERM", "linux"), ("RAPID_PICTURES", "blocks")], cell, Some(Protocol::Blocks)),
             (&[("TERM", "foot"), ("RAPID_PICTURES", "text")], cell, None),
         ] {
             assert_eq!(detected(environment, cell), expected, "{environment:?} {cell:?}");
         }
+    }
+
+    #[test]
+    fn half_blocks_keep_the_proportions_and_the_mean_colours() {
+        // White above, black below; the right half is as bright as the mean of stripes of 0 and 200.
+        let shade = |x: u32, y: u32| match (x < 16, y < 8) {
+            (false, _) => 200 * u8::try_from(x / 4 % 2).unwrap(),
+            (true, true) => 255,
+            (true, false) => 0,
+        };
+        let picture = Picture::decode(&grey(32, 16, shade)).unwrap().unwrap();
+        let rgb = |value| Color::Rgb(value, value, value);
+        for (area, columns, rows) in [((8, 9), 8, 4), ((20, 2), 8, 4), ((4, 4), 4, 2), ((2, 4), 2, 1), ((1, 1), 1, 1)] {
+            let blocks = Blocks::new(&picture, Size::from(area));
+            assert_eq!((blocks.width, blocks.cells.len()), (columns, columns * usize::div_ceil(rows, 2)), "{area:?}");
+            assert!(blocks.cells.iter().all(|(_, lower)| lower.is_some() == (rows > 1)), "{area:?}");
+        }
+        let Blocks { width, cells } = Blocks::new(&picture, Size::new(4, 2));
+        assert_eq!(
+            (width, cells),
+            (
+                4,
+                vec![
+                    (rgb(255), Some(rgb(0))),
+                    (rgb(255), Some(rgb(0))),
+                    (rgb(100), Some(rgb(100))),
+                    (rgb(100), Some(rgb(100)))
+                ]
+            )
+        );
+        // Enlarged: a pixel is repeated.
+        let small = Picture::decode(&grey(2, 1, |x, _| if x == 0 { 9 } else { 90 })).unwrap().unwrap();
+        let Blocks { width, cells } = Blocks::new(&small, Size::new(4, 1));
+        assert_eq!(
+            (width, &cells[..2], &cells[2..]),
+            (4, &[(rgb(9), Some(rgb(9))); 2][..], &[(rgb(90), Some(rgb(90))); 2][..])
+        );
+        // An odd number of rows ends with an upper half.
+        let square = Picture::decode(&grey(3, 3, |_, _| 7)).unwrap().unwrap();
+        assert_eq!(Blocks::new(&square, Size::new(3, 9)).cells[3..], [(rgb(7), None); 3]);
     }
 
     #[test]
