@@ -31,7 +31,6 @@ pub(super) struct Cells<'a> {
     pub(super) time_ns: i64,
 }
 
-/// Makes them.
 #[derive(Debug)]
 pub(super) struct CellMaker<'f> {
     features: &'f Features,

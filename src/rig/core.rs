@@ -130,7 +130,6 @@ pub struct Core {
     cooldown: Duration,
 }
 
-/// One modality.
 #[derive(Debug, Clone)]
 struct ModalityState {
     id: ModalityId,

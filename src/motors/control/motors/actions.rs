@@ -18,14 +18,12 @@ use crate::control::interpolate::Interpolator;
 /// Actions may be this far in the future: the clock is the same, but ticks are rounded.
 const EARLY: Duration = Duration::from_millis(100);
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Actions {
     /// The newest one, followed or not, and its tick.
     newest: (Vec<f64>, Stamp),
     line: Interpolator,
     deadman: Deadman,
-    /// When the motors were armed.
     armed: Stamp,
     /// Why the last one was refused, if it was.
     refusing: Option<Refusal>,

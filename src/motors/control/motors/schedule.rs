@@ -25,7 +25,6 @@ pub fn stalled_after(spec: &DamiaoSpec) -> Duration {
     (spec.timeout * 3 / 4).max(cycle(spec) * SLOW_CYCLES)
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Schedule {
     cycle: Duration,
