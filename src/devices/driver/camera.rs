@@ -20,7 +20,6 @@
 //! through a range of sizes in both dimensions at once, with a panic if a driver gives a step of 0, so it is not used
 //! for ranges at all.
 //!
-//! Invariant: listing never leaves a descriptor open.
 //! Invariant: a borrowed picture is exactly the bytes that the kernel reports it wrote; row padding is removed.
 //! Invariant: a picture that the kernel discarded, or that arrived empty, is counted in `lost`.
 //! Invariant: dropping a camera neither waits for the device nor panics.
@@ -275,7 +274,7 @@ pub fn set_control(path: &Path, name: &str, value: i64) -> Result<i64, String> {
 }
 
 /// The modes and controls of the camera at `path`. Blocks while the device answers; may set its format, unless another
-/// program streams from it.
+/// program streams from it. Leaves no descriptor open.
 ///
 /// # Errors
 /// When the node cannot be opened or is not a camera.

@@ -2,7 +2,7 @@
 //!
 //! Invariant: an action is followed only if its tick is after the arm, after the ticks of all earlier actions, and no
 //! older than the deadman allows.
-//! Invariant: the first one after an arm is near the position of every joint.
+//! Invariant: the first one after an arm is near the position of every joint; otherwise the arm or the action is refused.
 
 use std::time::Duration;
 

@@ -1,6 +1,7 @@
 //! When a bus of motors has had its cycles, and whose frames come first in the next.
 //!
-//! Invariant: a pause between cycles of [`stalled_after`] or more is a fault: what the motors did meanwhile is unknown.
+//! Invariant: a pause between cycles of [`stalled_after`] or more is a fault, which ends an arm: what the motors did
+//! meanwhile is unknown.
 
 use std::time::Duration;
 
