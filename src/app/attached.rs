@@ -34,7 +34,6 @@ const LONGEST_COMMAND: u64 = 16_384;
 pub(super) struct Attached {
     board: Arc<Board>,
     commands: mpsc::Sender<Command>,
-    /// How many are attached.
     count: Arc<AtomicUsize>,
 }
 

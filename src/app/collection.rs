@@ -82,7 +82,6 @@ fn mounted(now: &[String], requested: &[String], known: &[ModuleSpec]) -> Result
     Ok(kept.chain(new.iter().map(|module| module.name.clone())).collect())
 }
 
-/// See the module's comment.
 pub(super) struct Collection {
     board: Arc<Board>,
     recorder: Recorder,
@@ -161,7 +160,6 @@ impl Collection {
         self.session.is_done()
     }
 
-    /// What is collected is complete.
     pub(super) fn is_complete(&self) -> bool {
         self.session.is_complete()
     }

@@ -32,7 +32,6 @@ use crate::rig::{Addition, RigCommand};
 const ENDING: &str = "the run is ending";
 const UNCHANGED: &str = "nothing was changed";
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Reload {
     /// The registry as the run has it: with what the command line changed in it, and with added entries.

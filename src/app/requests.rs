@@ -37,7 +37,6 @@ pub(super) fn asker(conductor: &mpsc::UnboundedSender<Request>) -> Asker {
     })
 }
 
-/// Who receives requests.
 #[derive(Debug)]
 pub(super) struct Receivers {
     /// Its requests wait in an unbounded queue: a person types them, and other programs wait for an answer to each.

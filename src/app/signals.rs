@@ -9,7 +9,6 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 pub(crate) struct Signals {
     ends: [Signal; 4],
     _too_large: Signal,
-    /// How many arrived.
     received: u32,
 }
 
@@ -27,7 +26,6 @@ impl Signals {
         })
     }
 
-    /// Waits for the next one.
     pub(crate) async fn next(&mut self) {
         let [interrupt, terminate, quit, hangup] = &mut self.ends;
         tokio::select! {

@@ -16,7 +16,6 @@ const WAITING: usize = 16;
 #[derive(Debug)]
 pub(super) struct Streaming {
     pub(super) stage: Stage,
-    /// Receives requests to the rig.
     pub(super) commands: mpsc::Sender<RigCommand>,
     /// Cancelled when the rig begins to close its devices without a request.
     pub(super) ending: CancellationToken,

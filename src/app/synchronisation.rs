@@ -31,7 +31,6 @@ impl Synchronisation {
         Ok(Self { alignment, additions })
     }
 
-    /// Starts the stage.
     pub(super) fn start(self) -> Stage {
         Stage::start("the synchronisation", |stop| async move {
             tokio::select! {

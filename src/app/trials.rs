@@ -12,7 +12,6 @@ use super::stage::Stage;
 /// How often it looks: a trial takes ten seconds and more.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// Starts the stage.
 pub(super) fn start(trial: SharedTrial, board: Arc<Board>) -> Stage {
     Stage::start("the trials", |stop| async move {
         let mut look = interval(LOOK);

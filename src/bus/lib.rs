@@ -13,9 +13,6 @@
 //! Invariant: every segment of this program has all its memory from its creation (`space`). A program of this user that
 //! truncates one, or overwrites iceoryx2's tables in it, ends this process. Nothing of the bus is writable by others,
 //! and nothing outlives the processes that use it (`stale_files`).
-//! Invariant: no topic is closed during a run; one is opened for an entry that is added ([`Extension`]).
-//! Invariant: writers live as long as the bus. Samples that a reader has not fetched are lost with their writer
-//! (iceoryx2 0.10), so a writer that ended with its device would take the last samples along.
 
 mod actions;
 mod error;
@@ -92,9 +89,11 @@ impl Deref for Header {
     }
 }
 
-/// The node and all its topics.
+/// The node and all its topics. No topic is closed during a run; one is opened for an entry that is added ([`Extension`]).
 pub struct Bus {
     // Declared in the order they must be dropped: ports, services, node.
+    /// They live as long as the bus. Samples that a reader has not fetched are lost with their writer (iceoryx2 0.10), so a
+    /// writer that ended with its device would take the last samples along.
     writers: Vec<(TopicId, Arc<Writer>)>,
     /// `None` without an actuator.
     actions: Option<Arc<Actions>>,

@@ -26,7 +26,6 @@ use iceoryx2_cal::{
 
 use super::shared::Shared;
 
-/// See the module's comment.
 #[derive(Debug, Clone)]
 pub(super) struct Service {}
 

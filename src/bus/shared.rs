@@ -30,7 +30,6 @@ const SPARE: usize = 4;
 /// Larger blocks are not kept: the objects made for every sample are smaller.
 const SPARE_BYTES: usize = 512;
 
-/// See the module's comment.
 pub(super) struct Shared<T>(NonNull<Inner<T>>, PhantomData<Inner<T>>);
 
 struct Inner<T> {
@@ -104,7 +103,6 @@ impl<T: Send + Abandonable> Abandonable for Shared<T> {
     }
 }
 
-/// The value, locked.
 pub(super) struct Guard<'a, T>(ReentrantMutexGuard<'a, T>);
 
 impl<T> Deref for Guard<'_, T> {

@@ -231,7 +231,6 @@ pub enum PlanError {
     },
 }
 
-/// One configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Configuration {
     /// Value of the finger's tag.

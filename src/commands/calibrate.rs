@@ -263,7 +263,6 @@ struct Measured {
     device: String,
     #[serde(flatten)]
     estimate: Estimate,
-    /// Which light flashed.
     light: &'static str,
     /// Declared latency of the light, subtracted from the result.
     light_delay_ms: f64,

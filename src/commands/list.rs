@@ -82,7 +82,6 @@ impl Row {
     }
 }
 
-/// Which rows are wanted.
 #[derive(Debug)]
 struct Filter<'a> {
     args: &'a ListArgs,

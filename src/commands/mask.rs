@@ -211,7 +211,6 @@ struct LastMask {
     alive: bool,
 }
 
-/// A change to print.
 #[derive(Debug)]
 enum Change {
     Mask { record: MaskRecord, before: PhysicalMask },

@@ -105,7 +105,6 @@ enum Outgoing {
     Command(Command),
 }
 
-/// A connection to a run.
 pub(super) struct Connection {
     process: u32,
     stream: UnixStream,
@@ -128,7 +127,6 @@ impl Connection {
         Ok((connection, first))
     }
 
-    /// The next snapshot.
     pub(super) fn read(&mut self) -> Result<Snapshot, LinkError> {
         self.decoder.read(&mut self.reader)
     }

@@ -82,7 +82,6 @@ struct Written<'a> {
     bytes: usize,
 }
 
-/// Where the pictures go.
 enum Destination<'a> {
     Beside,
     In(&'a Path),

@@ -89,7 +89,6 @@ struct Work<'a> {
     /// What is executed of it.
     chunk: Vec<f32>,
     again: Again,
-    /// Chunks that were tried.
     tried: usize,
     wanted: Wanted,
     inputs: Option<ChunkInputs>,

@@ -56,7 +56,6 @@ pub(super) struct RecordedChunk {
     pub(super) tick: u64,
     /// Time of that tick.
     pub(super) observed_ns: u64,
-    /// What was present.
     mask: String,
     /// Seed of the noise.
     pub(super) seed: u64,
@@ -72,7 +71,6 @@ pub(super) struct RecordedChunk {
 }
 
 impl RecordedChunk {
-    /// What was present.
     pub(super) fn mask(&self) -> Option<PhysicalMask> {
         u64::from_str_radix(self.mask.strip_prefix("0x")?, 16).ok().map(PhysicalMask)
     }
@@ -176,7 +174,6 @@ impl Survey {
     }
 }
 
-/// One received item.
 #[derive(Debug)]
 pub(super) enum Received {
     Sample { id: ModalityId, header: SampleHeader, payload: Vec<u8> },

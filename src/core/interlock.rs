@@ -9,10 +9,9 @@
 //! What an input is read from, and when it is lost, is known to the code that reports it; the orders are given by
 //! [`Permission`](crate::permission::Permission).
 //!
-//! Invariant: an input that has not reported yet is lost.
+//! Invariant: an input that has not reported yet is lost. One that has stopped runs again only after it has reported nothing
+//! else for [`SETTLES_IN`]: a chattering contact is one stop.
 //! Invariant: nothing here moves anything: an input that runs again only permits an arm.
-//! Invariant: an input that has stopped runs again only after it has reported nothing else for [`SETTLES_IN`]: a
-//! chattering contact is one stop.
 //! Invariant: nothing here waits, locks or, except to refuse an arm, allocates.
 
 use std::sync::Arc;

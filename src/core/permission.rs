@@ -3,11 +3,12 @@
 //! Every order of a run is given here, whatever its source: the operator at the screen, another program, an emergency
 //! stop or an enabling switch, the end of the run.
 //!
-//! Invariant: a disarm holds for the rest of the run, whether or not an actuator is plugged in, until a newer arm.
+//! Invariant: a disarm is never refused, and holds for the rest of the run, whether or not an actuator is plugged in, until a
+//! newer arm.
 //! Invariant: an arm that was given before the last disarm arrived does nothing, in whatever order the two arrive. Nor
-//! does one that is older than [`VOID_AFTER`], or arrives while no actuator is plugged in. A disarm is never refused.
-//! Invariant: no arm is given while an input of an [`Interlock`](crate::interlock) does not run, nor one that was given
-//! before it stopped, whatever it has reported since.
+//! does one that is older than [`VOID_AFTER`], or arrives while no actuator is plugged in, or while an input of an
+//! [`Interlock`](crate::interlock) does not run, nor one that was given before that input stopped, whatever it has reported
+//! since.
 //! Invariant: nothing here waits, locks or allocates.
 
 use std::sync::Arc;

@@ -55,7 +55,6 @@ pub(super) fn usual_places() -> Vec<PathBuf> {
     places
 }
 
-/// Adds an entry.
 pub(super) fn register(
     global: &Global,
     args: &RegisterArgs,
@@ -74,7 +73,6 @@ pub(super) fn register(
     Ok(block_on(register::register(&target, &attached, args, talk, format, out))??)
 }
 
-/// Removes an entry.
 pub(super) fn unregister(
     global: &Global,
     args: &UnregisterArgs,

@@ -30,7 +30,6 @@ const HEAD: u64 = 9;
 /// Bytes of a message before its data.
 const MESSAGE: usize = 22;
 
-/// See the module's comment.
 pub(crate) struct ChunkWriter<S: Write> {
     writer: Writer<NoSeek<BufWriter<S>>>,
     own: Option<Own>,
@@ -166,10 +165,8 @@ impl<S: Sink> ChunkWriter<S> {
 /// A channel to be added.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Channel<'a> {
-    /// Number of its schema.
     pub(crate) schema: u16,
     pub(crate) topic: &'a str,
-    /// Encoding of its messages.
     pub(crate) encoding: &'a str,
     pub(crate) metadata: &'a BTreeMap<String, String>,
 }

@@ -35,7 +35,6 @@ impl IndexedRecord {
     }
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Index {
     /// Ascending.

@@ -18,7 +18,6 @@ const LARGEST: usize = 8 << 20;
 /// Schemas and channels.
 const MOST: usize = 4096;
 
-/// See the module's comment.
 #[derive(Debug, Default)]
 pub(super) struct Names {
     /// Check value of each definition shown or waiting, by opcode and number.

@@ -58,7 +58,6 @@ impl Own {
         Self { content: [&MARK[..], &episode.0].concat(), known: BTreeSet::new() }
     }
 
-    /// The record's content.
     pub(crate) fn content(&self) -> &[u8] {
         &self.content
     }
@@ -128,7 +127,6 @@ const LARGEST_ABOUT: u64 = 4 << 20;
 pub(super) struct Owners {
     /// By their first chunk.
     seen: Vec<Mention>,
-    /// Chunks so far.
     chunks: u64,
     /// Those that lie within a chunk of another.
     nested: Vec<EpisodeId>,

@@ -11,8 +11,7 @@
 //! Invariant: every message of every chunk with a right check value is shown once, if its channel is known; nothing of
 //! a damaged chunk is shown. Everything left out is counted in `Integrity`.
 //! Invariant: memory holds one record of the file at a time, a chunk of at most `MAX_RECORD` both packed and
-//! decompressed, and the head of every chunk.
-//! Invariant: work, including decompression, is bounded by the size of the file.
+//! decompressed, and the head of every chunk. Work, including decompression, is bounded by the size of the file.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;

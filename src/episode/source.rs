@@ -179,7 +179,6 @@ impl<R: ReadAt> WindowedFile<R> {
 /// A field of a record.
 #[derive(Debug, Clone, Copy)]
 enum Part {
-    /// So many bytes.
     Bytes(u64),
     /// A u32 length and as many bytes: text, a map, an array; the length is a multiple of this.
     Short(u64),
@@ -190,7 +189,6 @@ enum Part {
 /// How the fields of a record fill it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Fit {
-    /// Exactly.
     Exact,
     /// Bytes are left over, or its fields are unknown.
     Loose,
@@ -224,7 +222,6 @@ fn parts(opcode: u8) -> &'static [Part] {
     }
 }
 
-/// Is this a defined opcode?
 pub(super) fn is_known(opcode: u8) -> bool {
     (1..=op::DATA_END).contains(&opcode) || opcode >= op::PRIVATE
 }

@@ -1,7 +1,7 @@
 //! The values of a row in a dataset.
 //!
 //! Invariant: of a modality that is not there, or whose sample cannot be used, pictures are black and numbers zero, and it
-//! is not valid.
+//! is not valid. A picture in JPEG is copied byte for byte.
 
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -31,7 +31,6 @@ pub(super) struct Cells<'a> {
     pub(super) time_ns: i64,
 }
 
-/// Makes them.
 #[derive(Debug)]
 pub(super) struct CellMaker<'f> {
     features: &'f Features,

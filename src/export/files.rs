@@ -19,7 +19,6 @@ use super::features::IMAGES;
 
 /// Files of a folder; also `chunks_size` in `info.json`.
 pub(super) const CHUNK: u64 = 1000;
-/// Folder of the videos.
 pub(super) const VIDEOS: &str = "videos";
 /// What is in a file of Parquet about its writer.
 pub(super) const CREATED_BY: &str = concat!("rapid ", env!("CARGO_PKG_VERSION"));

@@ -8,13 +8,10 @@
 //! <https://huggingface.co/docs/lerobot/lerobot-dataset-v3>.
 //!
 //! Invariant: which sample belongs to a row follows from `/rapid/frame` alone.
-//! Invariant: a picture in JPEG is copied byte for byte, and what is absent has its mask.
 //! Invariant: an episode is in the set once its file in `meta/episodes` has its name, and everything of it is complete
 //! by then; a program that is killed leaves files without a name in the set, and the next one removes them.
 //! Invariant: an episode's rows depend on nothing but the episode, the features and its position in the set, so that it makes
 //! no difference how many are prepared at a time.
-//! Invariant: memory holds, of each episode that is being prepared, what is between a sample and its frame, and one group
-//! of rows.
 
 mod cells;
 mod error;

@@ -199,7 +199,6 @@ fn numbers(payload: &[u8]) -> Vec<f64> {
     numbers.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect()
 }
 
-/// One row.
 #[derive(Debug)]
 pub(super) struct Row<'a> {
     pub(super) number: usize,

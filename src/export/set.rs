@@ -488,7 +488,8 @@ pub struct Prepared {
 }
 
 /// Writes the rows of an episode for the dataset in `folder`, as they are at `position`. Several may be prepared at a time,
-/// after [`DataSet::begin`], each for a position of its own.
+/// after [`DataSet::begin`], each for a position of its own: memory holds, of each of them, what is between a sample and its
+/// frame, and one group of rows.
 ///
 /// # Errors
 /// When a file cannot be written, or the episode has changed since it was surveyed; also when `stop` is set.

@@ -244,7 +244,6 @@ impl Rows {
     }
 }
 
-/// A row of a table.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RowView<'a> {
     batch: &'a RecordBatch,

@@ -54,7 +54,6 @@ const REQUEST: &str = r#"{"type":"object","properties":{}}"#;
 const ANSWER: &str = r#"{"type":"object","properties":{"text":{"type":"string"}}}"#;
 
 impl Controls {
-    /// The services.
     pub(super) fn services(&self) -> Vec<Service> {
         let service = |(control, name): (Control, &'static str)| {
             let schema = |name, text: &'static str| Schema::new(name, "jsonschema", text.as_bytes());

@@ -10,7 +10,6 @@
 //! when it reads (`relay`).
 //! Invariant: a turn is short, whatever waits on the bus: on a busy machine the connections would wait for its end, and of all that it
 //! sends a client gets the last topics alone.
-//! Invariant: nothing is encoded for a topic to which no client subscribes.
 //! Invariant: whatever ends the thread, the run continues.
 
 mod control;

@@ -31,7 +31,6 @@ use super::pictures::RateLimit;
 /// Time between two messages about where a sensor sits.
 const PLACES_EVERY: Duration = Duration::from_secs(1);
 
-/// See the module's comment.
 pub(super) struct Topics {
     context: Arc<Context>,
     tracks: Vec<Option<Track>>,
@@ -227,7 +226,6 @@ impl Topics {
         }
     }
 
-    /// So many events were missed.
     pub(super) const fn missed(&mut self, count: u64) {
         self.left_out.events = self.left_out.events.saturating_add(count);
     }

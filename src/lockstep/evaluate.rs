@@ -64,7 +64,6 @@ pub enum Condition {
 /// When a cable is unplugged or plugged in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum When {
-    /// At this step.
     Step(u32),
     /// So many steps after the touch.
     AfterTouch(u32),

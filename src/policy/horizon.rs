@@ -24,7 +24,6 @@
 //! [`ActionQueue::wants_observation`], then one to [`ActionQueue::step`].
 //! Invariant: no action is taken from a chunk whose observation is older than the beginning of the last hold: a plan
 //! from before a stop may not fit the world after it.
-//! Invariant: at most one observation is with the policy at a time.
 //! Invariant: nothing here allocates after construction, and no input causes a panic.
 
 use std::time::Duration;
@@ -274,7 +273,7 @@ impl ActionQueue {
     }
 
     /// Whether the observation of `tick` must be sent to the policy. If so, it counts as sent: [`Self::take`] or
-    /// [`Self::failed`] must follow before the next one.
+    /// [`Self::failed`] must follow before the next one. At most one observation is with the policy at a time.
     pub fn wants_observation(&mut self, tick: u64, situation: Situation) -> bool {
         self.too_old = false;
         let seen = self.relevant(situation.mask);

@@ -162,7 +162,6 @@ macro_rules! kinds {
             /// Every kind and its word.
             pub(crate) const ALL: &[(&str, Self)] = &[$((stringify!($module), Self::$kind)),+];
 
-            /// Its word.
             pub(crate) const fn word(self) -> &'static str {
                 match self {
                     $(Self::$kind => stringify!($module)),+

@@ -369,13 +369,11 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// A list of texts.
     pub(super) fn texts(&self, key: &str) -> Option<Vec<String>> {
         let text = |value: &DeValue<'_>| value.as_str().map(str::to_owned);
         self.list(key, text, "a list of texts", "write it as [\"a\", \"b\"]")
     }
 
-    /// A list of numbers.
     pub(super) fn numbers(&self, key: &str) -> Option<Vec<f64>> {
         self.list(key, as_f64, "a list of numbers", "write it as [0, 1.5]")
     }

@@ -23,7 +23,6 @@ use rustix::fs::{FileType, Stat};
 pub struct Distrust {
     /// The object that others can change.
     place: EntryType,
-    /// Its path.
     path: PathBuf,
     why: Why,
 }

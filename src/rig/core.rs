@@ -7,7 +7,6 @@
 //! Invariant: a step that changes the mask, or what is plugged in, has [`Effect::Publish`] as its first effect, once, with
 //! both after the whole step: no effect that allocates or locks precedes it.
 //! Invariant: a bit is set only while its device is attached and a stream of its newest epoch runs.
-//! Invariant: the device attached to a slot is the one that the assigner gave to its entry.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -130,7 +129,6 @@ pub struct Core {
     cooldown: Duration,
 }
 
-/// One modality.
 #[derive(Debug, Clone)]
 struct ModalityState {
     id: ModalityId,
@@ -269,7 +267,8 @@ impl Core {
         }
     }
 
-    /// The assigner gave this device to `id`. A repeated report is the same attachment.
+    /// The assigner gave this device to `id`: no other one is ever attached to a slot. A repeated report is the same
+    /// attachment.
     fn attach(&mut self, id: ModalityId, attachment: Attachment, now: Stamp, effects: &mut Vec<Effect>) {
         let Some(modality) = self.modality_mut(id).filter(|modality| modality.slot.attached() != Some(&attachment))
         else {

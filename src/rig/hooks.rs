@@ -66,7 +66,6 @@ impl HookQueue {
         self.programs.tasks.spawn(runner.run_all(Arc::clone(&self.turn)));
     }
 
-    /// It was removed.
     pub(super) fn removed(&self) {
         self.gone.cancel();
     }

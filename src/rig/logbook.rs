@@ -33,7 +33,6 @@ const DEPTH: usize = 1024;
 /// How long the end of a run waits for the disk.
 const LAST: Duration = Duration::from_secs(1);
 
-/// See the module's comment.
 #[derive(Debug, Clone)]
 pub(super) struct Logbook {
     /// `None` if there is no folder or no thread for it.

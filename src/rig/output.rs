@@ -29,7 +29,6 @@ const TELL_EVERY: Duration = Duration::from_secs(5);
 /// Bytes per read.
 const CHUNK: usize = 16 << 10;
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Output {
     device: String,

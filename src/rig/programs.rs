@@ -22,7 +22,6 @@ pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
 /// Allowance for the kernel and a busy machine, beyond the time a program has to end.
 pub(super) const MARGIN: Duration = Duration::from_secs(2);
 
-/// See the module's comment.
 #[derive(Debug, Clone)]
 pub(super) struct Programs {
     pub(super) spawner: Spawner,

@@ -61,7 +61,6 @@ pub(super) enum Report {
     Event(StreamEvent),
     /// Samples or actions are lost, or an order is refused, and why; reported once per epoch each.
     Refused(String),
-    /// A notice from an actuator.
     Actuator(ActuatorNotice),
     /// The clock of the computer that the device is on, with the worst uncertainty since the last report.
     Clock(ClockOffset),
@@ -75,7 +74,6 @@ pub(super) struct Reported {
     pub(super) report: Report,
 }
 
-/// How a stream ended.
 #[derive(Debug)]
 pub(super) struct Ended {
     pub(super) end: End,
@@ -107,7 +105,6 @@ impl Numbers {
 pub(super) struct Stream {
     pub(super) spec: Arc<DeviceSpec>,
     pub(super) attachment: Attachment,
-    /// When the device was attached.
     pub(super) attached: Stamp,
     pub(super) epoch: Epoch,
     pub(super) writer: Arc<Writer>,
@@ -387,7 +384,6 @@ enum Pulse {
     Stalled,
 }
 
-/// Notices of an actuator.
 type Notices = Option<mpsc::Receiver<ActuatorNotice>>;
 
 /// The next notice. Never returns if there are none or the sender has ended.

@@ -126,7 +126,6 @@ fn filter_of(chosen: &str) -> Result<EnvFilter, ParseError> {
     Ok(EnvFilter::try_new(chosen)?.add_directive(format!("{}=error", panics::TARGET).parse()?))
 }
 
-/// A formatted line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct LogLine {
     /// Wall time, ns since 1970.

@@ -103,7 +103,6 @@ enum Next {
     Planned,
     /// Another episode.
     Begin,
-    /// Nothing.
     Wait,
 }
 

@@ -131,7 +131,6 @@ impl Intervals {
         (0..Self::COUNT).map(move |bucket| Self::FIRST.mul_f64(half_octave.powi(i32::try_from(bucket).unwrap_or(0))))
     }
 
-    /// Counts an interval.
     pub(super) fn count(&self, interval: Duration) {
         let ratio = interval.as_nanos() as f64 / Self::FIRST.as_nanos() as f64;
         #[expect(

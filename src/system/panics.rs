@@ -24,7 +24,6 @@ pub const CONTROL_THREAD: &str = "control";
 enum Goes {
     /// To standard error, as by Rust's hook.
     Stderr,
-    /// To the log.
     Log,
     /// To the log and into this list.
     Kept(Vec<String>),

@@ -20,7 +20,6 @@ use super::token::Token;
 /// Why a request is not answered: the status, and why in words.
 pub(super) type Refusal = (StatusCode, &'static str);
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Door {
     /// `None`: none is needed.

@@ -4,7 +4,6 @@ use rapid_core::random::Random;
 
 use super::world::{AXES, World, stream};
 
-/// Phase of the demonstration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     Approach,

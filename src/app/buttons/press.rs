@@ -22,9 +22,7 @@ const UNPLUGGED_WITHIN: Duration = Duration::from_millis(200);
 /// What was done with a button.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Gesture {
-    /// It was pressed.
     Press,
-    /// It was held.
     Hold,
     /// It was pressed twice in a row.
     Double,
@@ -59,7 +57,6 @@ enum State {
     },
 }
 
-/// The state of a button.
 #[derive(Debug, Default)]
 pub(super) struct Presses {
     rules: Rules,

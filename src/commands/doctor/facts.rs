@@ -19,9 +19,7 @@ pub(super) struct Facts {
     pub(super) usb: Vec<UsbDevice>,
     /// Nodes of USB devices that programs open.
     pub(super) nodes: Vec<Node>,
-    /// The user of this process.
     pub(super) user: User,
-    /// Whether a udev daemon runs.
     pub(super) udev_runs: bool,
     /// The installed rules, if there are any.
     pub(super) rules: Option<String>,
@@ -35,7 +33,6 @@ pub(super) struct Facts {
     pub(super) disk: Option<Disk>,
     /// The kernel's clock source.
     pub(super) clock: Option<String>,
-    /// CAN interfaces.
     pub(super) can: Vec<Interface>,
     /// Memory that all programs together may use for transfers through usbfs, MB.
     pub(super) usbfs_mb: Option<u64>,
@@ -56,16 +53,13 @@ pub(super) struct Node {
     pub(super) is_open_to_us: bool,
     /// Its group, by name or number.
     pub(super) group: String,
-    /// Its permissions.
     pub(super) mode: u32,
 }
 
 /// The user of this process.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) struct User {
-    /// The user is root.
     pub(super) is_root: bool,
-    /// Groups, by name.
     pub(super) groups: Vec<String>,
 }
 
@@ -238,19 +232,13 @@ fn interfaces(root: &Path, usb: &[UsbDevice]) -> Vec<Interface> {
 pub(super) struct UsbDevice {
     /// Its port: `1-2.3`, or `usb1` for a root hub.
     pub(super) port: String,
-    /// Bus.
     pub(super) bus: u32,
     /// Negotiated speed, Mbit/s.
     pub(super) mbit: f64,
-    /// Vendor id.
     pub(super) vid: u16,
-    /// Product id.
     pub(super) pid: u16,
-    /// Product string.
     pub(super) product: Option<String>,
-    /// Serial number.
     pub(super) serial: Option<String>,
-    /// It is a hub.
     pub(super) is_hub: bool,
     /// The kernel may suspend it while it is unused.
     pub(super) autosuspends: bool,

@@ -6,7 +6,6 @@ use serde::Serialize;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Level {
-    /// In order.
     Ok,
     /// Works, with limitations.
     Warn,
@@ -17,7 +16,6 @@ pub(super) enum Level {
 /// The result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(super) struct Finding {
-    /// Severity.
     pub(super) level: Level,
     /// Its subject, in one word.
     pub(super) about: &'static str,

@@ -21,9 +21,7 @@ const SIZES: [(u32, u32); 6] = [(1920, 1080), (1280, 720), (800, 600), (640, 480
 /// A camera and its configured format.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct CameraLoad {
-    /// Entry.
     pub(super) name: String,
-    /// Format.
     pub(super) camera: CameraSpec,
     /// Largest picture of a compressed format, bytes.
     pub(super) max_bytes: usize,

@@ -26,7 +26,6 @@ struct Listed<'a> {
 
 /// The device to register.
 pub(super) enum Selection {
-    /// This unit.
     Unit(Box<Candidate>),
     /// A device that is described but not plugged in.
     NotPlugged,

@@ -5,8 +5,8 @@
 //! and dropped without being counted. `nan` and `inf` are valid values and are passed on unchanged.
 //!
 //! Invariant: the messages depend only on the bytes, not on how reads divide them.
-//! Invariant: memory is bounded by the longest permitted message, whatever the device sends; longer ones are not held.
-//! Invariant: a well-formed message causes no allocation.
+//! Invariant: memory is bounded by the longest permitted message, whatever the device sends; longer ones are not held, and a
+//! well-formed one causes no allocation.
 //! Invariant: a stamp is the moment the bytes that completed the message were read; a serial line provides no earlier
 //! one. Each of several messages in one read is older than the next by the least time that its bytes take on a line
 //! (`arrival`): stamps always increase.

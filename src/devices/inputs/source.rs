@@ -10,7 +10,6 @@ use super::gpio::Gpio;
 use super::key::{self, Keys};
 use super::line::Lines;
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) enum InputSource {
     Keys(Box<Keys>),

@@ -15,7 +15,6 @@ use super::{InputGroup, Report, lost_at_a_panic};
 /// Time between a loss of a place and its reopening.
 const AGAIN: Duration = Duration::from_millis(500);
 
-/// Why a thread woke.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Woken {
     /// The run ends.

@@ -57,7 +57,6 @@ fn part(share: f64, count: usize) -> usize {
     at.min(count - 1)
 }
 
-/// What a row is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Subject {
     /// A modality, whichever of its channels a sample is on.
@@ -98,7 +97,6 @@ impl Row {
     }
 }
 
-/// A moment that was marked.
 #[derive(Debug)]
 pub(super) struct Mark {
     /// Where it lies, 0 to 1.
@@ -106,7 +104,6 @@ pub(super) struct Mark {
     pub(super) text: String,
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Timeline {
     pub(super) span: Span,

@@ -105,7 +105,6 @@ impl Svg {
         self.end("image", title);
     }
 
-    /// What was written.
     pub(super) fn finish(self) -> String {
         self.0
     }

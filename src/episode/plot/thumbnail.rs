@@ -11,14 +11,12 @@ const QUALITY: u8 = 72;
 /// Pixels of a picture that is decoded, at most: 96 MB of memory.
 const LARGEST: u64 = 32 << 20;
 
-/// A small picture.
 #[derive(Clone)]
 pub(super) struct Thumbnail {
     /// When it was captured, 0 to 1.
     pub(super) share: f64,
     /// Its shape: width over height.
     pub(super) aspect: f64,
-    /// A JPEG file.
     pub(super) jpeg: Vec<u8>,
 }
 

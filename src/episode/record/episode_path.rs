@@ -49,9 +49,7 @@ pub struct EpisodeRequest {
 #[derive(Debug)]
 pub(super) struct EpisodePath {
     pub(super) folder: Folder,
-    /// The name once finished.
     pub(super) finished: PathBuf,
-    /// The name while written.
     pub(super) partial: PathBuf,
     /// The open file itself, independent of its names; it holds the lock.
     pub(super) file: Arc<File>,

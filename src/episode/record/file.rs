@@ -34,7 +34,6 @@ use crate::reference::{self, ReferenceSample};
 use crate::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::{ABOUT, SUMMARY, channel};
 
-/// See the module's comment.
 pub(super) struct EpisodeFile {
     /// Declared before the writer, which writes its own end when dropped.
     #[expect(dead_code, reason = "held to be dropped")]
@@ -55,7 +54,6 @@ pub(super) struct EpisodeFile {
     frame: u16,
     event: u16,
     log: u16,
-    /// Messages written.
     pub(super) messages: u64,
     /// Payload bytes of samples written.
     pub(super) bytes: u64,

@@ -5,11 +5,9 @@ use rapid_core::time::Stamp;
 /// The numbers of a sample that show whether others are missing between it and the next.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Last {
-    /// Its number.
     pub(super) seq: u64,
     /// Samples its device lost up to it.
     pub(super) lost: u64,
-    /// When it was captured.
     pub(super) captured: Stamp,
 }
 

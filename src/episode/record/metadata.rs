@@ -93,13 +93,11 @@ pub(super) struct Ending<'a> {
     pub(super) frames: u64,
     /// Between the earliest and the latest sample of a frame.
     pub(super) skew: Option<Spread>,
-    /// The verdict.
     pub(super) verdict: &'a Verdict,
     /// Why the episode is not whole, if it is not.
     pub(super) cut_short: Option<&'a str>,
     /// Everything that was attached or ran at some time.
     pub(super) units: &'a Units,
-    /// When the episode began.
     pub(super) begin: Stamp,
 }
 

@@ -87,7 +87,6 @@ fn judged<'a>(qualities: &'a [(&DeviceSpec, Quality)]) -> Vec<Judged<'a>> {
     qualities.iter().map(judged).collect()
 }
 
-/// See the module's comment.
 pub(super) struct OpenEpisode {
     registry: Arc<Registry>,
     board: Arc<Board>,
@@ -240,7 +239,6 @@ impl OpenEpisode {
         }
     }
 
-    /// Takes an event.
     pub(super) fn event(&mut self, event: &Event) {
         self.units.take(event);
         if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {

@@ -36,7 +36,6 @@ struct Incarnation {
 pub(super) struct Attached(Units);
 
 impl Attached {
-    /// Takes an event.
     pub(super) fn take(&mut self, event: &Event) {
         let Self(units) = self;
         match &event.what {
@@ -72,7 +71,6 @@ impl Units {
         attached.0.clone()
     }
 
-    /// Takes an event.
     pub(super) fn take(&mut self, event: &Event) {
         match &event.what {
             EventKind::Attach { device, unit, .. } => {

@@ -22,9 +22,7 @@ const COMMAND: usize = 200;
 /// A program that published on one of our topics.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Publisher {
-    /// The topic.
     pub(super) topic: String,
-    /// Its process.
     pub(super) process: u32,
     /// Its command line.
     pub(super) command: String,
@@ -83,7 +81,6 @@ impl Publishers {
         counted.map_or(self, Self)
     }
 
-    /// The list.
     pub(super) fn list(&self) -> &[Publisher] {
         &self.0
     }

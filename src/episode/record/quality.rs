@@ -34,9 +34,7 @@ const MOST_PENDING: usize = 4096;
 /// A modality to be measured.
 #[derive(Debug, Clone)]
 pub(super) struct Measured {
-    /// Its name.
     pub(super) name: String,
-    /// Its number.
     pub(super) id: ModalityId,
     /// Its limits: whether payloads are compared, and its nominal rate.
     pub(super) limits: VerdictSpec,
@@ -145,7 +143,6 @@ impl Quality {
     }
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Measures {
     grid: Grid,
@@ -349,7 +346,6 @@ pub(super) struct SampleFacts<'a> {
     pub(super) flagged: bool,
     /// It is a JPEG picture.
     pub(super) jpeg: bool,
-    /// Its bytes.
     pub(super) payload: &'a [u8],
     /// The bytes equal those of the previous sample; `None`: to be determined here by hashing.
     pub(super) repeated: Option<bool>,

@@ -298,7 +298,6 @@ impl References {
         Self { taken, all: Vec::new() }
     }
 
-    /// All so far.
     fn all(&mut self) -> &[ReferenceSample] {
         self.all.extend(self.taken.try_iter());
         &self.all

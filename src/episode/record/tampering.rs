@@ -27,7 +27,6 @@ use crate::record_iter::RecordIter;
 /// Room for the events of one read; more need another.
 const EVENT_BYTES: usize = 1024;
 
-/// See the module's comment.
 pub(super) struct FileWatch {
     file: Arc<File>,
     partial: PathBuf,

@@ -29,11 +29,8 @@ use super::quality::Quality;
 /// A modality with its limits.
 #[derive(Debug, Clone)]
 pub(super) struct Judged<'a> {
-    /// Its name.
     pub(super) name: &'a str,
-    /// What was measured.
     pub(super) quality: &'a Quality,
-    /// Its limits.
     pub(super) limits: VerdictSpec,
 }
 
@@ -62,16 +59,13 @@ pub(super) enum Losses {
 pub(super) struct Missing {
     /// Publications of the mask.
     pub(super) masks: u64,
-    /// Actions.
     pub(super) actions: u64,
-    /// Events.
     pub(super) events: u64,
 }
 
 /// The facts that an episode is judged by.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Facts<'a> {
-    /// Its modalities.
     pub(super) modalities: &'a [Judged<'a>],
     /// Losses other than samples.
     pub(super) missing: Missing,
@@ -83,7 +77,6 @@ pub(super) struct Facts<'a> {
     pub(super) seconds: f64,
     /// Whether losses are distinguished.
     pub(super) losses: Losses,
-    /// Its file.
     pub(super) file: FileState<'a>,
     /// Further reasons for SUSPECT, found outside this module.
     pub(super) findings: &'a [String],
@@ -101,7 +94,6 @@ pub(super) fn is_short(seconds: f64) -> bool {
     seconds < SHORTEST.as_secs_f64()
 }
 
-/// The verdict.
 pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
     let found = findings(facts);
     let grade = found.first().map_or(Grade::Good, |finding| finding.grade);

@@ -13,7 +13,6 @@ use std::thread::JoinHandle;
 
 use rapid_system::folder::Folder;
 
-/// See the module's comment.
 pub(super) struct Writeback {
     ask: SyncSender<()>,
     thread: JoinHandle<io::Result<()>>,

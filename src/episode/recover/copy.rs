@@ -1,6 +1,8 @@
 //! Copies the readable parts of a file into a whole one.
 //!
 //! Channels and schemas keep their numbers, messages their order; everything that the reader leaves out is counted.
+//!
+//! Invariant: memory does not grow with the file, except for the index of its chunks.
 
 use std::cell::{Cell, RefCell};
 use std::fs::File;

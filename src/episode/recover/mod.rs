@@ -18,8 +18,6 @@
 //! Invariant: what the recorder called BAD stays BAD.
 //! Invariant: at every moment all recorded data is in the repaired file or in one that a later repair finds; an
 //! interrupted repair leaves a `.recovering` file, which the next one replaces.
-//! Invariant: a file that another process writes or repairs is left alone.
-//! Invariant: memory does not grow with the file, except for the index of its chunks.
 
 mod copy;
 #[cfg(test)]
@@ -192,7 +190,8 @@ impl RecoverError {
     }
 }
 
-/// Repairs the file at `path`; blocks for as long as it takes to copy it.
+/// Repairs the file at `path`; blocks for as long as it takes to copy it. One that another process writes or repairs is left
+/// alone.
 ///
 /// # Errors
 /// See [`RecoverError`]; the file is unchanged.

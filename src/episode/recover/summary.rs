@@ -14,7 +14,6 @@ pub(super) const LOSSLESS: &str = "lossless";
 /// Key of `rapid/recovered`: SHA-256 of the original.
 pub(super) const SHA256: &str = "source_sha256";
 
-/// See the module's comment.
 #[derive(Debug, Default)]
 pub(super) struct Summary {
     /// Messages on channels that are known.
@@ -60,7 +59,6 @@ pub(super) struct Channel {
 }
 
 impl Summary {
-    /// Counts a record.
     pub(super) fn take(&mut self, entry: &Entry<'_>) {
         match entry {
             Entry::Channel { id, topic, metadata, .. } => {

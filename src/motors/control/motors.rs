@@ -18,6 +18,9 @@
 //! Every arm reads the parameters again: a motor that lost power has forgotten its mode and its time limit, after which
 //! it stops on its own when this program is killed.
 //!
+//! Two parts have invariants of their own, as important as those below: `schedule`, how long a pause between cycles may
+//! be; `actions`, which actions are followed.
+//!
 //! Invariant: no command is sent before an arm is requested, nor after a disarm or a stop until the next request; after
 //! a fault only commands that damp a joint or hold its position.
 //! Invariant: one motor that is silent, faulty or hot stops all, each as configured ([`Stop`](rapid_registry::Stop)):
@@ -27,15 +30,6 @@
 //! slew limit at most, as softly as [`Ramp`] allows, and stays within the limits; for a joint beyond them it stays or
 //! comes back. In MIT mode the stiffness requests no more than the torque limit: the command moves towards the joint as
 //! fast as permitted, and the stiffness is lowered for the rest.
-//! Invariant: a pause between cycles longer than [`stalled_after`] ends an arm: what the motors did meanwhile is
-//! unknown.
-//! Invariant: the first action after an arm is near the position of every joint; otherwise the arm or the action is
-//! refused.
-//! Invariant: an action is followed only if its tick is after the arm, after the ticks of all earlier actions, and no
-//! older than the deadman allows.
-//! Invariant: a sample holds an answer of every motor, each newer than in the previous sample.
-//! Invariant: a motor that answers eventually appears in samples, whatever happened to the bus before its ranges were
-//! read, unless the ranges are unusable.
 
 mod actions;
 mod brakes;
@@ -209,7 +203,11 @@ impl MotorBus {
     }
 
     /// Fills `out` with [`SAMPLE_VALUES`] values per motor if every motor has answered since the last sample, and
-    /// returns the time of the earliest answer. Also `None` if `out` has another length.
+    /// returns the time of the earliest answer: each is newer than in the previous sample. Also `None` if `out` has another
+    /// length.
+    ///
+    /// A motor that answers eventually appears here, whatever happened to the bus before its ranges were read, unless the
+    /// ranges are unusable.
     pub fn sample(&mut self, out: &mut [f64]) -> Option<Stamp> {
         if out.len() != self.motors.len() * SAMPLE_VALUES {
             return None;

@@ -19,7 +19,6 @@ use super::spec::BundleErrors;
 /// Maximum number of reported problems; a file with more was not written by a policy exporter.
 const MOST_PROBLEMS: usize = 100;
 
-/// The problems found so far.
 #[derive(Debug)]
 pub(super) struct Problems {
     file: String,

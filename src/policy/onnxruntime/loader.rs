@@ -34,7 +34,6 @@ const PACKAGES: [(&str, &str); 8] = [
     ("ld-linux", "libc6"),
 ];
 
-/// Loads the C++ library.
 pub(super) fn load_libstdcxx() -> Result<(), Cause> {
     load_one_of(LIBSTDCXX_NAME, LIBSTDCXX)
 }

@@ -252,7 +252,6 @@ fn numbers_of(node: &NodeSpec) -> Option<usize> {
     usize::try_from(count).ok()
 }
 
-/// Reads one entry.
 pub(crate) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>) -> Draft<'a> {
     if let Some((message, fix)) = name_problem(name) {
         section.report_at(section.at, message, fix);

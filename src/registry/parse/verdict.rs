@@ -119,9 +119,7 @@ pub(super) struct VerdictTable {
 /// The owner of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Whose {
-    /// All devices.
     Rig,
-    /// One device.
     Device,
 }
 

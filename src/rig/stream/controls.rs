@@ -19,7 +19,6 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use super::source::SampleSource;
 
-/// See the module's comment.
 #[derive(Debug, Clone)]
 pub(in crate::rig) struct Controls {
     actions: Arc<Actions>,

@@ -32,7 +32,6 @@ pub(super) struct Judged {
     pub(super) lost: u64,
 }
 
-/// Why a sample is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 enum Refusal {
     #[error("its samples carry modality {0}, not {1}: a program must send RAPID_BIT as id")]
@@ -58,7 +57,6 @@ enum Expected {
     Bytes,
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Intake {
     id: u32,

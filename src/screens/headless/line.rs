@@ -60,7 +60,6 @@ pub(super) fn begin_json(snapshot: &Snapshot, wall_ns: u64) -> serde_json::Resul
 pub(super) struct Columns {
     /// Columns for the longest device name.
     pub(super) name: usize,
-    /// Colours.
     pub(super) palette: Palette,
 }
 

@@ -28,7 +28,6 @@ const FACTS: u16 = 44;
 const HISTOGRAM: u16 = 6;
 const COLOURS: [Color; PLOTTED] = [Color::Cyan, Color::Yellow, Color::Green, Color::Magenta, Color::Blue, Color::Red];
 
-/// The page.
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, (theme, canvas): (Theme, &mut Canvas)) {
     let Some(device) = model.selected_device() else { return };
     let wide = area.width >= 2 * FACTS;

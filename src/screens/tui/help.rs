@@ -12,7 +12,6 @@ use super::link::LinkState;
 use super::model::Model;
 use super::theme::Theme;
 
-/// Pages of the help.
 pub(super) const PAGES: usize = 2;
 /// Width of the box with its border and padding.
 const WIDTH: u16 = 58;

@@ -20,7 +20,6 @@ pub(super) enum Cell {
     Absent,
     /// It was present; the share of its nominal rate that arrived, 0 to 1.
     Rate(f32),
-    /// Nothing is known.
     #[default]
     Unknown,
 }
@@ -31,13 +30,9 @@ pub(super) const MASK_SECONDS: usize = 300;
 /// A bit of the mask during some seconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Bit {
-    /// Nothing is known.
     Unknown,
-    /// It was set.
     Set,
-    /// It was clear.
     Clear,
-    /// It changed.
     Edge,
 }
 
@@ -86,7 +81,6 @@ impl Default for History {
 }
 
 impl History {
-    /// Takes a snapshot into account.
     pub(super) fn update(&mut self, snapshot: &Snapshot) {
         let begun = *self.begun.get_or_insert(snapshot.taken);
         if snapshot.taken.since(begun) >= UNSEEN {

@@ -23,7 +23,6 @@ pub(super) enum Act {
     Discard,
     /// Take the discarded episode back.
     Undo,
-    /// Mark this moment.
     Mark,
     /// Label the episode as a success.
     Success,
@@ -57,7 +56,6 @@ pub(super) enum Act {
     AskToArm,
     /// Arm the actuator, right after the question.
     Arm,
-    /// Disarm the actuator.
     Disarm,
     /// Disarm the actuator and close whatever is open.
     Escape,
@@ -91,7 +89,6 @@ pub(super) enum Act {
     Web,
     /// Open or close the help.
     Help,
-    /// End the program.
     Quit,
     /// Disarm the actuator, then end the program.
     Interrupt,

@@ -20,7 +20,6 @@ pub(super) struct Entry<'a> {
     pub times: usize,
 }
 
-/// See the module's comment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct LogView {
     /// The least severity that is shown.
@@ -44,7 +43,6 @@ impl Default for LogView {
 }
 
 impl LogView {
-    /// The lines about one device.
     pub(super) fn of_device(device: &str) -> Self {
         Self { device: Some(device.to_owned()), ..Self::default() }
     }

@@ -167,7 +167,6 @@ pub struct Model {
     pub(super) log: LogView,
     /// Columns and rows of the terminal.
     pub(super) size: (u16, u16),
-    /// Pictures are shown.
     pub(super) pictures: bool,
     /// Frames that the terminal had not taken when the next was due, less those that it had, while a picture is shown.
     late: u8,

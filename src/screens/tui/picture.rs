@@ -26,7 +26,6 @@ const LARGEST: usize = 640;
 /// From dark to light.
 const RAMP: &[u8] = b" .:-=+*#%@";
 
-/// A decoded picture.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Picture {
     device: ModalityId,
@@ -170,7 +169,6 @@ impl Canvas {
         }
     }
 
-    /// Begins a frame.
     pub(super) fn begin_frame(&mut self) {
         self.drawn = [None, self.drawn[0]];
     }

@@ -37,7 +37,6 @@ use super::view;
 /// How long a blocked terminal may take for the last frame before it is abandoned.
 const LAST_FRAME: Duration = Duration::from_millis(500);
 
-/// The screen is up.
 static UP: AtomicBool = AtomicBool::new(false);
 
 /// The terminal while it shows the monitor.

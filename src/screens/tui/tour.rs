@@ -23,12 +23,10 @@ pub(super) enum Tour {
     Lose(u8),
     /// It acts without the sensor, which is to be plugged in again.
     Regain,
-    /// It is over.
     Over,
 }
 
 impl Tour {
-    /// Takes a snapshot into account.
     pub(super) fn update(&mut self, now: &Snapshot) {
         let is_recording = now.recording.is_some();
         let is_absent = now.devices.iter().any(|device| device.state == SlotState::Absent);

@@ -31,7 +31,6 @@ use v4l::v4l2::{self, vidioc};
 use super::super::DriverError;
 use super::format::{Agreed, Card, ControlInfo, Frame, Rate, fourcc};
 
-/// `V4L2_BUF_TYPE_VIDEO_CAPTURE`.
 pub(super) const CAPTURE: u32 = v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE;
 
 /// A C structure of the V4L2 interface, for which all bits zero is a valid value.

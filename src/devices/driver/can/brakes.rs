@@ -132,7 +132,6 @@ impl Brakes {
         }
     }
 
-    /// Their states.
     pub(super) fn state(&self, now: Stamp) -> State {
         self.chips.iter().fold(State::default(), |all, chip| {
             let State { released, moving, broken } = chip.shared.state(now);
@@ -251,7 +250,6 @@ struct Line {
     spec: BrakeSpec,
     /// Bits of its motors.
     motors: u16,
-    /// Their names.
     names: String,
     output: Option<Output>,
     /// The guard has the line, or knows that it is closed.

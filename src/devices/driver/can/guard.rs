@@ -12,7 +12,6 @@
 //!
 //! Invariant: the guard sends nothing while cycles arrive or no motor is on.
 //! Invariant: the guard leaves the answers of motors to the guarded process while that runs.
-//! Invariant: a cycle costs one system call, and neither allocates nor waits.
 //! Invariant: the guard has ended, or was killed, before the adapter is closed here: a serial line that it kept open
 //! would get another name when replugged.
 
@@ -85,7 +84,8 @@ impl Guard {
         Ok(Self { socket: ours, process: command.spawn()?, received: OFF, is_reported: false })
     }
 
-    /// Reports a finished cycle. Returns why the guard has become useless, once.
+    /// Reports a finished cycle, which costs one system call, and neither allocates nor waits. Returns why the guard has
+    /// become useless, once.
     pub(super) fn cycle(&mut self, bus: &MotorBus) -> Option<&'static str> {
         let mut message = [0; LONGEST];
         let mut length = 1;

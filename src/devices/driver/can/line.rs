@@ -53,7 +53,6 @@ enum Codec {
 /// Bytes of the longest frame.
 const LONGEST: usize = if slcan::LONGEST > damiao_serial::SENT { slcan::LONGEST } else { damiao_serial::SENT };
 
-/// The result of decoding bytes.
 enum Decoded {
     Frame(CanFrame),
     Answer { refused: bool },

@@ -17,7 +17,6 @@ const CONNECT_LIMIT: Duration = Duration::from_secs(2);
 /// Pending connections; only one is expected.
 const BACKLOG: u32 = 4;
 
-/// See the module's comment.
 #[derive(Debug, Clone)]
 pub(super) struct DeviceAddress {
     interface: Option<String>,

@@ -63,7 +63,6 @@ pub(super) struct Clips {
     pub(super) reserve: Option<u64>,
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Gopro {
     states: mpsc::Receiver<Result<State, DriverError>>,
@@ -242,14 +241,12 @@ struct Shutter {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Before {
-    /// There was none.
     Nothing,
     Clip(Name),
     /// Unknown, and why: no clip can be identified as the episode's.
     Unknown(String),
 }
 
-/// See the module's comment.
 #[derive(Debug, Default)]
 struct Books {
     /// `None` where there is no folder for it.

@@ -43,7 +43,6 @@ const LONGEST_SESSION: usize = 500;
 /// Maximum length of the comment: 18 numbers, the longest of which take 330 digits.
 const COMMENT: usize = 2 << 10;
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Phone {
     name: String,

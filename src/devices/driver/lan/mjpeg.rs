@@ -20,7 +20,6 @@ use crate::driver::{DriverError, Reading};
 
 const HEAD_LIMIT: Duration = Duration::from_secs(5);
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Camera {
     name: String,

@@ -45,7 +45,6 @@ enum State {
     Unsized,
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Multipart {
     /// Without its leading dashes.
@@ -210,7 +209,6 @@ impl Multipart {
         Cut::Open
     }
 
-    /// The body is whole.
     fn complete(&mut self) -> Cut {
         self.state = State::Between;
         self.reported = true;

@@ -25,9 +25,7 @@ const MOST_MISSING: u64 = 1 << 20;
 const OLDEST: Duration = Duration::from_mins(1);
 const FURTHEST: Duration = Duration::from_secs(1);
 
-/// What is read.
 pub(super) struct Wanted<'a> {
-    /// The other computer.
     pub(super) host: &'a str,
     /// The device there.
     pub(super) device: &'a str,
@@ -35,7 +33,6 @@ pub(super) struct Wanted<'a> {
     pub(super) lease: Duration,
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Remote {
     name: String,

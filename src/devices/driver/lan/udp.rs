@@ -33,7 +33,6 @@ const ASK_AFTER: Duration = Duration::from_millis(500);
 /// If a packet seems to have waited longer than this, the wall clock was set meanwhile.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Packets {
     socket: AsyncFd<OwnedFd>,

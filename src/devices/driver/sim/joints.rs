@@ -15,7 +15,6 @@ use crate::driver::DriverError;
 /// Queue length for notices.
 const NOTICES: usize = 16;
 
-/// See the module's comment.
 #[derive(Debug, Default)]
 pub(in crate::driver) struct Joints {
     positions: Vec<f64>,
@@ -52,7 +51,6 @@ impl Joints {
         Ok(joints)
     }
 
-    /// Number of motors.
     pub(super) const fn count(&self) -> usize {
         self.positions.len()
     }

@@ -62,7 +62,6 @@ pub(super) struct Wanted {
     asked: Option<Stamp>,
 }
 
-/// An instance that is announced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct AnnouncedDevice {
     /// Its own name, without the service's.

@@ -48,14 +48,11 @@ impl From<Probe> for Question {
     }
 }
 
-/// Result of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Answer {
-    /// The device is present.
     Here,
     /// Its address answers, and the port is closed.
     Refused,
-    /// No answer.
     Silence,
 }
 

@@ -16,7 +16,6 @@ use tokio::sync::mpsc;
 use super::super::{HotplugEvent, UnplugSource};
 use crate::link::{LinkState, NetworkLink};
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Watch {
     pub(super) entry: String,
@@ -24,7 +23,6 @@ pub(super) struct Watch {
     /// Extension of the lease until the driver has received from the device.
     grace: Duration,
     lease: Lease,
-    /// When the driver last received.
     pub(super) last_received: LastReceived,
     pub(super) link: NetworkLink,
     /// The address of the device, while it is present.
@@ -133,16 +131,12 @@ impl Watch {
     }
 }
 
-/// A change that was noticed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Change {
-    /// The device is present.
     Came,
-    /// The device is gone.
     Went,
 }
 
-/// See the module's comment.
 #[derive(Debug, Clone, Copy)]
 struct Lease {
     length: Duration,

@@ -78,7 +78,6 @@ fn facts(report: &Inspection) -> String {
     words.collect::<Vec<_>>().join("  ·  ")
 }
 
-/// What people noted.
 fn notes(noted: &EpisodeEntry) -> String {
     let label = noted.label.map(|label| match noted.label_reason.as_str() {
         "" => format!("label {}", Label::word(label)),

@@ -35,7 +35,6 @@ const EVENT: usize = 128;
 /// Bytes of an event that is read; those of ours have up to a few kB.
 const MAX_EVENT: usize = 64 << 10;
 
-/// See the module's comment.
 #[derive(Debug, Default)]
 pub(super) struct Collected {
     topics: BTreeMap<u16, TopicCounter>,

@@ -132,7 +132,6 @@ impl Judge {
         self.measures.sample(id, &seen);
     }
 
-    /// Takes a mask.
     pub(super) fn mask(&mut self, at_ns: u64, mask: PhysicalMask) {
         self.measures.mask(at_ns, mask);
     }

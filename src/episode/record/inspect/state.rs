@@ -40,7 +40,6 @@ pub(super) struct Ending<'a> {
     pub(super) failed: Option<&'a str>,
     /// What is left out if parts of it are damaged.
     pub(super) damage: &'a str,
-    /// What was counted in it.
     pub(super) counted: Counted,
 }
 

@@ -87,7 +87,6 @@ pub(super) struct Plugged {
 /// Over an episode, ns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Time {
-    /// Plugged in.
     pub(super) plugged_ns: u64,
     /// Longest plugged in with the bit of the mask not set.
     pub(super) idle_ns: u64,

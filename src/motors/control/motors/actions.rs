@@ -2,7 +2,7 @@
 //!
 //! Invariant: an action is followed only if its tick is after the arm, after the ticks of all earlier actions, and no
 //! older than the deadman allows.
-//! Invariant: the first one after an arm is near the position of every joint.
+//! Invariant: the first one after an arm is near the position of every joint; otherwise the arm or the action is refused.
 
 use std::time::Duration;
 
@@ -18,14 +18,12 @@ use crate::control::interpolate::Interpolator;
 /// Actions may be this far in the future: the clock is the same, but ticks are rounded.
 const EARLY: Duration = Duration::from_millis(100);
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Actions {
     /// The newest one, followed or not, and its tick.
     newest: (Vec<f64>, Stamp),
     line: Interpolator,
     deadman: Deadman,
-    /// When the motors were armed.
     armed: Stamp,
     /// Why the last one was refused, if it was.
     refusing: Option<Refusal>,

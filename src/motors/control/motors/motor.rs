@@ -66,7 +66,6 @@ enum Phase {
     Kept(Kept),
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Motor {
     pub(super) joint: Joint,
@@ -142,7 +141,6 @@ impl Motor {
         }
     }
 
-    /// Takes what its brake is.
     pub(super) fn take_brake(&mut self, is: BrakeIs, now: Stamp, notices: &mut Notices) {
         // A brake that is to be released may already be moving: it counts as engaged only once engagement is wanted.
         let is = if is == BrakeIs::Engaged && self.releases() { BrakeIs::Moving } else { is };

@@ -1,6 +1,7 @@
 //! When a bus of motors has had its cycles, and whose frames come first in the next.
 //!
-//! Invariant: a pause between cycles of [`stalled_after`] or more is a fault: what the motors did meanwhile is unknown.
+//! Invariant: a pause between cycles of [`stalled_after`] or more is a fault, which ends an arm: what the motors did
+//! meanwhile is unknown.
 
 use std::time::Duration;
 
@@ -25,7 +26,6 @@ pub fn stalled_after(spec: &DamiaoSpec) -> Duration {
     (spec.timeout * 3 / 4).max(cycle(spec) * SLOW_CYCLES)
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Schedule {
     cycle: Duration,

@@ -26,7 +26,6 @@ pub(super) const DISMISSED: u8 = 2;
 pub(super) const BRAKE: u8 = 3;
 /// Bytes of a frame: identifier (u32, little endian), length, three zeros, data.
 pub(super) const FRAME: usize = 16;
-/// Longest message.
 pub(super) const LONGEST: usize = 3 + MAX_MOTORS * FRAME;
 
 pub(super) fn encode(frame: &CanFrame) -> [u8; FRAME] {

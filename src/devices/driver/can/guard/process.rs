@@ -49,7 +49,6 @@ impl Post {
     }
 }
 
-/// What the guard is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
     /// No motor is on.
@@ -60,7 +59,6 @@ enum State {
     Stopping(Stamp),
     /// It stopped them, and the guarded process does not run.
     Stopped,
-    /// Nothing is left to do.
     Done,
 }
 
@@ -81,7 +79,6 @@ impl Ward {
         Self { post, state: State::Idle, will: Vec::with_capacity(MAX_MOTORS), engages_first: 0, is_orphan: false }
     }
 
-    /// Takes a message.
     fn receive(&mut self, message: &[u8], now: Stamp) {
         match message {
             [ON, low, high, frames @ ..] => {

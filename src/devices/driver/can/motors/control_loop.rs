@@ -59,7 +59,6 @@ pub(super) struct Shared {
     pub(super) orders: OrderSlot,
     /// Orders that the thread takes directly from where they were given.
     pub(super) attended: OnceLock<Arc<Attended>>,
-    /// The source of actions.
     pub(super) actions: OnceLock<Arc<dyn ActionSource>>,
     reason: OnceLock<LinkError>,
     pub(super) punctuality: OnceLock<Punctuality>,

@@ -132,7 +132,6 @@ impl Drop for Effector {
     }
 }
 
-/// The thread.
 struct Worker {
     solver: Solver,
     motors: usize,

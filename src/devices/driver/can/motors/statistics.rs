@@ -39,7 +39,6 @@ impl fmt::Display for Punctuality {
     }
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct LoopStatistics {
     /// How late cycles began, ns.

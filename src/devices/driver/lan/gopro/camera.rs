@@ -30,7 +30,6 @@ use crate::driver::DriverError;
 /// The episode in progress, if there is one; `None` until the camera was notified.
 pub(super) type ReportedEpisode = Option<Option<PathBuf>>;
 
-/// Time limits.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TimeLimits {
     /// The camera switches itself off when it receives nothing for longer than this (Open GoPro, "keep alive").
@@ -51,7 +50,6 @@ impl TimeLimits {
 
 const LOOK_FOR_CLIP: Duration = Duration::from_millis(100);
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Camera {
     name: String,

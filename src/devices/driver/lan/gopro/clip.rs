@@ -36,7 +36,6 @@ const BLOCK: usize = 1 << 20;
 /// A note has a few hundred bytes.
 const LARGEST_NOTE: u64 = 64 << 10;
 
-/// See the module's comment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Clip {
     pub(super) name: Name,
@@ -95,7 +94,6 @@ impl Clip {
         self.beside(&self.name.file)
     }
 
-    /// Path of the note.
     pub(super) fn note_path(&self) -> PathBuf {
         self.beside("clip.json")
     }

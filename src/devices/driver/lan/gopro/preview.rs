@@ -47,10 +47,8 @@ const LARGEST_DATAGRAM: usize = 64 << 10;
 const PIECE: usize = 64 << 10;
 /// Of `mpjpeg`.
 const BOUNDARY: &str = "ffmpeg";
-/// Ends the stream.
 const STOP: &str = "/gopro/camera/stream/stop";
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Preview {
     /// The output of each decoder that was started.
@@ -163,7 +161,6 @@ fn parser(largest: usize) -> Result<Multipart, DriverError> {
     Multipart::new(BOUNDARY, largest).ok_or_else(|| DriverError::Fatal(format!("{BOUNDARY} is not a boundary")))
 }
 
-/// The camera's stream.
 struct Stream {
     name: String,
     server: Server,

@@ -43,7 +43,6 @@ pub(in crate::driver::lan) struct Frame {
     pub(in crate::driver::lan) wall_clock: f64,
 }
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(in crate::driver::lan) struct Packets {
     header: [u8; HEADER],

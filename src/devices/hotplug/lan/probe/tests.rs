@@ -21,7 +21,6 @@ async fn server<F: Future<Output = ()> + Send>(answer: impl Fn(TcpStream) -> F +
     address
 }
 
-/// A closed port.
 fn closed_port() -> SocketAddr {
     let listener = std::net::TcpListener::bind((LOCAL, 0)).expect("a port");
     listener.local_addr().expect("an address")

@@ -18,14 +18,12 @@ use crate::control::ramp::Ramp;
 /// How fast a joint is driven back, rad/s: slow enough to step aside and to disarm.
 pub const RETURN_SPEED: f64 = 0.1;
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(in crate::control::motors) struct Axis {
     limits: Limits,
     ramp: Ramp,
     /// What is commanded, rad or rad/s.
     command: f64,
-    /// What is aimed at.
     target: f64,
     /// Targets beyond the limits are reported once a second at most.
     clamped: Seldom,
@@ -34,7 +32,6 @@ pub(in crate::control::motors) struct Axis {
 /// The command of a joint in this cycle, rad or rad/s.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Commanded {
-    /// The command.
     pub(super) command: f64,
     /// The command without the torque bound.
     pub(super) wanted: f64,

@@ -7,7 +7,6 @@ use std::time::Duration;
 use rapid_core::time::Stamp;
 use rapid_registry::BrakeSpec;
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(in crate::control::motors) struct Brake {
     /// `None` if the joint has no brake.
@@ -34,14 +33,12 @@ impl Brake {
         Self { spec, is: BrakeIs::default(), since: None }
     }
 
-    /// Takes what it is.
     pub(super) fn take(&mut self, is: BrakeIs, now: Stamp) {
         if self.since.is_none() || self.is != is {
             (self.is, self.since) = (is, Some(now));
         }
     }
 
-    /// Is there one?
     pub(super) const fn exists(&self) -> bool {
         self.spec.is_some()
     }

@@ -13,7 +13,6 @@ use crate::control::limits::stiffness;
 /// Ids of commands, relative to the motor's own.
 const COMMANDS: [u32; 4] = [0, 0x100, 0x200, 0x300];
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(in crate::control::motors) struct Joint {
     /// Its position in the entry.
@@ -29,7 +28,6 @@ impl Joint {
         frame.id == u32::from(self.spec.master) && slave_fits
     }
 
-    /// Its name.
     pub(in crate::control::motors) fn name(&self) -> &str {
         &self.spec.name
     }

@@ -11,7 +11,6 @@ use rapid_registry::Stop;
 
 use super::brake::Brake;
 
-/// See the module's comment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Kept {
     stop: Stop,
@@ -27,7 +26,6 @@ impl Kept {
         (stop != Stop::Limp).then_some(Self { stop, is_brake_due: false, is_missed: false })
     }
 
-    /// How it was stopped.
     pub(super) const fn stop(self) -> Stop {
         self.stop
     }

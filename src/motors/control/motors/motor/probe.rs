@@ -23,7 +23,6 @@ const PROBE: [Parameter; 5] =
 /// its time limit nothing stops a motor once this program is dead, and in other ranges it goes elsewhere.
 const LOOK_AGAIN: Duration = Duration::from_millis(150);
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Probe {
     /// The number of [`Parameter::Timeout`].
@@ -72,7 +71,6 @@ impl Probe {
         (self.look, self.looks) = (None, 0);
     }
 
-    /// What it is asked for.
     pub(super) fn asked_for(&self) -> Parameter {
         PROBE.get(self.at).copied().unwrap_or(Parameter::ControlMode)
     }

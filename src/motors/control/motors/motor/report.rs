@@ -12,7 +12,6 @@ use crate::control::damiao::codec::Feedback;
 /// of the winding °C, and the code of its status.
 pub const SAMPLE_VALUES: usize = 6;
 
-/// See the module's comment.
 #[derive(Debug)]
 pub(in crate::control::motors) struct Report {
     /// `None` before its ranges are known.

@@ -9,7 +9,6 @@ use crate::control::motors::fault::Fault;
 /// So many frames in a row make sure that a motor has turned itself off.
 const SURE: u8 = 2;
 
-/// See the module's comment.
 #[derive(Debug, Default)]
 pub(in crate::control::motors) struct Status {
     /// Since it was last ordered to turn off.

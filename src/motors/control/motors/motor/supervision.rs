@@ -93,7 +93,6 @@ impl Spell {
     }
 }
 
-/// See the module's comment.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Supervision {
     /// When its newest frame arrived.

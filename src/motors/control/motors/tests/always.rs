@@ -6,7 +6,6 @@ use rapid_registry::{Mounting, Stop};
 use super::*;
 use crate::control::damiao::codec::StateCommand;
 
-/// What happens next.
 #[derive(Debug, Clone)]
 enum Event {
     Cycles(usize),

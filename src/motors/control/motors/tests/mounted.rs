@@ -28,7 +28,6 @@ fn ready(mode: MotorMode, mounting: Mounting) -> World {
     world
 }
 
-/// They are armed.
 fn armed(mode: MotorMode, mounting: Mounting) -> World {
     let mut world = ready(mode, mounting);
     world.arm();

@@ -442,7 +442,6 @@ impl World {
         }
     }
 
-    /// Judges a frame.
     fn look(&mut self, frame: &CanFrame) {
         assert!(!self.judge.stopped, "{frame:x?} after a stop");
         let silent_after = self.spec.silent_after.max(CYCLE * 3) + CYCLE * 2;
