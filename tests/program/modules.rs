@@ -2,11 +2,21 @@
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
-use crate::support::{Episode, Place, until};
+use crate::support::{Episode, Place, Running, until};
 use serde_json::Value;
 
 const SCENARIO: &str =
     "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"spare\"\nlike = \"tactile_tip\"\nserial = \"SPARE1\"\n";
+
+/// A run whose first episode has begun: a request for one before that would begin the first.
+fn recording() -> (Place, Running) {
+    let place = Place::new();
+    place.write("devices.toml", include_str!("../../devices.toml"));
+    place.write("scenario.toml", SCENARIO);
+    let arguments = ["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out"];
+    let running = place.start(&arguments, "\"event\":\"recording\"");
+    (place, running)
+}
 
 fn ok(place: &Place, options: &[&str]) -> String {
     let output = place.run(options);
@@ -23,11 +33,7 @@ fn refused(place: &Place, options: &[&str]) -> String {
 
 #[test]
 fn a_type_of_module_is_taken_up_and_mounted_while_the_rig_runs() {
-    let place = Place::new();
-    place.write("devices.toml", include_str!("../../devices.toml"));
-    place.write("scenario.toml", SCENARIO);
-    let running =
-        place.start(&["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out"], "streaming");
+    let (place, running) = recording();
     let sim = ["--sim", "scenario.toml"];
     ok(&place, &[&["register", "--module", "tip_tactile", "--serial", "SPARE1"][..], &sim].concat());
     ok(&place, &["register", "--module", "handheld_adapter"]);
@@ -62,11 +68,7 @@ fn a_type_of_module_is_taken_up_and_mounted_while_the_rig_runs() {
 
 #[test]
 fn a_type_of_the_user_is_mounted_while_the_rig_runs() {
-    let place = Place::new();
-    place.write("devices.toml", include_str!("../../devices.toml"));
-    place.write("scenario.toml", SCENARIO);
-    let running =
-        place.start(&["--sim", "scenario.toml", "--headless", "--json", "--record", "--out", "out"], "streaming");
+    let (place, running) = recording();
     // Written during the run: the run never read it.
     let tip = ok(&place, &["modules", "tip_tactile"]).replace("tip_tactile", "tip_thermal");
     let tip = tip.replace("finger=tactile", "finger=thermal");

@@ -21,7 +21,7 @@ const INBOX: usize = 4096;
 /// Ignored by adapters that are USB devices themselves; the usual rate of those behind a UART.
 const SLCAN_BAUD: u32 = 115_200;
 /// An adapter that answers does so within a few ms; some never do.
-const ANSWER: Duration = Duration::from_millis(100);
+pub(super) const ANSWER: Duration = Duration::from_millis(100);
 
 /// An adapter on a serial line.
 #[derive(Debug)]
@@ -60,7 +60,8 @@ enum Decoded {
 }
 
 impl Line {
-    pub(super) fn slcan(path: &Path, bitrate: u32) -> Result<Self, LinkError> {
+    /// Waits for each answer of the adapter for `longest`.
+    pub(super) fn slcan(path: &Path, bitrate: u32, longest: Duration) -> Result<Self, LinkError> {
         let Some(set) = slcan::Command::bitrate(bitrate) else {
             return Err(LinkError::Fatal(format!(
                 "slcan has no name for {bitrate} bits a second: choose another bitrate"
@@ -70,9 +71,9 @@ impl Line {
         let fd = serial::open_raw(path, SLCAN_BAUD).map_err(LinkError::of_driver)?;
         let mut line = Self::new(fd, Codec::Slcan(slcan::Decoder::default()), description);
         // An open adapter accepts no bit rate; a closed one refuses to close.
-        line.order(slcan::Command::Close)?;
+        line.order(slcan::Command::Close, longest)?;
         for (command, what) in [(set, "the bit rate"), (slcan::Command::Open, "to open the bus")] {
-            if line.order(command)? {
+            if line.order(command, longest)? {
                 return Err(LinkError::Retry(format!("{}: the adapter refused {what}", path.display())));
             }
         }
@@ -110,8 +111,8 @@ impl Line {
     }
 
     /// Sends a command of slcan and waits for the answer; returns whether it was refused. Silence is not a refusal.
-    fn order(&mut self, command: slcan::Command) -> Result<bool, LinkError> {
-        let deadline = Stamp::now().after(ANSWER);
+    fn order(&mut self, command: slcan::Command, longest: Duration) -> Result<bool, LinkError> {
+        let deadline = Stamp::now().after(longest);
         self.put(command.encode().bytes())?;
         loop {
             while self.taken < self.filled {
@@ -124,7 +125,10 @@ impl Line {
                 if left.is_zero() {
                     return Ok(false);
                 }
-                let timeout = Timespec { tv_sec: 0, tv_nsec: left.subsec_nanos().into() };
+                let timeout = Timespec {
+                    tv_sec: left.as_secs().try_into().unwrap_or(i64::MAX),
+                    tv_nsec: left.subsec_nanos().into(),
+                };
                 // Errors also show in the read and the deadline.
                 let _ = poll(&mut [PollFd::new(&self.fd, PollFlags::IN)], Some(&timeout));
             }

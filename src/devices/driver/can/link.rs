@@ -19,7 +19,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use super::line::Line;
+use super::line::{ANSWER, Line};
 use super::outcome::{Arrival, LinkError, Received, is_bus_off};
 use super::socket::Socket;
 
@@ -77,7 +77,7 @@ impl Link {
     /// # Errors
     /// When the line is gone, held by another program or not permitted, or the adapter refuses.
     pub fn open_slcan(path: &Path, bitrate: u32) -> Result<Self, LinkError> {
-        Line::slcan(path, bitrate).map(Self::Slcan)
+        Line::slcan(path, bitrate, ANSWER).map(Self::Slcan)
     }
 
     /// Opens the serial line at `path` to an adapter of Damiao's. May block: keep it off the runtime.
