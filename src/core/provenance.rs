@@ -86,7 +86,7 @@ pub enum Format {
         width: u32,
         /// Pixels.
         height: u32,
-        /// Pictures a second; absent if the driver cannot set a rate.
+        /// Images per second; absent if the driver cannot set a rate.
         #[serde(skip_serializing_if = "Option::is_none")]
         fps: Option<f64>,
     },
@@ -95,7 +95,7 @@ pub enum Format {
         /// Bits a second; absent where there is no line.
         #[serde(skip_serializing_if = "Option::is_none")]
         baud: Option<u32>,
-        /// Numbers in a message; 0 if it is not parsed.
+        /// Values in a message; 0 if it is not parsed.
         channels: usize,
         /// Messages a second, where it is known.
         #[serde(skip_serializing_if = "Option::is_none")]

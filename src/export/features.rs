@@ -555,10 +555,7 @@ mod tests {
         let joined = of(&episode, &["force", "arm.position"], &["arm.tip", "arm.0"]).unwrap();
         assert_eq!(joined.state, [axis(2, 0, "force.0"), arm[0].clone()]);
         assert_eq!(joined.action, [arm[2].clone(), arm[0].clone()]);
-        assert_eq!(
-            of(&episode, &["raw"], &[]).unwrap_err(),
-            "\"raw\" is not a sensor of numbers; those are arm, force"
-        );
+        assert_eq!(of(&episode, &["raw"], &[]).unwrap_err(), "\"raw\" is not a numeric sensor; those are arm, force");
         for chosen in ["/action", "/action.0"] {
             let refused = of(&episode, &[], &["arm", chosen]).unwrap_err();
             assert!(refused.starts_with("no action was sent in this episode"), "{refused}");

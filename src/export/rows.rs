@@ -71,7 +71,7 @@ pub enum Refusal {
         last: u64,
     },
     /// Neither a camera nor a vector.
-    #[error("neither a camera nor a sensor of numbers")]
+    #[error("neither a camera nor a numeric sensor")]
     Nothing,
     /// The pictures of a camera have several sizes.
     #[error("{name}: a picture of {found} in frame {frame}, and {expected} before")]
@@ -97,7 +97,7 @@ pub enum Refusal {
     #[error("{0}: no usable sample to take the size from, and neither the other episodes nor the registry give it")]
     NoSize(String),
     /// Numbers of several lengths.
-    #[error("{name}: {found} numbers, and {expected} before")]
+    #[error("{name}: {found} values, and {expected} before")]
     Length {
         /// The modality, or the topic of actions.
         name: String,

@@ -13,10 +13,10 @@ use super::normalize::Normalizer;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum VectorError {
     /// The observation is made of pictures.
-    #[error("observation `{0}` is made of pictures, not of numbers")]
+    #[error("observation `{0}` is made of pictures, not of values")]
     Pictures(String),
     /// The sample has another shape than the policy requires.
-    #[error("a sample of {found} numbers, where observation `{key}` takes {wanted}: see its `slice` in policy.json")]
+    #[error("a sample of {found} values, where observation `{key}` takes {wanted}: see its `slice` in policy.json")]
     Length {
         /// The observation.
         key: String,
@@ -115,7 +115,7 @@ impl ObservationTensors {
                 rows = rotation::rows(rotation.ok_or_else(|| VectorError::Rotation(tensor.key.clone()))?);
                 rows.as_flattened()
             }
-            // A checked bundle takes 4 numbers.
+            // A checked bundle takes 4 values.
             (Some(VectorRotation::Rotation6d), _) => return Err(VectorError::Rotation(tensor.key.clone())),
         };
         if let Some(place) = tensor.values.chunks_exact_mut(tensor.step.max(1)).nth(step) {

@@ -34,7 +34,7 @@ pub enum PolicyError {
     #[error(transparent)]
     Scheduler(#[from] SchedulerError),
     /// The output does not have the length of a chunk.
-    #[error("a chunk of {expected} numbers does not go into {found}")]
+    #[error("a chunk of {expected} values does not go into {found}")]
     Place {
         /// Numbers of a chunk.
         expected: usize,

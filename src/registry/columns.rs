@@ -24,7 +24,7 @@ pub struct Vector {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ColumnError {
     /// No vector has the name.
-    #[error("{name:?} is not a sensor of numbers; those are {}", if known.is_empty() { "none" } else { known })]
+    #[error("{name:?} is not a numeric sensor; those are {}", if known.is_empty() { "none" } else { known })]
     Unknown {
         /// The name.
         name: String,
@@ -52,7 +52,7 @@ pub enum ColumnError {
         names: String,
     },
     /// How many columns the vector has is not known.
-    #[error("{0}: how many numbers it has is not known")]
+    #[error("{0}: how many values it has is not known")]
     NoLength(String),
     /// A column is chosen twice.
     #[error("{0:?} is chosen twice")]
@@ -178,7 +178,7 @@ mod tests {
     #[test]
     fn what_names_nothing_is_refused_with_what_there_is() {
         let refused = |parts: &[&str]| chosen(parts).unwrap_err();
-        assert_eq!(refused(&["arm.0"]), "\"arm\" is not a sensor of numbers; those are leg, force, late");
+        assert_eq!(refused(&["arm.0"]), "\"arm\" is not a numeric sensor; those are leg, force, late");
         let known = "it has 0-3: hip.position, hip.velocity, knee.position, knee.velocity";
         for which in ["4", "2-4", "3-2", "99999999999999999999999", "hips", "hip.", "", "1-", "-1"] {
             assert_eq!(
@@ -189,7 +189,7 @@ mod tests {
         // The names are of another length than the samples.
         assert_eq!(refused(&["force.x"]), "\"force.x\": force has no column \"x\"; it has 0-1");
         assert_eq!(refused(&["leg.1-2", "leg.position"]), "\"leg.2\" is chosen twice");
-        assert_eq!(refused(&["late.0"]), "late: how many numbers it has is not known");
+        assert_eq!(refused(&["late.0"]), "late: how many values it has is not known");
     }
 
     #[test]

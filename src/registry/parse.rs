@@ -49,7 +49,7 @@ keys! {
         rig = About::Table(&[RigSpec::KEYS]);
         /// What policies are computed on.
         inference = About::Table(&[InferenceSpec::KEYS]);
-        /// Which numbers a dataset has.
+        /// Which values a dataset has.
         export = About::Table(&[ExportSpec::KEYS]);
         /// Limits of the verdict for all devices.
         verdict = About::Table(verdict::OF_THE_RIG);

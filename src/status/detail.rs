@@ -86,7 +86,7 @@ impl StaticDetail {
     }
 }
 
-/// Names and limits of the numbers in a sample: those of motors, or of an actuator that reports what it is sent.
+/// Names and limits of the values in a sample: those of motors, or of an actuator that reports what it is sent.
 fn channels(device: &DeviceSpec) -> Vec<Channel> {
     if let NodeSpec::Can(can) = &device.node
         && let CanProtocol::Damiao(bus) = &can.protocol

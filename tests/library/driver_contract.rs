@@ -194,7 +194,7 @@ async fn a_serial_line_counts_unreadable_messages() {
     assert_eq!(reading.encoding, Encoding::F64);
     let reading = driver.read().await.unwrap();
     assert_eq!((numbers(reading.bytes), reading.lost), (vec![3.0, 4.0], 2));
-    assert!(driver.description().contains("2 numbers in JSON in lines"), "{}", driver.description());
+    assert!(driver.description().contains("2 values in JSON in lines"), "{}", driver.description());
 }
 
 #[tokio::test]

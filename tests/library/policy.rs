@@ -184,7 +184,7 @@ fn numbers_of_the_wrong_shape_are_rejected_and_named() {
     let mut sampler = sampler(&bundle, None);
     let mut observation = observation(&bundle);
     let error = observation.write_vector(2, 0, &[1.0, 2.0, 3.0]).unwrap_err().to_string();
-    assert!(error.starts_with("a sample of 3 numbers, where observation `state` takes numbers 0 to 4"), "{error}");
+    assert!(error.starts_with("a sample of 3 values, where observation `state` takes numbers 0 to 4"), "{error}");
     assert!(observation.write_vector(0, 0, &[1.0]).is_err() && observation.step_mut(0, STEPS).is_none());
     assert!(matches!(
         sampler.chunk(&observation, 0, &mut [0.0; 3]),

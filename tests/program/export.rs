@@ -238,7 +238,7 @@ fn nothing_left(place: &Place, short: &str, slow: &str) {
     };
     let unknown = state(&["--state", "cam_wrist"]);
     let text = String::from_utf8_lossy(&unknown.stderr).into_owned();
-    assert!(text.contains("\"cam_wrist\" is not a sensor of numbers; those are motor_state"), "{text}");
+    assert!(text.contains("\"cam_wrist\" is not a numeric sensor; those are motor_state"), "{text}");
     assert!(text.contains("error: nothing exported: none of 1 episode"), "{text}");
     assert_eq!((unknown.status.code(), place.path("other").exists()), (Some(1), false));
     let as_action = state(&["--state", "motor_state", "--action", "motor_state"]);

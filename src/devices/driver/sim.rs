@@ -166,7 +166,7 @@ impl Sim {
         match (&self.content, target.try_into()) {
             (Content::Task { part: TaskPart::Arm, trial }, Ok(target)) => trial.lock().command(target),
             (Content::Task { part: TaskPart::Arm, .. }, Err(_)) => {
-                let text = format!("{} takes {} numbers, not {}", self.device.name, task::AXES, target.len());
+                let text = format!("{} takes {} values, not {}", self.device.name, task::AXES, target.len());
                 return Err(DriverError::Retry(text));
             }
             _ => return Err(DriverError::Fatal(format!("{} is not an actuator", self.device.name))),
@@ -295,7 +295,7 @@ impl Sim {
             SimSource::Serial { channels, hz, .. } => match self.content {
                 Content::Records { records, .. } => format!("{} at {hz} Hz", records.describe()),
                 _ if self.joints.count() > 0 => format!("simulated motors, {} at {hz} Hz", self.joints.count()),
-                _ => format!("simulated serial line, {channels} numbers at {hz} Hz"),
+                _ => format!("simulated serial line, {channels} values at {hz} Hz"),
             },
             SimSource::Task { part: TaskPart::Arm, .. } => "arm of the simulated task".to_owned(),
             SimSource::Task { part: TaskPart::Phone, .. } => "phone of the simulated task".to_owned(),
@@ -414,13 +414,13 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             if *channels == serial.channels {
                 return Ok(());
             }
-            (format!("{channels} numbers"), serial.channels.to_string())
+            (format!("{channels} values"), serial.channels.to_string())
         }
         (SimSource::Serial { channels, .. }, NodeSpec::Can(can)) => {
             if *channels == can.channels() {
                 return Ok(());
             }
-            (format!("{channels} numbers"), can.channels().to_string())
+            (format!("{channels} values"), can.channels().to_string())
         }
         (SimSource::Camera { .. } | SimSource::Depth { .. }, NodeSpec::Serial(_)) => {
             (String::from("pictures"), String::from("a serial line"))

@@ -88,7 +88,7 @@ fn representation(
     let mut check = |key: &str, range: &Range<usize>, wanted| {
         if range.len() != wanted {
             is_right = false;
-            let message = format!("[{}, {}] names {} numbers instead of {wanted}", range.start, range.end, range.len());
+            let message = format!("[{}, {}] names {} values instead of {wanted}", range.start, range.end, range.len());
             problems.wrong(&format!("{entry}.{key}"), message);
         }
     };

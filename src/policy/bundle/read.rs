@@ -375,7 +375,7 @@ const KEYS: &[Key] = keys! {
     "kind": "\"image\" or \"vector\"; this program knows no other", "\"image\"";
     "modality": "the name of the device in devices.toml", "\"modality\"";
     "required": "true if the policy must not run without it, else false", "true";
-    "shape": "[3, height, width] after resize and crop, sides from 1 to 8192; of a vector [how many numbers, 1 to 4096]", "[3, 96, 96]";
+    "shape": "[3, height, width] after resize and crop, sides from 1 to 8192; of a vector [how many values, 1 to 4096]", "[3, 96, 96]";
     "color": "\"rgb\" or \"bgr\"", "\"rgb\"";
     "resize": "[height, width] that pictures are resized to, or null", "[96, 96]";
     "crop": "[height, width] of the middle that is kept after the resize, or null", "[96, 96]";
@@ -386,7 +386,7 @@ const KEYS: &[Key] = keys! {
     "history.steps": "how many steps it has, 2 to 64", "2";
     "history.valid": "the name of the encoder's input that says which steps have a sample, as text", "\"valid\"";
     "observations.rotation": "\"rotation_6d\" if slice names a quaternion; leave it out for numbers as they are", "null";
-    "observations.slice": "[begin, end] of the sample's numbers, end not included; leave it out for all of them", "[0, 1]";
+    "observations.slice": "[begin, end] of the sample's values, end not included; leave it out for all of them", "[0, 1]";
 
     "observations.normalization": "{\"mode\": \"min_max\", \"min\": [..], \"max\": [..]}, or mode \"mean_std\" or \"identity\"", "{}";
     "mode": "\"min_max\", \"mean_std\" or \"identity\"", "\"identity\"";
@@ -411,7 +411,7 @@ const KEYS: &[Key] = keys! {
     "action.rotation": "\"rotation_6d\" or \"quaternion\"; leave it out for actions without a rotation", "null";
     "action.base": "{\"modality\": .., \"position\": [begin, end], \"rotation\": [begin, end]}: where the pose is that actions are relative to", "{}";
     "base.modality": "the modality of a required vector observation", "\"modality\"";
-    "base.position": "[begin, end] of the sample's 3 numbers x, y, z, end not included", "[0, 3]";
+    "base.position": "[begin, end] of the sample's 3 values x, y, z, end not included", "[0, 3]";
     "base.rotation": "[begin, end] of the sample's quaternion x y z w, end not included, if the action has a rotation", "[3, 7]";
     "limits": "{\"min\": [..], \"max\": [..]}, beyond which no action goes", "{}";
     "limits.min": "the smallest values that may be executed, one number per dimension", "[0]";

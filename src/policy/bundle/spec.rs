@@ -187,7 +187,7 @@ pub struct VectorSpec {
     pub len: usize,
     /// `slice`: which numbers of the sample are used, `len` of them. `None` uses all, and the sample has `len`.
     pub slice: Option<Range<usize>>,
-    /// `rotation`: `None` uses them as they are. Otherwise `slice` has the 4 numbers of a quaternion, and `len` is 6.
+    /// `rotation`: `None` uses them as they are. Otherwise `slice` has the 4 values of a quaternion, and `len` is 6.
     pub rotation: Option<VectorRotation>,
     /// `operation`, before the rotation.
     pub operation: Option<VectorOperation>,

@@ -277,7 +277,7 @@ fn pose(base: &BasePose, channels: usize, problems: &mut Problems) {
     for (key, range) in [("position", Some(&base.position)), ("rotation", base.rotation.as_ref())] {
         if let Some(range) = range.filter(|range| range.end > channels) {
             let name = &base.modality;
-            let message = format!("ends at {}, but \"{name}\" gives {channels} numbers", range.end);
+            let message = format!("ends at {}, but \"{name}\" gives {channels} values", range.end);
             let fix = format!("correct it, or channels of \"{name}\" in devices.toml");
             problems.report(&format!("action.base.{key}"), message, fix);
         }
@@ -287,11 +287,11 @@ fn pose(base: &BasePose, channels: usize, problems: &mut Problems) {
 fn numbers(entry: &str, name: &str, vector: &VectorSpec, channels: usize, problems: &mut Problems) {
     match &vector.slice {
         Some(slice) if slice.end > channels => {
-            let message = format!("slice ends at {}, but \"{name}\" gives {channels} numbers", slice.end);
+            let message = format!("slice ends at {}, but \"{name}\" gives {channels} values", slice.end);
             problems.report(entry, message, format!("correct the slice, or channels of \"{name}\" in devices.toml"));
         }
         None if vector.len != channels => {
-            let message = format!("wants {} numbers, but \"{name}\" gives {channels}", vector.len);
+            let message = format!("wants {} values, but \"{name}\" gives {channels}", vector.len);
             let fix = format!("write \"slice\": [begin, end], or correct channels of \"{name}\" in devices.toml");
             problems.report(entry, message, fix);
         }

@@ -101,7 +101,7 @@ fn every_difference_from_the_rig_is_reported() {
             "[observations[0]] wants pictures of 96x96 (height x width), but \"cam_wrist\" gives 480x640\n    \
              fix: set width = 96 and height = 96 in devices.toml, or \"resize\": [96, 96] here",
             "[observations[1]] modality \"tactile_tpi\" is not in devices.toml\n    fix: did you mean \"tactile_tip\"?",
-            "[observations[2]] slice ends at 4, but \"arm\" gives 3 numbers\n    \
+            "[observations[2]] slice ends at 4, but \"arm\" gives 3 values\n    \
              fix: correct the slice, or channels of \"arm\" in devices.toml",
         ]
     );
@@ -116,16 +116,16 @@ fn every_difference_from_the_rig_is_reported() {
         [
             "[observations[0]] wants pictures, but the device \"arm\" gives bytes without a known structure\n    \
              fix: give [device.arm] in devices.toml a device that gives pictures",
-            "[observations[2]] wants numbers, but the device \"arm\" gives bytes without a known structure\n    \
-             fix: give [device.arm] in devices.toml a device that gives numbers",
+            "[observations[2]] wants values, but the device \"arm\" gives bytes without a known structure\n    \
+             fix: give [device.arm] in devices.toml a device that gives values",
         ]
     );
     let five = "node = \"serial\"\n[device.arm.tty]\nchannels = 5";
     let five = problems(whole.check_registry(&registry(CAM, five)));
-    assert!(five[1].starts_with("[observations[2]] wants 4 numbers, but \"arm\" gives 5"), "{}", five[1]);
+    assert!(five[1].starts_with("[observations[2]] wants 4 values, but \"arm\" gives 5"), "{}", five[1]);
 }
 
-/// The bundle of relative actions with a rotation; the arm has position and quaternion in its first 7 numbers.
+/// The bundle of relative actions with a rotation; the arm has position and quaternion in its first 7 values.
 const RELATIVE: &str = include_str!("../../../tests/bundle/valid/relative.json");
 
 #[test]
@@ -138,9 +138,9 @@ fn a_base_beyond_the_samples_of_its_device_is_reported() {
     assert_eq!(
         found[1..],
         [
-            "[action.base.position] ends at 3, but \"arm\" gives 2 numbers\n    \
+            "[action.base.position] ends at 3, but \"arm\" gives 2 values\n    \
              fix: correct it, or channels of \"arm\" in devices.toml",
-            "[action.base.rotation] ends at 7, but \"arm\" gives 2 numbers\n    \
+            "[action.base.rotation] ends at 7, but \"arm\" gives 2 values\n    \
              fix: correct it, or channels of \"arm\" in devices.toml",
         ]
     );

@@ -271,12 +271,12 @@ fn check_vector(entry: &str, file: &VectorFile, problems: &mut Problems) -> Vect
             let message = if named == 0 {
                 "is missing".to_owned()
             } else {
-                format!("names {named} numbers, but a quaternion has {QUATERNION}")
+                format!("names {named} values, but a quaternion has {QUATERNION}")
             };
             problems.report(&format!("{entry}.slice"), message, ROTATION_SLICE);
         }
     } else if let Some(slice) = file.slice.as_ref().filter(|slice| slice.len() != len) {
-        let message = format!("[{}, {}] holds {} numbers, shape has {len}", slice.start, slice.end, slice.len());
+        let message = format!("[{}, {}] holds {} values, shape has {len}", slice.start, slice.end, slice.len());
         problems.wrong(&format!("{entry}.slice"), message);
     }
     VectorSpec { len, slice: file.slice.clone(), rotation: file.rotation, operation: file.operation }

@@ -24,11 +24,11 @@ keys! {
     /// `[device.NAME.camera]`.
     #[derive(Debug, Clone, PartialEq, Eq)]
     pub struct CameraSpec {
-        /// Width of a picture, pixels.
+        /// Width of an image, pixels.
         width: u32 = whole::<u32>(1, 8192), or 640;
-        /// Height of a picture, pixels.
+        /// Height of an image, pixels.
         height: u32 = whole::<u32>(1, 8192), or 480;
-        /// Pictures a second.
+        /// Images per second.
         fps: u32 = whole::<u32>(1, 1000), or 30;
         /// Pixel format. `Z16` is depth.
         format: PixelFormat = Words(&PixelFormat::WORDS), or PixelFormat::Mjpg;

@@ -104,7 +104,7 @@ pub struct LanPicture {
 pub enum PhoneStream {
     /// The picture, with the pose in a comment.
     Image,
-    /// The pose: 16 numbers, 4 by 4, column by column.
+    /// The pose: 16 values, 4 by 4, column by column.
     Pose,
 }
 
@@ -327,7 +327,7 @@ impl Kind for LanSpec {
                     RemoteSamples::Pictures(LanPicture { width, height, fps }, format) => {
                         format!("{format} {width}x{height} {fps} fps")
                     }
-                    RemoteSamples::Numbers(count) => format!("{count} numbers"),
+                    RemoteSamples::Numbers(count) => format!("{count} values"),
                     RemoteSamples::Bytes => "bytes".to_owned(),
                 };
                 format!("{device} of {host}, {samples}")

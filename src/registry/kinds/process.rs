@@ -29,11 +29,11 @@ keys! {
         opens: Opens = Words(&Opens::WORDS), or Opens::Usb;
         /// Content of its samples.
         kind: ModalityKind = Words(&KINDS), or ModalityKind::Bytes;
-        /// Of scalars: numbers in a sample.
+        /// Of scalars: values in a sample.
         channels: Option<u32> = whole::<u32>(1, 1024);
-        /// Of pictures: their width, pixels.
+        /// Of images: their width, pixels.
         width: Option<u32> = whole::<u32>(1, 8192);
-        /// Of pictures: their height, pixels.
+        /// Of images: their height, pixels.
         height: Option<u32> = whole::<u32>(1, 8192);
         /// Silent for this long it is stalled. The default suffices for a program that only checks once a second whether its
         /// device still answers.

@@ -27,7 +27,7 @@ keys! {
         framing: Framing = FRAMING, usually "`\"line\"`", or Framing::Line;
         /// Content of a message.
         parse: Parse = Words(&Parse::WORDS), or Parse::Csv;
-        /// Numbers in a message; 0 with `parse = "raw"`.
+        /// Values in a message; 0 with `parse = "raw"`.
         channels: usize = whole::<usize>(1, 1024), usually "needed, unless messages are raw", or 0;
     }
 }

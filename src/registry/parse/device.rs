@@ -78,7 +78,7 @@ keys! {
         camera = About::Table(&[CameraSpec::KEYS]);
         /// Limits of the verdict for this device.
         verdict = About::Table(verdict::OF_A_DEVICE);
-        /// Intrinsics of its pictures.
+        /// Intrinsics of its images.
         calibration = About::Table(&[form::CalibrationKeys::KEYS]);
     }
 }
@@ -90,11 +90,11 @@ keys! {
         verdict = About::Table(verdict::OF_A_DEVICE);
         /// The actions of a program's actuator.
         action = About::Table(&[ActionKeys::KEYS]);
-        /// Its numbers are a pose.
+        /// Its values are a pose.
         pose = About::Table(&form::POSE_KEYS);
-        /// Its numbers are the states of joints.
+        /// Its values are the states of joints.
         joints = About::Table(&[form::JointsKeys::KEYS]);
-        /// Intrinsics of its pictures.
+        /// Intrinsics of its images.
         calibration = About::Table(&[form::CalibrationKeys::KEYS]);
         /// Its packets are those of a LiDAR.
         points = About::Table(&[form::PointsKeys::KEYS]);

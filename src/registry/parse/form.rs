@@ -28,7 +28,7 @@ const MODELS: [(&str, (&str, usize)); 3] = [
 keys! {
     /// `[device.NAME.pose]`: the pose of a frame that has the name of the entry.
     pub(super) struct PoseKeys {
-        /// The order of its numbers.
+        /// The order of its values.
         layout: Option<PoseLayout> = Words(&PoseLayout::WORDS), usually "needed, but for a phone";
     }
 
@@ -42,7 +42,7 @@ keys! {
     pub(super) struct JointsKeys {
         /// Names of the joints, as in the robot's description.
         names: Option<Vec<String>> = TEXTS, need "write names = [\"shoulder\", \"elbow\"], as in the robot's description";
-        /// What the numbers of each joint are, in order: `"position"`, `"velocity"`, `"effort"`, `"other"`.
+        /// What the values of each joint are, in order: `"position"`, `"velocity"`, `"effort"`, `"other"`.
         quantities: Option<Vec<Quantity>> = QUANTITIES, usually "`[\"position\"]`";
     }
 
@@ -108,9 +108,9 @@ pub(super) fn form(name: &str, section: &Section<'_>, node: Option<&NodeSpec>, c
     if count == 0 {
         return section.refuse(key, "its samples are not numbers".to_owned(), "remove the table");
     }
-    let message = format!("{} numbers for a sample of {count}", form.numbers());
+    let message = format!("{} values for a sample of {count}", form.numbers());
     let fix = match &form {
-        Form::Pose(_) => "columns and rows have 16 numbers, a quaternion with its position 7: write as many `channels`",
+        Form::Pose(_) => "columns and rows have 16 values, a quaternion with its position 7: write as many `channels`",
         Form::Joints(_) | Form::Calibration(_) | Form::Points(_) => {
             "a sample has each of `quantities` for each of `names`: write as many `channels`"
         }
@@ -159,7 +159,7 @@ fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> O
     let distortion = if table.has("distortion") { keys.distortion? } else { Vec::new() };
     let intrinsics = keys.intrinsics?;
     let Ok(intrinsics) = <[f64; 9]>::try_from(intrinsics.as_slice()) else {
-        let message = format!("{} numbers, and the matrix has 9", intrinsics.len());
+        let message = format!("{} values, and the matrix has 9", intrinsics.len());
         return table.refuse("intrinsics", message, "write [fx, 0, cx, 0, fy, cy, 0, 0, 1], in pixels");
     };
     let is_matrix = intrinsics.iter().all(|number| number.is_finite()) && intrinsics[0] > 0.0 && intrinsics[4] > 0.0;
@@ -169,7 +169,7 @@ fn calibration(section: &Section<'_>, table: &Section<'_>, node: &NodeSpec) -> O
     }
     let (model, parameters) = if table.has("model") { keys.model? } else { ("plumb_bob", 5) };
     if !distortion.is_empty() && distortion.len() != parameters {
-        let message = format!("{} numbers, and {model} has {parameters}", distortion.len());
+        let message = format!("{} values, and {model} has {parameters}", distortion.len());
         return table.refuse("distortion", message, "write those of the calibration, or name its `model`");
     }
     if distortion.iter().any(|number| !number.is_finite()) {

@@ -139,7 +139,7 @@ pub(crate) fn number(table: &Section<'_>, drafts: &[Draft<'_>]) -> NumberKeys {
                     table.report("device", message, "name an entry whose samples are: serial, motors, a program");
                 }
                 (Some(count), Some(index)) if index >= count => {
-                    let message = format!("index = {index}, and a sample of [device.{name}] has {count} numbers");
+                    let message = format!("index = {index}, and a sample of [device.{name}] has {count} values");
                     table.report("index", message, format!("write index = 0 to {}", count - 1));
                 }
                 // The content of its samples is unknown, which has been reported.

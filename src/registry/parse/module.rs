@@ -27,9 +27,9 @@ keys! {
         /// The frame in which the place is given.
         parent: Option<String> = TEXT, usually "`\"gripper\"`";
         /// `[x, y, z]`, m.
-        position: Option<[f64; 3]> = numbers(place, "3 numbers"), need "write position = [x, y, z], in m";
+        position: Option<[f64; 3]> = numbers(place, "3 values"), need "write position = [x, y, z], in m";
         /// A quaternion `[x, y, z, w]` of length 1.
-        rotation: Option<[f64; 4]> = numbers(rotation, "4 numbers"), usually "`[0, 0, 0, 1]`";
+        rotation: Option<[f64; 4]> = numbers(rotation, "4 values"), usually "`[0, 0, 0, 1]`";
     }
 }
 
@@ -146,6 +146,6 @@ fn exactly<const COUNT: usize>(table: &Section<'_>, key: &str, fix: &str) -> Opt
     match <[f64; COUNT]>::try_from(numbers.as_slice()) {
         Ok(numbers) if numbers.iter().all(|number| number.is_finite()) => Some(numbers),
         Ok(_) => table.refuse(key, "a number that is not finite".to_owned(), fix),
-        Err(_) => table.refuse(key, format!("{} numbers, and it has {COUNT}", numbers.len()), fix),
+        Err(_) => table.refuse(key, format!("{} values, and it has {COUNT}", numbers.len()), fix),
     }
 }

@@ -6,12 +6,12 @@ use crate::section::Section;
 const COLUMNS: Own<Vec<String>> = texts(columns, "a list of columns");
 
 keys! {
-    /// Which numbers a dataset has, in the grammar of [`columns`](crate::columns): `[export]`, or `--state` and
+    /// Which values a dataset has, in the grammar of [`columns`](crate::columns): `[export]`, or `--state` and
     /// `--action` of `rapid export`, whose defaults it has.
     #[derive(Debug, Clone, Default, PartialEq, Eq)]
     pub struct ExportSpec {
         /// Columns of the state.
-        state: Vec<String> = COLUMNS, usually "all numbers of all sensors", or Vec::new();
+        state: Vec<String> = COLUMNS, usually "all values of all sensors", or Vec::new();
         /// Columns of the action.
         action: Vec<String> = COLUMNS, usually "the topic of actions", or Vec::new();
     }

@@ -33,7 +33,7 @@ pub struct PointsSpec {
 /// How a pose is given.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PoseSpec {
-    /// The order of its numbers.
+    /// The order of its values.
     pub layout: PoseLayout,
     /// The frame in which it is given, default `world`.
     pub parent: String,

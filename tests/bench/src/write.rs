@@ -294,7 +294,7 @@ fn yuyv() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Vectors of 14 numbers like those of a motor controller: slow curves with noise in the low digits.
+/// Vectors of 14 values like those of a motor controller: slow curves with noise in the low digits.
 fn scalars() -> Vec<Vec<u8>> {
     let mut noise = Noise(11);
     (0..4096_u32)

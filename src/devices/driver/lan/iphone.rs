@@ -1,8 +1,8 @@
 //! Phones that run aod321/iPhoneVIO: the phone connects to this program and sends pictures with the pose of its camera.
 //!
 //! One entry produces one kind of sample. For `image`, each sample is the received picture with a comment inserted
-//! after its first two bytes: `{"pose":[16 numbers],"device_time":s,"wall_clock":s}`, so that no measurement of the
-//! phone is lost. For `pose`, each sample is the 16 numbers. The phone makes one connection, so both at once are not
+//! after its first two bytes: `{"pose":[16 values],"device_time":s,"wall_clock":s}`, so that no measurement of the
+//! phone is lost. For `pose`, each sample is the 16 values. The phone makes one connection, so both at once are not
 //! available.
 //!
 //! A sample's time is the phone's own, converted to our clock by the smallest delay seen ([`Clock`]).
@@ -40,7 +40,7 @@ const INBOX: usize = 64 << 10;
 const LARGEST_UNSEEN: usize = 64 << 10;
 /// Logged length of a phone's session report.
 const LONGEST_SESSION: usize = 500;
-/// Maximum length of the comment: 18 numbers, the longest of which take 330 digits.
+/// Maximum length of the comment: 18 values, the longest of which take 330 digits.
 const COMMENT: usize = 2 << 10;
 
 #[derive(Debug)]

@@ -174,7 +174,7 @@ impl Remote {
             (RemoteSamples::Numbers(count), None) if encoding == Encoding::F64 => {
                 let sent = bytes / size_of::<f64>();
                 if !bytes.is_multiple_of(size_of::<f64>()) || u32::try_from(sent) != Ok(count) {
-                    return wrong(format!("its samples have {sent} numbers: write channels = {sent} in {table}"));
+                    return wrong(format!("its samples have {sent} values: write channels = {sent} in {table}"));
                 }
                 Ok(())
             }

@@ -15,7 +15,7 @@ use crate::spec::{ActionSpec, tip_numbers};
 
 /// The table.
 pub(crate) const EFFECTOR: &str = "effector";
-const POSITION: Own<[f64; 3]> = numbers(position, "3 numbers");
+const POSITION: Own<[f64; 3]> = numbers(position, "3 values");
 const ROTATION: Own<TipRotation> = own(
     rotation,
     "`\"commanded\"`, `\"free\"`, or a quaternion `[x, y, z, w]`",
@@ -145,7 +145,7 @@ pub(crate) fn read(section: &Section<'_>, damiao: &DamiaoSpec, programs: Program
     }
     let count = damiao.motors.len() * MOTOR_CHANNELS + spec.numbers();
     if count > MAX_ACTION {
-        let message = format!("a sample of {count} numbers, and {MAX_ACTION} is the limit");
+        let message = format!("a sample of {count} values, and {MAX_ACTION} is the limit");
         return section.refuse(EFFECTOR, message, "move some of the motors to another adapter");
     }
     Some(spec)
@@ -166,7 +166,7 @@ fn rotation(table: &Section<'_>, key: &str) -> Option<TipRotation> {
     }
     let numbers = table.numbers(key)?;
     let Ok(numbers) = <[f64; 4]>::try_from(numbers) else {
-        return table.refuse(key, "a quaternion has 4 numbers", FIX);
+        return table.refuse(key, "a quaternion has 4 values", FIX);
     };
     let length = numbers.iter().map(|number| number * number).sum::<f64>().sqrt();
     if !(0.5..=2.0).contains(&length) {

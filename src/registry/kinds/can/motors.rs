@@ -17,7 +17,7 @@ rapid_core::words! {
     Stop, 4: "limp" = Limp, "damp" = Damp, "hold" = Hold, "brake" = Brake;
 }
 
-/// Most motors of one bus: an action has an axis each, a sample 6 numbers each.
+/// Most motors of one bus: an action has an axis each, a sample 6 values each.
 pub const MAX_MOTORS: usize = 10;
 
 /// `protocol = "damiao"`.

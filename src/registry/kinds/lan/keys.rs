@@ -42,11 +42,11 @@ keys! {
         lease: Option<Duration> = Time(Duration::from_millis(500), Duration::from_mins(1)), usually "`\"3s\"`, with `remote` `\"1s\"`";
         /// Of mjpeg: what is requested.
         path: String = PATH, or "/".to_owned();
-        /// Width of a picture, pixels.
+        /// Width of an image, pixels.
         width: Option<u32> = SIDE, usually "by protocol";
-        /// Height of a picture, pixels.
+        /// Height of an image, pixels.
         height: Option<u32> = SIDE, usually "by protocol";
-        /// Pictures a second.
+        /// Images per second.
         fps: Option<u32> = whole::<u32>(1, 1000), usually "`30`";
         /// Of gopro: whether its clips are downloaded after the episode.
         download: bool = FLAG, or false;
@@ -56,9 +56,9 @@ keys! {
         device: Option<String> = TEXT, usually "the name of the entry";
         /// Of remote: content of a sample.
         kind: ModalityKind = Words(&KINDS), or ModalityKind::Image;
-        /// Of remote: pixel format of its pictures.
+        /// Of remote: pixel format of its images.
         format: PixelFormat = Words(&PixelFormat::WORDS), or PixelFormat::Mjpg;
-        /// Of remote: numbers in a sample.
+        /// Of remote: values in a sample.
         channels: Option<u32> = whole::<u32>(1, 1024);
     }
 }
@@ -190,7 +190,7 @@ fn samples(table: &Section<'_>, keys: &LanKeys) -> RemoteSamples {
         ModalityKind::Image => RemoteSamples::Pictures(picture(keys, LanPicture::OF_A_CAMERA), keys.format),
         ModalityKind::Depth => RemoteSamples::Pictures(picture(keys, LanPicture::OF_A_CAMERA), PixelFormat::Z16),
         ModalityKind::Scalars => {
-            table.need("channels", "write channels = the count of numbers in a sample");
+            table.need("channels", "write channels = the count of values in a sample");
             RemoteSamples::Numbers(keys.channels.unwrap_or(1))
         }
         ModalityKind::Bytes => RemoteSamples::Bytes,

@@ -100,7 +100,7 @@ async fn what_does_not_fit_the_entry_is_named_with_its_fix() {
         (PICTURES, F64, &[0; 8], "its samples are of another kind: write kind = \"scalars\" in [device.x.lan]"),
         (PICTURES, Bytes, b"x", "its samples are of another kind: write kind = \"bytes\" in [device.x.lan]"),
         (numbers, Grey, &[0; 8], "its samples are of another kind: write kind = \"image\" in [device.x.lan]"),
-        (numbers, F64, &[0; 0], "its samples have 0 numbers: write channels = 0 in [device.x.lan]"),
+        (numbers, F64, &[0; 0], "its samples have 0 values: write channels = 0 in [device.x.lan]"),
         (
             RemoteSamples::Bytes,
             F64,
