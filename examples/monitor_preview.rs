@@ -19,7 +19,7 @@ use rapid_registry::{
 use rapid_screens::headless::{self, HeadlessOptions};
 use rapid_screens::tui::{self, ScreenOptions};
 use rapid_status::session::SessionRequest;
-use rapid_status::{Board, Command, EventKind, Level, Outlook, RecordingStatus, SlotState};
+use rapid_status::{Board, Command, DeviceState, EventKind, Level, Outlook, RecordingStatus};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -114,7 +114,7 @@ fn registry(count: u8) -> Registry {
 
 async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Command>, shutdown: CancellationToken) {
     let begun = Stamp::now();
-    let mut states = vec![SlotState::Absent; usize::from(count)];
+    let mut states = vec![DeviceState::Absent; usize::from(count)];
     let mut sequence = 0;
     let mut episode: Option<(Stamp, PathBuf, u64)> = None;
     let mut beat = tokio::time::interval(Duration::from_millis(10));
@@ -137,7 +137,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                 | Command::Register { .. }
                 | Command::Control { .. }
                 | Command::Look(_) => {}
-                Command::Restart(id) => states[id.index()] = SlotState::Absent,
+                Command::Restart(id) => states[id.index()] = DeviceState::Absent,
             },
             _ = beat.tick() => {}
         }
@@ -151,7 +151,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
             let state = script(u64::try_from(elapsed).unwrap_or(0), u64::from(bit));
             if state != *before {
                 *before = state;
-                board.set_slot(id, state, Epoch(1), detail(state));
+                board.set_device_state(id, state, Epoch(1), detail(state));
                 board.announce(EventKind::State {
                     device: NAMES.get(index).copied().unwrap_or("sensor").to_owned(),
                     bit: id,
@@ -159,16 +159,16 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                     mask: SizedMask { mask: board.snapshot().mask, devices: usize::from(count) },
                     detail: detail(state).to_owned(),
                 });
-                let level = if state == SlotState::Failed { Level::Error } else { Level::Info };
+                let level = if state == DeviceState::Failed { Level::Error } else { Level::Info };
                 report(&board, level, &format!("bit {bit} is {state:?}, {}", detail(state)));
             }
-            if state == SlotState::Streaming && sequence % (5 * (1 + u64::from(bit) % 4)) == 0 {
+            if state == DeviceState::Streaming && sequence % (5 * (1 + u64::from(bit) % 4)) == 0 {
                 board.counters(id).count(30_000, now, u64::from(sequence % 5000 == 0));
                 if let Some((_, _, messages)) = &mut episode {
                     *messages += 1;
                 }
             }
-            mask = mask.with(id, matches!(state, SlotState::Streaming | SlotState::Stalled));
+            mask = mask.with(id, matches!(state, DeviceState::Streaming | DeviceState::Stalled));
         }
         board.set_mask(mask, sequence);
         board.set_recording(episode.as_ref().map(|(start, file, messages)| RecordingStatus {
@@ -184,24 +184,24 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
 }
 
 /// Each device goes through a life of its own, 40 s long.
-fn script(elapsed_ms: u64, bit: u64) -> SlotState {
+fn script(elapsed_ms: u64, bit: u64) -> DeviceState {
     match (elapsed_ms + bit * 6500) % 40_000 {
-        0..2_000 => SlotState::Opening,
-        2_000..28_000 => SlotState::Streaming,
-        28_000..30_000 => SlotState::Stalled,
-        30_000..33_000 => SlotState::Absent,
-        33_000..36_000 => SlotState::Backoff,
-        _ => SlotState::Failed,
+        0..2_000 => DeviceState::Opening,
+        2_000..28_000 => DeviceState::Streaming,
+        28_000..30_000 => DeviceState::Stalled,
+        30_000..33_000 => DeviceState::Absent,
+        33_000..36_000 => DeviceState::Backoff,
+        _ => DeviceState::Failed,
     }
 }
 
-fn detail(state: SlotState) -> &'static str {
+fn detail(state: DeviceState) -> &'static str {
     match state {
-        SlotState::Streaming | SlotState::Opening => "/dev/video0 MJPG 640x480@30",
-        SlotState::Stalled => "no sample for 500 ms",
-        SlotState::Backoff => "again in 2 s: device busy",
-        SlotState::Failed => "/dev/video0: permission denied, is the user in group video?",
-        SlotState::Absent => "",
+        DeviceState::Streaming | DeviceState::Opening => "/dev/video0 MJPG 640x480@30",
+        DeviceState::Stalled => "no sample for 500 ms",
+        DeviceState::Backoff => "again in 2 s: device busy",
+        DeviceState::Failed => "/dev/video0: permission denied, is the user in group video?",
+        DeviceState::Absent => "",
     }
 }
 

@@ -17,11 +17,11 @@ mod conductor;
 mod controls;
 mod discovery;
 mod error;
+#[cfg(feature = "foxglove")]
+mod foxglove;
 mod free_space;
 #[cfg(feature = "policy")]
 mod inference;
-#[cfg(feature = "foxglove")]
-mod live;
 mod optional;
 mod recording;
 mod reload;
@@ -70,10 +70,10 @@ use crate::session::journal::Plan;
 use buttons::Buttons;
 use conductor::Conductor;
 pub use error::AppError;
+#[cfg(feature = "foxglove")]
+pub use foxglove::FoxgloveOptions;
 #[cfg(feature = "policy")]
 pub use inference::PolicyOptions;
-#[cfg(feature = "foxglove")]
-pub use live::LiveOptions;
 pub use optional::{Policy, Server};
 use requests::Request;
 use signals::Signals;

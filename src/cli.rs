@@ -29,7 +29,7 @@ pub use measure::{AblationArgs, Calibration, Count, LatencyArgs};
 pub use policy::{EvalArgs, ObserveArgs, PolicyCommand, ShowArgs};
 pub use policy::{InferenceArgs, PolicyArgs, ReplayArgs};
 pub use registry::{RegisterArgs, UnregisterArgs};
-pub use run::{LiveArgs, RunArgs, ShownArgs, TaskArgs, WebArgs};
+pub use run::{FoxgloveArgs, RunArgs, ShownArgs, TaskArgs, WebArgs};
 pub use session::{EpisodeCommand, SessionCommand};
 
 /// Record robot demonstrations with hot-plugged sensors

@@ -404,8 +404,8 @@ fn policy_of(args: Option<PolicyArgs>, seed: u64, registry: &Registry) -> Result
 fn servers(args: &RunArgs) -> Vec<Box<dyn Server>> {
     let requested: Vec<Option<Box<dyn Server>>> = Vec::from([
         #[cfg(feature = "foxglove")]
-        args.live.foxglove.map(|address| -> Box<dyn Server> {
-            Box::new(app::LiveOptions { address, control: args.live.foxglove_control })
+        args.foxglove_server.foxglove.map(|address| -> Box<dyn Server> {
+            Box::new(app::FoxgloveOptions { address, control: args.foxglove_server.foxglove_control })
         }),
         #[cfg(feature = "web")]
         args.web.web.map(|address| -> Box<dyn Server> {
@@ -421,7 +421,7 @@ fn check_built(cli: &Cli) -> Result<(), Failure> {
     let run = replay.map_or(&cli.run, |replay| &replay.run);
     let infers = cli.policy.infer.is_some() || cli.task.expert || replay.is_some_and(|replay| replay.infer.is_some());
     let requested = [
-        ("foxglove", cfg!(feature = "foxglove"), run.live.foxglove.is_some(), "--foxglove"),
+        ("foxglove", cfg!(feature = "foxglove"), run.foxglove_server.foxglove.is_some(), "--foxglove"),
         ("policy", cfg!(feature = "policy"), infers, "--infer and --expert"),
         ("web", cfg!(feature = "web"), run.web.web.is_some(), "--web"),
     ];

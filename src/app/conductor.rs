@@ -9,7 +9,7 @@ use std::time::Duration;
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
 use rapid_episode::record::RecordError;
-use rapid_status::{Board, DeviceStatus, EpisodeReport, EventKind, Level, SlotState};
+use rapid_status::{Board, DeviceState, DeviceStatus, EpisodeReport, EventKind, Level};
 use rapid_system::fault;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
@@ -138,7 +138,7 @@ impl Conductor {
     /// A run that waits for its first device looks like one that works. Unplugged devices are reported by events.
     fn warn_if_none(&self) {
         let devices = self.board.snapshot().devices;
-        let never = |device: &DeviceStatus| device.state == SlotState::Absent && device.epoch == Epoch::default();
+        let never = |device: &DeviceStatus| device.state == DeviceState::Absent && device.epoch == Epoch::default();
         if !devices.is_empty() && devices.iter().all(never) {
             let text = "no device of the registry is plugged in; `rapid devices` lists what is, and which entry it is";
             self.board.announce(EventKind::Log { level: Level::Warn, text: text.to_owned() });

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rapid_status::{Board, DeviceStatus, SlotState, Snapshot};
+use rapid_status::{Board, DeviceState, DeviceStatus, Snapshot};
 
 /// Every attached device delivers by then, or is not waited for.
 pub(super) const LIMIT: Duration = Duration::from_secs(3);
@@ -17,7 +17,7 @@ pub(super) fn has_settled(board: &Board, waited: Duration) -> bool {
 
 fn is_everything_published(snapshot: &Snapshot) -> bool {
     let published = |device: &DeviceStatus| {
-        device.state != SlotState::Opening && device.state.is_present() == snapshot.mask.contains(device.id)
+        device.state != DeviceState::Opening && device.state.is_present() == snapshot.mask.contains(device.id)
     };
     snapshot.devices.iter().all(published)
 }
@@ -32,14 +32,15 @@ mod tests {
     #[test]
     fn a_device_is_waited_for_until_the_published_mask_agrees_with_its_state() {
         for (state, without, with) in [
-            (SlotState::Absent, true, false),
-            (SlotState::Opening, false, false),
-            (SlotState::Streaming, false, true),
-            (SlotState::Stalled, false, true),
-            (SlotState::Backoff, true, false),
-            (SlotState::Failed, true, false),
+            (DeviceState::Absent, true, false),
+            (DeviceState::Opening, false, false),
+            (DeviceState::Streaming, false, true),
+            (DeviceState::Stalled, false, true),
+            (DeviceState::Backoff, true, false),
+            (DeviceState::Failed, true, false),
         ] {
-            let mut snapshot = snapshot(vec![device(0, "tip", SlotState::Streaming, ""), device(3, "cam", state, "")]);
+            let mut snapshot =
+                snapshot(vec![device(0, "tip", DeviceState::Streaming, ""), device(3, "cam", state, "")]);
             for (bit, settled) in [(false, without), (true, with)] {
                 snapshot.mask = PhysicalMask(1).with(id(3), bit);
                 assert_eq!(is_everything_published(&snapshot), settled, "{state:?}, its bit is {bit}");

@@ -3,7 +3,7 @@
 //! | stage           | its task                                           | what blocks for it                           |
 //! |-----------------|----------------------------------------------------|----------------------------------------------|
 //! | discovery       | reads hot-plug events and hands them to streaming  | nothing: netlink and mDNS sockets are polled |
-//! | streaming       | the rig: slots, mask, a task for each device       | thread `mask`, threads of drivers            |
+//! | streaming       | the rig: states, mask, a task for each device      | thread `mask`, threads of drivers            |
 //! | synchronisation | publishes the observation of each tick             | nothing: it looks at the bus at each tick    |
 //! | recording       | waits for its thread and joins it                  | thread `writer`                              |
 //! | inference       | loads the policy, starts it and joins its threads  | threads `grid` and `policy`                  |

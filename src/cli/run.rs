@@ -67,7 +67,7 @@ pub struct RunArgs {
     pub window: Option<Duration>,
     /// What other programs see live.
     #[command(flatten)]
-    pub live: LiveArgs,
+    pub foxglove_server: FoxgloveArgs,
     /// The page for a phone.
     #[command(flatten)]
     pub web: WebArgs,
@@ -78,12 +78,12 @@ pub struct RunArgs {
 
 /// What other programs see live.
 #[derive(Debug, Clone, Copy, Args)]
-pub struct LiveArgs {
+pub struct FoxgloveArgs {
     /// Show all topics live in Foxglove, as they are recorded [default address: 127.0.0.1:8765]
     ///
     /// In Foxglove: open connection, `ws://localhost:8765`. From another machine: `ssh -L 8765:localhost:8765 RIG`. With an
     /// address that other machines can reach, such as 0.0.0.0:8765, whoever reaches the port sees what the sensors see.
-    #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = live_address, default_missing_value = "127.0.0.1:8765", hide_short_help = true)]
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, value_parser = foxglove_address, default_missing_value = "127.0.0.1:8765", hide_short_help = true)]
     pub foxglove: Option<SocketAddr>,
     /// Let Foxglove begin and end episodes, arm and disarm
     ///
@@ -137,7 +137,7 @@ pub struct TaskArgs {
     pub episodes: usize,
 }
 
-fn live_address(text: &str) -> Result<SocketAddr, String> {
+fn foxglove_address(text: &str) -> Result<SocketAddr, String> {
     address(text, 8765)
 }
 

@@ -15,7 +15,7 @@ use rapid_core::time::Stamp;
 use rapid_screens::tui::model::{Effect, Msg};
 use rapid_screens::tui::{self, Closed, LinkState, RigLink, ScreenOptions, TuiError};
 use rapid_status::attach::{Decoder, LinkError};
-use rapid_status::{Command, SlotState, Snapshot};
+use rapid_status::{Command, DeviceState, Snapshot};
 use rapid_system::peer::ProcessState;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -217,7 +217,7 @@ fn follow(
 fn ended(snapshot: &mut Snapshot) {
     (snapshot.recording, snapshot.mask) = (None, PhysicalMask::EMPTY);
     for device in &mut snapshot.devices {
-        device.state = SlotState::Absent;
+        device.state = DeviceState::Absent;
         "the run has ended".clone_into(&mut device.detail);
     }
 }

@@ -3,7 +3,7 @@
 //! Owns the 64-bit value and its 32-byte record (paper, appendix "Physical Mask Data Format"). It is
 //! published by `rig/presence`.
 //!
-//! Invariant: a bit is a [`ModalityId`]; nothing here decides when a bit changes: the rule is `SlotState::is_present` in
+//! Invariant: a bit is a [`ModalityId`]; nothing here decides when a bit changes: the rule is `DeviceState::is_present` in
 //! `rapid-status`, and the rig (`rig/core`) applies it.
 
 use serde::{Deserialize, Serialize};

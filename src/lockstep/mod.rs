@@ -28,7 +28,7 @@ use rapid_registry::scenario::{Scenario, ScenarioAction};
 use rapid_registry::simulation::task::{self, AXES, AXIS_COUNT, STEP_HZ, SharedTrial};
 use rapid_registry::simulation::{SimSource, TaskPart};
 use rapid_registry::{DeviceSpec, Registry};
-use rapid_status::{Event, EventKind, Provenance, SlotState};
+use rapid_status::{DeviceState, Event, EventKind, Provenance};
 
 use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
 use timing::Timing;
@@ -203,7 +203,7 @@ impl Lockstep {
                 device.sequence += 1;
                 let id = device.spec.id;
                 taker.take(TopicId::Modality(id), &header, &sample.payload);
-                if self.core.state(id).0 == SlotState::Opening {
+                if self.core.state(id).0 == DeviceState::Opening {
                     self.apply(Input::Stream { id, epoch: sample.epoch, event: StreamEvent::Started }, taker);
                 }
             }

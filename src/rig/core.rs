@@ -1,4 +1,4 @@
-//! The decisions of a rig without any I/O: slots, assignment of devices to entries, and the mask.
+//! The decisions of a rig without any I/O: the lifecycles of devices, their assignment to entries, and the mask.
 //!
 //! [`Core::step`] takes one input and the time, and lists the effects. The caller carries them out in order: the live
 //! rig (`owner`) with tasks and shared memory, the lockstep rig with a virtual clock.
@@ -20,9 +20,9 @@ use rapid_core::time::Stamp;
 use rapid_devices::hotplug::HotplugEvent;
 use rapid_registry::device::{Attachment, Unit};
 use rapid_registry::{Assigner, Assignment, DeviceSpec, Registry};
-use rapid_status::SlotState;
+use rapid_status::DeviceState;
 
-use super::slot::{self, End, Slot};
+use super::lifecycle::{self, End, Lifecycle};
 
 /// What happens to a rig.
 #[derive(Debug, Clone, PartialEq)]
@@ -103,20 +103,20 @@ pub enum DeviceEffect {
     Unplugged,
     /// Start a stream.
     Start(Epoch, Attachment),
-    /// Report a new state of the slot.
+    /// Report a new state of the device.
     State(Transition),
 }
 
-/// How the state of a slot changed.
+/// How the state of a device changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Transition {
     /// State before.
-    pub from: SlotState,
+    pub from: DeviceState,
     /// State now.
-    pub to: SlotState,
-    /// Time until the next start, in [`SlotState::Backoff`].
+    pub to: DeviceState,
+    /// Time until the next start, in [`DeviceState::Backoff`].
     pub wait: Option<Duration>,
-    /// The source that noticed the removal, in [`SlotState::Absent`].
+    /// The source that noticed the removal, in [`DeviceState::Absent`].
     pub source: Option<UnplugSource>,
 }
 
@@ -132,7 +132,7 @@ pub struct Core {
 #[derive(Debug, Clone)]
 struct ModalityState {
     id: ModalityId,
-    slot: Slot<Attachment>,
+    lifecycle: Lifecycle<Attachment>,
     /// When the newest device was attached.
     attached_at: Stamp,
     /// A removal was announced, with no attachment since.
@@ -141,7 +141,7 @@ struct ModalityState {
 
 impl ModalityState {
     fn new(id: ModalityId, cooldown: Duration) -> Self {
-        Self { id, slot: Slot::new(cooldown), attached_at: Stamp::default(), is_announced_gone: false }
+        Self { id, lifecycle: Lifecycle::new(cooldown), attached_at: Stamp::default(), is_announced_gone: false }
     }
 }
 
@@ -169,14 +169,15 @@ impl Core {
                 self.stream(id, epoch, event, now, effects);
             }
             Input::Stream { .. } => {}
-            Input::Restart(id) => self.apply(id, slot::Input::Restart, None, now, effects),
+            Input::Restart(id) => self.apply(id, lifecycle::Input::Restart, None, now, effects),
             Input::Register(device) => self.register(&device, now, effects),
             Input::Timer => {
                 for index in 0..self.modalities.len() {
-                    let due =
-                        |modality: &&ModalityState| modality.slot.deadline().is_some_and(|deadline| deadline <= now);
+                    let due = |modality: &&ModalityState| {
+                        modality.lifecycle.deadline().is_some_and(|deadline| deadline <= now)
+                    };
                     if let Some(id) = self.modalities.get(index).filter(due).map(|modality| modality.id) {
-                        self.apply(id, slot::Input::Timer, None, now, effects);
+                        self.apply(id, lifecycle::Input::Timer, None, now, effects);
                     }
                 }
             }
@@ -194,7 +195,8 @@ impl Core {
 
     /// The mask in force, and what is plugged in.
     pub fn bits(&self) -> Bits {
-        let is_plugged = |modality: &&ModalityState| modality.slot.attached().is_some() && !modality.is_announced_gone;
+        let is_plugged =
+            |modality: &&ModalityState| modality.lifecycle.attached().is_some() && !modality.is_announced_gone;
         let plugged =
             self.modalities.iter().filter(is_plugged).fold(self.mask, |all, modality| all.with(modality.id, true));
         Bits { mask: self.mask, plugged }
@@ -202,23 +204,24 @@ impl Core {
 
     /// When [`Input::Timer`] is due, if no other input comes before.
     pub fn deadline(&self) -> Option<Stamp> {
-        self.modalities.iter().filter_map(|modality| modality.slot.deadline()).min()
+        self.modalities.iter().filter_map(|modality| modality.lifecycle.deadline()).min()
     }
 
     /// Whether this stream runs now. Reports of any other stream have no effect.
     pub fn is_current(&self, id: ModalityId, epoch: Epoch) -> bool {
-        self.modality(id).is_some_and(|modality| modality.slot.is_current(epoch))
+        self.modality(id).is_some_and(|modality| modality.lifecycle.is_current(epoch))
     }
 
     /// State and newest epoch of a modality; absent if there is no such modality.
-    pub fn state(&self, id: ModalityId) -> (SlotState, Epoch) {
-        self.modality(id)
-            .map_or((SlotState::Absent, Epoch(0)), |modality| (modality.slot.state(), modality.slot.epoch()))
+    pub fn state(&self, id: ModalityId) -> (DeviceState, Epoch) {
+        self.modality(id).map_or((DeviceState::Absent, Epoch(0)), |modality| {
+            (modality.lifecycle.state(), modality.lifecycle.epoch())
+        })
     }
 
     /// The device that is attached as this modality.
     pub fn attached(&self, id: ModalityId) -> Option<&Attachment> {
-        self.modality(id)?.slot.attached()
+        self.modality(id)?.lifecycle.attached()
     }
 
     /// When the newest device of this modality was attached.
@@ -259,7 +262,7 @@ impl Core {
         let detached = self.assigner.detach(syspath);
         for id in detached.freed {
             self.announce_detach(id, source, effects);
-            self.apply(id, slot::Input::Detached, Some(source), now, effects);
+            self.apply(id, lifecycle::Input::Detached, Some(source), now, effects);
             effects.push(Effect::Device(id, DeviceEffect::Unplugged));
         }
         for (id, attachment) in detached.assigned {
@@ -267,10 +270,11 @@ impl Core {
         }
     }
 
-    /// The assigner gave this device to `id`: no other one is ever attached to a slot. A repeated report is the same
+    /// The assigner gave this device to `id`: no other one is ever attached to its lifecycle. A repeated report is the same
     /// attachment.
     fn attach(&mut self, id: ModalityId, attachment: Attachment, now: Stamp, effects: &mut Vec<Effect>) {
-        let Some(modality) = self.modality_mut(id).filter(|modality| modality.slot.attached() != Some(&attachment))
+        let Some(modality) =
+            self.modality_mut(id).filter(|modality| modality.lifecycle.attached() != Some(&attachment))
         else {
             return;
         };
@@ -278,7 +282,7 @@ impl Core {
         modality.is_announced_gone = false;
         effects.push(Effect::Device(id, DeviceEffect::AnnounceAttach));
         effects.push(Effect::Device(id, DeviceEffect::Plugged));
-        self.apply(id, slot::Input::Attached(attachment), None, now, effects);
+        self.apply(id, lifecycle::Input::Attached(attachment), None, now, effects);
     }
 
     fn stream(&mut self, id: ModalityId, epoch: Epoch, event: StreamEvent, now: Stamp, effects: &mut Vec<Effect>) {
@@ -294,9 +298,9 @@ impl Core {
                 }
                 return;
             }
-            StreamEvent::Started => slot::Input::Started(epoch),
-            StreamEvent::Stalled => slot::Input::Stalled(epoch),
-            StreamEvent::Resumed => slot::Input::Resumed(epoch),
+            StreamEvent::Started => lifecycle::Input::Started(epoch),
+            StreamEvent::Stalled => lifecycle::Input::Stalled(epoch),
+            StreamEvent::Resumed => lifecycle::Input::Resumed(epoch),
             StreamEvent::Ended(end) => {
                 source = match end {
                     End::Gone => Some(UnplugSource::Stream),
@@ -306,7 +310,7 @@ impl Core {
                 if let Some(source) = source {
                     self.announce_detach(id, source, effects);
                 }
-                slot::Input::Ended(epoch, end)
+                lifecycle::Input::Ended(epoch, end)
             }
         };
         self.apply(id, input, source, now, effects);
@@ -324,32 +328,35 @@ impl Core {
     fn apply(
         &mut self,
         id: ModalityId,
-        input: slot::Input<Attachment>,
+        input: lifecycle::Input<Attachment>,
         source: Option<UnplugSource>,
         now: Stamp,
         effects: &mut Vec<Effect>,
     ) {
         let Some(modality) = self.modalities.iter_mut().find(|modality| modality.id == id) else { return };
-        let (from, epoch) = (modality.slot.state(), modality.slot.epoch());
-        let ran = modality.slot.is_current(epoch);
-        let slot::Effects { stop, start } = modality.slot.apply(input, now);
-        self.mask = self.mask.with(id, modality.slot.is_present());
+        let (from, epoch) = (modality.lifecycle.state(), modality.lifecycle.epoch());
+        let ran = modality.lifecycle.is_current(epoch);
+        let lifecycle::Effects { stop, start } = modality.lifecycle.apply(input, now);
+        self.mask = self.mask.with(id, modality.lifecycle.is_present());
         let mut push = |effect| effects.push(Effect::Device(id, effect));
         if stop.is_some() {
             push(DeviceEffect::Stop);
         }
-        if ran && !modality.slot.is_current(epoch) {
+        if ran && !modality.lifecycle.is_current(epoch) {
             push(DeviceEffect::Ended);
         }
-        let to = modality.slot.state();
+        let to = modality.lifecycle.state();
         let is_changed = to != from || start.is_some();
         if let Some((epoch, attachment)) = start {
             push(DeviceEffect::Start(epoch, attachment));
         }
         if is_changed {
-            let wait =
-                modality.slot.deadline().filter(|_| to == SlotState::Backoff).map(|deadline| deadline.since(now));
-            let source = source.filter(|_| to == SlotState::Absent);
+            let wait = modality
+                .lifecycle
+                .deadline()
+                .filter(|_| to == DeviceState::Backoff)
+                .map(|deadline| deadline.since(now));
+            let source = source.filter(|_| to == DeviceState::Absent);
             push(DeviceEffect::State(Transition { from, to, wait, source }));
         }
     }

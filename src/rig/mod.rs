@@ -1,7 +1,7 @@
 //! The rig: turns hot-plug events into running device streams and the physical mask.
 //!
-//! One task owns every slot. It takes hot-plug events, the reports and ends of streams, commands and deadlines, applies
-//! them to the slots, and carries out the slots' decisions.
+//! One task owns the lifecycle of every device. It takes hot-plug events, the reports and ends of streams, commands and deadlines, applies
+//! them to them, and carries out their decisions.
 //!
 //! Invariant: only this module decides the mask.
 //! Invariant: this task never waits for a device; a stream is asked to end and then forgotten.
@@ -9,12 +9,12 @@
 
 pub mod core;
 mod hooks;
+pub mod lifecycle;
 mod logbook;
 mod output;
 mod owner;
 pub mod presence;
 mod programs;
-pub mod slot;
 mod stream;
 mod worker;
 

@@ -21,7 +21,7 @@ use rapid_devices::inputs::tap::Tap;
 use rapid_registry::candidate::{Candidate, unregistered};
 use rapid_registry::device::Attachment;
 use rapid_registry::{DeviceSpec, Registry};
-use rapid_status::{Board, EpisodeWatch, EventKind, Level, SlotState, UnregisteredDevice};
+use rapid_status::{Board, DeviceState, EpisodeWatch, EventKind, Level, UnregisteredDevice};
 use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
@@ -29,9 +29,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::core::{Core, DeviceEffect, Effect, Input, StreamEvent, Transition};
 use super::hooks::HookQueue;
+use super::lifecycle::End;
 use super::presence::{JsonDevice, PERIOD, Presence};
 use super::programs::{BusNames, Programs};
-use super::slot::End;
 use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
 use super::worker::ProcessSlot;
 use super::{Addition, RigCommand, RigError};
@@ -95,7 +95,7 @@ struct Modality {
 }
 
 impl Rig {
-    /// A rig with every slot empty, which publishes through `presence`.
+    /// A rig without devices, which publishes through `presence`.
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
         let programs = Programs::new(registry, bus, &board);
         let names = BusNames::of(&bus.membership());
@@ -189,7 +189,7 @@ impl Rig {
         let mut json = interval(JSON_PERIOD);
         json.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let result = loop {
-            // A distant time if no slot is waiting.
+            // A distant time if no device is waited for.
             let deadline = self.core.deadline().unwrap_or_else(|| Stamp::now().after(Duration::from_hours(1)));
             tokio::select! {
                 // Shutdown first, then the earliest sources of an unplug, then the rest.
@@ -409,11 +409,11 @@ impl Rig {
     fn show(&self, id: ModalityId) {
         let (state, epoch) = self.core.state(id);
         if let Some(modality) = self.modalities.iter().find(|modality| modality.spec.id == id) {
-            self.board.set_slot(id, state, epoch, &modality.detail);
+            self.board.set_device_state(id, state, epoch, &modality.detail);
         }
     }
 
-    fn announce_state(&mut self, id: ModalityId, state: SlotState) {
+    fn announce_state(&mut self, id: ModalityId, state: DeviceState) {
         let mask = SizedMask { mask: self.core.mask(), devices: self.modalities.len() };
         let Some(modality) = self.modalities.iter().find(|modality| modality.spec.id == id) else { return };
         let (device, detail) = (modality.spec.name.clone(), modality.detail.clone());
@@ -497,16 +497,16 @@ impl Modality {
         }
     }
 
-    /// Keeps, for people, why the slot is in its new state.
+    /// Keeps, for people, why the device is in its new state.
     fn describe(&mut self, Transition { from, to, wait, source }: Transition) {
         if let Some(source) = source {
             self.detail = format!("unplugged ({})", source.word());
         }
         if let Some(wait) = wait {
-            let reason = if from == SlotState::Absent { "cooldown" } else { self.detail.as_str() };
+            let reason = if from == DeviceState::Absent { "cooldown" } else { self.detail.as_str() };
             self.detail = format!("{reason}; starts in {:.1} s", wait.as_secs_f64());
         }
-        if (from, to) == (SlotState::Absent, SlotState::Failed) {
+        if (from, to) == (DeviceState::Absent, DeviceState::Failed) {
             "attached, but its driver repeatedly reported a disconnection: replug it, or restart it"
                 .clone_into(&mut self.detail);
         }

@@ -27,7 +27,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::core::StreamEvent;
-use super::slot::End;
+use super::lifecycle::End;
 use super::worker::ProcessSlot;
 
 /// A device that does not open within this time is retried.

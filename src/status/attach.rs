@@ -169,7 +169,7 @@ mod tests {
 
     use rapid_core::sample::Encoding;
 
-    use super::super::{Level, SlotState};
+    use super::super::{DeviceState, Level};
     use super::*;
     use crate::literal::{device, every_state, line, policy, recording, snapshot};
 
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn numbers_that_json_does_not_have_reach_the_screen() {
-        let mut odd = snapshot(vec![device(0, "a", SlotState::Streaming, "")]);
+        let mut odd = snapshot(vec![device(0, "a", DeviceState::Streaming, "")]);
         let mut policy = policy();
         policy.action[0].1 = f64::NAN;
         odd.policy = Some(policy);

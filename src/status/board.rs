@@ -1,8 +1,8 @@
 //! The board: where stages report the data that a screen may show.
 //!
 //! It is what screens see and nothing else: what one stage sends another goes over a channel or a handle of the stage that
-//! owns it. One writer per item: the rig writes slots and the mask, streams write their own counters, the recorder writes the
-//! recording. A screen only takes [`Snapshot`]s.
+//! owns it. One writer per item: the rig writes the states of devices and the mask, streams write their own counters, the
+//! recorder writes the recording. A screen only takes [`Snapshot`]s.
 //!
 //! Invariant: per-sample data and the mask are atomics; everything else is guarded by one lock, so that a snapshot is of one
 //! moment. It changes at most a few times a second.
@@ -26,8 +26,8 @@ use super::detail::{DeviceDetail, Intervals, StaticDetail};
 use super::preview::{LOOKED_AT, Preview};
 use super::session::{Answered, SessionStatus};
 use super::{
-    DeviceStatus, Event, EventKind, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance, RecordingStatus,
-    SlotState, Snapshot, StopStatus, UnregisteredDevice, Verdict,
+    DeviceState, DeviceStatus, Event, EventKind, Grade, Level, LogLine, PolicyStatus, PrintedOn, Provenance,
+    RecordingStatus, Snapshot, StopStatus, UnregisteredDevice, Verdict,
 };
 
 /// Log lines kept for the screen.
@@ -126,8 +126,8 @@ struct Log {
 }
 
 #[derive(Debug, Clone, Default)]
-struct SlotStatus {
-    state: SlotState,
+struct ReportedState {
+    state: DeviceState,
     epoch: Epoch,
     detail: String,
 }
@@ -153,7 +153,7 @@ struct State {
     entries: Vec<Entry>,
     unregistered: Vec<UnregisteredDevice>,
     registry_answer: Option<Answered>,
-    slots: Vec<SlotStatus>,
+    states: Vec<ReportedState>,
     stops: Vec<StopStatus>,
     recording: Option<RecordingStatus>,
     not_started: Option<String>,
@@ -176,7 +176,7 @@ impl State {
             entries: registry.devices.iter().map(Entry::of).collect(),
             unregistered: Vec::new(),
             registry_answer: None,
-            slots: vec![SlotStatus::default(); MAX_MODALITIES],
+            states: vec![ReportedState::default(); MAX_MODALITIES],
             stops: StopStatus::unreported(registry),
             recording: None,
             not_started: None,
@@ -296,12 +296,12 @@ impl Board {
         self.state().registry_answer = Some(answer);
     }
 
-    /// Reports the state of a slot.
-    pub fn set_slot(&self, id: ModalityId, state: SlotState, epoch: Epoch, detail: &str) {
-        let slot = &mut self.state().slots[id.index()];
-        slot.state = state;
-        slot.epoch = epoch;
-        detail.clone_into(&mut slot.detail);
+    /// Reports the state of a device.
+    pub fn set_device_state(&self, id: ModalityId, state: DeviceState, epoch: Epoch, detail: &str) {
+        let reported = &mut self.state().states[id.index()];
+        reported.state = state;
+        reported.epoch = epoch;
+        detail.clone_into(&mut reported.detail);
     }
 
     /// Reports the state of an emergency stop or an enabling switch, and announces it.
@@ -481,15 +481,15 @@ impl Board {
 
     fn device(&self, entry: &Entry, state: &State) -> DeviceStatus {
         let counters = &self.counters[entry.id.index()];
-        let slot = &state.slots[entry.id.index()];
+        let reported = &state.states[entry.id.index()];
         let newest = counters.newest.load(Ordering::Relaxed);
         DeviceStatus {
             name: entry.name.clone(),
             id: entry.id,
             topic: entry.topic.clone(),
-            state: slot.state,
-            epoch: slot.epoch,
-            detail: slot.detail.clone(),
+            state: reported.state,
+            epoch: reported.epoch,
+            detail: reported.detail.clone(),
             nominal_hz: entry.nominal_hz,
             samples: counters.samples.load(Ordering::Relaxed),
             gaps: counters.gaps.load(Ordering::Relaxed),
@@ -533,7 +533,7 @@ mod tests {
                     if is_over.load(Ordering::Relaxed) {
                         return;
                     }
-                    board.set_slot(id, SlotState::Absent, Epoch(number), "");
+                    board.set_device_state(id, DeviceState::Absent, Epoch(number), "");
                     board.set_links(vec![number.to_string()]);
                 }
             });

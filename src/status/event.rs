@@ -14,7 +14,7 @@ use rapid_core::time::Stamp;
 use rapid_registry::device::Unit;
 use serde::Serialize;
 
-use super::{Chunk, Grade, Hold, Level, PolicyEnd, PrintedOn, SlotState, StopStatus, Verdict};
+use super::{Chunk, DeviceState, Grade, Hold, Level, PolicyEnd, PrintedOn, StopStatus, Verdict};
 
 /// A state change with its time. As JSON, one object: `{"event":"state","device":...}`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -64,14 +64,14 @@ pub enum EventKind {
         #[serde(rename = "witness")]
         source: UnplugSource,
     },
-    /// A slot changed its state.
+    /// A device changed its state.
     State {
         /// Modality.
         device: String,
         /// Its bit.
         bit: ModalityId,
         /// The new state.
-        state: SlotState,
+        state: DeviceState,
         /// The mask after the change, in JSON `0x05`.
         mask: SizedMask,
         /// Why, or the settings agreed with the device.
@@ -443,7 +443,7 @@ impl EventKind {
     pub fn log_line(&self) -> Option<(Level, String)> {
         let described = self.describe();
         let is_silent = match self {
-            // The slot's state changes with the first two; that event names the source or the agreed settings. The last
+            // The state of the device changes with the first two; that event names the source or the agreed settings. The last
             // is a measurement, twice a second.
             Self::Detach { .. } | Self::Opened { .. } | Self::Clock { .. } => true,
             // A policy produces them continuously.
@@ -488,7 +488,7 @@ mod tests {
     use rapid_core::provenance::UnplugSource;
 
     use super::*;
-    use crate::SlotState;
+    use crate::DeviceState;
 
     #[test]
     fn a_state_is_a_sentence_in_the_log() {
@@ -502,12 +502,12 @@ mod tests {
         };
         let table = [
             (
-                state(SlotState::Absent, "unplugged (kernel)"),
+                state(DeviceState::Absent, "unplugged (kernel)"),
                 Level::Info,
                 "tactile_tip absent, mask 0x05: unplugged (kernel)",
             ),
-            (state(SlotState::Streaming, ""), Level::Info, "tactile_tip streaming, mask 0x05"),
-            (state(SlotState::Failed, "busy"), Level::Error, "tactile_tip failed, mask 0x05: busy"),
+            (state(DeviceState::Streaming, ""), Level::Info, "tactile_tip streaming, mask 0x05"),
+            (state(DeviceState::Failed, "busy"), Level::Error, "tactile_tip failed, mask 0x05: busy"),
         ];
         for (what, level, text) in table {
             assert_eq!(what.log_line(), Some((level, text.to_owned())));

@@ -66,7 +66,7 @@ macro_rules! words {
 words! {
     /// What the device of a modality is doing.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
-    SlotState {
+    DeviceState {
         /// Not attached.
         #[default]
         Absent = "absent",
@@ -83,7 +83,7 @@ words! {
     }
 }
 
-impl SlotState {
+impl DeviceState {
     /// Whether the bit of such a device is set in the physical mask. A stalled device is attached and running.
     #[must_use]
     pub const fn is_present(self) -> bool {
@@ -109,8 +109,8 @@ pub struct DeviceStatus {
     pub id: ModalityId,
     /// Topic.
     pub topic: String,
-    /// State of the slot.
-    pub state: SlotState,
+    /// State of the device.
+    pub state: DeviceState,
     /// Incarnation.
     pub epoch: Epoch,
     /// Node in use and agreed format, or the reason of the state.

@@ -7,7 +7,7 @@ use std::io::IsTerminal;
 
 use anstyle::{AnsiColor, Color, Style};
 
-use crate::{Grade, Level, SlotState};
+use crate::{DeviceState, Grade, Level};
 
 /// Something good.
 pub const GOOD: Style = AnsiColor::Green.on_default();
@@ -24,13 +24,13 @@ pub const CODE: Style =
     Style::new().fg_color(Some(Color::Ansi(AnsiColor::BrightWhite))).bg_color(Some(Color::Ansi(AnsiColor::Black)));
 
 /// The style of a state.
-pub const fn of_state(state: SlotState) -> Style {
+pub const fn of_state(state: DeviceState) -> Style {
     match state {
-        SlotState::Streaming => GOOD,
-        SlotState::Opening | SlotState::Backoff => WARN,
-        SlotState::Stalled => AnsiColor::Magenta.on_default(),
-        SlotState::Absent => AnsiColor::Red.on_default(),
-        SlotState::Failed => BAD,
+        DeviceState::Streaming => GOOD,
+        DeviceState::Opening | DeviceState::Backoff => WARN,
+        DeviceState::Stalled => AnsiColor::Magenta.on_default(),
+        DeviceState::Absent => AnsiColor::Red.on_default(),
+        DeviceState::Failed => BAD,
     }
 }
 
@@ -106,7 +106,7 @@ impl Palette {
     }
 
     /// `text` in the style of a state.
-    pub fn state(self, state: SlotState, text: &str) -> String {
+    pub fn state(self, state: DeviceState, text: &str) -> String {
         self.paint(of_state(state), text)
     }
 

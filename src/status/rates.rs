@@ -132,7 +132,7 @@ mod tests {
     use rapid_core::sample::Epoch;
 
     use super::*;
-    use crate::{RecordingStatus, SlotState};
+    use crate::{DeviceState, RecordingStatus};
 
     const MS: u64 = 1_000_000;
 
@@ -152,7 +152,7 @@ mod tests {
                 name: "cam".to_owned(),
                 id: id(),
                 topic: "/cam".to_owned(),
-                state: SlotState::Streaming,
+                state: DeviceState::Streaming,
                 epoch: Epoch(1),
                 detail: String::new(),
                 nominal_hz: None,

@@ -97,7 +97,7 @@ fn what_a_rig_lacks_or_has_otherwise_is_named_with_its_device() {
         (
             format!("{other}{ARM}"),
             &[
-                "wants pictures of 96x96 (height x width), but \"cam_wrist\" gives 480x640",
+                "wants images of 96x96 (height x width), but \"cam_wrist\" gives 480x640",
                 "modality \"tactile_tip\" is not in devices.toml",
                 "slice ends at 4, but \"arm\" gives 3 values",
                 "has 4 values, but \"arm\" takes 3",

@@ -12,7 +12,9 @@ use rapid_core::sync::WhenStale;
 use rapid_core::time::Stamp;
 use rapid_registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec};
 
-use rapid_status::{Board, DeviceStatus, Level, LogLine, Outlook, PolicyStatus, RecordingStatus, SlotState, Snapshot};
+use rapid_status::{
+    Board, DeviceState, DeviceStatus, Level, LogLine, Outlook, PolicyStatus, RecordingStatus, Snapshot,
+};
 
 /// Moment of the snapshots: 754 s after the boot.
 pub(crate) const TAKEN: Stamp = Stamp(754_000_000_000);
@@ -23,9 +25,9 @@ pub(crate) fn id(bit: u8) -> ModalityId {
     ModalityId::new(bit).unwrap()
 }
 
-pub(crate) fn device(bit: u8, name: &str, state: SlotState, detail: &str) -> DeviceStatus {
+pub(crate) fn device(bit: u8, name: &str, state: DeviceState, detail: &str) -> DeviceStatus {
     let running = state.is_present();
-    let age = if state == SlotState::Stalled { 2345 } else { 12 + u64::from(bit) };
+    let age = if state == DeviceState::Stalled { 2345 } else { 12 + u64::from(bit) };
     DeviceStatus {
         name: name.to_owned(),
         id: id(bit),
@@ -71,20 +73,20 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
 
 pub(crate) fn three_streaming() -> Snapshot {
     snapshot(vec![
-        device(0, "cam_wrist", SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
-        device(1, "cam_top", SlotState::Streaming, "/dev/video2 MJPG 640x480@30"),
-        device(2, "tof", SlotState::Streaming, "/dev/ttyACM0 115200 csv 8"),
+        device(0, "cam_wrist", DeviceState::Streaming, "/dev/video0 MJPG 640x480@30"),
+        device(1, "cam_top", DeviceState::Streaming, "/dev/video2 MJPG 640x480@30"),
+        device(2, "tof", DeviceState::Streaming, "/dev/ttyACM0 115200 csv 8"),
     ])
 }
 
 pub(crate) fn every_state() -> Snapshot {
     let mut snapshot = snapshot(vec![
-        device(0, "cam_wrist", SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
-        device(1, "cam_top", SlotState::Absent, ""),
-        device(2, "tof", SlotState::Opening, "/dev/ttyACM0"),
-        device(3, "imu", SlotState::Stalled, "no sample for 500 ms"),
-        device(4, "gripper", SlotState::Failed, "/dev/ttyACM1: permission denied, is the user in group dialout?"),
-        device(5, "tactile", SlotState::Backoff, "again in 2 s: device busy"),
+        device(0, "cam_wrist", DeviceState::Streaming, "/dev/video0 MJPG 640x480@30"),
+        device(1, "cam_top", DeviceState::Absent, ""),
+        device(2, "tof", DeviceState::Opening, "/dev/ttyACM0"),
+        device(3, "imu", DeviceState::Stalled, "no sample for 500 ms"),
+        device(4, "gripper", DeviceState::Failed, "/dev/ttyACM1: permission denied, is the user in group dialout?"),
+        device(5, "tactile", DeviceState::Backoff, "again in 2 s: device busy"),
     ]);
     snapshot.devices[3].gaps = 3;
     snapshot.log = vec![
@@ -129,9 +131,9 @@ pub(crate) fn policy() -> PolicyStatus {
 
 pub(crate) fn sixty_four() -> Snapshot {
     let state = |bit: u8| match bit % 8 {
-        3 => SlotState::Absent,
-        5 => SlotState::Opening,
-        _ => SlotState::Streaming,
+        3 => DeviceState::Absent,
+        5 => DeviceState::Opening,
+        _ => DeviceState::Streaming,
     };
     snapshot((0..64).map(|bit| device(bit, &format!("sensor_{bit}"), state(bit), "/dev/ttyACM0")).collect())
 }

@@ -211,7 +211,7 @@ async fn keys_pressed_while_an_episode_ends_are_handled_in_order() {
 async fn a_key_pressed_while_devices_settle_begins_exactly_one_episode() {
     let mut bench = Bench::new(true, None, |file| Box::new(file));
     let silent = Registry::builtin().devices[0].id;
-    bench.board.set_slot(silent, SlotState::Opening, Epoch(1), "");
+    bench.board.set_device_state(silent, DeviceState::Opening, Epoch(1), "");
     let keys = async {
         bench.keys.send(end()).unwrap();
         until(&bench.board, "an episode", |file| file.is_some()).await;

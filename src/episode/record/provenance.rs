@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 
 use rapid_core::time::Stamp;
-use rapid_status::{Event, EventKind, Provenance, SlotState};
+use rapid_status::{DeviceState, Event, EventKind, Provenance};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -123,10 +123,10 @@ impl Units {
     }
 }
 
-const fn has_ended(state: SlotState) -> bool {
+const fn has_ended(state: DeviceState) -> bool {
     match state {
-        SlotState::Absent | SlotState::Backoff | SlotState::Failed => true,
-        SlotState::Opening | SlotState::Streaming | SlotState::Stalled => false,
+        DeviceState::Absent | DeviceState::Backoff | DeviceState::Failed => true,
+        DeviceState::Opening | DeviceState::Streaming | DeviceState::Stalled => false,
     }
 }
 
@@ -172,7 +172,7 @@ mod tests {
         Event { stamp: Stamp(ms * 1_000_000), what: EventKind::Opened { device: "cam".into(), bit, provenance } }
     }
 
-    fn state(ms: u64, state: SlotState) -> Event {
+    fn state(ms: u64, state: DeviceState) -> Event {
         let bit = ModalityId::new(0).unwrap();
         let what =
             EventKind::State { device: "cam".into(), bit, state, mask: SizedMask::default(), detail: String::new() };
@@ -182,16 +182,16 @@ mod tests {
     #[test]
     fn each_epoch_of_an_episode_names_its_unit() {
         let mut attached = Attached::default();
-        for event in [attach(1_000, "A"), open(8_000, 1, "A"), state(8_100, SlotState::Streaming)] {
+        for event in [attach(1_000, "A"), open(8_000, 1, "A"), state(8_100, DeviceState::Streaming)] {
             attached.take(&event);
         }
         let mut units = Units::new(&attached);
         for event in [
-            state(12_000, SlotState::Absent),
-            state(12_001, SlotState::Backoff),
+            state(12_000, DeviceState::Absent),
+            state(12_001, DeviceState::Backoff),
             attach(13_000, "B"),
             open(15_000, 2, "B"),
-            state(15_100, SlotState::Stalled),
+            state(15_100, DeviceState::Stalled),
             // The end of the second was not reported: the third implies it.
             open(16_500, 3, "B"),
         ] {
@@ -256,7 +256,7 @@ mod tests {
     #[test]
     fn epochs_that_ended_before_the_episode_are_not_in_it() {
         let mut attached = Attached::default();
-        for event in [attach(1_000, "A"), open(2_000, 1, "A"), state(3_000, SlotState::Failed)] {
+        for event in [attach(1_000, "A"), open(2_000, 1, "A"), state(3_000, DeviceState::Failed)] {
             attached.take(&event);
         }
         let units = Units::new(&attached);

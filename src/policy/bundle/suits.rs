@@ -112,13 +112,13 @@ impl Bundle {
                 }
                 (input, kind) => {
                     let wanted = match input {
-                        ObservationInput::Image(_) => "pictures",
-                        ObservationInput::Vector(_) => "numbers",
+                        ObservationInput::Image(_) => "images",
+                        ObservationInput::Vector(_) => "values",
                     };
                     let given = match kind {
-                        ModalityKind::Image => "pictures",
+                        ModalityKind::Image => "images",
                         ModalityKind::Depth => "depth images",
-                        ModalityKind::Scalars => "numbers",
+                        ModalityKind::Scalars => "values",
                         ModalityKind::Bytes => "bytes without a known structure",
                     };
                     let message = format!("wants {wanted}, but the device \"{name}\" gives {given}");
@@ -261,7 +261,7 @@ fn picture(entry: &str, name: &str, image: &ImageSpec, shape: &[u32], problems: 
     if !fits {
         let than = if image.crop.is_some() { "at least " } else { "" };
         let message = format!(
-            "wants pictures of {than}{}x{} (height x width), but \"{name}\" gives {height}x{width}",
+            "wants images of {than}{}x{} (height x width), but \"{name}\" gives {height}x{width}",
             wanted[0], wanted[1]
         );
         let fix = format!(

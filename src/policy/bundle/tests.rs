@@ -98,7 +98,7 @@ fn every_difference_from_the_rig_is_reported() {
     assert_eq!(
         problems(strange.check_registry(&registry("width = 640\nheight = 480", serial))),
         [
-            "[observations[0]] wants pictures of 96x96 (height x width), but \"cam_wrist\" gives 480x640\n    \
+            "[observations[0]] wants images of 96x96 (height x width), but \"cam_wrist\" gives 480x640\n    \
              fix: set width = 96 and height = 96 in devices.toml, or \"resize\": [96, 96] here",
             "[observations[1]] modality \"tactile_tpi\" is not in devices.toml\n    fix: did you mean \"tactile_tip\"?",
             "[observations[2]] slice ends at 4, but \"arm\" gives 3 values\n    \
@@ -114,8 +114,8 @@ fn every_difference_from_the_rig_is_reported() {
     assert_eq!(
         raw,
         [
-            "[observations[0]] wants pictures, but the device \"arm\" gives bytes without a known structure\n    \
-             fix: give [device.arm] in devices.toml a device that gives pictures",
+            "[observations[0]] wants images, but the device \"arm\" gives bytes without a known structure\n    \
+             fix: give [device.arm] in devices.toml a device that gives images",
             "[observations[2]] wants values, but the device \"arm\" gives bytes without a known structure\n    \
              fix: give [device.arm] in devices.toml a device that gives values",
         ]

@@ -64,6 +64,6 @@ fn an_added_entry_starts_the_device_that_is_plugged_in_and_touches_no_other() {
     assert_eq!(effects.iter().filter(|effect| started(effect)).count(), 1, "{effects:?}");
     let effects = step(&mut core, Input::Stream { id: id(3), epoch: Epoch(1), event: StreamEvent::Started });
     assert_eq!(effects.first(), Some(&Effect::Publish(PhysicalMask(0b10_1001).into())));
-    assert_eq!(core.state(id(5)), (SlotState::Streaming, Epoch(1)));
+    assert_eq!(core.state(id(5)), (DeviceState::Streaming, Epoch(1)));
     assert_eq!(step(&mut core, Input::Register(added)), [], "it is there");
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::time::{realtime_ns, rfc3339};
-use rapid_status::SlotState;
+use rapid_status::DeviceState;
 use rapid_system::folder::{Folder, Links, Missing, Sync};
 use serde::Serialize;
 
@@ -23,8 +23,8 @@ pub struct JsonDevice {
     pub online: bool,
     /// Is the device attached?
     pub usb_connected: bool,
-    /// State of its slot.
-    pub state: SlotState,
+    /// State of its device.
+    pub state: DeviceState,
 }
 
 #[derive(Serialize)]

@@ -191,7 +191,7 @@ fn the_json_document_has_the_papers_fields() {
         bit,
         online: true,
         usb_connected: true,
-        state: rapid_status::SlotState::Streaming,
+        state: rapid_status::DeviceState::Streaming,
     };
     json::write(&path, PhysicalMask(1), 9, &[device]).expect("write");
     let document: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).expect("file")).expect("json");

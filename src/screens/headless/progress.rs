@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_status::rates::Rates;
-use rapid_status::{PolicyStatus, SlotState, Snapshot};
+use rapid_status::{DeviceState, PolicyStatus, Snapshot};
 use serde::Serialize;
 
 /// Progress as one line, without a line end: time, mask, policy, the episode, rates of streaming devices.
@@ -26,7 +26,7 @@ pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, durati
     }
     let running = snapshot.devices.iter().filter(|device| snapshot.mask.contains(device.id));
     parts.extend(running.map(|device| {
-        let stalled = if device.state == SlotState::Stalled { " stalled" } else { "" };
+        let stalled = if device.state == DeviceState::Stalled { " stalled" } else { "" };
         format!("{} {} Hz{stalled}", text::plain(&device.name), text::hertz(rates.samples(device.id)))
     }));
     parts.join("  ")
@@ -52,7 +52,7 @@ struct Progress<'a> {
 struct DeviceProgress<'a> {
     device: &'a str,
     bit: u8,
-    state: SlotState,
+    state: DeviceState,
     samples: u64,
     gaps: u64,
     hz: f64,

@@ -8,8 +8,8 @@ use rapid_registry::device::UsbIdentity;
 
 use crate::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use rapid_status::{
-    Chunk, EpisodeReport, EventKind, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors,
-    SlotState, StopStatus, Verdict,
+    Chunk, DeviceState, EpisodeReport, EventKind, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance,
+    RecordingStatus, Sensors, StopStatus, Verdict,
 };
 use serde_json::Value;
 
@@ -40,7 +40,7 @@ fn event(what: EventKind) -> Event {
     Event { stamp: Stamp(0), what }
 }
 
-fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> EventKind {
+fn state(device: &str, bit: u8, state: DeviceState, detail: &str) -> EventKind {
     EventKind::State {
         device: device.to_owned(),
         bit: id(bit),
@@ -153,9 +153,9 @@ fn all_events() -> Vec<EventKind> {
                 latency_ns: 35_000_000,
             }),
         },
-        state("cam_wrist", 0, SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
+        state("cam_wrist", 0, DeviceState::Streaming, "/dev/video0 MJPG 640x480@30"),
         EventKind::Detach { device: "tof".to_owned(), bit: id(12), source: UnplugSource::Kernel },
-        state("tof", 12, SlotState::Absent, ""),
+        state("tof", 12, DeviceState::Absent, ""),
         EventKind::Unregistered { device: "046d:0825 \nX".to_owned(), reason: "no entry has this serial".to_owned() },
         EventKind::Recording { file: "out/a.mcap".into() },
         episode(0, None),
@@ -227,7 +227,7 @@ fn lines_for_people_have_their_columns() {
 #[test]
 fn colours_follow_the_state_and_nothing_else_is_an_escape() {
     let columns = line::Columns { name: 9, palette: Palette::Ansi };
-    let line = columns.line(&event(state("tof", 2, SlotState::Failed, "a\x1b[31mb")), WALL_NS);
+    let line = columns.line(&event(state("tof", 2, DeviceState::Failed, "a\x1b[31mb")), WALL_NS);
     assert!(line.contains("\x1b[1m\x1b[31mfailed      \x1b[0m"), "{line:?}");
     assert!(line.contains("a [31mb"), "{line:?}");
 }
@@ -235,7 +235,7 @@ fn colours_follow_the_state_and_nothing_else_is_an_escape() {
 #[test]
 fn json_is_the_event_with_its_wall_time() {
     let object: Value =
-        serde_json::from_str(&line::json(&event(state("cam_wrist", 0, SlotState::Streaming, "x")), WALL_NS).unwrap())
+        serde_json::from_str(&line::json(&event(state("cam_wrist", 0, DeviceState::Streaming, "x")), WALL_NS).unwrap())
             .unwrap();
     let expected = serde_json::json!({
         "event": "state", "device": "cam_wrist", "bit": 0, "state": "streaming", "mask": "0x05", "detail": "x",
@@ -369,10 +369,10 @@ fn the_mean_rate_excludes_the_time_that_closing_takes() {
     for announced in [true, false] {
         let mut totals = RunTotals::new(&start);
         if announced {
-            totals.count(&Event { stamp: at(4000), what: state("cam_wrist", 0, SlotState::Absent, "") });
+            totals.count(&Event { stamp: at(4000), what: state("cam_wrist", 0, DeviceState::Absent, "") });
         }
         // Silence does not count as closing.
-        totals.count(&Event { stamp: at(3000), what: state("cam_top", 1, SlotState::Stalled, "") });
+        totals.count(&Event { stamp: at(3000), what: state("cam_top", 1, DeviceState::Stalled, "") });
         let mut end = start.clone();
         end.taken = at(4000);
         for device in &mut end.devices {
@@ -392,7 +392,7 @@ fn the_summary_counts_from_its_beginning_and_averages_over_presence() {
     let at = |seconds: u64| Stamp(start.taken.0 + seconds * 1_000_000_000);
     // Present from 0 to 4 s and from 9 s to the end: half of the run.
     for (seconds, to) in
-        [(4, SlotState::Absent), (8, SlotState::Opening), (9, SlotState::Streaming), (9, SlotState::Stalled)]
+        [(4, DeviceState::Absent), (8, DeviceState::Opening), (9, DeviceState::Streaming), (9, DeviceState::Stalled)]
     {
         totals.count(&Event { stamp: at(seconds), what: state("cam_wrist", 0, to, "") });
     }
@@ -433,8 +433,8 @@ async fn announcements_before_the_end_are_printed_and_summarized() {
     let options = HeadlessOptions::default();
     let output = run(Arc::clone(&board), board.events(), shutdown.clone(), options, kept.clone());
     // Announced after the call and before the first poll: not lost.
-    board.set_slot(id(0), SlotState::Streaming, Epoch(1), "");
-    board.announce(state("cam_wrist", 0, SlotState::Streaming, "/dev/video0"));
+    board.set_device_state(id(0), DeviceState::Streaming, Epoch(1), "");
+    board.announce(state("cam_wrist", 0, DeviceState::Streaming, "/dev/video0"));
     board.counters(id(0)).count(100, Stamp::now(), 0);
     board.announce(episode(0, None));
     shutdown.cancel();

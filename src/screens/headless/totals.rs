@@ -9,7 +9,7 @@ use rapid_core::modality::MAX_MODALITIES;
 use rapid_core::text;
 use rapid_core::time::Stamp;
 use rapid_status::palette::Palette;
-use rapid_status::{DeviceStatus, EpisodeReport, Event, EventKind, PolicyEnd, SlotState, Snapshot, Verdict};
+use rapid_status::{DeviceState, DeviceStatus, EpisodeReport, Event, EventKind, PolicyEnd, Snapshot, Verdict};
 use serde::Serialize;
 
 /// How long each device was present, and which episodes were closed.
@@ -36,10 +36,10 @@ struct DevicePresence {
 }
 
 impl DevicePresence {
-    fn set(&mut self, state: SlotState, at: Stamp) {
+    fn set(&mut self, state: DeviceState, at: Stamp) {
         let running = state.is_present();
         if running {
-            self.stalled = state == SlotState::Stalled;
+            self.stalled = state == DeviceState::Stalled;
         }
         match (self.since, running) {
             (None, true) => self.since = Some(at),

@@ -6,7 +6,7 @@ use std::time::Duration;
 use rapid_core::text;
 use rapid_status::detail::{Channel, DeviceDetail, Intervals};
 use rapid_status::palette::Palette;
-use rapid_status::{DeviceStatus, SlotState};
+use rapid_status::{DeviceState, DeviceStatus};
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Style};
@@ -126,7 +126,7 @@ fn draw_sample(
         |frame: &mut Frame<'_>, text: &str| frame.render_widget(Line::styled(text.to_owned(), theme.faint()), inner);
     let Some(preview) = preview else {
         let why = match device.state {
-            SlotState::Streaming => "no sample yet",
+            DeviceState::Streaming => "no sample yet",
             _ => "no samples arrive",
         };
         return line(frame, why);

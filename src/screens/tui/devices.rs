@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use rapid_core::text;
-use rapid_status::{DeviceStatus, Finding, Level, SlotState, Snapshot};
+use rapid_status::{DeviceState, DeviceStatus, Finding, Level, Snapshot};
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::{Modifier, Style, Stylize};
@@ -135,7 +135,7 @@ fn strip(device: &DeviceStatus, width: u16, model: &Model, theme: Theme) -> Vec<
         Cell::Rate(share) => {
             #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 7, and saturates")]
             let bar = BARS.get((share * 7.99) as usize).copied().unwrap_or(("█", "8"));
-            let style = if *share < LOW { theme.warning() } else { theme.state(SlotState::Streaming) };
+            let style = if *share < LOW { theme.warning() } else { theme.state(DeviceState::Streaming) };
             Span::styled(theme.symbol(bar.0, bar.1), style)
         }
     };
@@ -184,7 +184,7 @@ fn row(
     let none = theme.symbol("–", "-").to_owned();
     let rate = if running { text::hertz(reading.hz) } else { none.clone() };
     let age = reading.age.filter(|_| running).map_or(none, text::age);
-    let is_old = device.state == SlotState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
+    let is_old = device.state == DeviceState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
     let lost = model.lost(device);
     let gaps = if lost > 0 { theme.level(Level::Warn) } else { theme.faint() };
     let word = format!("{} {}", theme.state_symbol(device.state), device.state.word());
@@ -198,7 +198,7 @@ fn row(
     let figures = if running { Style::new() } else { theme.faint() };
     let style = match finding(device, model) {
         Some(finding) => theme.grade(finding.grade),
-        None if device.state == SlotState::Failed => theme.alarm(),
+        None if device.state == DeviceState::Failed => theme.alarm(),
         None => theme.faint(),
     };
     let mut spans = vec![
@@ -237,7 +237,7 @@ fn detail_of(device: &DeviceStatus, model: &Model, theme: Theme) -> String {
     if let Some(finding) = finding(device, model) {
         return format!("would be {}: {}", finding.grade.word(), theme.safe(&finding.text));
     }
-    if device.state != SlotState::Absent || !device.detail.is_empty() {
+    if device.state != DeviceState::Absent || !device.detail.is_empty() {
         return theme.safe(&device.detail);
     }
     match model.unplugged_for(device) {

@@ -4,7 +4,7 @@
 use rapid_core::interlock::{InputState, StopKind};
 use rapid_core::text;
 use rapid_core::time::Stamp;
-use rapid_status::{Grade, SlotState, StopStatus};
+use rapid_status::{DeviceState, Grade, StopStatus};
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::{Style, Stylize};
@@ -117,7 +117,7 @@ pub(super) fn draw_banner(frame: &mut Frame<'_>, area: Rect, model: &Model, them
     for device in &snapshot.devices {
         let ago = model.unplugged_for(device).map(|ago| format!("{} unplugged {} ago", device.name, text::clock(ago)));
         let trouble = match device.state {
-            SlotState::Failed | SlotState::Stalled => Some(format!("{} {}", device.name, device.state.word())),
+            DeviceState::Failed | DeviceState::Stalled => Some(format!("{} {}", device.name, device.state.word())),
             _ => None,
         };
         parts.extend(ago.or(trouble).map(|text| (text, theme.state(device.state))));

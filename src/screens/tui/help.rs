@@ -1,6 +1,6 @@
 //! The help: all keys on two pages, and the meaning of the states.
 
-use rapid_status::SlotState;
+use rapid_status::DeviceState;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
 use ratatui::style::Modifier;
@@ -15,13 +15,13 @@ use super::theme::Theme;
 pub(super) const PAGES: usize = 2;
 /// Width of the box with its border and padding.
 const WIDTH: u16 = 58;
-const STATES: [(SlotState, &str); 6] = [
-    (SlotState::Streaming, "samples arrive; bit set"),
-    (SlotState::Stalled, "attached, samples have stopped; bit set"),
-    (SlotState::Opening, "attached, waiting for the first sample"),
-    (SlotState::Backoff, "attached, waiting to be restarted"),
-    (SlotState::Failed, "attached, given up: replug it or press r"),
-    (SlotState::Absent, "not attached"),
+const STATES: [(DeviceState, &str); 6] = [
+    (DeviceState::Streaming, "samples arrive; bit set"),
+    (DeviceState::Stalled, "attached, samples have stopped; bit set"),
+    (DeviceState::Opening, "attached, waiting for the first sample"),
+    (DeviceState::Backoff, "attached, waiting to be restarted"),
+    (DeviceState::Failed, "attached, given up: replug it or press r"),
+    (DeviceState::Absent, "not attached"),
 ];
 
 /// The lines of a page, from 1: keys about episodes and motion, then keys about the screen, and the states.

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::time::Stamp;
-use rapid_status::{DeviceStatus, SlotState, Snapshot};
+use rapid_status::{DeviceState, DeviceStatus, Snapshot};
 
 /// Seconds that are kept.
 pub(super) const SECONDS: usize = 60;
@@ -188,7 +188,7 @@ impl DeviceHistory {
         let hz = arrived as f64 / length.as_secs_f64();
         self.highest = self.highest.max(hz);
         let expected = device.nominal_hz.unwrap_or(self.highest) * length.as_secs_f64();
-        if device.state == SlotState::Stalled && arrived == 0 {
+        if device.state == DeviceState::Stalled && arrived == 0 {
             return Cell::Rate(0.0);
         }
         // A regular device is one sample short where its phase is unlucky.
@@ -206,7 +206,7 @@ mod tests {
     use super::*;
 
     /// A device of 30 Hz: its state and samples at each tenth of a second.
-    fn played(history: &mut History, tenths: impl Iterator<Item = (SlotState, u64)>) {
+    fn played(history: &mut History, tenths: impl Iterator<Item = (DeviceState, u64)>) {
         for (tenth, (state, samples)) in tenths.enumerate() {
             let mut cam = device(0, "cam", state, "");
             cam.samples = samples;
@@ -220,7 +220,7 @@ mod tests {
     #[test]
     fn what_was_not_seen_is_unknown_and_no_absence() {
         let mut history = History::default();
-        let mut now = snapshot(vec![device(0, "cam", SlotState::Streaming, "")]);
+        let mut now = snapshot(vec![device(0, "cam", DeviceState::Streaming, "")]);
         now.mask = PhysicalMask(1);
         for ms in (0..=5000).step_by(100).chain((35_000..=40_000).step_by(100)) {
             now.taken = Stamp(1_000_000_000_000 + ms * 1_000_000);
@@ -241,15 +241,15 @@ mod tests {
     fn a_second_shows_the_rate_and_the_slightest_absence() {
         let mut history = History::default();
         let tenths = (0..=50).map(|tenth| match tenth {
-            0..=10 => (SlotState::Streaming, tenth * 3),
+            0..=10 => (DeviceState::Streaming, tenth * 3),
             // Half of the rate.
-            11..=20 => (SlotState::Streaming, 30 + (tenth - 10) * 3 / 2),
+            11..=20 => (DeviceState::Streaming, 30 + (tenth - 10) * 3 / 2),
             // Away for 100 ms.
-            25 => (SlotState::Absent, 60),
-            21..=30 => (SlotState::Streaming, 45 + (tenth - 20) * 3),
+            25 => (DeviceState::Absent, 60),
+            21..=30 => (DeviceState::Streaming, 45 + (tenth - 20) * 3),
             // Silent.
-            31..=40 => (SlotState::Stalled, 75),
-            _ => (SlotState::Streaming, 75 + (tenth - 40) * 3),
+            31..=40 => (DeviceState::Stalled, 75),
+            _ => (DeviceState::Streaming, 75 + (tenth - 40) * 3),
         });
         played(&mut history, tenths);
         let strip = history.strip(id(0), 60);
@@ -267,8 +267,8 @@ mod tests {
         let mut history = History::default();
         // Away from second 20 to 30, and for an instant in second 40.
         let tenths = (0..=1000).map(|tenth| match tenth {
-            200..=300 | 405 => (SlotState::Absent, 0),
-            _ => (SlotState::Streaming, tenth * 3),
+            200..=300 | 405 => (DeviceState::Absent, 0),
+            _ => (DeviceState::Streaming, tenth * 3),
         });
         played(&mut history, tenths);
         let bits = history.bits(id(0), MASK_SECONDS);
@@ -287,8 +287,9 @@ mod tests {
     #[test]
     fn an_old_minute_is_forgotten() {
         let mut history = History::default();
-        let absent_first = (0..=1300)
-            .map(|tenth| if tenth < 300 { (SlotState::Absent, 0) } else { (SlotState::Streaming, (tenth - 300) * 3) });
+        let absent_first = (0..=1300).map(|tenth| {
+            if tenth < 300 { (DeviceState::Absent, 0) } else { (DeviceState::Streaming, (tenth - 300) * 3) }
+        });
         played(&mut history, absent_first);
         for columns in [60, 30, 20] {
             assert!(history.strip(id(0), columns).iter().all(|cell| *cell == Cell::Rate(1.0)), "{columns}");

@@ -3,7 +3,7 @@
 //! Invariant: a key has one meaning, apart from the text of a prompt.
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
-use rapid_status::SlotState;
+use rapid_status::DeviceState;
 use rapid_status::session::Phase;
 
 use super::model::{Model, Page};
@@ -195,12 +195,12 @@ fn restores(model: &Model) -> Option<&'static str> {
 }
 
 fn restarts(model: &Model) -> Option<&'static str> {
-    model.selected_device().is_some_and(|device| device.state == SlotState::Failed).then_some("restart")
+    model.selected_device().is_some_and(|device| device.state == DeviceState::Failed).then_some("restart")
 }
 
 fn plugs(model: &Model) -> Option<&'static str> {
     let device = model.selected_device().filter(|_| model.latest().simulated)?;
-    Some(if device.state == SlotState::Absent { "plug in" } else { "unplug" })
+    Some(if device.state == DeviceState::Absent { "plug in" } else { "unplug" })
 }
 
 use KeyCode::{Char, Down, End, Esc, F, Home, Left, PageDown, PageUp, Right, Up};

@@ -18,7 +18,7 @@ use rapid_core::time::{Stamp, Zone};
 use rapid_status::preview::Preview;
 use rapid_status::rates::Rates;
 use rapid_status::session::{Label, PRESS_AGAIN, SessionRequest};
-use rapid_status::{Command, DeviceStatus, Grade, SlotState, Snapshot};
+use rapid_status::{Command, DeviceState, DeviceStatus, Grade, Snapshot};
 
 use super::history::{Bit, Cell, History};
 use super::keys::{self, Act};
@@ -291,9 +291,9 @@ impl Model {
                 *lost = device.gaps;
             }
             let before = self.latest.devices.iter().find(|before| before.id == device.id);
-            let was_attached = before.is_some_and(|before| before.state != SlotState::Absent);
+            let was_attached = before.is_some_and(|before| before.state != DeviceState::Absent);
             if let Some(unplugged) = self.unplugged.get_mut(device.id.index())
-                && device.state == SlotState::Absent
+                && device.state == DeviceState::Absent
                 && was_attached
             {
                 *unplugged = Some(snapshot.taken);
@@ -650,7 +650,7 @@ impl Model {
         let id = device.id;
         // The view may be paused: the current state counts.
         let Some(now) = self.latest.devices.iter().find(|device| device.id == id) else { return Effect::None };
-        if now.state == SlotState::Failed {
+        if now.state == DeviceState::Failed {
             let text = format!("restarting {}", now.name);
             self.notify(&text);
             return Effect::Send(Command::Restart(id));
@@ -668,7 +668,7 @@ impl Model {
             self.notify("U unplugs simulated devices only (rapid --sim)");
             return Effect::None;
         }
-        let is_plugged = self.latest.devices.iter().any(|now| now.name == name && now.state != SlotState::Absent);
+        let is_plugged = self.latest.devices.iter().any(|now| now.name == name && now.state != DeviceState::Absent);
         self.notify(&if is_plugged { format!("unplugging {name}") } else { format!("plugging {name} in") });
         Effect::Send(Command::Plug(name))
     }
@@ -745,13 +745,13 @@ impl Model {
         let outlook = self.shown().recording.as_ref().and_then(|recording| recording.outlook.of(&device.name));
         match (outlook.map(|finding| finding.grade), device.state) {
             (Some(Grade::Bad), _) => 0,
-            (_, SlotState::Failed) => 1,
+            (_, DeviceState::Failed) => 1,
             (Some(Grade::Suspect), _) => 2,
-            (_, SlotState::Stalled) => 3,
-            (_, SlotState::Backoff) => 4,
-            (_, SlotState::Absent) => 5,
-            (_, SlotState::Opening) => 6,
-            (_, SlotState::Streaming) => 7,
+            (_, DeviceState::Stalled) => 3,
+            (_, DeviceState::Backoff) => 4,
+            (_, DeviceState::Absent) => 5,
+            (_, DeviceState::Opening) => 6,
+            (_, DeviceState::Streaming) => 7,
         }
     }
 
@@ -794,7 +794,7 @@ impl Model {
     pub fn unplugged_for(&self, device: &DeviceStatus) -> Option<Duration> {
         let unplugged = self.unplugged.get(device.id.index()).copied().flatten()?;
         let shown = self.shown().taken;
-        (device.state == SlotState::Absent && unplugged <= shown).then(|| shown.since(unplugged))
+        (device.state == DeviceState::Absent && unplugged <= shown).then(|| shown.since(unplugged))
     }
 
     /// Samples that a device lost: in the episode in progress or, without one, in the run.
@@ -833,7 +833,7 @@ fn news(before: &Snapshot, after: &Snapshot) -> Vec<String> {
 fn calls_attention(before: &Snapshot, after: &Snapshot) -> bool {
     let is_lost = |device: &DeviceStatus| {
         let now = after.devices.iter().find(|now| now.id == device.id);
-        device.state == SlotState::Streaming && now.is_none_or(|now| now.state != SlotState::Streaming)
+        device.state == DeviceState::Streaming && now.is_none_or(|now| now.state != DeviceState::Streaming)
     };
     before.recording.is_some() != after.recording.is_some() || before.devices.iter().any(is_lost)
 }

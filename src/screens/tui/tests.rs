@@ -11,7 +11,7 @@ use crate::literal::{TAKEN, board, device, every_state, line, recording, sixty_f
 use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 use insta::assert_snapshot;
 use rapid_status::{
-    Finding, Grade, Level, Outlook, RecordingStatus, Sensors, SlotState, Snapshot, StopStatus, Verdict,
+    DeviceState, Finding, Grade, Level, Outlook, RecordingStatus, Sensors, Snapshot, StopStatus, Verdict,
 };
 use ratatui::Terminal;
 use ratatui::backend::TestBackend;
@@ -188,7 +188,7 @@ fn the_last_minute_of_each_device_is_a_strip() {
             *count += rate;
             device.samples = *count;
         }
-        now.devices[1].state = if is_away { SlotState::Absent } else { SlotState::Streaming };
+        now.devices[1].state = if is_away { DeviceState::Absent } else { DeviceState::Streaming };
         now.taken = end.before(Duration::from_secs(60 - second));
         model.update(Msg::Snapshot(Box::new(now.clone())));
     }
@@ -293,9 +293,9 @@ fn sixty_four_devices_fit_and_scroll() {
 #[test]
 fn long_and_foreign_names_keep_the_columns() {
     let mut end = snapshot(vec![
-        device(0, "a_name_of_sixty_four_characters_which_is_the_longest_that_is_ok", SlotState::Streaming, "x"),
-        device(1, "相机手腕左侧的相机", SlotState::Streaming, "/dev/video0 相机手腕左侧的相机手腕左侧的"),
-        device(2, "e\u{301}te\u{301}", SlotState::Absent, "\x1b[2J\x1b[Hhello\r\n\u{202e}reversed"),
+        device(0, "a_name_of_sixty_four_characters_which_is_the_longest_that_is_ok", DeviceState::Streaming, "x"),
+        device(1, "相机手腕左侧的相机", DeviceState::Streaming, "/dev/video0 相机手腕左侧的相机手腕左侧的"),
+        device(2, "e\u{301}te\u{301}", DeviceState::Absent, "\x1b[2J\x1b[Hhello\r\n\u{202e}reversed"),
     ]);
     end.rig = "a rig whose name is far too long for a header".to_owned();
     end.log = vec![line(0, Level::Warn, &"wörter ".repeat(40)), line(1, Level::Info, "bell\x07 and\ttab")];
@@ -376,11 +376,11 @@ fn a_number_that_does_not_fit_is_left_out_and_not_cut() {
 #[test]
 fn an_absent_device_shows_since_when() {
     let mut end = three_streaming();
-    end.devices.push(device(3, "imu", SlotState::Absent, ""));
+    end.devices.push(device(3, "imu", DeviceState::Absent, ""));
     end.devices[3].samples = 0;
     let mut model = measured(&end);
     let mut later = end.clone();
-    later.devices[1].state = SlotState::Absent;
+    later.devices[1].state = DeviceState::Absent;
     later.devices[1].detail.clear();
     later.taken = Stamp(TAKEN.0 + 100_000_000);
     model.update(Msg::Snapshot(Box::new(later.clone())));
@@ -391,9 +391,9 @@ fn an_absent_device_shows_since_when() {
     assert!(screen.contains("unplugged 3 s ago · /rapid/cam_top"), "{screen}");
     assert!(screen.contains("not plugged in"), "{screen}");
     // Plugged in and unplugged again: counted from the second unplug.
-    later.devices[1].state = SlotState::Streaming;
+    later.devices[1].state = DeviceState::Streaming;
     model.update(Msg::Snapshot(Box::new(later.clone())));
-    later.devices[1].state = SlotState::Absent;
+    later.devices[1].state = DeviceState::Absent;
     later.taken = Stamp(TAKEN.0 + 70_000_000_000);
     model.update(Msg::Snapshot(Box::new(later.clone())));
     later.taken = Stamp(TAKEN.0 + 200_000_000_000);

@@ -5,7 +5,7 @@
 
 use rapid_core::text;
 use rapid_status::palette::{self, Palette};
-use rapid_status::{Grade, Level, SlotState};
+use rapid_status::{DeviceState, Grade, Level};
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::symbols::border;
 
@@ -112,20 +112,20 @@ impl Theme {
         }
     }
 
-    /// A state of a slot.
-    pub fn state(self, state: SlotState) -> Style {
+    /// A state of a device.
+    pub fn state(self, state: DeviceState) -> Style {
         self.style(palette::of_state(state))
     }
 
     /// The symbol of a state, one column.
-    pub fn state_symbol(self, state: SlotState) -> &'static str {
+    pub fn state_symbol(self, state: DeviceState) -> &'static str {
         match state {
-            SlotState::Streaming => self.symbol("●", "*"),
-            SlotState::Opening => self.symbol("◐", "~"),
-            SlotState::Backoff => self.symbol("◌", ":"),
-            SlotState::Stalled => self.symbol("◆", "!"),
-            SlotState::Absent => self.symbol("○", "-"),
-            SlotState::Failed => self.symbol("✕", "X"),
+            DeviceState::Streaming => self.symbol("●", "*"),
+            DeviceState::Opening => self.symbol("◐", "~"),
+            DeviceState::Backoff => self.symbol("◌", ":"),
+            DeviceState::Stalled => self.symbol("◆", "!"),
+            DeviceState::Absent => self.symbol("○", "-"),
+            DeviceState::Failed => self.symbol("✕", "X"),
         }
     }
 
@@ -211,7 +211,7 @@ mod tests {
         let bold = Style::new().add_modifier(Modifier::BOLD);
         assert_eq!((coloured.alarm(), plain.alarm()), (bold.fg(Color::Red), bold));
         assert_eq!((coloured.code(), plain.code()), (Style::new().fg(Color::White).bg(Color::Black), Style::new()));
-        let absent = SlotState::Absent;
+        let absent = DeviceState::Absent;
         assert_eq!((coloured.state(absent), plain.state(absent)), (Style::new().fg(Color::Red), Style::new()));
     }
 }

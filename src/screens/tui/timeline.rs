@@ -1,7 +1,7 @@
 //! The last five minutes of each bit of the mask, a row each.
 
 use rapid_core::text;
-use rapid_status::SlotState;
+use rapid_status::DeviceState;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -33,7 +33,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
         ];
         spans.extend(model.bits(device.id, columns).into_iter().map(|bit| match bit {
             Bit::Unknown => Span::raw(" "),
-            Bit::Set => Span::styled(theme.symbol("▄", "="), theme.state(SlotState::Streaming)),
+            Bit::Set => Span::styled(theme.symbol("▄", "="), theme.state(DeviceState::Streaming)),
             Bit::Clear => Span::styled(theme.symbol("·", "."), theme.faint()),
             Bit::Edge => Span::styled(theme.symbol("┃", "|"), theme.warning()),
         }));

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a step is over once the rig shows it, whatever was pressed.
 
-use rapid_status::{SlotState, Snapshot};
+use rapid_status::{DeviceState, Snapshot};
 
 /// Snapshots, ten a second: a policy that loses what it requires acts until its next tick.
 const SURE: u8 = 10;
@@ -29,8 +29,8 @@ pub(super) enum Tour {
 impl Tour {
     pub(super) fn update(&mut self, now: &Snapshot) {
         let is_recording = now.recording.is_some();
-        let is_absent = now.devices.iter().any(|device| device.state == SlotState::Absent);
-        let is_whole = !is_absent && now.devices.iter().all(|device| device.state == SlotState::Streaming);
+        let is_absent = now.devices.iter().any(|device| device.state == DeviceState::Absent);
+        let is_whole = !is_absent && now.devices.iter().all(|device| device.state == DeviceState::Streaming);
         let acts = now.policy.as_ref().is_some_and(|policy| policy.hold.is_none() && policy.mask == now.mask);
         *self = match *self {
             Self::Begin if now.policy.is_some() => Self::Lose(0),
@@ -47,7 +47,7 @@ impl Tour {
 
     /// What to do now, with `selected` the device that the keys are about. The key comes first: the end may be cut.
     pub(super) fn text(self, now: &Snapshot, selected: Option<&str>) -> Option<String> {
-        let absent = now.devices.iter().find(|device| device.state == SlotState::Absent).map(|device| &*device.name);
+        let absent = now.devices.iter().find(|device| device.state == DeviceState::Absent).map(|device| &*device.name);
         let plug = absent.map(|name| if selected == Some(name) { "U".to_owned() } else { format!("select {name}, U") });
         let holds = now.policy.as_ref().is_some_and(|policy| policy.hold.is_some());
         Some(match (self, plug, absent) {
@@ -102,10 +102,10 @@ mod tests {
         step(&now, Tour::Begin);
         now.recording = Some(recording(0));
         step(&now, Tour::Unplug);
-        let mut gone = snapshot(vec![device(0, "cam", SlotState::Absent, "")]);
+        let mut gone = snapshot(vec![device(0, "cam", DeviceState::Absent, "")]);
         gone.recording.clone_from(&now.recording);
         step(&gone, Tour::Plug);
-        let mut opening = snapshot(vec![device(0, "cam", SlotState::Opening, "")]);
+        let mut opening = snapshot(vec![device(0, "cam", DeviceState::Opening, "")]);
         opening.recording.clone_from(&now.recording);
         step(&opening, Tour::Plug);
         step(&now, Tour::End);
@@ -115,7 +115,7 @@ mod tests {
         // With a policy.
         let mut tour = Tour::default();
         let mut step = |mask: u64, holds: bool, is_there: bool, expected| {
-            let state = if is_there { SlotState::Streaming } else { SlotState::Absent };
+            let state = if is_there { DeviceState::Streaming } else { DeviceState::Absent };
             let mut now = snapshot(vec![device(0, "cam", state, "")]);
             now.mask = PhysicalMask(mask);
             let hold = holds.then(|| Hold { device: None, reason: "late".to_owned() });
@@ -149,7 +149,7 @@ mod tests {
             Some("1/2 select tactile_tip (up, down), U")
         );
         assert_eq!(text(Tour::Lose(0), &now, Some("tactile_tip")).split(':').next(), Some("1/2 U"));
-        now.devices[2].state = SlotState::Absent;
+        now.devices[2].state = DeviceState::Absent;
         now.devices[2].name = "arm".into();
         assert!(text(Tour::Plug, &now, Some("cam_wrist")).starts_with("3/4 select arm, U: plug it in again"));
         assert!(text(Tour::Plug, &now, Some("arm")).starts_with("3/4 U: plug it in again"));

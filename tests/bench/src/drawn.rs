@@ -18,7 +18,7 @@ use rapid_screens::tui::picture::Canvas;
 use rapid_screens::tui::theme::Theme;
 use rapid_screens::tui::view;
 use rapid_status::palette::Palette;
-use rapid_status::{Board, Level, SlotState, Snapshot};
+use rapid_status::{Board, DeviceState, Level, Snapshot};
 use ratatui::backend::CrosstermBackend;
 use ratatui::buffer::Buffer;
 use ratatui::crossterm::event::KeyCode;
@@ -93,7 +93,7 @@ impl Monitor {
         let ids: Vec<ModalityId> = registry.devices.iter().map(|device| device.id).collect();
         let board = Board::new(&registry);
         for id in &ids {
-            board.set_slot(*id, SlotState::Streaming, Epoch(1), "/dev/video0 MJPG 640x480@30");
+            board.set_device_state(*id, DeviceState::Streaming, Epoch(1), "/dev/video0 MJPG 640x480@30");
         }
         let now = Stamp::now().after(AHEAD);
         let set = |name: &str| (name == "LC_ALL").then(|| "C.UTF-8".to_owned());
@@ -123,8 +123,8 @@ impl Monitor {
         let mut mask = PhysicalMask::EMPTY;
         for id in &self.ids {
             let is_away = id.index() as u64 == number / EDGE % DEVICES as u64 && number % EDGE < 5;
-            let state = if is_away { SlotState::Absent } else { SlotState::Streaming };
-            self.board.set_slot(*id, state, Epoch(1), "/dev/video0 MJPG 640x480@30");
+            let state = if is_away { DeviceState::Absent } else { DeviceState::Streaming };
+            self.board.set_device_state(*id, state, Epoch(1), "/dev/video0 MJPG 640x480@30");
             self.board.counters(*id).count(60_000, self.now, 0);
             mask = mask.with(*id, !is_away);
         }

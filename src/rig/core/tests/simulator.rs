@@ -66,7 +66,7 @@ const PORTS: [(&str, &str); 5] = [("1", "1-1"), ("1", "1-2"), ("1", "1-9"), ("2"
 #[derive(Debug)]
 struct Model {
     id: ModalityId,
-    state: SlotState,
+    state: DeviceState,
     running: Option<Epoch>,
     newest: Epoch,
     /// The newest announcement was an attachment.
@@ -137,7 +137,7 @@ impl Storm {
         registry.rig.cooldown = if seed.is_multiple_of(4) { Duration::ZERO } else { 2 * SECOND };
         let model = |id| Model {
             id,
-            state: SlotState::Absent,
+            state: DeviceState::Absent,
             running: None,
             newest: Epoch(0),
             is_announced: false,
@@ -172,7 +172,7 @@ impl Storm {
     fn calm(&mut self) -> Result<(), String> {
         self.step(&Input::Hotplug(removed("/sys", UnplugSource::Enumeration, self.now)))?;
         for model in &self.models {
-            let is_empty = model.state == SlotState::Absent && !model.is_announced && !model.is_plugged;
+            let is_empty = model.state == DeviceState::Absent && !model.is_announced && !model.is_plugged;
             ensure(is_empty, || format!("not empty after everything was unplugged: {model:?}"))?;
         }
         ensure(self.core.mask() == PhysicalMask::EMPTY, || "the mask is not empty at the end".to_owned())?;
@@ -347,7 +347,7 @@ impl Storm {
                 .map_err(|why| format!("{why}: effect {index} {effect:?} of {model:?}"))?;
             match effect {
                 DeviceEffect::Start(..) => self.reached.starts += 1,
-                DeviceEffect::State(Transition { to: SlotState::Failed, .. }) => self.reached.failures += 1,
+                DeviceEffect::State(Transition { to: DeviceState::Failed, .. }) => self.reached.failures += 1,
                 DeviceEffect::Unplugged => {
                     let plugs = |effect: &Effect| matches!(effect, Effect::Device(_, DeviceEffect::Plugged));
                     self.reached.promotions += u64::from(self.effects.iter().any(plugs));
@@ -363,14 +363,14 @@ impl Storm {
         for model in &self.models {
             let id = model.id;
             let Some(modality) = self.core.modality(id) else { return Err(format!("no modality {id}")) };
-            let attached = modality.slot.attached();
+            let attached = modality.lifecycle.attached();
             let (state, epoch) = self.core.state(id);
             ensure(state == model.state, || format!("{id} is {state:?}, announced as {:?}", model.state))?;
-            let runs = matches!(state, SlotState::Opening | SlotState::Streaming | SlotState::Stalled);
+            let runs = matches!(state, DeviceState::Opening | DeviceState::Streaming | DeviceState::Stalled);
             ensure(model.running == runs.then_some(epoch), || format!("{id} is {state:?} {epoch:?}, {model:?}"))?;
-            let is_present = matches!(state, SlotState::Streaming | SlotState::Stalled);
+            let is_present = matches!(state, DeviceState::Streaming | DeviceState::Stalled);
             ensure(self.core.mask().contains(id) == is_present, || format!("the bit of {id}, which is {state:?}"))?;
-            ensure(attached.is_some() || state == SlotState::Absent, || format!("{id} is {state:?}, not attached"))?;
+            ensure(attached.is_some() || state == DeviceState::Absent, || format!("{id} is {state:?}, not attached"))?;
             ensure(attached.is_some() == model.is_plugged, || format!("hooks of {id}: {model:?}"))?;
             ensure(attached.is_some() || !model.is_announced, || format!("{id} was not announced as detached"))?;
             let is_plugged = is_present || model.is_announced;
@@ -378,8 +378,8 @@ impl Storm {
                 format!("{id} is plugged in or not: {model:?}")
             })?;
             // Every waiting state has a deadline.
-            let waits = state == SlotState::Backoff || state == SlotState::Absent && attached.is_some();
-            let deadline = modality.slot.deadline();
+            let waits = state == DeviceState::Backoff || state == DeviceState::Absent && attached.is_some();
+            let deadline = modality.lifecycle.deadline();
             ensure(waits == deadline.is_some(), || format!("{id} is {state:?} with deadline {deadline:?}"))?;
             let is_due = deadline.is_some_and(|deadline| deadline <= self.now);
             ensure(*input != Input::Timer || !is_due, || format!("the deadline of {id} was ignored"))?;
@@ -443,9 +443,9 @@ impl Model {
             }
             DeviceEffect::State(Transition { from, to, wait, source }) => {
                 ensure(*from == self.state, || "it was in another state".to_owned())?;
-                ensure(wait.is_some() == (*to == SlotState::Backoff), || "how long it waits".to_owned())?;
-                ensure(source.is_some() == (*to == SlotState::Absent), || "what noticed the removal".to_owned())?;
-                if *to == SlotState::Absent {
+                ensure(wait.is_some() == (*to == DeviceState::Backoff), || "how long it waits".to_owned())?;
+                ensure(source.is_some() == (*to == DeviceState::Absent), || "what noticed the removal".to_owned())?;
+                if *to == DeviceState::Absent {
                     self.absent_since = Some(now);
                 }
                 self.state = *to;

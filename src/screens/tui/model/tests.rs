@@ -291,7 +291,9 @@ fn the_bell_rings_at_begin_end_and_each_loss_unless_it_is_off() {
     let quiet = three_streaming();
     let mut recording = quiet.clone();
     recording.recording = Some(crate::literal::recording(0));
-    for lost in [SlotState::Absent, SlotState::Stalled, SlotState::Backoff, SlotState::Failed, SlotState::Opening] {
+    for lost in
+        [DeviceState::Absent, DeviceState::Stalled, DeviceState::Backoff, DeviceState::Failed, DeviceState::Opening]
+    {
         let mut without = recording.clone();
         without.devices[1].state = lost;
         let mut model = Model::new(quiet.clone());
@@ -325,7 +327,7 @@ fn a_key_unplugs_simulated_devices_and_no_others() {
     assert_eq!(model.update(press(KeyCode::Char('U'))), Effect::Send(Command::Plug(name.clone())));
     assert_eq!(model.notice(), Some(format!("unplugging {name}").as_str()));
     assert_eq!(model.update(repeated(KeyCode::Char('U'))), Effect::None);
-    simulated.devices[1].state = SlotState::Absent;
+    simulated.devices[1].state = DeviceState::Absent;
     model.update(after(&simulated, 100));
     assert_eq!(model.update(press(KeyCode::Char('U'))), Effect::Send(Command::Plug(name.clone())));
     assert_eq!(model.notice(), Some(format!("plugging {name} in").as_str()));
@@ -415,16 +417,16 @@ fn devices_in_trouble_come_first_by_a_key_and_the_selection_stays_on_its_device(
     assert!(by_bit.is_sorted());
     model.update(press(KeyCode::Char('o')));
     let states: Vec<_> = model.rows().iter().map(|device| device.state).collect();
-    assert_eq!(states.first(), Some(&SlotState::Failed), "{states:?}");
-    assert_eq!(states.last(), Some(&SlotState::Streaming), "{states:?}");
+    assert_eq!(states.first(), Some(&DeviceState::Failed), "{states:?}");
+    assert_eq!(states.last(), Some(&DeviceState::Streaming), "{states:?}");
     assert_eq!(name(&model), selected);
     // The state of another device changes, and with it the order.
     let mut changed = every_state();
-    let failed = changed.devices.iter_mut().find(|device| device.state == SlotState::Failed).unwrap();
-    failed.state = SlotState::Streaming;
+    let failed = changed.devices.iter_mut().find(|device| device.state == DeviceState::Failed).unwrap();
+    failed.state = DeviceState::Streaming;
     model.update(after(&changed, 100));
     assert_eq!(name(&model), selected);
-    assert_ne!(model.rows()[0].state, SlotState::Failed);
+    assert_ne!(model.rows()[0].state, DeviceState::Failed);
     model.update(press(KeyCode::Char('o')));
     assert_eq!(model.rows().iter().map(|device| device.id.bit()).collect::<Vec<_>>(), by_bit);
 }

@@ -61,7 +61,7 @@ const NICE: i32 = 10;
 
 /// Where the server listens, and what clients may request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LiveOptions {
+pub struct FoxgloveOptions {
     /// Its address; with port 0 a free one is chosen.
     pub address: SocketAddr,
     /// Clients may begin and end episodes, and arm and disarm.
@@ -70,7 +70,7 @@ pub struct LiveOptions {
 
 /// Why there is no server.
 #[derive(Debug, thiserror::Error)]
-pub enum LiveError {
+pub enum ServerError {
     /// The address cannot be listened on.
     #[error("--foxglove {address}: {source}{}", fix(source))]
     Listen {
@@ -106,7 +106,7 @@ fn fix(error: &io::Error) -> &'static str {
 }
 
 /// An entry that was added during the run, and its samples.
-pub type LiveAddition = (Arc<DeviceSpec>, Subscription);
+pub type Addition = (Arc<DeviceSpec>, Subscription);
 
 /// What the server shows.
 #[derive(Debug)]
@@ -120,33 +120,33 @@ pub struct Feed {
     /// What the recorder makes.
     pub made: mpsc::Receiver<Made>,
     /// Entries that are added.
-    pub additions: mpsc::Receiver<LiveAddition>,
+    pub additions: mpsc::Receiver<Addition>,
 }
 
 /// A server that listens, and its thread.
 #[derive(Debug)]
-pub struct Live {
+pub struct FoxgloveServer {
     feed: Option<oneshot::Sender<Feed>>,
     thread: Option<JoinHandle<()>>,
     stop: CancellationToken,
     ended: CancellationToken,
     board: Arc<Board>,
     /// Its address is the one that is listened on.
-    options: LiveOptions,
+    options: FoxgloveOptions,
 }
 
-impl Live {
+impl FoxgloveServer {
     /// Listens for clients. They get the topics of `registry`, and samples from [`Self::feed`] on. With `controls` they
     /// may request something.
     ///
     /// # Errors
     /// When the address is in use or none of this machine, or the system provides no thread.
     pub async fn listen(
-        options: LiveOptions,
+        options: FoxgloveOptions,
         registry: Arc<Registry>,
         board: Arc<Board>,
         controls: Option<Controls>,
-    ) -> Result<Self, LiveError> {
+    ) -> Result<Self, ServerError> {
         let (stop, ended) = (CancellationToken::new(), CancellationToken::new());
         let (feed, first_feed) = oneshot::channel();
         let (listening, listens) = oneshot::channel();
@@ -173,13 +173,13 @@ impl Live {
             // A client that does not read must not hold up the end.
             runtime.shutdown_background();
         })?;
-        let mut live = Self { feed: Some(feed), thread: Some(thread), stop, ended, board, options };
-        live.options.address = listens.await.unwrap_or(Err(LiveError::Panicked))?;
-        Ok(live)
+        let mut server = Self { feed: Some(feed), thread: Some(thread), stop, ended, board, options };
+        server.options.address = listens.await.unwrap_or(Err(ServerError::Panicked))?;
+        Ok(server)
     }
 
     fn announce(&self) {
-        let LiveOptions { address, control } = self.options;
+        let FoxgloveOptions { address, control } = self.options;
         let text = format!("Foxglove: open connection ws://{address}");
         self.board.announce(EventKind::Log { level: Level::Info, text });
         if !address.ip().is_loopback() {
@@ -219,7 +219,7 @@ impl Live {
     }
 }
 
-impl Drop for Live {
+impl Drop for FoxgloveServer {
     /// The subscriber of the bus must not outlive the bus.
     fn drop(&mut self) {
         self.stop.cancel();
@@ -242,12 +242,12 @@ struct Server {
 
 impl Server {
     async fn start(
-        options: LiveOptions,
+        options: FoxgloveOptions,
         registry: &Registry,
         controls: Option<Controls>,
-    ) -> Result<(Self, SocketAddr), LiveError> {
-        let LiveOptions { address, .. } = options;
-        let in_use = |source| LiveError::Listen { address, source };
+    ) -> Result<(Self, SocketAddr), ServerError> {
+        let FoxgloveOptions { address, .. } = options;
+        let in_use = |source| ServerError::Listen { address, source };
         let listener = relay::listen(address).await.map_err(in_use)?;
         let bound = listener.local_addr().map_err(in_use)?;
         let context = Context::new();

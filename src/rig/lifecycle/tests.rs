@@ -1,5 +1,5 @@
 use super::*;
-use SlotState::{Absent, Backoff, Failed, Opening, Stalled, Streaming};
+use DeviceState::{Absent, Backoff, Failed, Opening, Stalled, Streaming};
 use proptest::prelude::*;
 
 const COOLDOWN: Duration = Duration::from_secs(2);
@@ -8,10 +8,10 @@ fn ms(ms: u64) -> Stamp {
     Stamp(1_000_000_000_000 + ms * 1_000_000)
 }
 
-/// A slot brought into `state` by legal inputs, at 0 ms, with attachment `a` and epoch 1 where it
+/// A lifecycle brought into `state` by legal inputs, at 0 ms, with attachment `a` and epoch 1 where it
 /// has run.
-fn slot_in(state: SlotState) -> Slot<char> {
-    let mut slot = Slot::new(COOLDOWN);
+fn lifecycle_in(state: DeviceState) -> Lifecycle<char> {
+    let mut lifecycle = Lifecycle::new(COOLDOWN);
     let inputs: &[Input<char>] = match state {
         Absent => &[],
         Opening => &[Input::Attached('a')],
@@ -21,10 +21,10 @@ fn slot_in(state: SlotState) -> Slot<char> {
         Failed => &[Input::Attached('a'), Input::Ended(Epoch(1), End::Fatal)],
     };
     for input in inputs {
-        slot.apply(input.clone(), ms(0));
+        lifecycle.apply(input.clone(), ms(0));
     }
-    assert_eq!(slot.state(), state);
-    slot
+    assert_eq!(lifecycle.state(), state);
+    lifecycle
 }
 
 fn stop(epoch: u32) -> Effects<char> {
@@ -112,10 +112,10 @@ fn every_transition_of_the_current_epoch() {
     ];
     assert_eq!(table.len(), 6 * 11);
     for (from, input, to, effects) in table {
-        let mut slot = slot_in(from);
-        let got = slot.apply(input.clone(), ms(10));
-        assert_eq!((slot.state(), &got), (to, &effects), "{from:?} {input:?}");
-        assert_eq!(slot.is_present(), matches!(to, Streaming | Stalled), "{from:?} {input:?}");
+        let mut lifecycle = lifecycle_in(from);
+        let got = lifecycle.apply(input.clone(), ms(10));
+        assert_eq!((lifecycle.state(), &got), (to, &effects), "{from:?} {input:?}");
+        assert_eq!(lifecycle.is_present(), matches!(to, Streaming | Stalled), "{from:?} {input:?}");
     }
 }
 
@@ -132,10 +132,10 @@ fn an_older_epoch_changes_nothing_in_any_state() {
                 Input::Ended(old, End::LinkDown),
                 Input::Ended(old, End::Fatal),
             ] {
-                let mut slot = slot_in(state);
-                let deadline = slot.deadline();
-                assert_eq!(slot.apply(input.clone(), ms(10)), Effects::NONE);
-                assert_eq!((slot.state(), slot.deadline()), (state, deadline), "{input:?}");
+                let mut lifecycle = lifecycle_in(state);
+                let deadline = lifecycle.deadline();
+                assert_eq!(lifecycle.apply(input.clone(), ms(10)), Effects::NONE);
+                assert_eq!((lifecycle.state(), lifecycle.deadline()), (state, deadline), "{input:?}");
             }
         }
     }
@@ -143,103 +143,103 @@ fn an_older_epoch_changes_nothing_in_any_state() {
 
 #[test]
 fn a_cooldown_delays_a_replug_and_counts_from_the_first_witness() {
-    let mut slot = slot_in(Streaming);
-    slot.apply(Input::Ended(Epoch(1), End::Gone), ms(1000));
-    assert_eq!(slot.state(), Absent);
-    assert_eq!(slot.apply(Input::Detached, ms(1050)), Effects::NONE);
-    assert_eq!(slot.apply(Input::Attached('b'), ms(1300)), Effects::NONE);
-    assert_eq!((slot.state(), slot.deadline()), (Backoff, Some(ms(3000))));
-    assert_eq!(slot.apply(Input::Timer, ms(2999)), Effects::NONE);
-    assert_eq!(slot.apply(Input::Timer, ms(3000)), start(2, 'b'));
-    assert_eq!(slot.deadline(), None);
+    let mut lifecycle = lifecycle_in(Streaming);
+    lifecycle.apply(Input::Ended(Epoch(1), End::Gone), ms(1000));
+    assert_eq!(lifecycle.state(), Absent);
+    assert_eq!(lifecycle.apply(Input::Detached, ms(1050)), Effects::NONE);
+    assert_eq!(lifecycle.apply(Input::Attached('b'), ms(1300)), Effects::NONE);
+    assert_eq!((lifecycle.state(), lifecycle.deadline()), (Backoff, Some(ms(3000))));
+    assert_eq!(lifecycle.apply(Input::Timer, ms(2999)), Effects::NONE);
+    assert_eq!(lifecycle.apply(Input::Timer, ms(3000)), start(2, 'b'));
+    assert_eq!(lifecycle.deadline(), None);
 }
 
 #[test]
 fn after_the_cooldown_a_replug_starts_at_once() {
-    let mut slot = slot_in(Streaming);
-    slot.apply(Input::Detached, ms(1000));
-    assert_eq!(slot.apply(Input::Attached('b'), ms(3000)), start(2, 'b'));
+    let mut lifecycle = lifecycle_in(Streaming);
+    lifecycle.apply(Input::Detached, ms(1000));
+    assert_eq!(lifecycle.apply(Input::Attached('b'), ms(3000)), start(2, 'b'));
 }
 
 #[test]
 fn bounces_within_the_cooldown_settle_on_the_last_attachment() {
-    let mut slot = slot_in(Streaming);
-    slot.apply(Input::Detached, ms(0));
-    slot.apply(Input::Attached('b'), ms(100));
-    slot.apply(Input::Detached, ms(200));
-    slot.apply(Input::Attached('c'), ms(300));
-    assert_eq!(slot.deadline(), Some(ms(2200)));
-    assert_eq!(slot.apply(Input::Timer, ms(2200)), start(2, 'c'));
+    let mut lifecycle = lifecycle_in(Streaming);
+    lifecycle.apply(Input::Detached, ms(0));
+    lifecycle.apply(Input::Attached('b'), ms(100));
+    lifecycle.apply(Input::Detached, ms(200));
+    lifecycle.apply(Input::Attached('c'), ms(300));
+    assert_eq!(lifecycle.deadline(), Some(ms(2200)));
+    assert_eq!(lifecycle.apply(Input::Timer, ms(2200)), start(2, 'c'));
 }
 
 #[test]
 fn a_stream_that_was_wrong_about_an_unplug_is_started_again() {
-    let mut slot = slot_in(Streaming);
-    slot.apply(Input::Ended(Epoch(1), End::Gone), ms(0));
-    assert_eq!(slot.apply(Input::Timer, ms(2000)), start(2, 'a'));
+    let mut lifecycle = lifecycle_in(Streaming);
+    lifecycle.apply(Input::Ended(Epoch(1), End::Gone), ms(0));
+    assert_eq!(lifecycle.apply(Input::Timer, ms(2000)), start(2, 'a'));
 }
 
 #[test]
 fn a_stream_that_is_repeatedly_wrong_about_an_unplug_fails_until_a_replug() {
-    let mut slot = slot_in(Opening);
+    let mut lifecycle = lifecycle_in(Opening);
     let mut now = 0;
     for (n, wait) in [2000, 2000, 2000, 4000, 8000].into_iter().enumerate() {
         let epoch = Epoch(u32::try_from(n).expect("small") + 1);
-        slot.apply(Input::Ended(epoch, End::Gone), ms(now));
-        assert_eq!((slot.state(), slot.deadline()), (Absent, Some(ms(now + wait))));
+        lifecycle.apply(Input::Ended(epoch, End::Gone), ms(now));
+        assert_eq!((lifecycle.state(), lifecycle.deadline()), (Absent, Some(ms(now + wait))));
         now += wait;
-        assert_eq!(slot.apply(Input::Timer, ms(now)), start(epoch.0 + 1, 'a'));
+        assert_eq!(lifecycle.apply(Input::Timer, ms(now)), start(epoch.0 + 1, 'a'));
     }
-    slot.apply(Input::Ended(Epoch(6), End::Gone), ms(now));
-    assert_eq!((slot.state(), slot.deadline()), (Absent, Some(ms(now + 2000))));
-    assert_eq!(slot.apply(Input::Timer, ms(now + 2000)), Effects::NONE);
-    assert_eq!((slot.state(), slot.deadline()), (Failed, None));
-    let mut by_hand = slot.clone();
+    lifecycle.apply(Input::Ended(Epoch(6), End::Gone), ms(now));
+    assert_eq!((lifecycle.state(), lifecycle.deadline()), (Absent, Some(ms(now + 2000))));
+    assert_eq!(lifecycle.apply(Input::Timer, ms(now + 2000)), Effects::NONE);
+    assert_eq!((lifecycle.state(), lifecycle.deadline()), (Failed, None));
+    let mut by_hand = lifecycle.clone();
     assert_eq!(by_hand.apply(Input::Restart, ms(now + 2001)), start(7, 'a'));
-    slot.apply(Input::Detached, ms(now + 3000));
-    slot.apply(Input::Attached('b'), ms(now + 3100));
-    assert_eq!(slot.apply(Input::Timer, ms(now + 5000)), start(7, 'b'));
+    lifecycle.apply(Input::Detached, ms(now + 3000));
+    lifecycle.apply(Input::Attached('b'), ms(now + 3100));
+    assert_eq!(lifecycle.apply(Input::Timer, ms(now + 5000)), start(7, 'b'));
     // A stream that ran for a minute resets the back-off.
-    slot.apply(Input::Ended(Epoch(7), End::Gone), ms(now + 70_000));
-    assert_eq!(slot.deadline(), Some(ms(now + 72_000)));
+    lifecycle.apply(Input::Ended(Epoch(7), End::Gone), ms(now + 70_000));
+    assert_eq!(lifecycle.deadline(), Some(ms(now + 72_000)));
 }
 
 #[test]
 fn restarts_back_off_and_give_up_after_five_in_a_minute() {
-    let mut slot = slot_in(Opening);
+    let mut lifecycle = lifecycle_in(Opening);
     let mut now = 0;
     for (n, backoff) in [500, 1000, 2000, 4000, 8000].into_iter().enumerate() {
         let epoch = Epoch(u32::try_from(n).expect("small") + 1);
-        slot.apply(Input::Ended(epoch, End::Retry), ms(now));
-        assert_eq!(slot.deadline(), Some(ms(now + backoff)));
+        lifecycle.apply(Input::Ended(epoch, End::Retry), ms(now));
+        assert_eq!(lifecycle.deadline(), Some(ms(now + backoff)));
         now += backoff;
-        assert_eq!(slot.apply(Input::Timer, ms(now)), start(epoch.0 + 1, 'a'));
+        assert_eq!(lifecycle.apply(Input::Timer, ms(now)), start(epoch.0 + 1, 'a'));
     }
-    slot.apply(Input::Ended(Epoch(6), End::Retry), ms(now));
-    assert_eq!((slot.state(), slot.deadline()), (Failed, None));
+    lifecycle.apply(Input::Ended(Epoch(6), End::Retry), ms(now));
+    assert_eq!((lifecycle.state(), lifecycle.deadline()), (Failed, None));
 }
 
 #[test]
 fn a_cable_may_be_pulled_any_number_of_times() {
-    let mut slot = slot_in(Opening);
+    let mut lifecycle = lifecycle_in(Opening);
     for n in 1..20 {
         let now = 600 * u64::from(n);
-        slot.apply(Input::Ended(Epoch(n), End::LinkDown), ms(now));
-        assert_eq!((slot.state(), slot.deadline()), (Backoff, Some(ms(now + 500))));
-        assert_eq!(slot.apply(Input::Timer, ms(now + 500)), start(n + 1, 'a'));
+        lifecycle.apply(Input::Ended(Epoch(n), End::LinkDown), ms(now));
+        assert_eq!((lifecycle.state(), lifecycle.deadline()), (Backoff, Some(ms(now + 500))));
+        assert_eq!(lifecycle.apply(Input::Timer, ms(now + 500)), start(n + 1, 'a'));
     }
 }
 
 #[test]
 fn a_stream_stable_for_a_minute_resets_the_backoff() {
-    let mut slot = slot_in(Backoff);
-    slot.apply(Input::Timer, ms(500));
-    slot.apply(Input::Started(Epoch(2)), ms(600));
-    slot.apply(Input::Ended(Epoch(2), End::Retry), ms(61_000));
-    assert_eq!(slot.deadline(), Some(ms(61_500)));
+    let mut lifecycle = lifecycle_in(Backoff);
+    lifecycle.apply(Input::Timer, ms(500));
+    lifecycle.apply(Input::Started(Epoch(2)), ms(600));
+    lifecycle.apply(Input::Ended(Epoch(2), End::Retry), ms(61_000));
+    assert_eq!(lifecycle.deadline(), Some(ms(61_500)));
 }
 
-/// An event that a slot reacts to.
+/// An event that a lifecycle reacts to.
 #[derive(Debug, Clone)]
 enum Event {
     Attach(char),
@@ -259,32 +259,32 @@ fn event() -> impl Strategy<Value = Event> {
     ]
 }
 
-/// Lets a slot settle with a working device: timers run, a started stream delivers samples.
-fn settle(slot: &mut Slot<char>, now: &mut Stamp) {
+/// Lets a lifecycle settle with a working device: timers run, a started stream delivers samples.
+fn settle(lifecycle: &mut Lifecycle<char>, now: &mut Stamp) {
     for _ in 0..32 {
-        let effects = match (slot.state(), slot.deadline()) {
-            (Opening, _) => slot.apply(Input::Started(slot.epoch()), *now),
-            (Stalled, _) => slot.apply(Input::Resumed(slot.epoch()), *now),
+        let effects = match (lifecycle.state(), lifecycle.deadline()) {
+            (Opening, _) => lifecycle.apply(Input::Started(lifecycle.epoch()), *now),
+            (Stalled, _) => lifecycle.apply(Input::Resumed(lifecycle.epoch()), *now),
             (_, Some(deadline)) => {
                 *now = (*now).max(deadline);
-                slot.apply(Input::Timer, *now)
+                lifecycle.apply(Input::Timer, *now)
             }
             _ => return,
         };
         assert!(effects.stop.is_none(), "settling never stops a stream");
     }
-    panic!("the slot never settles: {slot:?}");
+    panic!("the lifecycle never settles: {lifecycle:?}");
 }
 
 proptest! {
     /// After any sequence of events, with reports of old and new streams: once a working device has been attached, the
-    /// slot streams; once it is gone, the slot is Absent.
+    /// lifecycle streams; once it is gone, the lifecycle is Absent.
     #[test]
     fn the_settled_state_depends_only_on_the_attachments(
         history in proptest::collection::vec(event(), 0..60),
         last in proptest::option::of(proptest::char::range('a', 'd')),
     ) {
-        let mut slot = Slot::new(COOLDOWN);
+        let mut lifecycle = Lifecycle::new(COOLDOWN);
         let mut now = ms(0);
         let mut running = None;
         let mut attached = None;
@@ -296,7 +296,7 @@ proptest! {
                 Event::Restart => Input::Restart,
                 Event::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
                 Event::Report(age, kind) => {
-                    let epoch = Epoch(slot.epoch().0.saturating_sub(age));
+                    let epoch = Epoch(lifecycle.epoch().0.saturating_sub(age));
                     match kind {
                         0 => Input::Started(epoch),
                         1 => Input::Stalled(epoch),
@@ -308,8 +308,8 @@ proptest! {
                     }
                 }
             };
-            let before = slot.epoch();
-            let effects = slot.apply(input, now);
+            let before = lifecycle.epoch();
+            let effects = lifecycle.apply(input, now);
             // At most one stream runs, and a new one always has a new epoch.
             if let Some(epoch) = effects.stop { prop_assert_eq!(running.take(), Some(epoch)); }
             if let Some((epoch, device)) = effects.start {
@@ -317,22 +317,22 @@ proptest! {
                 prop_assert_eq!(Some(device), attached, "only what is attached is started");
                 running = Some(epoch);
             }
-            if !slot.is_running() { running = None; }
-            prop_assert!(attached.is_some() || slot.state() == Absent, "nothing attached, yet {:?}", slot.state());
-            prop_assert!(!slot.is_present() || attached.is_some());
+            if !lifecycle.is_running() { running = None; }
+            prop_assert!(attached.is_some() || lifecycle.state() == Absent, "nothing attached, yet {:?}", lifecycle.state());
+            prop_assert!(!lifecycle.is_present() || attached.is_some());
         }
         // The final events: the device is unplugged, and perhaps one is plugged in.
-        slot.apply(Input::Detached, now);
-        if let Some(device) = last { slot.apply(Input::Attached(device), now); }
-        settle(&mut slot, &mut now);
-        prop_assert_eq!(slot.attached().copied(), last);
-        prop_assert_eq!(slot.state(), if last.is_some() { Streaming } else { Absent });
+        lifecycle.apply(Input::Detached, now);
+        if let Some(device) = last { lifecycle.apply(Input::Attached(device), now); }
+        settle(&mut lifecycle, &mut now);
+        prop_assert_eq!(lifecycle.attached().copied(), last);
+        prop_assert_eq!(lifecycle.state(), if last.is_some() { Streaming } else { Absent });
     }
 
     /// As above without the final events: a history in which no stream failed needs none.
     #[test]
     fn no_replug_is_lost_however_fast(history in proptest::collection::vec(event(), 0..60)) {
-        let mut slot = Slot::new(COOLDOWN);
+        let mut lifecycle = Lifecycle::new(COOLDOWN);
         let mut now = ms(0);
         let mut attached = None;
         for event in history {
@@ -340,19 +340,19 @@ proptest! {
                 Event::Attach(device) => { attached = Some(device); Input::Attached(device) }
                 Event::Detach => { attached = None; Input::Detached }
                 Event::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
-                Event::Report(age, 3) => Input::Ended(Epoch(slot.epoch().0.saturating_sub(age)), End::Gone),
-                Event::Report(age, _) => Input::Started(Epoch(slot.epoch().0.saturating_sub(age))),
+                Event::Report(age, 3) => Input::Ended(Epoch(lifecycle.epoch().0.saturating_sub(age)), End::Gone),
+                Event::Report(age, _) => Input::Started(Epoch(lifecycle.epoch().0.saturating_sub(age))),
                 Event::Restart => Input::Restart,
             };
-            slot.apply(input, now);
+            lifecycle.apply(input, now);
         }
-        settle(&mut slot, &mut now);
+        settle(&mut lifecycle, &mut now);
         // Failed after its driver reported too often that it is gone: only the user can end that.
-        if slot.state() == Failed {
-            slot.apply(Input::Restart, now);
-            settle(&mut slot, &mut now);
+        if lifecycle.state() == Failed {
+            lifecycle.apply(Input::Restart, now);
+            settle(&mut lifecycle, &mut now);
         }
-        prop_assert_eq!(slot.attached().copied(), attached);
-        prop_assert_eq!(slot.state(), if attached.is_some() { Streaming } else { Absent });
+        prop_assert_eq!(lifecycle.attached().copied(), attached);
+        prop_assert_eq!(lifecycle.state(), if attached.is_some() { Streaming } else { Absent });
     }
 }

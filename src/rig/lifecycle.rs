@@ -1,4 +1,4 @@
-//! A slot: the life of one modality's device, as a pure state machine.
+//! The lifecycle of one modality's device, as a pure state machine.
 //!
 //! | state     | attached | running | bit | waits for                            |
 //! |-----------|----------|---------|-----|--------------------------------------|
@@ -9,7 +9,7 @@
 //! | Backoff   | yes      | no      | 0   | the end of the cooldown or back-off  |
 //! | Failed    | yes      | no      | 0   | a replug, or a restart by hand       |
 //!
-//! (*) When the stream notices an unplug first, the slot becomes Absent at once, before hot-plug confirms it. If no
+//! (*) When the stream notices an unplug first, the device becomes Absent at once, before hot-plug confirms it. If no
 //! removal comes within the cooldown, the device never left and is started again, which counts as a restart: a driver
 //! that keeps reporting this reaches the limit.
 //!
@@ -21,16 +21,16 @@ use std::time::Duration;
 
 use rapid_core::sample::Epoch;
 use rapid_core::time::Stamp;
-use rapid_status::SlotState;
+use rapid_status::DeviceState;
 
 /// A stream that ends while its device is attached is restarted this many times...
 const MAX_RESTARTS: usize = 5;
-/// ...within this time; then the slot is Failed.
+/// ...within this time; then the device is Failed.
 const RESTART_WINDOW: Duration = Duration::from_mins(1);
 /// Delay before the first restart; each further restart in the window waits twice as long.
 const FIRST_BACKOFF: Duration = Duration::from_millis(500);
 
-/// An input to a slot. `A` is an attachment.
+/// An input to a lifecycle. `A` is an attachment.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Input<A> {
     /// A device of this modality was plugged in.
@@ -47,7 +47,7 @@ pub enum Input<A> {
     Ended(Epoch, End),
     /// A user requests a restart of the device.
     Restart,
-    /// Time passed; see [`Slot::deadline`].
+    /// Time passed; see [`Lifecycle::deadline`].
     Timer,
 }
 
@@ -79,8 +79,8 @@ impl<A> Effects<A> {
 
 /// See the module's comment.
 #[derive(Debug, Clone)]
-pub struct Slot<A> {
-    state: SlotState,
+pub struct Lifecycle<A> {
+    state: DeviceState,
     epoch: Epoch,
     attached: Option<A>,
     /// When the last removal was first noticed.
@@ -92,11 +92,11 @@ pub struct Slot<A> {
     cooldown: Duration,
 }
 
-impl<A: Clone> Slot<A> {
-    /// An empty slot.
+impl<A: Clone> Lifecycle<A> {
+    /// Before a device is attached.
     pub fn new(cooldown: Duration) -> Self {
         Self {
-            state: SlotState::Absent,
+            state: DeviceState::Absent,
             epoch: Epoch(0),
             attached: None,
             removed: None,
@@ -107,7 +107,7 @@ impl<A: Clone> Slot<A> {
     }
 
     /// The state.
-    pub const fn state(&self) -> SlotState {
+    pub const fn state(&self) -> DeviceState {
         self.state
     }
 
@@ -136,9 +136,15 @@ impl<A: Clone> Slot<A> {
         match input {
             Input::Attached(attachment) => self.attach(attachment, now),
             Input::Detached => self.detach(now),
-            Input::Started(epoch) if self.is_current(epoch) => self.enter_if(SlotState::Opening, SlotState::Streaming),
-            Input::Stalled(epoch) if self.is_current(epoch) => self.enter_if(SlotState::Streaming, SlotState::Stalled),
-            Input::Resumed(epoch) if self.is_current(epoch) => self.enter_if(SlotState::Stalled, SlotState::Streaming),
+            Input::Started(epoch) if self.is_current(epoch) => {
+                self.enter_if(DeviceState::Opening, DeviceState::Streaming)
+            }
+            Input::Stalled(epoch) if self.is_current(epoch) => {
+                self.enter_if(DeviceState::Streaming, DeviceState::Stalled)
+            }
+            Input::Resumed(epoch) if self.is_current(epoch) => {
+                self.enter_if(DeviceState::Stalled, DeviceState::Streaming)
+            }
             Input::Ended(epoch, end) if self.is_current(epoch) => self.end(end, now),
             Input::Started(_) | Input::Stalled(_) | Input::Resumed(_) | Input::Ended(..) => Effects::NONE,
             Input::Restart => self.restart_by_hand(now),
@@ -152,7 +158,7 @@ impl<A: Clone> Slot<A> {
     }
 
     const fn is_running(&self) -> bool {
-        self.is_present() || matches!(self.state, SlotState::Opening)
+        self.is_present() || matches!(self.state, DeviceState::Opening)
     }
 
     fn attach(&mut self, attachment: A, now: Stamp) -> Effects<A> {
@@ -171,12 +177,12 @@ impl<A: Clone> Slot<A> {
     fn detach(&mut self, now: Stamp) -> Effects<A> {
         let stop = self.is_running().then_some(self.epoch);
         // The stream may have noticed first: the cooldown starts at the first report.
-        if self.attached.is_some() && self.state != SlotState::Absent {
+        if self.attached.is_some() && self.state != DeviceState::Absent {
             self.removed = Some(now);
         }
         self.attached = None;
         self.restarts.clear();
-        self.enter(SlotState::Absent);
+        self.enter(DeviceState::Absent);
         Effects { stop, start: None }
     }
 
@@ -184,11 +190,11 @@ impl<A: Clone> Slot<A> {
         match end {
             End::Gone => {
                 self.removed = Some(now);
-                self.enter(SlotState::Absent);
+                self.enter(DeviceState::Absent);
                 let wait = self.backoff(now).map_or(self.cooldown, |backoff| backoff.max(self.cooldown));
                 self.deadline = Some(now.after(wait));
             }
-            End::Fatal => self.enter(SlotState::Failed),
+            End::Fatal => self.enter(DeviceState::Failed),
             // No restart limit: a cable may be pulled any number of times.
             End::LinkDown => {
                 self.restarts.clear();
@@ -199,7 +205,7 @@ impl<A: Clone> Slot<A> {
                     self.restarts.push(now);
                     self.wait_until(now.after(backoff));
                 }
-                None => self.enter(SlotState::Failed),
+                None => self.enter(DeviceState::Failed),
             },
         }
         Effects::NONE
@@ -212,7 +218,7 @@ impl<A: Clone> Slot<A> {
     }
 
     fn restart_by_hand(&mut self, now: Stamp) -> Effects<A> {
-        if !matches!(self.state, SlotState::Failed | SlotState::Backoff) {
+        if !matches!(self.state, DeviceState::Failed | DeviceState::Backoff) {
             return Effects::NONE;
         }
         self.restarts.clear();
@@ -231,9 +237,9 @@ impl<A: Clone> Slot<A> {
         }
         self.deadline = None;
         // Its driver reported it gone, yet it is attached.
-        if self.state == SlotState::Absent && self.attached.is_some() {
+        if self.state == DeviceState::Absent && self.attached.is_some() {
             if self.backoff(now).is_none() {
-                self.enter(SlotState::Failed);
+                self.enter(DeviceState::Failed);
                 return Effects::NONE;
             }
             self.restarts.push(now);
@@ -245,23 +251,23 @@ impl<A: Clone> Slot<A> {
     fn start(&mut self) -> Effects<A> {
         let Some(attachment) = self.attached.clone() else { return Effects::NONE };
         self.epoch = self.epoch.next();
-        self.enter(SlotState::Opening);
+        self.enter(DeviceState::Opening);
         Effects { stop: None, start: Some((self.epoch, attachment)) }
     }
 
     fn wait_until(&mut self, deadline: Stamp) {
-        self.enter(SlotState::Backoff);
+        self.enter(DeviceState::Backoff);
         self.deadline = Some(deadline);
     }
 
-    fn enter_if(&mut self, from: SlotState, to: SlotState) -> Effects<A> {
+    fn enter_if(&mut self, from: DeviceState, to: DeviceState) -> Effects<A> {
         if self.state == from {
             self.enter(to);
         }
         Effects::NONE
     }
 
-    const fn enter(&mut self, state: SlotState) {
+    const fn enter(&mut self, state: DeviceState) {
         self.state = state;
         self.deadline = None;
     }
