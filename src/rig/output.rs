@@ -94,7 +94,6 @@ impl Output {
         self.notify();
     }
 
-    /// Reads once.
     fn read_once(&mut self, index: usize, read: impl FnOnce(&mut [u8]) -> io::Result<usize>) {
         let mut chunk = [0; CHUNK];
         let read = match read(&mut chunk) {

@@ -135,7 +135,7 @@ impl Space {
         }
     }
 
-    /// Looks, at most every [`LOOK_EVERY`].
+    /// Checks the room, at most every [`LOOK_EVERY`].
     pub(super) fn check(&mut self, now: Stamp, ask: &mut Asker) -> Option<Finding> {
         if now.since(self.looked) < LOOK_EVERY {
             return None;
