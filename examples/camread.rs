@@ -90,7 +90,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         form: None,
         action: None,
         hooks: rapid_registry::Hooks::default(),
-        verdict: rapid_registry::VerdictSpec::of(
+        verdict: rapid_registry::VerdictSpec::defaults(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             None,

@@ -80,7 +80,7 @@ fn registry(count: u8) -> Registry {
             max_bytes: 1 << 20,
             depth: 8,
             when_stale: WhenStale::Hold,
-            verdict: rapid_registry::VerdictSpec::of(
+            verdict: rapid_registry::VerdictSpec::defaults(
                 rapid_core::modality::ModalityKind::Image,
                 std::time::Duration::from_millis(500),
                 None,

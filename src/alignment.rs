@@ -91,7 +91,7 @@ impl Alignment {
     fn publish(&mut self, number: u64, tick: Stamp, now: Stamp) -> Result<(), BusError> {
         let Self { aligner, queues, writer, board, .. } = self;
         queues.drain(&mut |topic, header, payload| {
-            aligner.take(topic, header, payload);
+            aligner.receive(topic, header, payload);
             if let TopicId::Modality(id) = topic {
                 board.preview(id, header, payload);
             }
@@ -137,7 +137,7 @@ impl Aligner {
         self.sync.add(&modality(device));
     }
 
-    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+    fn receive(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         match topic {
             TopicId::Modality(id) => self.sample(id, header),
             TopicId::Mask => {
@@ -218,16 +218,16 @@ mod tests {
         let crashed = Bits { mask: PhysicalMask(0b1000), plugged: PhysicalMask(0b1001) };
         assert_eq!(read(aligner.observe(Stamp(50 * MS))), (0, vec![(0, 0, 0, 0), (3, 0, 0, 0)]), "before any mask");
 
-        aligner.take(TopicId::Mask, &mask(60), &Bits::from(PhysicalMask(0b1001)).payload(1));
-        aligner.take(TopicId::Mask, &mask(62), &Bits::from(PhysicalMask(0b1001)).payload(2));
-        aligner.take(TopicId::Mask, &mask(110), &crashed.payload(3));
-        aligner.take(TopicId::Mask, &mask(115), &Bits::from(PhysicalMask(0b1000)).payload(4));
-        aligner.take(TopicId::Mask, &mask(112), b"short");
-        aligner.take(TopicId::Modality(cam), &sample(7, 90, 95, 0), b"");
+        aligner.receive(TopicId::Mask, &mask(60), &Bits::from(PhysicalMask(0b1001)).payload(1));
+        aligner.receive(TopicId::Mask, &mask(62), &Bits::from(PhysicalMask(0b1001)).payload(2));
+        aligner.receive(TopicId::Mask, &mask(110), &crashed.payload(3));
+        aligner.receive(TopicId::Mask, &mask(115), &Bits::from(PhysicalMask(0b1000)).payload(4));
+        aligner.receive(TopicId::Mask, &mask(112), b"short");
+        aligner.receive(TopicId::Modality(cam), &sample(7, 90, 95, 0), b"");
         // In transit at the tick; damaged.
-        aligner.take(TopicId::Modality(cam), &sample(8, 99, 101, 0), b"");
-        aligner.take(TopicId::Modality(cam), &sample(9, 100, 100, FLAG_ERROR), b"");
-        aligner.take(TopicId::Modality(tof), &sample(1, 40, 41, 0), b"");
+        aligner.receive(TopicId::Modality(cam), &sample(8, 99, 101, 0), b"");
+        aligner.receive(TopicId::Modality(cam), &sample(9, 100, 100, FLAG_ERROR), b"");
+        aligner.receive(TopicId::Modality(tof), &sample(1, 40, 41, 0), b"");
         let (chosen, stale) = (1 | 2 | 8 | 16, 1 | 4 | 8 | 16);
         assert_eq!(read(aligner.observe(Stamp(100 * MS))), (0b1001, vec![(0, chosen, 7, 10), (3, stale, 1, 60)]));
         // Its driver failed, and it is unplugged: nothing of it, however fresh.
@@ -239,14 +239,14 @@ mod tests {
     fn an_added_modality_is_in_the_next_observation() {
         let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
         let mut aligner = Aligner::new(&registry);
-        aligner.take(TopicId::Mask, &SampleHeader::default(), &Bits::from(PhysicalMask(0b110)).payload(1));
+        aligner.receive(TopicId::Mask, &SampleHeader::default(), &Bits::from(PhysicalMask(0b110)).payload(1));
         assert_eq!(read(aligner.observe(Stamp(50 * MS))).1.len(), 2);
         let text = REGISTRY.replace("tof", "new").replace("bit = 3", "bit = 2");
         let added = Registry::parse(&text, None).expect("a registry").registry;
         aligner.add(&added.devices[1]);
         let header =
             SampleHeader { seq: 4, capture_ns: 90 * MS, recv_ns: 90 * MS, epoch: 1, ..SampleHeader::default() };
-        aligner.take(TopicId::Modality(added.devices[1].id), &header, b"");
+        aligner.receive(TopicId::Modality(added.devices[1].id), &header, b"");
         let seen = read(aligner.observe(Stamp(100 * MS)));
         assert_eq!(seen, (0b110, vec![(0, 0, 0, 0), (2, 1 | 2 | 8 | 16, 4, 10), (3, 0, 0, 0)]));
     }

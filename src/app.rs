@@ -168,7 +168,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     }
     raise_open_files();
     // Before anything that can fail on a full or damaged machine.
-    let Received { permission, orders: _orders, arrivals } = receive_orders(&options, interlocks::of(&registry))?;
+    let Received { permission, orders: _orders, arrivals } =
+        receive_orders(&options, interlocks::from_registry(&registry))?;
     let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
 
     rapid_bus::check_memory()?;

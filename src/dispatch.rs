@@ -100,7 +100,7 @@ pub fn dispatch(cli: Cli) -> ExitCode {
             let message = with_cause(text);
             let lines: Vec<_> = message.lines().map(|line| text::plain(line).into_owned()).collect();
             if !message.is_empty() {
-                let message = format!("{} {}\n", Palette::of(&io::stderr()).bad("error:"), lines.join("\n"));
+                let message = format!("{} {}\n", Palette::for_output(&io::stderr()).bad("error:"), lines.join("\n"));
                 outlet::write_within(io::stderr(), message, STDERR_TIMEOUT);
                 if json {
                     print_ended(&command, &lines.join("\n"), code);
@@ -161,7 +161,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
                 LevelArg::Error => Level::Error,
             };
             let zone = if utc { Zone::UTC } else { Zone::local() };
-            let palette = Palette::of(&io::stdout());
+            let palette = Palette::for_output(&io::stdout());
             let options = LogsOptions { device, least, follow, zone, format, palette };
             Ok(commands::logs::logs(global.instance.as_deref(), &options, out)?)
         }
@@ -179,11 +179,11 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         }
         Command::Inspect { paths, plot: None } => {
             let columns = rapid_screens::tui::columns().unwrap_or(100);
-            let palette = Palette::of(&io::stdout());
+            let palette = Palette::for_output(&io::stdout());
             reported(commands::inspect::inspect(&paths, format, columns, palette, out)?)
         }
         Command::List(args) => {
-            let palette = Palette::of(&io::stdout());
+            let palette = Palette::for_output(&io::stdout());
             reported(commands::list::list(&args, format, palette, out, &|error| {
                 print_warning(&format_args!("labels and notes are missing: {error}"));
             })?)
@@ -284,7 +284,7 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let json = json_path(&path);
     let names = || commands::mask::layout(&rapid_system::folder::read_text(&json, LARGEST_JSON).ok()?);
     let read = || read_mask(&path).map_err(|error| no_mask(&error));
-    let options = MaskOptions { watch, json: global.json, palette: Palette::of(&io::stdout()) };
+    let options = MaskOptions { watch, json: global.json, palette: Palette::for_output(&io::stdout()) };
     let stop = CancellationToken::new();
     block_on(async {
         let interrupted = stop.clone();
@@ -488,7 +488,7 @@ struct Failure {
 
 impl Failure {
     /// A reader that has closed the output needs no message, and what the command did is done.
-    fn of(text: String, code: u8) -> Self {
+    fn new(text: String, code: u8) -> Self {
         // EPIPE, as worded by the standard library.
         if text.ends_with("(os error 32)") { Self::printed(0) } else { Self { text, code } }
     }
@@ -526,7 +526,7 @@ macro_rules! failures {
         impl From<$error> for Failure {
             fn from(error: $error) -> Self {
                 let code: fn(&$error) -> u8 = $code;
-                Self::of(error.to_string(), code(&error))
+                Self::new(error.to_string(), code(&error))
             }
         }
     )+};
@@ -623,7 +623,7 @@ failures! {
 
 impl From<io::Error> for Failure {
     fn from(error: io::Error) -> Self {
-        Self::of(format!("output: {error}"), 1)
+        Self::new(format!("output: {error}"), 1)
     }
 }
 

@@ -42,7 +42,7 @@ struct ScreenGuard(Arc<AtomicUsize>);
 
 impl ScreenGuard {
     /// `None` when [`SCREENS`] are attached.
-    fn take(count: &Arc<AtomicUsize>) -> Option<Self> {
+    fn acquire(count: &Arc<AtomicUsize>) -> Option<Self> {
         let place = Self(Arc::clone(count));
         (count.fetch_add(1, Ordering::Relaxed) < SCREENS).then_some(place)
     }
@@ -67,7 +67,7 @@ impl Attached {
     /// Attaches a screen until it or the run ends.
     pub(super) fn attach(&self, viewer: Viewer) {
         let Viewer { stream, read_only } = viewer;
-        let place = ScreenGuard::take(&self.count);
+        let place = ScreenGuard::acquire(&self.count);
         let (board, commands) = (Arc::clone(&self.board), self.commands.clone());
         tokio::spawn(async move {
             if let Ok(stream) = stream.set_nonblocking(true).and_then(|()| UnixStream::from_std(stream)) {

@@ -257,7 +257,7 @@ impl Collection {
             tokio::select! {
                 biased;
                 Some(end) = self.recorder.ended() => return end,
-                Some(outcome) = self.outcomes.recv() => self.take(outcome),
+                Some(outcome) = self.outcomes.recv() => self.apply_outcome(outcome),
                 // This holds a sender: it does not end.
                 Some(found) = self.found.recv() => self.examined(&found),
             }
@@ -306,7 +306,7 @@ impl Collection {
     }
 
     /// Takes an outcome of the keeper.
-    fn take(&mut self, outcome: Outcome) {
+    fn apply_outcome(&mut self, outcome: Outcome) {
         match outcome {
             Outcome::Discarded(file) => self.moved(EventKind::Discarded { file: self.episode.out.join(file) }),
             Outcome::Restored(file) => self.moved(EventKind::Restored { file: self.episode.out.join(file) }),
@@ -483,7 +483,7 @@ impl Collection {
             None => Ok(()),
         };
         while let Some(outcome) = self.outcomes.recv().await {
-            self.take(outcome);
+            self.apply_outcome(outcome);
         }
         outcome
     }

@@ -89,7 +89,7 @@ fn open(
     if !Path::new(UDEV).exists() {
         tracing::warn!("no udev runs here ({UDEV} is missing): USB devices are not detected; start systemd-udevd");
     }
-    let machine = UdevMonitor::open(Ask::of(registry, camera::formats))?;
+    let machine = UdevMonitor::open(Ask::from_registry(registry, camera::formats))?;
     Ok(with_lan(Box::pin(machine), &registry.devices, registry.rig.cooldown))
 }
 

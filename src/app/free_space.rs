@@ -25,5 +25,5 @@ pub(super) async fn watch(out: &Path, board: &Board) -> ! {
 fn free(folder: &Path) -> Option<u64> {
     let absolute: PathBuf = std::path::absolute(folder).ok()?;
     let open = absolute.ancestors().find_map(|folder| File::open(folder).ok())?;
-    Disk::of(&open).ok().map(|disk| disk.free)
+    Disk::of_file(&open).ok().map(|disk| disk.free)
 }

@@ -135,7 +135,7 @@ impl Flight {
 
     /// Whether the time of a chunk suits the rate of its actions.
     fn judge(&self, chunk: Duration) -> Result<(), AppError> {
-        let PaceReport { verdict, text } = PaceReport::of(&self.options.live.bundle, chunk);
+        let PaceReport { verdict, text } = PaceReport::new(&self.options.live.bundle, chunk);
         match verdict {
             PaceVerdict::Whole => tracing::debug!("{text}"),
             PaceVerdict::Pauses => self.board.announce(EventKind::Log { level: Level::Warn, text }),

@@ -72,7 +72,7 @@ fn monitor(
 
 fn lines(screen: Screen, board: Arc<Board>, events: broadcast::Receiver<Event>, duration: Option<Duration>) -> Stage {
     let (json, stdout) = (screen == Screen::Json, std::io::stdout());
-    let palette = if json { Palette::Plain } else { Palette::of(&stdout) };
+    let palette = if json { Palette::Plain } else { Palette::for_output(&stdout) };
     let options = HeadlessOptions { json, palette, in_place: !json && stdout.is_terminal(), duration };
     Stage::start("the screen", |stop| {
         let run = headless::run(board, events, stop, options, stdout);

@@ -90,7 +90,7 @@ impl Ingress {
     ///
     /// # Errors
     /// When the topic cannot be read.
-    pub fn take(&self) -> Result<Option<Given>, BusError> {
+    pub fn receive(&self) -> Result<Option<Given>, BusError> {
         match self.subscriber.receive() {
             Ok(sample) => Ok(sample.map(|sample| Given { header: sample.user_header().0, sample })),
             Err(error) => Err(BusError::Transfer { topic: self.topic.clone(), reason: format!("{error:?}") }),
@@ -101,7 +101,7 @@ impl Ingress {
     pub fn clear(&self) {
         // Bounded: a program that publishes meanwhile must not hold up the caller.
         for _ in 0..2 * self.depth {
-            if !matches!(self.take(), Ok(Some(_))) {
+            if !matches!(self.receive(), Ok(Some(_))) {
                 return;
             }
         }

@@ -47,7 +47,7 @@ impl<T> Shared<T> {
     const LAYOUT: Layout = Layout::new::<Inner<T>>();
 
     fn with(value: T) -> Self {
-        let memory = spare::take(Self::LAYOUT).cast::<Inner<T>>();
+        let memory = spare::allocate(Self::LAYOUT).cast::<Inner<T>>();
         // SAFETY: the memory has the layout of `Inner<T>` and no other owner.
         unsafe { memory.write(Inner { handles: AtomicUsize::new(1), value: ReentrantMutex::new(value) }) };
         Self(memory, PhantomData)
@@ -152,7 +152,7 @@ mod spare {
     }
 
     /// Uninitialised memory of `layout`, whose size is not 0.
-    pub(super) fn take(layout: Layout) -> NonNull<u8> {
+    pub(super) fn allocate(layout: Layout) -> NonNull<u8> {
         let fitting = |piece: &&mut Option<Piece>| piece.is_some_and(|(_, kept)| kept == layout);
         // At the end of a thread the kept blocks may be gone already.
         let kept = PIECES.try_with(|pieces| Some(pieces.borrow_mut().0.iter_mut().find(fitting)?.take()?.0));

@@ -122,7 +122,7 @@ fn recorded(folder: &Path) -> Result<(Vec<Recorded>, usize), ReadError> {
     let mut found = Vec::new();
     progress::each(&files, inspect::inspect, |_, inspected| {
         match inspected {
-            Ok(episode) => found.push(of(episode)),
+            Ok(episode) => found.push(recorded_from(episode)),
             Err(_) => unreadable += 1,
         }
         Ok::<_, ReadError>(())
@@ -130,7 +130,7 @@ fn recorded(folder: &Path) -> Result<(Vec<Recorded>, usize), ReadError> {
     Ok((found, unreadable))
 }
 
-fn of(episode: Inspection) -> Recorded {
+fn recorded_from(episode: Inspection) -> Recorded {
     let Inspection { task, tags, present_at_begin, verdict, .. } = episode;
     Recorded { task, tags, present: present_at_begin, grade: verdict.grade() }
 }

@@ -119,7 +119,7 @@ pub async fn latency(
     out: &mut dyn Write,
 ) -> Result<(), CalibrateError> {
     let (spec, node) = choose(registry, attached, args.device.as_deref())?;
-    let light = Chosen::of(args.led.as_deref())?;
+    let light = Chosen::from_option(args.led.as_deref())?;
     if let (Chosen::Led(led), Format::Text) = (&light, format) {
         let length = show_duration(args.duration);
         writeln!(out, "Flashing {} for {length}; ctrl-C ends.", text::plain(&led.to_string_lossy()))?;
@@ -359,7 +359,7 @@ enum Chosen {
 
 impl Chosen {
     /// The terminal, or the LED of this name or folder.
-    fn of(led: Option<&Path>) -> Result<Self, LightError> {
+    fn from_option(led: Option<&Path>) -> Result<Self, LightError> {
         match led {
             // A single name is an LED of the kernel's list, anything else a path.
             Some(led) if led.components().count() == 1 => Ok(Self::Led(Path::new(LEDS).join(led))),

@@ -83,7 +83,7 @@ fn lines(loaded: &Loaded) -> Vec<Line<'_>> {
     let mut lines: Vec<_> = registry.devices.iter().map(|device| Line::Device(row(device))).collect();
     lines.extend(registry.modules.iter().map(Line::Module));
     lines.extend(motors(registry).map(Line::Motor));
-    lines.extend(registry.stops.iter().map(|stop| Line::Stop(StopRow::of(stop))));
+    lines.extend(registry.stops.iter().map(|stop| Line::Stop(StopRow::new(stop))));
     lines.extend(registry.buttons.iter().map(Line::Button));
     lines.extend(warnings.iter().map(Line::Warning));
     lines
@@ -138,11 +138,11 @@ fn motors(registry: &Registry) -> impl Iterator<Item = MotorRow<'_>> {
         NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) => Some((device, motors)),
         _ => None,
     });
-    buses.flat_map(|(device, bus)| bus.motors.iter().map(|motor| MotorRow::of(device, motor)))
+    buses.flat_map(|(device, bus)| bus.motors.iter().map(|motor| MotorRow::new(device, motor)))
 }
 
 impl<'a> MotorRow<'a> {
-    fn of(device: &'a DeviceSpec, motor: &'a MotorSpec) -> Self {
+    fn new(device: &'a DeviceSpec, motor: &'a MotorSpec) -> Self {
         let StopSpec { own_fault, other_fault, emergency, .. } = motor.stop;
         Self {
             name: &motor.name,
@@ -186,7 +186,7 @@ struct StopRow<'a> {
 }
 
 impl<'a> StopRow<'a> {
-    fn of(stop: &'a InterlockSpec) -> Self {
+    fn new(stop: &'a InterlockSpec) -> Self {
         Self { name: &stop.name, stops_as: stop.kind, actuators: &stop.actuators, input: &stop.input }
     }
 }

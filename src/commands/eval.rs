@@ -121,7 +121,7 @@ fn warn_of_training_seeds(bundle: &Bundle, args: &EvalArgs) {
              --seed {}",
             last.saturating_add(1)
         );
-        let _ = writeln!(io::stderr(), "{} {text}", Palette::of(&io::stderr()).warn("warning:"));
+        let _ = writeln!(io::stderr(), "{} {text}", Palette::for_output(&io::stderr()).warn("warning:"));
     }
 }
 

@@ -101,7 +101,7 @@ struct Summary<'a> {
 }
 
 impl<'a> Summary<'a> {
-    const fn of(out: &'a Path) -> Self {
+    const fn new(out: &'a Path) -> Self {
         Self {
             out,
             exported: 0,
@@ -154,7 +154,7 @@ pub fn export(
             Some(found.map_err(SetError::from)?)
         }
     };
-    let mut report = Report { format, out, err, summary: Summary::of(&args.out) };
+    let mut report = Report { format, out, err, summary: Summary::new(&args.out) };
     let found = found(&files, args, &set, stop, &mut report)?;
     let mut sources = found.already;
     let fitting = fitting(found.new, args, pictures, &set, &mut report)?;
@@ -314,7 +314,7 @@ fn fitting(
     set: &DataSet,
     report: &mut Report<'_>,
 ) -> Result<Vec<(Survey, Features)>, ExportError> {
-    let mut known = set.features().map(Known::of).unwrap_or_default();
+    let mut known = set.features().map(Known::from_features).unwrap_or_default();
     for episode in &episodes {
         known.learn(episode);
     }
@@ -326,7 +326,7 @@ fn fitting(
             Some(common) => of_user.or(common.choice()),
             None => of_user.or(&episode.export),
         };
-        let features = Features::of(&episode, &choice, pictures, &known)
+        let features = Features::from_survey(&episode, &choice, pictures, &known)
             .and_then(|features| common.get_or_insert_with(|| features.clone()).check(&features).map(|()| features));
         match features {
             Ok(features) => fitting.push((episode, features)),

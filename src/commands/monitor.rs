@@ -120,7 +120,7 @@ impl Connection {
         let limits = stream.set_read_timeout(Some(SILENT)).and_then(|()| stream.set_write_timeout(Some(WRITE_LIMIT)));
         let reader = limits.and_then(|()| stream.try_clone()).map_err(|error| of(error.into()))?;
         let mut connection = Self { process, stream, decoder: Decoder::default(), reader: BufReader::new(reader) };
-        let first = connection.read().map_err(|error| match ProcessState::of(process) {
+        let first = connection.read().map_err(|error| match ProcessState::read(process) {
             ProcessState::Stopped => MonitorError::Stopped(process),
             ProcessState::Alive | ProcessState::Ended => of(error),
         })?;
@@ -186,7 +186,7 @@ fn follow(
         let since = Stamp::now();
         let mut failed = String::new();
         let (next, snapshot) = loop {
-            let runs = ProcessState::of(connection.process) != ProcessState::Ended;
+            let runs = ProcessState::read(connection.process) != ProcessState::Ended;
             shown.send_modify(|view| {
                 view.state = LinkState::Lost { since, read_only, runs };
                 if !runs {

@@ -243,7 +243,7 @@ impl Shown {
             }
             shown
         });
-        let pace = match PaceReport::of(bundle, *chunk).verdict {
+        let pace = match PaceReport::new(bundle, *chunk).verdict {
             PaceVerdict::Whole => "whole",
             PaceVerdict::Pauses => "pauses",
             PaceVerdict::TooSlow => "too_slow",
@@ -280,7 +280,7 @@ impl Shown {
         )?;
         let (provider, threads) = (computing.on.provider.word(), computing.on.threads);
         let threads = text::counted(threads as u64, "thread");
-        line("speed", &format!("{}; on {threads} of {provider}, {library}", PaceReport::of(bundle, *chunk).text))?;
+        line("speed", &format!("{}; on {threads} of {provider}, {library}", PaceReport::new(bundle, *chunk).text))?;
         match rig {
             None => line("rig", "no registry here: --config FILE or --sim task compares it with one"),
             Some(rig) if unfit.is_empty() => line("rig", &format!("{rig}: it has all that the policy wants")),

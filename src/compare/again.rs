@@ -388,7 +388,7 @@ impl Work<'_> {
         for (index, (recorded, computed)) in rows.enumerate() {
             let tick = chunk.tick.saturating_add(index as u64).saturating_sub(self.bundle.action_start as u64);
             let recorded = recorded.iter().map(|value| value.map_or(f64::NAN, f64::from));
-            self.again.difference.take(tick, recorded, computed.iter().copied().map(f64::from));
+            self.again.difference.add(tick, recorded, computed.iter().copied().map(f64::from));
         }
     }
 }
@@ -424,7 +424,7 @@ fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
         match planned.min_by(|one, other| apart(one).total_cmp(&apart(other))) {
             Some(planned) => {
                 actions.compared += 1;
-                actions.difference.take(action.sequence.into(), planned.into_iter(), action.values.iter().copied());
+                actions.difference.add(action.sequence.into(), planned.into_iter(), action.values.iter().copied());
             }
             None => actions.without_chunk += 1,
         }

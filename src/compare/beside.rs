@@ -127,7 +127,7 @@ impl Follower<'_> {
         let (number, stamp) = (self.tick, self.grid.tick(self.tick));
         self.tick += 1;
         self.beside.ticks += 1;
-        if self.pilot.look(number, stamp, stamp) {
+        if self.pilot.observe(number, stamp, stamp) {
             self.pilot.fill(number, stamp, &mut self.request);
             let refused = match self.model.answer(&self.request, &mut self.chunk) {
                 Ok(()) => self.pilot.answer(&self.request, &self.chunk).err().map(|refused| refused.to_string()),
@@ -145,7 +145,7 @@ impl Follower<'_> {
             (Some(action), Some(recorded)) => {
                 self.beside.compared += 1;
                 let action = action.iter().copied().map(f64::from);
-                self.beside.difference.take(number, action, recorded.iter().copied());
+                self.beside.difference.add(number, action, recorded.iter().copied());
             }
             (Some(_), None) => self.beside.without_recorded += 1,
             (None, _) => {

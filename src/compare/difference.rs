@@ -19,7 +19,7 @@ pub struct Spread {
 }
 
 impl Spread {
-    fn take(&mut self, tick: u64, distance: f64) {
+    fn add(&mut self, tick: u64, distance: f64) {
         self.values += 1;
         if distance > self.largest {
             (self.largest, self.at_tick) = (distance, tick);
@@ -64,11 +64,11 @@ impl Difference {
     }
 
     /// Takes the two versions of the action of `tick`.
-    pub(super) fn take(&mut self, tick: u64, one: impl Iterator<Item = f64>, other: impl Iterator<Item = f64>) {
+    pub(super) fn add(&mut self, tick: u64, one: impl Iterator<Item = f64>, other: impl Iterator<Item = f64>) {
         for (axis, (one, other)) in self.axes.iter_mut().zip(one.zip(other)) {
             let distance = distance(one, other);
-            self.all.take(tick, distance);
-            axis.spread.take(tick, distance);
+            self.all.add(tick, distance);
+            axis.spread.add(tick, distance);
         }
     }
 }
@@ -91,11 +91,11 @@ mod tests {
     fn the_mean_and_the_largest_are_reported_with_its_tick() {
         let mut spread = Spread::default();
         for (tick, distance) in [(3, 1.0), (4, 4.0), (5, 1.0)] {
-            spread.take(tick, distance);
+            spread.add(tick, distance);
         }
         assert_eq!(spread, Spread { mean: 2.0, largest: 4.0, at_tick: 4, values: 3 });
-        spread.take(6, f64::INFINITY);
-        spread.take(7, 0.0);
+        spread.add(6, f64::INFINITY);
+        spread.add(7, 0.0);
         assert!(spread.mean.is_infinite() && spread.at_tick == 6);
     }
 

@@ -73,11 +73,11 @@ impl Message {
 
 impl Recorded {
     fn new() -> Self {
-        Self::of(&[])
+        Self::with_changes(&[])
     }
 
     /// Of a policy with these changes.
-    fn of(changes: &[onnx::Change<'_>]) -> Self {
+    fn with_changes(changes: &[onnx::Change<'_>]) -> Self {
         Self::with(&onnx::encoder(), changes)
     }
 
@@ -316,7 +316,7 @@ fn a_reference_from_before_the_episode_is_attached_to_it() {
     for (recorded, at, key, topic) in [
         (Recorded::new(), 1, "tactile", TACTILE),
         (history(), 1, "tactile", TACTILE),
-        (Recorded::of(&[first]), 2, "state", ARM),
+        (Recorded::with_changes(&[first]), 2, "state", ARM),
     ] {
         let chunks = recorded.chunks();
         let of_chunk = |chunk: &Value, at: usize| {
@@ -428,7 +428,7 @@ fn chunks_of_a_history_are_recomputed_with_its_gaps() {
 #[test]
 fn the_first_numbers_of_a_run_stand_for_all_later_ones() {
     let first = onnx::Change { what: r#""slice": [0, 4],"#, with: r#""slice": [0, 4], "operation": "first_of_run","# };
-    let recorded = Recorded::of(&[first]);
+    let recorded = Recorded::with_changes(&[first]);
     let chunks = recorded.chunks();
     let whole = recorded.again(&recorded.bytes);
     assert_eq!((whole.chunks, whole.compared), (chunks.len() as u64, chunks.len() as u64), "{whole:?}");

@@ -147,14 +147,14 @@ impl OrderSlot {
         self.bell.ring();
     }
 
-    /// Rings with every order, until the next [`Self::take`].
+    /// Rings with every order, until the next [`Self::take_pending`].
     pub const fn bell(&self) -> &Bell {
         &self.bell
     }
 
     /// Takes the pending orders in their order of execution. An emergency stop comes before a disarm, which also turns
     /// off what an emergency stop would hold.
-    pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
+    pub fn take_pending(&self) -> impl Iterator<Item = Order> + use<> {
         // First: an order that arrives in between rings again, which is harmless.
         self.bell.silence();
         let given = self.given.swap(0, Ordering::SeqCst);
@@ -213,8 +213,8 @@ mod tests {
             for order in given {
                 slot.give(*order);
             }
-            assert_eq!(slot.take().collect::<Vec<_>>(), taken, "{given:?}");
-            assert_eq!(slot.take().count(), 0);
+            assert_eq!(slot.take_pending().collect::<Vec<_>>(), taken, "{given:?}");
+            assert_eq!(slot.take_pending().count(), 0);
         }
     }
 }

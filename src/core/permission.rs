@@ -159,7 +159,7 @@ impl Permission {
     /// An actuator was plugged in: it receives orders until the returned value is dropped, but none that were given
     /// before.
     pub fn attend(self: &Arc<Self>) -> Attended {
-        self.slot.take().for_each(drop);
+        self.slot.take_pending().for_each(drop);
         self.actuators.fetch_add(1, Ordering::SeqCst);
         Attended(Arc::clone(self))
     }
@@ -212,14 +212,14 @@ impl Attended {
         }
     }
 
-    /// Rings with every order, until the next [`Self::take`].
+    /// Rings with every order, until the next [`Self::take_pending`].
     pub fn bell(&self) -> &Bell {
         self.0.slot.bell()
     }
 
     /// Takes its orders since the last call, in their order of execution.
-    pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
-        self.0.slot.take()
+    pub fn take_pending(&self) -> impl Iterator<Item = Order> + use<> {
+        self.0.slot.take_pending()
     }
 }
 

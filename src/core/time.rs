@@ -116,7 +116,7 @@ impl ClockWatch {
 
     /// By how many ns the wall clock was set since the last step, forward or backward; `None` if by less
     /// than [`STEP`].
-    pub fn look(&mut self, now: WallClock) -> Option<i64> {
+    pub fn detect_step(&mut self, now: WallClock) -> Option<i64> {
         let step = now.offset_ns - self.0.offset_ns;
         if step.unsigned_abs() < STEP.as_nanos() {
             return None;
@@ -215,7 +215,7 @@ mod tests {
     fn a_clock_step_is_reported_once_and_a_slew_never() {
         const SECOND: i128 = 1_000_000_000;
         let mut watch = ClockWatch::new(WallClock::with_offset(1_700 * SECOND));
-        let mut look = |offset| watch.look(WallClock::with_offset(offset));
+        let mut look = |offset| watch.detect_step(WallClock::with_offset(offset));
         assert_eq!(look(1_700 * SECOND + 9_999_999), None);
         assert_eq!(look(1_700 * SECOND - 9_999_999), None);
         assert_eq!(look(5_300 * SECOND), Some(3_600_000_000_000));
@@ -232,7 +232,7 @@ mod tests {
     #[test]
     fn the_clocks_of_this_machine_keep_their_relation() {
         let mut watch = ClockWatch::new(WallClock::now());
-        assert_eq!((0..1000).find_map(|_| watch.look(WallClock::now())), None);
+        assert_eq!((0..1000).find_map(|_| watch.detect_step(WallClock::now())), None);
     }
 
     #[test]

@@ -44,7 +44,7 @@ pub enum LinkState {
 
 impl NetworkLink {
     /// The link of the interface of this name.
-    pub fn of(interface: &str) -> Self {
+    pub fn of_interface(interface: &str) -> Self {
         Self { carrier: Some(Path::new(INTERFACES).join(interface).join("carrier")) }
     }
 
@@ -60,7 +60,7 @@ impl NetworkLink {
                 IpAddr::V6(address) => route_v6(&table("/proc/net/ipv6_route"), address),
             },
         };
-        interface.filter(|name| name != "lo").map_or_else(Self::default, |name| Self::of(&name))
+        interface.filter(|name| name != "lo").map_or_else(Self::default, |name| Self::of_interface(&name))
     }
 
     /// Its present state.
@@ -94,7 +94,7 @@ pub struct LinkWatch {
 
 impl LinkWatch {
     /// Watches this link.
-    pub fn of(link: NetworkLink) -> Self {
+    pub fn new(link: NetworkLink) -> Self {
         Self { link, look: looks() }
     }
 
@@ -227,8 +227,8 @@ mod tests {
     fn a_loopback_address_has_no_link_that_goes_down() {
         assert_eq!(NetworkLink::to(([127, 0, 0, 1], 80).into()), NetworkLink::default());
         assert_eq!(NetworkLink::default().state(), LinkState::Up);
-        assert_eq!(NetworkLink::of("no-such-interface").state(), LinkState::Gone);
-        assert_eq!(NetworkLink::of("lo").state(), LinkState::Up);
+        assert_eq!(NetworkLink::of_interface("no-such-interface").state(), LinkState::Gone);
+        assert_eq!(NetworkLink::of_interface("lo").state(), LinkState::Up);
     }
 
     #[tokio::test]
@@ -236,7 +236,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let report = |carrier: &str| fs::write(folder.path().join("carrier"), carrier).expect("written");
         let link = NetworkLink { carrier: Some(folder.path().join("carrier")) };
-        let is_lost = async || timeout(3 * LOOK_EVERY, LinkWatch::of(link.clone()).lost()).await.is_ok();
+        let is_lost = async || timeout(3 * LOOK_EVERY, LinkWatch::new(link.clone()).lost()).await.is_ok();
         let is_restored = async || timeout(3 * LOOK_EVERY, link.restored()).await.is_ok();
 
         report("0\n");

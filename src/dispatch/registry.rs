@@ -31,7 +31,7 @@ pub(super) fn load(path: &Path) -> Result<Registry, Failure> {
 }
 
 pub(super) fn print_warning(warning: &dyn std::fmt::Display) {
-    let _ = writeln!(io::stderr(), "{} {warning}", Palette::of(&io::stderr()).warn("warning:"));
+    let _ = writeln!(io::stderr(), "{} {warning}", Palette::for_output(&io::stderr()).warn("warning:"));
 }
 
 pub(super) fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
@@ -101,7 +101,7 @@ pub(super) fn connected(global: &Global) -> Result<(Registry, Vec<Attachment>), 
 
 /// What capture nodes are asked in order to assign them.
 fn asked(registry: Option<&Registry>) -> Ask {
-    registry.map_or(Ask::NOTHING, |registry| Ask::of(registry, camera::formats))
+    registry.map_or(Ask::NOTHING, |registry| Ask::from_registry(registry, camera::formats))
 }
 
 /// Lists connected devices first, even if the registry is invalid.

@@ -112,7 +112,7 @@ pub(crate) fn is_sound(bytes: &[u8], crc: u32) -> bool {
 }
 
 /// Takes the first record off `records`: its opcode and content.
-pub(super) fn take<'a>(records: &mut Fields<'a>) -> Option<(u8, &'a [u8])> {
+pub(super) fn first_record<'a>(records: &mut Fields<'a>) -> Option<(u8, &'a [u8])> {
     let (opcode, length) = (records.u8()?, records.u64()?);
     Some((opcode, records.bytes(length)?))
 }
@@ -121,7 +121,7 @@ pub(super) fn take<'a>(records: &mut Fields<'a>) -> Option<(u8, &'a [u8])> {
 fn count(records: &[u8]) -> Option<u64> {
     let (mut fields, mut count) = (Fields(records), 0);
     while !fields.0.is_empty() {
-        take(&mut fields)?;
+        first_record(&mut fields)?;
         count += 1;
     }
     Some(count)

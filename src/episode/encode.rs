@@ -122,7 +122,7 @@ impl Announced {
     ///
     /// # Errors
     /// When it has no form as JSON.
-    pub fn of(event: &Event) -> Result<Self, serde_json::Error> {
+    pub fn new(event: &Event) -> Result<Self, serde_json::Error> {
         let json = serde_json::to_value(event)?;
         Ok(Self { text: event.what.describe().sentence, whole: json.to_string(), json })
     }
@@ -458,10 +458,10 @@ mod tests {
     #[test]
     fn a_payload_that_does_not_match_its_header_is_bytes() {
         let header = |encoding| SampleHeader { encoding, ..SampleHeader::default() };
-        assert_eq!(SampleSchema::of(&header(4), &[0; 16]), SampleSchema::Scalars);
-        assert_eq!(SampleSchema::of(&header(4), &[0; 15]), SampleSchema::Bytes);
-        assert_eq!(SampleSchema::of(&header(77), &[0; 16]), SampleSchema::Bytes);
-        assert_eq!(SampleSchema::of(&header(1), &[]), SampleSchema::CompressedImage);
+        assert_eq!(SampleSchema::for_sample(&header(4), &[0; 16]), SampleSchema::Scalars);
+        assert_eq!(SampleSchema::for_sample(&header(4), &[0; 15]), SampleSchema::Bytes);
+        assert_eq!(SampleSchema::for_sample(&header(77), &[0; 16]), SampleSchema::Bytes);
+        assert_eq!(SampleSchema::for_sample(&header(1), &[]), SampleSchema::CompressedImage);
     }
 
     #[test]

@@ -16,7 +16,7 @@ impl EpisodeId {
     }
 
     /// Of the episode whose metadata [`ABOUT`] are these.
-    pub(crate) fn of(about: &BTreeMap<String, String>) -> Option<Self> {
+    pub(crate) fn from_metadata(about: &BTreeMap<String, String>) -> Option<Self> {
         let number = |key: &str| about.get(key)?.parse().ok();
         Some(Self::new(number("begin_wall_ns")?, number("begin_monotonic_ns")?))
     }

@@ -40,7 +40,7 @@ impl Failed {
     }
 
     /// Reads the mark from the end of a file of `size` bytes, if present; the last of several.
-    pub(crate) fn of(file: &(impl ReadAt + ?Sized), size: u64) -> io::Result<Option<Self>> {
+    pub(crate) fn read(file: &(impl ReadAt + ?Sized), size: u64) -> io::Result<Option<Self>> {
         let mut end = Vec::new();
         let from = size.saturating_sub(SEARCHED);
         if !WindowedFile::new(file, size).read(from, size - from, &mut end)? || end.ends_with(&MAGIC) {
@@ -69,7 +69,7 @@ mod tests {
     #[test]
     fn trailing_bytes_hide_the_mark_only_if_they_end_an_mcap_file() {
         let bytes = |behind: &[u8]| [&b"content"[..], &Failed::mark("another program cut it"), behind].concat();
-        let found = |bytes: &[u8]| Failed::of(bytes, bytes.len() as u64).unwrap();
+        let found = |bytes: &[u8]| Failed::read(bytes, bytes.len() as u64).unwrap();
         for behind in [&b"\n"[..], b"a line\n", &[0; 300], &vec![7; 1 << 19]] {
             let found = found(&bytes(behind)).unwrap_or_else(|| panic!("{} bytes", behind.len()));
             assert_eq!((found.at, found.why.as_str()), (7, "another program cut it"), "{} bytes", behind.len());
@@ -87,15 +87,15 @@ mod tests {
         for before in [&b""[..], b"x", &[0; 9000]] {
             for why in ["", "another program cut it", &long] {
                 let bytes = [before, &Failed::mark(why)].concat();
-                let found = Failed::of(&bytes[..], bytes.len() as u64).unwrap().unwrap();
+                let found = Failed::read(&bytes[..], bytes.len() as u64).unwrap().unwrap();
                 assert_eq!((found.at, found.why.len()), (before.len() as u64, why.len().min(LONGEST)));
                 assert!(why.starts_with(&found.why));
                 for at in before.len()..bytes.len() {
                     let mut flipped = bytes.clone();
                     flipped[at] ^= 1;
-                    assert_eq!(Failed::of(&flipped[..], bytes.len() as u64).unwrap(), None, "byte {at}");
+                    assert_eq!(Failed::read(&flipped[..], bytes.len() as u64).unwrap(), None, "byte {at}");
                     if before.len() < 2 {
-                        assert_eq!(Failed::of(&bytes[..at], at as u64).unwrap(), None, "cut at {at}");
+                        assert_eq!(Failed::read(&bytes[..at], at as u64).unwrap(), None, "cut at {at}");
                     }
                 }
             }

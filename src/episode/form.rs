@@ -31,7 +31,7 @@ pub enum Derived {
 
 impl Derived {
     /// Those of a device.
-    pub const fn of(device: &DeviceSpec) -> &'static [Self] {
+    pub const fn for_device(device: &DeviceSpec) -> &'static [Self] {
         match device.form {
             Some(Form::Pose(_)) => &[Self::Pose, Self::Transform],
             Some(Form::Joints(JointsSpec { tip: Some(_), .. })) => &[Self::Joints, Self::Pose, Self::Transform],

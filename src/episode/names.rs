@@ -37,7 +37,7 @@ pub(super) struct Names {
 }
 
 impl Names {
-    pub(super) fn of(owner: Owner) -> Self {
+    pub(super) fn new(owner: Owner) -> Self {
         Self { owner, ..Self::default() }
     }
 

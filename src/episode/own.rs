@@ -13,7 +13,7 @@
 use std::collections::BTreeSet;
 use std::io;
 
-use super::chunk::take;
+use super::chunk::first_record;
 use super::episode_id::{EpisodeId, about};
 use super::framing::{HEAD, MAGIC};
 use super::integrity::{LARGEST_HEADER, Writer, writer};
@@ -39,8 +39,8 @@ pub(super) enum Owner {
     Episode(EpisodeId),
 }
 
-impl Owner {
-    pub(super) fn of(episode: Option<EpisodeId>) -> Self {
+impl From<Option<EpisodeId>> for Owner {
+    fn from(episode: Option<EpisodeId>) -> Self {
         episode.map_or(Self::Unnamed, Self::Episode)
     }
 }
@@ -86,7 +86,7 @@ pub(crate) fn is(content: &[u8]) -> bool {
 
 /// The record's episode and its definitions, if the first of these records is one.
 pub(super) fn first(records: &[u8]) -> Option<(EpisodeId, Fields<'_>)> {
-    let (opcode, content) = take(&mut Fields(records))?;
+    let (opcode, content) = first_record(&mut Fields(records))?;
     let rest = content.strip_prefix(&MARK).filter(|_| opcode == op::OWN)?;
     let (episode, definitions) = rest.split_first_chunk()?;
     Some((EpisodeId(*episode), Fields(definitions)))
@@ -142,7 +142,7 @@ struct Mention {
 
 impl Owners {
     /// Takes a valid chunk of an episode.
-    pub(super) fn take(&mut self, owner: Owner, records: &[u8]) {
+    pub(super) fn add_chunk(&mut self, owner: Owner, records: &[u8]) {
         self.chunks += 1;
         let itself = if let Owner::Episode(episode) = owner { Some(episode) } else { None };
         for inner in marks(records).filter(|inner| Some(*inner) != itself) {
@@ -184,7 +184,7 @@ impl Owners {
         let is_begun = |seen: &Mention| begun.iter().any(|(_, episode)| *episode == seen.episode);
         let lost = outer.iter().filter(|seen| !is_begun(seen)).max_by_key(|seen| seen.last);
         let owner = lost.or(outer.first()).copied().or(self.seen.first());
-        Ok(Owner::of(owner.map(|seen| seen.episode)))
+        Ok(Owner::from(owner.map(|seen| seen.episode)))
     }
 }
 
@@ -225,5 +225,5 @@ fn beginning<R: ReadAt>(source: &mut WindowedFile<R>, at: u64) -> io::Result<Opt
         }
         at += HEAD + length;
     }
-    Ok(about(&content).and_then(|about| EpisodeId::of(&about)))
+    Ok(about(&content).and_then(|about| EpisodeId::from_metadata(&about)))
 }

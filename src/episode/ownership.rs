@@ -3,7 +3,7 @@
 use std::io;
 
 use super::BOOT_ID;
-use super::chunk::{Records, take};
+use super::chunk::{Records, first_record};
 use super::episode_id::{EpisodeId, about};
 use super::integrity::Writer;
 use super::op;
@@ -39,7 +39,7 @@ impl<R: ReadAt> RecordIter<R> {
 
     /// Learns from a valid chunk; `false` if it does not belong to this file.
     pub(super) fn learn(&mut self, records: &Records) -> io::Result<bool> {
-        let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
+        let owner = Owner::from(first(self.bytes(records)).map(|(episode, _)| episode));
         if self.names.owner == Owner::Unknown {
             // The metadata at the beginning name the episode; without them its first chunk does.
             let is_named = self.names.named.is_none_or(|named| owner == Owner::Episode(named));
@@ -57,10 +57,10 @@ impl<R: ReadAt> RecordIter<R> {
         let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
         let bytes = bytes.get(records.range.clone()).unwrap_or_default();
         if self.names.owner == Owner::Any {
-            self.names.owners.take(owner, bytes);
+            self.names.owners.add_chunk(owner, bytes);
         }
         let mut definitions = first(bytes).map_or(Fields(&[]), |(_, definitions)| definitions);
-        while let Some((opcode, data)) = take(&mut definitions) {
+        while let Some((opcode, data)) = first_record(&mut definitions) {
             self.names.wait(opcode, data);
         }
         Ok(true)
@@ -75,13 +75,13 @@ impl<R: ReadAt> RecordIter<R> {
         self.begin_ns = about.get("begin_wall_ns").and_then(|ns| ns.parse().ok());
         self.same_boot = self.boot.is_some() && about.get(BOOT_ID) == self.boot.as_ref();
         // Records after damage may belong to another file.
-        self.names.named = if self.checked && !self.chunked { EpisodeId::of(&about) } else { None };
+        self.names.named = if self.checked && !self.chunked { EpisodeId::from_metadata(&about) } else { None };
     }
 
     /// Whether these records, found after damage, belong to this file. If no chunk names an episode, they do unless
     /// they contradict it.
     pub(super) fn is_own(&mut self, records: &Records) -> io::Result<bool> {
-        let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
+        let owner = Owner::from(first(self.bytes(records)).map(|(episode, _)| episode));
         self.look_for_owner()?;
         Ok(match self.names.owner {
             Owner::Any => true,

@@ -32,7 +32,7 @@ pub(crate) enum Lock {
 }
 
 /// Tries to take the lock of `file`, which was opened as `path`. Never waits.
-pub(crate) fn take(file: &File, path: &Path) -> io::Result<Lock> {
+pub(crate) fn lock(file: &File, path: &Path) -> io::Result<Lock> {
     match file.try_lock() {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => return Ok(Lock::Others),

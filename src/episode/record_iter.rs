@@ -16,7 +16,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 
-use super::chunk::{self, ChunkHead, Opened, Records, take};
+use super::chunk::{self, ChunkHead, Opened, Records, first_record};
 use super::framing::{HEAD, MAGIC, MAX_RECORD};
 use super::index::Index;
 use super::integrity::{LARGEST_HEADER, Writer, writer};
@@ -128,7 +128,7 @@ impl<R: ReadAt> RecordIter<R> {
 
     /// With an owner only the definitions of its chunks are used.
     pub(super) fn begin(source: WindowedFile<R>, owner: Option<Owner>) -> io::Result<Option<Self>> {
-        let mut records = Self::of(source, owner);
+        let mut records = Self::with_owner(source, owner);
         if records.source.peek(0, MAGIC.len())?.starts_with(&MAGIC) {
             records.begin_read();
             return Ok(Some(records));
@@ -138,7 +138,7 @@ impl<R: ReadAt> RecordIter<R> {
             return Ok(None);
         }
         let Some(base) = records.beginning()? else { return Ok(Some(records)) };
-        let mut records = Self::of(records.source.from(base), owner);
+        let mut records = Self::with_owner(records.source.from(base), owner);
         records.begin_read();
         records.integrity.left_out.bytes_before = base;
         Ok(Some(records))
@@ -151,7 +151,7 @@ impl<R: ReadAt> RecordIter<R> {
         (self.sure, self.integrity.bytes) = (self.at, self.at);
     }
 
-    fn of(source: WindowedFile<R>, owner: Option<Owner>) -> Self {
+    fn with_owner(source: WindowedFile<R>, owner: Option<Owner>) -> Self {
         let allowed = |(least, each): (u64, u64)| source.size.saturating_mul(each).saturating_add(least);
         let budget = (allowed(UNPACKED), allowed(TRIED));
         let early = EARLY.0 + source.size / EARLY.1;
@@ -175,7 +175,7 @@ impl<R: ReadAt> RecordIter<R> {
             with_checks: false,
             cut: false,
             seen: BTreeSet::new(),
-            names: Names::of(owner.unwrap_or_default()),
+            names: Names::new(owner.unwrap_or_default()),
             summarised: Vec::new(),
             defining: owner.is_some(),
             budget,
@@ -277,7 +277,7 @@ impl<R: ReadAt> RecordIter<R> {
             let bytes = if chunk.unpacked { &self.unpacked } else { &self.buffer };
             let mut fields = Fields(bytes.get(chunk.range.clone()).unwrap_or_default());
             // The end, or the first record that is not whole.
-            let Some((opcode, data)) = take(&mut fields) else {
+            let Some((opcode, data)) = first_record(&mut fields) else {
                 self.chunk = None;
                 return None;
             };
@@ -343,11 +343,11 @@ impl<R: ReadAt> RecordIter<R> {
             return Ok(Step::Again);
         }
         self.sure = at;
-        self.take(at, opcode, length)
+        self.take_record(at, opcode, length)
     }
 
     /// Takes the complete record at `at`.
-    fn take(&mut self, at: u64, opcode: u8, length: u64) -> io::Result<Step> {
+    fn take_record(&mut self, at: u64, opcode: u8, length: u64) -> io::Result<Step> {
         // The footer's check value covers the summary and the footer's own first bytes, that of the data ends before
         // the record that holds it.
         if opcode != op::DATA_END && self.counts() {

@@ -28,7 +28,7 @@ pub struct ReferenceSample {
 /// The attachment of a sample that was captured at `wall_ns`. `message` is memory for it.
 pub(crate) fn attachment<'a>(message: &'a mut Vec<u8>, wall_ns: u64, sample: &ReferenceSample) -> Attachment<'a> {
     let ReferenceSample { observation, modality, header, payload } = sample;
-    let schema = SampleSchema::of(header, payload);
+    let schema = SampleSchema::for_sample(header, payload);
     encode::sample(message, schema, wall_ns, modality, header, payload);
     Attachment {
         log_time: wall_ns,

@@ -15,7 +15,7 @@
 
 use std::io;
 
-use super::chunk::{self, ChunkHead, Opened, Packing, may_begin, take};
+use super::chunk::{self, ChunkHead, Opened, Packing, first_record, may_begin};
 use super::framing::{HEAD, MAGIC, MAX_RECORD};
 use super::index::{Index, IndexedRecord, TAIL, footer};
 use super::op;
@@ -299,7 +299,7 @@ impl<R: ReadAt> RecordIter<R> {
     pub(super) fn is_consistent(&self, records: &[u8]) -> bool {
         let mut fields = Fields(records);
         let earliest = self.begin_ns.unwrap_or(0).saturating_sub(BEFORE);
-        while let Some((opcode, data)) = take(&mut fields) {
+        while let Some((opcode, data)) = first_record(&mut fields) {
             let foreign = match opcode {
                 op::SCHEMA | op::CHANNEL => self.names.contradicts(opcode, data),
                 op::MESSAGE => {

@@ -110,7 +110,7 @@ impl SampleSchema {
 
     /// The schema that stores a sample without losing a byte: a payload that does not match its header is written as
     /// bytes.
-    pub fn of(header: &SampleHeader, payload: &[u8]) -> Self {
+    pub fn for_sample(header: &SampleHeader, payload: &[u8]) -> Self {
         match Encoding::from_raw(header.encoding) {
             Some(Encoding::Mjpeg) => Self::CompressedImage,
             Some(Encoding::Yuyv | Encoding::Grey | Encoding::Depth) => Self::RawImage,

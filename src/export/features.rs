@@ -95,7 +95,12 @@ impl Features {
     ///
     /// # Errors
     /// When a name chosen is not in the episode, or the shape of a sensor's samples is not known.
-    pub fn of(episode: &Survey, choice: &ExportSpec, pictures: Pictures, known: &Known) -> Result<Self, Refusal> {
+    pub fn from_survey(
+        episode: &Survey,
+        choice: &ExportSpec,
+        pictures: Pictures,
+        known: &Known,
+    ) -> Result<Self, Refusal> {
         let mut features = Self {
             fps: episode.fps,
             modalities: episode.streams.iter().map(|stream| stream.name.clone()).collect(),
@@ -404,7 +409,7 @@ impl Known {
     }
 
     /// What a dataset has. Of a vector the columns up to the last that it has.
-    pub fn of(features: &Features) -> Self {
+    pub fn from_features(features: &Features) -> Self {
         let name = |place: usize| features.modalities.get(place).cloned().unwrap_or_default();
         let camera =
             |(place, shape): &(usize, Shape)| (name(*place), Content::Camera { found: Some(*shape), declared: None });
@@ -525,7 +530,7 @@ mod tests {
         let camera = |found, declared| ("cam", Content::Camera { found, declared });
         let arm = ("arm", Content::Vector { found: Some(3), declared: None });
         let of = |content, known: &Known| {
-            Features::of(&episode(&[content, arm]), &ExportSpec::default(), Pictures::Files, known)
+            Features::from_survey(&episode(&[content, arm]), &ExportSpec::default(), Pictures::Files, known)
         };
         let height = |found: Result<Features, Refusal>| found.map(|features| features.cameras[0].1.height);
         let mut known = Known::default();
@@ -535,7 +540,7 @@ mod tests {
         assert!(refused.starts_with("cam: no usable sample to take the size from"), "{refused}");
         known.learn(&episode(&[camera(shape(720), None), arm]));
         assert_eq!(height(of(camera(None, shape(240)), &known)).unwrap(), 720);
-        assert_eq!(Known::of(&features()).length("arm"), Some(2));
+        assert_eq!(Known::from_features(&features()).length("arm"), Some(2));
     }
 
     #[test]
@@ -545,7 +550,7 @@ mod tests {
         episode.streams[0].names = ["hip.position", "hip.velocity", "tip.x"].map(str::to_owned).into();
         let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
         let of = |episode: &Survey, state: &[&str], action: &[&str]| {
-            let found = Features::of(episode, &choice(state, action), Pictures::Files, &Known::default());
+            let found = Features::from_survey(episode, &choice(state, action), Pictures::Files, &Known::default());
             found.map_err(|refusal| refusal.to_string())
         };
         let arm = [axis(0, 0, "arm.hip.position"), axis(0, 1, "arm.hip.velocity"), axis(0, 2, "arm.tip.x")];

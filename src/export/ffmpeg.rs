@@ -149,7 +149,7 @@ impl Ffmpeg {
         loop {
             match running.read(&mut part, stop)? {
                 0 => break,
-                count => packets.take(part.get(..count).unwrap_or_default()),
+                count => packets.feed(part.get(..count).unwrap_or_default()),
             }
         }
         let messages = running.end(stop)?;
@@ -375,7 +375,7 @@ struct Packets {
 }
 
 impl Packets {
-    fn take(&mut self, bytes: &[u8]) {
+    fn feed(&mut self, bytes: &[u8]) {
         for byte in bytes {
             if *byte == b'\n' {
                 let line = String::from_utf8_lossy(&std::mem::take(&mut self.line)).into_owned();
@@ -476,7 +476,7 @@ mod tests {
     fn each_frame_has_to_be_at_its_time() {
         let packets = |text: &str| {
             let mut packets = Packets { fps: 30, ..Packets::default() };
-            text.as_bytes().chunks(7).for_each(|part| packets.take(part));
+            text.as_bytes().chunks(7).for_each(|part| packets.feed(part));
             (packets.count, packets.wrong.map(|_| packets.first_wrong))
         };
         let head = "#software: Lavf59.27.100\n#tb 0: 1/15360\n#media_type 0: video\n";

@@ -174,7 +174,7 @@ pub(super) enum Payload {
 }
 
 impl Payload {
-    fn of(sample: &Sample<'_>) -> Option<Self> {
+    fn from_sample(sample: &Sample<'_>) -> Option<Self> {
         match sample.encoding {
             encoding @ (Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey) => {
                 let (width, height) = (sample.width, sample.height);
@@ -502,7 +502,7 @@ impl<'a> Waiting<'a> {
         if !uses.contains_key(&place) {
             return Ok(false);
         }
-        let payload = Payload::of(sample).unwrap_or(Payload::Numbers(Vec::new()));
+        let payload = Payload::from_sample(sample).unwrap_or(Payload::Numbers(Vec::new()));
         self.bytes += payload.size();
         samples.insert(place, Rc::new(payload));
         if self.bytes > MOST_WAITING { Err(Refusal::Order) } else { Ok(true) }

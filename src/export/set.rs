@@ -535,11 +535,11 @@ fn statistics(episode: &Survey, features: &Features, position: Position) -> Stat
     let rows = 0..episode.rows as u64;
     let mut times: Vec<f64> = rows.clone().map(|row| f64::from(timestamp(row, features.fps))).collect();
     let [first, others @ ..] = OWN;
-    statistics.insert(first.to_owned(), vec![Column::of(&mut times)]);
+    statistics.insert(first.to_owned(), vec![Column::from_values(&mut times)]);
     for (at, key) in others.into_iter().enumerate() {
         let value = |row| position.own(row).get(at).map_or(0.0, |value| *value as f64);
         let mut values: Vec<f64> = rows.clone().map(value).collect();
-        statistics.insert(key.to_owned(), vec![Column::of(&mut values)]);
+        statistics.insert(key.to_owned(), vec![Column::from_values(&mut values)]);
     }
     statistics
 }

@@ -21,7 +21,7 @@ pub(super) struct Column {
 
 impl Column {
     /// Of these values, which it sorts.
-    pub(super) fn of(values: &mut [f64]) -> Self {
+    pub(super) fn from_values(values: &mut [f64]) -> Self {
         values.sort_unstable_by(f64::total_cmp);
         let (Some(min), Some(max)) = (values.first(), values.last()) else { return Self::default() };
         let count = values.len() as f64;
@@ -57,7 +57,7 @@ impl Column {
     pub(super) fn of_flags(set: u64, rows: u64) -> Self {
         let mut flags = vec![0.0; usize::try_from(rows - set.min(rows)).unwrap_or_default()];
         flags.resize(usize::try_from(rows).unwrap_or_default(), 1.0);
-        Self::of(&mut flags)
+        Self::from_values(&mut flags)
     }
 
     /// Of both together.
@@ -127,14 +127,14 @@ mod tests {
         let quantiles = [1.03, 1.3, 3.0, 6.8, 7.88];
         let std = 7.1875_f64.sqrt();
         let expected = Column { min: 1.0, max: 8.0, mean: 3.75, std, quantiles, count: 4 };
-        near(Column::of(&mut [8.0, 1.0, 4.0, 2.0]), expected);
-        assert_eq!(Column::of(&mut []), Column::default());
+        near(Column::from_values(&mut [8.0, 1.0, 4.0, 2.0]), expected);
+        assert_eq!(Column::from_values(&mut []), Column::default());
     }
 
     #[test]
     fn two_episodes_together_are_as_one() {
-        let all = Column::of(&mut [1.0, 5.0, 2.0, 9.0, 9.5]);
-        let parts = Column::of(&mut [1.0, 5.0]).with(Column::of(&mut [2.0, 9.0, 9.5]));
+        let all = Column::from_values(&mut [1.0, 5.0, 2.0, 9.0, 9.5]);
+        let parts = Column::from_values(&mut [1.0, 5.0]).with(Column::from_values(&mut [2.0, 9.0, 9.5]));
         near(parts, Column { quantiles: parts.quantiles, ..all });
         // Without a valid row an episode has no weight.
         assert_eq!(all.with(Column::default()), all);

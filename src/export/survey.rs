@@ -94,7 +94,7 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         return Err(Refusal::Nothing);
     }
     let mut found = RowCollector::new(&index);
-    index.rows(path, stop, |row| found.take(row))?;
+    index.rows(path, stop, |row| found.add(row))?;
     let RowCollector { gatherers, time_ns: mut times, actions, unusable, .. } = found;
     let rows = index.ticks.len();
     let (registry, unread_registry) = registry_of(&index.registry);
@@ -116,7 +116,7 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         unread_registry,
         action_names: index.action_names.clone(),
         action: index.action_length().map(|_| columns(actions)),
-        time_ns: Column::of(&mut times),
+        time_ns: Column::from_values(&mut times),
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
     })
 }
@@ -170,7 +170,7 @@ impl RowCollector {
         Self { gatherers, time_ns: Vec::new(), actions, unusable: 0 }
     }
 
-    fn take(&mut self, row: &Row<'_>) -> Result<(), Refusal> {
+    fn add(&mut self, row: &Row<'_>) -> Result<(), Refusal> {
         self.time_ns.push(row.time_ns as f64);
         for (axis, value) in self.actions.iter_mut().zip(row.action) {
             // In the precision of the dataset.
@@ -178,7 +178,7 @@ impl RowCollector {
         }
         for ((gatherer, slot), sample) in self.gatherers.iter_mut().zip(row.slots).zip(row.samples) {
             let is_usable = match sample {
-                Some(payload) => gatherer.take(row.number, payload, slot.valid)?,
+                Some(payload) => gatherer.add(row.number, payload, slot.valid)?,
                 None => false,
             };
             self.unusable += u64::from(sample.is_some() && !is_usable);
@@ -200,7 +200,7 @@ pub(super) fn narrow(value: f64) -> f32 {
 }
 
 fn columns(values: Vec<Vec<f64>>) -> Vec<Column> {
-    values.into_iter().map(|mut values| Column::of(&mut values)).collect()
+    values.into_iter().map(|mut values| Column::from_values(&mut values)).collect()
 }
 
 /// Can a sample of this kind of modality be used?
@@ -273,7 +273,7 @@ impl Gatherer {
     }
 
     /// Takes the sample of a row; returns whether it can be used.
-    fn take(&mut self, row: usize, payload: &Payload, is_valid: bool) -> Result<bool, Refusal> {
+    fn add(&mut self, row: usize, payload: &Payload, is_valid: bool) -> Result<bool, Refusal> {
         if !is_usable(self.kind, payload) {
             return Ok(false);
         }
@@ -345,7 +345,7 @@ impl Gatherer {
             present: Column::of_flags(self.present, rows),
             plugged: Column::of_flags(self.plugged, rows),
             valid: Column::of_flags(valid, rows),
-            age: Column::of(&mut self.ages),
+            age: Column::from_values(&mut self.ages),
         }
     }
 }

@@ -79,7 +79,7 @@ impl Recording {
 
     fn sample(&mut self, bit: Option<u8>, sequence: u32, encoding: Encoding, payload: &[u8]) {
         let header = SampleHeader { encoding: encoding as u32, width: 4, height: 2, ..SampleHeader::default() };
-        let kind = SampleSchema::of(&header, payload);
+        let kind = SampleSchema::for_sample(&header, payload);
         let at_ms = u64::from(sequence) * 100;
         encode::sample(&mut self.message, kind, BEGIN + at_ms * 1_000_000, "", &header, payload);
         let topic = bit.map_or_else(|| ACTION_TOPIC.to_owned(), |bit| format!("/rapid/{bit}/{encoding:?}"));

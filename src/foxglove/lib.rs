@@ -308,7 +308,7 @@ impl Server {
         let Feed { queues, events, clock, made, .. } = feed;
         // After the capture of whatever is taken below: an episode's clock is in force before it begins.
         let (is_more, drained) = queues.drain_some(IN_A_TURN, &mut |topic, header, payload| {
-            topics.take(topic, header, payload, *clock.borrow());
+            topics.send_sample(topic, header, payload, *clock.borrow());
         });
         topics.send_pictures();
         for made in made.try_iter() {

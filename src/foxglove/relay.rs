@@ -296,7 +296,7 @@ mod tests {
     use super::*;
 
     /// A frame of the server with a message of this topic, or with text, and so many bytes of content.
-    fn of(topic: Topic, content: &[u8]) -> Vec<u8> {
+    fn frame_of(topic: Topic, content: &[u8]) -> Vec<u8> {
         let payload = match topic {
             Some(topic) => [&[1][..], &topic.to_le_bytes(), &[0; 8], content].concat(),
             None => content.to_vec(),
@@ -315,7 +315,7 @@ mod tests {
         let response = b"HTTP/1.1 101 Switching Protocols\r\nconnection: Upgrade\r\n\r\n".to_vec();
         let mut expected = vec![(None, response)];
         for length in [0, 112, 113, 300, 70_000] {
-            expected.extend([Some(7), None].map(|topic| (topic, of(topic, &vec![5; length]))));
+            expected.extend([Some(7), None].map(|topic| (topic, frame_of(topic, &vec![5; length]))));
         }
         expected.push((None, vec![0x88, 0]));
         let all: Vec<u8> = expected.iter().flat_map(|(_, frame)| frame.clone()).collect();
@@ -338,14 +338,14 @@ mod tests {
         let mut waiting = Waiting::default();
         let (mut expected, mut left_out) = (Vec::new(), 0);
         for number in 0_u32..1000 {
-            let small = of(Some(1), &number.to_le_bytes());
-            let other = of(None, &number.to_le_bytes());
+            let small = frame_of(Some(1), &number.to_le_bytes());
+            let other = frame_of(None, &number.to_le_bytes());
             for (topic, frame) in [(Some(1), &small), (None, &other)] {
                 waiting.push(topic, frame.clone()).unwrap();
                 expected.push(frame.clone());
             }
             for camera in [2, 3] {
-                let picture = of(Some(camera), &number.to_le_bytes().repeat(10_000));
+                let picture = frame_of(Some(camera), &number.to_le_bytes().repeat(10_000));
                 waiting.push(Some(camera), picture.clone()).unwrap();
                 if number == 999 {
                     expected.push(picture);
@@ -363,13 +363,13 @@ mod tests {
     #[test]
     fn what_waits_is_bounded() {
         let mut waiting = Waiting::default();
-        let frame = of(Some(1), &[0; 1000]);
+        let frame = frame_of(Some(1), &[0; 1000]);
         let most = TOPIC_BYTES / frame.len();
         for _ in 0..3 * most {
             waiting.push(Some(1), frame.clone()).unwrap();
         }
         assert_eq!(std::iter::from_fn(|| waiting.pop()).count(), most);
-        let answer = of(None, &vec![0; 1 << 20]);
+        let answer = frame_of(None, &vec![0; 1 << 20]);
         let fits = (0..100).take_while(|_| waiting.push(None, answer.clone()).is_ok()).count();
         assert_eq!(fits, 15, "their heads count too");
     }
@@ -380,10 +380,10 @@ mod tests {
             let mut waiting = Waiting::default();
             frames.take_while(|(topic, frame)| waiting.push(*topic, frame.clone()).is_ok()).count()
         };
-        let picture = of(Some(0), &vec![0; 200_000]);
+        let picture = frame_of(Some(0), &vec![0; 200_000]);
         let pictures = fits(&mut (0..10_000).map(|id| (Some(id), picture.clone())));
         assert_eq!(pictures, CLIENT_BYTES / (picture.len() + FRAME_COST));
-        let message = of(Some(0), &[]);
+        let message = frame_of(Some(0), &[]);
         let messages = fits(&mut (0..1_000_000).map(|id| (Some(id), message.clone())));
         assert_eq!(messages, CLIENT_BYTES / (message.len() + FRAME_COST));
         let pongs = fits(&mut std::iter::repeat_n((None, vec![0x8a, 0]), 1_000_000));
@@ -417,7 +417,7 @@ mod tests {
         assert_eq!((error.kind(), error.to_string().as_str()), (io::ErrorKind::TimedOut, "no handshake"));
         drop(silent);
         tokio::time::advance(2 * HOUR).await;
-        let frame = of(Some(1), &[7]);
+        let frame = frame_of(Some(1), &[7]);
         server.write_all(&frame).await.unwrap();
         let mut received = vec![0; frame.len()];
         client.read_exact(&mut received).await.unwrap();
@@ -429,7 +429,7 @@ mod tests {
     #[tokio::test]
     async fn a_client_that_does_not_read_the_rest_is_closed() {
         let (client, mut server, relay) = connected().await;
-        let picture = of(Some(1), &vec![0; 16 << 20]);
+        let picture = frame_of(Some(1), &vec![0; 16 << 20]);
         server.write_all(&[&b"HTTP/1.1 101 Switching Protocols\r\n\r\n"[..], &picture].concat()).await.unwrap();
         drop(server);
         tokio::time::pause();

@@ -114,7 +114,7 @@ impl Topics {
             picture: Vec::new(),
         };
         track.channel(&self.context, SampleSchema::expected(device));
-        for derived in Derived::of(device) {
+        for derived in Derived::for_device(device) {
             let made = || {
                 let metadata = channel::of_derived(device, *derived);
                 advertise(&self.context, derived.schema(), &derived.topic(device), &metadata)
@@ -134,13 +134,13 @@ impl Topics {
     }
 
     /// Sends a sample to those who subscribe to its topic; a picture by [`Self::send_pictures`].
-    pub(super) fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8], clock: WallClock) {
+    pub(super) fn send_sample(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8], clock: WallClock) {
         let log_time = clock.wall_ns(Stamp(header.capture_ns));
         let message = &mut self.message;
         match topic {
             TopicId::Modality(id) => {
                 let Some(Some(track)) = self.tracks.get_mut(id.index()) else { return };
-                self.left_out.pictures += track.take(&self.context, message, (header, payload), log_time);
+                self.left_out.pictures += track.send(&self.context, message, (header, payload), log_time);
             }
             TopicId::Mask => {
                 let Some(channel) = wanted(self.mask.as_ref()) else { return };
@@ -151,7 +151,7 @@ impl Topics {
             }
             TopicId::Action => {
                 let Some(channel) = wanted(self.action.as_ref()) else { return };
-                if SampleSchema::of(header, payload) == SampleSchema::Scalars {
+                if SampleSchema::for_sample(header, payload) == SampleSchema::Scalars {
                     encode::sample(message, SampleSchema::Scalars, log_time, "", header, payload);
                     send(channel, message, log_time);
                 }
@@ -181,7 +181,7 @@ impl Topics {
         let (log_time, message) = (clock.wall_ns(event.stamp), &mut self.message);
         // What has no JSON is in no file either, and the recorder reports it.
         if let Some(channel) = wanted(self.event.as_ref())
-            && let Ok(announced) = Announced::of(event)
+            && let Ok(announced) = Announced::new(event)
         {
             encode::event(message, log_time, &announced.fields());
             send(channel, message, log_time);
@@ -250,14 +250,14 @@ impl Track {
     }
 
     /// Returns how many pictures were left out.
-    fn take(
+    fn send(
         &mut self,
         context: &Arc<Context>,
         message: &mut Vec<u8>,
         (header, payload): (&SampleHeader, &[u8]),
         log_time: u64,
     ) -> u64 {
-        let schema = SampleSchema::of(header, payload);
+        let schema = SampleSchema::for_sample(header, payload);
         if let Some(form) = &self.form {
             for (derived, channel) in self.derived.iter().filter(|(_, channel)| channel.has_sinks()) {
                 if derived.encode(message, log_time, &self.name, form, (schema, payload)) {

@@ -131,7 +131,7 @@ impl Hand {
 
     /// At tick `tick` of the control grid; what it does is seen at the next one.
     fn act(&mut self, tick: u32, rig: &mut Lockstep) {
-        self.look(tick, rig);
+        self.observe(tick, rig);
         let touched = self.touched.map(|(tick, _)| tick);
         let is_due = |when: Option<When>| match when {
             Some(When::Step(step)) => tick + 1 >= step,
@@ -149,7 +149,7 @@ impl Hand {
         }
     }
 
-    fn look(&mut self, tick: u32, rig: &Lockstep) {
+    fn observe(&mut self, tick: u32, rig: &Lockstep) {
         let trial = rig.trial().lock();
         let world = &trial.world;
         if self.touched.is_none() && world.pressure >= FELT {
@@ -198,7 +198,7 @@ impl StaticLoop {
         Self { newest: vec![Stamp::default(); sensors.len()], sensors }
     }
 
-    fn take(&mut self, topic: TopicId, header: &SampleHeader) {
+    fn note_sample(&mut self, topic: TopicId, header: &SampleHeader) {
         for ((id, _), newest) in self.sensors.iter().zip(&mut self.newest) {
             if topic == TopicId::Modality(*id) {
                 *newest = Stamp(header.recv_ns);
@@ -348,7 +348,7 @@ impl Bench<'_> {
                 break;
             }
             let number = u64::from(tick);
-            let answer = witness.pilot.look(number, rig.now(), rig.now()).then(|| {
+            let answer = witness.pilot.observe(number, rig.now(), rig.now()).then(|| {
                 witness.pilot.fill(number, rig.now(), &mut request);
                 self.model.answer(&request, &mut chunk)
             });
@@ -357,7 +357,7 @@ impl Bench<'_> {
                 rig.act(number, action, &mut witness);
             }
             rig.step(0.0, &mut witness)?;
-            let skipped = take(answer, &mut witness.pilot, &request, &chunk, &mut failure);
+            let skipped = pass_answer(answer, &mut witness.pilot, &request, &chunk, &mut failure);
             if let Some(recorder) = &mut witness.recorder {
                 if let Some(skipped) = skipped {
                     let (devices, latency_ms) = (self.registry.devices.len(), STEP.as_secs_f64() * 1e3);
@@ -397,7 +397,7 @@ impl Bench<'_> {
 }
 
 /// Passes the answer to the pilot. Returns how many actions of a chunk came too late; `None` without a chunk.
-fn take(
+fn pass_answer(
     answer: Option<Result<(), AnswerError>>,
     pilot: &mut Pilot,
     asked: &Request,
@@ -444,18 +444,18 @@ struct Spectator<'a> {
 }
 
 impl Taker for Spectator<'_> {
-    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+    fn receive(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         if let Some(recorder) = &mut self.recorder {
-            recorder.take(topic, header, payload);
+            recorder.receive(topic, header, payload);
         }
         if let Some(reads) = &mut self.reads {
-            reads.take(topic, header);
+            reads.note_sample(topic, header);
             // A fixed list has no mask: the policy does not see a sensor leave.
             if topic == TopicId::Mask {
                 return;
             }
         }
-        self.pilot.take(topic, header, payload);
+        self.pilot.receive(topic, header, payload);
     }
 
     fn event(&mut self, event: &Event) {
@@ -525,13 +525,13 @@ mod tests {
         };
         for (bit, ms) in [(0, 100), (1, 100), (0, 200)] {
             let (topic, header) = sample(bit, ms);
-            reads.take(topic, &header);
+            reads.note_sample(topic, &header);
         }
         assert!(reads.read(Stamp(300_000_000)).is_ok());
         let error = reads.read(Stamp(300_000_001)).expect_err("tactile is late").to_string();
         assert_eq!(error, "tactile_tip: no sample within 200ms");
         let (topic, header) = sample(1, 300);
-        reads.take(topic, &header);
+        reads.note_sample(topic, &header);
         assert!(reads.read(Stamp(400_000_000)).is_ok());
     }
 
@@ -543,9 +543,9 @@ mod tests {
         for (reads, expected) in [(None, later), (Some(StaticLoop::new(&registry, start)), start)] {
             let pilot = Pilot::new(&bundle, &registry, WithoutMask::Hold, 0);
             let mut spectator = Spectator { pilot, recorder: None, reads: None };
-            spectator.take(TopicId::Mask, &SampleHeader::default(), &Bits::from(start).payload(1));
+            spectator.receive(TopicId::Mask, &SampleHeader::default(), &Bits::from(start).payload(1));
             spectator.reads = reads;
-            spectator.take(TopicId::Mask, &SampleHeader::default(), &Bits::from(later).payload(2));
+            spectator.receive(TopicId::Mask, &SampleHeader::default(), &Bits::from(later).payload(2));
             assert_eq!(spectator.pilot.mask, expected);
         }
     }

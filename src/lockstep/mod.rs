@@ -202,7 +202,7 @@ impl Lockstep {
                 let header = header(device, &sample);
                 device.sequence += 1;
                 let id = device.spec.id;
-                taker.take(TopicId::Modality(id), &header, &sample.payload);
+                taker.receive(TopicId::Modality(id), &header, &sample.payload);
                 if self.core.state(id).0 == DeviceState::Opening {
                     self.apply(Input::Stream { id, epoch: sample.epoch, event: StreamEvent::Started }, taker);
                 }
@@ -225,7 +225,7 @@ impl Lockstep {
             width: AXIS_COUNT,
             ..SampleHeader::default()
         };
-        taker.take(TopicId::Action, &header, &self.payload);
+        taker.receive(TopicId::Action, &header, &self.payload);
     }
 
     /// Applies the plugs and unplugs up to now, and the deadlines that have passed.
@@ -297,7 +297,7 @@ impl Lockstep {
             encoding: Encoding::Mask as u32,
             ..SampleHeader::default()
         };
-        taker.take(TopicId::Mask, &header, &payload);
+        taker.receive(TopicId::Mask, &header, &payload);
     }
 }
 

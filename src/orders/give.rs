@@ -82,7 +82,7 @@ pub enum GiveError {
 }
 
 fn standstill(process: u32, error: &io::Error) -> String {
-    if ProcessState::of(process) == ProcessState::Stopped {
+    if ProcessState::read(process) == ProcessState::Stopped {
         format!("is stopped (`kill -CONT {process}` continues it) and does not answer")
     } else {
         format!("does not answer ({})", unanswered(error))
@@ -241,7 +241,7 @@ impl Run {
             if error.kind() != ErrorKind::WouldBlock {
                 return Err(failed(error));
             }
-            if ProcessState::of(process) == ProcessState::Stopped {
+            if ProcessState::read(process) == ProcessState::Stopped {
                 return Err(GiveError::Stopped(process));
             }
         }
@@ -296,7 +296,7 @@ fn connect(name: &str) -> io::Result<Run> {
     stream.set_nonblocking(false)?;
     stream.set_read_timeout(Some(ANSWER_LIMIT))?;
     stream.set_write_timeout(Some(ANSWER_LIMIT))?;
-    let Peer { process, user, group } = Peer::of(&stream)?;
+    let Peer { process, user, group } = Peer::from_stream(&stream)?;
     // The number in the socket's name, where its processes are not visible from here.
     let process = process.or_else(|| process_of(name)).unwrap_or_default();
     Ok(Run { stream, process, user, group })

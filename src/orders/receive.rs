@@ -173,7 +173,8 @@ impl Desk {
             let now = Stamp::now();
             let mut ready_of = ready.iter().skip(2).copied();
             for mut one in std::mem::take(&mut self.waiting) {
-                let taken = if ready_of.next().unwrap_or(false) { one.take(&self.permission) } else { Taken::Nothing };
+                let taken =
+                    if ready_of.next().unwrap_or(false) { one.receive(&self.permission) } else { Taken::Nothing };
                 self.handle(one, taken, now);
             }
             if ready.get(1) == Some(&true) {
@@ -185,7 +186,7 @@ impl Desk {
     fn accept(&mut self, now: Stamp) {
         while let Ok((stream, _)) = self.listener.accept() {
             let is_member = |group| Peer::is_member(&stream, group);
-            let is_allowed = Peer::of(&stream).is_ok_and(|peer| peer.user == this_user() || peer.user == 0)
+            let is_allowed = Peer::from_stream(&stream).is_ok_and(|peer| peer.user == this_user() || peer.user == 0)
                 || self.group.is_some_and(is_member);
             if !is_allowed || stream.set_nonblocking(true).is_err() {
                 continue;
@@ -194,7 +195,7 @@ impl Desk {
                 self.waiting.remove(0);
             }
             let mut one = Waiting { stream, since: now, line: Vec::new() };
-            let taken = one.take(&self.permission);
+            let taken = one.receive(&self.permission);
             self.handle(one, taken, now);
         }
     }
@@ -230,7 +231,7 @@ enum Taken {
 
 impl Waiting {
     /// Reads what was sent, and carries out an order.
-    fn take(&mut self, permission: &Permission) -> Taken {
+    fn receive(&mut self, permission: &Permission) -> Taken {
         let mut bytes = [0; 4096];
         match self.stream.read(&mut bytes) {
             Ok(0) => return Taken::All,
@@ -304,8 +305,8 @@ mod tests {
             let mut waiting = Waiting { stream, since: Stamp::now(), line: Vec::new() };
             giver.write_all(line(order, Stamp::now()).as_bytes()).unwrap();
             let giver = (!is_gone).then_some(giver);
-            assert_eq!(waiting.take(&permission), Taken::All);
-            assert_eq!(attended.take().collect::<Vec<_>>(), taken, "{order:?}, gone: {is_gone}");
+            assert_eq!(waiting.receive(&permission), Taken::All);
+            assert_eq!(attended.take_pending().collect::<Vec<_>>(), taken, "{order:?}, gone: {is_gone}");
             drop(giver);
         }
     }

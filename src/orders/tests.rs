@@ -50,7 +50,7 @@ impl Run {
 }
 
 fn taken(attended: &Attended) -> Vec<Order> {
-    attended.take().collect()
+    attended.take_pending().collect()
 }
 
 /// The answer to these bytes.

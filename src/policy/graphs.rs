@@ -60,7 +60,7 @@ pub enum GraphProblem {
 }
 
 impl GraphProblem {
-    fn of(self, name: &str) -> GraphError {
+    fn in_graph(self, name: &str) -> GraphError {
         GraphError { name: name.to_owned(), what: self }
     }
 }
@@ -79,14 +79,14 @@ impl LoadedGraph {
     /// When the bytes are not a graph that this onnxruntime can run, or it does not have the provider.
     pub fn load(environment: &Environment, name: &str, bytes: &[u8], on: InferenceSpec) -> Result<Self, GraphError> {
         let builder = Session::builder(&environment.ort).and_then(|builder| configure(builder, name, on.threads));
-        let builder = builder.map_err(|error| GraphProblem::Load(error.to_string()).of(name))?;
+        let builder = builder.map_err(|error| GraphProblem::Load(error.to_string()).in_graph(name))?;
         let session = provided(builder, on.provider)
             .map_err(|error| {
                 let (provider, library) = (on.provider.word(), environment.origin.to_string());
-                GraphProblem::Provider { provider, library, reason: error.to_string() }.of(name)
+                GraphProblem::Provider { provider, library, reason: error.to_string() }.in_graph(name)
             })?
             .commit_from_memory(bytes)
-            .map_err(|error| GraphProblem::Load(error.to_string()).of(name))?;
+            .map_err(|error| GraphProblem::Load(error.to_string()).in_graph(name))?;
         Ok(Self { name: name.to_owned(), session })
     }
 
@@ -134,7 +134,7 @@ impl BoundGraph {
     /// When there is none.
     pub fn input_index(&self, name: &str) -> Result<usize, GraphError> {
         let place = self.session.inputs().iter().position(|input| input.name() == name);
-        place.ok_or_else(|| GraphProblem::NoInput(name.to_owned()).of(&self.name))
+        place.ok_or_else(|| GraphProblem::NoInput(name.to_owned()).in_graph(&self.name))
     }
 
     /// Writes the numbers of an input.
@@ -173,7 +173,7 @@ impl BoundGraph {
         };
         match filled {
             Ok(true) => Ok(()),
-            Ok(false) => Err(GraphProblem::Input(index).of(&self.name)),
+            Ok(false) => Err(GraphProblem::Input(index).in_graph(&self.name)),
             Err(error) => Err(run_error(&self.name, &error)),
         }
     }
@@ -277,9 +277,9 @@ fn make_output(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError>
 }
 
 fn kind(graph: &str, shape: &TensorShape) -> GraphError {
-    GraphProblem::Kind(shape.name.clone()).of(graph)
+    GraphProblem::Kind(shape.name.clone()).in_graph(graph)
 }
 
 fn run_error(graph: &str, error: &ort::Error) -> GraphError {
-    GraphProblem::Run(error.to_string()).of(graph)
+    GraphProblem::Run(error.to_string()).in_graph(graph)
 }

@@ -272,7 +272,7 @@ impl ActionQueue {
         }
     }
 
-    /// Whether the observation of `tick` must be sent to the policy. If so, it counts as sent: [`Self::take`] or
+    /// Whether the observation of `tick` must be sent to the policy. If so, it counts as sent: [`Self::accept_chunk`] or
     /// [`Self::failed`] must follow before the next one. At most one observation is with the policy at a time.
     pub fn wants_observation(&mut self, tick: u64, situation: Situation) -> bool {
         self.too_old = false;
@@ -299,7 +299,7 @@ impl ActionQueue {
     ///
     /// # Errors
     /// Why the chunk is rejected; the previous chunk stays in use.
-    pub fn take(&mut self, observed: u64, values: &[f32]) -> Result<u64, ChunkError> {
+    pub fn accept_chunk(&mut self, observed: u64, values: &[f32]) -> Result<u64, ChunkError> {
         let taken = self.check(observed, values);
         let skipped = taken.map_err(|reason| self.refuse(observed, reason))?;
         self.in_flight = None;

@@ -257,7 +257,7 @@ impl Control {
 
     fn drain(&mut self) {
         let Self { inbox, pilot, .. } = self;
-        let drained = inbox.drain(&mut |topic, header, payload| pilot.take(topic, header, payload));
+        let drained = inbox.drain(&mut |topic, header, payload| pilot.receive(topic, header, payload));
         if let Err(error) = drained {
             self.complain(&format!("policy: {error}"));
         }
@@ -305,7 +305,7 @@ impl Control {
     fn tick(&mut self, tick: u64, at: Stamp) {
         self.drain();
         // While the policy works on a request, no new one is made.
-        if self.pilot.look(tick, at, Stamp::now())
+        if self.pilot.observe(tick, at, Stamp::now())
             && let Some(mut exchange) = self.exchange.take()
         {
             self.pilot.fill(tick, at, &mut exchange.request);

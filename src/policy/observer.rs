@@ -214,7 +214,7 @@ impl Observer {
 
     /// Observes tick number `number`, at `tick`, with the samples known at `now`; numbers rise. Returns the age of the
     /// oldest chosen sample of the present modalities; `None` if one of them has no sample at all, or none is present.
-    pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp, mask: PhysicalMask) -> Option<Duration> {
+    pub fn observe(&mut self, number: u64, tick: Stamp, now: Stamp, mask: PhysicalMask) -> Option<Duration> {
         self.sync.observe(tick, now, mask);
         let ticks = self.number.replace(number).map_or(1, |last| number.saturating_sub(last));
         let mut oldest = None;

@@ -29,7 +29,7 @@ pub enum PaceVerdict {
 
 impl PaceReport {
     /// Of a policy whose chunks take `chunk`.
-    pub fn of(bundle: &Bundle, chunk: Duration) -> Self {
+    pub fn new(bundle: &Bundle, chunk: Duration) -> Self {
         let ticks = |count: usize| Duration::from_secs_f64(count as f64 / bundle.control_hz);
         let covered = ticks(bundle.horizon - bundle.action_start);
         let executed = ticks(bundle.n_action_steps);
@@ -69,12 +69,12 @@ mod tests {
     fn the_verdict_follows_from_horizon_and_rate() {
         let bundle = Bundle::parse(example::POLICY, "policy.json").unwrap();
         let bundle = Bundle { horizon: 16, action_start: 1, n_action_steps: 8, control_hz: 10.0, ..bundle };
-        let verdict = |ms| PaceReport::of(&bundle, Duration::from_millis(ms)).verdict;
+        let verdict = |ms| PaceReport::new(&bundle, Duration::from_millis(ms)).verdict;
         // 15 actions cover 1.5 s; a new chunk is requested after 0.8 s.
         assert_eq!([1, 699, 700].map(verdict), [PaceVerdict::Whole; 3]);
         assert_eq!([701, 800, 1499].map(verdict), [PaceVerdict::Pauses; 3]);
         assert_eq!([1500, 9000].map(verdict), [PaceVerdict::TooSlow; 2]);
-        let text = |ms| PaceReport::of(&bundle, Duration::from_millis(ms)).text;
+        let text = |ms| PaceReport::new(&bundle, Duration::from_millis(ms)).text;
         assert_eq!(text(100), "a chunk takes 100 ms, and its 15 actions cover 1500 ms at 10 Hz");
         assert_eq!(
             text(800),
@@ -97,7 +97,7 @@ mod tests {
             (1499, PaceVerdict::Pauses, "try a smaller n_action_steps in policy.json"),
             (1500, PaceVerdict::TooSlow, "try more --threads"),
         ] {
-            let pace = PaceReport::of(&bundle, Duration::from_millis(ms));
+            let pace = PaceReport::new(&bundle, Duration::from_millis(ms));
             assert!(pace.verdict == verdict && pace.text.contains(fix), "{ms} ms: {pace:?}");
         }
     }

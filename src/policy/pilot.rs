@@ -56,7 +56,7 @@ impl Pilot {
     }
 
     /// Takes a sample from the bus.
-    pub fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+    pub fn receive(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         match topic {
             TopicId::Modality(id) => self.observer.push(id, header, payload),
             TopicId::Mask => {
@@ -75,8 +75,8 @@ impl Pilot {
 
     /// Observes tick number `number` of the control grid, at `tick`. Returns whether a request to the policy
     /// is due; if so, [`Self::fill`] fills it, and [`Self::answer`] or [`ActionQueue::failed`] must follow.
-    pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp) -> bool {
-        let observation_age = self.observer.look(number, tick, now, self.mask);
+    pub fn observe(&mut self, number: u64, tick: Stamp, now: Stamp) -> bool {
+        let observation_age = self.observer.observe(number, tick, now, self.mask);
         self.situation = Situation { mask: self.mask, observation_age };
         self.queue.wants_observation(number, self.situation)
     }
@@ -96,7 +96,7 @@ impl Pilot {
     /// Why the chunk is not used; the previous one stays in use.
     pub fn answer(&mut self, request: &Request, output: &[f32]) -> Result<u64, ChunkError> {
         match self.composer.compose(request, output, &mut self.chunk) {
-            Ok(()) => self.queue.take(request.tick, &self.chunk),
+            Ok(()) => self.queue.accept_chunk(request.tick, &self.chunk),
             Err(reason) => Err(self.queue.refuse(request.tick, reason)),
         }
     }

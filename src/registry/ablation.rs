@@ -62,10 +62,10 @@ impl AblationPlan {
     /// # Errors
     /// All problems of the text.
     pub fn parse(text: &str, path: &Path) -> Result<Self, RegistryErrors> {
-        read(&file_label(Some(path), ""), text, |root| Ok(Self::of(root)))
+        read(&file_label(Some(path), ""), text, |root| Ok(Self::from_section(root)))
     }
 
-    fn of(root: &Section<'_>) -> Self {
+    fn from_section(root: &Section<'_>) -> Self {
         root.allow(&["task", "episodes", "tag", "fingers", "modalities", "words"]);
         let task = root.text("task").map(str::to_owned);
         let mut plan = Self { task, ..Self::default() };

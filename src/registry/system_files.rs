@@ -163,7 +163,7 @@ pub(crate) struct Needs {
 }
 
 impl Needs {
-    fn of(registry: &Registry) -> Self {
+    fn from_registry(registry: &Registry) -> Self {
         let mut needs = Self::default();
         for device in &registry.devices {
             device.node.of_kind().need(&mut needs);
@@ -251,7 +251,7 @@ const PROGRAMS: &str = "\
 /// digits, `-`, `_` and `.`, none of which systemd interprets.
 fn unit(registry: &Registry) -> String {
     let rig = &registry.rig.name;
-    let needs = Needs::of(registry);
+    let needs = Needs::from_registry(registry);
     let (families, only_without, kill_mode) =
         (needs.families(), needs.only_without(), if needs.guard { GUARDED } else { "KillMode=mixed\n" });
     let (make_group, group, allow) = needs.nodes();

@@ -64,8 +64,8 @@ impl Output {
         loop {
             let [out, err] = self.lines.each_ref().map(|lines| !lines.closed);
             tokio::select! {
-                result = stdout.readable(), if out => self.look(0, |chunk| result.and_then(|()| stdout.try_read(chunk))),
-                result = stderr.readable(), if err => self.look(1, |chunk| result.and_then(|()| stderr.try_read(chunk))),
+                result = stdout.readable(), if out => self.read_once(0, |chunk| result.and_then(|()| stdout.try_read(chunk))),
+                result = stderr.readable(), if err => self.read_once(1, |chunk| result.and_then(|()| stderr.try_read(chunk))),
                 () = sleep(TELL_EVERY.saturating_sub(Stamp::now().since(self.reported))), if self.left_out > 0 => {
                     self.notify();
                 }
@@ -83,7 +83,7 @@ impl Output {
             // At most one pipe's capacity: a pipe that is still written to would never end.
             for _ in 0..4 {
                 // The end of the child may be seen before what it printed last: `try_read` asks the runtime, not the pipe.
-                self.look(index, |chunk| Ok(rustix::io::read(pipe, chunk)?));
+                self.read_once(index, |chunk| Ok(rustix::io::read(pipe, chunk)?));
             }
             if let Some(lines) = self.lines.get_mut(index)
                 && let Some(line) = lines.rest()
@@ -94,8 +94,7 @@ impl Output {
         self.notify();
     }
 
-    /// Reads once.
-    fn look(&mut self, index: usize, read: impl FnOnce(&mut [u8]) -> io::Result<usize>) {
+    fn read_once(&mut self, index: usize, read: impl FnOnce(&mut [u8]) -> io::Result<usize>) {
         let mut chunk = [0; CHUNK];
         let read = match read(&mut chunk) {
             Ok(read) => read,
@@ -104,7 +103,7 @@ impl Output {
         };
         let Some(lines) = self.lines.get_mut(index) else { return };
         lines.closed = read == 0;
-        let complete = lines.take(chunk.get(..read).unwrap_or_default());
+        let complete = lines.feed(chunk.get(..read).unwrap_or_default());
         for line in complete {
             self.print(index, &line);
         }
@@ -153,7 +152,7 @@ struct Lines {
 
 impl Lines {
     /// The non-empty lines that end in `bytes`.
-    fn take(&mut self, bytes: &[u8]) -> Vec<String> {
+    fn feed(&mut self, bytes: &[u8]) -> Vec<String> {
         let mut complete = Vec::new();
         for piece in bytes.split_inclusive(|byte| *byte == b'\n') {
             let (text, ends) = match piece.split_last() {
@@ -249,10 +248,10 @@ mod tests {
     #[test]
     fn lines_are_cut_and_sanitized() {
         let mut lines = Lines::default();
-        assert_eq!(lines.take(b"one\r\n\n\ntw"), ["one"]);
-        assert_eq!(lines.take(b"o\n\x1b[31mred\xff\n"), ["two", " [31mred\u{fffd}"]);
-        assert_eq!(lines.take(&[b'x'; 3 * LONGEST]), [""; 0]);
-        let cut = lines.take(b"y\nnext");
+        assert_eq!(lines.feed(b"one\r\n\n\ntw"), ["one"]);
+        assert_eq!(lines.feed(b"o\n\x1b[31mred\xff\n"), ["two", " [31mred\u{fffd}"]);
+        assert_eq!(lines.feed(&[b'x'; 3 * LONGEST]), [""; 0]);
+        let cut = lines.feed(b"y\nnext");
         assert_eq!(cut, [format!("{}\u{2026}", "x".repeat(LONGEST))]);
         assert_eq!(lines.rest().as_deref(), Some("next"));
         assert_eq!(lines.rest(), None);
@@ -277,9 +276,9 @@ mod tests {
             let (first, second) = bytes.split_at(at.min(bytes.len()));
             let mut whole = Lines::default();
             let mut halves = Lines::default();
-            let expected = whole.take(&bytes);
-            let mut got = halves.take(first);
-            got.extend(halves.take(second));
+            let expected = whole.feed(&bytes);
+            let mut got = halves.feed(first);
+            got.extend(halves.feed(second));
             prop_assert_eq!(got, expected);
             prop_assert_eq!(halves.rest(), whole.rest());
         }

@@ -98,7 +98,7 @@ impl Rig {
     /// A rig without devices, which publishes through `presence`.
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
         let programs = Programs::new(registry, bus, &board);
-        let names = BusNames::of(&bus.membership());
+        let names = BusNames::from_membership(&bus.membership());
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             let spec = Arc::new(spec.clone());

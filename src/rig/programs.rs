@@ -77,7 +77,7 @@ pub(super) struct BusNames {
 }
 
 impl BusNames {
-    pub(super) fn of(membership: &Membership) -> Self {
+    pub(super) fn from_membership(membership: &Membership) -> Self {
         Self { prefix: membership.prefix(), root: membership.root() }
     }
 }

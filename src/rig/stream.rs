@@ -93,7 +93,7 @@ pub(super) struct Numbers {
 impl Numbers {
     /// `seq` and `lost` of a sample before which the device lost `lost` others. They leave a gap in `seq`, so that
     /// every consumer can see it.
-    fn take(&self, lost: u64) -> (u64, u64) {
+    fn assign(&self, lost: u64) -> (u64, u64) {
         // Only one stream at a time counts here: an older one publishes nothing more.
         let seq = self.next.fetch_add(lost + 1, Ordering::Relaxed) + lost;
         (seq, self.lost.fetch_add(lost, Ordering::Relaxed) + lost)
@@ -314,9 +314,9 @@ impl Stream {
         fault::point("stream");
         // First of all, so that an emergency stop takes effect whatever happens to the sample.
         for tap in &*self.taps {
-            tap.look(reading.encoding, reading.bytes);
+            tap.feed(reading.encoding, reading.bytes);
         }
-        let (seq, lost) = self.numbers.take(reading.lost);
+        let (seq, lost) = self.numbers.assign(reading.lost);
         let header = SampleHeader {
             seq,
             lost,
@@ -437,6 +437,6 @@ mod tests {
     #[test]
     fn samples_lost_by_the_device_leave_a_gap_in_the_sequence() {
         let numbers = Numbers::default();
-        assert_eq!([0, 2, 0].map(|lost| numbers.take(lost)), [(0, 0), (3, 2), (4, 2)]);
+        assert_eq!([0, 2, 0].map(|lost| numbers.assign(lost)), [(0, 0), (3, 2), (4, 2)]);
     }
 }

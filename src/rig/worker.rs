@@ -106,7 +106,8 @@ impl Worker {
             started,
             ended: ending,
         };
-        let mut env: Environment = environment(spec, attachment, seat.ingress.topic(), &BusNames::of(&seat.membership));
+        let mut env: Environment =
+            environment(spec, attachment, seat.ingress.topic(), &BusNames::from_membership(&seat.membership));
         env.push(("RAPID_EPOCH", Some(epoch.0.to_string().into())));
         let launch = Launch { program: process.program.clone(), args: process.args.clone(), env };
         programs.tasks.spawn(supervisor.keep(launch));
@@ -151,7 +152,7 @@ impl Worker {
         loop {
             // A program that publishes faster than this reads must not keep this task from being stopped.
             tokio::task::consume_budget().await;
-            let given = self.ingress.take().map_err(|error| DriverError::Retry(error.to_string()))?;
+            let given = self.ingress.receive().map_err(|error| DriverError::Retry(error.to_string()))?;
             if let Some(given) = given {
                 let judged = self.intake.judge(given.header(), given.bytes(), Stamp::now());
                 if let Some(text) = self.intake.complaint() {

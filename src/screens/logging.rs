@@ -136,11 +136,11 @@ struct LogLine {
 
 /// Receives formatted lines.
 trait Sink: 'static {
-    fn take(&self, line: LogLine);
+    fn write(&self, line: LogLine);
 }
 
 impl Sink for Arc<Board> {
-    fn take(&self, line: LogLine) {
+    fn write(&self, line: LogLine) {
         self.log(line.level, &line.text);
     }
 }
@@ -158,7 +158,7 @@ struct StderrSink {
 
 impl StderrSink {
     fn new(form: Stderr, outlet: Arc<Outlet>) -> Self {
-        let palette = Palette::of(&io::stderr());
+        let palette = Palette::for_output(&io::stderr());
         let shared = form == Stderr::Text && io::stderr().is_terminal() && io::stdout().is_terminal();
         Self { form, palette, before: if shared { ERASE_LINE } else { "" }, outlet, lost: AtomicU64::new(0) }
     }
@@ -176,7 +176,7 @@ impl StderrSink {
 }
 
 impl Sink for StderrSink {
-    fn take(&self, line: LogLine) {
+    fn write(&self, line: LogLine) {
         let mut text = self.render(&line);
         let lost = self.lost.swap(0, Ordering::Relaxed);
         if lost > 0 {
@@ -234,7 +234,7 @@ where
             }
         }
         let line: String = text::plain(line.trim()).chars().take(LONGEST).collect();
-        self.sink.take(LogLine { wall_ns: realtime_ns(), level: level(*event.metadata().level()), text: line });
+        self.sink.write(LogLine { wall_ns: realtime_ns(), level: level(*event.metadata().level()), text: line });
     }
 }
 

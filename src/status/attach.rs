@@ -137,7 +137,7 @@ impl Decoder {
                 Message::Hello { protocol: PROTOCOL, .. } => {}
                 Message::Hello { version, .. } => return Err(LinkError::Version(version)),
                 Message::Snapshot(snapshot) => return Ok(self.complete(*snapshot)),
-                Message::Preview(preview) => self.take(preview, from)?,
+                Message::Preview(preview) => self.read_preview(preview, from)?,
             }
         }
     }
@@ -150,7 +150,7 @@ impl Decoder {
         snapshot
     }
 
-    fn take(&mut self, mut preview: Preview, from: &mut impl Read) -> Result<(), LinkError> {
+    fn read_preview(&mut self, mut preview: Preview, from: &mut impl Read) -> Result<(), LinkError> {
         if preview.bytes > LARGEST_PREVIEW {
             return Err(LinkError::Version(format!("a preview of {} bytes", preview.bytes)));
         }

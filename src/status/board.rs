@@ -173,7 +173,7 @@ struct State {
 impl State {
     fn new(registry: &Registry) -> Self {
         Self {
-            entries: registry.devices.iter().map(Entry::of).collect(),
+            entries: registry.devices.iter().map(Entry::new).collect(),
             unregistered: Vec::new(),
             registry_answer: None,
             states: vec![ReportedState::default(); MAX_MODALITIES],
@@ -235,7 +235,7 @@ struct Entry {
 }
 
 impl Entry {
-    fn of(device: &DeviceSpec) -> Self {
+    fn new(device: &DeviceSpec) -> Self {
         let DeviceSpec { id, name, topic, verdict, .. } = device;
         Self {
             id: *id,
@@ -243,7 +243,7 @@ impl Entry {
             topic: topic.clone(),
             kind: device.node.modality_kind(),
             nominal_hz: verdict.hz,
-            detail: StaticDetail::of(device),
+            detail: StaticDetail::new(device),
         }
     }
 }
@@ -277,7 +277,7 @@ impl Board {
 
     /// Adds an entry, whose bit no other has.
     pub fn add(&self, device: &DeviceSpec) {
-        let entry = Entry::of(device);
+        let entry = Entry::new(device);
         let entries = &mut self.state().entries;
         let at = entries.partition_point(|entry| entry.id < device.id);
         entries.insert(at, entry);
@@ -413,7 +413,7 @@ impl Board {
         if !self.state().preview(id).is_none_or(is_due) {
             return;
         }
-        let preview = Preview::of(id, header, payload).map(Arc::new);
+        let preview = Preview::from_sample(id, header, payload).map(Arc::new);
         let previews = &mut self.state().previews;
         previews.retain(|last| last.device != id);
         previews.extend(preview);
@@ -503,7 +503,7 @@ impl Board {
         let looked_at = state.entries.iter().filter(|entry| self.is_looked_at(entry.id, now));
         let detail = |entry: &Entry| {
             let opened = state.opened.get(entry.id.index()).and_then(Option::as_ref);
-            DeviceDetail::of(&entry.detail, opened, self.counters(entry.id).intervals.counts())
+            DeviceDetail::new(&entry.detail, opened, self.counters(entry.id).intervals.counts())
         };
         looked_at.map(detail).collect()
     }

@@ -37,7 +37,7 @@ pub struct DeviceDetail {
 
 impl DeviceDetail {
     /// Of an entry and, if it was opened, its newest incarnation.
-    pub(super) fn of(entry: &StaticDetail, opened: Option<&Provenance>, intervals: Vec<u64>) -> Self {
+    pub(super) fn new(entry: &StaticDetail, opened: Option<&Provenance>, intervals: Vec<u64>) -> Self {
         let StaticDetail { id, facts, channels } = entry;
         let mut facts = facts.clone();
         let mut controls = Vec::new();
@@ -72,7 +72,7 @@ pub(super) struct StaticDetail {
 }
 
 impl StaticDetail {
-    pub(super) fn of(device: &DeviceSpec) -> Self {
+    pub(super) fn new(device: &DeviceSpec) -> Self {
         let fact = |name: &str, value: String| (name.to_owned(), value);
         let mut facts = vec![fact("target", device.node.format())];
         if let Some(usb) = device.identity.usb() {

@@ -289,7 +289,7 @@ impl EpisodeReport {
         let sentence = format!(
             "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{sensors}{why}"
         );
-        Description::of(level, "episode", word, sentence).without(&format!("{word} "))
+        Description::new(level, "episode", word, sentence).without(&format!("{word} "))
     }
 }
 
@@ -315,7 +315,7 @@ pub struct Description {
 
 impl Description {
     /// An independent sentence that starts with neither `subject` nor `word`.
-    fn of(level: Level, subject: &str, word: &'static str, sentence: String) -> Self {
+    fn new(level: Level, subject: &str, word: &'static str, sentence: String) -> Self {
         Self { level, subject: subject.to_owned(), bit: None, word, sentence, detail: 0 }
     }
 
@@ -370,47 +370,47 @@ impl EventKind {
                 D::joined(state.level(), device, state.word(), ", ", &rest).with_bit(*bit)
             }
             Self::Unregistered { device, reason } => {
-                D::of(Level::Info, "device", "unregistered", format!("{device} not registered: {reason}"))
+                D::new(Level::Info, "device", "unregistered", format!("{device} not registered: {reason}"))
             }
             Self::Policy { policy, hash, hz, dry_run, library, .. } => {
                 let (word, dry) = if *dry_run { ("dry run", ", dry run: nothing moves") } else { ("loaded", "") };
                 let hash: String = hash.chars().take(HASH).collect();
                 let sentence = format!("policy {policy} loaded: {hz} Hz, hash {hash}, onnxruntime {library}{dry}");
-                D::of(Level::Info, "policy", word, sentence).without("policy ")
+                D::new(Level::Info, "policy", word, sentence).without("policy ")
             }
             Self::Chunk(chunk) => describe_chunk(chunk),
             Self::Hold(hold) => D::joined(Level::Warn, "policy", "holds", ": ", &hold.to_string()),
             Self::Act { tick } => D::joined(Level::Info, "policy", "acts", " ", &format!("from tick {tick}")),
             Self::PolicyEnd(end) => D::joined(Level::Info, "policy", "ended", ": ", &end.to_string()),
             Self::Recording { file } => {
-                D::of(Level::Info, "episode", "recording", format!("recording {}", file.display()))
+                D::new(Level::Info, "episode", "recording", format!("recording {}", file.display()))
                     .without("recording ")
             }
             Self::Episode(end) => end.describe(),
             Self::Discarded { file } => {
-                D::of(Level::Info, "episode", "discarded", format!("episode {} is in the trash", file.display()))
+                D::new(Level::Info, "episode", "discarded", format!("episode {} is in the trash", file.display()))
             }
             Self::Restored { file } => {
-                D::of(Level::Info, "episode", "restored", format!("episode {} is back", file.display()))
+                D::new(Level::Info, "episode", "restored", format!("episode {} is back", file.display()))
             }
             Self::Mark { text } => {
                 let text = if text.is_empty() { String::new() } else { format!(" {text:?}") };
-                D::of(Level::Info, "episode", "mark", format!("mark{text}"))
+                D::new(Level::Info, "episode", "mark", format!("mark{text}"))
             }
             // Data was lost before this run began.
-            Self::Recovered { text, .. } => D::of(Level::Warn, "episode", "repaired", text.clone()),
+            Self::Recovered { text, .. } => D::new(Level::Warn, "episode", "repaired", text.clone()),
             Self::DiskLow { folder, free, seconds } => {
                 let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
                 let folder = folder.display();
                 let sentence =
                     format!("{folder}: disk nearly full, {free} free: the episode will be closed in about {left}");
-                D::of(Level::Warn, "disk", "warn", sentence)
+                D::new(Level::Warn, "disk", "warn", sentence)
             }
             Self::ClockStep { seconds } => {
                 let (direction, by) = (if *seconds < 0.0 { "back" } else { "forward" }, seconds.abs());
                 let sentence =
                     format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are");
-                D::of(Level::Warn, "clock", "warn", sentence)
+                D::new(Level::Warn, "clock", "warn", sentence)
             }
             Self::Clock { device, bit, offset_ns, uncertainty_ns } => {
                 let (offset, within) = (*offset_ns as f64 / 1e9, *uncertainty_ns as f64 / 1e6);
@@ -420,16 +420,16 @@ impl EventKind {
             Self::Actuator { device, bit, arming, is_problem, text } => {
                 let prefix = format!("{device}: ");
                 let sentence = format!("{prefix}{text}");
-                D::of(warn_if(*is_problem), device, arming.word(), sentence).without(&prefix).with_bit(*bit)
+                D::new(warn_if(*is_problem), device, arming.word(), sentence).without(&prefix).with_bit(*bit)
             }
-            Self::Stop(stop) => D::of(warn_if(stop.is_problem()), &stop.stop, stop.word(), stop.sentence()),
+            Self::Stop(stop) => D::new(warn_if(stop.is_problem()), &stop.stop, stop.word(), stop.sentence()),
             Self::Publisher { topic, process, command } => {
                 let sentence = format!("another program publishes on {topic}: process {process} ({command}); end it");
-                D::of(Level::Warn, "bus", "warn", sentence)
+                D::new(Level::Warn, "bus", "warn", sentence)
             }
-            Self::Log { level, text } => D::of(*level, "log", level.word(), text.clone()),
+            Self::Log { level, text } => D::new(*level, "log", level.word(), text.clone()),
             Self::Printed { level, device, printed, text } => {
-                let described = D::of(*level, device, printed.word(), text.clone());
+                let described = D::new(*level, device, printed.word(), text.clone());
                 if text.starts_with(&format!("{device}: ")) {
                     described.without(&format!("{device}: "))
                 } else {
@@ -479,7 +479,7 @@ fn describe_chunk(chunk: &Chunk) -> Description {
         late => (Level::Warn, "late chunk", format!(", {late} actions too late")),
     };
     let sentence = format!("chunk of tick {}: {:.1} ms{late}, mask {}", chunk.tick, chunk.latency_ms, chunk.mask);
-    Description::of(level, "policy", word, sentence).without("chunk of ")
+    Description::new(level, "policy", word, sentence).without("chunk of ")
 }
 
 #[cfg(test)]

@@ -172,7 +172,7 @@ impl Outlook {
     }
 
     /// The most severe finding against a modality.
-    pub fn of(&self, modality: &str) -> Option<&Finding> {
+    pub fn finding(&self, modality: &str) -> Option<&Finding> {
         self.findings.iter().find(|finding| finding.modality.as_deref() == Some(modality))
     }
 }

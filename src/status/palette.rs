@@ -67,7 +67,7 @@ impl Palette {
     /// The palette for `out` in the environment of this process, by the conventions of <https://no-color.org> and
     /// <https://bixense.com/clicolors>: `NO_COLOR` takes precedence over `CLICOLOR_FORCE`, that over `CLICOLOR=0`, and
     /// that over the terminal, which must not be `TERM=dumb` or without a `TERM`.
-    pub fn of(out: &impl IsTerminal) -> Self {
+    pub fn for_output(out: &impl IsTerminal) -> Self {
         let can_show = || out.is_terminal() && anstyle_query::term_supports_ansi_color();
         // anstyle-query takes `0` as a request too.
         let is_forced = std::env::var_os("CLICOLOR_FORCE").is_some_and(|value| !value.is_empty() && value != "0");

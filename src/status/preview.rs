@@ -51,7 +51,7 @@ fn nothing() -> Arc<[u8]> {
 
 impl Preview {
     /// Of a published sample; `None` if its encoding is unknown or it is too large to be sent to a screen.
-    pub fn of(device: ModalityId, header: &SampleHeader, payload: &[u8]) -> Option<Self> {
+    pub fn from_sample(device: ModalityId, header: &SampleHeader, payload: &[u8]) -> Option<Self> {
         let encoding = Encoding::from_raw(header.encoding)?;
         (payload.len() <= LARGEST_PREVIEW).then(|| Self {
             device,
@@ -93,9 +93,9 @@ mod tests {
         let payload: Vec<u8> = [1.5_f64, -2.0].iter().flat_map(|number| number.to_le_bytes()).chain([9, 9]).collect();
         let header = SampleHeader { encoding: Encoding::F64 as u32, seq: 7, ..SampleHeader::default() };
         let id = ModalityId::new(3).unwrap();
-        let preview = Preview::of(id, &header, &payload).unwrap();
+        let preview = Preview::from_sample(id, &header, &payload).unwrap();
         assert_eq!((preview.numbers(), preview.seq, preview.bytes), (vec![1.5, -2.0], 7, 18));
-        assert_eq!(Preview::of(id, &SampleHeader { encoding: 77, ..header }, &payload), None);
+        assert_eq!(Preview::from_sample(id, &SampleHeader { encoding: 77, ..header }, &payload), None);
     }
 
     #[test]

@@ -49,7 +49,7 @@ impl Rates {
         for device in &snapshot.devices {
             let before = self.window.back().and_then(|last| last.streams.get(device.id.index())).copied();
             if let Some(stream) = streams.get_mut(device.id.index()) {
-                *stream = Stream::of(device, snapshot.taken, before);
+                *stream = Stream::new(device, snapshot.taken, before);
             }
         }
         let recorded = snapshot.recording.as_ref().map(|recording| (recording.file.clone(), recording.bytes));
@@ -116,7 +116,7 @@ impl Rates {
 }
 
 impl Stream {
-    fn of(device: &DeviceStatus, taken: Stamp, before: Option<Self>) -> Self {
+    fn new(device: &DeviceStatus, taken: Stamp, before: Option<Self>) -> Self {
         let changed = before.filter(|before| before.samples == device.samples).map_or(taken, |before| before.changed);
         Self { samples: device.samples, newest: device.newest.unwrap_or_default(), changed }
     }

@@ -24,7 +24,7 @@ impl Disk {
     ///
     /// # Errors
     /// When the file system does not answer.
-    pub fn of(file: &File) -> io::Result<Self> {
+    pub fn of_file(file: &File) -> io::Result<Self> {
         let stat = fstatvfs(file)?;
         Ok(Self {
             free: stat.f_bavail.saturating_mul(stat.f_frsize),

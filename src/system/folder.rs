@@ -48,7 +48,7 @@ pub enum Missing {
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
     /// A part of the path is a symbolic link that is not followed.
-    #[error("{}: a symbolic link{}, which is not followed here; name the real folder", path.display(), of(*owner))]
+    #[error("{}: a symbolic link{}, which is not followed here; name the real folder", path.display(), of_user(*owner))]
     Link {
         /// The link.
         path: PathBuf,
@@ -89,7 +89,7 @@ pub fn state_directory() -> Option<PathBuf> {
     })
 }
 
-fn of(owner: u32) -> String {
+fn of_user(owner: u32) -> String {
     if owner == rustix::process::geteuid().as_raw() { String::new() } else { format!(" of user {owner}") }
 }
 

@@ -67,7 +67,7 @@ impl Input {
     ///
     /// # Errors
     /// When it can no longer be read, as text for the user.
-    pub fn take(&mut self, report: &mut dyn FnMut(bool)) -> Result<(), String> {
+    pub fn drain(&mut self, report: &mut dyn FnMut(bool)) -> Result<(), String> {
         take_levels(&self.levels, &self.shown, report)
     }
 }
@@ -114,7 +114,7 @@ fn poll_levels(request: Request, line: u32, shown: String) -> io::Result<OwnedFd
     Ok(levels)
 }
 
-/// A line that is driven. Another process may hold it too: see [`Output::of`].
+/// A line that is driven. Another process may hold it too: see [`Output::from_descriptor`].
 #[derive(Debug)]
 pub struct Output(File);
 
@@ -134,11 +134,11 @@ impl Output {
     }
 
     /// A line that another process has opened, and keeps open for as long as this is.
-    pub fn of(descriptor: OwnedFd) -> Self {
+    pub fn from_descriptor(descriptor: OwnedFd) -> Self {
         Self(File::from(descriptor))
     }
 
-    /// The descriptor that another process needs for [`Self::of`].
+    /// The descriptor that another process needs for [`Self::from_descriptor`].
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }
@@ -202,7 +202,7 @@ mod tests {
 
     #[test]
     fn a_descriptor_that_is_not_a_line_cannot_be_set() {
-        let output = Output::of(File::open("/dev/null").unwrap().into());
+        let output = Output::from_descriptor(File::open("/dev/null").unwrap().into());
         assert!(output.set(true).is_err());
     }
 }

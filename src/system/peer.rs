@@ -25,7 +25,7 @@ impl Peer {
     ///
     /// # Errors
     /// When the kernel does not report it.
-    pub fn of(stream: &UnixStream) -> io::Result<Self> {
+    pub fn from_stream(stream: &UnixStream) -> io::Result<Self> {
         let mut found = libc::ucred { pid: 0, uid: 0, gid: 0 };
         let mut length = libc::socklen_t::try_from(size_of::<libc::ucred>()).unwrap_or_default();
         // SAFETY: both outlive the call, and `length` is the size of `found`, for which all bytes are valid.
@@ -47,7 +47,7 @@ impl Peer {
     /// Whether the process that created the other end of `stream` is a member of `group`, by its primary or another
     /// group (`SO_PEERGROUPS`, since Linux 4.13). No, where the kernel does not report it.
     pub fn is_member(stream: &UnixStream, group: u32) -> bool {
-        if Self::of(stream).is_ok_and(|peer| peer.group == group) {
+        if Self::from_stream(stream).is_ok_and(|peer| peer.group == group) {
             return true;
         }
         let mut groups = vec![0_u32; MOST_GROUPS];
@@ -80,7 +80,7 @@ pub enum ProcessState {
 
 impl ProcessState {
     /// The state of `process`, see proc(5).
-    pub fn of(process: u32) -> Self {
+    pub fn read(process: u32) -> Self {
         let stat = std::fs::read_to_string(format!("/proc/{process}/stat"));
         // The state follows the name in parentheses, which may contain anything.
         match stat.ok().as_deref().and_then(|stat| stat.rsplit_once(") ")?.1.bytes().next()) {
@@ -99,7 +99,7 @@ mod tests {
     fn the_other_end_of_a_pair_is_this_process() {
         let (one, _other) = UnixStream::pair().unwrap();
         let (user, group) = (rustix::process::geteuid().as_raw(), rustix::process::getegid().as_raw());
-        assert_eq!(Peer::of(&one).unwrap(), Peer { process: Some(std::process::id()), user, group });
+        assert_eq!(Peer::from_stream(&one).unwrap(), Peer { process: Some(std::process::id()), user, group });
         assert!(Peer::is_member(&one, group));
         for other in rustix::process::getgroups().unwrap() {
             assert!(Peer::is_member(&one, other.as_raw()));

@@ -97,7 +97,7 @@ pub(super) struct Server {
 struct ConnectionGuard(Rc<Server>);
 
 impl ConnectionGuard {
-    fn take(server: &Rc<Server>) -> Self {
+    fn new(server: &Rc<Server>) -> Self {
         server.connections.set(server.connections.get() + 1);
         Self(Rc::clone(server))
     }
@@ -143,7 +143,7 @@ impl Server {
                 continue;
             }
             // From now on, and not from when its task first runs.
-            let place = ConnectionGuard::take(self);
+            let place = ConnectionGuard::new(self);
             spawn_local(Rc::clone(self).connect(stream, peer, place));
         }
     }
@@ -172,19 +172,19 @@ impl Server {
             turns.tick().await;
             fault::point("web");
             if self.views.receiver_count() > 0 {
-                self.look();
+                self.update_views();
             } else {
                 self.rates.take();
             }
         }
     }
 
-    fn look(&self) {
+    fn update_views(&self) {
         let snapshot = self.board.snapshot();
         let mut rates = self.rates.borrow_mut();
         rates.update(&snapshot);
         // Its types have nothing that JSON refuses.
-        let text = text::json(&View::of(&snapshot, &rates, &self.board.cameras())).unwrap_or_default();
+        let text = text::json(&View::new(&snapshot, &rates, &self.board.cameras())).unwrap_or_default();
         self.views.send_if_modified(|view| {
             let is_new = **view != *text;
             if is_new {
@@ -254,7 +254,7 @@ impl Server {
 
     /// Views until the connection ends. A client that reads slowly gets fewer of them.
     fn events(self: &Rc<Self>, connection: &Rc<Connection>) -> Response<Outgoing> {
-        self.look();
+        self.update_views();
         let mut views = self.views.subscribe();
         views.mark_changed();
         let (to, frames) = mpsc::channel(1);

@@ -77,7 +77,7 @@ struct Warning<'a> {
 
 impl<'a> View<'a> {
     /// What is shown of this snapshot; `cameras` are the modalities whose samples are pictures.
-    pub(super) fn of(snapshot: &'a Snapshot, rates: &Rates, cameras: &[ModalityId]) -> Self {
+    pub(super) fn new(snapshot: &'a Snapshot, rates: &Rates, cameras: &[ModalityId]) -> Self {
         let session = snapshot.session.as_ref();
         let phase = session.map(|session| session.phase).unwrap_or_default();
         let is_current = matches!(phase, Phase::Recording | Phase::Ending);
@@ -171,7 +171,7 @@ mod tests {
     use std::time::Duration;
 
     fn shown(snapshot: &Snapshot) -> serde_json::Value {
-        serde_json::to_value(View::of(snapshot, &Rates::default(), &[id(0), id(1)])).unwrap()
+        serde_json::to_value(View::new(snapshot, &Rates::default(), &[id(0), id(1)])).unwrap()
     }
 
     #[test]

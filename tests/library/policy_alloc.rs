@@ -105,13 +105,13 @@ fn a_tick_does_not_allocate() {
         if let Some(asked) = asked.take_if(|asked| number - *asked > number % 3) {
             match number % 5 {
                 0 => pilot.queue.failed(asked),
-                1 => drop(pilot.queue.take(asked, &wild)),
-                _ => drop(pilot.queue.take(asked, &chunk)),
+                1 => drop(pilot.queue.accept_chunk(asked, &wild)),
+                _ => drop(pilot.queue.accept_chunk(asked, &chunk)),
             }
         }
         // Late by a while at times.
         let now = at(number).after(Duration::from_millis(number % 7));
-        if pilot.look(number, at(number), now) {
+        if pilot.observe(number, at(number), now) {
             pilot.fill(number, at(number), &mut request);
             asked = Some(number);
         }
@@ -144,7 +144,7 @@ fn composing_a_chunk_and_steps_far_apart_do_not_allocate() {
             pilot.observer.push(registry.devices[device].id, header, payload);
         });
         pilot.mask = PhysicalMask(0b111);
-        if pilot.look(number, at(number), at(number)) {
+        if pilot.observe(number, at(number), at(number)) {
             pilot.fill(number, at(number), &mut request);
             // Some samples of the arm are too short for a pose.
             let _ = pilot.answer(&request, &output);
@@ -171,7 +171,7 @@ fn a_history_with_gaps_does_not_allocate() {
             pilot.observer.push(registry.devices[device].id, header, payload);
         });
         pilot.mask = PhysicalMask(if number % 16 < 12 { 0b111 } else { 0b101 });
-        let _ = pilot.look(number, at(number), at(number));
+        let _ = pilot.observe(number, at(number), at(number));
         // Every step of the history is of every tick at some time.
         pilot.fill(number, at(number), &mut request);
         for step in 0..request.steps(1) {
@@ -258,7 +258,7 @@ fn keeping_a_sample_does_not_allocate() {
     (0..begin).for_each(|number| push(number, true));
     assert_eq!(allocations(|| (begin..begin + TICKS).for_each(|number| push(number, false))), 0);
     let last = begin + TICKS - 1;
-    assert!(observer.look(last, at(last), at(last), PhysicalMask(0b111)).is_some(), "nothing was kept");
+    assert!(observer.observe(last, at(last), at(last), PhysicalMask(0b111)).is_some(), "nothing was kept");
 }
 
 #[test]
@@ -274,7 +274,7 @@ fn a_step_of_the_horizon_never_allocates() {
             let asked = queue.wants_observation(tick, situation);
             let _ = queue.step(tick, situation);
             if asked {
-                let _ = queue.take(tick, &chunk);
+                let _ = queue.accept_chunk(tick, &chunk);
             }
         }
     });

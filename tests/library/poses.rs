@@ -90,7 +90,7 @@ fn run(bundle: &Bundle) -> (Vec<f32>, Vec<f32>, Vec<Vec<f32>>) {
     let mut executed = Vec::new();
     for tick in 0..6 {
         push(&mut pilot, &registry, tick);
-        let wants = pilot.look(tick, at(tick), at(tick));
+        let wants = pilot.observe(tick, at(tick), at(tick));
         if tick < 3 {
             pilot.queue.failed(tick);
             continue;
@@ -189,7 +189,7 @@ fn an_answer_without_a_rotation_is_not_executed() {
     let mut output = vec![0.0; bundle.horizon * bundle.action.outputs()];
     for (tick, expected) in [(0, ChunkError::NoBase), (1, ChunkError::NotFinite)] {
         push(&mut pilot, &registry, tick);
-        assert!(pilot.look(tick, at(tick), at(tick)));
+        assert!(pilot.observe(tick, at(tick), at(tick)));
         pilot.fill(tick, at(tick), &mut request);
         // The arm of the task has four numbers, and no rotation.
         let refused = pilot.answer(&request, &output);
@@ -226,7 +226,7 @@ fn relative_poses_of_a_policy_become_targets_that_lead_to_them() {
     let start = [0.3, 0.2, 1.2, -0.4, 1.0, 0.5, 0.0];
     let mut numbers = sample(&start);
     let mut tip = [0.0; 8];
-    effector.look(&numbers, &mut tip);
+    effector.update(&numbers, &mut tip);
     numbers.extend(tip);
     let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
     let header = SampleHeader { encoding: Encoding::F64 as u32, ..SampleHeader::default() };

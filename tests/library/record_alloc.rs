@@ -37,7 +37,7 @@ fn encoding_and_synchronising_do_not_allocate() {
     let mut once = |n: u64| {
         let at = Stamp(n * 33_000_000);
         let header = SampleHeader { seq: n, capture_ns: at.0, encoding: Encoding::Mjpeg as u32, ..Default::default() };
-        encode::sample(&mut out, SampleSchema::of(&header, &payload), at.0, "cam", &header, &payload);
+        encode::sample(&mut out, SampleSchema::for_sample(&header, &payload), at.0, "cam", &header, &payload);
         sync.push(ID, SyncSample { capture: at, recv: at, seq: n, epoch: Epoch(1), keep: () });
         encode::mask(&mut out, at.0, PhysicalMask(1), n);
         let observation = sync.observe(at, at, PhysicalMask(1));
@@ -116,7 +116,7 @@ async fn only_chunks_allocate() {
         form: None,
         action: None,
         hooks: rapid_registry::Hooks::default(),
-        verdict: rapid_registry::VerdictSpec::of(
+        verdict: rapid_registry::VerdictSpec::defaults(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),

@@ -90,7 +90,7 @@ fn defaults_match_the_documentation() {
     let device = &registry.devices[0];
     assert_eq!((device.topic.as_str(), device.depth, device.max_bytes), ("/rapid/camera/cam", 60, 640 * 480 * 2));
     assert_eq!(device.stall_after.as_millis(), 500);
-    assert_eq!(device.verdict, VerdictSpec::of(ModalityKind::Image, device.stall_after, Some(30.0)));
+    assert_eq!(device.verdict, VerdictSpec::defaults(ModalityKind::Image, device.stall_after, Some(30.0)));
     assert_eq!((registry.rig.name.as_str(), registry.rig.observation_hz), ("rig", 30.0));
     assert_eq!(registry.rig.sync_window.as_millis(), 25);
     assert_eq!((registry.rig.cooldown.as_secs(), registry.rig.memory_budget), (2, 512 << 20));

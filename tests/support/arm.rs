@@ -60,7 +60,7 @@ pub(crate) fn arm_of(joints: &[(&str, &str)], more: &str) -> Arm {
     );
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let motors = declared(&names, more);
-    Arm::of(motors.effector.as_deref().expect("an effector"), &motors.motors, &urdf).expect("it fits")
+    Arm::from_urdf(motors.effector.as_deref().expect("an effector"), &motors.motors, &urdf).expect("it fits")
 }
 
 /// A sample of the motors at these positions.

@@ -32,7 +32,7 @@ fn the_result_names_what_it_includes_and_the_line_to_write() {
          In /etc/rapid/devices.toml, under [device.cam]:\n\n    \
              latency = \"48ms\"\n"
     );
-    let led = Chosen::of(Some("ACT".as_ref())).unwrap();
+    let led = Chosen::from_option(Some("ACT".as_ref())).unwrap();
     assert!(matches!(&led, Chosen::Led(folder) if folder.as_os_str() == "/sys/class/leds/ACT"));
     let text = printed(ESTIMATE, &led, 0, "36500us");
     assert!(

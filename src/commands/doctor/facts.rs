@@ -202,7 +202,7 @@ fn limits(root: &Path) -> (Option<u64>, Option<u64>) {
 #[cfg(feature = "motors")]
 pub(super) fn query_can(interfaces: &mut [Interface]) {
     for interface in interfaces {
-        if let Ok(seen) = netlink::look(&interface.name) {
+        if let Ok(seen) = netlink::read_interface(&interface.name) {
             (interface.bitrate, interface.bus_off) = (seen.bitrate, seen.bus_off);
         }
     }

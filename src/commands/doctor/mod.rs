@@ -62,7 +62,7 @@ fn report(facts: &Facts, registry: Result<&Registry, &str>, format: Format, out:
     match format {
         Format::Json => {
             for device in &facts.usb {
-                let line = Line::of(device, names(device));
+                let line = Line::new(device, names(device));
                 writeln!(out, "{}", text::json(&line).map_err(io::Error::from)?)?;
             }
             for finding in &findings {
@@ -138,7 +138,7 @@ struct Line<'a> {
 }
 
 impl<'a> Line<'a> {
-    fn of(device: &'a UsbDevice, entries: Vec<&'a str>) -> Self {
+    fn new(device: &'a UsbDevice, entries: Vec<&'a str>) -> Self {
         Self {
             event: "usb",
             port: &device.port,

@@ -51,7 +51,7 @@ pub(super) fn read(
     let mut bits: Vec<u8> = found.iter().filter_map(|device| position(&device.name)).collect();
     let mut entries = Vec::new();
     for device in &found {
-        let reader = Reader::of(device, node, attached);
+        let reader = Reader::for_device(device, node, attached);
         // A device that cannot be used yet keeps its bit, and gets no new one.
         let free = || free_bit(target.registry.as_ref(), &bits).filter(|_| reader.is_ok());
         let bit = position(&device.name).or_else(free);
@@ -69,7 +69,7 @@ struct Reader {
 
 impl Reader {
     /// The driver and settings of a device, or why they are unknown.
-    fn of(device: &Foreign, node: Option<&str>, attached: &[Attachment]) -> Result<Self, String> {
+    fn for_device(device: &Foreign, node: Option<&str>, attached: &[Attachment]) -> Result<Self, String> {
         if let Some(service) = &device.service {
             let Some((_, protocol)) = PROTOCOLS.iter().find(|(known, _)| known == service) else {
                 return Err(format!("it is found by mDNS ({service}), whose protocol is unknown"));

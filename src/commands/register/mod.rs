@@ -125,7 +125,7 @@ pub async fn register(
         let entries = import::read(file, args.layout.as_deref(), args.node.as_deref(), attached, target)?;
         return commit(target, &entries, &[], talk.as_mut(), args, format, out);
     }
-    let module = args.module.as_deref().map(|name| Mounting::of(name, args, target)).transpose()?;
+    let module = args.module.as_deref().map(|name| Mounting::new(name, args, target)).transpose()?;
     let module = match module {
         Some(Mounting { entry: None, text, .. }) => {
             return commit(target, &[], &[text], talk.as_mut(), args, format, out);
@@ -183,7 +183,7 @@ struct Mounting {
 
 impl Mounting {
     /// Of this type. `--name` is the name of the module and of its sensor.
-    fn of(name: &str, args: &RegisterArgs, target: &Target) -> Result<Self, RegisterError> {
+    fn new(name: &str, args: &RegisterArgs, target: &Target) -> Result<Self, RegisterError> {
         let descriptor = modules::descriptor(name)?;
         let registry = target.registry.as_ref();
         let module = args.name.clone().unwrap_or_else(|| descriptor.name.clone());
@@ -454,7 +454,7 @@ async fn read(spec: &DeviceSpec, node: &DeviceNode) -> String {
     while stats.samples < ENOUGH {
         match timeout_at(begun + READING, driver.read()).await {
             Err(_) => break,
-            Ok(Ok(reading)) => stats.take(reading.encoding, reading.bytes, (reading.width, reading.height)),
+            Ok(Ok(reading)) => stats.add(reading.encoding, reading.bytes, (reading.width, reading.height)),
             Ok(Err(error)) => return format!("Test: {description}: {error}"),
         }
     }
@@ -469,7 +469,7 @@ struct SampleStats {
 }
 
 impl SampleStats {
-    fn take(&mut self, encoding: Encoding, bytes: &[u8], (width, height): (u32, u32)) {
+    fn add(&mut self, encoding: Encoding, bytes: &[u8], (width, height): (u32, u32)) {
         if self.samples == 0 {
             self.first = match encoding {
                 Encoding::F64 => {

@@ -17,12 +17,12 @@ fn a_disarm_without_an_actuator_is_remembered_until_a_newer_arm() {
     assert!(!permission.disarm(at(1)));
     let attended = permission.attend();
     assert!(!is_armed(&attended).unwrap());
-    assert_eq!(attended.take().count(), 0);
+    assert_eq!(attended.take_pending().count(), 0);
     // Given before the disarm arrived.
     assert_eq!(permission.arm(at(1), at(1)), Err(ArmRefused::Overtaken));
-    assert_eq!(attended.take().count(), 0);
+    assert_eq!(attended.take_pending().count(), 0);
     assert_eq!(permission.arm(Stamp(at(1).0 + 1), at(2)), Ok(()));
-    assert_eq!(attended.take().collect::<Vec<_>>(), [Arm]);
+    assert_eq!(attended.take_pending().collect::<Vec<_>>(), [Arm]);
 }
 
 #[test]
@@ -33,11 +33,11 @@ fn an_arm_that_is_too_old_or_early_or_without_an_actuator_does_nothing() {
     assert!(!is_armed(&attended).unwrap());
     assert_eq!(permission.arm(at(1), at(3)), Err(ArmRefused::Old(Duration::from_secs(2))));
     assert_eq!(permission.arm(at(4), at(3)), Err(ArmRefused::Early));
-    assert_eq!(attended.take().count(), 0);
+    assert_eq!(attended.take_pending().count(), 0);
     assert_eq!(permission.arm(at(2), at(3)), Ok(()));
     drop(attended);
     // Intended for the one that was unplugged.
-    assert_eq!(permission.attend().take().count(), 0);
+    assert_eq!(permission.attend().take_pending().count(), 0);
 }
 
 /// Whether it is armed as at its plug.
@@ -81,7 +81,7 @@ fn a_stop_during_the_arm_at_the_first_plug_is_given_after_it() {
             if order == Arm {
                 stop(&permission);
                 // The thread that carries orders out takes the stop before the arm reaches it.
-                attended.take().for_each(drop);
+                attended.take_pending().for_each(drop);
             }
             given.push(order);
             Ok::<_, ()>(())
@@ -117,11 +117,11 @@ proptest! {
                 expected = false;
             }
             if looks {
-                attended.take().for_each(|order| is_armed = order == Arm);
+                attended.take_pending().for_each(|order| is_armed = order == Arm);
                 prop_assert_eq!(is_armed, expected);
             }
         }
-        attended.take().for_each(|order| is_armed = order == Arm);
+        attended.take_pending().for_each(|order| is_armed = order == Arm);
         prop_assert_eq!(is_armed, expected);
     }
 }
@@ -133,7 +133,7 @@ fn a_disarm_wins_against_a_concurrent_arm() {
         let attended = permission.attend();
         let given = Stamp::now();
         concurrently(|| permission.arm(given, Stamp::now()), || permission.disarm(Stamp::now()));
-        assert_eq!(attended.take().last(), Some(Disarm));
+        assert_eq!(attended.take_pending().last(), Some(Disarm));
     }
 }
 
@@ -167,7 +167,7 @@ fn an_arm_is_refused_with_the_reason_until_every_input_runs() {
     let refused = permission.arm(at(6), at(6)).unwrap_err().to_string();
     assert_eq!(refused, "emergency stop door is pressed: release it, then arm again");
     let door = Order::Emergency(Trip { stop: 2, is_lost: false });
-    assert_eq!(attended.take().collect::<Vec<_>>(), [door, Disarm]);
+    assert_eq!(attended.take_pending().collect::<Vec<_>>(), [door, Disarm]);
 }
 
 #[test]
@@ -178,7 +178,7 @@ fn an_arm_given_before_a_trip_is_void_even_if_the_input_runs_again() {
     permission.report(0, InputState::Lost, at(3));
     permission.report(0, InputState::Runs, at(4));
     assert_eq!(permission.arm(at(3), at(4)), Err(ArmRefused::Overtaken));
-    assert_eq!(attended.take().collect::<Vec<_>>(), [Order::Emergency(Trip { stop: 0, is_lost: true })]);
+    assert_eq!(attended.take_pending().collect::<Vec<_>>(), [Order::Emergency(Trip { stop: 0, is_lost: true })]);
     assert_eq!(permission.arm(at(4), at(4)), Ok(()));
 }
 
@@ -199,7 +199,7 @@ fn an_arm_at_the_first_plug_is_refused_too_and_does_not_wait_for_an_input() {
         let attended = permission.attend();
         assert_eq!(is_armed(&attended).ok(), expected, "{reports:?}");
         all_run(&permission);
-        assert_eq!((is_armed(&attended), attended.take().count()), (Ok(false), 0), "once");
+        assert_eq!((is_armed(&attended), attended.take_pending().count()), (Ok(false), 0), "once");
     }
 }
 
@@ -221,7 +221,7 @@ proptest! {
             if let Some(input) = states.get_mut(what) {
                 *input = state;
                 let is_news = permission.report(what, state, Stamp(now));
-                let orders: Vec<Order> = attended.take().collect();
+                let orders: Vec<Order> = attended.take_pending().collect();
                 is_armed = orders.iter().fold(is_armed, |_, order| *order == Arm);
                 if state == InputState::Runs {
                     prop_assert!(!orders.contains(&Arm) || is_given, "an input alone arms nothing");
@@ -244,7 +244,7 @@ proptest! {
                 permission.disarm(Stamp(now));
             }
             if looks {
-                is_armed = attended.take().fold(is_armed, |_, order| order == Arm);
+                is_armed = attended.take_pending().fold(is_armed, |_, order| order == Arm);
                 is_given = false;
             }
             prop_assert!(!is_armed || states.iter().all(|state| *state == InputState::Runs));
@@ -291,7 +291,7 @@ fn a_trip_wins_against_a_concurrent_arm() {
             || permission.arm(given, Stamp::now()),
             || permission.report(0, InputState::Stopped, Stamp::now()),
         );
-        let orders: Vec<Order> = attended.take().collect();
+        let orders: Vec<Order> = attended.take_pending().collect();
         assert_eq!(orders, [Order::Emergency(Trip { stop: 0, is_lost: false })]);
     }
 }

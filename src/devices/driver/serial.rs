@@ -483,10 +483,10 @@ impl Framer {
             Framing::Cobs => 0,
         };
         let Some(end) = bytes.iter().position(|&byte| byte == delimiter) else {
-            self.take(bytes);
+            self.append(bytes);
             return (bytes.len(), Cut::Open);
         };
-        self.take(&bytes[..end]);
+        self.append(&bytes[..end]);
         (end + 1, self.finish())
     }
 
@@ -521,7 +521,7 @@ impl Framer {
         (count, if self.complete { Cut::Message } else { Cut::Open })
     }
 
-    fn take(&mut self, bytes: &[u8]) {
+    fn append(&mut self, bytes: &[u8]) {
         if !self.aligned || self.overlong {
             return;
         }

@@ -141,7 +141,7 @@ impl Sim {
     /// # Errors
     /// When the description of the arm that its motors move does not fit them.
     pub(super) fn with_node(mut self, spec: &NodeSpec) -> Result<Self, DriverError> {
-        if let (Some(records), Content::Values { seed, .. }) = (Records::of(spec), &self.content) {
+        if let (Some(records), Content::Values { seed, .. }) = (Records::for_node(spec), &self.content) {
             self.content = Content::Records { records, seed: *seed };
             self.payload.reserve(CAN_RECORD);
         }
@@ -149,7 +149,7 @@ impl Sim {
             self.controls = camera.controls.iter().cloned().collect();
         }
         if let NodeSpec::Can(can) = spec {
-            self.joints = Joints::of(can)?;
+            self.joints = Joints::from_spec(can)?;
         }
         self.agreed = Agreed { description: self.description(), negotiated: self.negotiated() };
         Ok(self)
@@ -354,7 +354,7 @@ enum Records {
 
 impl Records {
     /// The samples of a device of this kind; `None` if it sends pictures or numbers.
-    fn of(node: &NodeSpec) -> Option<Self> {
+    fn for_node(node: &NodeSpec) -> Option<Self> {
         match node {
             _ if node.modality_kind() != ModalityKind::Bytes => None,
             #[cfg(feature = "motors")]

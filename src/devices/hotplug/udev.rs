@@ -45,7 +45,7 @@ impl Ask {
     pub const NOTHING: Self = Self { models: BTreeSet::new(), formats: |_| Vec::new() };
 
     /// What a run with these entries asks.
-    pub fn of(registry: &Registry, formats: fn(&Path) -> Vec<String>) -> Self {
+    pub fn from_registry(registry: &Registry, formats: fn(&Path) -> Vec<String>) -> Self {
         let streams = registry.devices.iter().filter(|device| registry.shares_unit(device));
         Self {
             models: streams.filter_map(|device| device.identity.usb()).map(|usb| (usb.vid, usb.pid)).collect(),
@@ -88,7 +88,7 @@ impl UdevMonitor {
         Ok(())
     }
 
-    fn take(&mut self, event: &udev::Event, source: UnplugSource) -> Result<(), HotplugError> {
+    fn handle_event(&mut self, event: &udev::Event, source: UnplugSource) -> Result<(), HotplugError> {
         let (sequence, now) = (event.sequence_number(), Stamp::now());
         match event.event_type() {
             EventType::Remove => {
@@ -125,7 +125,7 @@ impl UdevMonitor {
                 continue;
             };
             drop(guard);
-            self.take(&event, source)?;
+            self.handle_event(&event, source)?;
         }
     }
 }

@@ -25,8 +25,8 @@ impl Gpio {
         self.input.fd()
     }
 
-    pub(super) fn take(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
+    pub(super) fn drain(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
         let on_while_high = self.on_while_high;
-        self.input.take(&mut |is_high| report(0, is_high == on_while_high))
+        self.input.drain(&mut |is_high| report(0, is_high == on_while_high))
     }
 }

@@ -61,7 +61,7 @@ impl Keys {
         self.device.as_fd()
     }
 
-    pub(super) fn take(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
+    pub(super) fn drain(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
         let Self { device, shown, wanted } = self;
         let fail = |error: std::io::Error| not_opened(shown, "input", &error);
         match device.fetch_events() {

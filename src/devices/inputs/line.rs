@@ -48,7 +48,7 @@ impl Lines {
         Ok(Self { fd, shown, words: Words::new(specs) })
     }
 
-    pub(super) fn take(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
+    pub(super) fn drain(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
         self.words.begin(report);
         let mut bytes = [0; 256];
         // A flooded port must not delay the thread at the end of the run.

@@ -53,7 +53,7 @@ pub enum InputGroup {
 
 impl InputGroup {
     /// The place of one input.
-    pub fn of(input: &InputSpec) -> Self {
+    pub fn from_spec(input: &InputSpec) -> Self {
         match input.clone() {
             InputSpec::Key(key) => Self::Keys(vec![key]),
             InputSpec::Gpio(gpio) => Self::Gpio(gpio),
@@ -82,7 +82,7 @@ impl InputGroup {
         for (index, input) in inputs.enumerate() {
             match all.iter_mut().find_map(|(place, own)| place.add(input).then_some(own)) {
                 Some(own) => own.push(index),
-                None => all.push((Self::of(input), vec![index])),
+                None => all.push((Self::from_spec(input), vec![index])),
             }
         }
         all

@@ -44,15 +44,15 @@ impl InputSource {
     /// without waiting.
     /// # Errors
     /// When it can no longer be read, as text for the user.
-    pub(super) fn take(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
+    pub(super) fn drain(&mut self, report: &mut dyn FnMut(usize, bool)) -> Result<(), String> {
         match self {
-            Self::Keys(keys) => keys.take(report),
-            Self::Gpio(gpio) => gpio.take(report),
-            Self::Lines(lines) => lines.take(report),
+            Self::Keys(keys) => keys.drain(report),
+            Self::Gpio(gpio) => gpio.drain(report),
+            Self::Lines(lines) => lines.drain(report),
         }
     }
 
-    /// How long after a call of [`Self::take`] the next one is due at the latest; `None` where it cannot be queried.
+    /// How long after a call of [`Self::drain`] the next one is due at the latest; `None` where it cannot be queried.
     pub(super) const fn look_after(&self) -> Option<Duration> {
         match self {
             Self::Keys(_) => Some(key::LOOK),

@@ -56,7 +56,7 @@ impl Tap {
     }
 
     /// A sample has arrived.
-    pub fn look(&self, encoding: Encoding, bytes: &[u8]) {
+    pub fn feed(&self, encoding: Encoding, bytes: &[u8]) {
         let tap = &*self.0;
         let Some(value) = (encoding == Encoding::F64).then(|| number(bytes, tap.index)).flatten() else {
             self.lose("its sample does not hold the number");

@@ -74,7 +74,7 @@ fn follow(source: &mut InputSource, report: &dyn Report, stop: &OwnedFd) -> Opti
     let mut is_silent = false;
     loop {
         let mut has_reported = false;
-        let taken = source.take(&mut |which, is_on| {
+        let taken = source.drain(&mut |which, is_on| {
             has_reported = true;
             report.level(which, is_on);
         });

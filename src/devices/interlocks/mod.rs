@@ -22,7 +22,7 @@ use crate::inputs::tap::Tap;
 use crate::inputs::{InputGroup, Readers, Report};
 
 /// The stops of a registry, none of which runs.
-pub fn of(registry: &Registry) -> Interlocks {
+pub fn from_registry(registry: &Registry) -> Interlocks {
     Interlocks::new(registry.stops.iter().map(|stop| (stop.name.as_str(), stop.kind)))
 }
 
@@ -53,7 +53,7 @@ impl Watched {
                 board: Arc::clone(board),
                 is_ending: Arc::clone(&watched.is_ending),
             };
-            let place = InputGroup::of(&spec.input);
+            let place = InputGroup::from_spec(&spec.input);
             if let InputGroup::Field(field) = &place {
                 // Before any sample can come.
                 input.lost(&format!("no sample of {} has come", field.device));

@@ -44,7 +44,7 @@ struct Run {
 fn run(stops: &str) -> Run {
     let registry = Registry::parse(&format!("{DEVICES}{stops}"), None).unwrap().registry;
     let board = Arc::new(Board::new(&registry));
-    let permission = Arc::new(Permission::new(false).with_interlocks(of(&registry)));
+    let permission = Arc::new(Permission::new(false).with_interlocks(from_registry(&registry)));
     let attended = permission.attend();
     let events = board.events();
     let reported = Reported::nothing(&registry);
@@ -75,7 +75,7 @@ impl Run {
     }
 
     fn orders(&self) -> Vec<Order> {
-        self.attended.take().collect()
+        self.attended.take_pending().collect()
     }
 
     /// The words of the announcements since the last call.
@@ -189,7 +189,7 @@ fn a_number_of_a_stream_stops_by_value_by_silence_and_by_the_end_of_its_stream()
     let taps: Arc<[Tap]> = run.watched.taps().into();
     assert_eq!(taps[0].device(), "buttons");
     let bytes = |value: f64| [9.0_f64.to_le_bytes(), value.to_le_bytes()].concat();
-    let look = |value: f64| taps[0].look(Encoding::F64, &bytes(value));
+    let look = |value: f64| taps[0].feed(Encoding::F64, &bytes(value));
     // Until the stop has settled.
     let run_again = |run: &Run| {
         let end = Instant::now() + PATIENCE;
@@ -215,7 +215,7 @@ fn a_number_of_a_stream_stops_by_value_by_silence_and_by_the_end_of_its_stream()
     // Not a number, missing, or not of the stream.
     for bytes in [bytes(f64::NAN), bytes(1.0)[..15].to_vec(), Vec::new()] {
         run_again(&run);
-        taps[0].look(Encoding::F64, &bytes);
+        taps[0].feed(Encoding::F64, &bytes);
         assert_eq!(run.orders(), [Order::Disarm]);
     }
     run_again(&run);

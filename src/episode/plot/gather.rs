@@ -38,7 +38,7 @@ pub(super) struct Span {
 }
 
 impl Span {
-    pub(super) fn of(report: &Inspection) -> Self {
+    pub(super) fn from_report(report: &Inspection) -> Self {
         // A file without messages has no length.
         Self { begin_ns: report.begin_ns, seconds: report.seconds.max(1e-3) }
     }
@@ -133,7 +133,7 @@ impl Timeline {
         }
     }
 
-    pub(super) fn take(&mut self, item: &Item<'_>) {
+    pub(super) fn add(&mut self, item: &Item<'_>) {
         let Item::Message(message) = item else { return };
         let Some(share) = self.span.share(message.log_time) else { return };
         let bin = part(share, BINS);
@@ -176,7 +176,7 @@ impl Timeline {
     fn sample(&mut self, subject: Subject, message: &Message<'_>, share: f64, bin: usize) {
         let row = self.rows.entry(subject).or_insert_with(|| Row::new(message.channel.topic.clone()));
         let before = row.numbers.missing;
-        row.numbers.take(message.sequence);
+        row.numbers.add(message.sequence);
         add(&mut row.samples, bin, 1);
         add(&mut row.missing, bin, u32::try_from(row.numbers.missing - before).unwrap_or(u32::MAX));
         let is_picture =
@@ -191,7 +191,7 @@ impl Timeline {
             let (width, height) = (sample.width, sample.height);
             let taken = Picture { encoding: sample.encoding, width, height, bytes: sample.payload };
             if taken.encoding.is_picture() {
-                *picture = self.thumbnails.of(&taken, share);
+                *picture = self.thumbnails.make(&taken, share);
             }
         }
     }

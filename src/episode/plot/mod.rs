@@ -41,11 +41,11 @@ pub fn plot(path: &Path, noted: Option<&EpisodeEntry>) -> Result<Plot, ReadError
     let report = inspect::inspect(path)?;
     // A file of another program has no modalities: then its topics are drawn.
     let every_topic = report.modalities.is_empty() && report.verdict == Judgement::NotOurs;
-    let mut timeline = Timeline::new(Span::of(&report), every_topic);
+    let mut timeline = Timeline::new(Span::from_report(&report), every_topic);
     match Reader::open(path) {
         Ok(mut reader) => {
             while reader.advance()? {
-                timeline.take(&reader.item());
+                timeline.add(&reader.item());
             }
         }
         // The recorder's mark that it failed is all there is.

@@ -97,7 +97,7 @@ fn the_picture_is_bounded_and_escaped_whatever_is_in_the_file() {
     };
     for seconds in [3600.0, 0.0, 1e300, 4e-4] {
         report.seconds = seconds;
-        let mut timeline = Timeline::new(Span::of(&report), false);
+        let mut timeline = Timeline::new(Span::from_report(&report), false);
         timeline.rows = (0..64).filter_map(ModalityId::new).map(|id| (Subject::Modality(id), row())).collect();
         timeline.marks = (0..200).map(|at| Mark { share: f64::from(at) / 200.0, text: HOSTILE.to_owned() }).collect();
         let svg = draw::draw(&report, &timeline, Some(&noted));

@@ -34,7 +34,7 @@ pub(super) struct Thumbnails {
 
 impl Thumbnails {
     /// Of a picture captured at `share`; `None` if it is damaged.
-    pub(super) fn of(&mut self, picture: &Picture<'_>, share: f64) -> Option<Thumbnail> {
+    pub(super) fn make(&mut self, picture: &Picture<'_>, share: f64) -> Option<Thumbnail> {
         if u64::from(picture.width) * u64::from(picture.height) > LARGEST {
             return None;
         }
@@ -93,7 +93,7 @@ mod tests {
         let (width, height) = (640_u32, 320_u32);
         let bytes: Vec<u8> = (0..width * height).map(|at| if at % width < width / 2 { 0 } else { 255 }).collect();
         let picture = Picture { encoding: Encoding::Grey, width, height, bytes: &bytes };
-        let thumbnail = Thumbnails::default().of(&picture, 0.5).unwrap();
+        let thumbnail = Thumbnails::default().make(&picture, 0.5).unwrap();
         assert!((thumbnail.aspect - 2.0).abs() < 1e-9 && thumbnail.jpeg.len() < 4000, "{thumbnail:?}");
         let mut pixels = Pixels::default();
         let again = Picture { encoding: Encoding::Mjpeg, width: 176, height: 88, bytes: &thumbnail.jpeg };
@@ -101,9 +101,9 @@ mod tests {
         let at = |x: usize| pixels.values()[CHANNELS * (176 * 44 + x)];
         assert!(at(40) < 8 && at(140) > 247, "{} {}", at(40), at(140));
         let cut = Picture { bytes: &bytes[1..], ..picture };
-        assert!(Thumbnails::default().of(&cut, 0.5).is_none());
+        assert!(Thumbnails::default().make(&cut, 0.5).is_none());
         let huge = Picture { width: 8000, height: 8000, ..picture };
-        assert!(Thumbnails::default().of(&huge, 0.5).is_none());
+        assert!(Thumbnails::default().make(&huge, 0.5).is_none());
     }
 
     #[test]

@@ -29,7 +29,7 @@ pub(super) struct Announced {
 
 /// Announces new faults, at most once a second per modality; at the end all that are left. `announced` has an entry per
 /// modality.
-pub(super) fn look(
+pub(super) fn announce_faults(
     announced: &mut [Announced],
     measures: &Measures,
     registry: &Registry,

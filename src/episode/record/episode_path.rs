@@ -128,7 +128,7 @@ fn claim(folder: &Folder, out: &Path, name: &str) -> io::Result<Option<(File, Pa
         made => made?,
     };
     let (finished, partial) = (out.join(name), out.join(partial));
-    let is_ours = matches!(partial::take(&file, &partial)?, Lock::Ours | Lock::Unknown);
+    let is_ours = matches!(partial::lock(&file, &partial)?, Lock::Ours | Lock::Unknown);
     Ok(is_ours.then_some((file, finished, partial)))
 }
 

@@ -78,7 +78,7 @@ struct Latch {
 }
 
 impl Latch {
-    fn take<T>(&mut self, work: impl FnOnce(&mut dyn Sink) -> io::Result<T>) -> io::Result<T> {
+    fn run<T>(&mut self, work: impl FnOnce(&mut dyn Sink) -> io::Result<T>) -> io::Result<T> {
         if self.shut.load(Ordering::Relaxed) {
             return Err(io::Error::other("given up after an error"));
         }
@@ -92,19 +92,19 @@ impl Latch {
 
 impl Write for Latch {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let taken = self.take(|sink| sink.write(bytes))?;
+        let taken = self.run(|sink| sink.write(bytes))?;
         self.written.fetch_add(taken as u64, Ordering::Relaxed);
         Ok(taken)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.take(|sink| sink.flush())
+        self.run(|sink| sink.flush())
     }
 }
 
 impl Sink for Latch {
     fn sync(&mut self) -> io::Result<()> {
-        self.take(|sink| sink.sync())
+        self.run(|sink| sink.sync())
     }
 }
 
@@ -187,7 +187,7 @@ impl EpisodeFile {
             let (channels, form, derived) = ([None; SampleSchema::COUNT], device.form.clone(), Vec::new());
             let mut track = Track { name, topic, metadata, channels, form, derived, message, newest };
             track.channel(&mut file.writer, SampleSchema::expected(device))?;
-            for derived in Derived::of(device) {
+            for derived in Derived::for_device(device) {
                 let metadata = channel::of_derived(device, *derived);
                 let channel = add_channel(&mut file.writer, derived.schema(), &derived.topic(device), &metadata)?;
                 track.derived.push((*derived, channel));
@@ -209,7 +209,7 @@ impl EpisodeFile {
     /// Writes a sample; one of a modality that is not registered is not written.
     pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) -> io::Result<()> {
         let Some(Some(track)) = self.tracks.get_mut(id.index()) else { return Ok(()) };
-        let schema = SampleSchema::of(header, payload);
+        let schema = SampleSchema::for_sample(header, payload);
         let channel = track.channel(&mut self.writer, schema)?;
         let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
         track.newest = Some(encode::sample(&mut track.message, schema, log_time, &track.name, header, payload));
@@ -237,7 +237,7 @@ impl EpisodeFile {
 
     /// Writes an action, if the registry has an actuator for it.
     pub(super) fn action(&mut self, header: &SampleHeader, payload: &[u8]) -> io::Result<()> {
-        let schema = SampleSchema::of(header, payload);
+        let schema = SampleSchema::for_sample(header, payload);
         let Some(channel) = self.action.filter(|_| schema == SampleSchema::Scalars) else { return Ok(()) };
         let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
         encode::sample(&mut self.message, schema, log_time, "", header, payload);
@@ -313,7 +313,7 @@ impl EpisodeFile {
     pub(super) fn flush(&mut self) -> io::Result<()> {
         self.writer.flush().map_err(io_error)?;
         let written = self.written.load(Ordering::Relaxed);
-        self.tampering.look(written)
+        self.tampering.check(written)
     }
 
     /// Ends the file with the summary and waits for the disk. A file that is dropped instead, or

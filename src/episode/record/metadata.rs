@@ -163,7 +163,7 @@ pub(super) const CONFIGURATION: &str = "configuration";
 
 impl Configuration {
     /// With the declared modules and tags, and the mask of the beginning.
-    pub(super) fn of(registry: &Registry, report: &[String], tags: &[(String, String)], mask: PhysicalMask) -> Self {
+    pub(super) fn new(registry: &Registry, report: &[String], tags: &[(String, String)], mask: PhysicalMask) -> Self {
         let is_present = |name: &String| registry.named(name).is_some_and(|device| mask.contains(device.id));
         let mut found = Self {
             modules: Vec::new(),
@@ -215,7 +215,7 @@ mod tests {
         let of = |report: &[&str], tags: &[(&str, &str)], mask| {
             let report: Vec<String> = report.iter().map(|name| (*name).to_owned()).collect();
             let tags: Vec<_> = tags.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
-            let found = Configuration::of(&registry, &report, &tags, PhysicalMask(mask));
+            let found = Configuration::new(&registry, &report, &tags, PhysicalMask(mask));
             let tags: Vec<String> = found.tags.iter().map(|(key, value)| format!("{key}={value}")).collect();
             format!("{} | {} | {}", found.modules.join(" "), found.present.join(" "), tags.join(" "))
         };
@@ -232,7 +232,7 @@ mod tests {
         let mounts = "[module.straight]\nslot = \"top\"\ntags = [\"wrist=straight\"]\ndevices = [\"cam_wrist\"]\n\
             [module.angled]\nslot = \"top\"\ntags = [\"wrist=angled\"]\ndevices = [\"cam_wrist\"]\n";
         let registry = Registry::parse(&format!("{}{mounts}", rapid_registry::BUILTIN), None).unwrap().registry;
-        let of = |report: &[String]| Configuration::of(&registry, report, &[], PhysicalMask(0b001)).modules;
+        let of = |report: &[String]| Configuration::new(&registry, report, &[], PhysicalMask(0b001)).modules;
         assert_eq!(of(&[]), Vec::<String>::new());
         assert_eq!(of(&["angled".to_owned()]), ["angled"]);
     }

@@ -30,7 +30,7 @@ use rapid_core::time::{Stamp, WallClock};
 use rapid_registry::{DeviceSpec, ModuleSpec, Registry};
 use rapid_status::{Board, EpisodeReport, Event, EventKind, Level, Outlook, RecordingStatus};
 
-use super::announce::{Announced, look};
+use super::announce::{Announced, announce_faults};
 use super::episode_path::{self, EpisodePath, EpisodeRequest};
 use super::file::EpisodeFile;
 use super::hole::Hole;
@@ -121,7 +121,7 @@ impl OpenEpisode {
         let Beginning { registry, board, request, path, sink, attached, clock, begin, shown, references } = beginning;
         let units = Units::new(attached);
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, bits, _)| bits.mask);
-        let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
+        let configuration = Configuration::new(&registry, &request.modules, &request.tags, mask);
         for (named, sensed) in &configuration.contradicted {
             let text =
                 format!("module {named} was named, but the sensor in its slot is of {sensed}: recorded as {sensed}");
@@ -133,7 +133,7 @@ impl OpenEpisode {
         let is_mounted = |module: &&ModuleSpec| configuration.modules.contains(&module.name);
         file.transforms(registry.modules.iter().filter(is_mounted), begin)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
-        let mut measures = Measures::new(&Measured::all(&registry), Frames::of(&registry, begin, settle));
+        let mut measures = Measures::new(&Measured::all(&registry), Frames::new(&registry, begin, settle));
         for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {
             measures.plugged(device.id, begin.0, true);
         }
@@ -240,12 +240,12 @@ impl OpenEpisode {
     }
 
     pub(super) fn event(&mut self, event: &Event) {
-        self.units.take(event);
+        self.units.apply(event);
         if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {
             return;
         }
         // An event that is not valid JSON is dropped; it is no reason to lose the episode.
-        let report = match Report::of(event) {
+        let report = match Report::new(event) {
             Ok(report) => report,
             Err(error) => {
                 tracing::error!(%error, ?event, "an event is not recorded");
@@ -276,7 +276,7 @@ impl OpenEpisode {
             self.write_frame(masks);
         }
         self.measures.settle();
-        look(&mut self.announced, &self.measures, &self.registry, &self.board, now, false);
+        announce_faults(&mut self.announced, &self.measures, &self.registry, &self.board, now, false);
     }
 
     /// Fixes the end of the episode, if it is not fixed to an earlier moment.
@@ -337,7 +337,7 @@ impl OpenEpisode {
         while self.failed.is_none() && self.next_tick < ticks {
             self.write_frame(masks);
         }
-        look(&mut self.announced, &self.measures, &self.registry, &self.board, now, true);
+        announce_faults(&mut self.announced, &self.measures, &self.registry, &self.board, now, true);
         let seconds = end.since(self.begin).as_secs_f64();
         let messages = self.file.messages;
         let dropped = self.measures.dropped();

@@ -36,7 +36,7 @@ struct Incarnation {
 pub(super) struct Attached(Units);
 
 impl Attached {
-    pub(super) fn take(&mut self, event: &Event) {
+    pub(super) fn apply(&mut self, event: &Event) {
         let Self(units) = self;
         match &event.what {
             EventKind::Detach { device, .. } => drop(units.serials.remove(device)),
@@ -46,7 +46,7 @@ impl Attached {
                 if let EventKind::Opened { device, .. } = what {
                     units.epochs.remove(device);
                 }
-                units.take(event);
+                units.apply(event);
             }
         }
     }
@@ -71,7 +71,7 @@ impl Units {
         attached.0.clone()
     }
 
-    pub(super) fn take(&mut self, event: &Event) {
+    pub(super) fn apply(&mut self, event: &Event) {
         match &event.what {
             EventKind::Attach { device, unit, .. } => {
                 drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)));
@@ -183,7 +183,7 @@ mod tests {
     fn each_epoch_of_an_episode_names_its_unit() {
         let mut attached = Attached::default();
         for event in [attach(1_000, "A"), open(8_000, 1, "A"), state(8_100, DeviceState::Streaming)] {
-            attached.take(&event);
+            attached.apply(&event);
         }
         let mut units = Units::new(&attached);
         for event in [
@@ -195,7 +195,7 @@ mod tests {
             // The end of the second was not reported: the third implies it.
             open(16_500, 3, "B"),
         ] {
-            units.take(&event);
+            units.apply(&event);
         }
         let epochs = units.epochs(BEGIN);
         let report: Vec<_> = epochs["cam"]
@@ -240,16 +240,16 @@ mod tests {
         let end = Event { stamp: Stamp(0), what: end };
         let mut attached = Attached::default();
         assert_eq!(Units::new(&attached).policy(), None);
-        attached.take(&policy("before"));
+        attached.apply(&policy("before"));
         let mut units = Units::new(&attached);
         let reported = |name: &str| Some(json!({"name": name, "hash": "ff", "dry_run": true}));
         assert_eq!(units.policy(), reported("before"));
         // It ran, although it has ended.
-        units.take(&end);
+        units.apply(&end);
         assert_eq!(units.policy(), reported("before"));
-        units.take(&policy("within"));
+        units.apply(&policy("within"));
         assert_eq!(units.policy(), reported("within"));
-        attached.take(&end);
+        attached.apply(&end);
         assert_eq!(Units::new(&attached).policy(), None, "it ended before the episode");
     }
 
@@ -257,7 +257,7 @@ mod tests {
     fn epochs_that_ended_before_the_episode_are_not_in_it() {
         let mut attached = Attached::default();
         for event in [attach(1_000, "A"), open(2_000, 1, "A"), state(3_000, DeviceState::Failed)] {
-            attached.take(&event);
+            attached.apply(&event);
         }
         let units = Units::new(&attached);
         assert_eq!((units.epochs(BEGIN), units.serials()), (json!({}), json!({"cam": "A"})));

@@ -70,7 +70,7 @@ pub(super) struct Frames {
 
 impl Frames {
     /// The frames of an episode that begins at `begin`; each waits for its window and for `settle`.
-    pub(super) fn of(registry: &Registry, begin: Stamp, settle: Duration) -> Self {
+    pub(super) fn new(registry: &Registry, begin: Stamp, settle: Duration) -> Self {
         let window = registry.rig.sync_window;
         Self { begin_ns: begin.0, hz: registry.rig.observation_hz, window, wait: window + settle }
     }
@@ -292,7 +292,7 @@ impl Measures {
         let known = self.presence.is_known();
         let plugged = plugged.time(&self.presence, id, self.begin_ns, end_ns);
         let mut runs = meter.runs;
-        meter.repeats.iter().for_each(|repeat| runs.take(*repeat, &self.presence, id));
+        meter.repeats.iter().for_each(|repeat| runs.add(*repeat, &self.presence, id));
         let present = self.presence.time(id, self.begin_ns, end_ns) as f64 / 1e9;
         Some(Quality {
             frozen_samples: runs.longest.samples,
@@ -328,7 +328,7 @@ impl ModalityMeters {
             self.longest_gap_ns = self.longest_gap_ns.max(gap);
         }
         for repeat in self.meter.repeats.drain(..) {
-            self.meter.runs.take(repeat, presence, self.measured.id);
+            self.meter.runs.add(repeat, presence, self.measured.id);
         }
     }
 }
@@ -373,7 +373,7 @@ pub(super) struct Runs {
 
 impl Runs {
     /// The time of an absence does not count, whatever came before and after it.
-    fn take(&mut self, repeat: Repeat, presence: &PresenceHistory, id: ModalityId) {
+    fn add(&mut self, repeat: Repeat, presence: &PresenceHistory, id: ModalityId) {
         let Some((from, to)) = repeat else {
             self.newest = Run::default();
             return;

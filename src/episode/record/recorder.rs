@@ -134,7 +134,7 @@ impl RecorderConfig {
             registry,
             board,
             sink: Box::new(|file| Box::new(file)),
-            disk: Box::new(Disk::of),
+            disk: Box::new(Disk::of_file),
             clock: Box::new(WallClock::now),
             begin: Box::new(Stamp::now),
             shown: None,
@@ -405,7 +405,8 @@ impl Writer {
         // Read before the drain: samples received by then are taken by it.
         let now = Stamp::now();
         let Self { streams, open, .. } = self;
-        let drained = source.drain(&mut |topic, header, payload| streams.take(open.as_mut(), topic, header, payload));
+        let drained =
+            source.drain(&mut |topic, header, payload| streams.receive(open.as_mut(), topic, header, payload));
         if let Err(error) = drained {
             self.complain_about_bus(&error);
         }
@@ -425,7 +426,7 @@ impl Writer {
         loop {
             match self.events.try_recv() {
                 Ok(event) => {
-                    self.attached.take(&event);
+                    self.attached.apply(&event);
                     if let Some(open) = &mut self.open {
                         open.event(&event);
                     }
@@ -541,7 +542,7 @@ impl Writer {
     }
 
     fn watch_space(&mut self, now: Stamp) {
-        let found = self.space.as_mut().and_then(|space| space.look(now, &mut self.config.disk));
+        let found = self.space.as_mut().and_then(|space| space.check(now, &mut self.config.disk));
         let Some((found, open)) = found.zip(self.open.as_ref()) else { return };
         match found {
             Finding::Low { free, left } => {
@@ -565,7 +566,7 @@ impl Writer {
         }
         self.clock_looked = now;
         let now = (self.config.clock)();
-        if let Some(step_ns) = self.clock.look(now) {
+        if let Some(step_ns) = self.clock.detect_step(now) {
             if self.open.is_none() {
                 self.in_force.send_replace(now);
             }

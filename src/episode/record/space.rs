@@ -135,8 +135,8 @@ impl Space {
         }
     }
 
-    /// Looks, at most every [`LOOK_EVERY`].
-    pub(super) fn look(&mut self, now: Stamp, ask: &mut Asker) -> Option<Finding> {
+    /// Checks the room, at most every [`LOOK_EVERY`].
+    pub(super) fn check(&mut self, now: Stamp, ask: &mut Asker) -> Option<Finding> {
         if now.since(self.looked) < LOOK_EVERY {
             return None;
         }
@@ -286,7 +286,7 @@ mod tests {
     #[test]
     fn reserved_space_lies_after_the_end_and_is_released() {
         let file = Arc::new(tempfile::tempfile().unwrap());
-        let mut ask: Asker = Box::new(Disk::of);
+        let mut ask: Asker = Box::new(Disk::of_file);
         let blocks = |file: &File| fstat(file).unwrap().st_blocks;
         let space = Space::begin(Arc::clone(&file), Path::new("."), Some(0), Stamp(0), &mut ask).unwrap();
         assert_eq!(fstat(&file).unwrap().st_size, 0);

@@ -21,7 +21,7 @@ use crate::chunk_writer::Sink;
 /// Who sees what a rig sends, in the order of time.
 pub trait Taker {
     /// A sample, a publication of the mask, or an action.
-    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]);
+    fn receive(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]);
     /// An event.
     fn event(&mut self, event: &Event);
 }
@@ -89,12 +89,12 @@ impl Stepped {
 }
 
 impl Taker for Stepped {
-    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
-        self.streams.take(self.open.as_mut(), topic, header, payload);
+    fn receive(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        self.streams.receive(self.open.as_mut(), topic, header, payload);
     }
 
     fn event(&mut self, event: &Event) {
-        self.attached.take(event);
+        self.attached.apply(event);
         if let Some(open) = &mut self.open {
             open.event(event);
         }

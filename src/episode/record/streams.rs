@@ -26,7 +26,7 @@ impl Streams {
     }
 
     /// Takes a sample, for `open` too if there is one.
-    pub(super) fn take(
+    pub(super) fn receive(
         &mut self,
         open: Option<&mut OpenEpisode>,
         topic: TopicId,

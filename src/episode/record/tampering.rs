@@ -64,7 +64,7 @@ impl FileWatch {
     ///
     /// # Errors
     /// When another program cut, extended or replaced it; the text is the reason.
-    pub(super) fn look(&mut self, written: u64) -> io::Result<()> {
+    pub(super) fn check(&mut self, written: u64) -> io::Result<()> {
         let is = fstat(&self.file)?;
         let size = u64::try_from(is.st_size).unwrap_or(0);
         if size < written {
@@ -90,7 +90,7 @@ impl FileWatch {
     /// # Errors
     /// When it is not; the text is the reason.
     pub(super) fn verify(mut self, written: u64) -> io::Result<()> {
-        self.look(written)?;
+        self.check(written)?;
         if !self.was_opened {
             return Ok(());
         }

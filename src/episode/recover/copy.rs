@@ -38,7 +38,7 @@ pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut ProgressFn<'_>) 
     let mut summary = Summary::default();
     while let Some(record) = records.next().map_err(|error| file.error(error))? {
         if let Some(entry) = Entry::read(record) {
-            summary.take(&entry);
+            summary.add(&entry);
         }
         file.done.set(records.integrity().bytes);
     }
@@ -66,7 +66,7 @@ pub(super) fn copy(
             copy.writer.part().map_err(|error| Error::Write(io_error(error)))?;
         }
         copy.writer.belong(records.episode());
-        copy.take(records.record())?;
+        copy.write(records.record())?;
         file.done.set(records.integrity().bytes);
     }
     let integrity = records.integrity();
@@ -175,7 +175,7 @@ impl<S: Sink> Copy<S> {
     }
 
     /// Writes a record; an invalid one is counted.
-    fn take(&mut self, record: Record<'_>) -> Result<(), Error> {
+    fn write(&mut self, record: Record<'_>) -> Result<(), Error> {
         let Some(entry) = Entry::read(record) else {
             self.refused += 1;
             return Ok(());
@@ -205,7 +205,7 @@ impl<S: Sink> Copy<S> {
         };
         match written {
             Ok(()) => {
-                self.summary.take(&entry);
+                self.summary.add(&entry);
                 Ok(())
             }
             Err(

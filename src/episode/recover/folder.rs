@@ -50,14 +50,14 @@ pub fn finished(folder: &Path) -> io::Result<Vec<PathBuf>> {
 /// When it cannot be read, or `watch` ends it.
 pub fn is_damaged(path: &Path, watch: &mut ProgressFn<'_>) -> Result<bool, RecoverError> {
     let (file, size) = crate::open(path)?;
-    let failed = Failed::of(&file, size).map_err(|source| super::io_of(path, source))?;
+    let failed = Failed::read(&file, size).map_err(|source| super::io_of(path, source))?;
     let source = LockedFile { path, file, size, failed };
     let Some(known) = source.read(watch)? else { return Ok(false) };
     if source.failed.is_none() && known.is_whole() {
         return Ok(false);
     }
     let sha256 = source.sha256(watch)?;
-    Ok(source.repaired(&Names::of(path), &sha256, watch)?.is_none())
+    Ok(source.repaired(&Names::for_path(path), &sha256, watch)?.is_none())
 }
 
 fn entries(folder: &Path, ending: &[u8]) -> io::Result<Vec<DirEntry>> {
@@ -132,7 +132,7 @@ fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Bo
         let path = entry.path();
         let size = metadata.map_or(0, |metadata| metadata.len());
         let room = |size| {
-            let disk = File::open(folder).and_then(|folder| Disk::of(&folder)).ok()?;
+            let disk = File::open(folder).and_then(|folder| Disk::of_file(&folder)).ok()?;
             disk.lacks_room_beside_an_episode(size, reserve).then_some(disk.free)
         };
         let refused = |free| {

@@ -201,8 +201,8 @@ pub fn recover(path: &Path, watch: &mut ProgressFn<'_>) -> Result<Recovered, Rec
         return Err(RecoverError::NotFile(path.to_owned()));
     }
     let (file, _) = crate::open(path)?;
-    let names = Names::of(path);
-    match partial::take(&file, path).map_err(io)? {
+    let names = Names::for_path(path);
+    match partial::lock(&file, path).map_err(io)? {
         Lock::Ours => {}
         Lock::Others => return Err(RecoverError::Busy(path.to_owned())),
         Lock::Gone => return Err(io(io::ErrorKind::NotFound.into())),
@@ -212,7 +212,7 @@ pub fn recover(path: &Path, watch: &mut ProgressFn<'_>) -> Result<Recovered, Rec
     }
     // From here on no other program writes it.
     let size = file.metadata().map_err(io)?.len();
-    let failed = Failed::of(&file, size).map_err(io)?;
+    let failed = Failed::read(&file, size).map_err(io)?;
     let mut source = LockedFile { path, file, size, failed };
     let outcome = if names.is_partial { source.partial(&names, watch) } else { source.finished(&names, watch) };
     outcome.map(|outcome| Recovered { file: path.to_owned(), outcome })

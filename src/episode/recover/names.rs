@@ -25,7 +25,7 @@ pub(super) struct Names {
 }
 
 impl Names {
-    pub(super) fn of(path: &Path) -> Self {
+    pub(super) fn for_path(path: &Path) -> Self {
         let name = path.file_name().unwrap_or_default();
         // Names need not be UTF-8.
         let partial = name.as_bytes().strip_suffix(PARTIAL.as_bytes()).and_then(|name| name.strip_suffix(b"."));
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn repaired_files_get_names_beside_the_original() {
-        let names = Names::of(Path::new("out/20261121_t_003.mcap.partial"));
+        let names = Names::for_path(Path::new("out/20261121_t_003.mcap.partial"));
         assert!(names.is_partial);
         assert_eq!(names.finished, Path::new("out/20261121_t_003.mcap"));
         assert_eq!(names.recovering, Path::new("out/20261121_t_003.mcap.recovering"));
@@ -122,7 +122,7 @@ mod tests {
             ("a.b.mcap", "a.b.recovered.mcap", "a.b.recovered-2.mcap"),
             ("a.partial", "a.partial.recovered.mcap", "a.partial.recovered-2.mcap"),
         ] {
-            let names = Names::of(Path::new(file));
+            let names = Names::for_path(Path::new(file));
             assert!(!names.is_partial);
             assert_eq!(names.finished, Path::new(first));
             let candidates: Vec<_> = names.candidates().take(2).collect();

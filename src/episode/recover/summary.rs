@@ -59,7 +59,7 @@ pub(super) struct Channel {
 }
 
 impl Summary {
-    pub(super) fn take(&mut self, entry: &Entry<'_>) {
+    pub(super) fn add(&mut self, entry: &Entry<'_>) {
         match entry {
             Entry::Channel { id, topic, metadata, .. } => {
                 let channel =

@@ -65,7 +65,7 @@ impl Deadman {
     }
 
     /// What to do at `now`, at this action period.
-    pub fn look(&self, now: Stamp, period: Duration) -> Verdict {
+    pub fn verdict(&self, now: Stamp, period: Duration) -> Verdict {
         let holds_from = self.fresh.map_or(self.armed, |fresh| fresh.after(self.patience(period)));
         if self.fresh.is_some() && now < holds_from {
             Verdict::Follow

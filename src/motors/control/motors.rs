@@ -169,7 +169,7 @@ impl MotorBus {
 
     /// The oldest notice that was not taken yet.
     pub fn take_notice(&mut self) -> Option<Notice> {
-        self.notices.take()
+        self.notices.pop()
     }
 
     /// The brakes that must be released after the last step, one bit per motor; all others must be engaged.
@@ -234,7 +234,7 @@ impl MotorBus {
             return;
         };
         let Some(motor) = self.motors.get_mut(index) else { return };
-        let taken = motor.take(frame, reply.as_ref(), now, &mut self.notices);
+        let taken = motor.feed(frame, reply.as_ref(), now, &mut self.notices);
         // At once: the next report of a motor must not mask it.
         if self.state != BusState::Stopped
             && let Some(fault) = taken.err().or_else(|| self.judge(index))
@@ -278,7 +278,7 @@ impl MotorBus {
     /// a joint that is armed, or being armed, cannot be driven.
     pub fn feed_brakes(&mut self, brakes: Brakes, now: Stamp) {
         for (index, motor) in self.motors.iter_mut().enumerate() {
-            motor.take_brake(brakes.of(index), now, &mut self.notices);
+            motor.take_brake(brakes.state(index), now, &mut self.notices);
         }
         let broken = self.motors.iter().position(|motor| motor.brake.is_broken()).filter(|_| self.is_arming());
         if let Some(motor) = broken {

@@ -102,14 +102,14 @@ impl Arm {
     pub fn open(spec: &EffectorSpec, motors: &[MotorSpec]) -> Result<Self, ArmError> {
         let file = &spec.urdf;
         let text = read(file).map_err(|source| ArmError::File { file: file.clone(), source })?;
-        Self::of(spec, motors, &text)
+        Self::from_urdf(spec, motors, &text)
     }
 
     /// The same of a description that is at hand.
     ///
     /// # Errors
     /// When it has other joints than there are motors.
-    pub fn of(spec: &EffectorSpec, motors: &[MotorSpec], urdf: &str) -> Result<Self, ArmError> {
+    pub fn from_urdf(spec: &EffectorSpec, motors: &[MotorSpec], urdf: &str) -> Result<Self, ArmError> {
         let chain = Chain::read(urdf, spec.frame.as_deref(), &spec.tip);
         let chain = chain.map_err(|source| ArmError::Chain { file: spec.urdf.clone(), source })?;
         let mismatch = |message: String| ArmError::Names { file: spec.urdf.clone(), message };

@@ -19,7 +19,7 @@ fn motors(more: &str) -> DamiaoSpec {
 
 fn arm(more: &str) -> Arm {
     let motors = motors(more);
-    Arm::of(motors.effector.as_deref().expect("an effector"), &motors.motors, URDF).expect("it fits")
+    Arm::from_urdf(motors.effector.as_deref().expect("an effector"), &motors.motors, URDF).expect("it fits")
 }
 
 const SEVEN: [(&str, &str); 7] =
@@ -241,7 +241,8 @@ fn no_joint_jumps_on_a_circle() {
 fn a_description_that_does_not_fit_is_refused_by_name() {
     let motors = motors(DOWN);
     let effector = motors.effector.as_deref().expect("an effector");
-    let refused = |spec: &EffectorSpec, urdf: &str| Arm::of(spec, &motors.motors, urdf).expect_err(urdf).to_string();
+    let refused =
+        |spec: &EffectorSpec, urdf: &str| Arm::from_urdf(spec, &motors.motors, urdf).expect_err(urdf).to_string();
     let with = |tip: &str, frame: Option<&str>| EffectorSpec {
         tip: tip.to_owned(),
         frame: frame.map(str::to_owned),

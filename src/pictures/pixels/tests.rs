@@ -37,7 +37,7 @@ struct Apart {
 
 impl Apart {
     /// Decoded `found` compared with `expected`, both red, green and blue of each pixel, row by row.
-    fn of(found: &[u8], expected: &[u8], [height, width]: [usize; 2]) -> Self {
+    fn between(found: &[u8], expected: &[u8], [height, width]: [usize; 2]) -> Self {
         assert_eq!(found.len(), expected.len());
         let differences = found.iter().zip(expected).enumerate().map(|(at, (found, expected))| {
             let pixel = at / CHANNELS;
@@ -88,12 +88,12 @@ fn pictures_differ_from_those_of_training_by_no_more_than_documented() {
         let mut pixels = Pixels::default();
         let [height, width] = size.map(|side| u32::try_from(side).unwrap());
         pixels.decode(&Picture { encoding: Encoding::Mjpeg, width, height, bytes: &jpeg }).unwrap();
-        let found = Apart::of(pixels.values(), rgb, size);
+        let found = Apart::between(pixels.values(), rgb, size);
         println!("{name}: {found:?}");
         assert!(found.is_within(&bound), "{name}: {found:?}, not within {bound:?}");
         // The check can fail: one pixel further to the right nothing fits.
         let moved = [&rgb[rgb.len() - CHANNELS..], &rgb[..rgb.len() - CHANNELS]].concat();
-        let found = Apart::of(pixels.values(), &moved, size);
+        let found = Apart::between(pixels.values(), &moved, size);
         assert!(found.inside > bound.inside && found.share > bound.share, "{name}: {found:?}");
     }
 }

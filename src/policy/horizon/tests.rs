@@ -53,7 +53,7 @@ fn at(queue: &mut ActionQueue, tick: u64, situation: Situation) -> Result<f32, H
 /// One tick in which each request is answered at once.
 fn lockstep(queue: &mut ActionQueue, tick: u64, situation: Situation) -> Result<f32, HoldReason> {
     if queue.wants_observation(tick, situation) {
-        queue.take(tick, &chunk(tick)).unwrap();
+        queue.accept_chunk(tick, &chunk(tick)).unwrap();
     }
     at(queue, tick, situation)
 }
@@ -72,7 +72,7 @@ fn the_old_chunk_bridges_the_time_until_the_new_one_arrives() {
     let mut queue = queue();
     assert!(queue.wants_observation(0, FRESH));
     assert_eq!(at(&mut queue, 0, FRESH), Err(HoldReason::Waiting));
-    assert_eq!(queue.take(0, &chunk(0)), Ok(0), "one tick is what computing takes");
+    assert_eq!(queue.accept_chunk(0, &chunk(0)), Ok(0), "one tick is what computing takes");
     assert!(!queue.wants_observation(1, FRESH));
     assert_eq!(at(&mut queue, 1, FRESH), Ok(2.0));
     assert_eq!(at(&mut queue, 2, FRESH), Ok(3.0));
@@ -80,7 +80,7 @@ fn the_old_chunk_bridges_the_time_until_the_new_one_arrives() {
     assert_eq!(at(&mut queue, 3, FRESH), Ok(4.0), "beyond n_action_steps");
     assert!(!queue.wants_observation(4, FRESH), "one is with the policy");
     assert_eq!(at(&mut queue, 4, FRESH), Ok(5.0));
-    assert_eq!(queue.take(3, &chunk(3)), Ok(1), "late, and used from the action of the tick");
+    assert_eq!(queue.accept_chunk(3, &chunk(3)), Ok(1), "late, and used from the action of the tick");
     let step = queue.step(5, FRESH);
     assert_eq!((step.action, step.index, step.chunk_age_ticks), (Some(&[303.0, 0.5][..]), Some(3), Some(2)));
     let counts = queue.counts();
@@ -96,7 +96,7 @@ fn a_chunk_with_nan_or_infinity_is_dropped_whole() {
             if queue.wants_observation(tick, FRESH) {
                 let mut values = chunk(tick);
                 *values.last_mut().unwrap() = bad;
-                assert_eq!(queue.take(tick, &values), Err(ChunkError::NotFinite));
+                assert_eq!(queue.accept_chunk(tick, &values), Err(ChunkError::NotFinite));
             }
             assert_eq!(at(&mut queue, tick, FRESH), Ok((1 + tick) as f32), "the old one continues");
         }
@@ -109,11 +109,11 @@ fn a_chunk_with_nan_or_infinity_is_dropped_whole() {
 #[test]
 fn a_chunk_of_another_length_or_tick_is_not_used() {
     let mut queue = queue();
-    assert_eq!(queue.take(0, &chunk(0)), Err(ChunkError::Unasked));
+    assert_eq!(queue.accept_chunk(0, &chunk(0)), Err(ChunkError::Unasked));
     assert!(queue.wants_observation(0, FRESH));
-    assert_eq!(queue.take(7, &chunk(7)), Err(ChunkError::Unasked));
+    assert_eq!(queue.accept_chunk(7, &chunk(7)), Err(ChunkError::Unasked));
     assert_eq!(queue.in_flight, Some(0));
-    assert_eq!(queue.take(0, &chunk(0)[1..]), Err(ChunkError::Length));
+    assert_eq!(queue.accept_chunk(0, &chunk(0)[1..]), Err(ChunkError::Length));
     assert_eq!(queue.in_flight, None);
     let counts = queue.counts();
     assert_eq!((counts.unasked_chunks, counts.wrong_length_chunks, counts.chunks), (2, 1, 0));
@@ -138,7 +138,7 @@ fn a_chunk_without_remaining_actions_is_dropped() {
     for tick in 0..5 {
         assert_eq!(at(&mut queue, tick, FRESH), Err(HoldReason::Waiting));
     }
-    assert_eq!(queue.take(0, &chunk(0)), Err(ChunkError::Expired));
+    assert_eq!(queue.accept_chunk(0, &chunk(0)), Err(ChunkError::Expired));
     assert_eq!(queue.counts().expired_chunks, 1);
     // With one tick less its last action would have been executed.
     let mut queue = self::queue();
@@ -146,7 +146,7 @@ fn a_chunk_without_remaining_actions_is_dropped() {
     for tick in 0..4 {
         assert_eq!(at(&mut queue, tick, FRESH), Err(HoldReason::Waiting));
     }
-    assert_eq!(queue.take(0, &chunk(0)), Ok(3));
+    assert_eq!(queue.accept_chunk(0, &chunk(0)), Ok(3));
     assert_eq!(at(&mut queue, 4, FRESH), Ok(5.0));
     assert_eq!(queue.counts().skipped_actions, 3);
 }
@@ -159,7 +159,7 @@ fn values_beyond_the_limits_are_clamped_and_reported_once_a_chunk() {
         let mut values = chunk(tick);
         values[3] = 1.5;
         values[4] = -7.0;
-        queue.take(tick, &values).unwrap();
+        queue.accept_chunk(tick, &values).unwrap();
         let step = queue.step(tick, FRESH);
         assert_eq!((step.action.unwrap()[1], step.clamped_is_news), (1.0, true));
         let step = queue.step(tick + 1, FRESH);
@@ -213,7 +213,7 @@ fn without_a_required_modality_it_holds_at_once_and_drops_its_chunk() {
     // It is back, and the chunk of tick 0 has actions for tick 3.
     assert!(queue.wants_observation(3, FRESH));
     assert_eq!(at(&mut queue, 3, FRESH), Err(HoldReason::Waiting));
-    queue.take(3, &chunk(3)).unwrap();
+    queue.accept_chunk(3, &chunk(3)).unwrap();
     assert_eq!(at(&mut queue, 4, FRESH), Ok(302.0));
     assert_eq!((queue.counts().holds, queue.counts().held_ticks), (1, 3));
 }
@@ -228,7 +228,7 @@ fn a_request_from_before_a_hold_is_not_executed_after_it() {
     assert!(queue.wants_observation(3, FRESH));
     assert!(at(&mut queue, 3, FRESH).is_ok());
     assert_eq!(at(&mut queue, 4, seen(NO_CAM)), Err(HoldReason::RequiredMissing));
-    assert_eq!(queue.take(3, &chunk(3)), Err(ChunkError::BeforeHold));
+    assert_eq!(queue.accept_chunk(3, &chunk(3)), Err(ChunkError::BeforeHold));
     assert_eq!(queue.counts().before_hold_chunks, 1);
     assert_eq!(lockstep(&mut queue, 5, FRESH), Ok(501.0));
 }
@@ -240,7 +240,7 @@ fn a_modality_that_leaves_during_a_wait_restarts_the_wait() {
     assert_eq!(at(&mut queue, 0, FRESH), Err(HoldReason::Waiting));
     assert_eq!(at(&mut queue, 1, seen(NO_CAM)), Err(HoldReason::RequiredMissing));
     assert_eq!(at(&mut queue, 2, FRESH), Err(HoldReason::Waiting));
-    assert_eq!(queue.take(0, &chunk(0)), Err(ChunkError::BeforeHold));
+    assert_eq!(queue.accept_chunk(0, &chunk(0)), Err(ChunkError::BeforeHold));
     assert_eq!(lockstep(&mut queue, 3, FRESH), Ok(301.0));
 }
 
@@ -272,7 +272,7 @@ fn the_highest_tick_numbers_cause_no_overflow() {
     let mut queue = queue();
     lockstep(&mut queue, 0, FRESH).unwrap();
     assert!(queue.wants_observation(u64::MAX, FRESH));
-    assert_eq!(queue.take(u64::MAX, &chunk(0)), Ok(0));
+    assert_eq!(queue.accept_chunk(u64::MAX, &chunk(0)), Ok(0));
     assert_eq!(at(&mut queue, u64::MAX, FRESH), Ok(1.0));
     assert!(at(&mut queue, 0, FRESH).is_err(), "a tick before the chunk's observation");
 }
@@ -344,20 +344,20 @@ proptest! {
                 }
                 Event::Answer(Answer::Stranger(observed)) => {
                     if asked != Some(observed) {
-                        prop_assert_eq!(queue.take(observed, &chunk(observed)), Err(ChunkError::Unasked));
+                        prop_assert_eq!(queue.accept_chunk(observed, &chunk(observed)), Err(ChunkError::Unasked));
                     }
                 }
                 Event::Answer(answer) => {
                     let Some(observed) = asked.take() else { continue };
                     match answer {
-                        Answer::Good => _ = queue.take(observed, &chunk(observed)),
+                        Answer::Good => _ = queue.accept_chunk(observed, &chunk(observed)),
                         Answer::Bad => {
                             let mut values = chunk(observed);
                             values[3] = f32::NAN;
-                            prop_assert_eq!(queue.take(observed, &values), Err(ChunkError::NotFinite));
+                            prop_assert_eq!(queue.accept_chunk(observed, &values), Err(ChunkError::NotFinite));
                         }
                         Answer::Short => {
-                            prop_assert_eq!(queue.take(observed, &[0.0]), Err(ChunkError::Length));
+                            prop_assert_eq!(queue.accept_chunk(observed, &[0.0]), Err(ChunkError::Length));
                         }
                         Answer::Never | Answer::Stranger(_) => queue.failed(observed),
                     }

@@ -75,7 +75,7 @@ fn steps_are_as_many_ticks_apart_as_each_observation_says() {
                 let before = Duration::from_millis(5) + PERIOD.mul_f64((samples - 1 - sample) as f64 / samples as f64);
                 push(&mut observer, tick, before, tick * samples + sample, 1);
             }
-            assert!(observer.look(tick, at(tick), at(tick), ARM).is_some());
+            assert!(observer.observe(tick, at(tick), at(tick), ARM).is_some());
             let newest = |back: u64| tick.saturating_sub(back) * samples + samples - 1;
             let [apart, together] = steps(&observer, &bundle, tick);
             // At the beginning there is no earlier tick: the step has the sample of the next one.
@@ -97,7 +97,7 @@ fn a_sample_that_lasts_for_ticks_is_the_step_of_each() {
         if tick % 4 == 0 {
             push(&mut observer, tick, Duration::from_millis(5), tick, 1);
         }
-        assert!(observer.look(tick, at(tick), at(tick), ARM).is_some());
+        assert!(observer.observe(tick, at(tick), at(tick), ARM).is_some());
         let [apart, together] = steps(&observer, &bundle, tick);
         if tick >= 6 {
             assert_eq!(apart, [6, 3, 0].map(|back| (tick - back) / 4 * 4), "tick {tick}");
@@ -118,7 +118,7 @@ fn after_a_replug_earlier_steps_show_the_first_new_sample() {
             push(&mut observer, tick, Duration::from_millis(5), seq, epoch);
         }
         let mask = if is_there { ARM } else { PhysicalMask::EMPTY };
-        assert_eq!(observer.look(tick, at(tick), at(tick), mask).is_some(), is_there);
+        assert_eq!(observer.observe(tick, at(tick), at(tick), mask).is_some(), is_there);
         let [apart, _] = steps(&observer, &bundle, tick);
         let expected: &[u64] = match tick {
             10..14 => &[],
@@ -147,7 +147,7 @@ fn held_samples_stand_in_with_their_distance() {
         if tick < 10 {
             push(&mut observer, tick, Duration::from_millis(5), tick, 1);
         }
-        observer.look(tick, at(tick), at(tick), mask);
+        observer.observe(tick, at(tick), at(tick), mask);
         let [apart, _] = steps(&observer, &bundle, tick);
         match tick {
             9..=12 => assert_eq!(apart, [3, 6, 9], "tick {tick}"),
@@ -164,7 +164,7 @@ fn missed_ticks_count() {
     // Tick 8 and 9 are missed.
     for tick in [0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15_u64] {
         push(&mut observer, tick, Duration::from_millis(5), tick, 1);
-        observer.look(tick, at(tick), at(tick), ARM);
+        observer.observe(tick, at(tick), at(tick), ARM);
         let [apart, together] = steps(&observer, &bundle, tick);
         let known = |tick: u64| if (8..10).contains(&tick) { 7 } else { tick };
         if tick >= 6 {
@@ -174,11 +174,11 @@ fn missed_ticks_count() {
     }
     // A long gap, and the numbers of another run after it.
     push(&mut observer, 90, Duration::from_millis(5), 90, 1);
-    observer.look(90, at(90), at(90), ARM);
+    observer.observe(90, at(90), at(90), ARM);
     assert_eq!(steps(&observer, &bundle, 90)[0], [15, 15, 90]);
     observer.clear();
     push(&mut observer, 91, Duration::from_millis(5), 91, 1);
-    observer.look(0, at(91), at(91), ARM);
+    observer.observe(0, at(91), at(91), ARM);
     assert_eq!(steps(&observer, &bundle, 91)[0], [91, 91, 91]);
 }
 
@@ -222,7 +222,7 @@ fn nothing_stands_in_for_a_step_of_a_history() {
                 push(&mut observer, tick, Duration::from_millis(5), 100 + tick, if tick < 10 { 1 } else { 2 });
             }
             let mask = if is_there(tick) { ARM } else { PhysicalMask::EMPTY };
-            assert_eq!(observer.look(tick, at(tick), at(tick), mask).is_some(), is_there(tick));
+            assert_eq!(observer.observe(tick, at(tick), at(tick), mask).is_some(), is_there(tick));
             let (felt, newest) = felt(&observer, &mut request, tick);
             let of = |back: u64| tick.checked_sub(back).filter(|tick| is_there(*tick)).map(|tick| 100 + tick);
             assert_eq!(felt, [3, 2, 1, 0].map(|back| of(back * apart as u64)), "tick {tick}, {apart} apart");
@@ -243,7 +243,7 @@ fn a_history_begins_with_the_run_and_a_missed_tick_has_the_choice_before_it() {
     let mut observer = observer(&bundle, 60);
     let mut request = Request::new(&bundle);
     // Present, but without a sample.
-    assert!(observer.look(0, at(0), at(0), ARM).is_none());
+    assert!(observer.observe(0, at(0), at(0), ARM).is_none());
     assert_eq!(felt(&observer, &mut request, 0), (vec![None; 3], None));
     for (tick, expected) in [
         (1, [None, None, Some(1)]),
@@ -257,12 +257,12 @@ fn a_history_begins_with_the_run_and_a_missed_tick_has_the_choice_before_it() {
         (30, [Some(9), Some(9), Some(30)]),
     ] {
         push(&mut observer, tick, Duration::from_millis(5), tick, 1);
-        observer.look(tick, at(tick), at(tick), ARM);
+        observer.observe(tick, at(tick), at(tick), ARM);
         assert_eq!(felt(&observer, &mut request, tick).0, expected, "tick {tick}");
     }
     observer.clear();
     push(&mut observer, 31, Duration::from_millis(5), 31, 1);
-    observer.look(0, at(31), at(31), ARM);
+    observer.observe(0, at(31), at(31), ARM);
     assert_eq!(felt(&observer, &mut request, 31).0, [None, None, Some(31)], "of another run");
 }
 
@@ -273,15 +273,15 @@ fn a_history_is_not_held_and_counts_for_nothing_when_it_is_old() {
     let mut request = Request::new(&bundle);
     assert_eq!(observer.first_sight(ARM), None);
     push(&mut observer, 0, Duration::from_millis(5), 7, 1);
-    let age = observer.look(0, at(0), at(0), ARM);
+    let age = observer.observe(0, at(0), at(0), ARM);
     assert!(age.is_some());
     // The arm has left: only `state` is held, and nothing that is present has an age.
-    assert_eq!(observer.look(2, at(2), at(2), PhysicalMask::EMPTY), None);
+    assert_eq!(observer.observe(2, at(2), at(2), PhysicalMask::EMPTY), None);
     assert_eq!(felt(&observer, &mut request, 2), (vec![None, Some(7), None], Some(7)));
     assert_eq!([request.is_present(0), request.is_present(1)], [true, false]);
     // Back, with a sample of now: the age is that of this one.
     push(&mut observer, 4, Duration::from_millis(5), 9, 2);
-    assert_eq!(observer.look(4, at(4), at(4), ARM), age);
+    assert_eq!(observer.observe(4, at(4), at(4), ARM), age);
     // Tick 2 was the last one that was looked at, tick 3 has its choice: none.
     assert_eq!(felt(&observer, &mut request, 4).0, [Some(7), None, Some(9)]);
 }
@@ -316,7 +316,7 @@ proptest! {
                 push(&mut observer, tick, Duration::from_millis(5 + 20 * (samples - 1 - sample)), seq, epoch);
             }
             let mask = if is_there { ARM } else { PhysicalMask::EMPTY };
-            observer.look(tick, at(tick), at(tick), mask);
+            observer.observe(tick, at(tick), at(tick), mask);
             let (felt, now) = felt(&observer, &mut request, tick);
             newest.push(now);
             let of = |step: usize| newest.iter().rev().nth((steps - 1 - step) * apart).copied().flatten();

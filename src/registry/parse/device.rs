@@ -184,7 +184,7 @@ impl<'d> Draft<'d> {
     pub(super) fn finish(self, rig: &VerdictTable, sync_window: Duration) -> Option<(Section<'d>, DeviceSpec)> {
         let node = self.node?;
         let fps = node.picture().map(|picture| f64::from(picture.fps));
-        let mut usual = VerdictSpec::of(node.modality_kind(), self.stall_after, fps);
+        let mut usual = VerdictSpec::defaults(node.modality_kind(), self.stall_after, fps);
         node.of_kind().judge(&mut usual, sync_window);
         let spec = DeviceSpec {
             verdict: verdict::changed(usual, rig, &self.verdict),

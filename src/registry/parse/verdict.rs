@@ -1,7 +1,7 @@
 //! The limits of the verdict: `[verdict]`, `[verdict.bad]`, `[device.NAME.verdict]` and
 //! `[device.NAME.verdict.bad]`.
 //!
-//! 1. A limit that is not written is that of [`VerdictSpec::of`].
+//! 1. A limit that is not written is that of [`VerdictSpec::defaults`].
 //! 2. `[verdict]` changes what is on by default; a check that is off for a kind of modality (two
 //!    equal vectors of numbers are not a fault) is only turned on by the device's own table.
 //! 3. A limit for SUSPECT beyond the one for BAD moves that one too, unless both are written: then

@@ -72,7 +72,7 @@ impl VerdictSpec {
     /// * valid 90 %, 50 %: a policy is trained on the content of the frames, and a tick without a valid sample has
     ///   an old one or none. A device slower than twice `sync_window` misses ticks by its phase alone.
     /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
-    pub fn of(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
+    pub fn defaults(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
         let image = matches!(kind, ModalityKind::Image | ModalityKind::Depth);
         let suspect = Limits {
             lost: Some(0.01),

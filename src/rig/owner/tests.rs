@@ -45,7 +45,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         form: None,
         action: None,
         hooks: rapid_registry::Hooks::default(),
-        verdict: rapid_registry::VerdictSpec::of(
+        verdict: rapid_registry::VerdictSpec::defaults(
             rapid_core::modality::ModalityKind::Image,
             Duration::from_millis(500),
             Some(30.0),

@@ -104,7 +104,7 @@ impl MaskFile {
     /// Creates the file, or takes over that of a dead process.
     pub(super) fn create(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
         // First the file that shows whether another process owns the rig.
-        let file = take(path)?;
+        let file = open_locked(path)?;
         json::claim(&json_path(path)).inspect_err(|_| {
             // We hold its lock, and it is empty or belongs to a dead process.
             let _ = std::fs::remove_file(path);
@@ -125,7 +125,7 @@ impl MaskFile {
         if self.is_there() {
             return Ok(false);
         }
-        self.file = take(&self.path)?;
+        self.file = open_locked(&self.path)?;
         Ok(true)
     }
 
@@ -184,7 +184,7 @@ impl Drop for MaskFile {
     }
 }
 
-fn take(path: &Path) -> Result<File, PresenceError> {
+fn open_locked(path: &Path) -> Result<File, PresenceError> {
     let io = |error: Errno| PresenceError::Io { path: path.to_owned(), error: error.into() };
     let foreign = |what: &str| PresenceError::Foreign { path: path.to_owned(), what: what.to_owned() };
     for _ in 0..TRIES {

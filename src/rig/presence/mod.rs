@@ -222,7 +222,7 @@ impl Heartbeat {
             }
             beats = (beats + 1) % LOOK_EVERY;
             if beats == 0 {
-                lost = self.look(lost);
+                lost = self.restore(lost);
             }
             match self.publish(bits, now) {
                 Ok(()) => failed = false,
@@ -248,7 +248,7 @@ impl Heartbeat {
     }
 
     /// Creates the file again if it is gone. True while that fails, which is reported once.
-    fn look(&mut self, failed: bool) -> bool {
+    fn restore(&mut self, failed: bool) -> bool {
         match self.file.restore() {
             Ok(false) => false,
             Ok(true) => {

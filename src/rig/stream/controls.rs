@@ -96,7 +96,7 @@ impl Controlled {
     /// # Errors
     /// When it does not accept one.
     pub(super) fn pass_on_orders(&mut self, source: &mut SampleSource) -> Result<(), DriverError> {
-        self.orders.take().try_for_each(|order| source.order(order))
+        self.orders.take_pending().try_for_each(|order| source.order(order))
     }
 
     /// Passes the device the newest action since the last call, if any.

@@ -130,7 +130,7 @@ impl Printer {
                     // The board, which this task holds, keeps the channel open.
                     Err(RecvError::Closed) => break,
                 },
-                _ = looks.tick() => self.look(&board.snapshot())?.filter(|_| outlet.is_idle()),
+                _ = looks.tick() => self.progress(&board.snapshot())?.filter(|_| outlet.is_idle()),
             };
             let Some(piece) = piece else { continue };
             tokio::select! {
@@ -197,7 +197,7 @@ impl Printer {
         self.whole_line(&line)
     }
 
-    fn look(&mut self, snapshot: &Snapshot) -> io::Result<Option<String>> {
+    fn progress(&mut self, snapshot: &Snapshot) -> io::Result<Option<String>> {
         self.rates.update(snapshot);
         let elapsed = snapshot.taken.since(self.began);
         if !self.options.in_place {

@@ -104,7 +104,7 @@ pub(super) fn json(
             dropped: recording.dropped,
             disk_seconds: recording.room.map(|left| left.as_secs()),
         }),
-        policy: snapshot.policy.as_ref().map(|policy| PolicyProgress::of(policy, snapshot.devices.len())),
+        policy: snapshot.policy.as_ref().map(|policy| PolicyProgress::new(policy, snapshot.devices.len())),
     })
 }
 
@@ -141,7 +141,7 @@ pub(super) struct PolicyProgress<'a> {
 }
 
 impl<'a> PolicyProgress<'a> {
-    pub(super) fn of(policy: &'a PolicyStatus, devices: usize) -> Self {
+    pub(super) fn new(policy: &'a PolicyStatus, devices: usize) -> Self {
         Self {
             policy: &policy.name,
             dry_run: policy.dry_run,

@@ -487,7 +487,7 @@ fn progress_in_place_is_erased_before_a_line() {
     let snapshot = three_streaming();
     let options = HeadlessOptions { in_place: true, ..HeadlessOptions::default() };
     let mut printer = Printer::new(&snapshot, options);
-    let piece = printer.look(&snapshot).unwrap().unwrap();
+    let piece = printer.progress(&snapshot).unwrap().unwrap();
     assert!(piece.starts_with(ERASE_LINE) && !piece.contains('\n'), "{piece:?}");
     let line = printer.event(&event(episode(0, None))).unwrap();
     assert!(line.starts_with(ERASE_LINE) && line.ends_with('\n'), "{line:?}");
@@ -495,13 +495,13 @@ fn progress_in_place_is_erased_before_a_line() {
     assert!(!line.contains(ERASE_LINE), "{line:?}");
 
     let mut printer = Printer::new(&snapshot, HeadlessOptions::default());
-    assert_eq!(printer.look(&snapshot).unwrap(), None);
+    assert_eq!(printer.progress(&snapshot).unwrap(), None);
     let mut later = snapshot.clone();
     later.taken = later.taken.after(PROGRESS_LINE);
-    let piece = printer.look(&later).unwrap().unwrap();
+    let piece = printer.progress(&later).unwrap().unwrap();
     assert!(piece.starts_with("00:10  mask 0x07") && piece.ends_with('\n'), "{piece:?}");
 
     let mut printer = Printer::new(&snapshot, HeadlessOptions { json: true, ..HeadlessOptions::default() });
-    let piece = printer.look(&later).unwrap().unwrap();
+    let piece = printer.progress(&later).unwrap().unwrap();
     assert!(piece.contains("\"event\":\"progress\"") && piece.ends_with('\n'), "{piece:?}");
 }

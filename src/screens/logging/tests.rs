@@ -8,7 +8,7 @@ use super::*;
 struct Kept(Arc<Mutex<Vec<LogLine>>>);
 
 impl Sink for Kept {
-    fn take(&self, line: LogLine) {
+    fn write(&self, line: LogLine) {
         self.0.lock().unwrap().push(line);
     }
 }
@@ -81,14 +81,14 @@ fn a_stalled_reader_blocks_no_writer_and_is_informed_of_lost_lines() {
     let line = |text: String| LogLine { wall_ns: 0, level: Level::Warn, text };
     // Pipe and queue fill up; from then on every line is lost.
     while sink.lost.load(Ordering::Relaxed) <= DEPTH as u64 {
-        sink.take(line("x".repeat(200)));
+        sink.write(line("x".repeat(200)));
     }
     let reading = std::thread::spawn(move || {
         let mut text = String::new();
         io::Read::read_to_string(&mut reader, &mut text).map(|_| text)
     });
     while sink.lost.load(Ordering::Relaxed) > 0 {
-        sink.take(line("last".to_owned()));
+        sink.write(line("last".to_owned()));
         std::thread::yield_now();
     }
     drop(sink);
@@ -104,7 +104,7 @@ fn what_was_logged_is_written_when_the_log_is_dropped_though_the_subscriber_keep
     let log = Log(Some(Arc::clone(&sink.outlet)));
     // Fits into a pipe, so that nothing waits for the reader.
     for number in 0..100 {
-        sink.take(LogLine { wall_ns: 0, level: Level::Warn, text: format!("line {number}") });
+        sink.write(LogLine { wall_ns: 0, level: Level::Warn, text: format!("line {number}") });
     }
     drop(log);
     let mut text = [0; 4096];
@@ -133,7 +133,7 @@ fn a_line_without_room_is_not_the_end_of_the_log() {
     let written = Arc::default();
     let sink = sink_to(Stderr::Text, "", Full(Arc::clone(&written), true));
     for text in ["one", "two"] {
-        sink.take(LogLine { wall_ns: 0, level: Level::Warn, text: text.to_owned() });
+        sink.write(LogLine { wall_ns: 0, level: Level::Warn, text: text.to_owned() });
     }
     sink.outlet.drain(Duration::from_hours(1));
     let text = String::from_utf8(written.lock().unwrap().clone()).unwrap();

@@ -82,7 +82,9 @@ fn facts(device: &DeviceStatus, model: &Model, theme: Theme) -> Vec<(String, Str
         fact("run", format!("{} samples, {}, {} lost", device.samples, text::size(device.bytes), device.gaps)),
         fact("starts", device.epoch.0.to_string()),
     ];
-    if let Some(finding) = model.latest().recording.as_ref().and_then(|recording| recording.outlook.of(&device.name)) {
+    if let Some(finding) =
+        model.latest().recording.as_ref().and_then(|recording| recording.outlook.finding(&device.name))
+    {
         facts.push(fact("episode", format!("would be {}: {}", finding.grade.word(), finding.text)));
     }
     if let Some(detail) = detail(device, model) {

@@ -229,7 +229,7 @@ fn compact(count: u64) -> String {
 
 /// What makes the episode in progress worse than GOOD because of this device.
 fn finding<'a>(device: &DeviceStatus, model: &'a Model) -> Option<&'a Finding> {
-    model.latest().recording.as_ref()?.outlook.of(&device.name)
+    model.latest().recording.as_ref()?.outlook.finding(&device.name)
 }
 
 /// The detail of a device, first what is wrong with it; for an absent one, since when.

@@ -15,7 +15,7 @@ pub(super) struct Sweep {
 
 impl Sweep {
     /// Takes a packet of any known format; whether it was one.
-    pub(super) fn take(&mut self, packet: &[u8]) -> bool {
+    pub(super) fn feed(&mut self, packet: &[u8]) -> bool {
         let taken = PacketFormat::WORDS.iter().any(|(_, format)| {
             points::read(*format, packet, |point| {
                 let [ahead, left, _] = point.position;
@@ -53,14 +53,14 @@ mod tests {
             block[4 + 3 * 15..][..2].copy_from_slice(&2500_u16.to_le_bytes());
         }
         let mut sweep = Sweep::default();
-        assert!(sweep.take(&packet));
+        assert!(sweep.feed(&packet));
         let points: Vec<_> = sweep.points().collect();
         assert_eq!(points.len(), 12);
         let level = 5.0 * 15.0_f64.to_radians().cos();
         assert!(points.iter().all(|(x, y)| (x - level).abs() < 1e-6 && y.abs() < 1e-6), "{points:?}");
         assert!((sweep.range() - level).abs() < 1e-6);
         packet[0] = 0;
-        assert!(!sweep.take(&packet) && !sweep.take(&packet[1..]) && !sweep.take(&[]));
+        assert!(!sweep.feed(&packet) && !sweep.feed(&packet[1..]) && !sweep.feed(&[]));
         assert_eq!(sweep.points().count(), 12);
     }
 }

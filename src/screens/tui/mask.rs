@@ -70,18 +70,18 @@ impl Plan {
         let rows = usize::from(rows.clamp(1, 6));
         let name = devices.iter().map(|device| text::width(&device.name)).max().unwrap_or(0).clamp(1, NAME);
         // Names in more than three rows are hard to read.
-        let names = Self::of(Density::Named(name), devices.len(), width);
+        let names = Self::fit(Density::Named(name), devices.len(), width);
         if usize::from(names.rows) <= rows.min(3) {
             return names;
         }
-        let numbers = Self::of(Density::Numbered, devices.len(), width);
+        let numbers = Self::fit(Density::Numbered, devices.len(), width);
         if usize::from(numbers.rows) <= rows {
             return numbers;
         }
-        Self::of(Density::Dots, devices.len(), width)
+        Self::fit(Density::Dots, devices.len(), width)
     }
 
-    fn of(density: Density, devices: usize, width: usize) -> Self {
+    fn fit(density: Density, devices: usize, width: usize) -> Self {
         let most = density.per_row(width).max(1);
         let rows = devices.div_ceil(most).max(1);
         // Rows of equal length, in whole groups of eight.

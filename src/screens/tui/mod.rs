@@ -123,7 +123,7 @@ pub async fn run(
 /// # Errors
 /// When there is no terminal, or it goes away.
 pub async fn show(mut link: impl RigLink, options: ScreenOptions, shutdown: CancellationToken) -> Result<(), TuiError> {
-    let theme = Theme::detect(Palette::of(&io::stdout()), |name| std::env::var(name).ok());
+    let theme = Theme::detect(Palette::for_output(&io::stdout()), |name| std::env::var(name).ok());
     let mut screen = Screen::open(options.mouse).map_err(TuiError::NoTerminal)?;
     let size = crossterm::terminal::size().ok();
     // The size comes with later changes of it.
@@ -156,7 +156,7 @@ async fn drive(
     let mut model = Model::new(link.snapshot());
     model.zone = if options.utc { Zone::UTC } else { Zone::local() };
     model.tour = options.tour.then(tour::Tour::default);
-    let theme = Theme::detect(Palette::of(&io::stdout()), |name| std::env::var(name).ok());
+    let theme = Theme::detect(Palette::for_output(&io::stdout()), |name| std::env::var(name).ok());
     let mut frames = tokio::time::interval(FRAME);
     frames.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut is_drawn = true;

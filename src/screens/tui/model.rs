@@ -260,7 +260,7 @@ impl Model {
         match msg {
             Msg::Snapshot(snapshot) => {
                 self.advance(*snapshot);
-                return self.look();
+                return self.request_previews();
             }
             Msg::Size(columns, rows) => self.size = (columns, rows),
             Msg::Click(target) => self.click(target),
@@ -311,7 +311,7 @@ impl Model {
         if self.frozen.is_none() {
             // Other screens look at other devices.
             let own = snapshot.previews.iter().filter(|preview| Some(preview.device) == selected);
-            own.for_each(|preview| self.seen.take(preview));
+            own.for_each(|preview| self.seen.update(preview));
         }
         let marked = self.marked_episode();
         let news = news(&self.latest, &snapshot);
@@ -577,7 +577,7 @@ impl Model {
     }
 
     /// Requests previews of the selected device while they are shown.
-    fn look(&mut self) -> Effect {
+    fn request_previews(&mut self) -> Effect {
         let is_shown = self.shows_a_device();
         let is_due = self.looked.is_none_or(|looked| self.latest.taken.since(looked) >= LOOK_AGAIN);
         let is_linked = !matches!(self.link, LinkState::Lost { .. });
@@ -742,7 +742,7 @@ impl Model {
 
     /// How urgent a device is, the lowest first.
     fn trouble(&self, device: &DeviceStatus) -> u8 {
-        let outlook = self.shown().recording.as_ref().and_then(|recording| recording.outlook.of(&device.name));
+        let outlook = self.shown().recording.as_ref().and_then(|recording| recording.outlook.finding(&device.name));
         match (outlook.map(|finding| finding.grade), device.state) {
             (Some(Grade::Bad), _) => 0,
             (_, DeviceState::Failed) => 1,

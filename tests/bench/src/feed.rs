@@ -100,7 +100,7 @@ impl Feed {
 }
 
 fn lane(id: ModalityId, topic: &str, frame_id: &str, header: SampleHeader, payloads: Vec<Vec<u8>>, hz: u64) -> Lane {
-    let schema = payloads.first().map_or(SampleSchema::Bytes, |payload| SampleSchema::of(&header, payload));
+    let schema = payloads.first().map_or(SampleSchema::Bytes, |payload| SampleSchema::for_sample(&header, payload));
     let encoded = |payload: &Vec<u8>| {
         let mut message = Vec::new();
         encode::sample(&mut message, schema, u64::MAX / 2, frame_id, &header, payload);

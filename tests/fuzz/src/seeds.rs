@@ -122,7 +122,7 @@ fn samples() -> Vec<(SampleSchema, Vec<u8>)> {
     ]
     .into_iter()
     .map(|(header, payload)| {
-        let schema = SampleSchema::of(&header, &payload);
+        let schema = SampleSchema::for_sample(&header, &payload);
         let mut message = Vec::new();
         encode::sample(&mut message, schema, 1_700_000_000_000_000_000, "cam", &header, &payload);
         (schema, message)

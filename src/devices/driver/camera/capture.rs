@@ -72,7 +72,7 @@ impl Camera {
             }
             self.progress.skip(frame.sequence);
         };
-        let lost = self.progress.take(frame.sequence);
+        let lost = self.progress.accept(frame.sequence);
         let (captured, from_kernel) = self.progress.stamp(&frame, arrived);
         let bytes = ring.get_ref().lent();
         let mut flags = frame.flags(self.layout, bytes);

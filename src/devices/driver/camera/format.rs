@@ -397,7 +397,7 @@ impl Numbering {
     }
 
     /// A picture that is passed on; returns how many were lost before it.
-    pub(super) fn take(&mut self, sequence: u32) -> u64 {
+    pub(super) fn accept(&mut self, sequence: u32) -> u64 {
         self.count(sequence);
         std::mem::take(&mut self.lost)
     }

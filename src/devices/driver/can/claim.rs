@@ -21,13 +21,13 @@ impl Claim {
     ///
     /// # Errors
     /// When another process holds the claim; the text names it.
-    pub(super) fn take(name: &str) -> Result<Self, LinkError> {
+    pub(super) fn acquire(name: &str) -> Result<Self, LinkError> {
         let refused = |error: std::io::Error| LinkError::Retry(format!("claiming {name}: {error}"));
         let address = SocketAddr::from_abstract_name(format!("rapid/can/{name}")).map_err(refused)?;
         match UnixListener::bind_addr(&address) {
             Ok(listener) => Ok(Self(listener)),
             Err(error) if error.kind() == ErrorKind::AddrInUse => {
-                let owner = UnixStream::connect_addr(&address).and_then(|stream| Peer::of(&stream)).ok();
+                let owner = UnixStream::connect_addr(&address).and_then(|stream| Peer::from_stream(&stream)).ok();
                 let process = owner.and_then(|owner| owner.process);
                 let who = process.map_or("another process".to_owned(), |process| format!("process {process}"));
                 Err(LinkError::Retry(format!("{who} drives the motors behind {name}: end it")))
@@ -44,10 +44,10 @@ mod tests {
     #[test]
     fn a_second_master_is_refused_with_the_process_of_the_first() {
         let name = format!("test{}", std::process::id());
-        let first = Claim::take(&name).unwrap();
-        let text = Claim::take(&name).unwrap_err().to_string();
+        let first = Claim::acquire(&name).unwrap();
+        let text = Claim::acquire(&name).unwrap_err().to_string();
         assert_eq!(text, format!("process {} drives the motors behind {name}: end it", std::process::id()));
         drop(first);
-        Claim::take(&name).unwrap();
+        Claim::acquire(&name).unwrap();
     }
 }

@@ -72,7 +72,7 @@ impl Kind {
         Self::BusError,
     ];
 
-    fn of(byte: u8) -> Option<Self> {
+    fn from_byte(byte: u8) -> Option<Self> {
         Self::ALL.into_iter().find(|kind| *kind as u8 == byte)
     }
 }
@@ -143,7 +143,7 @@ impl Decoder {
 
 fn message(bytes: &[u8; RECEIVED]) -> Option<Message> {
     let [HEAD, kind, format, id0, id1, id2, id3, data @ .., TAIL] = bytes else { return None };
-    let kind = Kind::of(*kind)?;
+    let kind = Kind::from_byte(*kind)?;
     let (len, extended, remote) = (format & 0x3f, format & 0x40 != 0, format & 0x80 != 0);
     let id = u32::from_le_bytes([*id0, *id1, *id2, *id3]);
     let legal = len <= 8 && id <= if extended { 0x1fff_ffff } else { 0x7ff };

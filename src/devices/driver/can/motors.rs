@@ -67,7 +67,7 @@ impl Motors {
             let arm = arm.map_err(|error| DriverError::Fatal(error.to_string()))?;
             let claim = match &node {
                 // Before the interface is brought up, and the first frame.
-                DeviceNode::Net(name) => Some(Claim::take(name).map_err(LinkError::into_driver)?),
+                DeviceNode::Net(name) => Some(Claim::acquire(name).map_err(LinkError::into_driver)?),
                 _ => None,
             };
             let link = Link::open(&can, &node).map_err(LinkError::into_driver)?;
@@ -131,7 +131,7 @@ impl Motors {
         if let Some((motors, tip)) = values.split_at_mut_checked(count) {
             motors.copy_from_slice(sample.values.get(..count).unwrap_or_default());
             if let Some(effector) = &self.effector {
-                count += effector.look(motors, tip);
+                count += effector.update(motors, tip);
             }
         }
         let values = values.get(..count).unwrap_or_default();

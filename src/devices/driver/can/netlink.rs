@@ -68,7 +68,7 @@ fn replace(index: u32, by: u32) {
 ///
 /// # Errors
 /// [`LinkError::Gone`] when there is none.
-pub fn look(name: &str) -> Result<Interface, LinkError> {
+pub fn read_interface(name: &str) -> Result<Interface, LinkError> {
     let interface = CanInterface::open(name).map_err(|error| refusal(name, &error))?;
     interface.details().map(|details| read(&details)).map_err(|error| refusal(name, &error))
 }
@@ -256,7 +256,7 @@ mod tests {
 
     #[test]
     fn a_missing_interface_is_reported_as_gone() {
-        assert_eq!(look("no-such-can0"), Err(LinkError::Gone));
+        assert_eq!(read_interface("no-such-can0"), Err(LinkError::Gone));
         assert_eq!(bring_up("no-such-can0", 1_000_000), Err(LinkError::Gone));
         assert!(is_gone("no-such-can0", 1));
     }

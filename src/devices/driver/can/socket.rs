@@ -43,17 +43,17 @@ impl Socket {
     pub(super) fn open(name: &str, bitrate: u32) -> Result<Self, LinkError> {
         let ready = netlink::bring_up(name, bitrate)?;
         let socket = listen(ready.index).map_err(|error| open_error(name, &error))?;
-        Ok(Self::of(socket, name, ready, format!("{name} at {bitrate} bit/s")))
+        Ok(Self::new(socket, name, ready, format!("{name} at {bitrate} bit/s")))
     }
 
     /// Datagrams stand in for frames: the kernel delivers both, their stamps and the count of losses in the same way.
     pub(super) fn stand_in(socket: OwnedFd) -> Result<Self, LinkError> {
         let socket = CanSocket::from(socket);
         set_up(&socket).map_err(|error| LinkError::Retry(format!("the stand-in for a bus: {error}")))?;
-        Ok(Self::of(socket, "stand-in", Ready { index: 0, restarts: false }, "stand-in".to_owned()))
+        Ok(Self::new(socket, "stand-in", Ready { index: 0, restarts: false }, "stand-in".to_owned()))
     }
 
-    fn of(socket: CanSocket, name: &str, ready: Ready, description: String) -> Self {
+    fn new(socket: CanSocket, name: &str, ready: Ready, description: String) -> Self {
         let Ready { index, restarts } = ready;
         Self { bound: socket, name: name.to_owned(), index, restarts, dropped: 0, lost: 0, description }
     }

@@ -87,7 +87,7 @@ impl DeviceAddress {
 
     /// Whether the interface, and so the device, is gone.
     pub(super) fn is_gone(&self) -> bool {
-        self.interface.as_ref().is_some_and(|interface| NetworkLink::of(interface).state() == LinkState::Gone)
+        self.interface.as_ref().is_some_and(|interface| NetworkLink::of_interface(interface).state() == LinkState::Gone)
     }
 
     /// The error for a device that no longer answers.

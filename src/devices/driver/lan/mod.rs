@@ -92,7 +92,7 @@ impl Lan {
         let (description, format) = describe(lan, &at);
         let card = if let Protocol::Gopro(gopro) = &protocol { gopro.card() } else { None };
         let negotiated = Negotiated { card, bus: Some(at), format, ..Negotiated::default() };
-        Ok(Self { protocol, link: LinkWatch::of(link_of(node)), agreed: Agreed { description, negotiated } })
+        Ok(Self { protocol, link: LinkWatch::new(link_of(node)), agreed: Agreed { description, negotiated } })
     }
 
     /// The next sample.
@@ -146,7 +146,7 @@ impl Lan {
 /// The link of a network adapter, which stays plugged in when its cable, or the device behind it, is pulled. For a
 /// device found on the network, discovery monitors the link.
 fn link_of(node: &DeviceNode) -> NetworkLink {
-    if let DeviceNode::Net(interface) = node { NetworkLink::of(interface) } else { NetworkLink::default() }
+    if let DeviceNode::Net(interface) = node { NetworkLink::of_interface(interface) } else { NetworkLink::default() }
 }
 
 fn describe(lan: &LanSpec, at: &str) -> (String, Option<Format>) {

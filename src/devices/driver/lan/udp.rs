@@ -79,7 +79,7 @@ impl Packets {
                 Err(error) => return Err(self.place.lost(error)),
             };
             drop(guard);
-            if let Some(captured) = self.take(received, from.as_ref().and_then(address)) {
+            if let Some(captured) = self.accept(received, from.as_ref().and_then(address)) {
                 break captured;
             }
         };
@@ -96,7 +96,7 @@ impl Packets {
     }
 
     /// The packet's time and flags, if it is a sample.
-    fn take(&mut self, received: Datagram, from: Option<IpAddr>) -> Option<(Stamp, u32)> {
+    fn accept(&mut self, received: Datagram, from: Option<IpAddr>) -> Option<(Stamp, u32)> {
         self.lost += received.newly_dropped(&mut self.dropped);
         if !from.is_some_and(|from| self.place.means(from)) {
             return None;

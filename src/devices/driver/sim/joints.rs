@@ -39,7 +39,7 @@ impl Joints {
     /// # Errors
     /// When the description of their arm does not fit.
     #[cfg_attr(not(feature = "motors"), expect(clippy::unnecessary_wraps, reason = "the same as with motors"))]
-    pub(super) fn of(can: &CanSpec) -> Result<Self, DriverError> {
+    pub(super) fn from_spec(can: &CanSpec) -> Result<Self, DriverError> {
         let CanProtocol::Damiao(motors) = &can.protocol else { return Ok(Self::default()) };
         let joints = Self::new(motors.motors.len());
         #[cfg(feature = "motors")]

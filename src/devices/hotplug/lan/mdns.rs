@@ -146,7 +146,7 @@ impl Service {
                         return;
                     }
                 },
-                _ = look.tick() => for (full, limit) in self.look(Stamp::now()).await {
+                _ = look.tick() => for (full, limit) in self.check(Stamp::now()).await {
                     // Refused only while the library is busy; queried again a lease later.
                     let _ = daemon.verify(full, limit);
                 },
@@ -231,7 +231,7 @@ impl Service {
     }
 
     /// Checks leases and links; returns which instances must be queried again, and how long they have.
-    async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
+    async fn check(&mut self, now: Stamp) -> Vec<(String, Duration)> {
         let mut questions = Vec::new();
         for wanted in &mut self.wanted {
             let length = wanted.watch.length;
@@ -246,7 +246,7 @@ impl Service {
                 }
                 wanted.watch.renew(now);
             }
-            wanted.watch.look(now).await;
+            wanted.watch.check(now).await;
             if wanted.watch.is_there() {
                 continue;
             }

@@ -78,7 +78,7 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
                 let driver_has_port = *question == Question::Udp && watch.is_there();
                 answer = Box::pin(next(watch.last_received.clone(), driver_has_port, Arc::clone(&question), asked));
             }
-            _ = look.tick() => watch.look(Stamp::now()).await,
+            _ = look.tick() => watch.check(Stamp::now()).await,
         }
     }
 }

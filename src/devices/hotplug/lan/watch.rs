@@ -94,7 +94,7 @@ impl Watch {
     }
 
     /// Checks the link and the lease.
-    pub(super) async fn look(&mut self, now: Stamp) {
+    pub(super) async fn check(&mut self, now: Stamp) {
         if !self.is_there() {
             return;
         }
@@ -104,7 +104,7 @@ impl Watch {
             return self.gone(UnplugSource::Link, now).await;
         }
         let grace = if received == Stamp::default() { self.grace } else { Duration::ZERO };
-        let change = self.lease.look(now.before(grace));
+        let change = self.lease.check(now.before(grace));
         self.went(change, UnplugSource::Lease, now).await;
     }
 
@@ -171,7 +171,7 @@ impl Lease {
     }
 
     /// Checks whether the lease is over.
-    fn look(&mut self, now: Stamp) -> Option<Change> {
+    fn check(&mut self, now: Stamp) -> Option<Change> {
         if self.ends()? > now { None } else { self.end(now) }
     }
 

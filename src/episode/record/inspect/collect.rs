@@ -65,7 +65,7 @@ pub(super) struct Collected {
 
 impl Collected {
     /// Takes a record; one that cannot be understood is counted.
-    pub(super) fn take(&mut self, item: Item<'_>) {
+    pub(super) fn add(&mut self, item: Item<'_>) {
         match item {
             Item::Channel(channel) => {
                 self.is_ours |= [MASK_TOPIC, FRAME_TOPIC, EVENT_TOPIC, LOG_TOPIC].contains(&channel.topic.as_str());
@@ -91,7 +91,7 @@ impl Collected {
                 self.counted.abouts += 1;
                 // The first of two: it was written when the episode began.
                 if self.counted.abouts == 1 {
-                    self.judge = Judge::of(&map);
+                    self.judge = Judge::from_metadata(&map);
                     self.about = map;
                 }
             }
@@ -382,7 +382,7 @@ impl TopicCounter {
             self.longest_gap = self.longest_gap.max(captured.saturating_sub(self.previous));
         }
         self.messages += 1;
-        self.numbers.take(sequence);
+        self.numbers.add(sequence);
         self.previous = captured;
         self.first = self.first.min(captured);
         self.latest = self.latest.max(captured);
@@ -393,7 +393,7 @@ impl TopicCounter {
         let span = from(self.first, self.latest);
         let hz = if self.messages > 1 && span > 0.0 { (self.messages - 1) as f64 / span } else { 0.0 };
         // A frame waits for its deadline, always as long.
-        let lateness = self.lateness.as_ref().filter(|_| self.topic != FRAME_TOPIC).and_then(Lateness::of);
+        let lateness = self.lateness.as_ref().filter(|_| self.topic != FRAME_TOPIC).and_then(Lateness::from_histogram);
         TopicReport {
             topic: self.topic.clone(),
             messages: self.messages,
@@ -407,7 +407,7 @@ impl TopicCounter {
 
 impl Lateness {
     /// Of some durations; `None` without any.
-    pub(super) fn of(times: &DurationHistogram) -> Option<Self> {
+    pub(super) fn from_histogram(times: &DurationHistogram) -> Option<Self> {
         times.spread().map(|spread| Self { p50: spread.p50, p99: spread.p99, max: spread.max })
     }
 }

@@ -40,7 +40,7 @@ pub(crate) struct Numbers {
 }
 
 impl Numbers {
-    pub(crate) fn take(&mut self, number: u32) {
+    pub(crate) fn add(&mut self, number: u32) {
         // Numbers wrap after 32 bits; a step of more than half of that goes backwards.
         let step = self.next.map_or(0, |next| number.wrapping_sub(next));
         self.missing += u64::from(if step <= u32::MAX / 2 { step } else { 0 });
@@ -67,7 +67,7 @@ pub(super) struct Judge {
 
 impl Judge {
     /// A judge of the episode with these metadata; `None` if rapid did not record it.
-    pub(super) fn of(about: &BTreeMap<String, String>) -> Option<Self> {
+    pub(super) fn from_metadata(about: &BTreeMap<String, String>) -> Option<Self> {
         let number = |key: &str| about.get(key)?.parse::<u64>().ok();
         let begin_ns = number("begin_wall_ns")?;
         let hz = about.get("observation_hz")?.parse().ok()?;
@@ -118,7 +118,7 @@ impl Judge {
     /// Takes the message of a sample; `None`: its content cannot be read.
     pub(super) fn sample(&mut self, id: ModalityId, message: &Message<'_>, sample: Option<Sample<'_>>) {
         if let Some(numbers) = self.numbers.get_mut(id.index()) {
-            numbers.take(message.sequence);
+            numbers.add(message.sequence);
         }
         let seen = SampleFacts {
             seq: message.sequence.into(),
@@ -153,7 +153,7 @@ impl Judge {
     pub(super) fn judge(&self, modalities: &mut [ModalityReport], ending: &Ending<'_>) -> Verdict {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
         let end_ns = self.begin_ns.saturating_add((ending.seconds * 1e9).round() as u64);
-        let counted = Recorded::of(ending.summary);
+        let counted = Recorded::from_summary(ending.summary);
         let qualities: Vec<(&Measured, Quality)> =
             self.modalities.iter().filter_map(|known| Some((known, self.quality(known, &counted, end_ns)?))).collect();
         for report in modalities.iter_mut() {
@@ -253,7 +253,7 @@ struct Recorded<'a> {
 }
 
 impl<'a> Recorded<'a> {
-    fn of(summary: &'a BTreeMap<String, String>) -> Self {
+    fn from_summary(summary: &'a BTreeMap<String, String>) -> Self {
         let modalities = summary.get("modalities").and_then(|counted| serde_json::from_str(counted).ok());
         Self { summary, modalities }
     }
@@ -328,7 +328,7 @@ fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
         let kind: ModalityKind = serde_json::from_value(entry.get("kind")?.clone()).ok()?;
         // Files of earlier versions have no latencies.
         let latency_ns = entry.get("latency_ns").and_then(Value::as_u64).unwrap_or(0);
-        Some(Measured { name, id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns })
+        Some(Measured { name, id, limits: VerdictSpec::defaults(kind, STALL_AFTER, None), latency_ns })
     };
     let mut modalities: Vec<Measured> = list.iter().map(measured).collect::<Option<_>>()?;
     modalities.sort_by_key(|modality| modality.id);

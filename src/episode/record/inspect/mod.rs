@@ -264,13 +264,13 @@ pub fn inspect_bytes(bytes: &[u8]) -> Option<Inspection> {
 }
 
 fn inspect_from(file: impl ReadAt, size: u64, path: &Path, boot: Option<String>) -> Result<Inspection, ReadError> {
-    let failed = Failed::of(&file, size).map_err(|source| ReadError::Io { path: path.to_owned(), source })?;
+    let failed = Failed::read(&file, size).map_err(|source| ReadError::Io { path: path.to_owned(), source })?;
     let recorded = failed.as_ref().map_or(size, |failed| failed.at);
     let mut collected = Collected::default();
     let integrity = match Reader::new(file, recorded, path, boot) {
         Ok(mut reader) => {
             while reader.advance()? {
-                collected.take(reader.item());
+                collected.add(reader.item());
             }
             reader.integrity()
         }

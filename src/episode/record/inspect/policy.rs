@@ -114,7 +114,7 @@ impl Gathered {
     /// Exact of as many as are kept one by one, otherwise to one part in a hundred.
     fn latency(&mut self) -> Option<Lateness> {
         if self.chunks > MAX_LATENCIES as u64 {
-            return self.all_latencies.as_ref().and_then(Lateness::of);
+            return self.all_latencies.as_ref().and_then(Lateness::from_histogram);
         }
         self.latencies.sort_unstable();
         let at = |percent: usize| {

@@ -172,7 +172,7 @@ pub(super) fn doubts(ending: &Ending<'_>) -> Vec<String> {
     if ending.file.end == FileEnd::Finished && !ending.file.indexed {
         report.push("it has no index".to_owned());
     }
-    let named = EpisodeId::of(ending.about).zip(ending.file.episode);
+    let named = EpisodeId::from_metadata(ending.about).zip(ending.file.episode);
     if named.is_some_and(|(metadata, chunks)| metadata != chunks) {
         report.push("its metadata and its samples are of different episodes".to_owned());
     }

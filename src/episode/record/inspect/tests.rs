@@ -10,7 +10,7 @@ use crate::effort::{cases, every};
 use crate::record::tests::Bench;
 use crate::testing;
 
-fn of(bytes: &[u8]) -> Option<Inspection> {
+fn inspection(bytes: &[u8]) -> Option<Inspection> {
     match inspect_from(bytes, bytes.len() as u64, Path::new("x.mcap"), crate::boot_id()) {
         Err(ReadError::NotMcap(_)) => None,
         read => Some(read.unwrap()),
@@ -77,11 +77,11 @@ async fn a_finished_episode_is_reported_as_recorded() {
 async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
     let (_bench, file) = episode().await;
     let bytes = std::fs::read(&file).unwrap();
-    let whole = of(&bytes).unwrap();
+    let whole = inspection(&bytes).unwrap();
     assert!(bytes.len() > 20_000);
     let mut before = 0;
     for cut in (0..bytes.len()).step_by(61 * every(5)) {
-        let Some(report) = of(&bytes[..cut]) else {
+        let Some(report) = inspection(&bytes[..cut]) else {
             assert!(cut < mcap::MAGIC.len());
             continue;
         };
@@ -95,7 +95,7 @@ async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
     for at in (0..bytes.len()).step_by(37 * every(5)) {
         let mut flipped = bytes.clone();
         flipped[at] ^= 1 << (at % 8);
-        if let Some(report) = of(&flipped) {
+        if let Some(report) = inspection(&flipped) {
             noticed += usize::from(report.damaged_chunks > 0 || report.end != FileEnd::Finished);
             assert!(!render(&report, 80, Palette::Plain).is_empty());
         }
@@ -168,7 +168,7 @@ async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
     // A killed run leaves what stands at the beginning.
     let bytes = std::fs::read(&file).unwrap();
     let summary = bytes.windows(13).position(|window| window == b"rapid/summary").unwrap();
-    let cut = of(&bytes[..summary]).unwrap();
+    let cut = inspection(&bytes[..summary]).unwrap();
     assert_eq!(cut.recorded_verdict, None);
     assert_eq!(cut.policy.map(|policy| policy.name), Some("tactile-id".to_owned()));
 
@@ -196,14 +196,14 @@ fn chunks_of_other_writers_are_opened_and_their_damage_survived() {
         writer.finish().unwrap();
         drop(writer);
         let bytes = file.into_inner();
-        let report = of(&bytes).unwrap();
+        let report = inspection(&bytes).unwrap();
         assert_eq!((report.end, report.messages, report.topics.len()), (FileEnd::Finished, 50, 1), "{compression:?}");
         assert!((report.topics[0].hz - 100.0).abs() < 1e-6 && (report.seconds - 0.49).abs() < 1e-9);
         for at in 0..bytes.len() {
             for bit in 0..8 {
                 let mut flipped = bytes.clone();
                 flipped[at] ^= 1 << bit;
-                of(&flipped);
+                inspection(&flipped);
             }
         }
     }

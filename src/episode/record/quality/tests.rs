@@ -19,7 +19,7 @@ fn measures(kind: ModalityKind) -> Measures {
 }
 
 fn measures_at(hz: f64, kind: ModalityKind) -> Measures {
-    let limits = VerdictSpec::of(kind, Duration::from_millis(500), Some(30.0));
+    let limits = VerdictSpec::defaults(kind, Duration::from_millis(500), Some(30.0));
     let measured = [0, 3].map(|bit| Measured { name: String::new(), id: id(bit), limits, latency_ns: 0 });
     Measures::new(
         &measured,

@@ -51,7 +51,7 @@ fn whatever_came_half_a_second_ago_is_in_the_file() {
         };
         let Writer { streams, open, .. } = &mut writer;
         let topic = TopicId::Modality(ModalityId::new(TOF).unwrap());
-        streams.take(open.as_mut(), topic, &header, &[0; 16]);
+        streams.receive(open.as_mut(), topic, &header, &[0; 16]);
         writer.advance(now);
         most = most.max(EVERY * (number + 1 - kept(&partial)));
     }

@@ -314,10 +314,10 @@ fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
     for ms in 900..2200 {
         if ms % 10 == 0 {
             let header = scalars(ms / 10, ms, ms);
-            streams.take(Some(&mut open), TopicId::Modality(id(TOF)), &header, &[0; 16]);
+            streams.receive(Some(&mut open), TopicId::Modality(id(TOF)), &header, &[0; 16]);
         }
         for (number, _) in actions.iter().filter(|(_, at)| *at == ms) {
-            streams.take(Some(&mut open), TopicId::Action, &scalars(*number, ms, ms), &[0; 8]);
+            streams.receive(Some(&mut open), TopicId::Action, &scalars(*number, ms, ms), &[0; 8]);
         }
         open.advance(Stamp(ms * MS), &streams.masks);
     }
@@ -384,7 +384,7 @@ fn an_episode_in_progress_is_judged_like_a_finished_one() {
     let outlook = open.status(end).outlook;
     let report = open.finish(end, &masks, None, &[]);
     assert_eq!((outlook.grade(), report.verdict.grade), (Grade::Bad, Grade::Bad));
-    let lost = outlook.of("tof").expect("a finding").sentence();
+    let lost = outlook.finding("tof").expect("a finding").sentence();
     assert!(lost.contains("lost by the device"), "{lost}");
     assert!(report.verdict.reasons.contains(&lost), "{:?}", report.verdict.reasons);
 }

@@ -28,7 +28,7 @@ fn good() -> Quality {
 }
 
 fn limits() -> VerdictSpec {
-    VerdictSpec::of(ModalityKind::Image, Duration::from_millis(500), Some(30.0))
+    VerdictSpec::defaults(ModalityKind::Image, Duration::from_millis(500), Some(30.0))
 }
 
 /// Of an episode of ten seconds in which nothing went missing.

@@ -38,7 +38,7 @@ async fn a_folder_is_repaired_and_reported_in_the_background() {
 async fn a_repair_in_the_background_leaves_disk_space_for_an_episode() {
     let (folder, bytes) = recorded().await;
     let partial = put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
-    let free = Disk::of(&File::open(folder.path()).unwrap()).unwrap().free;
+    let free = Disk::of_file(&File::open(folder.path()).unwrap()).unwrap().free;
     let board = Arc::new(Board::new(&registry()));
     let mut events = board.events();
     // Three quarters of what is free: a repair would fit, and an episode be warned of.

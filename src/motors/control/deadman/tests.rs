@@ -23,10 +23,10 @@ fn when_actions_stop_the_joint_holds_and_is_then_disabled() {
             (500 + hold_ms + 999, Verdict::Hold),
             (500 + hold_ms + 1000, Verdict::Disable),
         ] {
-            assert_eq!(deadman.look(at(ms), period), verdict, "{configured:?} {ms}");
+            assert_eq!(deadman.verdict(at(ms), period), verdict, "{configured:?} {ms}");
         }
         deadman.feed(at(9000));
-        assert_eq!(deadman.look(at(9000), period), Verdict::Follow);
+        assert_eq!(deadman.verdict(at(9000), period), Verdict::Follow);
     }
 }
 
@@ -36,7 +36,7 @@ fn an_armed_motor_without_an_action_holds_and_is_then_disabled() {
     deadman.feed(at(9));
     deadman.arm(at(10));
     for (ms, verdict) in [(10, Verdict::Hold), (1009, Verdict::Hold), (1010, Verdict::Disable)] {
-        assert_eq!(deadman.look(at(ms), Duration::from_millis(100)), verdict);
+        assert_eq!(deadman.verdict(at(ms), Duration::from_millis(100)), verdict);
     }
 }
 
@@ -48,7 +48,7 @@ fn actions_faster_than_commands_still_have_time_to_arrive() {
     deadman.arm(at(0));
     deadman.feed(at(100));
     for (ms, verdict) in [(129, Verdict::Follow), (130, Verdict::Hold)] {
-        assert_eq!(deadman.look(at(ms), period), verdict);
+        assert_eq!(deadman.verdict(at(ms), period), verdict);
     }
     // What is configured is as it is.
     let deadman = Deadman::new(Some(Duration::from_millis(12)), Some(Duration::from_secs(1)), CYCLE);
@@ -61,6 +61,6 @@ fn an_arm_without_a_hold_limit_is_held_forever() {
     deadman.arm(at(10));
     deadman.feed(at(100));
     for ms in [300, 2_000, 100_000_000] {
-        assert_eq!(deadman.look(at(ms), Duration::from_millis(100)), Verdict::Hold);
+        assert_eq!(deadman.verdict(at(ms), Duration::from_millis(100)), Verdict::Hold);
     }
 }

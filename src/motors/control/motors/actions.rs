@@ -85,7 +85,7 @@ impl Actions {
 
     /// What the deadman says.
     pub(super) fn verdict(&self, now: Stamp) -> Verdict {
-        self.deadman.look(now, self.line.period())
+        self.deadman.verdict(now, self.line.period())
     }
 
     /// The newest action, followed or not, unless it is too old.
@@ -129,13 +129,13 @@ impl Actions {
     pub(super) fn refuse(&mut self, refusal: Refusal, now: Stamp) -> bool {
         let is_same = self.refusing.replace(refusal) == Some(refusal);
         // Another reason begins a new spell.
-        self.refused.look(is_same, now) || self.refused.look(true, now)
+        self.refused.update(is_same, now) || self.refused.update(true, now)
     }
 
     /// Takes an action that is not refused.
     pub(super) fn accept(&mut self, target: &[f64], tick: Stamp, now: Stamp) {
         self.refusing = None;
-        self.refused.look(false, now);
+        self.refused.update(false, now);
         if tick >= self.newest.1 {
             self.newest.0.copy_from_slice(target);
             self.newest.1 = tick;

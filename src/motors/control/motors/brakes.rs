@@ -24,7 +24,7 @@ pub struct Brakes {
 
 impl Brakes {
     /// Of a motor, by its position in the entry.
-    pub(super) fn of(self, index: usize) -> BrakeIs {
+    pub(super) fn state(self, index: usize) -> BrakeIs {
         let [broken, moving, released] =
             [self.broken, self.moving, self.released].map(|bits| bits >> (index % 16) & 1 == 1);
         match (broken, moving, released) {

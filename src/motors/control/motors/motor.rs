@@ -144,7 +144,7 @@ impl Motor {
     pub(super) fn take_brake(&mut self, is: BrakeIs, now: Stamp, notices: &mut Notices) {
         // A brake that is to be released may already be moving: it counts as engaged only once engagement is wanted.
         let is = if is == BrakeIs::Engaged && self.releases() { BrakeIs::Moving } else { is };
-        self.brake.take(is, now);
+        self.brake.update(is, now);
         if let Phase::Kept(kept) = &mut self.phase
             && kept.misses(&self.brake)
         {
@@ -156,7 +156,7 @@ impl Motor {
     ///
     /// # Errors
     /// What it reports is a fault, whatever the bus does.
-    pub(super) fn take(
+    pub(super) fn feed(
         &mut self,
         frame: &CanFrame,
         reply: Option<&Reply>,
@@ -175,7 +175,7 @@ impl Motor {
             Phase::On | Phase::Kept(_) => self.probe.compare(&self.joint, reply),
             Phase::Asked => {
                 let before = self.probe.ranges().copied();
-                if self.probe.take(&self.joint, reply, notices)? {
+                if self.probe.accept(&self.joint, reply, notices)? {
                     self.phase = Phase::Probed;
                     if self.probe.ranges() != before.as_ref() {
                         self.report.forget();
@@ -209,11 +209,11 @@ impl Motor {
                 return Ok(());
             }
             let is_near = |before: &Feedback, passed| is_near(before, &feedback, (&joint.spec, ranges), passed);
-            self.report.take(feedback, now, is_near);
+            self.report.update(feedback, now, is_near);
         }
         let is_on = matches!(self.phase, Phase::On | Phase::Kept(_));
         let is_ordered_off = matches!(self.phase, Phase::Off { reported: true } | Phase::Asked | Phase::Probed);
-        self.status.take(feedback.status, is_on, is_ordered_off);
+        self.status.update(feedback.status, is_on, is_ordered_off);
         self.supervision.feel(joint, &feedback, notices);
         Ok(())
     }
@@ -358,7 +358,7 @@ impl Motor {
     ) -> Option<Fault> {
         let (joint, feedback) = (&self.joint, self.report.feedback()?);
         let commanded = self.axis.follow(joint, (feedback.q, self.probe.ranges()?), target, passed, is_led);
-        self.supervision.look(joint, feedback, commanded, now, notices)
+        self.supervision.check(joint, feedback, commanded, now, notices)
     }
 
     /// Has it returned into its limits?

@@ -19,7 +19,7 @@ pub(super) struct Seldom {
 
 impl Seldom {
     /// The condition holds at `now`, or not. Is it to be reported?
-    pub(super) fn look(&mut self, is: bool, now: Stamp) -> bool {
+    pub(super) fn update(&mut self, is: bool, now: Stamp) -> bool {
         self.is_reported &= is;
         let is_due = is && !self.is_reported && self.last.is_none_or(|last| now.since(last) >= SELDOM);
         if is_due {
@@ -52,7 +52,7 @@ impl Notices {
         self.waiting.push_back(notice);
     }
 
-    pub(super) fn take(&mut self) -> Option<Notice> {
+    pub(super) fn pop(&mut self) -> Option<Notice> {
         self.waiting.pop_front()
     }
 

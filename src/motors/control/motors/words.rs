@@ -23,7 +23,7 @@ impl<'a, T> Words<'a, T> {
     }
 
     /// Something else, with the same names.
-    const fn of<U>(&self, what: &'a U) -> Words<'a, U> {
+    const fn with<U>(&self, what: &'a U) -> Words<'a, U> {
         Words { what, names: self.names, stops: self.stops }
     }
 
@@ -194,7 +194,7 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::Disabled(Reason::Asked) => f.write_str("motors are disabled"),
             Notice::Disabled(Reason::Deadman) => f.write_str("no action came for too long: motors are disabled"),
             Notice::Fault(fault) => {
-                write!(f, "{}: all motors are stopped", self.of(fault))
+                write!(f, "{}: all motors are stopped", self.with(fault))
             }
             Notice::Kept { damped, held, braked } => {
                 let parts = [
@@ -220,7 +220,7 @@ impl fmt::Display for Words<'_, Notice> {
                 write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
             }
             Notice::Refused(refusal) => {
-                write!(f, "an action is refused: {}", self.of(refusal))
+                write!(f, "an action is refused: {}", self.with(refusal))
             }
         }
     }

@@ -343,7 +343,7 @@ impl Storm {
                 return Err(format!("an effect for {id}, which no entry has"));
             };
             model
-                .take(effect, self.now, self.cooldown)
+                .apply(effect, self.now, self.cooldown)
                 .map_err(|why| format!("{why}: effect {index} {effect:?} of {model:?}"))?;
             match effect {
                 DeviceEffect::Start(..) => self.reached.starts += 1,
@@ -414,7 +414,7 @@ impl Storm {
 }
 
 impl Model {
-    fn take(&mut self, effect: &DeviceEffect, now: Stamp, cooldown: Duration) -> Result<(), String> {
+    fn apply(&mut self, effect: &DeviceEffect, now: Stamp, cooldown: Duration) -> Result<(), String> {
         match effect {
             DeviceEffect::Stop => ensure(self.running.is_some(), || "nothing runs".to_owned()),
             DeviceEffect::Ended => ensure(self.running.take().is_some(), || "nothing ran".to_owned()),

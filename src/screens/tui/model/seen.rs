@@ -25,7 +25,7 @@ pub(super) struct Seen {
 }
 
 impl Seen {
-    pub(super) fn take(&mut self, preview: &Preview) {
+    pub(super) fn update(&mut self, preview: &Preview) {
         if self.device != Some(preview.device) {
             *self = Self { device: Some(preview.device), ..Self::default() };
         }
@@ -40,7 +40,7 @@ impl Seen {
         }
         if preview.encoding == Encoding::Bytes {
             let mut sweep = self.sweep.take().unwrap_or_default();
-            self.sweep = sweep.take(&preview.payload).then_some(sweep);
+            self.sweep = sweep.feed(&preview.payload).then_some(sweep);
         }
     }
 }

@@ -121,17 +121,17 @@ fn damaged_pictures_are_flagged() {
 #[test]
 fn gaps_and_empty_pictures_are_lost_pictures() {
     let mut progress = Numbering::default();
-    assert_eq!(progress.take(5), 0, "samples before the first are unknown");
-    assert_eq!(progress.take(6), 0);
-    assert_eq!(progress.take(9), 2);
+    assert_eq!(progress.accept(5), 0, "samples before the first are unknown");
+    assert_eq!(progress.accept(6), 0);
+    assert_eq!(progress.accept(9), 2);
     progress.skip(10);
-    assert_eq!(progress.take(11), 1);
+    assert_eq!(progress.accept(11), 1);
     progress.skip(14);
-    assert_eq!(progress.take(15), 3);
-    assert_eq!(progress.take(15), 0, "a driver that does not count");
+    assert_eq!(progress.accept(15), 3);
+    assert_eq!(progress.accept(15), 0, "a driver that does not count");
     let mut wrapping = Numbering::default();
-    wrapping.take(u32::MAX);
-    assert_eq!(wrapping.take(1), 1);
+    wrapping.accept(u32::MAX);
+    assert_eq!(wrapping.accept(1), 1);
 }
 
 #[test]

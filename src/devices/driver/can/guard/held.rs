@@ -39,7 +39,7 @@ impl Drop for Line {
 
 impl Held {
     /// The line of these motors was opened, or closed.
-    pub(super) fn take(&mut self, motors: u16, engaged_high: bool, descriptor: Option<OwnedFd>) {
+    pub(super) fn set_line(&mut self, motors: u16, engaged_high: bool, descriptor: Option<OwnedFd>) {
         self.lines.retain(|line| line.motors != motors);
         let line = |descriptor| Line { motors, engaged_high, descriptor, is_engaged: Arc::default() };
         self.lines.extend(descriptor.map(line));
@@ -57,7 +57,7 @@ impl Held {
                 line.is_engaged.store(false, Ordering::SeqCst);
                 continue;
             };
-            let (output, level) = (Output::of(descriptor), line.engaged_high);
+            let (output, level) = (Output::from_descriptor(descriptor), line.engaged_high);
             let (is_wanted, end) = (Arc::clone(&line.is_engaged), Stamp::now().after(RETRIED_FOR));
             let set = move || {
                 while is_wanted.load(Ordering::SeqCst) && output.set(level).is_err() && Stamp::now() < end {

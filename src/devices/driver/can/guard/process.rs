@@ -187,7 +187,7 @@ fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool
         brakes.engage(ward.engages(now));
         if ward.is_orphan && claim.is_none() {
             // Until the motors are off no other program may command them.
-            claim = ward.post.interface.as_deref().and_then(|name| Claim::take(name).ok());
+            claim = ward.post.interface.as_deref().and_then(|name| Claim::acquire(name).ok());
         }
         if ward.state == State::Done {
             if ward.is_orphan && adapter == CanAdapter::Slcan {
@@ -210,7 +210,7 @@ fn listen(ward: &mut Ward, brakes: &mut Held, input: BorrowedFd<'_>) {
             Ok(RecvMsg { bytes: 0, .. }) | Err(Errno::CONNRESET) => ward.lose(Stamp::now()),
             Ok(RecvMsg { bytes, .. }) => match message.get(..bytes).unwrap_or_default() {
                 [BRAKE, low, high, level] => {
-                    brakes.take(u16::from_le_bytes([*low, *high]), *level == 1, descriptor(&mut control));
+                    brakes.set_line(u16::from_le_bytes([*low, *high]), *level == 1, descriptor(&mut control));
                 }
                 message => ward.receive(message, Stamp::now()),
             },

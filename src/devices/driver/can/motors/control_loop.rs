@@ -251,8 +251,8 @@ impl ControlLoop {
         let bus = &mut self.powered.bus;
         let before = bus.state();
         let mut is_stop = false;
-        let attended = self.shared.attended.get().map(|attended| attended.take());
-        for order in self.shared.orders.take().chain(attended.into_iter().flatten()) {
+        let attended = self.shared.attended.get().map(|attended| attended.take_pending());
+        for order in self.shared.orders.take_pending().chain(attended.into_iter().flatten()) {
             is_stop |= matches!(order, Order::Disarm | Order::Emergency(_));
             match order {
                 Order::Arm => bus.arm(now),

@@ -78,7 +78,7 @@ impl Effector {
     }
 
     /// Takes the state of the motors, and writes the numbers of the tip that follow it in a sample. Returns how many.
-    pub fn look(&self, motors: &[f64], tip: &mut [f64]) -> usize {
+    pub fn update(&self, motors: &[f64], tip: &mut [f64]) -> usize {
         for (place, position) in self.latest.positions.iter().zip(motors.iter().step_by(MOTOR_CHANNELS)) {
             place.store(position.to_bits(), Ordering::Relaxed);
         }

@@ -138,7 +138,7 @@ impl Camera {
                     self.settle().await;
                 }
                 _ = ticks.tick() => {
-                    let state = self.look().await;
+                    let state = self.query_state().await;
                     let is_over = state.is_err();
                     if !self.states.is_closed() && self.states.try_send(state).is_err() {
                         tracing::debug!(device = self.name, "a state was not read in time");
@@ -161,7 +161,7 @@ impl Camera {
         }
     }
 
-    async fn look(&self) -> Result<State, DriverError> {
+    async fn query_state(&self) -> Result<State, DriverError> {
         ask(&self.server, "/gopro/camera/keep_alive").await?;
         let asked = Stamp::now();
         let answer = ask(&self.server, "/gopro/camera/state").await?;
@@ -192,7 +192,7 @@ impl Camera {
 
     /// Checks whether the shutter of an earlier connection still runs. Returns whether this is known.
     async fn has_inherited(&mut self) -> bool {
-        let Ok(state) = self.look().await else { return false };
+        let Ok(state) = self.query_state().await else { return false };
         self.is_inherited = false;
         if let (Some(shutter), false) = (self.books.shutter().cloned(), state.recording) {
             self.unknown(&shutter, "its recording ended while it was not connected").await;
@@ -228,7 +228,7 @@ impl Camera {
             return;
         };
         // It may already be recording, started by hand.
-        if self.look().await.is_ok_and(|state| state.recording) {
+        if self.query_state().await.is_ok_and(|state| state.recording) {
             return;
         }
         self.books.set_shutter(None).await;
@@ -240,7 +240,7 @@ impl Camera {
     /// Stops the shutter and notes its clip; `false` if it keeps running.
     async fn stop(&mut self, shutter: Shutter) -> bool {
         if let Err(error) = ask(&self.server, "/gopro/camera/shutter/stop").await
-            && !self.look().await.is_ok_and(|state| !state.recording)
+            && !self.query_state().await.is_ok_and(|state| !state.recording)
         {
             if !std::mem::replace(&mut self.is_stated, true) {
                 tracing::error!(device = self.name, %error, "the camera is still recording; it is asked again to stop");

@@ -296,7 +296,7 @@ impl Part {
 /// Why this many more bytes do not fit on the disk of `file`; `None` if they do, or the file system reports no space.
 /// Episodes keep their space: twice the registry's `disk_reserve`, the level at which an episode is warned.
 fn full(file: &File, bytes: u64, reserve: Option<u64>) -> Option<String> {
-    let disk = Disk::of(file).ok().filter(|disk| disk.lacks_room_beside_an_episode(bytes, reserve))?;
+    let disk = Disk::of_file(file).ok().filter(|disk| disk.lacks_room_beside_an_episode(bytes, reserve))?;
     let (wanted, free) = (bytes.div_ceil(1 << 20), disk.free >> 20);
     let kept = disk.reserve(reserve).saturating_mul(2) >> 20;
     Some(format!(

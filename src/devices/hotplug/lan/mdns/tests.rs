@@ -59,7 +59,7 @@ impl Bench {
         let mut questions = 0;
         for _ in 0..ms / 100 {
             self.now = self.now.after(LOOK_EVERY);
-            questions += self.service.look(self.now).await.len();
+            questions += self.service.check(self.now).await.len();
         }
         (questions, self.reported())
     }
@@ -225,7 +225,7 @@ async fn a_link_that_was_down_for_a_moment_brings_its_device_back() {
     bench.announced("a", &["127.0.0.1:5"]).await;
     bench.pass(200).await;
     std::fs::write(&state, "0\n").expect("written");
-    bench.service.wanted[0].watch.lead_over(NetworkLink::of(folder.path().to_str().expect("plain text")));
+    bench.service.wanted[0].watch.lead_over(NetworkLink::of_interface(folder.path().to_str().expect("plain text")));
     assert_eq!(bench.pass(1000).await, (0, vec!["-/lan/phone link".to_owned()]));
     // Another instance's announcement is not evidence of this one.
     assert_eq!(bench.announced("b", &["127.0.0.1:6"]).await, ["+phone b 127.0.0.1:6"]);
@@ -242,7 +242,7 @@ async fn an_announcement_over_another_link_counts_at_once() {
     std::fs::write(folder.path().join("carrier"), "0\n").expect("written");
     let mut bench = Bench::new(&[("phone", None)]);
     bench.announced("a", &["127.0.0.1:5"]).await;
-    bench.service.wanted[0].watch.lead_over(NetworkLink::of(folder.path().to_str().expect("plain text")));
+    bench.service.wanted[0].watch.lead_over(NetworkLink::of_interface(folder.path().to_str().expect("plain text")));
     assert_eq!(bench.pass(500).await.1, ["-/lan/phone link"]);
     assert_eq!(bench.announced("a", &["127.0.0.2:5"]).await, ["+phone a 127.0.0.2:5"]);
 }

@@ -156,16 +156,16 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
     watch.found(closed_port(), None, begin).await;
     let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
-    watch.look(begin.after(EVERY * 2)).await;
+    watch.check(begin.after(EVERY * 2)).await;
     assert!(watch.is_there(), "its driver has not begun");
     // From the first packet on, the lease has its normal length.
     last_received.now();
-    watch.look(begin).await;
-    watch.look(last_received.at().after(EVERY)).await;
+    watch.check(begin).await;
+    watch.check(last_received.at().after(EVERY)).await;
     assert!(!watch.is_there());
     // A device that never sent is gone in the end.
     watch.found(closed_port(), None, begin.after(EVERY * 20)).await;
-    watch.look(begin.after(EVERY * 23)).await;
+    watch.check(begin.after(EVERY * 23)).await;
     assert!(!watch.is_there());
 }
 

@@ -18,7 +18,7 @@ use Step::{End, Look, Received};
 fn play(lease: &mut Lease, step: Step) -> Option<Change> {
     match step {
         Received(at) => lease.received(Stamp(at)),
-        Look(at) => lease.look(Stamp(at)),
+        Look(at) => lease.check(Stamp(at)),
         End(at) => lease.end(Stamp(at)),
     }
 }

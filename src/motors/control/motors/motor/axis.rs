@@ -88,7 +88,7 @@ impl Axis {
     /// Takes a target, as far as the limits allow.
     pub(super) fn aim(&mut self, motor: usize, target: f64, now: Stamp, notices: &mut Notices) {
         let Some(clamped) = self.limits.clamp(target) else { return };
-        if self.clamped.look(clamped.is_beyond, now) {
+        if self.clamped.update(clamped.is_beyond, now) {
             notices.notify(Notice::Clamped { motor, target, used: clamped.value });
         }
         self.target = clamped.value;

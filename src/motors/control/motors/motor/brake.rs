@@ -33,7 +33,7 @@ impl Brake {
         Self { spec, is: BrakeIs::default(), since: None }
     }
 
-    pub(super) fn take(&mut self, is: BrakeIs, now: Stamp) {
+    pub(super) fn update(&mut self, is: BrakeIs, now: Stamp) {
         if self.since.is_none() || self.is != is {
             (self.is, self.since) = (is, Some(now));
         }

@@ -93,7 +93,7 @@ impl Probe {
     ///
     /// # Errors
     /// The parameter cannot be used, or changed.
-    pub(super) fn take(&mut self, joint: &Joint, reply: &Reply, notices: &mut Notices) -> Result<bool, Fault> {
+    pub(super) fn accept(&mut self, joint: &Joint, reply: &Reply, notices: &mut Notices) -> Result<bool, Fault> {
         // What comes late, to an earlier question or to one that was repeated, answers nothing.
         if PROBE.get(self.at) != Some(&reply.parameter) || reply.written != self.setting.is_some() {
             return Ok(false);

@@ -49,7 +49,7 @@ impl Report {
     }
 
     /// Takes a feedback. `is_near`: could the joint move to it, from the one before, in this time?
-    pub(super) fn take(&mut self, feedback: Feedback, now: Stamp, is_near: impl FnOnce(&Feedback, Duration) -> bool) {
+    pub(super) fn update(&mut self, feedback: Feedback, now: Stamp, is_near: impl FnOnce(&Feedback, Duration) -> bool) {
         self.agrees = self.feedback.is_some_and(|before| is_near(&before, now.since(self.seen)));
         (self.feedback, self.seen, self.is_new) = (Some(feedback), now, true);
     }

@@ -23,7 +23,7 @@ pub(in crate::control::motors) struct Status {
 
 impl Status {
     /// Takes what it reports; `is_on`: it is on as far as we know, `is_ordered_off`: the order is on its way.
-    pub(super) fn take(&mut self, status: MotorStatus, is_on: bool, is_ordered_off: bool) {
+    pub(super) fn update(&mut self, status: MotorStatus, is_on: bool, is_ordered_off: bool) {
         let is_enabled = status == MotorStatus::Enabled;
         self.off_frames = if is_on && !is_enabled { self.off_frames.saturating_add(1) } else { 0 };
         self.newest = Some(status);

@@ -66,7 +66,7 @@ struct Spell {
 impl Spell {
     /// The condition holds at `now`, or not. Reports it once it has lasted for `word`; returns it once it has lasted
     /// for `limit`.
-    fn look(
+    fn update(
         &mut self,
         strange: Option<Strange>,
         now: Stamp,
@@ -183,7 +183,7 @@ impl Supervision {
     }
 
     /// The problem of a motor that is on, once it has lasted long enough to be a fault.
-    pub(super) fn look(
+    pub(super) fn check(
         &mut self,
         joint: &Joint,
         feedback: &Feedback,
@@ -207,7 +207,7 @@ impl Supervision {
             (lagging(spec, feedback, commanded), [at_once, LAG_AFTER]),
         ];
         let looks = self.spells.iter_mut().zip(table);
-        let lasting = looks.map(|(spell, (strange, limits))| spell.look(strange, now, limits, &mut notify));
+        let lasting = looks.map(|(spell, (strange, limits))| spell.update(strange, now, limits, &mut notify));
         // Every condition is updated, even after one that lasts.
         lasting.fold(None, Option::or).map(|what| Fault::Strange { motor, what })
     }

@@ -73,7 +73,7 @@ impl Sim {
     }
 
     /// Mounted as in its entry.
-    fn of(motor: &MotorSpec) -> Self {
+    fn mounted(motor: &MotorSpec) -> Self {
         let sign = if motor.mounting.reversed { -1.0 } else { 1.0 };
         Self { zero: motor.mounting.zero, sign, ..Self::new(motor.slave, motor.master) }
     }
@@ -292,7 +292,7 @@ impl World {
         let axes = spec.motors.len();
         Self {
             bus: MotorBus::new(&spec, now),
-            sims: spec.motors.iter().map(Sim::of).collect(),
+            sims: spec.motors.iter().map(Sim::mounted).collect(),
             spec,
             now,
             notices: Vec::new(),
@@ -415,7 +415,7 @@ impl World {
         assert!(sent.len() <= 2 * self.sims.len());
         let mut answers = Vec::new();
         for frame in &sent {
-            self.look(frame);
+            self.judge_frame(frame);
             answers.extend(self.sims.iter_mut().filter_map(|sim| sim.answer(frame)));
         }
         self.answers.push_back((self.now, answers));
@@ -442,7 +442,7 @@ impl World {
         }
     }
 
-    fn look(&mut self, frame: &CanFrame) {
+    fn judge_frame(&mut self, frame: &CanFrame) {
         assert!(!self.judge.stopped, "{frame:x?} after a stop");
         let silent_after = self.spec.silent_after.max(CYCLE * 3) + CYCLE * 2;
         for ((axis, sim), motor) in self.judge.axes.iter_mut().zip(&self.sims).zip(&self.spec.motors) {

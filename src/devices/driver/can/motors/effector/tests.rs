@@ -31,7 +31,7 @@ fn folded() -> Vec<f64> {
 fn poses_become_targets_with_their_ticks_and_what_is_out_of_reach_none() {
     let mut effector = effector();
     let mut tip = [0.0; 8];
-    assert_eq!(effector.look(&folded(), &mut tip), 8);
+    assert_eq!(effector.update(&folded(), &mut tip), 8);
     let actions = Arc::<Given>::default();
     let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
     let [x, y, z, ..] = tip;
@@ -60,7 +60,7 @@ fn poses_become_targets_with_their_ticks_and_what_is_out_of_reach_none() {
     // The motors are moved by hand: the next target is sought from where they are now.
     let mut moved = folded();
     moved[4 * MOTOR_CHANNELS] += 1.5;
-    effector.look(&moved, &mut tip);
+    effector.update(&moved, &mut tip);
     actions.add(Ok((pose(0.0), Stamp(10))));
     let (found, _) = next(&targets).expect("a target");
     assert!((found[4] - moved[4 * MOTOR_CHANNELS]).abs() < 0.05, "{found:?}");
@@ -73,7 +73,7 @@ fn poses_become_targets_with_their_ticks_and_what_is_out_of_reach_none() {
 fn an_arm_whose_gripper_holds_something_stays_as_it_is() {
     let mut effector = effector();
     let mut tip = [0.0; 8];
-    effector.look(&folded(), &mut tip);
+    effector.update(&folded(), &mut tip);
     let actions = Arc::<Given>::default();
     let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
     let [x, y, z, ..] = tip;
@@ -83,7 +83,7 @@ fn an_arm_whose_gripper_holds_something_stays_as_it_is() {
     let (first, _) = next(&targets).expect("a target");
     let mut behind = folded();
     behind[4 * MOTOR_CHANNELS] += 0.2;
-    effector.look(&behind, &mut tip);
+    effector.update(&behind, &mut tip);
     actions.add(pose(2));
     let (second, _) = next(&targets).expect("a target");
     assert!((second[4] - first[4]).abs() < 0.01, "{first:?} {second:?}");
@@ -94,7 +94,7 @@ fn actions_are_counted_by_what_became_of_them() {
     let mut effector = effector();
     assert_eq!(effector.stop(), None, "it does not run");
     let mut tip = [0.0; 8];
-    effector.look(&folded(), &mut tip);
+    effector.update(&folded(), &mut tip);
     let actions = Arc::<Given>::default();
     let targets = effector.follow(Arc::clone(&actions) as Arc<dyn ActionSource>).expect("a thread");
     let [x, y, z, ..] = tip;
