@@ -265,6 +265,8 @@ fn violations(files: &BTreeMap<PathBuf, String>, is_of_crate: impl Fn(&Path) -> 
         if !is_of_crate(path) {
             rules.append(&mut source.layers());
         }
+        rules.sort();
+        rules.dedup();
         found.extend(rules.into_iter().map(|(line, rule)| format!("{}:{line}: {rule}", path.display())));
     }
     found
