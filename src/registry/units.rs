@@ -1,9 +1,24 @@
 //! Durations and sizes as people write them: a number and a unit.
 //!
-//! Invariant: one grammar of durations, in registries, scenarios, journals and on the command line, with humantime's units.
+//! Invariant: one grammar of durations, in registries, scenarios, journals and on the command line, with the units of the
+//! crate humantime: a month is 30.44 days, a year 365.25.
 //! What is shown can be read again, and is the same.
 
 use std::time::Duration;
+
+const DURATIONS: [(&[&str], u128); 10] = [
+    (&["ns", "nsec", "nanos"], 1),
+    (&["us", "µs", "usec"], 1_000),
+    (&["ms", "msec", "millis"], 1_000_000),
+    (&["s", "sec", "secs", "second", "seconds"], SECOND),
+    (&["m", "min", "mins", "minute", "minutes"], 60 * SECOND),
+    (&["h", "hr", "hrs", "hour", "hours"], 3_600 * SECOND),
+    (&["d", "day", "days"], 86_400 * SECOND),
+    (&["w", "wk", "wks", "week", "weeks"], 604_800 * SECOND),
+    (&["M", "month", "months"], 2_630_016 * SECOND),
+    (&["y", "yr", "yrs", "year", "years"], 31_557_600 * SECOND),
+];
+const SECOND: u128 = 1_000_000_000;
 
 const SIZES: [(&str, u64); 9] = [
     ("B", 1),
@@ -43,7 +58,7 @@ fn nanoseconds(term: &str) -> Option<u128> {
     if !is_number(whole) || !is_number(fraction) {
         return None;
     }
-    let unit = humantime::parse_duration(&format!("1{unit}")).ok()?.as_nanos();
+    let (_, unit) = DURATIONS.into_iter().find(|(names, _)| names.contains(&unit))?;
     let part = fraction.get(..DIGITS).unwrap_or(fraction).parse::<u128>().ok()? * unit;
     let scale = 10_u128.pow(u32::try_from(fraction.len().min(DIGITS)).ok()?);
     let part = (part + scale / 2) / scale;
@@ -139,6 +154,12 @@ mod tests {
             ("0.3333333333333333333333333333333333333333333s", Some(Duration::from_nanos(333_333_333))),
             ("0.0001h", Some(Duration::from_millis(360))),
             ("1.5y", Some(Duration::from_hours(13_149))),
+            ("1 month", Some(Duration::from_secs(2_630_016))),
+            ("1M", Some(Duration::from_secs(2_630_016))),
+            ("1m", Some(Duration::from_mins(1))),
+            ("2 weeks 1 day", Some(Duration::from_hours(360))),
+            ("5µs", Some(Duration::from_micros(5))),
+            ("5S", None),
             ("1 5s", None),
             ("1. 5s", None),
             ("1.5 5s", None),
