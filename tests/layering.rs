@@ -304,7 +304,7 @@ impl Source {
         while !rest.is_empty() {
             let taken = match rest {
                 [Punct(hash), Group(attribute), item @ ..] if hash.as_char() == '#' && is_test(attribute) => {
-                    let end = item.iter().position(is_end).map_or(item.len(), |at| at + 1);
+                    let end = item.iter().position(is_end).map_or(0, |at| at + 1);
                     if let [.., Ident(word), Ident(name), Punct(_)] = &item[..end]
                         && word == "mod"
                     {

@@ -147,7 +147,7 @@ pub(super) fn may_begin(head: &ChunkHead, opcode: u8, begin: &[u8]) -> bool {
 fn unpack(packing: Packing, packed: &[u8], size: u64, into: &mut Vec<u8>) -> Option<()> {
     let read = match packing {
         Packing::Zstd => zstd::stream::read::Decoder::new(packed).ok()?.take(size).read_to_end(into),
-        Packing::Lz4 => lz4_flex::frame::FrameDecoder::new(packed).take(size).read_to_end(into),
+        Packing::Lz4 => lz4::Decoder::new(packed).ok()?.take(size).read_to_end(into),
         Packing::Plain | Packing::Unknown => return None,
     };
     (read.ok()? as u64 == size).then_some(())

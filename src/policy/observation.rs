@@ -13,7 +13,7 @@ use super::normalize::Normalizer;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum VectorError {
     /// The observation is made of pictures.
-    #[error("observation `{0}` is made of pictures, not of values")]
+    #[error("observation `{0}` is made of images, not of values")]
     Pictures(String),
     /// The sample has another shape than the policy requires.
     #[error("a sample of {found} values, where observation `{key}` takes {wanted}: see its `slice` in policy.json")]

@@ -1,7 +1,7 @@
 //! The rig: turns hot-plug events into running device streams and the physical mask.
 //!
-//! One task owns the lifecycle of every device. It takes hot-plug events, the reports and ends of streams, commands and deadlines, applies
-//! them to them, and carries out their decisions.
+//! One task owns the lifecycle of every device. It applies hot-plug events, the reports and ends of streams, commands and
+//! deadlines to it, and carries out its decisions.
 //!
 //! Invariant: only this module decides the mask.
 //! Invariant: this task never waits for a device; a stream is asked to end and then forgotten.

@@ -42,6 +42,8 @@ pub fn is_on_usb(node: &Path) -> bool {
 mod listing {
     use std::path::{Path, PathBuf};
 
+    use rapid_registry::PixelFormat;
+
     use super::CameraInfo;
     use crate::driver::{DriverError, built_without};
 
@@ -49,8 +51,9 @@ mod listing {
         Vec::new()
     }
 
+    /// All: an entry finds its node, and is refused when that is opened.
     pub fn formats(_: &Path) -> Vec<String> {
-        Vec::new()
+        PixelFormat::WORDS.iter().map(|(word, _)| (*word).to_owned()).collect()
     }
 
     pub fn name(_: &Path) -> Result<Option<String>, DriverError> {

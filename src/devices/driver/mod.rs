@@ -311,7 +311,7 @@ fn not_opened(spec: &DeviceSpec, node: &DeviceNode) -> DriverError {
         NodeSpec::Process(_) => ("program", None),
     };
     if let Some(feature) = missing {
-        return built_without(feature);
+        return DriverError::Fatal(format!("{}, or remove the entry", built_without(feature)));
     }
     let is = match node {
         DeviceNode::Video(_) => "a camera",
@@ -341,7 +341,6 @@ async fn unblock<T: Send + 'static>(
 /// Why there is no driver: a feature of the build is missing.
 fn built_without(feature: &str) -> DriverError {
     DriverError::Fatal(format!(
-        "this rapid was built without `{feature}`: build it with `cargo build --release --features {feature}`, or remove \
-         the entry"
+        "this rapid was built without `{feature}`: build it with `cargo build --release --features {feature}`"
     ))
 }

@@ -194,8 +194,8 @@ impl Decoder {
 
     fn description(&self) -> String {
         let content = match self.parse {
-            Parse::Csv => "comma-separated numbers",
-            Parse::Json => "numbers in JSON",
+            Parse::Csv => "comma-separated values",
+            Parse::Json => "values in JSON",
             Parse::F32le => "32-bit floats",
             Parse::Raw => return format!("bytes in {}", self.framer.description()),
         };

@@ -9,7 +9,7 @@ use super::spec::Normalization;
 /// Reports a list that has not one number for each of `len` dimensions.
 pub(super) fn check_length(entry: &str, numbers: &[f32], len: usize, problems: &mut Problems) -> bool {
     if numbers.len() != len {
-        let [found, len] = [(numbers.len(), "number"), (len, "dimension")].map(|(count, of)| counted(count as u64, of));
+        let [found, len] = [(numbers.len(), "value"), (len, "dimension")].map(|(count, of)| counted(count as u64, of));
         problems.wrong(entry, format!("has {found} for {len}"));
     }
     numbers.len() == len

@@ -116,7 +116,7 @@ pub(crate) fn read(entry: &Section<'_>, _: Programs<'_>) -> Option<Settings> {
         entry.report("camera", format!("a serial line has no table [{}]", entry.child("camera")), fix);
     }
     let Some(key) = TABLES.into_iter().find(|key| entry.is_table(key)) else {
-        let fix = format!("write [{}] with channels = the count of numbers in a message", entry.child("tty"));
+        let fix = format!("write [{}] with channels = the count of values in a message", entry.child("tty"));
         entry.missing("the table of the serial line", &fix);
         return None;
     };
@@ -139,7 +139,7 @@ pub(crate) fn read(entry: &Section<'_>, _: Programs<'_>) -> Option<Settings> {
         serial.channels = 0;
         return Some((NodeSpec::Serial(serial), None));
     }
-    table.need("channels", "write channels = the count of numbers in a message");
+    table.need("channels", "write channels = the count of values in a message");
     let channels = serial.channels;
     match (serial.parse, serial.framing) {
         // Missing, which was reported.

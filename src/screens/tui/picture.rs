@@ -95,9 +95,9 @@ enum Protocol {
 pub struct Canvas {
     /// `None`: as characters.
     protocol: Option<Protocol>,
-    /// Of a cell, in pixels.
+    /// By a graphics protocol.
     #[cfg(feature = "graphics")]
-    cell: (u16, u16),
+    encoder: Option<graphics::Encoder>,
     last: Option<(Key, Encoded)>,
     /// Where this frame, and the one before it, have a picture.
     drawn: [Option<Rect>; 2],
@@ -146,7 +146,11 @@ impl Canvas {
             _ if in_multiplexer => Protocol::Blocks,
             _ if set("KITTY_WINDOW_ID").is_some() || is("TERM", &["kitty", "ghostty"]) => {
                 // Not needed where it reports no size.
-                if cell.is_some() && places_pictures_in_text() { Protocol::Kitty } else { Protocol::Blocks }
+                if cfg!(feature = "graphics") && cell.is_some() && places_pictures_in_text() {
+                    Protocol::Kitty
+                } else {
+                    Protocol::Blocks
+                }
             }
             _ if is("TERM_PROGRAM", &["iTerm", "WezTerm"])
                 || is("LC_TERMINAL", &["iTerm"])
@@ -164,7 +168,7 @@ impl Canvas {
         Self {
             protocol: Some(if cell.is_some() && cfg!(feature = "graphics") { protocol } else { Protocol::Blocks }),
             #[cfg(feature = "graphics")]
-            cell: cell.unwrap_or((1, 2)),
+            encoder: cell.and_then(|cell| graphics::Encoder::new(protocol, cell)),
             ..Self::default()
         }
     }
@@ -203,12 +207,12 @@ impl Canvas {
     }
 
     /// `None` if it cannot be encoded.
-    #[cfg_attr(not(feature = "graphics"), expect(clippy::unused_self, reason = "half blocks need no size of a cell"))]
+    #[cfg_attr(not(feature = "graphics"), expect(clippy::unused_self, reason = "half blocks need no encoder"))]
     fn encode(&self, protocol: Protocol, picture: &Picture, size: Size) -> Option<Encoded> {
         match protocol {
             Protocol::Blocks => Some(Encoded::Blocks(Blocks::new(picture, size))),
             #[cfg(feature = "graphics")]
-            _ => graphics::Graphics::new(protocol, picture, self.cell, size).map(Encoded::Graphics),
+            _ => self.encoder.as_ref()?.encode(picture, size).map(Encoded::Graphics),
             #[cfg(not(feature = "graphics"))]
             _ => None,
         }

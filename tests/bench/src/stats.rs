@@ -43,7 +43,7 @@ pub(crate) fn range(runs: &[f64]) -> Option<(f64, f64)> {
     Some((*sorted.first()?, *sorted.last()?))
 }
 
-/// Differences of neighbours with consecutive numbers; how many values are missing between the others.
+/// Differences of neighbours with consecutive numbers; how many numbers are missing between the others.
 pub(crate) fn steps(numbered: &[(u64, u64)]) -> (Vec<u64>, u64) {
     let mut steps = Vec::with_capacity(numbered.len());
     let mut missing = 0;
