@@ -513,6 +513,8 @@ mod the_check_itself {
         );
         finds("orders.rs", "#[cfg(test)]\nmod tests {\n use crate::rig::Rig;\n fn f() { println!() }\n}", &[]);
         finds("orders.rs", "#[cfg(not(test))]\nmod x { use crate::rig::Rig; }", &["2: `orders`"]);
+        finds("alignment.rs", "struct A {\n #[cfg(test)]\n a: u8,\n b: Mutex<u8>,\n}", &["4: `Mutex`"]);
+        finds("alignment.rs", "enum A { #[cfg(test)] B, C(Mutex<u8>) }", &["1: `Mutex`"]);
         let files = [("orders/give.rs", "#[cfg(test)]\nmod tests;"), ("orders/give/tests.rs", "use crate::rig::Rig;")];
         assert_eq!(found(&files), [] as [&str; 0]);
     }
