@@ -1,6 +1,9 @@
 //! JPEG pictures (ITU-T T.81) as pixels, and pixels as JPEG pictures: 8 bits a value, row by row from the top.
 //!
-//! Invariant: no bytes cause a panic, and a picture that is not whole is refused where that is asked for.
+//! Invariant: no bytes cause a panic, and a picture that is not whole is refused.
+
+mod huffman;
+mod walk;
 
 use jpeg_encoder::{ColorType, Encoder, EncodingError};
 use zune_jpeg::JpegDecoder;
@@ -8,6 +11,8 @@ use zune_jpeg::errors::DecodeErrors;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
+
+pub use walk::{Damage, Frame, Walker};
 
 /// Pixels a picture may have along a side.
 pub const LARGEST: usize = 8192;
@@ -47,20 +52,35 @@ pub fn encode(
     Ok(Encoder::new(out, quality).encode(pixels, width, height, colors)?)
 }
 
-/// Why a picture has no pixels, as text.
+/// Why a picture has no pixels.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct DecodeError(String);
+pub enum DecodeError {
+    /// It is not whole.
+    #[error(transparent)]
+    Damage(#[from] Damage),
+    /// It is not of the size that is expected.
+    #[error("{found:?} pixels across and down in a sample of {expected:?}")]
+    Size {
+        /// Pixels of the picture.
+        found: [usize; 2],
+        /// Pixels of the sample.
+        expected: [usize; 2],
+    },
+    /// The decoder's own reason.
+    #[error("{0}")]
+    Decoder(String),
+}
 
 impl From<DecodeErrors> for DecodeError {
     fn from(error: DecodeErrors) -> Self {
-        Self(error.to_string())
+        Self::Decoder(error.to_string())
     }
 }
 
 /// Memory of one picture, used again for the next; the library itself allocates for every picture.
 #[derive(Debug, Default)]
 pub struct Decoder {
+    walker: Walker,
     /// The picture with the mark that the library requires.
     marked: Vec<u8>,
 }
@@ -71,23 +91,24 @@ impl Decoder {
     /// # Errors
     /// When the picture is damaged, truncated or of another size; `values` are then meaningless.
     pub fn rgb(&mut self, jpeg: &[u8], [height, width]: [usize; 2], values: &mut Vec<u8>) -> Result<(), DecodeError> {
-        // Strict: a truncated picture is refused, not padded with grey.
-        let mut decoder = self.decoder(jpeg, options(ColorSpace::RGB).set_strict_mode(true));
-        decoder.decode_headers()?;
-        if decoder.dimensions() != Some((width, height)) {
-            let (wide, high) = decoder.dimensions().unwrap_or_default();
-            return Err(DecodeError(format!("{wide}x{high} pixels in a sample of {width}x{height}")));
+        let frame = self.walker.walk(jpeg)?;
+        let found = [frame.width, frame.height].map(usize::from);
+        if found != [width, height] {
+            return Err(DecodeError::Size { found, expected: [width, height] });
         }
+        let mut decoder = self.decoder(picture(jpeg, frame), options(ColorSpace::RGB).set_strict_mode(true));
+        decoder.decode_headers()?;
         values.resize(CHANNELS * width * height, 0);
         Ok(decoder.decode_into(values)?)
     }
 
-    /// The luminance of each pixel of a picture of any size; where it is truncated, that of grey.
+    /// The luminance of each pixel of a picture of any size.
     ///
     /// # Errors
-    /// When the picture is damaged.
+    /// When the picture is damaged or truncated.
     pub fn luminance(&mut self, jpeg: &[u8]) -> Result<Vec<u8>, DecodeError> {
-        Ok(self.decoder(jpeg, options(ColorSpace::Luma)).decode()?)
+        let frame = self.walker.walk(jpeg)?;
+        Ok(self.decoder(picture(jpeg, frame), options(ColorSpace::Luma)).decode()?)
     }
 
     /// With the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the Huffman tables and imply those
@@ -105,6 +126,11 @@ impl Decoder {
 /// The sum of the squares of the differences between pixels and those that a lossy encoder made of them.
 pub fn squares(found: &[u8], expected: &[u8]) -> u64 {
     found.iter().zip(expected).map(|(found, expected)| u64::from(found.abs_diff(*expected)).pow(2)).sum()
+}
+
+/// The bytes of a picture that was walked.
+fn picture(jpeg: &[u8], frame: Frame) -> &[u8] {
+    jpeg.get(..frame.length).unwrap_or(jpeg)
 }
 
 fn options(colors: ColorSpace) -> DecoderOptions {
