@@ -7,8 +7,7 @@ use std::borrow::Cow;
 use std::fmt;
 
 use rapid_core::sample::Encoding;
-use rapid_episode::decode::jpeg_frame;
-use rapid_episode::record::is_whole_jpeg;
+use rapid_pictures::jpeg::Walker;
 use rapid_pictures::pixels::{LARGEST, Picture, PixelError, Pixels};
 
 use super::rows::Payload;
@@ -97,13 +96,16 @@ impl fmt::Display for Shape {
     }
 }
 
-/// The shape of a picture that can be used: of a JPEG, one with its beginning, its end and a size.
+/// The shape of a picture that can be used: of a JPEG, one that is whole.
 pub(super) fn shape(payload: &Payload) -> Option<Shape> {
     let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
     let (width, height) = (*width, *height);
     let pixels = usize::try_from(u64::from(width) * u64::from(height)).ok()?;
     let channels = match encoding {
-        Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components).filter(|_| is_whole_jpeg(bytes)),
+        Encoding::Mjpeg => {
+            let frame = Walker::default().walk(bytes).ok()?;
+            return Shape::new(frame.height.into(), frame.width.into(), if frame.components == 1 { 1 } else { 3 });
+        }
         Encoding::Grey => (bytes.len() == pixels).then_some(3),
         Encoding::Yuyv => (Some(bytes.len()) == pixels.checked_mul(2) && pixels.is_multiple_of(2)).then_some(3),
         Encoding::Bytes | Encoding::F64 | Encoding::Mask | Encoding::Depth => None,
