@@ -72,7 +72,7 @@ impl Codec {
 }
 
 /// Pixels along each side, and values of a pixel: 3, and 1 in the pictures of a camera that sends grey JPEGs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Shape {
     /// Rows.
     pub height: u32,
@@ -97,18 +97,23 @@ impl fmt::Display for Shape {
     }
 }
 
-/// The shape of a picture that can be used: of a JPEG, one with its beginning, its end and a size.
-pub(super) fn shape(payload: &Payload) -> Option<Shape> {
-    let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
-    let (width, height) = (*width, *height);
+/// The shape that a picture states of itself, whether it can be used or not.
+pub(super) fn stated(encoding: Encoding, width: u32, height: u32, bytes: &[u8]) -> Option<Shape> {
     let pixels = usize::try_from(u64::from(width) * u64::from(height)).ok()?;
     let channels = match encoding {
-        Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components).filter(|_| is_whole_jpeg(bytes)),
+        Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components),
         Encoding::Grey => (bytes.len() == pixels).then_some(3),
         Encoding::Yuyv => (Some(bytes.len()) == pixels.checked_mul(2) && pixels.is_multiple_of(2)).then_some(3),
         Encoding::Bytes | Encoding::F64 | Encoding::Mask | Encoding::Depth => None,
     };
     Shape::new(height, width, channels?)
+}
+
+/// The shape of a picture that can be used: of a JPEG, one with its beginning, its end and a size.
+pub(super) fn shape(payload: &Payload) -> Option<Shape> {
+    let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
+    let is_whole = *encoding != Encoding::Mjpeg || is_whole_jpeg(bytes);
+    stated(*encoding, *width, *height, bytes).filter(|_| is_whole)
 }
 
 /// The file of a picture.

@@ -25,7 +25,7 @@ use super::cells::CellMaker;
 use super::error::SetError;
 use super::features::{Axis, Features, Known, MASK, Origin, PLUGGED, STATE, VALID};
 use super::picture::{Codec, Pictures, Shape};
-use super::rows::{Index, Listed, Refusal, Row};
+use super::rows::{Form, Index, Listed, Refusal, Row};
 use super::set::{DataSet, prepare};
 use super::statistics::Column;
 use super::survey::{Content, Stream, Survey, survey};
@@ -82,7 +82,11 @@ impl Recording {
     }
 
     fn sample(&mut self, bit: Option<u8>, sequence: u32, encoding: Encoding, payload: &[u8]) {
-        let header = SampleHeader { encoding: encoding as u32, width: 4, height: 2, ..SampleHeader::default() };
+        self.sized(bit, sequence, encoding, [4, 2], payload);
+    }
+
+    fn sized(&mut self, bit: Option<u8>, sequence: u32, encoding: Encoding, [width, height]: [u32; 2], payload: &[u8]) {
+        let header = SampleHeader { encoding: encoding as u32, width, height, ..SampleHeader::default() };
         let kind = SampleSchema::for_sample(&header, payload);
         let at_ms = u64::from(sequence) * 100;
         encode::sample(&mut self.message, kind, BEGIN + at_ms * 1_000_000, "", &header, payload);
@@ -187,6 +191,7 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         grade: Grade::Good,
         rows: index.ticks.len(),
         unusable: 0,
+        unfit: Vec::new(),
         fps: index.fps,
         task: task.to_owned(),
         streams: index.modalities.iter().map(stream).collect(),
@@ -491,4 +496,114 @@ fn finite(key: &str, statistics: &Named) {
         assert!(!values.is_empty() && values.iter().all(|value| value.is_finite()), "{key}, {name}: {values:?}");
     }
     assert!(statistics["count"][0] >= 1.0, "{key}");
+}
+
+/// A sample of the camera, of the force sensor, or an action, and its size.
+#[derive(Clone)]
+enum Sent {
+    Picture(Encoding, [u32; 2], Vec<u8>),
+    Numbers(Vec<f64>),
+    Action(Vec<f64>),
+}
+
+fn jpeg(shape: [u16; 2], values: rapid_pictures::jpeg::Values) -> Vec<u8> {
+    let channels = if values == rapid_pictures::jpeg::Values::Grey { 1 } else { 3 };
+    let mut jpeg = Vec::new();
+    let pixels = shape.map(usize::from).iter().product::<usize>();
+    rapid_pictures::jpeg::encode(&vec![90; channels * pixels], shape, values, 90, &mut jpeg).unwrap();
+    jpeg
+}
+
+/// An episode of five rows with a JPEG, a number and an action in each, but for `other` in the row `at`.
+fn with_another(folder: &Path, name: &str, other: &Sent, at: u32) -> PathBuf {
+    let folder = folder.join(name);
+    std::fs::create_dir(&folder).unwrap();
+    let mut recording = Recording::new(&folder);
+    let usual = [
+        Sent::Picture(Encoding::Mjpeg, [4, 2], jpeg([2, 4], rapid_pictures::jpeg::Values::Rgb)),
+        Sent::Numbers(vec![0.5]),
+        Sent::Action(vec![1.0, 2.0]),
+    ];
+    for number in 0..5 {
+        recording.frame(number, [Some(number.into()); 2]);
+        for sent in &usual {
+            let is_other = number == at && std::mem::discriminant(sent) == std::mem::discriminant(other);
+            match if is_other { other } else { sent } {
+                Sent::Picture(encoding, size, bytes) => recording.sized(Some(0), number, *encoding, *size, bytes),
+                Sent::Numbers(numbers) => recording.numbers(Some(4), number, numbers),
+                Sent::Action(numbers) => recording.numbers(None, number, numbers),
+            }
+        }
+    }
+    recording.end()
+}
+
+#[test]
+fn a_sample_that_cannot_be_exported_is_one_row_and_is_named() {
+    use rapid_pictures::jpeg::Values;
+    let folder = tempfile::tempdir().unwrap();
+    let whole = jpeg([2, 4], Values::Rgb);
+    let picture = |size: [u32; 2], bytes: &[u8]| Sent::Picture(Encoding::Mjpeg, size, bytes.to_vec());
+    let cases = [
+        (
+            "size",
+            picture([16, 8], &jpeg([8, 16], Values::Rgb)),
+            "cam: 1 frame (a picture of 16x8, and not a picture of 4x2)",
+        ),
+        (
+            "grey",
+            picture([4, 2], &jpeg([2, 4], Values::Grey)),
+            "cam: 1 frame (a picture of 4x2 grey, and not a picture of 4x2)",
+        ),
+        (
+            "raw",
+            Sent::Picture(Encoding::Yuyv, [2, 2], YUYV[..8].to_vec()),
+            "cam: 1 frame (a picture of 2x2, and not a picture of 4x2)",
+        ),
+        ("cut", picture([4, 2], &whole[..whole.len() - 2]), "cam: 1 frame (damaged)"),
+        ("no header", picture([4, 2], &whole[..9]), "cam: 1 frame (damaged)"),
+        ("empty", picture([4, 2], &[]), "cam: 1 frame (damaged)"),
+        ("depth", Sent::Picture(Encoding::Depth, [4, 2], vec![0; 16]), "cam: 1 frame (damaged)"),
+        ("longer", Sent::Numbers(vec![1.0, 2.0]), "force: 1 frame (2 numbers, and not 1 number)"),
+        ("none", Sent::Numbers(vec![]), "force: 1 frame (damaged)"),
+        ("endless", Sent::Numbers(vec![f64::INFINITY]), "force: 1 frame (damaged)"),
+        ("three", Sent::Action(vec![1.0, 2.0, 3.0]), "/action: 1 message (3 numbers, and not 2)"),
+        ("no action", Sent::Action(vec![]), "/action: 1 message (0 numbers, and not 2)"),
+        ("not finite", Sent::Action(vec![1.0, f64::NAN]), "/action: 1 message (a number that is not finite)"),
+    ];
+    // Also the first one, which was what the others had to be as.
+    for ((name, other, expected), at) in cases.iter().flat_map(|case| [0, 3].map(|at| (case, at))) {
+        let name = format!("{name} {at}");
+        let episode = with_another(folder.path(), &name, other, at);
+        let out = folder.path().join(format!("{name} set"));
+        let survey = exported(&out, &[episode]).remove(0);
+        assert_eq!(survey.unfit.iter().map(ToString::to_string).collect::<Vec<_>>(), [*expected], "{name}");
+        let is_action = expected.starts_with("/action");
+        assert_eq!(survey.unusable, u64::from(!is_action), "{name}");
+        let mut rows = Rows::open(File::open(out.join("data/chunk-000/file-000.parquet")).unwrap()).unwrap();
+        for number in 0..5 {
+            let row = rows.advance().unwrap().expect("a row");
+            let is_other = number == at;
+            let [camera, force] = [expected.starts_with("cam"), expected.starts_with("force")].map(|is| is && is_other);
+            let flag = |is_unfit: bool| if is_unfit { 0.0 } else { 1.0 };
+            assert_eq!(row.numbers(VALID).unwrap(), [flag(camera), flag(force)], "{name} {number}");
+            assert_eq!(row.numbers(MASK).unwrap(), [1.0, 1.0], "{name} {number}");
+            assert_eq!(row.numbers(STATE).unwrap(), [0.5 * flag(force)], "{name} {number}");
+            // The action before it stays in force.
+            assert_eq!(row.numbers("action").unwrap(), [1.0, 2.0], "{name} {number}");
+            let found = row.picture(CAMERA).unwrap();
+            if camera { assert_eq!(decoded(found), [0; 24], "{name}") } else { assert_eq!(found, whole, "{name}") }
+        }
+    }
+}
+
+#[test]
+fn the_form_of_a_sensor_is_that_of_most_rows_then_the_declared_one() {
+    let shape = |width| Form::Picture(Shape::new(2, width, 3).unwrap());
+    let of =
+        |widths: &[u32], declared| Form::most_frequent(widths.iter().map(|width| shape(*width)), Some(shape(declared)));
+    assert_eq!(of(&[8, 4, 4], 8), Some(shape(4)));
+    assert_eq!(of(&[8, 4], 4), Some(shape(4)));
+    assert_eq!(of(&[8, 4], 6), Some(shape(8)), "the first");
+    assert_eq!(of(&[], 6), None);
 }
