@@ -5,6 +5,8 @@
 mod huffman;
 mod walk;
 
+use std::borrow::Cow;
+
 use jpeg_encoder::{ColorType, Encoder, EncodingError};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::errors::DecodeErrors;
@@ -128,6 +130,33 @@ pub fn squares(found: &[u8], expected: &[u8]) -> u64 {
     found.iter().zip(expected).map(|(found, expected)| u64::from(found.abs_diff(*expected)).pow(2)).sum()
 }
 
+/// A whole picture without what is behind its end, and without the metadata by which some readers turn a picture or change its
+/// colours while others do not: Exif and XMP (APP1), colour profiles and further pictures (APP2). Its pixels, which are
+/// what everything here decodes, stay bit for bit. Borrowed if nothing has to go, or if it is not whole.
+pub fn plain(jpeg: &[u8]) -> Cow<'_, [u8]> {
+    let Ok(frame) = Walker::default().walk(jpeg) else { return Cow::Borrowed(jpeg) };
+    let whole = picture(jpeg, frame);
+    let mut kept = Cow::Borrowed(whole);
+    let mut at = 2;
+    while let Some(&[0xff, marker, high, low]) = whole.get(at..).and_then(|rest| rest.first_chunk()) {
+        if marker == 0xff {
+            at += 1;
+            continue;
+        }
+        if marker == 0xda {
+            break;
+        }
+        let end = at + 2 + usize::from(u16::from_be_bytes([high, low]));
+        if matches!(marker, 0xe1 | 0xe2) {
+            // From the end of the picture, whose rest is the same.
+            let from = kept.len() - (whole.len() - at);
+            kept.to_mut().drain(from..from + (end - at));
+        }
+        at = end;
+    }
+    kept
+}
+
 /// The bytes of a picture that was walked.
 fn picture(jpeg: &[u8], frame: Frame) -> &[u8] {
     jpeg.get(..frame.length).unwrap_or(jpeg)
@@ -135,4 +164,29 @@ fn picture(jpeg: &[u8], frame: Frame) -> &[u8] {
 
 fn options(colors: ColorSpace) -> DecoderOptions {
     DecoderOptions::default().jpeg_set_out_colorspace(colors).set_max_width(LARGEST).set_max_height(LARGEST)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plain_picture_has_the_same_pixels_and_nothing_to_interpret() {
+        let mut jpeg = Vec::new();
+        let pixels: Vec<u8> = (0..40 * 24 * 3).map(|at| u8::try_from(at % 251).unwrap()).collect();
+        encode(&pixels, [24, 40], Values::Rgb, 85, &mut jpeg).unwrap();
+        assert!(matches!(plain(&jpeg), Cow::Borrowed(same) if same == jpeg));
+        // Turned by Exif (orientation 6), with a profile, a comment, and bytes behind the end.
+        let exif = b"\xff\xe1\x00\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
+        let (profile, comment) = (b"\xff\xe2\x00\x06ICC_", b"\xff\xff\xfe\x00\x06seq1");
+        let dressed = [&jpeg[..2], exif, comment, profile, &jpeg[2..], b"tail"].concat();
+        let bare = plain(&dressed);
+        assert_eq!(*bare, [&jpeg[..2], comment, &jpeg[2..]].concat());
+        let (mut decoder, mut found, mut expected) = (Decoder::default(), Vec::new(), Vec::new());
+        decoder.rgb(&jpeg, [24, 40], &mut expected).unwrap();
+        for picture in [&dressed, &*bare] {
+            decoder.rgb(picture, [24, 40], &mut found).unwrap();
+            assert_eq!(found, expected);
+        }
+    }
 }

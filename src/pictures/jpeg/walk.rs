@@ -197,7 +197,10 @@ impl Walker {
             return Err(Damage::Unsupported("not of 8 bits"));
         }
         let is_side = |side: u16| (1..=LARGEST).contains(&usize::from(side));
-        if !is_side(width) || !is_side(height) || !(1..=4).contains(&components) {
+        if !matches!(components, 1 | 3) {
+            return Err(Damage::Unsupported("neither grey nor of three colours"));
+        }
+        if !is_side(width) || !is_side(height) {
             return Err(damaged);
         }
         let described = rest.as_chunks::<3>().0.get(..usize::from(components)).ok_or(damaged)?;
