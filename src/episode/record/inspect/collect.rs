@@ -269,7 +269,7 @@ impl Collected {
             messages: counted.messages,
             dropped: state::sum(&self.summary, "dropped", &modalities, |quality| quality.dropped),
             lost: state::sum(&self.summary, "lost", &modalities, |quality| quality.lost),
-            damaged: answer(&self.summary, "damaged").parse().ok(),
+            damaged: state::sum(&self.summary, "damaged", &modalities, |quality| quality.damaged),
             frames: counted.frames,
             skew: judge.and_then(|judge| judge.skew()),
             modalities,

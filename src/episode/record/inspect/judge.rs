@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
-use rapid_core::sample::Encoding;
+use rapid_core::sample::{Encoding, damage};
 use rapid_registry::{Registry, VerdictSpec};
 use rapid_status::{Grade, Verdict};
 use serde_json::{Map, Value};
@@ -124,7 +124,8 @@ impl Judge {
             seq: message.sequence.into(),
             capture_ns: message.log_time,
             recv_ns: message.publish_time,
-            flagged: false,
+            // The flag is not in the file: what its content shows, in files of earlier versions too.
+            flagged: sample.is_some_and(|sample| damage(sample.encoding, sample.payload) != 0),
             jpeg: sample.is_some_and(|sample| sample.encoding == Encoding::Mjpeg),
             payload: sample.map_or(&[], |sample| sample.payload),
             repeated: None,
@@ -210,7 +211,7 @@ impl Judge {
             let all = gone.saturating_add(quality.lost).saturating_add(quality.dropped);
             (quality.lost, quality.dropped) = (0, all.max(missing));
         }
-        quality.damaged = quality.truncated.max(counted.of_modality(&known.name, "damaged").unwrap_or(0));
+        quality.damaged = quality.damaged.max(counted.of_modality(&known.name, "damaged").unwrap_or(0));
         Some(quality)
     }
 
