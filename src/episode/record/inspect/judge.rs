@@ -185,6 +185,7 @@ impl Judge {
             missing: Missing {
                 masks: count("masks_dropped", missing.masks),
                 actions: count("actions_dropped", missing.actions),
+                unusable_actions: missing.unusable_actions,
                 events: count("events_missed", missing.events),
             },
             expect: &self.expect,
