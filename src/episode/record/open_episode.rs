@@ -24,7 +24,7 @@ use std::time::Duration;
 
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
-use rapid_core::sample::{Epoch, FLAG_ERROR, SampleHeader};
+use rapid_core::sample::{Epoch, FLAG_ERROR, SampleHeader, are_usable_numbers};
 use rapid_core::sync::{Grid, SyncSample, Synchronizer};
 use rapid_core::time::{Stamp, WallClock};
 use rapid_pictures::judge::PictureJudge;
@@ -240,6 +240,7 @@ impl OpenEpisode {
             self.missing.actions = self.missing.actions.saturating_add(missing);
         }
         if self.holds(Stamp(header.capture_ns), Duration::ZERO) && self.failed.is_none() {
+            self.missing.unusable_actions += u64::from(!are_usable_numbers(payload));
             self.failed = self.file.action(header, payload).err();
         }
     }

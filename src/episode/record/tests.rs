@@ -247,6 +247,34 @@ impl Bench {
         finished
     }
 
+    /// Half a second in which `tof` is present and sends `numbers`, without a flag: as recorders of earlier versions took them.
+    pub(crate) async fn half_a_second_of(&mut self, numbers: impl Fn(u64) -> [f64; 2] + Send + 'static) -> PathBuf {
+        self.mask(0b10, 1, Stamp::now().0);
+        self.script.taken().await;
+        let script = self.script.clone();
+        *self.at_begin.lock().unwrap() = Some(Box::new(move |begin| {
+            for n in 0..50 {
+                let capture_ns = begin.0 + (1 + n * 10) * MS;
+                script.mask(0b10, n + 2, capture_ns);
+                let header = SampleHeader {
+                    seq: n,
+                    capture_ns,
+                    recv_ns: capture_ns,
+                    id: TOF.into(),
+                    epoch: 1,
+                    encoding: Encoding::F64 as u32,
+                    width: 2,
+                    ..SampleHeader::default()
+                };
+                let payload = numbers(n).into_iter().flat_map(f64::to_le_bytes).collect();
+                script.put((TopicId::Modality(id(TOF)), header, payload));
+            }
+        }));
+        let finished = self.recorder.start(self.request(Some(Duration::from_millis(500)))).await.unwrap();
+        self.until_file(&finished).await;
+        finished
+    }
+
     /// One second of a rig, laid out from `t0` on: the camera is away in the middle, the
     /// `tof` loses seven samples itself and one of its is lost on the way, `raw` sends one damaged frame and has no bit in
     /// the mask at first.

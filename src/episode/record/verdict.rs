@@ -20,6 +20,7 @@ mod tests;
 
 use std::time::Duration;
 
+use rapid_core::text;
 use rapid_registry::{Limits, VerdictSpec};
 use rapid_status::{Finding, Grade, Sensors, Verdict};
 
@@ -60,6 +61,8 @@ pub(super) struct Missing {
     /// Publications of the mask.
     pub(super) masks: u64,
     pub(super) actions: u64,
+    /// Actions in the file with a number that is not finite: no actuator carries them out.
+    pub(super) unusable_actions: u64,
     pub(super) events: u64,
 }
 
@@ -143,6 +146,10 @@ pub(super) fn findings(facts: &Facts<'_>) -> Vec<Finding> {
     for (count, is, are) in missing.into_iter().filter(|(count, ..)| *count > 0) {
         let are = if count == 1 { is } else { are };
         found.push(of_all(Grade::Suspect, format!("{count} {are} not in the file (limit 0)")));
+    }
+    if facts.missing.unusable_actions > 0 {
+        let actions = text::counted(facts.missing.unusable_actions, "action");
+        found.push(of_all(Grade::Suspect, format!("{actions} with a number that is not finite (limit 0)")));
     }
     found.extend(facts.publishers.iter().map(|publisher| of_all(Grade::Suspect, publisher.reason())));
     // Stable: of one grade in the order above.

@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
+use rapid_core::sample::damage;
 use rapid_pictures::judge::{Judgement, PictureJudge};
 use rapid_registry::{Registry, VerdictSpec};
 use rapid_status::{Grade, Verdict};
@@ -137,7 +138,8 @@ impl Judge {
             seq: message.sequence.into(),
             capture_ns: message.log_time,
             recv_ns: message.publish_time,
-            flagged: false,
+            // The flag is not in the file: what its content shows, in files of earlier versions too.
+            flagged: sample.is_some_and(|sample| damage(sample.encoding, sample.payload) != 0),
             picture,
             payload: sample.map_or(&[], |sample| sample.payload),
             repeated: None,
@@ -197,6 +199,7 @@ impl Judge {
             missing: Missing {
                 masks: count("masks_dropped", missing.masks),
                 actions: count("actions_dropped", missing.actions),
+                unusable_actions: missing.unusable_actions,
                 events: count("events_missed", missing.events),
             },
             expect: &self.expect,

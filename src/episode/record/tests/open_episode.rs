@@ -300,11 +300,13 @@ fn with_actuator() -> Registry {
     Registry::parse(&format!("{}{arm}", registry().text), None).unwrap().registry
 }
 
-/// Actions that arrive, by number and time in ms.
+/// The one number of an action, by the number of the action.
+type Numbered = fn(u64) -> f64;
+/// Numbers of actions, and when each arrives, ms.
 type Arrivals = &'static [(u64, u64)];
 
 /// An episode of a second, from 1000 ms on, of a sensor without fault, and of those actions that arrive.
-fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
+fn acted(folder: &Path, actions: Arrivals, numbers: Numbered) -> EpisodeReport {
     let registry = with_actuator();
     let board = Arc::new(Board::new(&registry));
     let mut streams = Streams::new();
@@ -317,7 +319,12 @@ fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
             streams.receive(Some(&mut open), TopicId::Modality(id(TOF)), &header, &[0; 16]);
         }
         for (number, _) in actions.iter().filter(|(_, at)| *at == ms) {
-            streams.receive(Some(&mut open), TopicId::Action, &scalars(*number, ms, ms), &[0; 8]);
+            streams.receive(
+                Some(&mut open),
+                TopicId::Action,
+                &scalars(*number, ms, ms),
+                &numbers(*number).to_le_bytes(),
+            );
         }
         open.advance(Stamp(ms * MS), &streams.masks);
     }
@@ -338,7 +345,7 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
     ];
     for (what, actions, lost) in table {
         let folder = tempfile::tempdir().unwrap();
-        let report = acted(folder.path(), actions);
+        let report = acted(folder.path(), actions, |_| 0.0);
         let within = actions.iter().filter(|(_, at)| (1000..2000).contains(at)).count();
         assert_eq!(read(&report.file).on(rapid_core::action::ACTION_TOPIC).count(), within, "{what}");
         let reasons: Vec<_> = lost
@@ -360,6 +367,24 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
         let mut of_actions = answer.verdict.reasons();
         of_actions.retain(|reason| reason.contains("action"));
         assert_eq!(of_actions, reasons, "{what}, killed");
+    }
+}
+
+#[test]
+fn actions_that_are_not_finite_are_suspect_by_the_recorder_and_by_inspect() {
+    const ACTIONS: Arrivals = &[(6, 990), (7, 1000), (8, 1100), (9, 1900)];
+    let table: [(Numbered, Option<&str>); 3] = [
+        (|number| number as f64, None),
+        (|number| if number == 6 { f64::NAN } else { 0.0 }, None),
+        (|number| if number < 9 { f64::NAN } else { 0.0 }, Some("2 actions")),
+    ];
+    for (numbers, reason) in table {
+        let folder = tempfile::tempdir().unwrap();
+        let report = acted(folder.path(), ACTIONS, numbers);
+        let reasons: Vec<_> =
+            reason.map(|count| format!("{count} with a number that is not finite (limit 0)")).into_iter().collect();
+        assert_eq!(report.verdict.reasons, reasons);
+        assert_eq!(inspect::inspect(&report.file).unwrap().verdict.verdict(), Some(&report.verdict));
     }
 }
 
