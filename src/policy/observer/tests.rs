@@ -360,7 +360,7 @@ fn a_picture_that_is_not_usable_is_never_observed() {
             let mut request = Request::new(&bundle);
             (request.tick, request.stamp) = (tick, at(tick));
             observer.fill(&mut request);
-            request.cell(0, 2).filter(|_| request.is_present(0)).map(|cell| (cell.seq, cell.bytes.to_vec()))
+            request.cell(0, 2).filter(|_| request.is_present(0)).map(|cell| (cell.seq, cell.bytes.clone()))
         };
         // One of another size is known for one only beside others.
         if name != "another size" {

@@ -47,8 +47,9 @@ fn quality_at(measures: &Measures, end_ms: u64) -> Quality {
 
 #[test]
 fn damaged_counts_flagged_samples_and_torn_pictures_once() {
-    let mut measures = measures(ModalityKind::Image);
     use Judgement::{NotWhole, OtherShape, Usable};
+
+    let mut measures = measures(ModalityKind::Image);
     for (n, (flagged, picture)) in
         (0_u64..).zip([(false, Usable), (true, Usable), (false, NotWhole), (true, NotWhole), (false, OtherShape)])
     {
