@@ -33,12 +33,12 @@ mod verify;
 mod video;
 
 pub use error::SetError;
-pub use features::{Features, Known};
+pub use features::{Features, Known, NotExported};
 pub use ffmpeg::{Ffmpeg, FfmpegError};
 pub use picture::{Codec, Pictures};
 pub use rows::{Refusal, Unfit};
 pub use set::{DataSet, Prepared, prepare};
-pub use survey::{Survey, survey};
+pub use survey::{Noted, Survey, Verdicts, survey};
 pub use table::Position;
 pub use verify::{Difference, Verified, verify};
 pub use video::{Encoded, Ends, encode};

@@ -28,7 +28,7 @@ use super::picture::{Codec, Pictures, Shape};
 use super::rows::{Form, Index, Listed, Refusal, Row};
 use super::set::{DataSet, prepare};
 use super::statistics::Column;
-use super::survey::{Content, Stream, Survey, survey};
+use super::survey::{Content, Noted, Stream, Survey, Verdicts, survey};
 use super::table::{Position, Rows, Table};
 use super::verify::verify;
 use super::video::{Encoded, FrameMaker, Shown};
@@ -189,6 +189,7 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         bytes: 0,
         sha256: sha256(path).unwrap(),
         grade: Grade::Good,
+        noted: Noted::default(),
         rows: index.ticks.len(),
         unusable: 0,
         unfit: Vec::new(),
@@ -201,6 +202,8 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         action: None,
         time_ns: none,
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
+        bits: Vec::new(),
+        topics: Vec::new(),
     }
 }
 
@@ -375,7 +378,7 @@ fn recorded(folder: &Path, name: &str, present: [bool; 2], values: [f64; 3]) -> 
 fn exported(out: &Path, episodes: &[PathBuf]) -> Vec<Survey> {
     let stop = AtomicBool::new(false);
     let surveys: Vec<Survey> =
-        episodes.iter().map(|path| survey(path, sha256(path).unwrap(), true, &stop).unwrap()).collect();
+        episodes.iter().map(|path| survey(path, sha256(path).unwrap(), Verdicts::All, &stop).unwrap()).collect();
     let mut set = DataSet::open(out).unwrap();
     set.begin().unwrap();
     for (number, episode) in surveys.iter().enumerate() {
