@@ -21,6 +21,7 @@ mod executable;
 mod features;
 mod ffmpeg;
 mod files;
+mod owned;
 mod picture;
 mod rows;
 mod set;

@@ -12,7 +12,6 @@
 //! its earlier episodes, or all and the last one.
 
 use std::collections::{BTreeMap, HashMap};
-use std::ffi::OsStr;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -34,6 +33,7 @@ use super::cells::CellMaker;
 use super::error::SetError;
 use super::features::{Features, IMAGES, OWN};
 use super::files::{self, CHUNK, NewFile, VIDEOS, numbered, write, write_parquet};
+use super::owned;
 use super::picture::Pictures;
 use super::rows::{Index, Refusal};
 use super::statistics::Column;
@@ -103,9 +103,8 @@ impl DataSet {
         }
         set.lock(Missing::Refused)?;
         let info = folder.join("meta/info.json");
-        if !info.exists() {
-            let set = set.unnamed()?;
-            files::remove_leftovers(folder)?;
+        if std::fs::symlink_metadata(&info).is_err() {
+            owned::check(folder, None)?;
             return Ok(set);
         }
         let foreign = |problem: &str| SetError::Foreign { path: info.clone(), problem: problem.to_owned() };
@@ -114,34 +113,19 @@ impl DataSet {
         let value: Value = serde_json::from_str(&text).map_err(|error| foreign(&error.to_string()))?;
         let features = Features::of_set(&value);
         set.features = Some(features.ok_or_else(|| foreign("not the features of a dataset of this version of rapid"))?);
-        files::remove_leftovers(folder)?;
         set.read_tasks()?;
         while let Some(entry) = set.read_entry()? {
             merge(&mut set.statistics, &entry.statistics);
             set.entries.push(entry);
         }
-        // Rows and videos whose facts are missing: the program was killed between the two, and LeRobot would read them.
-        let next = set.entries.len() as u64;
-        for left in set.video_paths(next).into_iter().chain([set.data_path(next)]).filter(|left| left.exists()) {
-            std::fs::remove_file(&left).map_err(|source| SetError::Io { path: left, source })?;
-        }
+        // Rows and videos whose facts are missing are removed: the program was killed between the two, and LeRobot would read
+        // them.
+        owned::check(folder, Some(set.entries.len() as u64))?;
         // The program was killed between an episode and the files about all of them.
         if value["total_episodes"].as_u64() != Some(set.entries.len() as u64) {
             set.publish()?;
         }
         Ok(set)
-    }
-
-    /// A folder without `info.json`: what a program left that was killed with its first episode, or an empty one.
-    fn unnamed(self) -> Result<Self, SetError> {
-        let folder = &self.folder;
-        let entries = std::fs::read_dir(folder).map_err(|source| SetError::Io { path: folder.clone(), source })?;
-        let is_ours = |name: &OsStr| ["data", "meta", VIDEOS].iter().any(|ours| name == *ours);
-        let other = entries.flatten().find(|entry| !is_ours(&entry.file_name()));
-        match other {
-            Some(other) => Err(SetError::Foreign { path: other.path(), problem: "not of a dataset".to_owned() }),
-            None => Ok(self),
-        }
     }
 
     fn lock(&mut self, missing: Missing) -> Result<(), SetError> {
@@ -152,6 +136,10 @@ impl DataSet {
         rustix::fs::flock(open.descriptor(), FlockOperation::NonBlockingLockExclusive)
             .map_err(|_| SetError::Busy(self.folder.clone()))?;
         self.lock = Some(open);
+        if missing == Missing::All {
+            // It did not exist when the set was opened.
+            owned::check(&self.folder, None)?;
+        }
         Ok(())
     }
 
