@@ -1,4 +1,5 @@
-//! Pictures of a dataset: a JPEG as the camera sent it, and what is not compressed as PNG, which loses nothing.
+//! Pictures of a dataset: a JPEG as the camera sent it, without what readers interpret differently, and what is not
+//! compressed as PNG, which loses nothing.
 //!
 //! Grey is written as three equal channels. YUYV becomes red, green and blue first, by the rule of `pixels`: LeRobot
 //! and its policies know no other pictures.
@@ -8,7 +9,7 @@ use std::fmt;
 
 use rapid_core::sample::Encoding;
 use rapid_episode::decode::jpeg_frame;
-use rapid_episode::record::is_whole_jpeg;
+use rapid_pictures::jpeg::{Walker, plain};
 use rapid_pictures::pixels::{LARGEST, Picture, PixelError, Pixels};
 
 use super::rows::Payload;
@@ -109,10 +110,10 @@ pub(super) fn stated(encoding: Encoding, width: u32, height: u32, bytes: &[u8]) 
     Shape::new(height, width, channels?)
 }
 
-/// The shape of a picture that can be used: of a JPEG, one with its beginning, its end and a size.
+/// The shape of a picture that can be used: of a JPEG, one that is whole.
 pub(super) fn shape(payload: &Payload) -> Option<Shape> {
     let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
-    let is_whole = *encoding != Encoding::Mjpeg || is_whole_jpeg(bytes);
+    let is_whole = *encoding != Encoding::Mjpeg || Walker::default().walk(bytes).is_ok();
     stated(*encoding, *width, *height, bytes).filter(|_| is_whole)
 }
 
@@ -122,7 +123,7 @@ pub(super) fn shape(payload: &Payload) -> Option<Shape> {
 /// When it has no pixels.
 pub(super) fn file<'a>(payload: &'a Payload, pixels: &mut Pixels) -> Result<Cow<'a, [u8]>, PixelError> {
     match payload {
-        Payload::Picture { encoding: Encoding::Mjpeg, bytes, .. } => Ok(Cow::Borrowed(bytes)),
+        Payload::Picture { encoding: Encoding::Mjpeg, bytes, .. } => Ok(plain(bytes)),
         Payload::Picture { encoding, width, height, bytes } => {
             let (encoding, width, height) = (*encoding, *width, *height);
             pixels.decode(&Picture { encoding, width, height, bytes })?;

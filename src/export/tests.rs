@@ -149,7 +149,7 @@ fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
     };
     index.rows(&path, &stop, take).unwrap();
     let expected =
-        [(Shown::Picture, true, true, true), (Shown::Damaged, false, true, false), (Shown::Black, false, false, false)];
+        [(Shown::Picture, true, true, true), (Shown::Black, false, true, false), (Shown::Black, false, false, false)];
     assert_eq!(found, expected);
 }
 

@@ -21,7 +21,7 @@ pub(super) mod packet;
 use std::io::{self, Write as _};
 use std::time::Duration;
 
-use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::time::Stamp;
 use rapid_registry::{LanPicture, PhoneStream};
 use tokio::io::AsyncReadExt as _;
@@ -30,7 +30,7 @@ use tokio::time::Instant;
 
 use self::packet::{Cut, FRAME_HEAD, Frame, Packets};
 use super::address::DeviceAddress;
-use super::mjpeg::check_size;
+use super::mjpeg::Mismatch;
 use super::{PATIENCE, jpeg};
 use crate::driver::{DriverError, Reading};
 
@@ -53,6 +53,7 @@ pub(super) struct Phone {
     picture: LanPicture,
     max_bytes: usize,
     output: Vec<u8>,
+    mismatch: Mismatch,
     lost: u64,
 }
 
@@ -89,6 +90,7 @@ impl Phone {
             picture,
             max_bytes,
             output: Vec::new(),
+            mismatch: Mismatch::default(),
             lost: 0,
         })
     }
@@ -116,12 +118,8 @@ impl Phone {
             let (bytes, width) = (self.output.as_slice(), 16);
             return Ok(Reading { bytes, encoding: Encoding::F64, captured, flags, width, height: 0, lost });
         }
-        if let Some(size) = jpeg::size(picture) {
-            check_size(&self.name, size, self.picture)?;
-        }
-        if !annotate(picture, &frame, &mut self.output) {
-            flags |= FLAG_ERROR;
-        }
+        flags |= self.mismatch.flags(picture, &self.name, self.picture, Instant::now())?;
+        annotate(picture, &frame, &mut self.output);
         Ok(Reading {
             bytes: &self.output,
             encoding: Encoding::Mjpeg,
