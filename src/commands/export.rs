@@ -16,7 +16,7 @@ use rapid_episode::record::inspect::{self, ReadError};
 use rapid_episode::sha256;
 use rapid_export::{
     self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal, SetError,
-    Survey, Verified,
+    Survey, Unfit, Verified,
 };
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
@@ -75,6 +75,8 @@ struct Exported<'a> {
     frames: Option<usize>,
     /// Samples that could not be used.
     unusable: Option<u64>,
+    /// The same by sensor, and actions that no frame has.
+    unfit: &'a [Unfit],
     verdict: Option<Grade>,
     /// Why it is left out.
     reason: Option<String>,
@@ -90,6 +92,8 @@ struct Summary<'a> {
     left_out: usize,
     /// How many of those are BAD.
     bad: usize,
+    /// Samples of exported episodes that belong to a frame and cannot be used.
+    unusable: u64,
     /// Episodes and frames of the set.
     episodes: usize,
     frames: u64,
@@ -108,6 +112,7 @@ impl<'a> Summary<'a> {
             already: 0,
             left_out: 0,
             bad: 0,
+            unusable: 0,
             episodes: 0,
             frames: 0,
             verified: None,
@@ -383,11 +388,12 @@ struct Report<'a> {
 impl Report<'_> {
     fn exported(&mut self, episode: &Survey, number: usize) -> io::Result<()> {
         self.summary.exported += 1;
-        let Survey { file, rows, unusable, grade, .. } = episode;
+        let Survey { file, rows, unusable, unfit, grade, .. } = episode;
+        self.summary.unusable += unusable;
         let mut line = format!("{}: episode {number}, {}", file.display(), text::counted(*rows as u64, "frame"));
-        if *unusable > 0 {
-            let samples = text::counted(*unusable, "frame");
-            line = format!("{line}; in {samples} a damaged sample is left out");
+        if !unfit.is_empty() {
+            let unfit: Vec<String> = unfit.iter().map(ToString::to_string).collect();
+            line = format!("{line}; samples left out, black or zero and not valid: {}", unfit.join("; "));
         }
         self.episode(
             &line,
@@ -397,6 +403,7 @@ impl Report<'_> {
                 episode: Some(number),
                 frames: Some(*rows),
                 unusable: Some(*unusable),
+                unfit,
                 verdict: Some(*grade),
                 reason: None,
             },
@@ -425,6 +432,7 @@ impl Report<'_> {
                 episode: Some(number),
                 frames: None,
                 unusable: None,
+                unfit: &[],
                 verdict: None,
                 reason: None,
             },
@@ -444,6 +452,7 @@ impl Report<'_> {
             episode: None,
             frames: None,
             unusable: None,
+            unfit: &[],
             verdict: None,
             reason: Some(refusal.to_string()),
         };
@@ -477,14 +486,17 @@ impl Report<'_> {
         if self.format == Format::Json {
             return writeln!(self.out, "{}", json_line("export", &self.summary)?);
         }
-        let Summary { out, exported, already, left_out, bad, episodes, frames, verified, differences, psnr_db } =
-            &self.summary;
+        let Summary { out, exported, already, left_out, bad, unusable, .. } = &self.summary;
+        let Summary { episodes, frames, verified, differences, psnr_db, .. } = &self.summary;
         let (episodes, frames) = (text::counted(*episodes as u64, "episode"), text::counted(*frames, "frame"));
         let bad = if *bad > 0 { format!(" ({bad} BAD)") } else { String::new() };
         let mut line = format!(
             "{exported} exported, {already} already there, {left_out} left out{bad}; {}: {episodes}, {frames}",
             out.display()
         );
+        if *unusable > 0 {
+            line = format!("{line}; {} that cannot be used", text::counted(*unusable, "sample"));
+        }
         if let Some(verified) = verified {
             let (verified, differences) =
                 (text::counted(*verified as u64, "frame"), text::counted(*differences as u64, "difference"));

@@ -12,9 +12,9 @@ use rapid_registry::columns::{self, ColumnError, Vector};
 use serde_json::{Map, Value, json};
 
 use super::picture::{Codec, Pictures, Shape};
-use super::rows::Refusal;
+use super::rows::{LONGEST, Refusal};
 use super::statistics::Column;
-use super::survey::{Content, LONGEST, Survey};
+use super::survey::{Content, Survey};
 
 /// Feature of the vectors.
 pub(super) const STATE: &str = "observation.state";
@@ -512,6 +512,7 @@ mod tests {
             grade: Grade::Good,
             rows: 1,
             unusable: 0,
+            unfit: Vec::new(),
             fps: 30,
             task: String::new(),
             export: ExportSpec::default(),

@@ -36,7 +36,7 @@ pub use error::SetError;
 pub use features::{Features, Known};
 pub use ffmpeg::{Ffmpeg, FfmpegError};
 pub use picture::{Codec, Pictures};
-pub use rows::Refusal;
+pub use rows::{Refusal, Unfit};
 pub use set::{DataSet, Prepared, prepare};
 pub use survey::{Survey, survey};
 pub use table::Position;

@@ -385,7 +385,7 @@ impl DataSet {
                 let is_picture = key.starts_with(IMAGES);
                 row.push(&format!("stats/{key}/{name}"), if is_picture { nested(&values) } else { floats(&values) });
             }
-            row.push(&format!("stats/{key}/count"), integers([most(columns)]));
+            row.push(&format!("stats/{key}/count"), integers([weight(columns)]));
             // By column: those of a sensor that was absent have none.
             row.push(&format!("rapid/counts/{key}"), integers(columns.iter().map(|column| column.count)));
         }
@@ -445,7 +445,7 @@ impl DataSet {
             for (name, values) in by_name(columns) {
                 named.insert(name.to_owned(), values.into_iter().map(shaped).collect());
             }
-            named.insert("count".to_owned(), json!([most(columns)]));
+            named.insert("count".to_owned(), json!([weight(columns)]));
             statistics.insert(key.clone(), Value::Object(named));
         }
         let (episodes, rows) = (self.entries.len(), self.rows());
@@ -554,9 +554,11 @@ fn merge(all: &mut Statistics, episode: &Statistics) {
     }
 }
 
-/// The most rows that a column has.
-fn most(columns: &[Column]) -> u64 {
-    columns.iter().map(|column| column.count).max().unwrap_or_default()
+/// The `count` that LeRobot reads: the most valid rows that a column has, and never 0. Its `aggregate_stats` weights by it
+/// and divides by the sum, so that a sensor that was absent everywhere would make not-a-number of what is merged. The
+/// zeros of such a sensor count as one row: next to nothing beside a set that has the sensor.
+fn weight(columns: &[Column]) -> u64 {
+    columns.iter().map(|column| column.count).max().unwrap_or_default().max(1)
 }
 
 /// The columns' values of each statistic.

@@ -1,9 +1,13 @@
 //! Rows of an episode made by hand: raw pictures, samples that cannot be used, frames before their samples.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use arrow_array::cast::AsArray;
+use arrow_array::types::{Float64Type, Int64Type};
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
@@ -19,12 +23,12 @@ use rapid_status::Grade;
 
 use super::cells::CellMaker;
 use super::error::SetError;
-use super::features::{Axis, Features, MASK, Origin, PLUGGED, STATE, VALID};
+use super::features::{Axis, Features, Known, MASK, Origin, PLUGGED, STATE, VALID};
 use super::picture::{Codec, Pictures, Shape};
-use super::rows::{Index, Listed, Refusal, Row};
+use super::rows::{Form, Index, Listed, Refusal, Row};
 use super::set::{DataSet, prepare};
 use super::statistics::Column;
-use super::survey::{Content, Stream, Survey};
+use super::survey::{Content, Stream, Survey, survey};
 use super::table::{Position, Rows, Table};
 use super::verify::verify;
 use super::video::{Encoded, FrameMaker, Shown};
@@ -78,7 +82,11 @@ impl Recording {
     }
 
     fn sample(&mut self, bit: Option<u8>, sequence: u32, encoding: Encoding, payload: &[u8]) {
-        let header = SampleHeader { encoding: encoding as u32, width: 4, height: 2, ..SampleHeader::default() };
+        self.sized(bit, sequence, encoding, [4, 2], payload);
+    }
+
+    fn sized(&mut self, bit: Option<u8>, sequence: u32, encoding: Encoding, [width, height]: [u32; 2], payload: &[u8]) {
+        let header = SampleHeader { encoding: encoding as u32, width, height, ..SampleHeader::default() };
         let kind = SampleSchema::for_sample(&header, payload);
         let at_ms = u64::from(sequence) * 100;
         encode::sample(&mut self.message, kind, BEGIN + at_ms * 1_000_000, "", &header, payload);
@@ -141,7 +149,7 @@ fn a_picture_that_cannot_be_decoded_is_a_black_frame_that_is_not_valid() {
     };
     index.rows(&path, &stop, take).unwrap();
     let expected =
-        [(Shown::Picture, true, true, true), (Shown::Damaged, false, true, false), (Shown::Black, false, false, false)];
+        [(Shown::Picture, true, true, true), (Shown::Black, false, true, false), (Shown::Black, false, false, false)];
     assert_eq!(found, expected);
 }
 
@@ -183,6 +191,7 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         grade: Grade::Good,
         rows: index.ticks.len(),
         unusable: 0,
+        unfit: Vec::new(),
         fps: index.fps,
         task: task.to_owned(),
         streams: index.modalities.iter().map(stream).collect(),
@@ -343,4 +352,258 @@ fn raw_pictures_lose_nothing_and_what_cannot_be_used_is_black_and_not_valid() {
     assert!(rows.advance().unwrap().is_none());
     stop.store(true, std::sync::atomic::Ordering::Relaxed);
     assert!(matches!(Index::read(&path, &stop), Err(Refusal::Interrupted)));
+}
+
+/// An episode in which devices that are not in `present` never were.
+fn recorded(folder: &Path, name: &str, present: [bool; 2], values: [f64; 3]) -> PathBuf {
+    let folder = folder.join(name);
+    std::fs::create_dir(&folder).unwrap();
+    let mut recording = Recording::new(&folder);
+    for (number, value) in (0..).zip(values) {
+        recording.frame(number, present.map(|is_present| is_present.then_some(number.into())));
+        if present[0] {
+            recording.sample(Some(0), number, Encoding::Grey, &GREY);
+        }
+        if present[1] {
+            recording.numbers(Some(4), number, &[value]);
+        }
+    }
+    recording.end()
+}
+
+/// These episodes as a new dataset, which is compared with them.
+fn exported(out: &Path, episodes: &[PathBuf]) -> Vec<Survey> {
+    let stop = AtomicBool::new(false);
+    let surveys: Vec<Survey> =
+        episodes.iter().map(|path| survey(path, sha256(path).unwrap(), true, &stop).unwrap()).collect();
+    let mut set = DataSet::open(out).unwrap();
+    set.begin().unwrap();
+    for (number, episode) in surveys.iter().enumerate() {
+        let choice = ExportSpec::default();
+        let features = Features::from_survey(episode, &choice, Pictures::Files, &Known::default()).unwrap();
+        let position = set.positions([episode])[0];
+        let prepared = prepare(out, episode, &features, position, Encoded::default(), &stop).unwrap();
+        assert_eq!(set.append(episode, &features, prepared, &stop).unwrap(), number);
+        assert_eq!(verify(&set, number, &episode.file, None, &stop).unwrap().differences, []);
+    }
+    surveys
+}
+
+/// The statistics of a feature, by their name.
+type Named = BTreeMap<String, Vec<f64>>;
+
+/// All numbers of a list of lists, of any depth.
+fn flat_numbers(value: &serde_json::Value) -> Vec<f64> {
+    match value {
+        serde_json::Value::Array(values) => values.iter().flat_map(flat_numbers).collect(),
+        // What is not finite is null in JSON.
+        value => vec![value.as_f64().unwrap_or(f64::NAN)],
+    }
+}
+
+/// `meta/stats.json`, by feature.
+fn statistics_of_set(out: &Path) -> BTreeMap<String, Named> {
+    let text = std::fs::read_to_string(out.join("meta/stats.json")).unwrap();
+    let all: BTreeMap<String, BTreeMap<String, serde_json::Value>> = serde_json::from_str(&text).unwrap();
+    let flat = |named: BTreeMap<String, serde_json::Value>| {
+        named.into_iter().map(|(name, value)| (name, flat_numbers(&value))).collect()
+    };
+    all.into_iter().map(|(key, named)| (key, flat(named))).collect()
+}
+
+/// `stats/...` of an episode's facts, by feature.
+fn statistics_of_episode(out: &Path, episode: usize) -> BTreeMap<String, Named> {
+    let path = out.join(format!("meta/episodes/chunk-000/file-{episode:03}.parquet"));
+    let batch = super::table::one_row(&path).unwrap().unwrap();
+    let mut all = BTreeMap::<String, Named>::new();
+    for (field, column) in batch.schema().fields().iter().zip(batch.columns()) {
+        let Some((key, name)) = field.name().strip_prefix("stats/").and_then(|key| key.rsplit_once('/')) else {
+            continue;
+        };
+        let mut values = Arc::clone(column.as_list::<i32>().values());
+        while let Some(lists) = values.as_list_opt::<i32>() {
+            values = Arc::clone(lists.values());
+        }
+        let wide = |value: &i64| f64::from(i32::try_from(*value).unwrap());
+        let numbers = match values.as_primitive_opt::<Float64Type>() {
+            Some(floats) => floats.values().to_vec(),
+            None => values.as_primitive::<Int64Type>().values().iter().map(wide).collect(),
+        };
+        all.entry(key.to_owned()).or_default().insert(name.to_owned(), numbers);
+    }
+    all
+}
+
+/// `lerobot.datasets.compute_stats.aggregate_feature_stats` of `lerobot` 0.4.4.
+fn aggregated(parts: &[&Named]) -> Named {
+    let count = |part: &Named| part["count"][0];
+    let total: f64 = parts.iter().map(|part| count(part)).sum();
+    let columns = parts[0]["mean"].len();
+    let weighted = |value: &dyn Fn(&Named, usize) -> f64| -> Vec<f64> {
+        let mean = |at| parts.iter().map(|part| value(part, at) * count(part)).sum::<f64>() / total;
+        (0..columns).map(mean).collect()
+    };
+    let mean = weighted(&|part, at| part["mean"][at]);
+    let variance = weighted(&|part, at| part["std"][at].powi(2) + (part["mean"][at] - mean[at]).powi(2));
+    let mut all: Named = parts[0]
+        .keys()
+        .filter(|name| name.starts_with('q'))
+        .map(|name| (name.clone(), weighted(&|part, at| part[name][at])))
+        .collect();
+    for (name, worst) in [("min", f64::min as fn(f64, f64) -> f64), ("max", f64::max)] {
+        let of = |at: usize| parts.iter().map(|part| part[name][at]).reduce(worst).unwrap();
+        all.insert(name.to_owned(), (0..columns).map(of).collect());
+    }
+    all.insert("std".to_owned(), variance.into_iter().map(f64::sqrt).collect());
+    all.extend([("mean".to_owned(), mean), ("count".to_owned(), vec![total])]);
+    all
+}
+
+#[test]
+fn statistics_are_finite_after_lerobot_has_merged_them() {
+    let folder = tempfile::tempdir().unwrap();
+    // Which of camera and force are there, by episode.
+    let [both, camera, force, none] = [[true, true], [true, false], [false, true], [false, false]];
+    let sets =
+        [vec![both], vec![camera], vec![force], vec![none], vec![none, none], vec![none, both], vec![force, camera]];
+    let mut of_sets = Vec::new();
+    for (number, episodes) in sets.iter().enumerate() {
+        let out = folder.path().join(format!("set {number}"));
+        let record = |(at, present): (usize, &[bool; 2])| {
+            recorded(folder.path(), &format!("{number} {at}"), *present, [1.0 + at as f64, 2.0, number as f64])
+        };
+        let files: Vec<PathBuf> = episodes.iter().enumerate().map(record).collect();
+        exported(&out, &files);
+        let of_episodes: Vec<_> = (0..episodes.len()).map(|at| statistics_of_episode(&out, at)).collect();
+        let of_set = statistics_of_set(&out);
+        for key in of_set.keys() {
+            // As its tools do it that split a set, and that remove an episode.
+            let parts: Vec<&Named> = of_episodes.iter().map(|episode| &episode[key]).collect();
+            finite(key, &aggregated(&parts));
+        }
+        of_sets.push(of_set);
+    }
+    // As its tool does it that joins sets, each with itself and with each other.
+    for (a, b) in of_sets.iter().flat_map(|a| of_sets.iter().map(move |b| (a, b))) {
+        for key in a.keys() {
+            finite(key, &aggregated(&[&a[key], &b[key]]));
+        }
+    }
+}
+
+fn finite(key: &str, statistics: &Named) {
+    for (name, values) in statistics {
+        assert!(!values.is_empty() && values.iter().all(|value| value.is_finite()), "{key}, {name}: {values:?}");
+    }
+    assert!(statistics["count"][0] >= 1.0, "{key}");
+}
+
+/// A sample of the camera, of the force sensor, or an action, and its size.
+#[derive(Clone)]
+enum Sent {
+    Picture(Encoding, [u32; 2], Vec<u8>),
+    Numbers(Vec<f64>),
+    Action(Vec<f64>),
+}
+
+fn jpeg(shape: [u16; 2], values: rapid_pictures::jpeg::Values) -> Vec<u8> {
+    let channels = if values == rapid_pictures::jpeg::Values::Grey { 1 } else { 3 };
+    let mut jpeg = Vec::new();
+    let pixels = shape.map(usize::from).iter().product::<usize>();
+    rapid_pictures::jpeg::encode(&vec![90; channels * pixels], shape, values, 90, &mut jpeg).unwrap();
+    jpeg
+}
+
+/// An episode of five rows with a JPEG, a number and an action in each, but for `other` in the row `at`.
+fn with_another(folder: &Path, name: &str, other: &Sent, at: u32) -> PathBuf {
+    let folder = folder.join(name);
+    std::fs::create_dir(&folder).unwrap();
+    let mut recording = Recording::new(&folder);
+    let usual = [
+        Sent::Picture(Encoding::Mjpeg, [4, 2], jpeg([2, 4], rapid_pictures::jpeg::Values::Rgb)),
+        Sent::Numbers(vec![0.5]),
+        Sent::Action(vec![1.0, 2.0]),
+    ];
+    for number in 0..5 {
+        recording.frame(number, [Some(number.into()); 2]);
+        for sent in &usual {
+            let is_other = number == at && std::mem::discriminant(sent) == std::mem::discriminant(other);
+            match if is_other { other } else { sent } {
+                Sent::Picture(encoding, size, bytes) => recording.sized(Some(0), number, *encoding, *size, bytes),
+                Sent::Numbers(numbers) => recording.numbers(Some(4), number, numbers),
+                Sent::Action(numbers) => recording.numbers(None, number, numbers),
+            }
+        }
+    }
+    recording.end()
+}
+
+#[test]
+fn a_sample_that_cannot_be_exported_is_one_row_and_is_named() {
+    use rapid_pictures::jpeg::Values;
+    let folder = tempfile::tempdir().unwrap();
+    let whole = jpeg([2, 4], Values::Rgb);
+    let picture = |size: [u32; 2], bytes: &[u8]| Sent::Picture(Encoding::Mjpeg, size, bytes.to_vec());
+    let cases = [
+        (
+            "size",
+            picture([16, 8], &jpeg([8, 16], Values::Rgb)),
+            "cam: 1 frame (a picture of 16x8, and not a picture of 4x2)",
+        ),
+        (
+            "grey",
+            picture([4, 2], &jpeg([2, 4], Values::Grey)),
+            "cam: 1 frame (a picture of 4x2 grey, and not a picture of 4x2)",
+        ),
+        (
+            "raw",
+            Sent::Picture(Encoding::Yuyv, [2, 2], YUYV[..8].to_vec()),
+            "cam: 1 frame (a picture of 2x2, and not a picture of 4x2)",
+        ),
+        ("cut", picture([4, 2], &whole[..whole.len() - 2]), "cam: 1 frame (damaged)"),
+        ("no header", picture([4, 2], &whole[..9]), "cam: 1 frame (damaged)"),
+        ("empty", picture([4, 2], &[]), "cam: 1 frame (damaged)"),
+        ("depth", Sent::Picture(Encoding::Depth, [4, 2], vec![0; 16]), "cam: 1 frame (damaged)"),
+        ("longer", Sent::Numbers(vec![1.0, 2.0]), "force: 1 frame (2 numbers, and not 1 number)"),
+        ("none", Sent::Numbers(vec![]), "force: 1 frame (damaged)"),
+        ("endless", Sent::Numbers(vec![f64::INFINITY]), "force: 1 frame (damaged)"),
+        ("three", Sent::Action(vec![1.0, 2.0, 3.0]), "/action: 1 message (3 numbers, and not 2)"),
+        ("no action", Sent::Action(vec![]), "/action: 1 message (0 numbers, and not 2)"),
+        ("not finite", Sent::Action(vec![1.0, f64::NAN]), "/action: 1 message (a number that is not finite)"),
+    ];
+    // Also the first one, which was what the others had to be as.
+    for ((name, other, expected), at) in cases.iter().flat_map(|case| [0, 3].map(|at| (case, at))) {
+        let name = format!("{name} {at}");
+        let episode = with_another(folder.path(), &name, other, at);
+        let out = folder.path().join(format!("{name} set"));
+        let survey = exported(&out, &[episode]).remove(0);
+        assert_eq!(survey.unfit.iter().map(ToString::to_string).collect::<Vec<_>>(), [*expected], "{name}");
+        let is_action = expected.starts_with("/action");
+        assert_eq!(survey.unusable, u64::from(!is_action), "{name}");
+        let mut rows = Rows::open(File::open(out.join("data/chunk-000/file-000.parquet")).unwrap()).unwrap();
+        for number in 0..5 {
+            let row = rows.advance().unwrap().expect("a row");
+            let is_other = number == at;
+            let [camera, force] = [expected.starts_with("cam"), expected.starts_with("force")].map(|is| is && is_other);
+            let flag = |is_unfit: bool| if is_unfit { 0.0 } else { 1.0 };
+            assert_eq!(row.numbers(VALID).unwrap(), [flag(camera), flag(force)], "{name} {number}");
+            assert_eq!(row.numbers(MASK).unwrap(), [1.0, 1.0], "{name} {number}");
+            assert_eq!(row.numbers(STATE).unwrap(), [0.5 * flag(force)], "{name} {number}");
+            // The action before it stays in force.
+            assert_eq!(row.numbers("action").unwrap(), [1.0, 2.0], "{name} {number}");
+            let found = row.picture(CAMERA).unwrap();
+            if camera { assert_eq!(decoded(found), [0; 24], "{name}") } else { assert_eq!(found, whole, "{name}") }
+        }
+    }
+}
+
+#[test]
+fn the_form_of_a_sensor_is_that_of_most_rows_then_the_declared_one() {
+    let shape = |width| Form::Picture(Shape::new(2, width, 3).unwrap());
+    let of =
+        |widths: &[u32], declared| Form::most_frequent(widths.iter().map(|width| shape(*width)), Some(shape(declared)));
+    assert_eq!(of(&[8, 4, 4], 8), Some(shape(4)));
+    assert_eq!(of(&[8, 4], 4), Some(shape(4)));
+    assert_eq!(of(&[8, 4], 6), Some(shape(8)), "the first");
+    assert_eq!(of(&[], 6), None);
 }

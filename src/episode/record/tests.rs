@@ -147,10 +147,13 @@ fn id(bit: u8) -> ModalityId {
     ModalityId::new(bit).unwrap()
 }
 
-/// What a picture looks like from outside.
+/// A picture of eight by eight pixels, with its number in a comment.
 fn picture(number: u64) -> Vec<u8> {
+    let mut jpeg = Vec::new();
+    rapid_pictures::jpeg::encode(&[90; 64], [8, 8], rapid_pictures::jpeg::Values::Grey, 90, &mut jpeg).unwrap();
     let inside = number.to_le_bytes().repeat(100);
-    [&[0xff, 0xd8], inside.as_slice(), &[0xff, 0xd9]].concat()
+    let length = u16::try_from(inside.len() + 2).unwrap().to_be_bytes();
+    [&jpeg[..2], &[0xff, 0xfe], &length, &inside, &jpeg[2..]].concat()
 }
 
 pub(crate) fn registry() -> Registry {

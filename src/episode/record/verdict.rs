@@ -183,11 +183,7 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
             Losses::Together => "missing, lost by the device or dropped on the way to the file",
         },
     );
-    let cut = match quality.truncated {
-        0 => "damaged".to_owned(),
-        cut if cut == quality.damaged => "not whole pictures".to_owned(),
-        cut => format!("damaged, {cut} of them not whole pictures"),
-    };
+    let cut = damaged_text(quality);
     let damaged = share(|limits| limits.damaged, quality.damaged, &cut);
     let duplicate =
         share(|limits| limits.duplicate, quality.duplicates, "with a non-increasing sequence number or capture time");
@@ -227,6 +223,19 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
     .into_iter()
     .flatten()
     .collect()
+}
+
+/// How the damaged samples are damaged.
+fn damaged_text(quality: &Quality) -> String {
+    let Quality { damaged, truncated, other_shape, .. } = *quality;
+    match (truncated, other_shape) {
+        (0, 0) => "damaged".to_owned(),
+        (cut, _) if cut == damaged => "not whole pictures".to_owned(),
+        (_, other) if other == damaged => "with a picture of another size or kind".to_owned(),
+        (cut, 0) => format!("damaged, {cut} of them not whole pictures"),
+        (0, other) => format!("damaged, {other} of them with a picture of another size or kind"),
+        (cut, other) => format!("damaged, {cut} of them not whole pictures, {other} of another size or kind"),
+    }
 }
 
 /// The findings of a modality that sent nothing and was present too briefly to be missing.

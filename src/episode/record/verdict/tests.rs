@@ -81,6 +81,16 @@ fn every_check_has_its_text_and_its_two_limits() {
     );
     is(|q| (q.damaged, q.truncated) = (4, 4), Suspect, &["cam: 4 of 210 samples not whole pictures (limit 1 %)"]);
     is(
+        |q| (q.damaged, q.other_shape) = (4, 4),
+        Suspect,
+        &["cam: 4 of 210 samples with a picture of another size or kind (limit 1 %)"],
+    );
+    is(
+        |q| (q.damaged, q.truncated, q.other_shape) = (4, 2, 1),
+        Suspect,
+        &["cam: 4 of 210 samples damaged, 2 of them not whole pictures, 1 of another size or kind (limit 1 %)"],
+    );
+    is(
         |q| q.duplicates = 1,
         Suspect,
         &["cam: 1 of 210 samples with a non-increasing sequence number or capture time (limit 0.1 %)"],
