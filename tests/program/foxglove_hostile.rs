@@ -157,6 +157,7 @@ fn a_hundred_hostile_clients_cost_neither_memory_nor_messages() {
     let mut most = before;
     honest.read_until("masks among hostile clients", |client| {
         most = most.max(resident(running.pid()));
+        assert!(most - before < BOUND, "{} MB more", (most - before) >> 20);
         client.count(MASK) > 4000 && hostile.fewest() > 20
     });
     // One that comes now is served, too: sooner or later, as they come all the time.
@@ -167,7 +168,6 @@ fn a_hundred_hostile_clients_cost_neither_memory_nor_messages() {
     honest.read_until("masks until then", |_| late.is_finished());
     late.join().expect("it was served");
     drop(hostile);
-    assert!(most - before < BOUND, "{} MB more", (most - before) >> 20);
     let file = good(&place, running);
     honest.read();
     honest.compare(&place, &file);
