@@ -405,7 +405,9 @@ fn servers(args: &RunArgs) -> Vec<Box<dyn Server>> {
     let requested: Vec<Option<Box<dyn Server>>> = Vec::from([
         #[cfg(feature = "foxglove")]
         args.foxglove_server.foxglove.map(|address| -> Box<dyn Server> {
-            Box::new(app::FoxgloveOptions { address, control: args.foxglove_server.foxglove_control })
+            let args = &args.foxglove_server;
+            let (control, origins) = (args.foxglove_control, args.foxglove_origin.clone());
+            Box::new(app::FoxgloveOptions { address, control, origins })
         }),
         #[cfg(feature = "web")]
         args.web.web.map(|address| -> Box<dyn Server> {

@@ -10,10 +10,9 @@
 //! Invariant: nothing but the page itself, which holds no secret, is sent to a client that has not shown the token, if one is
 //! needed.
 
-use std::net::IpAddr;
-
 use hyper::header::{COOKIE, HOST, HeaderMap, HeaderName, ORIGIN};
 use hyper::{Method, StatusCode};
+use rapid_core::site;
 
 use super::token::Token;
 
@@ -58,11 +57,8 @@ impl Door {
                 return Err(FOREIGN);
             }
         }
-        if method == Method::POST {
-            let origin = text(ORIGIN).and_then(|origin| origin.split_once("://"));
-            if origin.is_none_or(|(_, of)| of != host) {
-                return Err(FOREIGN);
-            }
+        if method == Method::POST && text(ORIGIN).is_none_or(|origin| !site::is_page_of(origin, host)) {
+            return Err(FOREIGN);
         }
         if asked == Asked::Rig && !self.has_token(headers) {
             return Err(NO_TOKEN);
@@ -90,17 +86,9 @@ impl Door {
         format!("rapid-{}", self.port)
     }
 
-    /// Whether `Host` names this machine: with any port, as `ssh -L` has another.
+    /// Whether `Host` names this machine. Others may answer for its name; they do not have its token.
     fn is_own(&self, host: &str) -> bool {
-        let name = match host.rsplit_once(':') {
-            Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
-            _ => host,
-        };
-        let address = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
-        let is_name = |own: &str| !own.is_empty() && name.eq_ignore_ascii_case(own);
-        // Others may answer for the name of this machine; they do not have its token.
-        let is_machine = || is_name(&self.machine) || is_name(&format!("{}.local", self.machine));
-        address.parse::<IpAddr>().is_ok() || is_name("localhost") || (self.token.is_some() && is_machine())
+        site::is_own(host, self.token.is_some().then_some(&self.machine))
     }
 }
 

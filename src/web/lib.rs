@@ -2,8 +2,8 @@
 //! discard and label an episode.
 //!
 //! Thread `web` has everything: the server with its connections, and the encoder of small pictures. It sees what a screen
-//! sees, the board, and requests what a screen may request. It has a port of its own: Foxglove's is that crate's, whose
-//! server answers websockets and nothing else.
+//! sees, the board, and requests what a screen may request. It has a port of its own: Foxglove's has no
+//! token, and answers websockets and nothing else.
 //!
 //! Invariant: nothing else waits for this thread: a client that reads slowly gets fewer views, and one that does not read
 //! is left (`serve`).
