@@ -12,6 +12,7 @@
 
 pub mod journal;
 pub mod keeper;
+pub mod noted;
 pub mod trash;
 
 use std::path::{Path, PathBuf};
