@@ -233,6 +233,9 @@ fn some_seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f64
 pub struct EpisodeEntry {
     /// Name of its file.
     pub file: String,
+    /// What it is of; empty if that is not known.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub task: String,
     /// When it began, RFC 3339, UTC.
     pub begun: String,
     /// Its length in seconds; absent while it is recorded, and if `rapid` was killed then.
@@ -269,6 +272,7 @@ impl EpisodeEntry {
     pub const fn begin(file: String, begun: String) -> Self {
         Self {
             file,
+            task: String::new(),
             begun,
             seconds: None,
             verdict: None,
