@@ -184,7 +184,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         }
         Command::List(args) => {
             let palette = Palette::for_output(&io::stdout());
-            reported(commands::list::list(&args, format, palette, out, &|error| {
+            reported(commands::list::list(&args, format, palette, out, &mut |error| {
                 print_warning(&format_args!("labels and notes are missing: {error}"));
             })?)
         }

@@ -69,6 +69,7 @@ const LOCK_HOMES: &[(&str, &str)] = &[
         "the simulated world, which its devices share, and a light that is switched for a calibration",
     ),
     ("policy/onnxruntime", "onnxruntime is loaded once, before the first chunk"),
+    ("system/fault", "injected faults, in builds with debug assertions alone"),
     ("system/panics", "messages of panics"),
     ("screens/tui", "the monitor's terminal"),
 ];
