@@ -335,7 +335,7 @@ mod tests {
             note: "# not a comment = 1".to_owned(),
             discarded: false,
             marks: vec![Mark { at: 12.5, text: String::new() }, Mark { at: 13.0, text: "grasp".to_owned() }],
-            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] }),
+            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()], away: Vec::new() }),
         }
     }
 

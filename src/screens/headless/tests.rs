@@ -67,7 +67,7 @@ fn episode(dropped: u64, error: Option<&str>) -> EventKind {
                 }
                 (_, Some(error)) => (Grade::Bad, vec![format!("the file could not be written: {error}")]),
             };
-            let sensors = Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] });
+            let sensors = Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()], away: Vec::new() });
             Verdict { grade, reasons, sensors }
         },
     })

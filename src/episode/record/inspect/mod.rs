@@ -192,7 +192,7 @@ pub struct EventReport {
 }
 
 /// The judgement of a file. As JSON `verdict`, which is `null` without one, `reasons` and `sensors`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Judgement {
     /// It is an episode.
     Episode(Verdict),
