@@ -416,6 +416,9 @@ pub struct Verdict {
     pub reasons: Vec<String>,
     /// Which sensors took part, and which of them not all the time; unknown (`null`) if the file does not state which were registered.
     pub sensors: Option<Sensors>,
+    /// The names of the files that were replayed, if its samples come from recordings.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub replay_of: Vec<String>,
 }
 
 impl Verdict {
@@ -429,9 +432,11 @@ impl Verdict {
         (self.grade, &self.reasons) == (other.grade, &other.reasons)
     }
 
-    /// `1 of 3 sensors, without gel, tactile_tip away 18.0 s of 31.0 s`; empty if unknown.
-    pub fn sensors(&self) -> String {
-        self.sensors.as_ref().map(ToString::to_string).unwrap_or_default()
+    /// `1 of 3 sensors, without gel, tactile_tip away 18.0 s of 31.0 s`, before it `replay of a.mcap` if it is one; empty
+    /// if nothing is known.
+    pub fn remarks(&self) -> String {
+        let replays = self.replay_of.iter().map(|file| format!("replay of {file}"));
+        replays.chain(self.sensors.as_ref().map(ToString::to_string)).collect::<Vec<_>>().join(", ")
     }
 }
 
@@ -461,10 +466,15 @@ pub struct Absence {
 }
 
 impl Sensors {
+    /// How many were present all the time.
+    pub const fn throughout(&self) -> usize {
+        self.recorded.saturating_sub(self.away.len())
+    }
+
     /// `1 of 3 sensors, without gel`: those that were present all the time are counted.
     pub fn counted(&self) -> String {
-        let Self { registered, recorded, without, away } = self;
-        let throughout = recorded.saturating_sub(away.len());
+        let Self { registered, without, .. } = self;
+        let throughout = self.throughout();
         let sensors = if *registered == 1 { "sensor" } else { "sensors" };
         let without = if without.is_empty() { String::new() } else { format!(", without {}", without.join(", ")) };
         format!("{throughout} of {registered} {sensors}{without}")

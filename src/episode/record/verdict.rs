@@ -11,7 +11,9 @@
 //! 6. An episode shorter than [`SHORTEST`] is BAD: too short for a demonstration.
 //! 7. A modality listed in `expect` is judged by its share of the episode; one without a sample has none. With that check
 //!    off, such an episode is SUSPECT.
-//! 8. If one fault fails two checks, only the more specific one is reported: a frozen camera also repeats its pictures,
+//! 8. A replay is no better than the recording that was replayed; an episode in which another unit of the model took over
+//!    is SUSPECT.
+//! 9. If one fault fails two checks, only the more specific one is reported: a frozen camera also repeats its pictures,
 //!    a silent one also has a low rate.
 //!
 //! Invariant: pure.
@@ -27,6 +29,7 @@ use rapid_status::{Absence, Finding, Grade, Sensors, Verdict};
 
 use super::publishers::Publisher;
 use super::quality::Quality;
+use super::sources::{self, Epochs};
 
 /// A modality with its limits.
 #[derive(Debug, Clone)]
@@ -84,6 +87,8 @@ pub(super) struct Facts<'a> {
     pub(super) file: FileState<'a>,
     /// Further reasons for SUSPECT, found outside this module.
     pub(super) findings: &'a [String],
+    /// What its samples come from.
+    pub(super) epochs: &'a Epochs,
 }
 
 /// With fewer expected samples, or less time, the rate is not judged.
@@ -110,7 +115,9 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
     let registered = facts.modalities.len();
     let away = facts.modalities.iter().filter_map(|judged| away(judged, facts.seconds)).collect();
     let sensors = Sensors { registered, recorded: registered - without.len(), without, away };
-    Verdict { grade, reasons: found.iter().map(Finding::sentence).collect(), sensors: Some(sensors) }
+    let reasons = found.iter().map(Finding::sentence).collect();
+    let replay_of = sources::replayed(facts.epochs).iter().map(|replayed| replayed.name().to_owned()).collect();
+    Verdict { grade, reasons, sensors: Some(sensors), replay_of }
 }
 
 /// How long a modality with a sample was away, if it was.
@@ -131,6 +138,8 @@ pub(super) fn findings(facts: &Facts<'_>) -> Vec<Finding> {
         FileState::Failed(why) => found.push(of_all(Grade::Bad, format!("the file could not be written: {why}"))),
     }
     found.extend(facts.findings.iter().map(|finding| of_all(Grade::Suspect, finding.clone())));
+    let of_sources = sources::reasons(facts.epochs, facts.seconds).into_iter();
+    found.extend(of_sources.map(|(grade, text)| of_all(grade, text)));
     if is_short(facts.seconds) {
         let limit = seconds(SHORTEST.as_secs_f64());
         found.push(of_all(Grade::Bad, format!("too short: {} (limit {limit})", seconds(facts.seconds))));

@@ -167,6 +167,9 @@ fn write_verdict(out: &mut String, inspection: &Inspection, palette: Palette) ->
         write!(line, "   when it was recorded: {other} {}", clean(&recorded.why()))?;
     }
     writeln!(out, "{line}")?;
+    for file in &verdict.replay_of {
+        writeln!(out, "  {}", clean(&format!("replay of {file}")))?;
+    }
     for absence in verdict.sensors.iter().flat_map(|sensors| &sensors.away) {
         writeln!(out, "  {}", clean(&absence.to_string()))?;
     }

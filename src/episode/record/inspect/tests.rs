@@ -388,6 +388,7 @@ fn suspect() -> Verdict {
         grade: Grade::Suspect,
         reasons: vec!["the file is not whole: its last record is cut".to_owned()],
         sensors: Some(Sensors { registered: 2, recorded: 1, without: vec!["tof".to_owned()], away: Vec::new() }),
+        replay_of: Vec::new(),
     }
 }
 
