@@ -21,6 +21,7 @@ mod provenance;
 mod publishers;
 mod quality;
 mod recorder;
+mod sources;
 mod space;
 pub mod stepped;
 mod streams;
