@@ -24,4 +24,5 @@ pub mod sync;
 pub mod text;
 pub mod time;
 pub mod topic;
+pub mod walked;
 mod words;
