@@ -154,10 +154,12 @@ fn a_hundred_hostile_clients_cost_neither_memory_nor_messages() {
     let mut honest = Client::connect_for(&address, Some(MASK));
     honest.read_until("masks", |client| client.count(MASK) > 500);
     let hostile = Hostile::begin(&address);
-    let mut most = before;
+    let bounded = || {
+        let more = resident(running.pid()).saturating_sub(before);
+        assert!(more < BOUND, "{} MB more", more >> 20);
+    };
     honest.read_until("masks among hostile clients", |client| {
-        most = most.max(resident(running.pid()));
-        assert!(most - before < BOUND, "{} MB more", (most - before) >> 20);
+        bounded();
         client.count(MASK) > 4000 && hostile.fewest() > 20
     });
     // One that comes now is served, too: sooner or later, as they come all the time.
@@ -165,7 +167,10 @@ fn a_hundred_hostile_clients_cost_neither_memory_nor_messages() {
         let address = address.clone();
         move || until("a late client is served", || is_served(&address))
     });
-    honest.read_until("masks until then", |_| late.is_finished());
+    honest.read_until("masks until then", |_| {
+        bounded();
+        late.is_finished()
+    });
     late.join().expect("it was served");
     drop(hostile);
     let file = good(&place, running);
